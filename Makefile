@@ -24,7 +24,7 @@ help:
 	@echo "make bounds  call the tracker with every kernel compiled with bounds checks, which takes a minute"
 	@echo "make ray     track on Ray clusters, with workers and a node killed, which takes a minute"
 	@echo "make lowest  test the wheel with the oldest packages that it may be installed with"
-	@echo "make pythons test the wheel with every Python newer than 3.11 that this machine has"
+	@echo "make pythons test the wheel with the newest Python that this machine has"
 	@echo "make paths   go the first ten minutes of four users, from empty environments with the wheel, and print what they take"
 	@echo "make repeat  run make test N=10 times in fresh clones, with LOAD=0 processes that compute beside it"
 	@echo "make bench   time the tracker, its kernels, the codec and the service, beside the saved baseline"
@@ -114,7 +114,7 @@ check: $(VENV)/.installed
 	$(BIN)/mypy
 	$(BIN)/python tests/nearest.py $(SINCE)
 
-# The wheel with the oldest packages that pyproject.toml allows; and with every newer Python that is here.
+# The wheel with the oldest packages that pyproject.toml allows; and with the newest Python on this machine.
 lowest: $(VENV)/.installed
 	mkdir -p out
 	$(BIN)/python tests/lowest.py >out/lowest.txt
@@ -140,7 +140,7 @@ repeat:
 
 schemas: $(VENV)/.installed
 	$(BIN)/python -m optipmb_schemas.export --check --page docs/messages.md schemas/json
-	$(BIN)/python docs/reference.py --check docs/operation.md
+	$(BIN)/python docs/reference.py --check docs/reference.md
 
 wheel: kernels
 	sh tests/wheel.sh $(PYTHON) $(BIN)
@@ -159,7 +159,7 @@ $(DOCS)/.installed: pyproject.toml
 	touch $@
 
 docs: $(DOCS)/.installed
-	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --strict
 	@echo "the site is in out/site"
 
 # Everything that a release needs, up to publishing.

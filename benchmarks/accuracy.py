@@ -20,9 +20,8 @@ from greedy import greedy_tracks
 from kalman import HABITS, kalman_tracks
 from optipmb_client.datasets import open_dataset
 from optipmb_client.evaluation.errors import evaluate_errors
-from optipmb_client.tuning.degrade import Degradation, degrade
-from optipmb_client.tuning.material import Clip, load, of_class, track_clip, track_fully
-from optipmb_client.tuning.scoring import rules_of, scorer_of
+from optipmb_client.tuning.clips import Clip, Degradation, degrade, load, of_class, track_clip, track_fully
+from optipmb_client.tuning.scoring import plain_figures, rules_of, scorer_of
 from optipmb_client.tuning.values import only
 
 import optipmb
@@ -93,7 +92,7 @@ def main() -> None:
                 clips = [degrade(clip, Degradation(), 0) for clip in clips]
             scorer = scorer_of(dataset, name, sequences)
             for way, run in ways(dataset, detections, name):
-                found = scorer.figures([scorer.measure(clip, run(clip)) for clip in clips]).to_json()
+                found = plain_figures(scorer.figures([scorer.measure(clip, run(clip)) for clip in clips]))
                 known = way in optipmb.profiles()
                 sides = backward(sequences, clips, way, name, scorer.near) if known else ("-", "-")
                 out.writerow((detections, name, way, *(_shown(found[key]) for key in SHOWN), *sides))

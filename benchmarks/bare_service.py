@@ -14,12 +14,12 @@ from collections import deque
 from typing import TYPE_CHECKING, Final
 
 import optipmb_schemas as schemas
-from optipmb_service.app.kernels import warm_up
-from optipmb_service.app.loops import settle
+from optipmb_service.app.lifecycle import settle
+from optipmb_service.app.worker import warm_up
 from optipmb_service.runtime.scheduler import Scheduler
 from optipmb_service.session import convert
 from optipmb_service.session.timeline import FrameId
-from optipmb_service.settings.model import Settings
+from optipmb_service.settings import Settings
 from optipmb_service.zenoh.connection import opened
 from optipmb_service.zenoh.handles import cached_publisher, directly
 
@@ -55,7 +55,7 @@ class Frames:
     def take(self, sample: zenoh.Sample) -> None:
         """Take detections."""
         self._waiting.append(sample.payload.to_bytes())
-        self._scheduler.submit(self)
+        self._scheduler.submit(self.work)
 
     def work(self) -> bool:
         """Answer a frame."""

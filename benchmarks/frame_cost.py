@@ -24,16 +24,8 @@ from typing import TYPE_CHECKING, Any
 
 import optipmb_schemas as schemas
 from optipmb_client.load import generated
-from optipmb_client.load.material import FIRST, head, message
-from optipmb_service.app.kernels import warm_up
-from optipmb_service.observability import logs
-from optipmb_service.observability.metrics import Metrics
-from optipmb_service.observability.problem_reporter import ProblemReporter
-from optipmb_service.runtime.persistence import NoPersistence
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.profiles import Profiles
-from optipmb_service.runtime.registry import Registry
-from optipmb_service.runtime.stream_actor import StreamActor
 from optipmb_service.runtime.track_publisher import TrackPublisher
 from optipmb_service.session import convert
 from optipmb_service.session.session import Session
@@ -99,7 +91,7 @@ class Network:
         """Run the actors until none has anything to do."""
         while self.waiting:
             actor = self.waiting.pop(0)
-            if actor.work():
+            if (actor if callable(actor) else actor.work)():
                 self.waiting.append(actor)
 
     def holds(self, stream: str) -> bool:
@@ -131,8 +123,9 @@ class Network:
 def packets(objects: int, points: int) -> Iterator[list[Packet]]:
     """Yield the messages of each frame, its cloud first."""
     frames, keys = generated(objects, points, RATE_HZ), schemas.Keys()
+    load = first_of("load.material", "load", package="optipmb_client")
     for k in range(WARM + FRAMES):
-        begins = head(STREAM, bytes(16), FIRST + k, 10**18 + round(k * 1e9 / RATE_HZ))
+        begins = load.head(STREAM, bytes(16), load.FIRST + k, 10**18 + round(k * 1e9 / RATE_HZ))
         made = []
         detections, cloud = frames.detections[k % len(frames)], frames.clouds[k % len(frames)]
         bodies = (
@@ -141,31 +134,38 @@ def packets(objects: int, points: int) -> Iterator[list[Packet]]:
         )
         for body, key, kind in bodies:
             if body is not None:
-                payload = message(body, begins)
+                payload = load.message(body, begins)
                 encoding = schemas.encoding_of(kind)
                 made.append(Packet(key, payload, len(payload), encoding, time.time_ns(), time.monotonic_ns()))
         yield made
 
 
-def first_of(*modules: str) -> Any:
-    """Return the first of these modules of the service that the checkout has: an earlier one has it all in another."""
+def first_of(*modules: str, package: str = "optipmb_service") -> Any:
+    """Return the first of these modules of a package that the checkout has: an earlier one has it all in another."""
     for module in modules:
         with contextlib.suppress(ModuleNotFoundError):
-            return import_module(f"optipmb_service.{module}")
+            return import_module(f"{package}.{module}")
     raise ModuleNotFoundError(modules[-1])
 
 
 def measured(objects: int, points: int) -> dict[str, float]:
     """Return the median microseconds of each part of a frame."""
-    logs.configure("console", "error")
-    warm_up()
+    first_of("telemetry.logs", "observability.logs").configure("console", "error")
+    first_of("app.kernels", "app.worker").warm_up()
+    metrics = first_of("telemetry.metrics", "observability.metrics").Metrics
+    reporter = first_of("telemetry.problem_reporter", "observability.problem_reporter").ProblemReporter
     parts = Parts()
     network: Any = Network()  # in the place of several parts
-    decoding = first_of("runtime.stream_tracking", "runtime.stream_actor")
+    decoding = first_of("runtime.stream", "runtime.stream_tracking", "runtime.stream_actor")
+    table, persistence = first_of("runtime.streams", "runtime.registry"), first_of("runtime.persistence")
+    streams_type = getattr(table, "Streams", None) or table.Registry
+    turn_of = first_of("runtime.stream", "runtime.stream_actor")
+    nothing: Any = None
     encode_checkpoint = first_of("session.checkpoint_codec", "session.checkpoint").encode_checkpoint
     for part, owner, name in (
-        ("handing over", Registry, "frame"),
-        ("handing over", Registry, "cloud"),
+        ("handing over", streams_type, "receive"),
+        ("handing over", streams_type, "frame"),
+        ("handing over", streams_type, "cloud"),
         ("decoding", decoding, "message_of"),
         ("session", Session, "on_detections"),
         ("session", Session, "on_points"),
@@ -174,41 +174,47 @@ def measured(objects: int, points: int) -> dict[str, float]:
         ("conversion", convert, "tracks_of"),
         ("step", optipmb.Tracker, "step"),
         ("publishing", TrackPublisher, "send"),
-        ("metrics", Metrics, "received"),
-        ("metrics", Metrics, "published"),
-        ("metrics", Metrics, "tracks"),
-        ("actor", StreamActor, "work"),
+        ("metrics", metrics, "received"),
+        ("metrics", metrics, "published"),
+        ("metrics", metrics, "tracks"),
+        ("actor", getattr(turn_of, "Stream", None) or turn_of.StreamActor, "work"),
     ):
         if hasattr(owner, name):
             setattr(owner, name, parts.time(part, getattr(owner, name)))
-    # What another checkout may not have yet.
-    newer: dict[str, Any] = {}
-    with contextlib.suppress(ModuleNotFoundError):
-        newer["missed"] = import_module("optipmb_service.runtime.missed_frames").NoLog()
-    registry = Registry(
+    # Another checkout may have other parts.
+    if hasattr(streams_type, "receive"):
+        writer = persistence.CheckpointWriter(nothing, 1.0, network, off="")
+        others = {"open_publisher": network.open_publisher, "checkpoints": writer, "log": None}
+    else:
+        others = {"sink": network, "persistence": persistence.NoPersistence()}
+        with contextlib.suppress(ModuleNotFoundError):
+            others["missed"] = import_module("optipmb_service.runtime.missed_frames").NoLog()
+    streams = streams_type(
         first_of("settings.model", "settings").Settings(instance="cost", store="none"),
         Profiles.read("nuscenes", {}),
-        sink=network,
-        reporter=ProblemReporter(network.publish_problem, lambda *_: None),
+        reporter=reporter(network.publish_problem, lambda *_: None),
         scheduler=network,
         member=network,
-        persistence=NoPersistence(),
         arm=lambda *_: None,
-        metrics=Metrics(),
-        **newer,
+        metrics=metrics(),
+        **others,
     )
     rows: list[dict[str, float]] = []
     checkpoints: list[float] = []
     for k, frame in enumerate(packets(objects, points)):
         for packet in frame:
-            (registry.frame if packet.key.endswith("detections") else registry.cloud)(packet)
+            if hasattr(streams, "receive"):
+                streams.receive(packet)
+            else:
+                (streams.frame if packet.key.endswith("detections") else streams.cloud)(packet)
         network.run()
         row = parts.taken()
         if k >= WARM:
             rows.append(row)
-            if k % CHECKPOINT_EVERY == 0 and (actor := registry.actor(STREAM)) is not None and actor.session:
+            if k % CHECKPOINT_EVERY == 0:
+                session = (streams.of if hasattr(streams, "of") else streams.actor)(STREAM).session
                 began_ns = time.thread_time_ns()
-                encode_checkpoint(actor.session.snapshot())
+                encode_checkpoint(session.snapshot())
                 checkpoints.append((time.thread_time_ns() - began_ns) / 1e3 / CHECKPOINT_EVERY)
     if network.published != WARM + FRAMES or network.problems:
         raise RuntimeError(f"{network.published} frames were answered, {network.problems[:1]}")

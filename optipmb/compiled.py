@@ -24,6 +24,7 @@ import hashlib
 import logging
 import os
 import tempfile
+import time
 from functools import cache, partial
 from pathlib import Path
 from stat import S_ISDIR, S_IWGRP, S_IWOTH
@@ -54,26 +55,45 @@ def _digest() -> str:
 
 _SOURCES: Final = _digest()
 
+PROGRESS_S: Final = 10.0
+"""Time between two lines about the progress of a compilation."""
 
-class _FirstCompilation(event.Listener):
-    """Logs one line when this process first compiles a kernel of the package: a first frame may take a minute.
 
-    It is a warning, because Python prints those to standard error where a program has not configured logging.
+class _Progress(event.Listener):
+    """Log that kernels of the package are compiled, and how far it is: a first frame may take a minute.
+
+    These are warnings, because Python prints those to standard error where a program has not configured logging.
     """
 
-    said = False
+    def __init__(self) -> None:
+        self.kernels: set[str] = set()
+        """All kernels of the modules imported so far."""
+        self.compiled: set[str] = set()
+        self.said_at: float | None = None
 
     def on_start(self, event: Any) -> None:
-        """Numba begins to compile a function that is not in its cache."""
-        if not self.said and event.data["dispatcher"].py_func.__module__.startswith(f"{__package__}."):
-            self.said = True
+        """Announce the first compilation of this process."""
+        if self.said_at is None and self._name(event) in self.kernels:
+            self.said_at = time.monotonic()
             _log.warning("optipmb: compiling the tracker, once after an installation; it takes up to a minute")
 
     def on_end(self, event: Any) -> None:
-        """It has compiled the function."""
+        """Count a compiled kernel, with a line every few seconds."""
+        if (name := self._name(event)) not in self.kernels:
+            return
+        self.compiled.add(name)
+        if self.said_at is not None and time.monotonic() > self.said_at + PROGRESS_S:
+            self.said_at = time.monotonic()
+            _log.warning("optipmb: compiled %d of %d kernels", len(self.compiled), len(self.kernels))
+
+    @staticmethod
+    def _name(event: Any) -> str:
+        function = event.data["dispatcher"].py_func
+        return f"{function.__module__}.{function.__qualname__}"
 
 
-event.register("numba:compile", _FirstCompilation())  # type: ignore[no-untyped-call]  # numba has no types
+_progress: Final = _Progress()
+event.register("numba:compile", _progress)  # type: ignore[no-untyped-call]  # numba has no types
 
 
 def kernel(function: F) -> F:
@@ -94,6 +114,7 @@ def long_kernel(function: F) -> F:
 
 
 def _compiled(function: F, *, nogil: bool) -> F:
+    _progress.kernels.add(f"{function.__module__}.{function.__qualname__}")
     jit = partial(numba.njit, nogil=nogil, error_model="numpy")
     try:
         compiled: Any = jit(cache=True)(function)

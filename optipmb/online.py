@@ -11,18 +11,19 @@ It is a thin object over the pure `Tracker.step`, for those who want no densitie
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from optipmb.class_names import class_indices
-from optipmb.errors import FrameError
+from optipmb.errors import FrameError, ParameterError
 from optipmb.frame import make_frame
 from optipmb.parameters import Parameters, load_profile
 from optipmb.tracker import Tracker
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     import pandas as pd
     import pyarrow as pa
@@ -33,14 +34,23 @@ if TYPE_CHECKING:
     from optipmb.field_of_view import FieldOfView
     from optipmb.frame import PointCloud, Pose
     from optipmb.paths import PredictedPaths
-    from optipmb.rows import Array
+    from optipmb.rows import Array, Index
     from optipmb.tracker import Modules
 
 
 FLAT: Final = (("center", ("x", "y", "z")), ("size", ("l", "w", "h")), ("velocity", ("vx", "vy")))
 """Arrays of a frame, and the columns that may stand for them."""
-CLASSES: Final = ("class", "label", "name")
+ALIASES: Final = {
+    "length": "l", "width": "w", "height": "h", "heading": "yaw", "confidence": "score",
+    "class": "label", "name": "label", "category": "label", "type": "label",
+}  # fmt: skip
+"""Other names of columns."""
+WITHOUT: Final = {"z": 0.0, "h": 1.5, "score": 1.0}
+"""Values of the columns that may be missing, as in the tables of `optipmb track`."""
 BOXES: Final = ("center", "size", "yaw", "score", "label")
+KNOWN: Final = (*BOXES, "velocity", "position_covariance", *(part for _, parts in FLAT for part in parts), *ALIASES)
+SHOWN_ROWS: Final = 10
+"""Tracks that the representation of `OnlineTracks` lists."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +59,8 @@ class OnlineTracks:
 
     Attributes:
         stamp_ns: of the frame, nanoseconds.
-        tracks: everything that the tracker gives.
-        name: (N,) class names.
+        tracks: the columns as `optipmb.Tracks`, for `optipmb.predict_tracks`.
+        name: (N,) class names as the detections gave them, those of the profile elsewhere.
         velocity: (N, 2) over ground, m/s; NaN while it is unknown: before the second detection, where the detector
             gives none.
         left_out: detections of classes that the profile lacks.
@@ -58,13 +68,30 @@ class OnlineTracks:
         class_probability: (N, C) probability of each class of the profile; None where it has no groups of classes.
         sensor_motion: (3,) velocity, m/s, and turn rate, rad/s, with which what stands passes the sensor, where the
             motion of the sensor is estimated; None elsewhere.
+
+    The other attributes are the columns of `optipmb.Tracks`.
     """
 
     stamp_ns: int
     tracks: Tracks
     name: NDArray[np.str_]
-    velocity: Array
     left_out: int
+    id: Index
+    label: Index
+    center: Array
+    size: Array
+    yaw: Array
+    heading_confidence: Array
+    velocity: Array
+    yaw_rate: Array
+    acceleration: Array
+    existence: Array
+    score: Array
+    covariance: Array
+    age: Array
+    time_since_detection: Array
+    detection: Index
+    confirmed: NDArray[np.bool_]
     paths: PredictedPaths | None = None
     class_probability: Array | None = None
     sensor_motion: Array | None = None
@@ -72,30 +99,29 @@ class OnlineTracks:
     def __len__(self) -> int:
         return len(self.tracks)
 
-    def __getattr__(self, name: str) -> Any:
-        """Give every other column of `optipmb.Tracks`: id, center, size, yaw, existence, covariance and so on."""
-        if name.startswith("_") or name == "tracks":
-            raise AttributeError(name)
-        return getattr(self.tracks, name)
+    def __repr__(self) -> str:
+        lines = [f"OnlineTracks: {len(self)} tracks at {self.stamp_ns / 1e9:.3f} s"]
+        if len(self):
+            lines.append(f"{'id':>6} {'class':<12} {'x':>9} {'y':>9} {'vx':>7} {'vy':>7} {'existence':>9} confirmed")
+        for i in range(min(len(self), SHOWN_ROWS)):
+            (x, y, _), (vx, vy) = self.center[i], self.velocity[i]
+            place = f"{self.id[i]:>6} {self.name[i]:<12} {x:>9.2f} {y:>9.2f} {vx:>7.2f} {vy:>7.2f}"
+            lines.append(f"{place} {self.existence[i]:>9.3f} {bool(self.confirmed[i])}")
+        return "\n".join([*lines, *([f"   ... {len(self) - SHOWN_ROWS} more"] if len(self) > SHOWN_ROWS else [])])
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Return the tracks as flat columns (N,), named as the tables of the command `optipmb track`."""
-        tracks = self.tracks
+        plain = ("score", "existence", "confirmed", "age", "time_since_detection", "detection")
         return {
             "stamp_ns": np.full(len(self), self.stamp_ns, dtype=np.int64),
-            "id": tracks.id,
+            "id": self.id,
             "class": self.name,
-            **{part: tracks.center[:, i] for i, part in enumerate("xyz")},
-            **{part: tracks.size[:, i] for i, part in enumerate("lwh")},
-            "yaw": tracks.yaw,
+            **{part: getattr(self, array)[:, i] for array, parts in FLAT[:2] for i, part in enumerate(parts)},
+            "yaw": self.yaw,
             **{part: self.velocity[:, i] for i, part in enumerate(("vx", "vy"))},
-            "yaw_rate": tracks.yaw_rate,
-            "acceleration": tracks.acceleration,
-            "score": tracks.score,
-            "existence": tracks.existence,
-            "age": tracks.age,
-            "time_since_detection": tracks.time_since_detection,
-            "detection": tracks.detection,
+            "yaw_rate": self.yaw_rate,
+            "acceleration": self.acceleration,
+            **{column: getattr(self, column) for column in plain},
         }
 
     def to_arrow(self) -> pa.Table:
@@ -129,8 +155,8 @@ class OnlineTracker:
     """Tracks one stream of frames.
 
     Args:
-        profile: parameters, or the name or file of a profile. `generic_parameters` makes some for a detector that
-            nobody tuned.
+        profile: parameters, or the name or file of a profile. `generic` suits road users of any detector;
+            `generic_parameters` makes parameters for other classes and rates.
         modules: which modules of the paper are on.
         unknown_classes: `refuse` raises for a detection of a class that the profile lacks, `leave out` counts it in
             `OnlineTracks.left_out`. Names that mean the same are one: `car`, `Car` and `vehicle.car`.
@@ -148,8 +174,12 @@ class OnlineTracker:
     ) -> None:
         if unknown_classes not in {"refuse", "leave out"}:
             raise FrameError("unknown_classes", "'refuse' or 'leave out'", repr(unknown_classes))
+        if profile == "auto":
+            expected = "'generic', which is auto at 10 Hz, or generic_parameters(labels, period)"
+            raise ParameterError("profile", expected, "'auto', which needs a whole recording")
         self.parameters = profile if isinstance(profile, Parameters) else load_profile(profile)
         self._tracker = Tracker(self.parameters, modules)
+        self._names = np.asarray(self.parameters.labels, dtype=np.object_)
         self._leave_out = unknown_classes == "leave out"
         self.density: Density = self._tracker.initial()
 
@@ -161,7 +191,7 @@ class OnlineTracker:
         self,
         boxes: Mapping[str, ArrayLike] | Any = None,
         *,
-        t: float | None = None,
+        t: float | datetime | np.datetime64 | None = None,
         stamp_ns: int | None = None,
         pose: Pose | None = None,
         cloud: PointCloud | None = None,
@@ -171,12 +201,13 @@ class OnlineTracker:
         """Take the detections of the next frame and return the tracks.
 
         Args:
-            boxes: columns by name: a dictionary, or a data frame of pandas, polars or pyarrow. `center` (M, 3) or `x`,
-                `y`, `z`; `size` (M, 3) length, width, height, or `l`, `w`, `h`; `yaw` (M,) rad; `score` (M,) in (0, 1];
-                `class`, `label` or `name` (M,): class names, or their places in the profile; `velocity` (M, 2) or
-                `vx`, `vy`, m/s, NaN where unknown; `position_covariance` (M, 3, 3), m^2, likewise. None: nothing was
-                detected.
-            t: time of the frame, s; or
+            boxes: columns by name: a dictionary, a list of one for each box, a structured array, or a data frame of
+                pandas, polars or pyarrow. `center` (M, 3) or `x`, `y`, `z`; `size` (M, 3) or `l`, `w`, `h` or `length`,
+                `width`, `height`; `yaw` or `heading` (M,) rad; `score` or `confidence` (M,) in (0, 1]; `class`,
+                `label`, `name`, `category` or `type` (M,): class names, or their places in the profile; `velocity`
+                (M, 2) or `vx`, `vy`, m/s, NaN where unknown; `position_covariance` (M, 3, 3), m^2, likewise. Without
+                `z` it is 0, without `h` 1.5 m, without `score` 1. None: nothing was detected.
+            t: time of the frame: seconds, or a date (of pandas too; UTC where it has no zone); or
             stamp_ns: nanoseconds.
             pose: world from sensor, or None when the boxes are in the world frame.
             cloud: the scan of the same stamp.
@@ -184,20 +215,16 @@ class OnlineTracker:
             arrays: the same columns as arguments.
 
         Raises:
-            FrameError: a column is missing, or a shape, value or class is not allowed, or the stamp goes back; names
-                it. The density stays as it was.
+            FrameError: a column is missing or unknown, or a shape, value or class is not allowed, or the stamp goes
+                back; names it. The density stays as it was.
         """
         if (t is None) == (stamp_ns is None):
             raise FrameError("t", "t (s) or stamp_ns (ns)", "both" if t is not None else "neither")
-        if t is not None:
-            if not np.isfinite(t):
-                raise FrameError("t", "finite seconds", repr(t))
-            stamp_ns = round(t * 1e9)
         columns = _columns(boxes, arrays)
         names, label, left_out = self._classes(columns.pop("label"))
         frame, missing = make_frame(
             self.parameters,
-            stamp_ns=stamp_ns or 0,
+            stamp_ns=_stamp(t) if stamp_ns is None else stamp_ns,
             labels=names,
             label=label,
             pose=pose,
@@ -209,12 +236,13 @@ class OnlineTracker:
         self.density = result.density
         tracks = result.tracks
         once = (tracks.age == tracks.time_since_detection) & (tracks.velocity == 0.0).all(axis=1)
+        known = dict(tracks.columns()) | {"velocity": np.where(once[:, None], np.nan, tracks.velocity)}
         return OnlineTracks(
             stamp_ns=frame.stamp_ns,
             tracks=tracks,
-            name=np.asarray(self.parameters.labels, dtype=np.str_)[tracks.label],
-            velocity=np.where(once[:, None], np.nan, tracks.velocity),
+            name=self._names[tracks.label].astype(np.str_),
             left_out=max(left_out, missing),
+            **known,
             paths=result.paths,
             class_probability=result.class_probability,
             sensor_motion=result.density.sensor_motion,
@@ -228,31 +256,84 @@ class OnlineTracker:
             return known, given.astype(np.int64), 0
         found, label = np.unique(given.astype(np.str_), return_inverse=True)
         names = tuple(found.tolist())
-        rows = np.flatnonzero(class_indices(names, known)[label] < 0)
+        places = class_indices(names, known)
+        rows = np.flatnonzero(places[label] < 0)
         if len(rows) and not self._leave_out:
             expected = f"one of {', '.join(known)} (unknown_classes='leave out' takes any)"
             raise FrameError(f"label[{rows[0]}]", expected, repr(str(given[rows[0]])))
+        for name, place in zip(names, places.tolist(), strict=True):
+            if place >= 0 and self._names[place] == known[place]:
+                self._names[place] = name
         return names, label.astype(np.int64), len(rows)
+
+
+def _stamp(t: Any) -> int:
+    """Return the nanoseconds of a time in seconds, or of a date."""
+    if isinstance(t, datetime):  # pandas' own has nanoseconds, and those of datetime are exact
+        since = t - datetime(1970, 1, 1, tzinfo=None if t.tzinfo is None else UTC)
+        return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000 + getattr(t, "nanosecond", 0)
+    if isinstance(t, np.datetime64):
+        return int(t.astype("datetime64[ns]").astype(np.int64))
+    try:
+        seconds = float(t)
+    except (TypeError, ValueError):
+        raise FrameError("t", "seconds or a date", repr(t)) from None
+    if not np.isfinite(seconds):
+        raise FrameError("t", "finite seconds", repr(t))
+    return round(seconds * 1e9)
 
 
 def _columns(boxes: Any, arrays: Mapping[str, ArrayLike]) -> dict[str, Any]:
     """Return the columns as `make_frame` takes them."""
-    given: dict[str, Any] = dict(arrays)
-    if boxes is not None:
-        names = getattr(boxes, "column_names", getattr(boxes, "columns", None))  # pyarrow; pandas and polars
-        given |= {str(name): boxes[name] for name in (boxes if names is None else names)}
+    given = {**_named(boxes), **arrays}
     if not given:
         return {"center": [], "size": [], "yaw": [], "score": [], "label": []}
+    if unknown := [name for name in given if name not in KNOWN]:
+        raise FrameError(unknown[0], f"columns among {', '.join(KNOWN)}", f"the columns {', '.join(given)}")
+    given = {ALIASES.get(name, name): values for name, values in given.items()}
     columns: dict[str, Any] = {}
     for name, parts in FLAT:
         if name in given:
             columns[name] = given[name]
-        elif all(part in given for part in parts):
-            columns[name] = np.column_stack([np.asarray(given[part], dtype=np.float64) for part in parts])
-    columns |= {name: given[name] for name in ("yaw", "score", "position_covariance") if name in given}
-    label = next((given[name] for name in CLASSES if name in given), None)
-    columns |= {} if label is None else {"label": label}
-    missing = [name for name in BOXES if name not in columns]
-    if missing:
+        elif any(part in given for part in parts):
+            columns[name] = _stacked(given, parts)
+    columns |= {name: given[name] for name in ("yaw", "score", "position_covariance", "label") if name in given}
+    columns.setdefault("score", [WITHOUT["score"]] * len(columns.get("yaw", ())))
+    if missing := [name for name in BOXES if name not in columns]:
         raise FrameError(missing[0], f"a column for each of {', '.join(BOXES)}", f"the columns {', '.join(given)}")
     return {name: values if isinstance(values, list) else np.asarray(values) for name, values in columns.items()}
+
+
+def _named(boxes: Any) -> dict[str, Any]:
+    """Return the columns of boxes in any of the forms that `update` takes."""
+    if boxes is None or (isinstance(boxes, list) and not boxes):
+        return {}
+    if isinstance(boxes, list):
+        names = boxes[0].keys() if isinstance(boxes[0], dict) else None
+        if names is None or not all(isinstance(one, dict) and one.keys() == names for one in boxes):
+            raise FrameError("boxes", "a dictionary with the same keys for each box", f"a list of {len(boxes)}")
+        return {str(name): [one[name] for one in boxes] for name in names}
+    if isinstance(boxes, np.ndarray):
+        if boxes.dtype.names is None:
+            raise FrameError("boxes", "a structured array, or columns by name", f"{boxes.shape} {boxes.dtype}")
+        return {name: boxes[name] for name in boxes.dtype.names}
+    columns = getattr(boxes, "column_names", getattr(boxes, "columns", None))  # pyarrow; pandas and polars
+    return {str(name): boxes[name] for name in (boxes if columns is None else columns)}
+
+
+def _stacked(given: Mapping[str, Any], parts: Sequence[str]) -> Array:
+    """Return one array of the columns of its parts."""
+    count = len(next(given[part] for part in parts if part in given))
+    columns = []
+    for part in parts:
+        if part not in given and part not in WITHOUT:
+            raise FrameError(part, f"the columns {', '.join(parts)}", f"the columns {', '.join(given)}")
+        values = given.get(part, [WITHOUT.get(part)] * count)
+        try:
+            column = np.asarray(values, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise FrameError(part, "numbers", f"{type(values).__name__} of {values!r:.60}") from None
+        if column.shape != (count,):
+            raise FrameError(part, f"({count},) numbers, one for each box", f"{column.shape}")
+        columns.append(column)
+    return np.column_stack(columns)

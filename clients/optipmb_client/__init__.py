@@ -5,11 +5,15 @@
 The command `optipmb` does everything that needs no programming.
 """
 
-from optipmb_client.errors import ClientError, ConnectionFailed, ServiceRefused, ServiceUnavailable, UsageError
-from optipmb_client.history import kept_tracks
-from optipmb_client.publisher import Publisher
-from optipmb_client.subscriber import Missed, Received, Statistics, Subscriber
-from optipmb_client.zenoh import DEFAULT_ENDPOINT, Connection
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from optipmb_client.errors import ClientError, ConnectionFailed, ServiceRefused, ServiceUnavailable, UsageError
+    from optipmb_client.history import kept_tracks
+    from optipmb_client.publisher import Publisher
+    from optipmb_client.subscriber import Missed, Received, Statistics, Subscriber
+    from optipmb_client.zenoh import DEFAULT_ENDPOINT, Connection
 
 __all__ = [
     "DEFAULT_ENDPOINT",
@@ -26,3 +30,19 @@ __all__ = [
     "UsageError",
     "kept_tracks",
 ]
+
+# Imported on first use: offline commands need no Zenoh.
+_MODULES = {
+    "errors": ("ClientError", "ConnectionFailed", "ServiceRefused", "ServiceUnavailable", "UsageError"),
+    "history": ("kept_tracks",),
+    "publisher": ("Publisher",),
+    "subscriber": ("Missed", "Received", "Statistics", "Subscriber"),
+    "zenoh": ("DEFAULT_ENDPOINT", "Connection"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for module, names in _MODULES.items():
+        if name in names:
+            return getattr(import_module(f"{__name__}.{module}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

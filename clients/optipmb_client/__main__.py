@@ -8,8 +8,8 @@ from optipmb_client.extras import to_install
 
 
 def main() -> NoReturn:
-    """Run the command line of this process and exit; say what to install where its packages are missing."""
-    gc.disable()  # what imports make stays: walking it again and again would be a tenth of the start
+    """Run the command line of this process and exit; a missing package gives the command that installs it."""
+    gc.disable()  # imported objects stay: collecting them again and again would be a tenth of the start
     try:
         from optipmb_client import cli  # noqa: PLC0415 - packages of an extra
     except ModuleNotFoundError as error:

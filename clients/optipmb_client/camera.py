@@ -1,7 +1,7 @@
 """The rectified camera frame of KITTI and the z-up sensor frame that stands for it.
 
-Conventions. The camera frame has x right, y down, z forward. The sensor frame is the same frame with its axes named
-anew: x_sensor = z_camera (forward), y_sensor = -x_camera (left), z_sensor = -y_camera (up). KITTI gives a box by the
+Conventions. The camera frame has x right, y down, z forward. The sensor frame is the same frame with its axes
+renamed: x_sensor = z_camera (forward), y_sensor = -x_camera (left), z_sensor = -y_camera (up). KITTI gives a box by the
 centre of its bottom and by rotation_y = ry about the camera's y axis, with ry = 0 along x_camera; in the sensor frame
 its yaw is -ry - pi/2. The alpha angle is ry - atan2(x, z). Pixels: x right, y down.
 """
@@ -15,11 +15,9 @@ from optipmb_client.geometry import Bools, Floats, box_corners, wrap_angle
 SENSOR_FROM_CAMERA: Floats = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], dtype=np.float64)
 """The relabelling of axes; orthogonal, so its transpose goes back."""
 
-KITTI_IMAGE = (1242.0, 375.0)
-"""Width and height of most images of the KITTI tracking benchmark, in pixels."""
+KITTI_IMAGE = (1242.0, 375.0)  # width and height of most images of the KITTI tracking benchmark, in pixels
 
-_NEAR = 0.1
-"""Depth in metres in front of which nothing is projected."""
+_NEAR = 0.1  # depth in metres in front of which nothing is projected
 
 _EDGES = np.array([[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]])
 
@@ -31,7 +29,6 @@ def sensor_from_kitti(bottom: Floats, hwl: Floats, rotation_y: Floats) -> tuple[
         bottom: (N, 3) centre of the bottom, camera frame.
         hwl: (N, 3) height, width, length.
         rotation_y: (N,).
-
     """
     center = bottom @ SENSOR_FROM_CAMERA.T
     center[:, 2] += 0.5 * hwl[:, 0]
@@ -76,9 +73,8 @@ class Camera:
             least_shown: part of the projected box that must lie in the image for the image to show it.
 
         Returns:
-            (N, 4) x1 y1 x2 y2 in pixels, and (N,) whether the image shows it. What it does not show (behind the camera,
-            beside its view) gets 0 0 0 0: a box without height, which the KITTI evaluation leaves out of account.
-
+            (N, 4) x1 y1 x2 y2 in pixels, and (N,) whether the image shows it. Others (behind the camera, outside
+            its view) get 0 0 0 0: a box without height, which the KITTI evaluation leaves out of account.
         """
         corners = box_corners(center, size, yaw) @ SENSOR_FROM_CAMERA  # (N, 8, 3), camera frame
         start, stop = corners[:, _EDGES[:, 0]], corners[:, _EDGES[:, 1]]
@@ -96,7 +92,7 @@ class Camera:
         limit = np.array([self.width - 1.0, self.height - 1.0])
         seen = np.asarray((least < limit).all(axis=1) & (most > 0.0).all(axis=1) & ahead.any(axis=1), dtype=np.bool_)
         boxes = np.concatenate([np.clip(least, 0.0, limit), np.clip(most, 0.0, limit)], axis=1)
-        with np.errstate(invalid="ignore"):  # what is not seen at all has infinite bounds
+        with np.errstate(invalid="ignore"):  # unseen boxes have infinite bounds
             whole = np.prod(most - least, axis=1)
         seen &= np.prod(boxes[:, 2:] - boxes[:, :2], axis=1) >= least_shown * np.where(seen, whole, 0.0)
         return np.where(seen[:, None], boxes, 0.0), seen

@@ -2,8 +2,6 @@
 
 from collections.abc import Sequence
 
-__all__ = ["class_like"]
-
 
 def class_like(name: str, names: Sequence[str]) -> str | None:
     """Return the one of `names` that means the same class, as profiles match them; None for none or several.

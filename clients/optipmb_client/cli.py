@@ -1,57 +1,55 @@
-"""The command `optipmb`. An error is one line on standard error and a status: 2 for what was asked, 1 for the rest."""
+"""The command `optipmb`. An error is one line on standard error and a status: 2 for wrong input, 1 for the rest."""
 
 import inspect
 import re
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib import import_module
 from importlib.metadata import version
 from types import FrameType
-from typing import Annotated, Any, Final, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 from optipmb_schemas import MessageError
 from typer.core import TyperCommand, TyperGroup
 
-from optipmb_client.arguments import filled, spread
 from optipmb_client.commands.options import MANY, RAY_ADDRESS, grouped
-from optipmb_client.datasets import DatasetError
 from optipmb_client.errors import ClientError, UsageError
 from optipmb_client.extras import to_install
-
-__all__ = ["app", "main", "run"]
+from optipmb_client.files import DatasetError
 
 FAILED = 1
 WRONG = 2
 INTERRUPTED = 128 + signal.SIGINT
 TERMINATED = 128 + signal.SIGTERM
 
-COMMANDS: Final = {
+# Module of each command, and its function where that has another name; in the order of the help
+COMMANDS = {
     "demo": "demo",
     "check": "check",
     "track": "track",
     "replay": "replay",
-    "record": "record",
-    "play": "play",
-    "watch": "watch",
+    "record": "recordings",
+    "play": "recordings",
+    "watch": "view",
     "evaluate": "evaluate",
     "tune": "tune",
     "ablate": "ablate",
-    "sweep": "sweep",
-    "plot": "plot",
-    "status": "status",
-    "tracks": "tracks",
+    "sweep": "ablate",
+    "plot": "view",
+    "status": "service",
+    "tracks": "service",
     "profiles": "profiles",
     "load": "load",
-    "set": "set_profile",  # a function of the command's name would hide Python's own
-    "move": "move",
-    "drain": "drain",
-    "warm-up": "warm_up",
+    "set": "service",
+    "move": "service",
+    "drain": "service",
+    "warm-up": "profiles",
 }
-"""Functions of the commands, in modules of the commands' names, in the order of the help."""
+FUNCTIONS = {"set": "set_profile", "warm-up": "warm_up"}
 
-# What the option parser raises for a wrong option: the base of its public subclass, as it has no public name itself.
+# The option parser's error for a wrong option: the base of its public subclass, as it has no public name itself.
 _OptionError: Any = typer.BadParameter.__base__
 
 
@@ -72,13 +70,12 @@ class _Commands(TyperGroup):
     def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002  as click calls it
         if cmd_name not in COMMANDS:
             return None
-        module = import_module(f"optipmb_client.commands.{cmd_name.replace('-', '_')}")
-        command = getattr(module, COMMANDS[cmd_name])
+        module = import_module(f"optipmb_client.commands.{COMMANDS[cmd_name]}")
+        command = getattr(module, FUNCTIONS.get(cmd_name, cmd_name))
         paragraphs = inspect.cleandoc(command.__doc__ or "").split("\n\n")
+        text = "\n\n".join(" ".join(part.split()) for part in paragraphs)
         alone = typer.Typer(add_completion=False)
-        alone.command(cmd_name, cls=_Command, help="\n\n".join(" ".join(part.split()) for part in paragraphs))(
-            grouped(command)
-        )
+        alone.command(cmd_name, cls=_Command, help=text)(grouped(command))
         return typer.main.get_command(alone)
 
 
@@ -149,3 +146,47 @@ def _terminate(_number: int, _frame: FrameType | None) -> NoReturn:
 def _fail(status: int, text: str) -> int:
     print("optipmb: " + " ".join(text.split()), file=sys.stderr)  # noqa: T201  this is the error line
     return status
+
+
+def filled(arguments: Sequence[str], option: str, values: re.Pattern[str], default: str) -> list[str]:
+    """Rewrite `--x` as `--x=DEFAULT` where none of the values that the option takes follows."""
+    end = arguments.index("--") if "--" in arguments else len(arguments)
+    return [
+        f"{one}={default}"
+        if one == option and place < end and not values.fullmatch("".join(arguments[place + 1 : place + 2]))
+        else one
+        for place, one in enumerate(arguments)
+    ]
+
+
+def spread(arguments: Sequence[str], options: Iterable[str]) -> list[str]:
+    """Rewrite `--x a b,c` as `--x a --x b --x c` for each of the `options`.
+
+    The values of an option are the arguments after it up to the next one that begins with a dash. A flag without a
+    value stays alone, for the parser to complain about.
+    """
+    many = set(options)
+    result: list[str] = []
+    flag = ""
+    for position, argument in enumerate(arguments):
+        if argument == "--":
+            return [*result, *arguments[position:]]
+        name, equals, value = argument.partition("=")
+        if name in many:
+            flag = name
+            following = arguments[position + 1 : position + 2]
+            if equals:
+                result += _pairs(flag, value)
+            elif not following or following[0].startswith("-"):
+                result.append(flag)
+        elif argument.startswith("-"):
+            flag = ""
+            result.append(argument)
+        else:
+            result += _pairs(flag, argument) if flag else [argument]
+    return result
+
+
+def _pairs(flag: str, values: str) -> list[str]:
+    names = [name for name in values.split(",") if name]
+    return [part for name in names or [""] for part in (flag, name)]

@@ -5,8 +5,6 @@ apart (Okabe and Ito, 2008); after seven tracks they come round again, so a trac
 drawn.
 """
 
-__all__ = ["COLOURS", "colour_of", "rgb_of"]
-
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#8C6D1F")
 
 

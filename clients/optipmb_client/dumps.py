@@ -1,4 +1,4 @@
-"""What a service saved when tracking a stream failed, gone through once more in this process.
+"""Dumps that a service saves when tracking a stream fails, tracked again in this process.
 
 Like `offline` this imports the tracker, and nothing of the service.
 """
@@ -9,22 +9,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
-from optipmb_schemas import (
-    Detections,
-    Dump,
-    DumpedFrame,
-    MessageError,
-    Points,
-    Pose,
-    Tracks,
-    decode_dump,
-)
+from optipmb_schemas import Detections, Dump, DumpedFrame, MessageError, Points, Pose, Tracks, decode_dump
 
 import optipmb
 from optipmb_client.errors import UsageError
 from optipmb_client.offline import track_fields
-
-__all__ = ["Replayed", "read", "replay"]
 
 
 class _Steps(Protocol):
@@ -33,23 +22,13 @@ class _Steps(Protocol):
 
 @dataclass(frozen=True)
 class Replayed:
-    """What going through the frames of a dump gave: the error of one of them, or none.
-
-    Attributes:
-        stream: whose frames they are.
-        frames: how many there are.
-        saved: type and text of the error that was saved.
-        error: type and text of the error now, None when there is none.
-        seq: number of the frame that raised it.
-        stamp_ns: its stamp.
-        trace: where it was raised.
-    """
+    """Result of tracking the frames of a dump again."""
 
     stream: str
     frames: int
-    saved: str
-    error: str | None = None
-    seq: int | None = None
+    saved: str  # type and text of the error that was saved
+    error: str | None = None  # type and text of the error now
+    seq: int | None = None  # number of the frame that raised it
     stamp_ns: int | None = None
     trace: str = ""
 
@@ -73,7 +52,7 @@ def read(file: Path) -> Dump:
 
 
 def replay(dump: Dump, tracker: Callable[[optipmb.Parameters], _Steps] = optipmb.Tracker) -> Replayed:
-    """Go through the frames of a dump as the service did, until one raises.
+    """Track the frames of a dump as the service did, until one raises.
 
     Raises:
         UsageError: the parameters or the density of the dump are none.
@@ -92,7 +71,7 @@ def replay(dump: Dump, tracker: Callable[[optipmb.Parameters], _Steps] = optipmb
             density = optipmb.Density.empty(parameters.labels, density.next_id)
         try:
             density = _step(steps, parameters, density, frame)
-        except Exception as error:  # noqa: BLE001  it is what was asked for
+        except Exception as error:  # noqa: BLE001  the result
             mark = frame.detections
             text = f"{type(error).__name__}: {error}"
             trace = "".join(traceback.format_exception(error))

@@ -8,8 +8,6 @@ from optipmb_schemas.installation import install_command
 
 from optipmb_client.errors import ClientError
 
-__all__ = ["needed", "to_install"]
-
 _EXTRAS: Final[Mapping[str, str]] = {
     "client": "zenoh typer rich",
     "service": "prometheus_client pydantic_settings starlette structlog uvicorn",

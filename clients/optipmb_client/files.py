@@ -1,4 +1,4 @@
-"""Files read with errors that name the place, and written so that nobody sees half a file."""
+"""Reading files with errors that name the place, and writing files that appear complete or not at all."""
 
 import os
 import tempfile
@@ -13,7 +13,7 @@ class DatasetError(ValueError):
     """Raised when data on disk, or an option that selects them, cannot be used.
 
     `path` is the file, folder or option; `line` counts from 1 and is None where no line is meant; `expected` and
-    `received` say what should have been there and what was. The text of the error is one line.
+    `received` describe the content. The text of the error is one line.
     """
 
     def __init__(self, path: Path | str, expected: str, received: str, *, line: int | None = None) -> None:
@@ -44,11 +44,10 @@ def read_bytes(path: Path, what: str) -> bytes:
 
 
 def read_points(path: Path, what: str, columns: int) -> NDArray[np.float32]:
-    """Return x, y, z (P, 3) of a file of 32-bit numbers, so many per point.
+    """Return x, y, z (P, 3) of a file of 32-bit numbers, `columns` per point.
 
     Raises:
-        DatasetError: the file cannot be read, or its size is that of no number of points.
-
+        DatasetError: The file cannot be read, or its size fits no number of points.
     """
     data = read_bytes(path, what)
     if len(data) % (4 * columns):
@@ -66,8 +65,7 @@ def numbers(path: Path, rows: Iterable[tuple[int, list[str]]], columns: int, wha
     """Return fields as finite numbers (R, columns).
 
     Raises:
-        DatasetError: a line has another number of fields, or a field is not a finite number; names the line.
-
+        DatasetError: A line has another number of fields, or a field is not a finite number; names the line.
     """
     values = np.empty((0, columns))
     taken = list(rows)
@@ -114,7 +112,7 @@ def write_whole(path: Path, content: bytes | Iterable[str]) -> None:
 
 
 def remove_unfinished(paths: Iterable[Path]) -> None:
-    """Remove what writers of these files left in their folders when they were killed; nobody writes them any more."""
+    """Remove temporary files that killed writers of these files left in their folders."""
     names: dict[Path, set[str]] = {}
     for path in paths:
         names.setdefault(path.parent, set()).add(path.name)

@@ -40,10 +40,8 @@ class PoseLike(Protocol):
 class Pose(NamedTuple):
     """World from sensor: x_world = R(quaternion) x_sensor + translation."""
 
-    translation: Floats
-    """(3,) metres."""
-    quaternion: Floats
-    """(4,) w x y z, unit length, w >= 0."""
+    translation: Floats  # (3,) metres
+    quaternion: Floats  # (4,) w x y z, unit length, w >= 0
 
 
 def wrap_angle(angle: Floats) -> Floats:
@@ -115,7 +113,6 @@ def to_world(rotation: Floats, translation: Floats, center: Floats, yaw: Floats)
 
     Returns:
         Centres (N, 3) and yaws (N,) in the world frame.
-
     """
     heading = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=-1)
     forward = np.einsum("...ij,...j->...i", rotation, heading)

@@ -13,8 +13,6 @@ from typing import NamedTuple
 
 from optipmb_schemas import Tracks
 
-__all__ = ["Merging", "Novelty"]
-
 
 class Novelty(enum.Enum):
     """What a message brings."""

@@ -36,13 +36,10 @@ from optipmb import (
     profiles,
     warm_up,
 )
-from optipmb_client.datasets import DataSequence, DetectionFrame
-from optipmb_client.datasets.interface import DETECTION_COLUMNS
+from optipmb_client.datasets import DataSequence, DetectionFrame, selected_frames
 from optipmb_client.datasets.motion import LEAST_ALONG, SURE_MOVES, headings_along
 from optipmb_client.errors import UsageError
 from optipmb_client.geometry import Floats
-from optipmb_client.recording import selected_frames
-from optipmb_client.smoothing import Smoother
 
 __all__ = [
     "AUTO",
@@ -59,30 +56,23 @@ __all__ = [
     "warm_up",
 ]
 
-AUTO: Final = "auto"
-"""Name of the profile that is made for the data: rate and classes as they come."""
+AUTO: Final = "auto"  # name of the profile that is made for the data: rate and classes as they come
 USUAL_PERIOD: Final = 0.1
-FAR: Final = 1.6
-"""A rate so many times that of the profile, or a part of it, is far from it."""
-LOOKED_AT: Final = 20
-"""Sequences, and"""
-LOOKED_INTO: Final = 300
-"""frames of each that tell rate and scores."""
-GLANCE: Final = 20
-"""Frames of each that tell whether the rate is about that of a profile: clouds, if there are any, take long to read."""
+FAR: Final = 1.6  # ratio of rates from which a profile does not fit
+LOOKED_AT: Final = 20  # sequences that tell rate and scores
+LOOKED_INTO: Final = 300  # frames of each of them
+GLANCE: Final = 20  # frames that tell whether the rate is about that of a profile: clouds, if any, take long to read
 
 
 @dataclass(frozen=True)
 class Tracked:
-    """The tracks of one sequence by frame index, and what they took."""
+    """Tracks of one sequence by frame index, and counts."""
 
     tracks: dict[int, Tracks]
     clouds: int
     detections: int
-    left_out: dict[str, int]
-    """Number of detections of each class that the profile lacks, or that are below its score filter."""
-    estimated: int
-    """Frames in which the motion of the sensor was estimated."""
+    left_out: dict[str, int]  # detections of each class that the profile lacks, or that are below its score filter
+    estimated: int  # frames in which the motion of the sensor was estimated
     steps_ns: tuple[int, ...]
     seconds: float
 
@@ -101,11 +91,11 @@ def read_profile(profile: str) -> Parameters:
 
 @dataclass(frozen=True)
 class FieldOfProfile:
-    """A field of a profile: its path below a class, what it means, and its value for each class that has it."""
+    """A field of a profile."""
 
-    path: str
+    path: str  # below a class
     description: str
-    values: dict[str, float]
+    values: dict[str, float]  # by class
 
 
 def fields_of(parameters: Parameters) -> Iterator[FieldOfProfile]:
@@ -158,7 +148,7 @@ def _nothing(profile: str, parameters: Parameters, labels: tuple[str, ...]) -> s
 
 
 def doubts(parameters: Parameters, sequences: Sequence[DataSequence]) -> Iterator[str]:
-    """Yield what does not fit between a profile and the sequences, a line each."""
+    """Yield doubts whether a profile fits the sequences, a line each."""
     known = parameters.labels
     labels = _labels(sequences)
     found = dict(zip(labels, class_indices(labels, known).tolist(), strict=True))
@@ -172,7 +162,7 @@ def doubts(parameters: Parameters, sequences: Sequence[DataSequence]) -> Iterato
             f"frames come at {1.0 / period:.3g} Hz, profile {parameters.name} is for {1.0 / nominal:.3g} Hz: "
             "--profile auto, or a profile tuned at this rate, may track better"
         )
-    share, moves = headings_along(one for one in sequences if not hasattr(one, "time_column"))  # tables told theirs
+    share, moves = headings_along(one for one in sequences if not one.time_column)  # tables told theirs
     if share < LEAST_ALONG and moves >= SURE_MOVES:
         yield f"headings and motion disagree: {share:.0%} of {moves} moves of boxes are along their headings"
 
@@ -182,10 +172,10 @@ def _labels(sequences: Sequence[DataSequence]) -> tuple[str, ...]:
 
 
 def _period(sequences: Sequence[DataSequence], frames: int) -> float | None:
-    """Return the median time in seconds between neighbouring frames, so many, at the start of the first sequences."""
+    """Return the median time in seconds between the first `frames` frames of the first sequences."""
     steps = [
         (after.stamp_ns - before.stamp_ns) / 1e9
-        for one in itertools.chain.from_iterable(getattr(one, "sensors", (one,)) for one in sequences[:LOOKED_AT])
+        for one in itertools.chain.from_iterable(one.sensors or (one,) for one in sequences[:LOOKED_AT])
         for before, after in itertools.pairwise(itertools.islice(one.frames(), frames))
     ]
     return median(steps) or None if steps else None
@@ -212,17 +202,16 @@ def tracker_frame(parameters: Parameters, sequence: str, given: DetectionFrame) 
             stamp_ns=given.stamp_ns,
             labels=given.labels,
             pose=Pose(*given.pose),
-            cloud=None if cloud is None else PointCloud(cloud.xyz, Pose(cloud.translation, cloud.quaternion)),
+            cloud=None if cloud is None else PointCloud(cloud.xyz, Pose(*cloud.pose)),
             field_of_view=FieldOfView.of(given.field_of_view, None),
-            **{name: getattr(given, name) for name in DETECTION_COLUMNS},
+            **given.columns,
         )
     except OptipmbError as error:
         raise UsageError(f"sequence {sequence}, frame {given.index}: {error}") from error
     return frame
 
 
-_warm = functools.cache(warm_up)
-"""Once in each process."""
+_warm = functools.cache(warm_up)  # once in each process
 
 
 def track_whole(
@@ -248,7 +237,11 @@ def track_whole(
     left_out: Counter[str] = Counter()
     least = np.array([one.score_filter for one in parameters.classes.values()])
     given, low = np.zeros(len(least), np.int64), np.zeros(len(least), np.int64)
-    smoother = Smoother(parameters) if smooth else None
+    smoother = None
+    if smooth:
+        from optipmb_client.smoothing import Smoother  # noqa: PLC0415  of --smooth alone
+
+        smoother = Smoother(parameters)
     # A smoother joins the frames of a track, which an estimated motion has in axes of their own.
     tracker = Tracker(parameters.model_copy(update={"sensor_motion": False}) if smooth else parameters, modules)
     density = tracker.initial()

@@ -1,4 +1,4 @@
-"""How far a long piece of work has come, shown on standard error so that standard output stays for results.
+"""Progress of long work, shown on standard error so that standard output stays for results.
 
 On a terminal: a bar with rate and time left. Elsewhere (a log file, CI): a plain line every ten seconds.
 """
@@ -12,8 +12,6 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-__all__ = ["FrameProgress", "StatusLine"]
-
 PLAIN_PERIOD_S = 10.0
 
 
@@ -21,7 +19,7 @@ class FrameProgress:
     """Counts frames up to a total; shows itself from the first frame on. Safe to use from several threads.
 
     Args:
-        title: What is being done, in a word or two.
+        title: Name of the work, in a word or two.
         total: Number of frames.
         terminal: Whether to draw a bar; default: whether standard error is a terminal.
     """
@@ -70,7 +68,7 @@ class FrameProgress:
                 print(text, file=sys.stderr, flush=True)  # noqa: T201  this is the display
 
     def note(self, text: str) -> None:
-        """Show a line about what happens, beside the count."""
+        """Show a line of text."""
         if self._bar is not None:
             self._bar.console.print(text, markup=False, highlight=False)
         else:

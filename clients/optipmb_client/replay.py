@@ -1,11 +1,11 @@
-"""Sending a dataset through the service and collecting the tracks: the same files as offline tracking, byte for byte.
+"""Sending a data set through the service and collecting the tracks: the same files as offline tracking, byte for byte.
 
 Each sequence becomes a stream `replay/<dataset>-<6 hex>/<sequence>` of its own, new in each run, so that nothing of an
-earlier run is in the way. One thread per sequence does everything in turn: publish a frame, take in the tracks that
+earlier run is in the way. One thread per sequence does everything in turn: publish a frame, receive the tracks that
 have come, wait for the time (at a recorded rate) or for room in the window (at full speed) of the next one.
 
-A frame counts as missing when its tracks have not come although those of a later frame have, or although nothing has
-come for a long time.
+A frame counts as missing when its tracks have not come although a later frame has some, or nothing has come for a long
+time.
 """
 
 import collections
@@ -16,23 +16,23 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 from optipmb_schemas import PREFIX, Problem, SessionParameters, Tracks
 
-from optipmb_client.datasets import DataSequence, Dataset, DetectionFrame
-from optipmb_client.datasets.interface import DETECTION_COLUMNS
+from optipmb_client.datasets import DataSequence, Dataset, DetectionFrame, selected_frames
 from optipmb_client.links import Link
 from optipmb_client.publisher import Publisher
-from optipmb_client.recording import Latency, Results, horizons_for, latency, selected_frames
+from optipmb_client.results.output import Latency, Results, horizons_for, latency
 from optipmb_client.sessions import close_session, set_parameters
 from optipmb_client.subscriber import Subscriber
 
-__all__ = ["Pace", "ReplayedSequence", "replay"]
+FrameId: TypeAlias = tuple[bytes, int]  # epoch and sequence number
 
 CLOUD_WAIT_S = 10.0  # a cloud may be late on a busy machine; tracking without it would change the result
 CACHED_CLOUDS = 16  # for a service that is killed and restarted meanwhile; it keeps no more of a stream by default
-CLOUDS_AHEAD = 4  # frames under way then: a successor goes back to a checkpoint, and needs the clouds since then, too
+CLOUDS_AHEAD = 4  # frames in flight then: a successor goes back to a checkpoint, and needs the clouds since then, too
 STRAGGLERS_S = 5.0  # how long frames that were overtaken by later ones may still be recovered
 POINTS_WANTED_S = 20.0  # how long to wait until the service's subscription to clouds has come to this session
 TICK_S = 0.2  # how often a waiting thread looks whether it shall stop
@@ -45,7 +45,7 @@ class Pace:
 
     Attributes:
         speed: Multiple of the recorded rate; None: as fast as tracks come back.
-        window: Frames under way at most when `speed` is None.
+        window: Frames in flight at most when `speed` is None.
         patience_s: The replay ends when nothing has come back for so long.
         service_s: How long to wait for a service to answer at the start.
     """
@@ -57,8 +57,29 @@ class Pace:
 
 
 @dataclass(frozen=True)
+class Replaying:
+    """How sequences are replayed.
+
+    Attributes:
+        profile: Profile that the service knows.
+        pace: How fast.
+        classes: Only detections of these; empty: all.
+        streams: Sequences at once.
+        prefix: First part of all keys.
+        full: Whether all columns of the tracks are written too, beside each result file.
+    """
+
+    profile: str
+    pace: Pace
+    classes: Sequence[str] = ()
+    streams: int = 1
+    prefix: str = PREFIX
+    full: bool = False
+
+
+@dataclass(frozen=True)
 class ReplayedSequence:
-    """What replaying one sequence gave. `latency` runs from publishing detections to receiving their tracks."""
+    """Result of replaying one sequence. `latency` runs from publishing detections to receiving their tracks."""
 
     name: str
     stream: str
@@ -81,23 +102,116 @@ class ReplayedSequence:
         return self.frames - self.returned
 
 
-def replay(  # noqa: PLR0913  one argument per decision of the caller
+class Exchange:
+    """Frames that were published on one stream, and the tracks that came back.
+
+    Args:
+        stream: Name of the stream.
+        link: To the service or its router.
+        frames: Number of frames to come.
+        pace: How fast.
+        prefix: First part of all keys.
+        on_frame: Called when the tracks of a frame have come back.
+    """
+
+    def __init__(
+        self, stream: str, link: Link, frames: int, *, pace: Pace, prefix: str, on_frame: Callable[[], None]
+    ) -> None:
+        self.stop = threading.Event()  # set to end early
+        self.results: dict[FrameId, Tracks] = {}  # newest revision
+        self.latencies: list[int] = []
+        self.problems: collections.deque[Problem] = collections.deque(maxlen=KEPT_PROBLEMS)
+        self.problem_count = 0
+        self.subscriber = Subscriber(
+            stream, connection=link, on_problem=self._note, queue=4 * frames + 64, prefix=prefix
+        )
+        self._pace = pace
+        self._on_frame = on_frame
+        self._sent: dict[FrameId, tuple[int, int]] = {}  # place and time of publishing
+        self._awaited = 0  # frames sent whose tracks are expected
+        self._newest = 0  # place after the last of them that came back
+        self._progress = time.monotonic()  # when something last came back, or was sent with nothing in flight
+
+    @property
+    def in_flight(self) -> int:
+        """Frames sent after the newest one that came back, as far as their tracks are expected."""
+        return self._awaited - self._newest
+
+    @property
+    def alive(self) -> bool:
+        """Whether to go on: `stop` is not set, and tracks have come back lately or none are in flight."""
+        return not self.stop.is_set() and (not self.in_flight or self._silent_s < self._pace.patience_s)
+
+    @property
+    def _silent_s(self) -> float:
+        return time.monotonic() - self._progress
+
+    def sent(self, frame: FrameId, put_ns: int, *, awaited: bool = True) -> None:
+        """Note a published frame, and whether tracks are expected; `put_ns` is the monotonic time of publishing."""
+        if not self.in_flight:
+            self._progress = time.monotonic()  # patience begins now
+        self._awaited += awaited
+        self._sent[frame] = self._awaited, put_ns
+
+    def receive(self, timeout: float) -> bool:
+        """Take one message of tracks, waiting for it up to `timeout` seconds; False when none came."""
+        received = self.subscriber.receive(timeout)
+        if received is None:
+            return False
+        frame = (received.tracks.epoch, received.tracks.seq)
+        if frame in self._sent:  # others are not of this run
+            place, put_ns = self._sent[frame]
+            if frame not in self.results:
+                self.latencies.append(received.monotonic_ns - put_ns)
+                self._on_frame()
+            self.results[frame] = received.tracks  # the subscriber returns newer revisions only
+            self._newest = max(self._newest, place)
+            self._progress = time.monotonic()
+        return True
+
+    def until(self, due: float, most: int | None = None) -> bool:
+        """Take tracks until the monotonic time `due`, and while `most` frames are in flight; False to end early."""
+        while self.receive(0.0):
+            pass
+        while (left := due - time.monotonic()) > 0.0:
+            if self.stop.is_set():
+                return False
+            self.receive(min(left, TICK_S))
+        return self.alive if most is None else self.until_room(most) and self.alive
+
+    def until_room(self, most: int) -> bool:
+        """Take tracks until less than `most` frames are in flight; False to end early."""
+        while self.in_flight >= most:
+            if not self.alive:
+                return False
+            self.receive(TICK_S)
+        return not self.stop.is_set()
+
+    def drain(self, complete: Callable[[], bool]) -> None:
+        """Take tracks until all are there, or no more will come."""
+        while not complete() and self.alive:
+            if not self.in_flight and self._silent_s > STRAGGLERS_S:
+                return
+            self.receive(TICK_S)
+
+    def give_up(self) -> None:
+        """Count frames in flight as lost."""
+        self._newest = self._awaited
+
+    def _note(self, problem: Problem) -> None:
+        self.problems.append(problem)
+        self.problem_count += problem.count
+
+
+def replay(
     connection: Link,
     dataset: Dataset,
     sequences: Sequence[DataSequence],
     out: Path,
-    *,
-    profile: str,
-    pace: Pace,
-    classes: Sequence[str] = (),
-    streams: int = 1,
-    prefix: str = PREFIX,
-    full: bool = False,
+    how: Replaying,
     on_frame: Callable[[], None] = lambda: None,
 ) -> list[ReplayedSequence]:
-    """Replay sequences, `streams` of them at once, and write the results into `out`, a folder or a table.
-
-    With `full`, all that is known of the tracks is written too, beside each result file.
+    """Replay sequences, and write the results into `out`, a folder or a table.
 
     Raises:
         ServiceUnavailable: No service answers.
@@ -105,128 +219,88 @@ def replay(  # noqa: PLR0913  one argument per decision of the caller
         UsageError: No such class.
     """
     run = f"{dataset.name}-{secrets.token_hex(3)}"
-    results = Results(dataset, out, full=full)
-    task = _Task(connection, out, results, profile, horizons_for(out), pace, classes, prefix, on_frame)
-    work = [_Replay(task, sequence, f"replay/{run}/{sequence.name}") for sequence in sequences]
-    with concurrent.futures.ThreadPoolExecutor(max_workers=streams, thread_name_prefix="replay") as pool:
+    results = Results(dataset, out, full=how.full)
+    stop = threading.Event()
+
+    def write(sequence: DataSequence) -> ReplayedSequence:
+        begun = time.monotonic()
+        one = _Replay(connection, how, sequence, f"replay/{run}/{sequence.name}", stop)
+        one.run(horizons_for(out), on_frame)
+        if stop.is_set():
+            raise concurrent.futures.CancelledError
+        seconds = time.monotonic() - begun
+        written = results.write(sequence, one.results)
+        results.take(sequence, written)
+        return one.result(written if isinstance(written, Path) else out, seconds)
+
+    with concurrent.futures.ThreadPoolExecutor(how.streams, thread_name_prefix="replay") as pool:
         try:
-            futures = [pool.submit(_replay_and_write, one) for one in work]
+            futures = [pool.submit(write, one) for one in sequences]
             pending = set(futures)
             while pending:
                 done, pending = concurrent.futures.wait(pending, TICK_S, concurrent.futures.FIRST_EXCEPTION)
                 for future in done:
                     future.result()
         except BaseException:  # one sequence failed, or an interrupt: the others end early and close their sessions
-            task.stop.set()
+            stop.set()
             pool.shutdown(cancel_futures=True)
             raise
     results.close(sequences)
     return [future.result() for future in futures]
 
 
-def _replay_and_write(one: "_Replay") -> ReplayedSequence:
-    begun = time.monotonic()
-    one.run()
-    if one.task.stop.is_set():
-        raise concurrent.futures.CancelledError
-    seconds = time.monotonic() - begun
-    written = one.task.results.write(one.sequence, one.results)
-    one.task.results.take(one.sequence, written)
-    return ReplayedSequence(
-        name=one.sequence.name,
-        stream=one.stream,
-        file=written if isinstance(written, Path) else one.task.out,
-        frames=len(one.sequence),
-        sent=one.sent,
-        returned=len(one.results),
-        clouds=len(one.with_cloud),
-        clouds_missed=sum(not one.results[index].cloud_used for index in one.with_cloud if index in one.results),
-        tracks=len({int(number) for tracks in one.results.values() for number in tracks.id}),
-        seconds=seconds,
-        latency=latency(one.latencies),
-        latencies_ns=tuple(one.latencies),
-        problems=one.problem_count,
-        newest_problems=tuple(one.problems),
-    )
-
-
-@dataclass(frozen=True)
-class _Task:
-    """What the sequences of one replay share."""
-
-    connection: Link
-    out: Path
-    results: Results
-    profile: str
-    horizons: Sequence[float] | None
-    pace: Pace
-    classes: Sequence[str]
-    prefix: str
-    on_frame: Callable[[], None]
-    stop: threading.Event = field(default_factory=threading.Event)
-
-
+@dataclass
 class _Replay:
     """One sequence on its way through the service."""
 
-    def __init__(self, task: _Task, sequence: DataSequence, stream: str) -> None:
-        self.task = task
-        self.sequence = sequence
-        self.stream = stream
-        self.results: dict[int, Tracks] = {}  # newest revision by frame index
-        self.with_cloud: set[int] = set()
-        self.latencies: list[int] = []
-        self.problems: collections.deque[Problem] = collections.deque(maxlen=KEPT_PROBLEMS)
-        self.problem_count = 0
-        self.sent = 0
-        self._index_of: dict[int, int] = {}  # frame index by sequence number
-        self._put_ns: dict[int, int] = {}  # time of publishing by sequence number
-        self._epoch = b""
-        self._newest = -1  # highest sequence number that came back
-        self._progress = time.monotonic()  # when something last came back
+    connection: Link
+    how: Replaying
+    sequence: DataSequence
+    stream: str
+    stop: threading.Event
+    results: dict[int, Tracks] = field(default_factory=dict)  # newest revision by frame index
+    with_cloud: set[int] = field(default_factory=set)
+    _index_of: dict[FrameId, int] = field(default_factory=dict)
 
-    def run(self) -> None:
+    def run(self, horizons: Sequence[float] | None, on_frame: Callable[[], None]) -> None:
         """Publish every frame and collect the tracks until all are there, or no more will come."""
         cache = len(self.sequence)  # the service may lose its link, or restart, anywhere in the sequence
+        clouds = CACHED_CLOUDS if self.sequence.has_clouds else 0
+        prefix, pace = self.how.prefix, self.how.pace
+        self.exchange = Exchange(self.stream, self.connection, cache, pace=pace, prefix=prefix, on_frame=on_frame)
+        self.exchange.stop = self.stop
         with (
-            Subscriber(
-                self.stream,
-                connection=self.task.connection,
-                on_problem=self._note,
-                queue=4 * cache + 64,
-                prefix=self.task.prefix,
-            ) as tracks,
+            self.exchange.subscriber,
             Publisher(
-                self.stream,
-                connection=self.task.connection,
-                cache=cache,
-                cache_clouds=CACHED_CLOUDS if self.sequence.has_clouds else 0,
-                prefix=self.task.prefix,
+                self.stream, connection=self.connection, cache=cache, cache_clouds=clouds, prefix=prefix
             ) as publisher,
         ):
-            self._epoch = publisher.epoch
-            horizons = None if self.task.horizons is None else np.array(self.task.horizons)
-            wanted = SessionParameters(profile=self.task.profile, cloud_wait_s=CLOUD_WAIT_S, horizons=horizons)
-            set_parameters(
-                self.task.connection, self.stream, wanted, prefix=self.task.prefix, patience_s=self.task.pace.service_s
+            wanted = SessionParameters(
+                profile=self.how.profile,
+                cloud_wait_s=CLOUD_WAIT_S,
+                horizons=None if horizons is None else np.array(horizons),
             )
+            set_parameters(self.connection, self.stream, wanted, prefix=prefix, patience_s=pace.service_s)
             try:
-                self._await_points_subscription(publisher)
-                self._publish_all(publisher, tracks)
-                self._drain(tracks)
+                if self.sequence.has_clouds:
+                    await_wanted(lambda: publisher.points_wanted)
+                self._publish_all(publisher)
+                self.exchange.drain(lambda: len(self.exchange.results) >= len(self._index_of))
             finally:
-                close_session(self.task.connection, self.stream, prefix=self.task.prefix)
+                close_session(self.connection, self.stream, prefix=prefix)
+        self.results = {self._index_of[frame]: tracks for frame, tracks in self.exchange.results.items()}
 
-    def _publish_all(self, publisher: Publisher, tracks: Subscriber) -> None:
-        speed = self.task.pace.speed
+    def _publish_all(self, publisher: Publisher) -> None:
+        pace, exchange = self.how.pace, self.exchange
         zero: float | None = None  # when stamp 0 would have been published; known once the first frame has been read
-        for frame in selected_frames(self.sequence, self.task.classes):
-            if speed is None:
-                ready = self._until_room(tracks)
+        for frame in selected_frames(self.sequence, self.how.classes):
+            if pace.speed is None:
+                ready = exchange.until_room(pace.window)
             else:
-                after = frame.stamp_ns / 1e9 / speed
+                after = frame.stamp_ns / 1e9 / pace.speed
                 zero = time.monotonic() - after if zero is None else zero
-                ready = self._until(zero + after, tracks)
+                # With clouds it waits longer while tracks are late, as when another service takes over.
+                ready = exchange.until(zero + after, CLOUDS_AHEAD if self.sequence.has_clouds else None)
             if not ready:
                 return
             self._publish(publisher, frame)
@@ -236,94 +310,40 @@ class _Replay:
         number = publisher.publish(
             stamp_ns=frame.stamp_ns,
             labels=frame.labels,
-            **{name: getattr(frame, name) for name in DETECTION_COLUMNS},
+            **frame.columns,
             pose=frame.pose,
             points=None if cloud is None else cloud.xyz,
-            points_pose=None if cloud is None else (cloud.translation, cloud.quaternion),
+            points_pose=None if cloud is None else cloud.pose,
             has_points=cloud is not None,
             field_of_view=frame.field_of_view,
         )
-        if self._newest == self.sent - 1:
-            self._progress = time.monotonic()  # nothing was under way: patience begins now
-        self._index_of[number] = frame.index
-        self._put_ns[number] = publisher.last_put_ns
+        self.exchange.sent((publisher.epoch, number), publisher.last_put_ns)
+        self._index_of[publisher.epoch, number] = frame.index
         if cloud is not None:
             self.with_cloud.add(frame.index)
-        self.sent += 1
 
-    def _until(self, due: float, tracks: Subscriber) -> bool:
-        """Take in tracks until the monotonic time `due`; False when the replay shall end.
+    def result(self, file: Path, seconds: float) -> ReplayedSequence:
+        """Return the result."""
+        return ReplayedSequence(
+            name=self.sequence.name,
+            stream=self.stream,
+            file=file,
+            frames=len(self.sequence),
+            sent=len(self._index_of),
+            returned=len(self.results),
+            clouds=len(self.with_cloud),
+            clouds_missed=sum(not self.results[index].cloud_used for index in self.with_cloud & self.results.keys()),
+            tracks=len({number for tracks in self.results.values() for number in tracks.id.tolist()}),
+            seconds=seconds,
+            latency=latency(self.exchange.latencies),
+            latencies_ns=tuple(self.exchange.latencies),
+            problems=self.exchange.problem_count,
+            newest_problems=tuple(self.exchange.problems),
+        )
 
-        With clouds it waits longer while tracks are late, as when another service takes over.
-        """
-        while self._take(tracks, 0.0):
-            pass
-        while (left := due - time.monotonic()) > 0.0:
-            if self.task.stop.is_set():
-                return False
-            self._take(tracks, min(left, TICK_S))
-        while self.sequence.has_clouds and self._under_way >= CLOUDS_AHEAD:
-            if not self._alive():
-                return False
-            self._take(tracks, TICK_S)
-        return self._alive()
 
-    @property
-    def _under_way(self) -> int:
-        """Frames sent after the newest one that came back."""
-        return self.sent - 1 - self._newest
-
-    @property
-    def _silent_s(self) -> float:
-        """Time since something last came back."""
-        return time.monotonic() - self._progress
-
-    def _until_room(self, tracks: Subscriber) -> bool:
-        """Take in tracks until less than a window of frames is under way; False when the replay shall end."""
-        while self._under_way >= self.task.pace.window:
-            if not self._alive():
-                return False
-            self._take(tracks, TICK_S)
-        return not self.task.stop.is_set()
-
-    def _drain(self, tracks: Subscriber) -> None:
-        """Take in tracks until every frame sent has come back, or no more will come."""
-        while len(self.results) < self.sent and self._alive():
-            overtaken = self._newest == self.sent - 1
-            if overtaken and self._silent_s > STRAGGLERS_S:
-                return
-            self._take(tracks, TICK_S)
-
-    def _alive(self) -> bool:
-        """Whether to go on: nobody has asked to stop, and tracks have come back lately or none are under way."""
-        if self._newest == self.sent - 1:
-            return not self.task.stop.is_set()
-        return not self.task.stop.is_set() and self._silent_s < self.task.pace.patience_s
-
-    def _take(self, tracks: Subscriber, timeout: float) -> bool:
-        """Take in one tracks message, waiting for it up to `timeout` seconds; False when none came."""
-        received = tracks.receive(timeout)
-        if received is None:
-            return False
-        number = received.tracks.seq
-        index = self._index_of.get(number)
-        if index is None or received.tracks.epoch != self._epoch:
-            return True  # not of this replay
-        if index not in self.results:
-            self.latencies.append(received.monotonic_ns - self._put_ns[number])
-            self.task.on_frame()
-        self.results[index] = received.tracks  # the subscriber gives out newer revisions only
-        self._newest = max(self._newest, number)
-        self._progress = time.monotonic()
-        return True
-
-    def _await_points_subscription(self, publisher: Publisher) -> None:
-        if not self.sequence.has_clouds:
-            return
-        deadline = time.monotonic() + POINTS_WANTED_S
-        while not publisher.points_wanted and time.monotonic() < deadline:
-            time.sleep(0.01)  # it comes with the network's own messages; there is nothing to wait on
-
-    def _note(self, problem: Problem) -> None:
-        self.problems.append(problem)
-        self.problem_count += problem.count
+def await_wanted(wanted: Callable[[], bool]) -> None:
+    """Wait until somebody subscribes to clouds; it comes with the network's own messages, nothing tells of it."""
+    deadline = time.monotonic() + POINTS_WANTED_S
+    while not wanted() and time.monotonic() < deadline:
+        time.sleep(0.01)

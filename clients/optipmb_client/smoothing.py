@@ -32,8 +32,6 @@ from optipmb.predict import ORDER, SPREAD, WEIGHT, predict_state
 from optipmb.table import ClassTable
 from optipmb_client.geometry import Bools, Floats, Ints, wrap_angle
 
-__all__ = ["Smoother"]
-
 _TURN: Final = np.array([-1.0 if s in {V, A} else 1.0 for s in range(STATE)])
 """Diagonal of T: x -> T x and phi + pi describes the same motion (`optipmb.lightweight`)."""
 

@@ -1,94 +1,79 @@
-"""Tracking the recordings of a dataset, one task each: in this process, in several, or on a Ray cluster."""
+"""Offline tracking of the recordings of a data set, one task each: here, in several processes, or on a Ray cluster."""
 
 import functools
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any
 
 from optipmb import Modules, Parameters
-from optipmb_client.bulk import Done, Executor, Failed, Here, Outcome, in_order, run
+from optipmb_client.bulk import Executor, Failed, Here, in_order, run
 from optipmb_client.datasets import DataSequence, Dataset, DatasetArguments
-from optipmb_client.errors import ClientError, UsageError
+from optipmb_client.errors import ClientError
 from optipmb_client.files import remove_unfinished
 from optipmb_client.offline import track_whole
-from optipmb_client.recording import Latency, Results, horizons_for, latency
-from optipmb_client.results.nuscenes import NUSCENES_MAX_BOXES
+from optipmb_client.results.output import Latency, Results, horizons_for, latency
 from optipmb_client.table_files import Columns
 
-__all__ = ["RecordingsFailed", "TrackedSequence", "track"]
-
-SHOWN: Final = 20
-"""Recordings that failed, named in the error."""
+SHOWN = 20  # recordings that failed, named in the error
 
 
 @dataclass(frozen=True)
 class TrackedSequence:
-    """What tracking one sequence took and gave. `step` are the durations of the tracker's steps."""
+    """Result of tracking one sequence."""
 
     name: str
     file: Path
     frames: int
     clouds: int
     detections: int
-    left_out: dict[str, int]
-    """Number of detections of each class that the profile lacks, or that are below its score filter."""
-    estimated: int
-    """Frames in which the motion of the sensor was estimated."""
-    cut: tuple[int, int]
-    """Number of boxes beyond those that a benchmark accepts in a sample, and of the samples."""
+    left_out: dict[str, int]  # detections of each class that the profile lacks, or that are below its score filter
+    estimated: int  # frames in which the motion of the sensor was estimated
+    cut: tuple[int, int]  # boxes beyond those that a benchmark accepts in a sample, and such samples
     tracks: int
-    confirmed: int
-    """Tracks that were confirmed in some frame."""
+    confirmed: int  # tracks that were confirmed in some frame
     seconds: float
-    step: Latency | None
-
-
-@dataclass(frozen=True)
-class Opened:
-    """A dataset that this process has opened, and in the process that was asked also the sequences."""
-
-    dataset: Dataset
-    sequences: Mapping[str, DataSequence] | None = None
-    on_frame: Callable[[], None] = lambda: None
-
-    def sequence(self, name: str) -> DataSequence:
-        """Return a sequence; elsewhere one that is read for this call, as so many cannot all be kept."""
-        if self.sequences is not None:
-            return self.sequences[name]
-        (sequence,) = self.dataset.sequences([name])
-        return sequence
+    step: Latency | None  # durations of the tracker's steps
 
 
 @dataclass(frozen=True)
 class Tracking:
-    """What all sequences of a run share; can be sent to another process without `here`."""
+    """How sequences are tracked."""
 
-    data: DatasetArguments | None
-    out: Path
     parameters: Parameters
-    classes: tuple[str, ...]
-    modules: Modules | None
-    full: bool
-    smooth: bool
-    here: Opened | None
+    classes: Sequence[str] = ()  # only detections of these; empty: all
+    modules: Modules | None = None
+    full: bool = False  # also write all columns of the tracks
+    smooth: bool = False  # estimate states from all frames of their track (`optipmb_client.smoothing`)
+
+
+@dataclass(frozen=True)
+class _Opened:
+    dataset: Dataset
+    sequences: Mapping[str, DataSequence] | None = None  # None: read for each task, as so many cannot all be kept
+    on_frame: Callable[[], None] = lambda: None
+
+
+@dataclass(frozen=True)
+class _Shared:
+    """Arguments of all tasks of a run; can be sent to another process without `here`."""
+
+    data: DatasetArguments
+    out: Path
+    how: Tracking
+    here: _Opened | None
 
     @functools.cached_property
-    def opened(self) -> Opened:
-        """The dataset; a process opens it once."""
-        if self.here is not None:
-            return self.here
-        if self.data is None:
-            raise UsageError("several processes need to know which data to open")
-        return Opened(self.data.open())
+    def opened(self) -> _Opened:
+        return self.here or _Opened(self.data.open())  # a process opens it once
 
 
 class RecordingsFailed(ClientError):  # noqa: N818  as its siblings
     """Some of several recordings failed; the others are tracked, and their results are written.
 
     Attributes:
-        failures: Name of the recording and what was wrong.
+        failures: Reason by name of the recording.
     """
 
     def __init__(self, failures: Mapping[str, Failed], count: int) -> None:
@@ -97,22 +82,18 @@ class RecordingsFailed(ClientError):  # noqa: N818  as its siblings
         super().__init__(f"{len(failures)} of {count} recordings failed, the others are tracked: {names}")
 
 
-def _track_one(shared: Tracking, name: str) -> tuple[TrackedSequence, Path | Columns]:
-    """Track one sequence and write its results; idempotent. Gives the rows where all sequences share one table."""
-    opened = shared.opened
-    sequence = opened.sequence(name)
-    found = track_whole(
-        shared.parameters,
-        sequence,
-        shared.classes,
-        shared.modules,
-        smooth=shared.smooth,
-        on_frame=opened.on_frame,
-    )
-    written = Results(opened.dataset, shared.out, full=shared.full).write(sequence, found.tracks)
-    limited = opened.dataset.name == "nuscenes" and isinstance(written, Path)
-    counts = [len(one.id) for one in found.tracks.values()] if limited else []
-    beyond = [count - NUSCENES_MAX_BOXES for count in counts if count > NUSCENES_MAX_BOXES]
+def _track_one(shared: _Shared, name: str) -> tuple[TrackedSequence, Path | Columns]:
+    """Track one sequence and write its results; idempotent. Return the rows where all sequences share one table."""
+    opened, how = shared.opened, shared.how
+    (sequence,) = [opened.sequences[name]] if opened.sequences else opened.dataset.sequences([name])
+    found = track_whole(how.parameters, sequence, how.classes, how.modules, smooth=how.smooth, on_frame=opened.on_frame)
+    written = Results(opened.dataset, shared.out, full=how.full).write(sequence, found.tracks)
+    beyond = []
+    if opened.dataset.name == "nuscenes" and isinstance(written, Path):
+        from optipmb_client.results.nuscenes import NUSCENES_MAX_BOXES  # noqa: PLC0415  of one format
+
+        counts = [len(one.id) for one in found.tracks.values()]
+        beyond = [count - NUSCENES_MAX_BOXES for count in counts if count > NUSCENES_MAX_BOXES]
     return TrackedSequence(
         name,
         written if isinstance(written, Path) else shared.out,
@@ -122,33 +103,48 @@ def _track_one(shared: Tracking, name: str) -> tuple[TrackedSequence, Path | Col
         found.left_out,
         found.estimated,
         (sum(beyond), len(beyond)),
-        len({int(number) for one in found.tracks.values() for number in one.id}),
-        len({int(number) for one in found.tracks.values() for number in one.id[one.confirmed == 1]}),
+        len({number for one in found.tracks.values() for number in one.id.tolist()}),
+        len({number for one in found.tracks.values() for number in one.id[one.confirmed == 1].tolist()}),
         found.seconds,
         latency(found.steps_ns),
     ), written
 
 
-def track(  # noqa: PLR0913  one argument per decision of the caller
+def _taken(
+    ended: Iterable[tuple[int, Any]],
+    sequences: Sequence[DataSequence],
+    results: Results,
+    note: Callable[[str], None],
+    on_frame: Callable[[], None],
+) -> Iterator[tuple[int, TrackedSequence | Failed]]:
+    """Yield the place and result of each sequence that ended, and count its frames."""
+    for place, value in ended:
+        sequence, result = sequences[place], value
+        if not isinstance(value, Failed):
+            result, written = value
+            if not results.take(sequence, written):
+                result = Failed(f"{written} is on another machine: --out needs a folder that all machines share")
+        if isinstance(result, Failed) and len(sequences) > 1:
+            note(f"recording {sequence.name} failed: {result.reason}")
+        yield place, result
+        for _ in range(len(sequence)):
+            on_frame()
+
+
+def track(
     dataset: Dataset,
     sequences: Sequence[DataSequence],
     out: Path,
+    how: Tracking,
     *,
-    parameters: Parameters,
-    data: DatasetArguments | None = None,
-    classes: Sequence[str] = (),
-    modules: Modules | None = None,
-    full: bool = False,
-    smooth: bool = False,
     executor: Executor | None = None,
     on_frame: Callable[[], None] = lambda: None,
     note: Callable[[str], None] = lambda _: None,
 ) -> Iterator[TrackedSequence]:
     """Track sequences, one task each, and write their results into `out`, a folder or a table.
 
-    Yields each sequence when it and those before it are done and written. With `full`, all that is known of the tracks
-    is written too. With `smooth`, states are given all frames of their track (`optipmb_client.smoothing`). The results
-    are the same bytes with any executor; those of other processes open `data`. What fails does not stop the others.
+    Yields each sequence when it and those before it are done and written. The results are the same bytes with any
+    executor; other processes open the data set themselves. A sequence that fails does not stop the others.
 
     Raises:
         RecordingsFailed: Some of several sequences failed; raised when all others are done and written.
@@ -156,15 +152,15 @@ def track(  # noqa: PLR0913  one argument per decision of the caller
     """
     executor = executor or Here()
     if (horizons := horizons_for(out)) is not None:
-        parameters = parameters.model_copy(update={"horizons": horizons})
+        how = replace(how, parameters=how.parameters.model_copy(update={"horizons": horizons}))
     names = tuple(one.name for one in sequences)
-    opened = Opened(dataset, {one.name: one for one in sequences}, on_frame) if executor.here else None
-    executor.start(_track_one, Tracking(data, out, parameters, tuple(classes), modules, full, smooth, opened))
-    results = Results(dataset, out, full=full)
-    outcomes = run(executor, names, lambda name: f"recording {name}", note)
+    opened = _Opened(dataset, {one.name: one for one in sequences}, on_frame) if executor.here else None
+    executor.start(_track_one, _Shared(dataset.arguments, out, replace(how, classes=tuple(how.classes)), opened))
+    results = Results(dataset, out, full=how.full)
     failures: dict[str, Failed] = {}
-    collected = _collected(outcomes, sequences, results, opened, on_frame, note)
-    for name, one in zip(names, in_order(collected), strict=True):
+    ended = run(executor, names, lambda name: f"recording {name}", note)
+    taken = _taken(ended, sequences, results, note, on_frame if opened is None else lambda: None)
+    for name, one in zip(names, in_order(taken), strict=True):
         if isinstance(one, Failed):
             failures[name] = one
         else:
@@ -176,29 +172,3 @@ def track(  # noqa: PLR0913  one argument per decision of the caller
         remove_unfinished(results.files)
     if failures:
         raise RecordingsFailed(failures, len(names))
-
-
-def _collected(
-    outcomes: Iterable[Outcome],
-    sequences: Sequence[DataSequence],
-    results: Results,
-    opened: Opened | None,
-    on_frame: Callable[[], None],
-    note: Callable[[str], None],
-) -> Iterator[tuple[int, TrackedSequence | Failed]]:
-    """Yield the place of each sequence that ended and what came of it; its results are taken, its frames counted."""
-    for outcome in outcomes:
-        sequence, result = sequences[outcome.place], outcome.result
-        if isinstance(result, Done):
-            tracked, written = result.value
-            if results.take(sequence, written):
-                yield outcome.place, tracked
-            else:
-                result = Failed(f"{written} is on another machine: --out needs a folder that all machines share")
-        if isinstance(result, Failed):
-            if len(sequences) > 1:
-                note(f"recording {sequence.name} failed: {result.reason}")
-            yield outcome.place, result
-        if opened is None:
-            for _ in range(len(sequence)):
-                on_frame()

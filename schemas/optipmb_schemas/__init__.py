@@ -6,7 +6,7 @@
 """
 
 from optipmb_schemas.arrays import Array
-from optipmb_schemas.codec import MESSAGES, decode, encoding_of
+from optipmb_schemas.codec import MESSAGES, decode, encode, encode_columns, encode_json, encoded, encoding_of
 from optipmb_schemas.control import (
     DrainRequest,
     MemberSummary,
@@ -20,7 +20,6 @@ from optipmb_schemas.control import (
     TracksRequest,
 )
 from optipmb_schemas.dump import STORED, Dump, DumpedFrame, decode_dump, encode_dump
-from optipmb_schemas.encoder import encode, encode_columns, encode_json, encoded
 from optipmb_schemas.errors import CODES, Code, MessageError
 from optipmb_schemas.keys import PREFIX, Keys, Query, Topic
 from optipmb_schemas.limits import DEFAULT, Limits

@@ -5,12 +5,13 @@ from typing import Literal
 from pydantic import Field
 
 from optipmb_schemas.errors import MessageError
-from optipmb_schemas.fields import (
+from optipmb_schemas.model import (
     MAX_TEXT,
     Count,
     Epoch,
     Flag,
     Horizons,
+    Message,
     Name,
     NonNegative,
     Plain,
@@ -20,7 +21,6 @@ from optipmb_schemas.fields import (
     Text,
     Word,
 )
-from optipmb_schemas.model import Message
 
 
 class SessionParameters(Message):

@@ -10,8 +10,7 @@ from typing import Annotated, Any, Final, TypeVar
 import msgpack
 from pydantic import BeforeValidator, StrictBool, StrictBytes, StrictInt, TypeAdapter, ValidationError
 
-from optipmb_schemas.codec import decode, read_map
-from optipmb_schemas.encoder import encode
+from optipmb_schemas.codec import decode, encode, read_map
 from optipmb_schemas.errors import MessageError, invalid, show
 from optipmb_schemas.limits import Limits
 from optipmb_schemas.messages import Detections, Points

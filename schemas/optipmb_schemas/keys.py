@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
 from optipmb_schemas.errors import MessageError, invalid
-from optipmb_schemas.fields import check_chunk, check_stream
+from optipmb_schemas.model import check_chunk, check_stream
 
 Topic = Literal["detections", "points", "tracks", "problems"]
 Query = Literal["state", "density", "tracks", "reset", "parameters"]

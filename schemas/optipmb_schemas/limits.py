@@ -4,13 +4,26 @@ The defaults carry the largest LiDAR clouds in use with room to spare, and keep 
 take in the tens of megabytes. A message above a limit is answered by a `too_large` problem that names it.
 """
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Final
 
 
 def _limit(default: int, meaning: str) -> int:
     value: int = field(default=default, metadata={"meaning": meaning})
     return value
+
+
+_DIMENSIONS: Final = {
+    "M": "max_detections",
+    "N": "max_tracks",
+    "P": "max_points",
+    "H": "max_horizons",
+    "C": "max_labels",
+}
+
+
+_STRUCTURE: Final = ("max_text", "max_values", "max_depth", "max_labels")
 
 
 @dataclass(frozen=True)
@@ -30,8 +43,18 @@ class Limits:
 
     def rows(self, dimension: str) -> int:
         """Return the limit of a dimension: M detections, N tracks or components, P points, H horizons, C classes."""
-        most = {"M": self.max_detections, "N": self.max_tracks, "P": self.max_points}
-        return (most | {"H": self.max_horizons, "C": self.max_labels})[dimension]
+        most: int = getattr(self, _DIMENSIONS[dimension])
+        return most
+
+    @cached_property
+    def at_least_default(self) -> bool:
+        """Whether no limit is below the default."""
+        return all(getattr(self, f.name) >= f.default for f in fields(self))
+
+    @cached_property
+    def has_usual_structure(self) -> bool:
+        """Whether none of texts, values, nesting and labels is below the default."""
+        return replace(DEFAULT, **{name: getattr(self, name) for name in _STRUCTURE}).at_least_default
 
     def described(self) -> list[tuple[str, int, str]]:
         """Return name, value and meaning of every limit, for people."""

@@ -15,8 +15,19 @@ from pydantic import AfterValidator, Field
 
 from optipmb_schemas.arrays import Array, Integers, Numeric, Reals, Singles, first_descent, numeric, unit_quaternion
 from optipmb_schemas.errors import MessageError, invalid, shape_text, show
-from optipmb_schemas.fields import Count, Epoch, Flag, Horizons, Labels, Name, NonNegative, SessionId, Stamp, Stream
-from optipmb_schemas.model import Message
+from optipmb_schemas.model import (
+    Count,
+    Epoch,
+    Flag,
+    Horizons,
+    Labels,
+    Message,
+    Name,
+    NonNegative,
+    SessionId,
+    Stamp,
+    Stream,
+)
 
 FAR = 1e8
 """Largest coordinate in metres: beyond every map projection, small enough that no square overflows."""
@@ -343,10 +354,8 @@ class Density(Message):
 
 
 def _check_labels(label: Integers, labels: tuple[str, ...]) -> None:
-    indices = label.tolist()
-    if (most := max(indices, default=-1)) >= len(labels):
-        at = indices.index(most)
-        raise MessageError("invalid_value", f"label[{at}]", f"an index into the {len(labels)} labels", show(most))
+    if len(label) and (most := label[at := numeric.largest(label)]) >= len(labels):
+        raise MessageError("invalid_value", f"label[{at}]", f"an index into the {len(labels)} labels", show(int(most)))
 
 
 def _check_covariances(covariance: Reals) -> None:

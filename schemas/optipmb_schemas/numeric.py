@@ -110,6 +110,11 @@ def first_outside(array: NDArray[Any], description: "Array") -> int | None:
     return None if good.all() else int(np.argmin(good))
 
 
+def largest(array: NDArray[Any]) -> int:
+    """Return which number of a non-empty array (N,) is the first of the largest."""
+    return int(array.argmax())
+
+
 def finite(points: Any) -> Any:
     """Return x, y, z of the points whose coordinates are finite; what is no cloud as it is."""
     if not isinstance(points, np.ndarray) or points.ndim != 2 or points.dtype.kind != "f":  # noqa: PLR2004  a table: rows and columns

@@ -185,6 +185,11 @@ def first_outside(numbers: Numbers, description: "Array") -> int | None:
     return outside[0] if outside else None
 
 
+def largest(numbers: Numbers) -> int:
+    """Return which number of a non-empty array (N,) is the first of the largest."""
+    return max(range(len(numbers)), key=numbers.flat.__getitem__)
+
+
 def finite(points: Any) -> Any:
     """Return x, y, z of the points whose coordinates are finite; what is no cloud as it is."""
     if not (isinstance(points, Numbers) and len(points.shape) == 2 and points.flat.format in _FLOATS):  # noqa: PLR2004  a table: rows and columns

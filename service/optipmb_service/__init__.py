@@ -10,7 +10,7 @@ From the outside in:
     cluster         leases, checkpoints and the log: SQLite or NATS
     runtime         streams and queries, found and sorted; one actor for each stream
     session         one density and all decisions about it
-    observability   metrics, health, problems, logs
+    telemetry       metrics, health, problems, logs
 
 Only `zenoh` knows Zenoh, only `session` knows the filter.
 """

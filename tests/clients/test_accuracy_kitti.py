@@ -14,7 +14,7 @@ from optipmb_client.datasets import Regions, Truth, open_dataset
 from optipmb_client.evaluation.calibration import CalibrationResult
 from optipmb_client.evaluation.errors import evaluate_errors
 from optipmb_client.tuning.calibrate import cross_calibration
-from optipmb_client.tuning.material import Clip, track_clip, track_fully
+from optipmb_client.tuning.clips import Clip, track_clip, track_fully
 from optipmb_client.tuning.values import only
 from real_data import kitti_root
 
@@ -37,17 +37,17 @@ def test_kitti_is_tracked_better_than_by_simple_trackers(name: str, lead: float)
     own = figures("kitti", "pointrcnn", name)
     for simple in (greedy_tracks, kalman_tracks):
         other = scorers[name].figures([scorers[name].measure(clip, simple(clip, name)) for clip in clips[name]])
-        assert own.samota >= other.samota + lead
-        assert own.mota >= other.mota + lead
-        assert own.amota >= other.amota + lead
+        assert own["sAMOTA"] >= other["sAMOTA"] + lead
+        assert own["MOTA"] >= other["MOTA"] + lead
+        assert own["AMOTA"] >= other["AMOTA"] + lead
 
 
 @pytest.mark.parametrize("name", ["Car", "Pedestrian", "Cyclist"])
 def test_kitti_is_tracked_at_least_as_well_as_with_the_papers_values(name: str) -> None:
     """Neither sAMOTA nor MOTA is less than with the values of the paper's table, by more than a thousandth."""
     tuned, paper = figures("kitti", "pointrcnn", name), figures("kitti-paper", "pointrcnn", name)
-    assert tuned.samota >= paper.samota - 0.001
-    assert tuned.mota >= paper.mota - 0.001
+    assert tuned["sAMOTA"] >= paper["sAMOTA"] - 0.001
+    assert tuned["MOTA"] >= paper["MOTA"] - 0.001
 
 
 def test_car_tracks_know_themselves() -> None:
@@ -64,10 +64,10 @@ def test_car_tracks_know_themselves() -> None:
 def test_cars_of_every_detector_are_tracked_as_well_as_with_the_papers_values(detections: str) -> None:
     """With `kitti`, sAMOTA and AMOTA are at most 0.002 below the paper's table, MOTA 0.003; no id switches."""
     tuned, paper = figures("kitti", detections, "Car"), figures("kitti-paper", detections, "Car")
-    assert tuned.samota >= paper.samota - 0.002
-    assert tuned.amota >= paper.amota - 0.002
-    assert tuned.mota >= paper.mota - 0.003
-    assert tuned.ids == 0
+    assert tuned["sAMOTA"] >= paper["sAMOTA"] - 0.002
+    assert tuned["AMOTA"] >= paper["AMOTA"] - 0.002
+    assert tuned["MOTA"] >= paper["MOTA"] - 0.003
+    assert tuned["IDS"] == 0
 
 
 @pytest.mark.parametrize(("name", "every", "most"), [("0004", 3, 1), ("0020", 5, 7)])
@@ -77,8 +77,8 @@ def test_cars_keep_their_ids_in_slow_streams(name: str, every: int, most: int) -
     (clip,) = (thinned(one, every) for one in clips["Car"] if one.name == name)
     tracks = track_clip(clip, only(optipmb.load_profile("kitti"), "Car"))
     found = scorers["Car"].figures([scorers["Car"].measure(clip, tracks)])
-    assert found.mota > 0.7
-    assert found.ids <= most
+    assert found["MOTA"] > 0.7
+    assert found["IDS"] <= most
 
 
 def thinned(clip: Clip, every: int) -> Clip:
@@ -120,7 +120,7 @@ def test_boxes_of_cars_lie_nearer_than_those_of_their_detector(detections: str, 
     figures_of: Any = found.figures(found.detected)
     for direction in ("along", "across", "height", "heading"):
         assert figures_of["track"][direction] <= figures_of["detection"][direction], direction
-    assert figures("kitti", detections, "Car").to_json()["MOTP"] >= motp + 0.015
+    assert figures("kitti", detections, "Car")["MOTP"] >= motp + 0.015
     assert figures_of["backward"]["track"] <= 1.2 * figures_of["backward"]["detection"]
     all_boxes: Any = found.figures(np.ones(len(found.speed), dtype=bool))
     assert 0.90 <= all_boxes["heading"]["coverage"] <= 0.98

@@ -11,14 +11,13 @@ import pytest
 from bulk_numbers import double
 from bulk_tasks import RECORDINGS, Dying, bytes_of, recordings, tracked_plainly
 from commands import run_here, start
-from optipmb_client.bulk import Executor, Failed, Here, executor_for, run, values
-from optipmb_client.bulk.executors import Processes
+from optipmb_client.bulk import Executor, Failed, Here, Processes, executor_for, run, values
 from optipmb_client.cli import run as command
 from optipmb_client.datasets import DatasetArguments
 from optipmb_client.errors import ClientError, UsageError
 from optipmb_client.offline import profile_for
 from optipmb_client.table_files import write_table
-from optipmb_client.tracking import track
+from optipmb_client.tracking import Tracking, track
 from optipmb_schemas.installation import install_command
 from own_tables import FRAMES, boxes
 
@@ -64,7 +63,7 @@ def test_killed_workers_lose_nothing(data: Path, tmp_path: Path) -> None:
     notes: list[str] = []
     with Processes(2) as executor:
         dying = Dying(executor, tmp_path, {"r017", "r090"})
-        done = track(opened, sequences, out, data=asked, parameters=parameters, executor=dying, note=notes.append)
+        done = track(opened, sequences, out, Tracking(parameters), executor=dying, note=notes.append)
         results = [next(done) for _ in range(40)]
         victim = workers(os.getpid()).pop()
         os.kill(victim, signal.SIGKILL)
@@ -82,11 +81,10 @@ def test_what_fails_stops_nothing_else(jobs: int) -> None:
     notes: list[str] = []
     with executor_for(jobs) as executor:
         executor.start(double, 2)
-        results = {
-            tasks[one.place]: one.result for one in run(executor, tasks, lambda task: f"task {task}", notes.append)
-        }
+        ended = run(executor, tasks, lambda task: f"task {task}", notes.append)
+        results = {tasks[place]: result for place, result in ended}
     failed = {task: one for task, one in results.items() if isinstance(one, Failed)}
-    assert {task: one.value for task, one in results.items() if not isinstance(one, Failed)} == {
+    assert {task: one for task, one in results.items() if not isinstance(one, Failed)} == {
         task: 2 * task for task in tasks if task not in {13, 14, 15}
     }
     assert failed[13] == Failed("thirteen", wrong_input=True)

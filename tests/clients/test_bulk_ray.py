@@ -14,7 +14,7 @@ from commands import optipmb
 from optipmb_client.bulk import Executor, executor_for
 from optipmb_client.datasets import DatasetArguments
 from optipmb_client.offline import profile_for
-from optipmb_client.tracking import TrackedSequence, track
+from optipmb_client.tracking import TrackedSequence, Tracking, track
 
 ray = pytest.importorskip("ray")
 cluster_utils = pytest.importorskip("ray.cluster_utils")
@@ -93,7 +93,7 @@ def tracked(data: Path, out: Path, executor: Executor) -> list[TrackedSequence]:
     opened = asked.open()
     sequences = opened.sequences(["all"])
     parameters = profile_for("kitti", sequences)
-    return list(track(opened, sequences, out, data=asked, parameters=parameters, executor=executor))
+    return list(track(opened, sequences, out, Tracking(parameters), executor=executor))
 
 
 def test_killed_workers_of_a_local_cluster_lose_nothing(data: Path, plain: dict[str, bytes], tmp_path: Path) -> None:

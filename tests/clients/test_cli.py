@@ -12,8 +12,7 @@ from commands import optipmb, run_here, start
 from fake_service import Behaviour, FakeService
 from hypothesis import given
 from hypothesis import strategies as st
-from optipmb_client.arguments import spread
-from optipmb_client.cli import run
+from optipmb_client.cli import run, spread
 from routers import free_endpoint
 
 SMALL = ["--dataset", "scene", "--option", "frames=8", "--option", "vehicles=4", "--option", "clouds=0"]

@@ -7,14 +7,17 @@ import pytest
 from commands import run_here
 from optipmb_client.camera import SENSOR_FROM_CAMERA, alpha_of, sensor_from_kitti
 from optipmb_client.datasets import DatasetError, open_dataset
-from optipmb_client.datasets.kitti import SPLITS, KittiDataset, KittiSequence, read_scan
-from optipmb_client.datasets.kitti_files import (
+from optipmb_client.datasets.kitti import (
     EARTH_RADIUS_M,
+    SPLITS,
+    KittiDataset,
+    KittiSequence,
     read_calibration,
     read_detections,
     read_labels,
     read_oxts,
     read_poses,
+    read_scan,
 )
 from optipmb_client.geometry import points_in_box, rotation_of, stack_poses, to_sensor, to_world, wrap_angle
 from real_data import kitti_root
@@ -310,7 +313,7 @@ def test_clouds_are_read_when_they_are_asked_for(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         cloud.pose.translation, frames[1].pose.translation + np.array([-0.27, 0.0, 0.08]), atol=1e-12
     )
-    np.testing.assert_allclose(rotation_of(cloud.quaternion), np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(rotation_of(cloud.pose.quaternion), np.eye(3), atol=1e-12)
     without = open_dataset("kitti", tmp_path, clouds=0).sequences(["all"])[0]
     assert not without.has_clouds
 
@@ -412,8 +415,8 @@ def test_real_scans_have_their_points_in_the_real_boxes(real: KittiDataset) -> N
         for frame in sequence.frames():
             if frame.cloud is None:
                 continue
-            rotation = rotation_of(frame.cloud.quaternion)
-            points = frame.cloud.xyz.astype(np.float64) @ rotation.T + frame.cloud.translation
+            rotation = rotation_of(frame.cloud.pose.quaternion)
+            points = frame.cloud.xyz.astype(np.float64) @ rotation.T + frame.cloud.pose.translation
             local = truth.to_sensor(sequence.poses)
             for row in np.flatnonzero((truth.frame == frame.index) & ~truth.ignored & (truth.occlusion == 0)):
                 if 5.0 < local.center[row, 0] < 30.0:

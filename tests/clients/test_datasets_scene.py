@@ -9,14 +9,12 @@ from typing import TypeAlias
 import numpy as np
 import pytest
 from optipmb_client.datasets import DatasetError, Truth, open_dataset
-from optipmb_client.datasets.scene.crossing import Crossing
 from optipmb_client.datasets.scene.dataset import MIN_POINTS, RADIUS, SceneSequence, visits
 from optipmb_client.datasets.scene.detector import CLASSES, FALSE, MIN_SCORE, Found, detection_probability
 from optipmb_client.datasets.scene.lidar import BEAMS, GROUND, NOTHING, cast, scan
-from optipmb_client.datasets.scene.paths import Path, resample, smooth, speed_limit
-from optipmb_client.datasets.scene.roads import MOVEMENTS, conflicts, fixed_boxes, parking_places
+from optipmb_client.datasets.scene.traffic import HALF_WIDTH, fixed_boxes, parking_places
 from optipmb_client.evaluation import Rules, evaluate_clear, iou_bev
-from optipmb_client.geometry import points_in_box, rotation_of, to_sensor, wrap_angle
+from optipmb_client.geometry import points_in_box, rotation_of, wrap_angle
 from optipmb_client.results import ResultTable
 
 import optipmb
@@ -191,8 +189,8 @@ def test_everything_happens_that_makes_tracking_hard(scenes: list[SceneSequence]
         turned = np.abs(np.unwrap(world.yaw, axis=0) - world.yaw[0])
         turning += int((turned[:, cars].max(axis=0) > 1.2).sum())
         standing += int((still[:, people].any(axis=0) & (speed[:, people].max(axis=0) > 0.8)).sum())
-        place = np.abs(world.center[:, people, :2])
-        crossing += int(((place < 3.0).any(axis=2) & (place.max(axis=2) < 12.0)).any(axis=0).sum())
+        from_middle = np.abs(np.abs(world.center[:, people, 1]) - HALF_WIDTH)
+        crossing += int((from_middle < 3.0).any(axis=0).sum())
     assert reversing >= 8
     assert stopping >= 10
     assert turning >= 10
@@ -268,7 +266,7 @@ def test_the_cloud_has_the_pose_of_the_sensor() -> None:
     """In the world frame the ground is at height 0."""
     frame = next(scene(0, 1).frames())
     assert frame.cloud is not None
-    world = frame.cloud.xyz @ rotation_of(frame.cloud.quaternion).T + frame.cloud.translation
+    world = frame.cloud.xyz @ rotation_of(frame.cloud.pose.quaternion).T + frame.cloud.pose.translation
     assert abs(np.median(world[:, 2])) < 0.02
     assert world[:, 2].min() > -0.2
 
@@ -439,55 +437,6 @@ def visible(truth: Truth) -> ResultTable:
     return ResultTable(rows.labels, *columns, np.ones(len(rows)), rows.box2d)
 
 
-def test_truth_and_poses_agree(scenes: list[SceneSequence]) -> None:
-    """The sensor's own way of carrying boxes is that of its published poses."""
-    sequence = scenes[1]
-    world = sequence._world
-    for frame in (0, 150, 299):
-        pose = sequence.poses[frame]
-        ours = sequence._local(frame, world.center[frame], world.yaw[frame])
-        theirs = to_sensor(rotation_of(pose.quaternion), pose.translation, world.center[frame], world.yaw[frame])
-        np.testing.assert_allclose(ours[0], theirs[0], atol=1e-9)
-        assert np.abs(wrap_angle(ours[1] - theirs[1])).max() < 1e-9
-
-
-def test_only_ways_that_meet_conflict() -> None:
-    """Opposite ways straight on do not conflict, crossing ones do, and right turns into free lanes do not."""
-    table = conflicts()
-    index = {(m.kind, m.start, m.stop): i for i, m in enumerate(MOVEMENTS)}
-    assert np.isneginf(table[index["car", 0, 2], index["car", 2, 0]])
-    assert table[index["car", 0, 2], index["car", 1, 3]] > 0.0
-    assert np.isneginf(table[index["car", 0, 1], index["car", 2, 3]])
-    assert np.isneginf(table[index["car", 0, 2], index["cycle", 0, 2]])
-    assert table[index["car", 0, 1], index["cycle", 0, 2]] > 0.0
-    np.testing.assert_array_equal(np.isneginf(table), np.isneginf(table.T))
-
-
-def test_nobody_enters_the_crossing_before_the_way_is_free() -> None:
-    """A second vehicle waits for the first, pedestrians for vehicles, vehicles for pedestrians."""
-    crossing = Crossing()
-    east, north = (
-        next(i for i, m in enumerate(MOVEMENTS) if (m.kind, m.start, m.stop) == way)
-        for way in (("car", 0, 2), ("car", 1, 3))
-    )
-    movements, near = {0: east, 1: north}, {0: 3.0, 1: 4.0}
-    crossing.ask(movements, near, {0: 10.0, 1: 10.0})
-    crossing.grant(movements, 0.1)
-    assert list(crossing.vehicles) == [0]
-    assert not crossing.wait_on_foot(2, 0.0)
-    assert crossing.wait_on_foot(1, 0.0)
-    crossing.vehicles[0] = (east, 100.0)
-    crossing.grant(movements, 0.1)
-    assert list(crossing.vehicles) == [0, 1]
-    crossing.vehicles.clear()
-    crossing.walkers[7] = 2
-    crossing.ask(movements, near, {0: 10.0, 1: 10.0})
-    crossing.grant(movements, 0.1)
-    assert list(crossing.vehicles) == [1]
-    assert not crossing.wait_on_foot(3, 60.0)
-    assert crossing.impatient == {3}
-
-
 def test_parking_places_do_not_overlap() -> None:
     """Cars on any two places keep clear of each other."""
     places, headings = parking_places()
@@ -495,30 +444,6 @@ def test_parking_places_do_not_overlap() -> None:
     first, second = np.triu_indices(len(places), 1)
     size = np.tile([4.9, 2.1, 1.5], (len(first), 1))
     assert iou_bev((center[first], size, headings[first]), (center[second], size, headings[second])).max() == 0.0
-
-
-def test_paths_are_walked_by_arc_length() -> None:
-    """Points a metre apart along the path are a metre apart on a line, and a smoothed corner is cut, not lengthened."""
-    path, arc = resample(np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]]))
-    np.testing.assert_allclose(arc, [0.0, 10.0, 20.0])
-    np.testing.assert_allclose(path.at(np.array([0.0, 3.1, 12.0])), [[0, 0], [3.1, 0], [10, 2]], atol=1e-12)
-    bent, places = smooth(path, 4.0)
-    assert bent.length < path.length
-    assert (np.diff(places) > 0).all()
-    steps = np.linalg.norm(np.diff(bent.points, axis=0), axis=1)
-    np.testing.assert_allclose(steps, 0.25, atol=0.02)
-
-
-def test_speed_limits_are_reached_by_braking() -> None:
-    """Before a bend of 5 m radius the limit falls as braking at 2 m/s2 allows, and in the bend it is sqrt(2 * 5)."""
-    angle = np.linspace(0, 0.5 * np.pi, 200)
-    bend = np.column_stack([50 + 5 * np.sin(angle), 5 - 5 * np.cos(angle)])
-    path, _ = resample(np.vstack([[0.0, 0.0], bend, [55.0, 40.0]]))
-    limit = speed_limit(Path(path.points), 20.0, 2.0, 2.0)
-    middle = int(53.9 / 0.25)
-    assert limit[middle] == pytest.approx(np.sqrt(10.0), rel=0.05)
-    assert limit[0] == pytest.approx(np.sqrt(10.0 + 2 * 2.0 * 50.0), rel=0.05)
-    assert (np.diff(limit**2) >= -2 * 2.0 * 0.25 - 1e-9).all()
 
 
 def test_the_profile_of_scenes_knows_their_classes() -> None:

@@ -14,12 +14,11 @@ from optipmb_client.evaluation.ab3dmot import (
     POINTS,
     Ab3dmotResult,
     Counts,
-    ab3dmot_rules,
     evaluate_ab3dmot,
     recall_points,
 )
-from optipmb_client.evaluation.cases import Case, prepare
-from optipmb_client.evaluation.figures import evaluate_figures, load_recordings
+from optipmb_client.evaluation.cases import Case, ab3dmot_rules, prepare
+from optipmb_client.evaluation.evaluate import evaluate_figures, load_recordings
 from scipy.optimize import linear_sum_assignment
 
 PATIENT = settings(deadline=None, max_examples=60)  # other work on the machine may make any example slow

@@ -4,8 +4,16 @@ import numpy as np
 from evaluation_cases import tracks_of, truth_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_client.evaluation.assignment import assign_frames, best_pairs, by_frame, most_pairs, uncontested
-from optipmb_client.evaluation.cases import Case, Rules, prepare
+from optipmb_client.evaluation.cases import (
+    Case,
+    Rules,
+    assign_frames,
+    best_pairs,
+    by_frame,
+    most_pairs,
+    prepare,
+    uncontested,
+)
 from optipmb_client.evaluation.clear import match_frames
 from scipy.optimize import linear_sum_assignment
 

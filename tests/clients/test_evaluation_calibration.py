@@ -8,10 +8,10 @@ from evaluation_cases import parked, tracks_of, truth_of
 from optipmb_client.datasets import DatasetError, open_dataset
 from optipmb_client.evaluation.calibration import CalibrationResult, calibration, evaluate_calibration
 from optipmb_client.evaluation.cases import Rules
-from optipmb_client.evaluation.figures import evaluate_figures, load_recordings
+from optipmb_client.evaluation.evaluate import evaluate_figures, load_recordings
 from optipmb_client.geometry import Floats
 from optipmb_client.results.full import FullTable, full_path, read_full, write_full
-from optipmb_client.tracking import track
+from optipmb_client.tracking import Tracking, track
 
 import optipmb
 
@@ -139,7 +139,7 @@ def test_track_keeps_everything_on_demand(tmp_path: Path) -> None:
     """With `full` a file beside the results holds all columns of the same tracks, in the same bytes; without, none."""
     dataset = open_dataset("scene", frames=20, vehicles=6, pedestrians=3, cyclists=2)
     sequences, scene = list(dataset.sequences(["0000"])), optipmb.load_profile("scene")
-    (result,) = track(dataset, sequences, tmp_path, parameters=scene, full=True)
+    (result,) = track(dataset, sequences, tmp_path, Tracking(scene, full=True))
     beside = full_path(result.file)
     content = beside.read_bytes()
     full = read_full(beside)
@@ -153,9 +153,9 @@ def test_track_keeps_everything_on_demand(tmp_path: Path) -> None:
     (cars, *_) = evaluate_figures("scene", [recording], ("Car", "Pedestrian", "Cyclist"))
     assert cars.calibration is not None
     assert 0 < len(cars.calibration.nees) <= len(cars.calibration.existence)
-    list(track(dataset, sequences, tmp_path, parameters=scene, full=True))
+    list(track(dataset, sequences, tmp_path, Tracking(scene, full=True)))
     assert beside.read_bytes() == content
-    list(track(dataset, sequences, tmp_path, parameters=scene))
+    list(track(dataset, sequences, tmp_path, Tracking(scene)))
     assert not beside.exists()
 
 

@@ -231,9 +231,8 @@ def test_real_truth_as_results_is_perfect(tmp_path: Path) -> None:
     for sequence in sequences:
         truth = sequence.truth()
         assert truth is not None
-        with dataset.writer(tmp_path, sequence) as writer:
-            for index, pose in enumerate(sequence.poses):
-                writer.add(index, pose, _Now(truth.take(truth.frame == index)))
+        frames = {index: _Now(truth.take(truth.frame == index)) for index in range(len(sequence))}
+        dataset.write(tmp_path, sequence, frames)
     results = evaluate_files(sequences, tmp_path, ("Car", "Pedestrian", "Tram"), default_rules("kitti"))
     assert [result.name for result in results] == ["Car", "Pedestrian"]
     for result in results:

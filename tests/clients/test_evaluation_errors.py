@@ -8,8 +8,8 @@ import pytest
 from optipmb_client.datasets import DataSequence, DetectionFrame, open_dataset
 from optipmb_client.evaluation.cases import Rules
 from optipmb_client.evaluation.errors import DIRECTIONS, ErrorResult, evaluate_errors
-from optipmb_client.evaluation.figures import evaluate_figures, load_recordings
-from optipmb_client.tracking import track
+from optipmb_client.evaluation.evaluate import evaluate_figures, load_recordings
+from optipmb_client.tracking import Tracking, track
 
 import optipmb
 
@@ -80,7 +80,7 @@ def test_detections_are_those_of_the_tracks(tmp_path: Path) -> None:
     """Tracked offline and evaluated: both columns are there, and detections that are raised by 3 m are 3 m too high."""
     dataset = open_dataset("scene", frames=80)
     sequences = dataset.sequences(["all"])[:1]
-    list(track(dataset, sequences, tmp_path, parameters=optipmb.load_profile("scene"), full=True))
+    list(track(dataset, sequences, tmp_path, Tracking(optipmb.load_profile("scene"), full=True)))
     recordings = load_recordings("scene", sequences, tmp_path)
     (car,) = evaluate_figures("scene", recordings, ["Car"])
     assert car.errors is not None
@@ -99,7 +99,7 @@ def test_other_detections_are_noticed(tmp_path: Path) -> None:
     """Tracks of some classes, compared with the detections of all: headings are judged, and the reason is told."""
     dataset = open_dataset("scene", frames=80)
     sequences = dataset.sequences(["all"])[:1]
-    list(track(dataset, sequences, tmp_path, parameters=optipmb.load_profile("scene"), classes=["Car"], full=True))
+    list(track(dataset, sequences, tmp_path, Tracking(optipmb.load_profile("scene"), ["Car"], full=True)))
     one = load_recordings("scene", sequences, tmp_path)[0]
     assert one.full is not None
     found = evaluate_errors([(one.sequence, one.truth, one.tracks, one.full)], "Car", NEAR).summary()

@@ -12,7 +12,7 @@ from evaluation_cases import write_kitti
 from optipmb_client.cli import run
 from optipmb_client.datasets import DatasetError, open_dataset
 from optipmb_client.datasets.kitti import KittiSequence
-from optipmb_client.evaluation.figures import Settings, evaluate_figures, load_recordings
+from optipmb_client.evaluation.evaluate import Settings, evaluate_figures, load_recordings
 from optipmb_client.results.kitti import LEAST_SHOWN, read_kitti_results
 from optipmb_client.table_files import write_table
 from real_data import kitti_root, nuscenes_root

@@ -12,11 +12,9 @@ from evaluation_cases import TrackRow, TruthRow, followed, parked, shuffled, tra
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_client.datasets import open_dataset
-from optipmb_client.evaluation.cases import Case, Rules, prepare
-from optipmb_client.evaluation.counted import counted, similarity
-from optipmb_client.evaluation.figures import evaluate_figures, load_recordings
+from optipmb_client.evaluation.cases import Case, Rules, counted, hota_2d_rules, prepare, similarity
+from optipmb_client.evaluation.evaluate import evaluate_figures, load_recordings
 from optipmb_client.evaluation.hota import NOTHING, HotaResult, evaluate_hota
-from optipmb_client.evaluation.hota_2d import hota_2d_rules
 
 PATIENT = settings(deadline=None, max_examples=60)  # other work on the machine may make any example slow
 NEAR = Rules("distance", 2.0)

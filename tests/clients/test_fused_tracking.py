@@ -11,8 +11,8 @@ from commands import result_of, run_here
 from fusing import FRONT, FUSED, REAR, SIDE, drive
 from optipmb_client.datasets import DatasetError, open_dataset
 from optipmb_client.datasets.fused import FusedSequence
-from optipmb_client.mcap_files.writing import RecordingWriter
 from optipmb_client.offline import track_whole
+from optipmb_client.recordings.files import RecordingWriter
 from optipmb_schemas import Keys, Tracks, encode, encoding_of
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Policy

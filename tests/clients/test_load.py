@@ -10,8 +10,7 @@ import pytest
 from commands import run_here
 from hypothesis import given
 from hypothesis import strategies as st
-from optipmb_client.load import Run, draw_runs, find_limit, generated, table_of
-from optipmb_client.load.material import FIRST, chain, head, message
+from optipmb_client.load import FIRST, Run, chain, draw_runs, find_limit, generated, head, message, table_of
 from optipmb_schemas import Detections, Points, decode
 
 if TYPE_CHECKING:

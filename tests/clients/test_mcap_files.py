@@ -19,11 +19,9 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from optipmb_client.datasets import DatasetError, dataset_at, open_dataset
-from optipmb_client.foxglove_messages import FoxgloveMessages
-from optipmb_client.foxglove_server import FoxgloveServer
-from optipmb_client.mcap_files.plan import plan, renamed, steps
-from optipmb_client.mcap_files.reading import Recorded, RecordingFile
-from optipmb_client.mcap_files.writing import RecordingWriter
+from optipmb_client.foxglove_view import FoxgloveMessages, FoxgloveServer
+from optipmb_client.recordings.files import Recorded, RecordingFile, RecordingWriter
+from optipmb_client.recordings.plan import plan, renamed, steps
 from optipmb_client.zenoh import Connection
 from optipmb_schemas import (
     Detections,

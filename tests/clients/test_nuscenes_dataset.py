@@ -25,8 +25,7 @@ from nuscenes_tables import (
 )
 from optipmb_client.datasets import DatasetError, open_dataset
 from optipmb_client.datasets import nuscenes_tables as tables_module
-from optipmb_client.datasets.nuscenes import NuScenesDataset, NuScenesSequence, read_sweep
-from optipmb_client.datasets.nuscenes_splits import SPLITS, scenes_of_split
+from optipmb_client.datasets.nuscenes import SPLITS, NuScenesDataset, NuScenesSequence, read_sweep, scenes_of_split
 from optipmb_client.datasets.nuscenes_tables import box_velocity, read_table
 from optipmb_client.geometry import rotation_of
 from real_data import nuscenes_root
@@ -167,9 +166,9 @@ def test_clouds_are_those_of_keyframes_that_are_present(tmp_path: Path) -> None:
     assert clouds[1].xyz.tolist() == [[1, 2, 3], [4, 5, 6]]
     ego = rotation_of(np.array(rotation(0.3)))
     in_car = rotation_of(np.array(TILTED)) @ [1, 2, 3] + [0.9, 0.0, 1.8]
-    world = rotation_of(clouds[1].quaternion) @ [1, 2, 3] + clouds[1].translation
+    world = rotation_of(clouds[1].pose.quaternion) @ [1, 2, 3] + clouds[1].pose.translation
     assert world == pytest.approx(ego @ in_car + [100.0, 200.0, 0.0])
-    assert sequence.poses[1].translation == pytest.approx(clouds[1].translation)
+    assert sequence.poses[1].translation == pytest.approx(clouds[1].pose.translation)
     assert sequence.ego_poses[1].translation == pytest.approx([100.0, 200.0, 0.0])
     (without,) = open_dataset("nuscenes", tmp_path, clouds=False).sequences([SCENE])
     assert not without.has_clouds

@@ -16,19 +16,28 @@ from nuscenes_tables import Scene, Thing, crowd, write_detections, write_root
 from optipmb_client.cli import run
 from optipmb_client.datasets import DatasetError
 from optipmb_client.datasets.nuscenes import NuScenesDataset, NuScenesSequence
-from optipmb_client.evaluation.nuscenes import NuScenesScores, evaluate_nuscenes, evaluate_scenes
-from optipmb_client.evaluation.nuscenes_figures import NuScenesClass, _Paths, figures, score_thresholds
-from optipmb_client.evaluation.nuscenes_matching import Event, Matching, Pairing, match, pair
-from optipmb_client.evaluation.nuscenes_scene import (
+from optipmb_client.evaluation.nuscenes import (
+    Event,
+    Matching,
+    NuScenesClass,
     NuScenesConfig,
     NuScenesScene,
+    NuScenesScores,
+    Pairing,
     Racks,
     TrackBoxes,
+    _Paths,
+    evaluate_nuscenes,
+    evaluate_scenes,
+    figures,
     interpolate,
+    match,
+    pair,
     prepare_scene,
+    score_thresholds,
 )
 from optipmb_client.results import ResultTable
-from optipmb_client.results.nuscenes_layout import NUSCENES_CLASSES
+from optipmb_client.results.nuscenes import NUSCENES_CLASSES
 from real_data import nuscenes_root
 
 CAR, PEDESTRIAN = NUSCENES_CLASSES.index("car"), NUSCENES_CLASSES.index("pedestrian")

@@ -15,10 +15,10 @@ from optipmb_client import Connection
 from optipmb_client.datasets import DatasetError
 from optipmb_client.datasets.nuscenes import NuScenesDataset, NuScenesSequence
 from optipmb_client.offline import read_profile
-from optipmb_client.recording import Results
-from optipmb_client.replay import Pace, replay
+from optipmb_client.replay import Pace, Replaying, replay
 from optipmb_client.results.nuscenes import NUSCENES_MAX_BOXES, read_nuscenes_results, result_table
-from optipmb_client.tracking import track
+from optipmb_client.results.output import Results
+from optipmb_client.tracking import Tracking, track
 
 SCENES = [crowd("scene-0103", 1, 6), crowd("scene-0916", 2, 5, 1_538_984_233_000_000)]
 FILE = "tracking_results.json"
@@ -72,9 +72,7 @@ def test_every_sample_is_there(root: Path, tmp_path: Path) -> None:
     """Samples without tracks, and frames never added, have an empty list; the meta is that of the detections."""
     dataset = NuScenesDataset(root)
     (sequence,) = dataset.sequences(["scene-0103"])
-    with dataset.writer(tmp_path, sequence) as writer:
-        writer.add(2, sequence.poses[2], rows(3))
-        writer.add(3, sequence.poses[3], rows(0))
+    dataset.write(tmp_path, sequence, {2: rows(3), 3: rows(0)})
     dataset.join(tmp_path, [sequence])
     content = json.loads((tmp_path / FILE).read_text())
     assert {token: len(boxes) for token, boxes in content["results"].items()} == {
@@ -193,10 +191,10 @@ def test_offline_tracking_writes_it(root: Path, tmp_path: Path) -> None:
     """Tracking the dataset with its own profile gives a file that can be read, with all samples."""
     dataset = NuScenesDataset(root)
     sequences = dataset.sequences(["all"])
-    done = list(track(dataset, sequences, tmp_path, parameters=read_profile(dataset.profile)))
+    done = list(track(dataset, sequences, tmp_path, Tracking(read_profile(dataset.profile))))
     assert [result.frames for result in done] == [6, 5]
     results = read_nuscenes_results(tmp_path)
-    assert all(token in results for sequence in sequences for token in sequence.samples)
+    assert all(token in results.rows for sequence in sequences for token in sequence.samples)
 
 
 def test_replaying_scenes_at_once_writes_the_same_file(endpoint: str, root: Path, tmp_path: Path) -> None:
@@ -206,9 +204,8 @@ def test_replaying_scenes_at_once_writes_the_same_file(endpoint: str, root: Path
     with FakeService(endpoint), Connection(endpoint) as link:
         for streams in (1, 2):
             out = tmp_path / str(streams)
-            done = replay(
-                link, dataset, dataset.sequences(["all"]), out, profile="nuscenes", pace=pace, streams=streams
-            )
+            how = Replaying("nuscenes", pace, streams=streams)
+            done = replay(link, dataset, dataset.sequences(["all"]), out, how)
             assert [result.missing for result in done] == [0, 0]
     written = [(tmp_path / streams / FILE).read_bytes() for streams in ("1", "2")]
     assert written[0] == written[1]

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from optipmb_client.datasets import Dataset, open_dataset
+from optipmb_client.datasets import Dataset, Preloaded, open_dataset, selected_frames
 from optipmb_client.errors import UsageError
 from optipmb_client.offline import read_profile, track_whole
-from optipmb_client.recording import Preloaded, latency, selected_frames
-from optipmb_client.tracking import track
+from optipmb_client.results.output import latency
+from optipmb_client.tracking import Tracking, track
 from optipmb_schemas import PATHS
 
 
@@ -23,7 +23,7 @@ def test_the_same_data_give_the_same_bytes(dataset: Dataset, tmp_path: Path) -> 
     """Two runs write the same file, and it is not empty."""
     files = []
     for run in ("one", "two"):
-        (result,) = track(dataset, dataset.sequences(["0000"]), tmp_path / run, parameters=read_profile("kitti"))
+        (result,) = track(dataset, dataset.sequences(["0000"]), tmp_path / run, Tracking(read_profile("kitti")))
         files.append(result.file.read_bytes())
     assert files[0] == files[1]
     assert len(files[0].splitlines()) > 40
@@ -34,8 +34,8 @@ def test_predicted_paths_are_written_with_all_columns(dataset: Dataset, tmp_path
     """With horizons in the profile the file of all columns has a path for each row; the result file is as without."""
     sequences, parameters = dataset.sequences(["0000"]), read_profile("kitti")
     asking = parameters.model_copy(update={"horizons": (0.1, 2.0)})
-    (plain,) = track(dataset, sequences, tmp_path / "a", parameters=parameters, full=True, smooth=smooth)
-    (found,) = track(dataset, sequences, tmp_path / "b", parameters=asking, full=True, smooth=smooth)
+    (plain,) = track(dataset, sequences, tmp_path / "a", Tracking(parameters, full=True, smooth=smooth))
+    (found,) = track(dataset, sequences, tmp_path / "b", Tracking(asking, full=True, smooth=smooth))
     assert plain.file.read_bytes() == found.file.read_bytes()
     without, columns = (np.load(one.file.with_suffix(".npz")) for one in (plain, found))
     assert set(columns) - set(without) == set(PATHS)
@@ -54,7 +54,7 @@ def test_what_is_reported_is_what_was_written(dataset: Dataset, tmp_path: Path) 
         dataset,
         dataset.sequences(["0000"]),
         tmp_path,
-        parameters=read_profile("kitti"),
+        Tracking(read_profile("kitti")),
         on_frame=lambda: seen.append(1),
     )
     rows = [line.split() for line in result.file.read_text().splitlines()]

@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import run_here
-from optipmb_client.animation import WIDTH_PX, animate_tracks
 from optipmb_client.datasets import DataSequence, Truth, open_dataset
 from optipmb_client.errors import ClientError
 from optipmb_client.evaluation import ClearResult, Rules, evaluate_clear
-from optipmb_client.pictures import Panel, draw_tracks
+from optipmb_client.pictures import WIDTH_PX, Panel, animate_tracks, draw_tracks
 from optipmb_client.results import ResultTable, empty_table
 from PIL import Image
 

@@ -2,14 +2,15 @@
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from fake_service import Behaviour, FakeService
 from optipmb_client import Connection, ServiceRefused, ServiceUnavailable, UsageError
 from optipmb_client.datasets import Dataset, open_dataset
-from optipmb_client.replay import Pace, ReplayedSequence, replay
+from optipmb_client.replay import Pace, ReplayedSequence, Replaying, replay
 from optipmb_schemas import Detections, Tracks
 from router import until
 
@@ -30,10 +31,17 @@ def link(endpoint: str) -> Iterator[Connection]:
         yield connection
 
 
-def run(link: Connection, dataset: Dataset, out: Path, *names: str, **options: object) -> list[ReplayedSequence]:
+def run(
+    link: Connection,
+    dataset: Dataset,
+    out: Path,
+    *names: str,
+    on_frame: Callable[[], None] = lambda: None,
+    **options: object,
+) -> list[ReplayedSequence]:
     """Replay sequences of the scene."""
-    arguments = {"profile": "kitti", "pace": QUICK, "streams": 1} | options
-    return replay(link, dataset, dataset.sequences(names or ["0000"]), out, **arguments)  # type: ignore[arg-type]  # given by the tests
+    how = replace(Replaying("kitti", QUICK), **options)  # type: ignore[arg-type]  # given by the tests
+    return replay(link, dataset, dataset.sequences(names or ["0000"]), out, how, on_frame)
 
 
 def test_every_frame_comes_back(endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from optipmb_client.datasets import DatasetError, open_dataset
 from optipmb_client.geometry import Floats, Ints, Pose, planar_pose, wrap_angle
 from optipmb_client.offline import read_profile, track_whole
 from optipmb_client.results import empty_table
-from optipmb_client.results.kitti import SUBMISSION_SCORES, KittiResultWriter, read_kitti_results
+from optipmb_client.results.kitti import SUBMISSION_SCORES, read_kitti_results, write_kitti_results
 from real_data import kitti_root
 
 LABELS = ("Car", "Pedestrian", "Cyclist")
@@ -58,10 +58,11 @@ def some_rows(rng: np.random.Generator, count: int) -> Rows:
 
 def write(path: Path, frames: list[tuple[int, Pose, Rows]]) -> Path:
     """Write tracks and give the path of the file."""
-    with KittiResultWriter(path, synthetic_camera()) as writer:
-        for index, pose, rows in frames:
-            writer.add(index, pose, rows)
-    return writer.path
+    poses = {index: pose for index, pose, _ in frames}
+    tracks = {index: rows for index, _, rows in frames}
+    return write_kitti_results(
+        path, synthetic_camera(), [poses.get(index) for index in range(max(poses, default=-1) + 1)], tracks
+    )
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=25)
@@ -249,15 +250,16 @@ def test_real_truth_written_as_results_is_the_label_file_again(tmp_path: Path) -
     (sequence,) = dataset.sequences(["0011"])
     truth = sequence.truth()
     assert truth is not None
-    with dataset.writer(tmp_path, sequence) as writer:
-        for index, pose in enumerate(sequence.poses):
-            now = truth.take(truth.frame == index)
-            rows = Rows(now.id, now.label, now.center, now.size, now.yaw, np.ones(len(now)), truth.labels)
-            writer.add(index, pose, rows)
-    assert writer.path == tmp_path / "0011.txt"
+    frames = [truth.take(truth.frame == index) for index in range(len(sequence))]
+    tracks = {
+        index: Rows(now.id, now.label, now.center, now.size, now.yaw, np.ones(len(now)), truth.labels)
+        for index, now in enumerate(frames)
+    }
+    path = dataset.write(tmp_path, sequence, tracks)
+    assert path == tmp_path / "0011.txt"
     lines = (kitti_root() / "training/label_02/0011.txt").read_text().splitlines()
     wanted = {tuple(f[:3]): f for f in (line.split() for line in lines) if f[2] != "DontCare"}
-    found = {tuple(f[:3]): f for f in (line.split() for line in writer.path.read_text().splitlines())}
+    found = {tuple(f[:3]): f for f in (line.split() for line in path.read_text().splitlines())}
     assert found.keys() == wanted.keys()
     ours = np.array([found[key][10:17] for key in wanted], dtype=np.float64)
     theirs = np.array([fields[10:17] for fields in wanted.values()], dtype=np.float64)

@@ -17,7 +17,7 @@ from optipmb_client.datasets import DataSequence, dataset_at, open_dataset
 from optipmb_client.files import DatasetError
 from optipmb_client.offline import read_profile
 from optipmb_client.results.full import FullTable, full_path, read_full
-from optipmb_client.tracking import track
+from optipmb_client.tracking import Tracking, track
 from real_data import kitti_root
 
 DETECTIONS = "/detector/boxes/tracks/detections"
@@ -42,7 +42,7 @@ def bag(scene: DataSequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def tracks_of(name: str, root: Path | None, out: Path, profile: str = "scene", **options: Any) -> FullTable:
     """Give the tracks of the only sequence of a dataset."""
     dataset = open_dataset(name, root, **options)
-    (result,) = track(dataset, dataset.sequences(["all"])[:1], out, parameters=read_profile(profile), full=True)
+    (result,) = track(dataset, dataset.sequences(["all"])[:1], out, Tracking(read_profile(profile), full=True))
     return read_full(full_path(result.file))
 
 

@@ -8,7 +8,7 @@ from fake_service import FakeService
 from optipmb_client import Connection
 from optipmb_client.cli import run
 from optipmb_client.sessions import find_services
-from optipmb_client.status import members_of, render
+from optipmb_client.terminal import members_of, status_tables
 from optipmb_schemas import MemberSummary, Problem, ServiceStatus
 from rich.console import Console
 
@@ -84,5 +84,5 @@ def test_text_from_the_network_is_never_markup() -> None:
     status = ServiceStatus(instance="x", version="1", started_ns=0, uptime_s=1.0, state="ready", problems=(problem,))
     console = Console(width=200)
     with console.capture() as capture:
-        console.print(render([status]))
+        console.print(status_tables([status]))
     assert f"{text} (3 times)" in capture.get()

@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_client.datasets import open_dataset
-from optipmb_client.tuning.calibrate import calibrate, judge_calibration
-from optipmb_client.tuning.material import Clip, load, of_class, track_clip, track_fully
-from optipmb_client.tuning.ranking import rank
+from optipmb_client.tuning.calibrate import calibrate, measured_calibration, rank
+from optipmb_client.tuning.clips import Clip, load, of_class, track_clip, track_fully
 from optipmb_client.tuning.scoring import rules_of, scorer_of
 from optipmb_client.tuning.values import only, profile_text, with_calibration, with_values
 from tuning_cases import Habits, recorded
@@ -49,8 +48,8 @@ def test_covariances_come_true_where_they_were_not_measured(lasting: float) -> N
     found = calibrate(known, SCORER, CARS, 0.8)
     assert found is not None
     assert (max(found.along) > 0.15) == (lasting > 0)
-    before = judge_calibration(other, SCORER, CARS)
-    after = judge_calibration(other, SCORER, with_calibration(CARS, "Car", found))
+    before = measured_calibration(other, SCORER, CARS)
+    after = measured_calibration(other, SCORER, with_calibration(CARS, "Car", found))
     assert after.mean < 2.6
     assert after.interval[0] < 2.3
     if lasting:
@@ -60,15 +59,15 @@ def test_covariances_come_true_where_they_were_not_measured(lasting: float) -> N
 
 def test_existence_comes_true_on_other_scenes() -> None:
     """Of the tracks that are said to exist with some probability, about this share does, in scenes not measured on."""
-    sequences = open_dataset("scene", frames=60, clouds=False).sequences([f"{i:04d}" for i in range(4)])
+    sequences = open_dataset("scene", frames=100, clouds=False).sequences([f"{i:04d}" for i in range(4)])
     clips = [of_class(load(one, PAPER, RULES), "Car", RULES) for one in sequences]
     found = calibrate(clips[:2], SCORER, CARS)
     assert found is not None
     assert found.existence[0] < 0.5
     assert found.existence[-1] > 0.9
     for result, most in (
-        (judge_calibration(clips[2:], SCORER, CARS), 1.0),
-        (judge_calibration(clips[2:], SCORER, with_calibration(CARS, "Car", found)), 0.15),
+        (measured_calibration(clips[2:], SCORER, CARS), 1.0),
+        (measured_calibration(clips[2:], SCORER, with_calibration(CARS, "Car", found)), 0.15),
     ):
         off = [abs(one.predicted - one.observed) for one in result.deciles if one.count >= 100]
         assert max(off) < most

@@ -5,9 +5,8 @@ import math
 import numpy as np
 import pytest
 from optipmb_client.datasets import open_dataset
-from optipmb_client.tuning.estimate import Estimate, estimate
-from optipmb_client.tuning.material import load, of_class
-from optipmb_client.tuning.robust import spread, usual
+from optipmb_client.tuning.clips import load, of_class
+from optipmb_client.tuning.estimate import Estimate, estimate, spread, usual
 from optipmb_client.tuning.scoring import rules_of
 from optipmb_client.tuning.values import only
 from tuning_cases import Habits, Recorded, recorded

@@ -1,26 +1,33 @@
-"""The search: the same trials whenever and however often it is taken up, better ones than it began with."""
+"""The search: the same trials whenever and however often it is resumed, better ones than it began with."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 from optipmb_client.errors import UsageError
-from optipmb_client.tuning.space import Dimension, dimensions, penalty, repaired
+from optipmb_client.tuning.search import Dimension, dimensions, penalty, repaired
 from optipmb_client.tuning.values import Value, profile_text, value_of, with_classes, with_values, write_profile
 
 import optipmb
 
 pytest.importorskip("optuna")
-from optipmb_client.tuning.search import Outcome, Search
+from optipmb_client.tuning.search import Search
 
 SPACE = (*(Dimension(f"d{i}", "log", 0.1, 10.0, 1.0) for i in range(5)), Dimension("n", "whole", 1, 100, 30))
 START = {one.path: one.value(one.start) for one in SPACE}
 
 
-def valley(values: Mapping[str, Value], _best: Outcome | None = None) -> float:
+def valley(values: Mapping[str, Value], _guess: Callable[[float], None] | None = None) -> float:
     """Rise towards d_i = 1.5, n = 20."""
     return -sum(math.log(values[f"d{i}"] / 1.5) ** 2 for i in range(5)) - 0.01 * abs(values["n"] - 20)
+
+
+def guessed(values: Mapping[str, Value], guess: Callable[[float], None]) -> float:
+    """Give the score after an early guess, which ends bad trials."""
+    guess(valley(values))
+    return valley(values)
 
 
 def search(path: Path, *, seed: int = 0, settings: dict[str, int] | None = None) -> Search:
@@ -28,52 +35,78 @@ def search(path: Path, *, seed: int = 0, settings: dict[str, int] | None = None)
     return Search(path, "valley", settings or {"a": 1}, SPACE, [START], seed)
 
 
+def tried(found: Search) -> list[tuple[dict[str, Any], list[float]]]:
+    """Give values and scores of all trials."""
+    return [(trial.params, trial.values) for trial in found.trials]
+
+
 class Stopped(Exception):  # noqa: N818 - nothing went wrong
     """The session was ended in the middle of a trial."""
 
 
 def test_an_interrupted_search_goes_on_as_if_it_had_not_been(tmp_path: Path) -> None:
-    """Ended in the middle of a trial and taken up again, the trials are those of one go; another seed has others."""
+    """Ended in the middle of a trial and resumed, the trials are those of one go; another seed has others."""
     whole = search(tmp_path / "whole.db")
-    whole.run(14, valley)
+    whole.run(14, guessed)
     count = 0
 
-    def failing(values: Mapping[str, Value], _best: Outcome | None) -> float:
+    def failing(values: Mapping[str, Value], guess: Callable[[float], None]) -> float:
         nonlocal count
         count += 1
         if count == 7:
             raise Stopped
-        return valley(values)
+        return guessed(values, guess)
 
     with pytest.raises(Stopped):
         search(tmp_path / "parts.db").run(14, failing)
-    assert len(search(tmp_path / "parts.db").outcomes()) == 6
-    search(tmp_path / "parts.db").run(11, valley)
+    assert len(search(tmp_path / "parts.db").trials) == 6
+    search(tmp_path / "parts.db").run(11, guessed)
     parts = search(tmp_path / "parts.db")
-    parts.run(14, valley)
-    assert parts.outcomes() == whole.outcomes()
-    assert [list(one.values) for one in parts.outcomes()] == [list(START)] * 14
-    first = [one.score for one in whole.outcomes()[:5]]
-    assert whole.run(5, valley).score == max(first)
+    parts.run(14, guessed)
+    assert tried(parts) == tried(whole)
+    first = [trial.values[0] for trial in whole.trials[:5]]
+    assert valley(whole.run(5, guessed)) == max(first)
     other = search(tmp_path / "other.db", seed=1)
-    other.run(14, valley)
-    assert other.outcomes() != whole.outcomes()
+    other.run(14, guessed)
+    assert tried(other) != tried(whole)
 
 
 def test_the_first_trial_is_the_start_and_the_best_is_better(tmp_path: Path) -> None:
     """Forty trials get more than half of the way from the start to the top."""
-    heard: list[Outcome] = []
-    found = search(tmp_path / "a.db")
-    best = found.run(40, valley, heard.append)
-    assert heard[0].values == START
-    assert len(heard) == 40
-    assert best.score == max(one.score for one in heard) == valley(best.values)
-    assert best.score > 0.5 * valley(START)
-    for one in heard:
+    heard: list[float] = []
+    asked: list[Mapping[str, Value]] = []
+
+    def noted(values: Mapping[str, Value], _guess: Callable[[float], None]) -> float:
+        asked.append(values)
+        return valley(values)
+
+    best = search(tmp_path / "a.db").run(40, noted, heard.append)
+    assert asked[0] == START
+    assert heard == [max(map(valley, asked[: i + 1])) for i in range(40)]
+    assert valley(best) == heard[-1]
+    assert heard[-1] > 0.5 * valley(START)
+    for values in asked:
         for dimension in SPACE:
-            value = one.values[dimension.path]
+            value = values[dimension.path]
             assert dimension.low <= value <= dimension.high
             assert dimension.value(float(value)) == value
+
+
+def test_a_trial_ends_where_its_first_score_is_bad(tmp_path: Path) -> None:
+    """Trials with an early score far below those of others are not scored, and are never the best."""
+    scored = 0
+
+    def score(values: Mapping[str, Value], guess: Callable[[float], None]) -> float:
+        nonlocal scored
+        guess(valley(values))
+        scored += 1
+        return valley(values)
+
+    found = search(tmp_path / "a.db")
+    best = found.run(30, score)
+    assert len(found.trials) == 30
+    assert 1 < scored < 25
+    assert valley(best) >= valley(START)
 
 
 def test_trials_of_another_session_are_not_mixed_in(tmp_path: Path) -> None:

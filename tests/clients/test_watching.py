@@ -12,12 +12,12 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from commands import start
-from optipmb_client.asking import DensityAsker
 from optipmb_client.cli import run
 from optipmb_client.colours import COLOURS, colour_of, rgb_of
 from optipmb_client.incoming import Answer, Inbox
-from optipmb_client.mcap_files.writing import RecordingWriter
-from optipmb_client.watching import LEGEND, View
+from optipmb_client.queries import DensityQueries
+from optipmb_client.recordings.files import RecordingWriter
+from optipmb_client.viewer import LEGEND, View
 from optipmb_schemas import Density, Detections, Keys, Points, Pose, Tracks, encode, encoding_of
 from routers import free_endpoint
 
@@ -215,7 +215,7 @@ class Answering:
 def test_only_streams_with_new_tracks_are_asked() -> None:
     """One question for a stream, however many tracks came, and none again while it is silent; never on our thread."""
     connection, inbox = Answering(), Inbox(9)
-    with DensityAsker(connection, inbox) as asker:  # type: ignore[arg-type]  # stands for a connection
+    with DensityQueries(connection, inbox) as asker:  # type: ignore[arg-type]  # stands for a connection
         for stream in ("a/b/c", "a/b/c", "a/b/d"):
             asker.note(stream)
         arrivals = [inbox.get(DEADLINE_S) for _ in range(2)]

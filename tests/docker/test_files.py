@@ -16,8 +16,8 @@ import dockerfile
 import kubernetes_validate
 import pytest
 import yaml
-from optipmb_service.observability.metrics import METRICS, NAMESPACE
-from optipmb_service.settings.model import Settings
+from optipmb_service.settings import Settings
+from optipmb_service.telemetry.metrics import METRICS, NAMESPACE
 from routers import free_endpoint
 from service_process import ServiceProcess
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from commands import kill, result_of, run_here, start
 from optipmb_client import Connection, Publisher, Subscriber
-from optipmb_client.child import ServiceProcess
 from optipmb_client.cli import run
+from optipmb_client.service_process import ServiceProcess
 from optipmb_client.sessions import find_services
 from optipmb_schemas import Detections, Keys, Points, Problem, SessionParameters, Tracks, encoding_of
 from routers import open_client

@@ -10,7 +10,7 @@ from typing import IO
 
 import pytest
 from optipmb_client import Publisher
-from optipmb_client.child import ServiceProcess
+from optipmb_client.service_process import ServiceProcess
 from optipmb_client.zenoh import DEFAULT_ENDPOINT
 from real_data import REPOSITORY
 from without_numpy import command

@@ -13,11 +13,11 @@ import pytest
 from commands import kill, result_of, run_here, start
 from mcap.reader import make_reader
 from optipmb_client import Connection, Subscriber
-from optipmb_client.child import ServiceProcess
 from optipmb_client.cli import run
 from optipmb_client.datasets import DatasetError, open_dataset
-from optipmb_client.mcap_files.reading import RecordingFile
-from optipmb_client.replay import Pace, replay
+from optipmb_client.recordings.files import RecordingFile
+from optipmb_client.replay import Pace, Replaying, replay
+from optipmb_client.service_process import ServiceProcess
 from optipmb_schemas import Tracks, decode, encode
 from real_data import kitti_root
 
@@ -109,10 +109,8 @@ def recorded_replay(service: ServiceProcess, folder: Path, dataset: "Dataset", *
                 dataset,
                 dataset.sequences(names),
                 folder / "replay",
-                profile=dataset.profile,
-                pace=pace,
-                streams=len(names),
-                on_frame=hold,
+                Replaying(dataset.profile, pace, streams=len(names)),
+                hold,
             )
         assert not any(one.missing or one.clouds_missed for one in replayed)
         # The recording hears of the newest tracks after the replay.

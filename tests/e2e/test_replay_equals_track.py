@@ -1,15 +1,16 @@
 """The promise of the replay: the service gives the same result files as the tracker in process, byte for byte."""
 
+import csv
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from commands import result_of, run_here
-from optipmb_client.child import ServiceProcess
 from optipmb_client.datasets import open_dataset
-from optipmb_client.mcap_files.writing import RecordingWriter
 from optipmb_client.offline import track_whole
+from optipmb_client.recordings.files import RecordingWriter
+from optipmb_client.service_process import ServiceProcess
 from optipmb_schemas import PATHS, Detections, Keys, encode, encoding_of
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Tracked
@@ -18,6 +19,7 @@ from router import Sensor
 
 from optipmb import load_profile
 
+SAMPLE = Path(__file__).parents[2] / "examples" / "crossing.csv"
 SCENE = ("--dataset", "scene", "--option", "frames=25")
 SPREADS = np.array([[[0.5, 0.2, 0.0], [0.2, 0.3, 0.0], [0.0, 0.0, 1.0]], np.full((3, 3), np.nan)] * 4)
 """Covariances of eight positions, every other unknown."""
@@ -88,6 +90,17 @@ def test_chosen_classes_and_another_profile(both: Both) -> None:
     both.replay(*data)
     text = (both.out / "track" / "0000.txt").read_text()
     assert {line.split()[2] for line in text.splitlines()} == {"Car", "Cyclist"}
+
+
+def test_a_table_without_a_profile(service: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A table is replayed with the profile generic where none is named: the bytes of `track --profile generic`."""
+    table, tracked, replayed = SAMPLE, tmp_path / "tracked.csv", tmp_path / "replayed.csv"
+    run_here(capsys, "track", table, "--profile", "generic", "--out", tracked)
+    done = run_here(capsys, "replay", table, "--connect", service.endpoint, "--out", replayed)
+    assert "profile generic, which is auto at 10 Hz" in done.stderr
+    assert tracked.read_bytes() == replayed.read_bytes()
+    rows = list(csv.DictReader(tracked.read_text().splitlines()))
+    assert {row["confirmed"] for row in rows} == {"0", "1"}
 
 
 def test_kitti(both: Both) -> None:

@@ -17,7 +17,7 @@ from gateway import EPOCH, GatewayProcess, connected, detections, frame, points,
 from optipmb_schemas import Points
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
-from optipmb_service.grpc.outbox import varint
+from optipmb_service.grpc.calls import varint
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -20,8 +20,7 @@ from optipmb_schemas import (
     encode,
     encoding_of,
 )
-from optipmb_schemas.export import main
-from optipmb_schemas.pages import fill, table
+from optipmb_schemas.export import fill, main, table
 
 ROOT = Path(__file__).parents[2]
 FILE = ROOT / "docs" / "messages.md"

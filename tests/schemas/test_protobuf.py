@@ -13,7 +13,7 @@ from optipmb_schemas import MessageError, SessionParameters, decode, encode, enc
 from optipmb_schemas.messages import Detections, Message, Points, Tracks
 from optipmb_schemas.protobuf import convert, export
 from optipmb_schemas.protobuf import tracking_pb2 as pb
-from optipmb_schemas.protobuf.transcode import transcode
+from optipmb_schemas.protobuf.convert import transcode
 
 SCHEMAS = Path(__file__).parents[2] / "schemas"
 BUF = Path(sys.executable).parent / "buf"

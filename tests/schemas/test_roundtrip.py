@@ -303,6 +303,14 @@ def test_order_of_map_keys_does_not_matter() -> None:
     assert encode(one) == encode(other)
 
 
+def test_numbers_of_numpy_are_encoded_as_those_of_python(examples: dict[str, Message]) -> None:
+    """A copy with a float64 of numpy in place of a number has the same bytes."""
+    tracks = examples["Tracks"]
+    delivery = tracks.delivery.model_copy(update={"queue_ms": np.float64(1.5)})  # type: ignore[attr-defined]
+    same = tracks.delivery.model_copy(update={"queue_ms": 1.5})  # type: ignore[attr-defined]
+    assert encode(tracks, delivery=delivery) == encode(tracks, delivery=same)
+
+
 def test_messages_and_errors_cross_processes(examples: dict[str, Message]) -> None:
     """Every message can be pickled."""
     for message in examples.values():

@@ -127,7 +127,7 @@ def test_a_limit_of_float32_is_the_same_without_numpy() -> None:
 
 def test_only_numpy_may_be_missing() -> None:
     """A module that is missing besides is an error where the messages are imported."""
-    missing = "optipmb_schemas.decoder"
+    missing = "optipmb_schemas.numeric"
     code = f"import sys; sys.modules[{missing!r}] = None\nimport optipmb_schemas.codec"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
     assert f"import of {missing} halted" in done.stderr

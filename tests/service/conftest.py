@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from optipmb_service.app.service import Service
 from optipmb_service.runtime.profiles import Profiles
-from optipmb_service.settings.loading import load
+from optipmb_service.settings import load
 from router import Node
 from routers import free_endpoint
 
@@ -19,8 +19,6 @@ import optipmb
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-
-    from optipmb_service.runtime.context import Actor
 
     Start = Callable[..., tuple[Service, str]]
 
@@ -59,8 +57,8 @@ def node(start: Start) -> Iterator[Node]:
         yield one
 
 
-def arm(actor: Actor, at_ns: int) -> None:
-    """Wake an actor in time, as the control loop does."""
-    timer = threading.Timer(max(0.0, at_ns - time.monotonic_ns()) / 1e9, actor.wake)
+def arm(wake: Callable[[], None], at_ns: int) -> None:
+    """Call a function in time, as the control loop does."""
+    timer = threading.Timer(max(0.0, at_ns - time.monotonic_ns()) / 1e9, wake)
     timer.daemon = True
     timer.start()

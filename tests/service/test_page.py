@@ -1,4 +1,4 @@
-"""What docs/operation.md says is what the code does."""
+"""Test that docs/operation.md and docs/reference.md describe the code."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ import optipmb_service
 import pytest
 from optipmb_schemas import Code
 from optipmb_service.app import cli
-from optipmb_service.observability.logs import EVENTS
 from optipmb_service.session.problems import CODES
-from optipmb_service.settings.loading import load
-from reference import main, page
+from optipmb_service.settings import LimitSettings, Ros2Settings, Ros2Stream, Settings, load
+from optipmb_service.telemetry.logs import EVENTS
+from reference import docstrings, main, page
 
-FILE = Path(__file__).parents[2] / "docs" / "operation.md"
+DOCS = Path(__file__).parents[2] / "docs"
+OPERATION = DOCS / "operation.md"
+REFERENCE = DOCS / "reference.md"
 SOURCES = sorted(Path(optipmb_service.__file__).parent.rglob("*.py"))
 LEVELS = {"debug", "info", "warning", "error", "exception"}
 
@@ -41,18 +43,24 @@ def texts(part: ast.AST) -> set[str]:
 
 
 def test_the_tables_are_current() -> None:
-    """`python docs/reference.py docs/operation.md` would change nothing."""
-    assert page(FILE.read_text(encoding="utf-8")) == FILE.read_text(encoding="utf-8")
-    assert main(["--check", str(FILE)]) == 0
+    """`python docs/reference.py docs/reference.md` would change nothing."""
+    assert page(REFERENCE.read_text(encoding="utf-8")) == REFERENCE.read_text(encoding="utf-8")
+    assert main(["--check", str(REFERENCE)]) == 0
 
 
 def test_a_page_that_is_not_current_is_found(tmp_path: Path) -> None:
     """The check sees a table that was not made anew, and writing makes it anew."""
     copy = tmp_path / "page.md"
-    copy.write_text(FILE.read_text(encoding="utf-8").replace("`cloud_wait_s`", "`cloud_wait`"), encoding="utf-8")
+    copy.write_text(REFERENCE.read_text(encoding="utf-8").replace("`cloud_wait_s`", "`cloud_wait`"), encoding="utf-8")
     assert main(["--check", str(copy)]) == 1
     assert main([str(copy)]) == 0
     assert main(["--check", str(copy)]) == 0
+
+
+def test_every_setting_is_described() -> None:
+    """No setting without a word on what it does."""
+    for table in (Settings, LimitSettings, Ros2Settings, Ros2Stream):
+        assert docstrings(table).keys() >= table.model_fields.keys()
 
 
 def test_every_log_event_is_described() -> None:
@@ -77,7 +85,7 @@ def test_every_problem_is_described() -> None:
 
 def test_the_exit_statuses_are_those_of_the_table(capsys: pytest.CaptureFixture[str]) -> None:
     """The table has each status that a command ends with: a printed answer, nobody there, a wrong option."""
-    (table,) = re.findall(r"\| exit status \|.*?\n\n", FILE.read_text(encoding="utf-8"), re.DOTALL)
+    (table,) = re.findall(r"\| exit status \|.*?\n\n", OPERATION.read_text(encoding="utf-8"), re.DOTALL)
     with socket.socket() as nobody:
         nobody.bind(("127.0.0.1", 0))  # and does not listen
         address = f"127.0.0.1:{nobody.getsockname()[1]}"
@@ -92,7 +100,7 @@ def test_the_exit_statuses_are_those_of_the_table(capsys: pytest.CaptureFixture[
 
 def test_the_example_is_a_settings_file(tmp_path: Path) -> None:
     """The TOML on the page is accepted as it stands."""
-    (example,) = re.findall(r"```toml\n(.*?)```", FILE.read_text(encoding="utf-8"), re.DOTALL)
+    (example,) = re.findall(r"```toml\n(.*?)```", OPERATION.read_text(encoding="utf-8"), re.DOTALL)
     file = tmp_path / "settings.toml"
     file.write_text(example, encoding="utf-8")
     settings = load(file).settings

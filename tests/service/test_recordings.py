@@ -20,11 +20,11 @@ from fusing import FUSED
 from optipmb_service.cluster.leases import Change, partition_of
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.profiles import Profiles
-from optipmb_service.runtime.stream_queries import StreamQueries
+from optipmb_service.runtime.queries import StreamQueries
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Policy, Quarantined, RefusedError, Tracked
-from registries import Around, packet_of, registry_of
+from registries import Around, packet_of, streams_of
 from router import SECOND
 from scenarios import FILE, PROFILE, SCENARIOS, SENSOR, STREAM, Raw, Recorded, Step, delivery
 from sessions import chained
@@ -201,10 +201,6 @@ class Process(Around):
         """Record a problem."""
         self._out.message(problem)
 
-    def awaited(self, *_: object) -> dict[str, bool]:
-        """Return no streams: no publisher has a cache."""
-        return {}
-
 
 class Question:
     """A query of the recordings, whose replies are recorded."""
@@ -245,16 +241,16 @@ class CoreSeam:
         for step in steps:
             self.now_ns += BETWEEN_NS
             self._step(step)
-            self._registry.resume()
+            self._streams.resume()
             self._process.run()
-        self._registry.finish()
+        self._streams.finish()
         self._process.run()
         self._ask("state", None)
-        self._out.add("totals", repr(self._registry.totals()).encode())
+        self._out.add("totals", repr(self._streams.totals()).encode())
 
     def _begin(self) -> None:
         self._process = Process(self._out, self._kept)
-        self._registry = registry_of(
+        self._streams = streams_of(
             self._process,
             profiles=PROFILES,
             reporter=self._process,
@@ -263,9 +259,8 @@ class CoreSeam:
             queue_frames=32,
             fuse=("site/node/*",) if self._stream == FUSED else (),
         )
-        self._registry.caches = self._process  # type: ignore[assignment]  # asked for nothing else
         nothing: Any = None
-        self._queries = StreamQueries(self._registry, nothing)
+        self._queries = StreamQueries(self._streams, nothing)
 
     def _step(self, step: Step) -> None:
         if isinstance(step, tuple):
@@ -276,11 +271,9 @@ class CoreSeam:
         elif isinstance(step, str):
             self._command(step)
         elif isinstance(step, Raw):
-            self._registry.frame(self._packet(step.payload))
-        elif isinstance(step, schemas.Points):
-            self._registry.cloud(packet_of(step))
-        elif isinstance(step, schemas.Detections):
-            self._registry.frame(packet_of(step))
+            self._streams.receive(self._packet(step.payload))
+        elif isinstance(step, (schemas.Points, schemas.Detections)):
+            self._streams.receive(packet_of(step))
         else:
             self._ask("reset" if isinstance(step, schemas.ResetRequest) else "parameters", step)
 
@@ -290,18 +283,17 @@ class CoreSeam:
 
     def _command(self, command: str) -> None:
         if command == "caches":
-            self._registry.caches_answered(KEYS.detections(self._stream))
+            self._streams.cache_answered(KEYS.detections(self._stream))
         elif command == "keep":
-            self._registry.keep()
+            self._streams.keep()
         elif command == "leave":
             self._process.holding = False
-            self._registry.changed(partition_of(self._stream), Change.RECALLED)
+            self._streams.changed(partition_of(self._stream), Change.RECALLED)
         else:
-            between = self._registry.untracked.recent([self._stream]) if command == "take" else []
+            between = self._streams.recent([self._stream]) if command == "take" else []
             self._begin()
-            self._registry.untracked.hold(self._stream)
-            clouds = KEYS.points(self._stream)
-            self._registry.take_up(self._stream, [(packet, packet.key != clouds) for packet in between])
+            self._streams.hold(self._stream)
+            self._streams.take_up(self._stream, between)
         self._process.run()
 
     def _ask(self, name: str, message: schemas.Message | None) -> None:

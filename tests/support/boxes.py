@@ -11,7 +11,7 @@ from optipmb_client.results.kitti import LEAST_SHOWN
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-    from optipmb_client.tuning.material import Clip
+    from optipmb_client.tuning.clips import Clip
 
 Row = tuple[int, int, "NDArray[np.float64]", "NDArray[np.float64]", float, float]
 """Frame, id, centre, size, yaw and score, in the world frame."""

@@ -15,7 +15,7 @@ from optipmb_client.bulk import Executor
 from optipmb_client.datasets import DatasetArguments
 from optipmb_client.offline import profile_for
 from optipmb_client.table_files import write_table
-from optipmb_client.tracking import track
+from optipmb_client.tracking import Tracking, track
 from own_tables import FRAMES, boxes
 
 RECORDINGS = 200
@@ -44,7 +44,7 @@ def tracked_plainly(data: Path, out: Path) -> dict[str, bytes]:
     """Track all recordings in this process; give the result files."""
     opened = DatasetArguments("table", data).open()
     sequences = opened.sequences(["all"])
-    assert len(list(track(opened, sequences, out, parameters=profile_for("kitti", sequences)))) == RECORDINGS
+    assert len(list(track(opened, sequences, out, Tracking(profile_for("kitti", sequences))))) == RECORDINGS
     return bytes_of(out)
 
 

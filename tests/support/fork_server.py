@@ -31,7 +31,7 @@ def load() -> None:
         import_module(name)
     with suppress(ModuleNotFoundError):  # an extra that not all tests need
         import_module("optipmb_service.cluster.jetstream")
-    import_module("optipmb_service.app.kernels").warm_up()
+    import_module("optipmb_service.app.worker").warm_up()
     import_module("optipmb_client.cli")
     gc.collect()
     gc.freeze()

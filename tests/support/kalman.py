@@ -22,7 +22,7 @@ from scipy.optimize import linear_sum_assignment
 if TYPE_CHECKING:
     from numpy.typing import NDArray
     from optipmb_client.results import ResultTable
-    from optipmb_client.tuning.material import Clip
+    from optipmb_client.tuning.clips import Clip
 
     Array = NDArray[np.float64]
 

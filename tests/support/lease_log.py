@@ -113,7 +113,7 @@ class MemoryLeases:
             raise StoreError("cut off")
 
 
-class Alone:
+class Alone(Member):
     """Leases of all partitions, for the checkpoints of a store that nobody else uses.
 
     Args:
@@ -205,7 +205,7 @@ class HandMember:
     @property
     def held(self) -> set[int]:
         """The partitions whose streams it would publish now."""
-        valid = self.member._write_lease.valid(self.clock.ns)
+        valid = self.clock.ns < self.member._may_write_until_ns
         return set(self.member._table.held) if valid else set()
 
     def end(self) -> None:

@@ -9,7 +9,7 @@ import sys
 import time
 from typing import TYPE_CHECKING, Self
 
-from optipmb_service.app.nats import PAYLOAD_MB, program
+from optipmb_service.app.cli import NATS_PAYLOAD_MB, nats_server
 from routers import free_endpoint
 
 if TYPE_CHECKING:
@@ -86,11 +86,11 @@ class NatsTrio:
         file.write_text(f"""
             server_name: n{index}
             listen: "{self._addresses[index]}"
-            max_payload: {PAYLOAD_MB}MB
+            max_payload: {NATS_PAYLOAD_MB}MB
             jetstream {{ store_dir: "{self._folder / str(index)}" }}
             cluster {{ name: test, listen: "{self._addresses[3 + index]}", routes: [{routes}] }}
         """)
-        server = program()
+        server = nats_server()
         assert server is not None
         command = [server, "--config", str(file)]
         self._processes[index] = started(command, self._addresses[index], self._folder / f"{index}.log")

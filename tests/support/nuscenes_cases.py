@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from optipmb_client.datasets import DetectionFrame
 from optipmb_client.datasets.nuscenes import NuScenesDataset, NuScenesSequence
-from optipmb_client.results.nuscenes import scene_file
-from optipmb_client.results.nuscenes_layout import NUSCENES_CLASSES
+from optipmb_client.results.nuscenes import NUSCENES_CLASSES, scene_file
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -45,9 +44,7 @@ class Rows:
 
 def write(dataset: NuScenesDataset, sequence: NuScenesSequence, frames: Sequence[Rows], out: Path) -> Path:
     """Write the tracks of one scene; give the path of the file that holds all scenes written so far."""
-    with dataset.writer(out, sequence) as writer:
-        for index, rows in enumerate(frames):
-            writer.add(index, sequence.poses[index], rows)
+    dataset.write(out, sequence, dict(enumerate(frames)))
     dataset.join(out, [one for one in dataset.sequences(["all"]) if scene_file(out, one.name).is_file()])
     return out / "tracking_results.json"
 

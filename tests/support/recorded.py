@@ -67,7 +67,7 @@ def recording(kind: str, root: Path, detector: str, name: str, stream: str, fram
         )
         points = None
         if frame.cloud is not None:
-            pose = Pose(translation=frame.cloud.translation, quaternion=frame.cloud.quaternion)
+            pose = Pose(translation=frame.cloud.pose.translation, quaternion=frame.cloud.pose.quaternion)
             points = Points(
                 stream=stream,
                 epoch=epoch,

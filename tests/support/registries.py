@@ -6,14 +6,12 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from optipmb_schemas import Detections, Keys, Points, encode, encoding_of
-from optipmb_service.observability.metrics import Metrics
-from optipmb_service.observability.problem_reporter import ProblemReporter
-from optipmb_service.runtime.missed_frames import NoLog
-from optipmb_service.runtime.persistence import NoPersistence
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.profiles import Profiles
-from optipmb_service.runtime.registry import Registry
-from optipmb_service.settings.model import Settings
+from optipmb_service.runtime.streams import Streams
+from optipmb_service.settings import Settings
+from optipmb_service.telemetry.metrics import Metrics
+from optipmb_service.telemetry.problem_reporter import ProblemReporter
 from sessions import chained
 
 if TYPE_CHECKING:
@@ -22,22 +20,21 @@ if TYPE_CHECKING:
     from optipmb_service.session.checkpoint import Checkpoint
 
 
-class Around(NoPersistence):
-    """Everything around the streams: it grants them all, keeps their states, and runs their actors when told to."""
+class Around:
+    """Everything around the streams: it grants them all, keeps their states, and gives them turns when told to."""
 
     strained = unlinked = False
 
     def __init__(self) -> None:
-        super().__init__()
-        self._working: list[Any] = []
+        self._working: list[Callable[[], bool]] = []
         self.kept: dict[str, Checkpoint] = {}
 
-    def submit(self, actor: Any) -> None:
-        """Take an actor that has something to do."""
-        self._working.append(actor)
+    def submit(self, work: Callable[[], bool]) -> None:
+        """Take work."""
+        self._working.append(work)
 
     def run(self) -> None:
-        """Run the actors until none has anything to do."""
+        """Give turns until no stream has anything to do."""
         while self.turn():
             pass
 
@@ -45,9 +42,9 @@ class Around(NoPersistence):
         """Run what was submitted first; False when there was nothing."""
         if not self._working:
             return False
-        actor = self._working.pop(0)
-        if actor.work():
-            self._working.append(actor)
+        work = self._working.pop(0)
+        if work():
+            self._working.append(work)
         return True
 
     def put(self, checkpoint: Checkpoint, _: int | None, then: Callable[[], None] | None = None) -> None:
@@ -61,6 +58,13 @@ class Around(NoPersistence):
     ) -> None:
         """Restore what was kept."""
         then(restore(self.kept[stream]) if stream in self.kept else None)
+
+    def forget(self, _: str) -> None:
+        """Nothing is still to be written."""
+
+    def awaited(self, *_: object) -> dict[str, bool]:
+        """No publisher has a cache."""
+        return {}
 
     def holds(self, _: str) -> bool:
         """Every stream is tracked here."""
@@ -87,30 +91,32 @@ class Around(NoPersistence):
         """Tracks go nowhere."""
 
 
-def registry_of(
+def streams_of(
     around: Around,
-    missed: NoLog | None = None,
+    log: Any = None,
     *,
     profiles: Profiles | None = None,
     reporter: Any = None,
     tracker: Any = chained,
     **settings: Any,
-) -> Registry:
+) -> Streams:
     """Return the streams of a process with these around it."""
     parts: Any = around  # in the place of several
-    return Registry(
+    streams = Streams(
         Settings(instance="test", store="none", step_limit_s=60, **settings),  # kernels may have to be compiled
         profiles or Profiles.read("nuscenes", {}),
-        sink=parts,
+        open_publisher=parts.open_publisher,
         reporter=reporter or ProblemReporter(lambda _: None, lambda *_: None),
         scheduler=parts,
         member=parts,
-        persistence=parts,
-        missed=missed or NoLog(),
+        checkpoints=parts,
+        log=log,
         arm=lambda *_: None,
         metrics=Metrics(),
         tracker=tracker,
     )
+    streams.caches = parts
+    return streams
 
 
 def packet_of(message: Detections | Points) -> Packet:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from importlib.metadata import version
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 import optipmb
 
+OTHER = {"l": "length", "w": "width", "h": "height", "yaw": "heading", "score": "confidence", "class": "category"}
 BOX = {"center": [[0.0, 0.0, 0.8]], "size": [[4.5, 1.9, 1.6]], "yaw": [0.0], "score": [0.9]}
 
 
@@ -51,11 +53,54 @@ def test_names_places_lists_arrays_and_tables_are_one() -> None:
         [flat(k, 0) for k in range(4)],
         [{name: np.array(values) for name, values in one.items()} for one in frames],
         [pa.table(one) for one in frames],
+        [[{name: values[0] for name, values in one.items()}] for one in frames],
+        [
+            np.array([tuple(v[0] for v in one.values())], [(n, "U9" if n == "class" else "f8") for n in one])
+            for one in frames
+        ],
+        [{OTHER.get(name, name): values for name, values in one.items()} for one in frames],
         [{**BOX, "center": [[float(k), 0.0, 0.8]], "label": ["vehicle.car"]} for k in range(4)],
     ):
         other = run(others)[-1]
         assert other.center.tobytes() == first.center.tobytes()
-        assert other.name.tolist() == ["Car"]
+
+
+def test_classes_have_the_names_that_the_detections_gave() -> None:
+    """A class is called as its first detection called it; without one, as the profile does."""
+    assert [run([flat(0, name)])[0].name.tolist() for name in ("car", "vehicle.car", 0)] == [
+        ["car"],
+        ["vehicle.car"],
+        ["Car"],
+    ]
+
+
+def test_columns_that_tables_may_lack_have_the_values_of_tables() -> None:
+    """Without z it is 0, without height 1.5 m, without scores 1."""
+    box = {name: values for name, values in flat(0).items() if name not in {"z", "h", "score"}}
+    given = run([{**box, "z": [0.0], "h": [1.5], "score": [1.0]}])[0]
+    assert run([box])[0].tracks.words.tobytes() == given.tracks.words.tobytes()
+
+
+def test_a_date_is_a_time() -> None:
+    """Dates of datetime and numpy give the stamp of their seconds since 1970."""
+    tracker = optipmb.OnlineTracker("kitti")
+    dates = (
+        datetime(2026, 1, 1, tzinfo=UTC),
+        np.datetime64("2026-01-01T00:00:00.1"),
+        datetime(2026, 1, 1, 0, 0, 1, tzinfo=UTC).replace(tzinfo=None),
+    )
+    stamps = [tracker.update(flat(0), t=date).stamp_ns for date in dates]
+    assert stamps == [1_767_225_600_000_000_000 + ms * 1_000_000 for ms in (0, 100, 1000)]
+
+
+def test_the_representation_lists_tracks() -> None:
+    """A notebook shows ids, classes, positions and existence; `dir` has the columns."""
+    tracks = run([flat(k) for k in range(3)])[-1]
+    head, names, row = repr(tracks).splitlines()
+    assert head == "OnlineTracks: 1 tracks at 0.200 s"
+    assert names.split() == ["id", "class", "x", "y", "vx", "vy", "existence", "confirmed"]
+    assert row.split()[:2] == ["1", "car"]
+    assert {"id", "center", "covariance", "confirmed"} <= set(dir(tracks))
 
 
 def test_an_unknown_velocity_is_not_a_number() -> None:
@@ -77,7 +122,15 @@ def test_nothing_detected_is_a_frame() -> None:
     ("boxes", "when", "text"),
     [
         (flat(0, "barrier"), {"t": 1.0}, r"label\[0\]: expected one of Car, Pedestrian, Cyclist .* 'barrier'"),
-        ({"x": [1.0]}, {"t": 1.0}, "center: expected a column for each of center, size, yaw, score, label"),
+        ({"yaw": [1.0]}, {"t": 1.0}, "center: expected a column for each of center, size, yaw, score, label"),
+        ({"x": [1.0]}, {"t": 1.0}, "y: expected the columns x, y, z"),
+        ({**flat(0), "vx": [1.0]}, {"t": 1.0}, "vy: expected the columns vx, vy"),
+        ({**flat(0), "velocity_x": [1.0]}, {"t": 1.0}, "velocity_x: expected columns among center, "),
+        ({**flat(0), "x": ["far"]}, {"t": 1.0}, "x: expected numbers, received list of ..far"),
+        ({**flat(0), "y": [1.0, 2.0]}, {"t": 1.0}, "y: expected .1,. numbers, one for each box, received .2,."),
+        ([flat(0), {"x": 1.0}], {"t": 1.0}, "boxes: expected a dictionary with the same keys for each box"),
+        (np.zeros((1, 7)), {"t": 1.0}, "boxes: expected a structured array, or columns by name"),
+        (flat(0), {"t": "noon"}, "t: expected seconds or a date, received 'noon'"),
         (flat(0), {}, "t: expected t .s. or stamp_ns .ns., received neither"),
         (flat(0), {"t": float("nan")}, "t: expected finite seconds"),
         ({**flat(0), "yaw": [float("nan")]}, {"t": 1.0}, r"yaw\[0\]: expected a finite number"),
@@ -99,6 +152,12 @@ def test_classes_that_are_left_out_are_counted() -> None:
     """On request, detections of classes that the profile lacks are left out and counted."""
     tracker = optipmb.OnlineTracker("kitti", unknown_classes="leave out")
     assert tracker.update(flat(0, "barrier"), t=0.0).left_out == 1
+
+
+def test_auto_needs_a_recording() -> None:
+    """The error names what to take in its place."""
+    with pytest.raises(optipmb.ParameterError, match="generic_parameters"):
+        optipmb.OnlineTracker("auto")
 
 
 def test_a_reset_uses_no_id_again() -> None:

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import ast
 import json
+import os
+import re
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
-from types import FunctionType, ModuleType
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-import numba
-from numba.core import event
-
 import optipmb
-from optipmb import compiled
 from optipmb.warm import kernels
 
 if TYPE_CHECKING:
@@ -109,13 +108,17 @@ def test_kernels_are_counted_while_another_thread_imports(monkeypatch: pytest.Mo
     assert "imported_meanwhile" in sys.modules
 
 
-def test_a_compilation_is_announced_once(caplog: pytest.LogCaptureFixture) -> None:
-    """The logger `optipmb` says once that a kernel of the package is compiled, and nothing of other functions."""
-    announcement = compiled._FirstCompilation()
-    for module in ("elsewhere", "optipmb.update", "optipmb.association"):
-        function = FunctionType((lambda: None).__code__, {"__name__": module})
-        dispatcher = numba.njit(function)
-        announcement.on_start(event.Event("numba:compile", event.EventStatus.START, {"dispatcher": dispatcher}))
-    assert [record.message for record in caplog.records if record.name == "optipmb"] == [
-        "optipmb: compiling the tracker, once after an installation; it takes up to a minute"
-    ]
+def test_a_compilation_is_announced_once_with_its_progress() -> None:
+    """A process without cached kernels says once that it compiles, then how many are compiled, on standard error."""
+    program = (
+        "import optipmb.compiled as compiled; compiled.PROGRESS_S = 0.0\n"
+        "import numpy as np, optipmb; optipmb.bev_iou(np.zeros((1, 5)), np.zeros((1, 5)))"
+    )
+    with tempfile.TemporaryDirectory() as cache:
+        environment = os.environ | {"NUMBA_CACHE_DIR": cache}
+        command = [sys.executable, "-c", program]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=280, check=True, env=environment)
+    first, *progress = done.stderr.splitlines()
+    assert first == "optipmb: compiling the tracker, once after an installation; it takes up to a minute"
+    counts = [re.fullmatch(r"optipmb: compiled (\d+) of (\d+) kernels", line) for line in progress]
+    assert [int(found[1]) for found in counts if found] == list(range(1, len(progress) + 1))

@@ -1,26 +1,18 @@
-"""`optipmb check`: what the readers find in data, before anything is tracked."""
+"""`optipmb check`: findings of the readers about data, before tracking."""
 
 import itertools
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import typer
-from rich.table import Table
 
 from optipmb_client.class_names import class_like
-from optipmb_client.commands.options import (
-    AsJson,
-    DataOptions,
-    open_sequences,
-    print_json,
-    print_table,
-)
+from optipmb_client.commands.options import AsJson, DataOptions, plain_table, print_json, print_table
 from optipmb_client.datasets.motion import headings_along
 
+# Kinds of objects that a profile for unknown detectors tells apart
 KINDS = ("car", "truck", "bus", "trailer", "pedestrian", "bicycle", "motorcycle")
-"""Kinds of objects that a profile for unknown detectors tells apart."""
 
 if TYPE_CHECKING:
     from collections.abc import Sequence as Many
@@ -29,25 +21,22 @@ if TYPE_CHECKING:
     from optipmb_client.geometry import Floats
 
 
-def check(
-    data: DataOptions,
-    *,
-    as_json: AsJson = False,
-) -> None:
+def check(data: DataOptions, *, as_json: AsJson = False) -> None:
     """Show how your data are read, without tracking: optipmb check detections.csv.
 
     Units, rate, classes, headings against the motion of the boxes, suspicious rows, and the options that read them
     otherwise. Status 1: track would refuse the data; the findings marked as wrong say why.
     """
-    asked = data.asked()
-    if asked.name == "table" and asked.root is not None:
+    name, root = data.named()
+    if name == "table" and root is not None:
         from optipmb_client.datasets.table import TableDataset  # noqa: PLC0415  packages of an extra
 
-        table = TableDataset(Path(asked.root), {name: str(value) for name, value in asked.options}, lenient=True)
+        options = {option: str(value) for option, value in data.options(name).items()}
+        table = TableDataset(root, options, lenient=True)
         chosen = list(table.sequences(data.sequences or ["all"]))
         findings: list[dict[str, Any]] = [asdict(one) for one in table.findings]
     else:
-        _, chosen = open_sequences(asked, data.sequences)
+        chosen = data.open().sequences
         share, moves = headings_along(chosen)
         text = f"{share:.0%} of {moves} moves are along the heading" if moves else "no box moves far enough to compare"
         findings = [{"topic": "yaw", "text": text, "option": "", "wrong": False}]
@@ -91,21 +80,20 @@ def _classes(sequences: "Many[DataSequence]") -> list[dict[str, Any]]:
     return found
 
 
-def _print(
-    findings: "Many[dict[str, Any]]", recordings: "Many[dict[str, Any]]", classes: "Many[dict[str, Any]]"
-) -> None:
-    table = Table(box=None, pad_edge=False)
-    for name in ("", "finding", "change with"):
-        table.add_column(name, no_wrap=not name)
+def _print(findings: "Many[dict[str, Any]]", *tables: "Many[dict[str, Any]]") -> None:
+    table = plain_table(("", "finding", "change with"))
+    for column in table.columns[1:]:
+        column.no_wrap = False
     for one in findings:
         mark = "WRONG " if one["wrong"] else ""
         table.add_row(one["topic"], mark + one["text"], one["option"])
     print_table(table)
-    for rows in (recordings, classes):
+    for rows in tables:
         print_table("")
-        table = Table(box=None, pad_edge=False)
-        for place, name in enumerate(rows[0] if rows else ()):
-            table.add_column(name.replace("_", " "), justify="right" if place else "left", no_wrap=bool(place))
+        names = [name.replace("_", " ") for name in rows[0]] if rows else []
+        table = plain_table(names[:1], names[1:])
+        for column in table.columns[:1]:
+            column.no_wrap = False
         for row in rows:
             table.add_row(*("-" if value is None else str(value) for value in row.values()))
         print_table(table)

@@ -1,26 +1,23 @@
 """`optipmb evaluate`: result files against the truth."""
 
-from collections.abc import Callable
-from collections.abc import Sequence as Many
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from optipmb_client.bulk import Executor, values
+from optipmb_client import bulk
 from optipmb_client.commands.options import (
     AsJson,
+    Data,
+    JobOptions,
     LabelledOptions,
-    Ray,
-    executor_of,
-    open_sequences,
     print_json,
     print_table,
     warn,
 )
-from optipmb_client.datasets import DataSequence, DatasetArguments
 from optipmb_client.errors import UsageError
 from optipmb_client.extras import needed
 
@@ -28,10 +25,45 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from optipmb_client.evaluation import ClassResult, Rules
-    from optipmb_client.evaluation.figures import ClassFigures
+    from optipmb_client.evaluation.evaluate import ClassFigures
 
 
-def evaluate(  # noqa: PLR0913  these are the command's options
+@dataclass(frozen=True, kw_only=True)
+class MatchingOptions:
+    """Options of how boxes are compared."""
+
+    iou: Annotated[
+        float | None, typer.Option(min=0.0, max=1.0, help="Boxes match from this 3D intersection over union on.")
+    ] = None
+    distance: Annotated[
+        float | None, typer.Option(min=0.0, help="Boxes match up to this distance of their centres, in metres.")
+    ] = None
+    cutoff: Annotated[float, typer.Option(min=0.01, help="Cut-off distance of GOSPA and OSPA, in metres.")] = 2.0
+    order: Annotated[float, typer.Option(min=1.0, help="Order of GOSPA and OSPA.")] = 2.0
+
+    def rules(self, dataset: str) -> "Rules":
+        """Return the rules of CLEAR MOT."""
+        from optipmb_client.evaluation import default_rules  # noqa: PLC0415  loads the solvers of scipy
+
+        if self.iou is not None and self.distance is not None:
+            raise UsageError("--iou and --distance: one of them at most")
+        if self.iou is not None:
+            return default_rules(dataset, "iou_3d", self.iou)
+        if self.distance is not None:
+            return default_rules(dataset, "distance", self.distance)
+        return default_rules(dataset)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationJobs(JobOptions):
+    """Options of evaluation in several processes."""
+
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Classes at once; default: one for each processor.", show_default=False)
+    ] = None
+
+
+def evaluate(
     data: LabelledOptions,
     *,
     tracks: Annotated[
@@ -45,19 +77,8 @@ def evaluate(  # noqa: PLR0913  these are the command's options
         list[str] | None,
         typer.Option("--class", "--classes", metavar="NAME...", help="Classes to evaluate.", show_default=False),
     ] = None,
-    iou: Annotated[
-        float | None, typer.Option(min=0.0, max=1.0, help="Boxes match from this 3D intersection over union on.")
-    ] = None,
-    distance: Annotated[
-        float | None, typer.Option(min=0.0, help="Boxes match up to this distance of their centres, in metres.")
-    ] = None,
-    cutoff: Annotated[float, typer.Option(min=0.01, help="Cut-off distance of GOSPA and OSPA, in metres.")] = 2.0,
-    order: Annotated[float, typer.Option(min=1.0, help="Order of GOSPA and OSPA.")] = 2.0,
-    jobs: Annotated[
-        int | None,
-        typer.Option(min=1, help="Classes at once; default: one for each processor.", show_default=False),
-    ] = None,
-    ray: Ray = None,
+    how: MatchingOptions,
+    jobs: EvaluationJobs,
     as_json: AsJson = False,
 ) -> None:
     """Compare result files with the truth, per class.
@@ -72,90 +93,77 @@ def evaluate(  # noqa: PLR0913  these are the command's options
     needed("optipmb evaluate", "evaluation", "scipy")
     from optipmb_client.commands.tables import comparison_tables  # noqa: PLC0415  loads the solvers of scipy
 
-    asked = data.asked()
-    if asked.name == "table":
-        asked = replace(asked, options=(*asked.options, ("tracks", " ".join(map(str, tracks)))))
-    _, chosen = open_sequences(asked, data.sequences)
-    labels = labels_of(chosen)
-    spelt = {label.lower(): label for label in labels}
-    names = tuple(one if one in labels else spelt.get(one.lower(), one) for one in classes or labels)
-    how = _How(iou, distance, cutoff, order, cache(warn))
-    with executor_of(jobs, ray, chosen, max(1, len(names))) as executor:
-        reports = {str(one): _judge(asked, chosen, one, names, how, executor) for one in tracks}
-    for tables in (one.tables for one in chosen if hasattr(one, "tables")):
+    more = {"tracks": " ".join(map(str, tracks))} if data.named()[0] == "table" else {}
+    opened = data.open(**more)
+    spelt = {label.lower(): label for label in opened.labels}
+    names = tuple(one if one in opened.labels else spelt.get(one.lower(), one) for one in classes or opened.labels)
+    note = cache(warn)  # prints each assumption once
+    with jobs.executor(opened.frames, max(1, len(names))) as executor:
+        reports = {str(one): _evaluated(opened, one, names, how, executor, note) for one in tracks}
+    for tables in (one.tables for one in opened.sequences if hasattr(one, "tables")):
         tables.check()
-    report = {"command": "evaluate", "dataset": asked.name, "sequences": [sequence.name for sequence in chosen]}
+    report = {"command": "evaluate", "dataset": opened.name, "sequences": opened.names}
     (first, *others) = reports.values()
     if as_json and others:
         print_json({**report, "trackers": {place: one.parts for place, one in reports.items()}})
     elif as_json:
         print_json({**report, "tracks": tracks[0], **first.parts})
     else:
-        tables = comparison_tables({place: one.figures for place, one in reports.items()}) if others else first.tables
-        for table in tables:
+        shown = comparison_tables({place: one.figures for place, one in reports.items()}) if others else first.tables
+        for table in shown:
             print_table(table)
 
 
 @dataclass(frozen=True)
-class _How:
-    """What the options say about comparing."""
-
-    iou: float | None
-    distance: float | None
-    cutoff: float
-    order: float
-    warn: Callable[[str], None]
-    """Prints each assumption once."""
-
-
-@dataclass(frozen=True)
-class _Judgement:
-    """What was found out about the tracks of one tracker: for programs, for tables beside each other, and as tables."""
+class _Evaluated:
+    """Result for the tracks of one tracker: for programs, for comparison, and as tables."""
 
     parts: dict[str, Any]
-    figures: "Many[ClassFigures]"
-    tables: "Many[RenderableType]"
+    figures: "Sequence[ClassFigures]"
+    tables: "Sequence[RenderableType]"
 
 
-def _judge(
-    asked: DatasetArguments,
-    chosen: "Many[DataSequence]",
+def _evaluated(
+    opened: Data,
     tracks: Path,
     names: tuple[str, ...],
-    how: _How,
-    executor: Executor,
-) -> _Judgement:
-    from optipmb_client.commands.tables import (  # noqa: PLC0415  loads the solvers of scipy
-        clear_table,
-        figure_tables,
-        nuscenes_table,
-    )
+    how: MatchingOptions,
+    executor: bulk.Executor,
+    note: Callable[[str], None],
+) -> _Evaluated:
+    from optipmb_client.commands.tables import clear_table, figure_tables, nuscenes_table  # noqa: PLC0415  as above
     from optipmb_client.evaluation import evaluate_files  # noqa: PLC0415  as above
-    from optipmb_client.evaluation.figures import Settings, class_average  # noqa: PLC0415  as above
-    from optipmb_client.evaluation.jobs import Evaluation, FiguresTask, figures_of  # noqa: PLC0415  as above
+    from optipmb_client.evaluation.evaluate import (  # noqa: PLC0415  as above
+        Evaluation,
+        FiguresTask,
+        Settings,
+        class_average,
+        figures_of,
+    )
     from optipmb_client.evaluation.nuscenes import evaluate_nuscenes  # noqa: PLC0415  as above
 
+    asked = opened.dataset.arguments
     head: list[RenderableType] = []
     overall: dict[str, Any] = {}
     settings = Settings((how.iou,), how.cutoff, how.order) if how.iou else Settings(cutoff=how.cutoff, order=how.order)
-    if asked.name == "nuscenes" and asked.root is not None:
+    if opened.name == "nuscenes" and asked.root is not None:
         if how.iou is not None or how.distance is not None:
             raise UsageError("--iou and --distance: the benchmark of nuScenes has its own rules")
-        scores = evaluate_nuscenes(asked.root, tracks, [sequence.name for sequence in chosen])
+        scores = evaluate_nuscenes(asked.root, tracks, opened.names)
         head = [nuscenes_table(scores, names)]
         overall = {"overall": scores.to_json()["overall"]}
         parts = {name: {"nuscenes": one.to_json()} for name, one in scores.classes.items() if name in names}
         best = {name: scores.classes[name].best.threshold for name in parts}
     else:
-        results = evaluate_files(chosen, tracks, names, _rules(asked.name, how.iou, how.distance), how.warn)
+        results = evaluate_files(opened.sequences, tracks, names, how.rules(opened.name), note)
         parts = {one.name: _figures(one) for one in results}
-        best = {} if asked.name == "kitti" else {one.name: one.sweep.thresholds[one.sweep.best] for one in results}
-        if asked.name != "kitti" or how.distance is not None:  # AB3DMOT's protocol gives them at its own threshold
+        best = {} if opened.name == "kitti" else {one.name: one.sweep.thresholds[one.sweep.best] for one in results}
+        if opened.name != "kitti" or how.distance is not None:  # AB3DMOT's protocol gives them at its own threshold
             head = [clear_table(results, metres=how.iou is None)]
-    recordings = tuple(sequence.name for sequence in chosen)
-    executor.start(figures_of, Evaluation(asked, recordings, settings, names, chosen if executor.here else None))
+    here = opened.sequences if executor.here else None
+    executor.start(figures_of, Evaluation(asked, tuple(opened.names), settings, names, here))
     tasks = [FiguresTask(tracks, name, best.get(name)) for name in names]
-    figures = [one for found in values(executor, tasks, str, warn) for one in found]
+    figures = [one for found in bulk.values(executor, tasks, str, warn) for one in found]
     if not figures:
         raise UsageError(f"{tracks}: neither the truth nor the tracks have objects of these classes")
     by_class = {one.name: {**parts.get(one.name, {}), **one.summary()} for one in figures}
@@ -163,24 +171,7 @@ def _judge(
     if average is not None:
         overall["overall"]["hota_centre"] = average
     tables = (*head, *figure_tables(figures, how.cutoff, average))
-    return _Judgement({**overall, "classes": by_class}, figures, tables)
-
-
-def labels_of(sequences: Many[DataSequence]) -> tuple[str, ...]:
-    """Return the classes of some sequences, in their order."""
-    return tuple(dict.fromkeys(label for sequence in sequences for label in sequence.labels))
-
-
-def _rules(dataset: str, iou: float | None, distance: float | None) -> "Rules":
-    from optipmb_client.evaluation import default_rules  # noqa: PLC0415  as above
-
-    if iou is not None and distance is not None:
-        raise UsageError("--iou and --distance: one of them at most")
-    if iou is not None:
-        return default_rules(dataset, "iou_3d", iou)
-    if distance is not None:
-        return default_rules(dataset, "distance", distance)
-    return default_rules(dataset)
+    return _Evaluated({**overall, "classes": by_class}, figures, tables)
 
 
 def _figures(result: "ClassResult") -> dict[str, Any]:

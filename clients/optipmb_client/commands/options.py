@@ -1,4 +1,4 @@
-"""Options that several commands share, and how they print."""
+"""Options that several commands share, and printing."""
 
 import contextlib
 import dataclasses
@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any
 
 import typer
 from optipmb_schemas.installation import install_command
@@ -18,46 +18,18 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 
 from optipmb_client.bulk import Executor, executor_for
-from optipmb_client.columns import parts
-from optipmb_client.datasets import DATASETS, DataSequence, Dataset, DatasetArguments, dataset_at
+from optipmb_client.datasets import DATASETS, DataSequence, Dataset, dataset_at, open_dataset
 from optipmb_client.errors import ClientError, UsageError
 from optipmb_client.table_files import SUFFIXES
 
-__all__ = [
-    "MANY",
-    "RAY_ADDRESS",
-    "AsJson",
-    "Classes",
-    "DataOptions",
-    "DatasetOptions",
-    "Full",
-    "LabelledOptions",
-    "Out",
-    "Profile",
-    "Ray",
-    "Tracks",
-    "executor_of",
-    "grouped",
-    "mcap_needed",
-    "open_sequences",
-    "print_json",
-    "print_table",
-    "say",
-    "warn",
-]
-
-WORTH_PROCESSES: Final = 3000
-"""Frames from which further processes are faster than this one alone."""
-
+WORTH_PROCESSES = 3000  # frames from which further processes are faster than this one alone
 WIDE = 200
 MANY = ("--sequences", "--classes", "--class", "--streams")  # options that take several values after one flag
+RAY_ADDRESS = re.compile(r"auto|local|(ray://)?[^\s/]+:\d+")  # values of --ray
 
 Classes = Annotated[
     list[str] | None,
     typer.Option("--classes", metavar="NAME...", help="Only objects of these classes.", show_default=False),
-]
-Tracks = Annotated[
-    Path, typer.Option("--tracks", help="Folder with the result files of track or replay, or a table of tracks.")
 ]
 
 
@@ -84,8 +56,6 @@ Profile = Annotated[
         "--profile", help="Parameter profile, or auto for a detector that nobody tuned; default: the dataset's own."
     ),
 ]
-RAY_ADDRESS: Final = re.compile(r"auto|local|(ray://)?[^\s/]+:\d+")
-"""What may follow --ray."""
 Ray = Annotated[
     str | None,
     typer.Option(
@@ -99,14 +69,41 @@ Ray = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
+@dataclass(frozen=True)
+class Data:
+    """A data set that was opened, and the sequences that were chosen."""
+
+    dataset: Dataset
+    sequences: list[DataSequence]
+
+    @property
+    def name(self) -> str:
+        """Name of the data set, as `--dataset` gives it."""
+        return self.dataset.name
+
+    @property
+    def frames(self) -> int:
+        """Frames of all sequences."""
+        return sum(map(len, self.sequences))
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the sequences."""
+        return [sequence.name for sequence in self.sequences]
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Classes of the sequences, in their order."""
+        return tuple(dict.fromkeys(label for sequence in self.sequences for label in sequence.labels))
+
+
 @dataclass(frozen=True, kw_only=True)
 class DatasetOptions:
-    """Options that name a dataset and what is used of it."""
+    """Options that name a data set and its sequences."""
 
     data: Path | None = field(default=None, init=False)
     dataset: Annotated[
-        str | None,
-        typer.Option("--dataset", help=f"Layout of the data: {', '.join(DATASETS)}.", show_default=False),
+        str | None, typer.Option("--dataset", help=f"Layout of the data: {', '.join(DATASETS)}.", show_default=False)
     ] = None
     root: Annotated[Path | None, typer.Option("--root", help="File or folder of the dataset; scenes need none.")] = None
     detections: Annotated[
@@ -126,12 +123,12 @@ class DatasetOptions:
     ] = None
     truth: Path | None = field(default=None, init=False)
 
-    def asked(self, *more: str) -> DatasetArguments:
-        """Return which data are named, with `more` options NAME=VALUE.
+    def named(self) -> tuple[str, Path | None]:
+        """Return the name of the data set and its root.
 
         Raises:
             DatasetError: The argument looks like no data that are known.
-            UsageError: No data are named, or two, or an option is not `NAME=VALUE`.
+            UsageError: No data are named, or two.
         """
         dataset, root = self.dataset, self.root
         if self.data is not None:
@@ -140,17 +137,41 @@ class DatasetOptions:
             dataset, root = dataset or dataset_at(self.data), self.data
         if dataset is None:
             raise UsageError("no data: name a table, a recording or a folder, or give --dataset and --root")
-        chosen = dict(_option(text) for text in (*(self.option or ()), *more))
+        return dataset, root
+
+    def options(self, dataset: str) -> dict[str, float | str]:
+        """Return the options of the data set.
+
+        Raises:
+            UsageError: An option is not `NAME=VALUE`, or not for this data set.
+        """
+        found = dict(_option(text) for text in self.option or ())
         if self.truth is not None:
             if dataset != "table":
                 raise UsageError(f"--truth: for tables; {dataset} has annotations of its own")
-            chosen["truth"] = str(self.truth)
-        return DatasetArguments(dataset, root, self.detections, tuple(chosen.items()))
+            found["truth"] = str(self.truth)
+        return found
+
+    def open(self, **more: float | str) -> Data:
+        """Open the data set and the chosen sequences, all by default; print the assumptions.
+
+        Args:
+            more: Further options of the data set.
+
+        Raises:
+            DatasetError, UsageError: Any of it is not there, or not allowed.
+        """
+        name, root = self.named()
+        opened = open_dataset(name, root, self.detections, **self.options(name) | more)
+        chosen = list(opened.sequences(self.sequences or ["all"]))
+        for note in (*opened.notes, *(note for one in chosen for note in one.notes)):
+            warn(note)
+        return Data(opened, chosen)
 
 
 @dataclass(frozen=True, kw_only=True)
 class DataOptions(DatasetOptions):
-    """Options of a dataset, which an argument may name too."""
+    """Options of a data set, which an argument may name too."""
 
     data: Annotated[
         Path | None,
@@ -175,6 +196,29 @@ class LabelledOptions(DataOptions):
     ] = None
 
 
+@dataclass(frozen=True, kw_only=True)
+class JobOptions:
+    """Options of work in several processes."""
+
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Recordings at once; default: one for each processor.", show_default=False)
+    ] = None
+    ray: Ray = None
+
+    def executor(self, frames: int, tasks: int) -> Executor:
+        """Return an executor of `tasks` tasks; by default a process for each processor, for few frames this one.
+
+        Raises:
+            ClientError: Ray is not installed, or no cluster answers.
+        """
+        if self.ray is not None:
+            return executor_for(self.jobs or 0, self.ray)
+        jobs = self.jobs
+        if jobs is None:
+            jobs = len(os.sched_getaffinity(0)) if frames > WORTH_PROCESSES else 1
+        return executor_for(min(jobs, tasks))
+
+
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
     """Return a command with the options of its groups as parameters of its own, which is how typer reads them."""
     given = inspect.signature(command, eval_str=True).parameters
@@ -195,55 +239,37 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
     return call
 
 
-def open_sequences(asked: DatasetArguments, sequences: list[str] | None) -> tuple[Dataset, list[DataSequence]]:
-    """Open a dataset and the sequences asked for, all of them by default; say what was assumed about it.
-
-    Raises:
-        DatasetError: Any of it is not there; says what.
-    """
-    opened = asked.open()
-    chosen = list(opened.sequences(sequences or ["all"]))
-    for note in (note for one in (opened, *chosen) for note in getattr(one, "notes", ())):
-        warn(note)
-    return opened, chosen
-
-
-def executor_of(jobs: int | None, ray: str | None, sequences: Sequence[DataSequence], tasks: int) -> Executor:
-    """Return what runs so many tasks, or more: by default a process for each processor, for little data this one.
-
-    Raises:
-        ClientError: Ray is not installed, or no cluster answers.
-    """
-    if ray is not None:
-        return executor_for(jobs or 0, ray)
-    if jobs is None:
-        jobs = len(os.sched_getaffinity(0)) if sum(map(len, sequences)) > WORTH_PROCESSES else 1
-    return executor_for(min(jobs, tasks))
-
-
-def warn(text: str) -> None:
-    """Print a line on standard error."""
-    typer.echo(f"optipmb: {text}", err=True)
-
-
 def _option(text: str) -> tuple[str, float | str]:
     name, equals, value = text.partition("=")
     if not (name and equals and value):
         raise UsageError(f"--option: expected NAME=VALUE, received {text!r}")
+    return name, number_or_text(value)
+
+
+def number_or_text(value: str) -> float | str:
+    """Return the value of an option of a data set as a number, if it is one."""
     try:
         number = float(value)
     except ValueError:
-        return name, value
-    return name, int(number) if number.is_integer() else number
+        return value
+    return int(number) if number.is_integer() else number
 
 
 @contextlib.contextmanager
 def mcap_needed() -> Iterator[None]:
-    """Say what to install where the packages for recordings are not."""
+    """Raise the command that installs the packages for recordings where they are missing."""
     try:
         yield
     except ImportError as error:
         raise ClientError(f"recordings need mcap, which is not installed: {install_command('record')}") from error
+
+
+def plain_table(left: Sequence[str], right: Sequence[str] = (), *, title: str | None = None) -> Table:
+    """Return a table without lines; the columns `right`, of numbers, are aligned to the right."""
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    for name in (*left, *right):
+        table.add_column(name, justify="right" if name in right else "left", no_wrap=True)
+    return table
 
 
 def print_table(table: RenderableType) -> None:
@@ -251,6 +277,8 @@ def print_table(table: RenderableType) -> None:
 
     A table that is wider than the terminal is printed in parts, one below the other, each with the first columns.
     """
+    from optipmb_client.terminal import parts  # noqa: PLC0415  most commands print no table
+
     console = Console()
     width = console.width if console.is_terminal or "COLUMNS" in os.environ else WIDE
     console = Console(width=width)
@@ -259,6 +287,15 @@ def print_table(table: RenderableType) -> None:
             if number:
                 console.print()
             console.print(fitting)
+
+
+def report(result: dict[str, Any], *lines: str, as_json: bool) -> None:
+    """Print a result as JSON, or the lines for people."""
+    if as_json:
+        print_json(result)
+    else:
+        for line in lines:
+            say(line)
 
 
 def print_json(result: Any) -> None:
@@ -270,6 +307,11 @@ def say(text: str) -> None:
     """Print a line for people on standard output, at once."""
     typer.echo(text)
     sys.stdout.flush()
+
+
+def warn(text: str) -> None:
+    """Print a line on standard error."""
+    typer.echo(f"optipmb: {text}", err=True)
 
 
 def _plain(value: Any) -> Any:

@@ -1,14 +1,14 @@
-"""`optipmb profiles`: the parameter profiles that ship; list, show, copy, explain."""
+"""`optipmb profiles` and `optipmb warm-up`: the parameter profiles that ship, and compiling the tracker."""
 
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Group
-from rich.table import Table
 from rich.text import Text
 
-from optipmb_client.commands.options import AsJson, print_json, print_table, say
+from optipmb_client.commands.options import AsJson, plain_table, print_json, print_table, report, say
 from optipmb_client.errors import UsageError
 from optipmb_client.files import write_whole
 
@@ -64,10 +64,22 @@ def _list(*, as_json: bool) -> None:
     if as_json:
         print_json({"command": "profiles", "profiles": {one: list(it.labels) for one, it in known.items()}})
         return
-    table = Table(box=None, pad_edge=False)
-    for column in ("profile", "Hz", "classes"):
-        table.add_column(column, justify="right" if column == "Hz" else "left")
+    table = plain_table(("profile", "Hz", "classes"))
+    table.columns[1].justify = "right"
+    for column in table.columns:
+        column.no_wrap = False
     for one, it in known.items():
         table.add_row(one, f"{1.0 / it.nominal_period:g}", ", ".join(it.labels))
     table.add_row(offline.AUTO, "any", "any: made for the data by track and tune")
     print_table(table)
+
+
+def warm_up(*, as_json: AsJson = False) -> None:
+    """Compile the tracker into its cache, as the last step of an installation or of an image."""
+    from optipmb_client import offline  # noqa: PLC0415  the help does not load the tracker
+
+    begun = time.monotonic()
+    compiled = offline.warm_up()
+    seconds = round(time.monotonic() - begun, 1)
+    text = f"compiled {compiled} kernels in {seconds} s" if compiled else f"all kernels were compiled ({seconds} s)"
+    report({"command": "warm-up", "compiled": compiled, "seconds": seconds}, text, as_json=as_json)

@@ -1,38 +1,37 @@
-"""`optipmb replay`: a dataset through the service."""
+"""`optipmb replay`: a data set through the service."""
 
+from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from optipmb_client.commands.options import (
-    AsJson,
-    Classes,
-    DataOptions,
-    Full,
-    Out,
-    Profile,
-    open_sequences,
-    print_json,
-    say,
-)
+from optipmb_client.commands.options import AsJson, Classes, DataOptions, Full, Out, Profile, report, warn
 from optipmb_client.commands.service_options import PaceOptions, ServiceOptions
 from optipmb_client.errors import UsageError
 from optipmb_client.links import linked
 from optipmb_client.progress import FrameProgress
-from optipmb_client.recording import latency
-from optipmb_client.replay import ReplayedSequence
+from optipmb_client.replay import ReplayedSequence, Replaying
 from optipmb_client.replay import replay as replay_sequences
+from optipmb_client.results.output import latency
 
 
-def replay(  # noqa: PLR0913  these are the command's options
+@dataclass(frozen=True, kw_only=True)
+class ReplayOptions:
+    """Options of a replay."""
+
+    out: Out = Path("out/replay")
+    profile: Profile = None
+    classes: Classes = None
+    full: Full = False
+
+
+def replay(
     data: DataOptions,
     *,
-    out: Out = Path("out/replay"),
-    profile: Profile = None,
-    classes: Classes = None,
-    full: Full = False,
+    how: ReplayOptions,
     service: ServiceOptions,
     pace: PaceOptions,
     streams: Annotated[int, typer.Option(min=1, help="Sequences sent at the same time.")] = 1,
@@ -43,62 +42,43 @@ def replay(  # noqa: PLR0913  these are the command's options
     The profile is one that the service knows. Ends with status 1 when tracks of some frames did not come back.
     """
     chosen_pace = pace.pace()
-    asked = data.asked()
-    opened, chosen = open_sequences(asked, data.sequences)
-    name = profile or opened.profile
+    opened = data.open()
+    name = how.profile or opened.dataset.profile
+    if how.profile == "auto":
+        raise UsageError("--profile: one that the service knows, such as generic; auto is made for offline tracking")
     if name == "auto":
-        raise UsageError(
-            "--profile: one that the service knows; auto is made for offline tracking (see: optipmb profiles)"
-        )
+        name = "generic"
+        warn("profile generic, which is auto at 10 Hz (--profile NAME, see: optipmb profiles)")
+    replaying = Replaying(name, chosen_pace, how.classes or (), streams, service.prefix, how.full)
     with (
         closing(linked(service.connect, config=service.config, timeout=pace.wait)) as connection,
-        FrameProgress("replaying", sum(map(len, chosen))) as progress,
+        FrameProgress("replaying", opened.frames) as progress,
     ):
-        results = replay_sequences(
-            connection,
-            opened,
-            chosen,
-            out,
-            profile=name,
-            pace=chosen_pace,
-            classes=classes or (),
-            streams=streams,
-            prefix=service.prefix,
-            full=full,
-            on_frame=progress.advance,
-        )
-    if as_json:
-        print_json(
-            {
-                "command": "replay",
-                "dataset": asked.name,
-                "profile": name,
-                "out": out,
-                "missing": sum(result.missing for result in results),
-                "latency": latency([ns for result in results for ns in result.latencies_ns]),
-                "sequences": [_summary(result) for result in results],
-            }
-        )
-    else:
-        for result in results:
-            say(_line(result))
-        say(f"results in {out}")
+        results = replay_sequences(connection, opened.dataset, opened.sequences, how.out, replaying, progress.advance)
+    shown = {
+        "command": "replay",
+        "dataset": opened.name,
+        "profile": name,
+        "out": how.out,
+        "missing": sum(result.missing for result in results),
+        "latency": latency([ns for result in results for ns in result.latencies_ns]),
+        "sequences": [_summary(result) for result in results],
+    }
+    report(shown, *map(_line, results), f"results in {how.out}", as_json=as_json)
     complain(results)
 
 
-def complain(results: list[ReplayedSequence]) -> None:
-    """Say on standard error what is wrong with the results, and exit with status 1 when anything is."""
+def complain(results: Sequence[ReplayedSequence]) -> None:
+    """Print problems of the results on standard error, and exit with status 1 if there are any."""
     missing = sum(result.missing for result in results)
     clouds = sum(result.clouds_missed for result in results)
     if missing:
-        total = sum(result.frames for result in results)
-        typer.echo(f"optipmb: {missing} of {total} frames have no tracks", err=True)
+        warn(f"{missing} of {sum(result.frames for result in results)} frames have no tracks")
     if clouds:
-        typer.echo(f"optipmb: {clouds} frames were tracked without the point cloud that was sent", err=True)
+        warn(f"{clouds} frames were tracked without the point cloud that was sent")
     for result in results:
         for problem in result.newest_problems[-1:]:
-            text = f"optipmb: {result.name}: {result.problems} problems reported, the newest: {problem.message}"
-            typer.echo(text, err=True)
+            warn(f"{result.name}: {result.problems} problems reported, the newest: {problem.message}")
     if missing or clouds:
         raise typer.Exit(1)
 
@@ -110,20 +90,12 @@ def _line(result: ReplayedSequence) -> str:
     return f"{text}, {result.returned / max(result.seconds, 1e-9):.0f} frames/s"
 
 
+_SHOWN = (
+    *("name", "stream", "file", "frames", "sent", "returned", "missing", "clouds", "clouds_missed", "tracks"),
+    *("seconds", "latency", "problems"),
+)
+
+
 def _summary(result: ReplayedSequence) -> dict[str, object]:
-    return {
-        "name": result.name,
-        "stream": result.stream,
-        "file": result.file,
-        "frames": result.frames,
-        "sent": result.sent,
-        "returned": result.returned,
-        "missing": result.missing,
-        "clouds": result.clouds,
-        "clouds_missed": result.clouds_missed,
-        "tracks": result.tracks,
-        "seconds": result.seconds,
-        "latency": result.latency,
-        "problems": result.problems,
-        "newest_problems": [{"code": problem.code, "message": problem.message} for problem in result.newest_problems],
-    }
+    problems = [{"code": problem.code, "message": problem.message} for problem in result.newest_problems]
+    return {name: getattr(result, name) for name in _SHOWN} | {"newest_problems": problems}

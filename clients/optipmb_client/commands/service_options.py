@@ -10,8 +10,6 @@ from optipmb_schemas import PREFIX
 from optipmb_client.replay import Pace
 from optipmb_client.zenoh import DEFAULT_ENDPOINT, Connection
 
-__all__ = ["PaceOptions", "ServiceOptions", "Speed", "speed_of"]
-
 Speed = Annotated[
     str, typer.Option("--speed", help="1: as recorded, 10: ten times as fast, max: as fast as tracks come back.")
 ]
@@ -35,7 +33,7 @@ class PaceOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ServiceOptions:
-    """Options that say where a service is."""
+    """Options of the connection to a service."""
 
     connect: Annotated[
         list[str] | None,

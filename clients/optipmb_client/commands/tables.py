@@ -10,34 +10,21 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from optipmb_client.evaluation.figures import FIGURES, cell
+
 if TYPE_CHECKING:
     from optipmb_client.evaluation import ClassResult
-    from optipmb_client.evaluation.figures import ClassFigures
+    from optipmb_client.evaluation.evaluate import ClassFigures
     from optipmb_client.evaluation.nuscenes import NuScenesScores
 
 _CLEAR = ("MOTA", "MOTP", "precision", "recall", "GT", "FP", "FN", "IDS", "FRAG")
 _PROTOCOL = ("sAMOTA", "AMOTA", "AMOTP", "score", "MOTA", "MOTP", "recall", "precision", "IDS", "FRAG", "FP", "FN")
 _SHARES = ("MT", "ML")
-_PLAIN = frozenset({"score"})
-_NUSCENES = {
-    "amota": "AMOTA",
-    "amotp": "AMOTP m",
-    "recall": "recall",
-    "mota": "MOTA",
-    "motp": "MOTP m",
-    "gt": "GT",
-    "tp": "TP",
-    "fp": "FP",
-    "fn": "FN",
-    "ids": "IDS",
-    "frag": "FRAG",
-}
-_METRES = frozenset({"amotp", "motp"})
-_COUNTS = frozenset({"gt", "tp", "fp", "fn", "ids", "frag"})
-SCORE = "score ≥"
+_NUSCENES = ("amota", "amotp", "recall", "mota", "motp", "gt", "tp", "fp", "fn", "ids", "frag")
 _HOTA = ("HOTA", "DetA", "AssA")
 _DIRECTIONS = ("along", "across", "height", "heading", "length", "width", "tall")
 _GOSPA = ("GOSPA", "localisation", "missed", "false", "OSPA")
+SCORE = "score ≥"
 
 
 def clear_table(results: "Sequence[ClassResult]", *, metres: bool) -> RenderableType:
@@ -49,18 +36,16 @@ def clear_table(results: "Sequence[ClassResult]", *, metres: bool) -> Renderable
             (result.name, "all", result.total.summary()),
             ("", f"{result.sweep.thresholds[best]:.3f}", result.sweep.results[best].summary()),
         ):
-            plain = {"MOTP"} if metres else set()
-            table.add_row(name, threshold, *(_shown(figures[column], column in plain) for column in _CLEAR))
+            table.add_row(name, threshold, *_cells(figures, _CLEAR, metres=metres))
     return table
 
 
 def nuscenes_table(scores: "NuScenesScores", names: Sequence[str]) -> RenderableType:
     """Return the figures of the benchmark of nuScenes, of some classes and overall; AMOTP and MOTP are in metres."""
-    table = _empty(("class", *(_NUSCENES[name] for name in _NUSCENES)))
+    table = _empty(("class", *(FIGURES[name].title for name in _NUSCENES)))
     rows = {name: one.to_json() for name, one in scores.classes.items() if name in names}
     for name, values in {**rows, "overall": scores.to_json()["overall"]}.items():
-        shown = (_counted(values[key]) if key in _COUNTS else _shown(values[key], key in _METRES) for key in _NUSCENES)
-        table.add_row(name, *shown)
+        table.add_row(name, *_cells(values, _NUSCENES))
     return _titled(
         "The benchmark of nuScenes: averages over 40 recalls, then the threshold with the highest MOTA", table
     )
@@ -97,8 +82,8 @@ def comparison_tables(trackers: "Mapping[str, Sequence[ClassFigures]]") -> Itera
             for one in (one.everything for one in figures if one.name == name):
                 table.add_row(
                     place,
-                    *(_shown(one.hota.summary()[column]) for column in (*_HOTA, "LocA")),
-                    *(_shown(one.gospa.summary()[column], plain=True) for column in _GOSPA),
+                    *_cells(one.hota.summary(), (*_HOTA, "LocA")),
+                    *_cells(one.gospa.summary(), _GOSPA),
                 )
         yield _titled(f"{name}: HOTA of centres in percent; GOSPA and OSPA in metres", table)
 
@@ -107,12 +92,8 @@ def _protocol(figures: "Sequence[ClassFigures]") -> Table:
     table = _empty(("class", "IoU", *_PROTOCOL, *_SHARES))
     for one in figures:
         for place, result in enumerate(one.ab3dmot):
-            values = result.summary()
-            table.add_row(
-                "" if place else one.name,
-                f"{result.limit:g}",
-                *(_shown(values[name], name in _PLAIN) for name in (*_PROTOCOL, *_SHARES)),
-            )
+            cells = _cells(result.summary(), (*_PROTOCOL, *_SHARES))
+            table.add_row("" if place else one.name, f"{result.limit:g}", *cells)
     return table
 
 
@@ -124,16 +105,16 @@ def _sets(figures: "Sequence[ClassFigures]", average: "Mapping[str, Mapping[str,
         for place, part in enumerate((one.everything, one.best)):
             if part is None:
                 continue
-            flat = part.hota_2d.summary() if part.hota_2d else {}
+            flat = part.hota_2d.summary() if part.hota_2d else dict.fromkeys(_HOTA)
             table.add_row(
                 "" if place else one.name,
                 f"{part.threshold:.3f}" if place else "all",
-                *(_shown(flat.get(name)) for name in _HOTA if image),
-                *(_shown(part.hota.summary()[name]) for name in (*_HOTA, "LocA")),
-                *(_shown(part.gospa.summary()[name], plain=True) for name in _GOSPA),
+                *(_cells(flat, _HOTA) if image else ()),
+                *_cells(part.hota.summary(), (*_HOTA, "LocA")),
+                *_cells(part.gospa.summary(), _GOSPA),
             )
     for key, values in average.items():
-        table.add_row("class average" if key == "all" else "", key, *(_shown(values[name]) for name in _HOTA))
+        table.add_row("class average" if key == "all" else "", key, *_cells(values, _HOTA))
     return table
 
 
@@ -147,11 +128,9 @@ def _nees(figures: "Sequence[ClassFigures]") -> Table:
         found: Mapping[str, Any] = one.calibration.summary()
         table.add_row(
             one.name,
-            *(_shown(found[name]) for name in ("samples", "objects")),
-            _shown(found["NEES"], plain=True),
+            *_cells(found, ("samples", "objects", "NEES")),
             *(_range(found[name]) for name in ("interval", "band")),
-            _shown(found["coverage"]),
-            *(_shown(found[name], plain=True) for name in ("error", "expected_error")),
+            *_cells(found, ("coverage", "error", "expected_error")),
         )
     return table
 
@@ -170,11 +149,10 @@ def _errors(figures: "Sequence[ClassFigures]") -> Iterator[RenderableType]:
             if values["boxes"]:
                 for kind in ("track", "detection"):
                     label = (head, str(values["boxes"])) if kind == "track" else ("", "")
-                    boxes.add_row(*label, kind[:5], *(_shown(values[kind][key], plain=True) for key in _DIRECTIONS))
+                    boxes.add_row(*label, kind[:5], *_cells(values[kind], _DIRECTIONS))
             if heading["boxes"]:
-                spread = (_shown(heading["NEES"], plain=True), _shown(heading["coverage"]))
-                both = (_shown(heading["backward"]), _shown(turned["detection"]))
-                headings.add_row(head, str(heading["boxes"]), *both, *spread)
+                both = (cell("backward", heading["backward"]), cell("backward", turned["detection"]))
+                headings.add_row(head, str(heading["boxes"]), *both, *_cells(heading, ("NEES", "coverage")))
     if boxes.row_count:
         yield _titled("Errors of tracks that exist with 50 % or more, and of their detections: m, rad", boxes)
     if headings.row_count:
@@ -190,8 +168,8 @@ def _reliability(figures: "Sequence[ClassFigures]") -> Table:
     table = _empty(("class", "", *heads))
     for name, deciles in calibrations:
         table.add_row(name, "tracks", *(str(deciles[place].count) for place in used))
-        table.add_row("", "predicted", *(_shown(_known(deciles[place].predicted)) for place in used))
-        table.add_row("", "observed", *(_shown(_known(deciles[place].observed)) for place in used))
+        table.add_row("", "predicted", *(cell("predicted", deciles[place].predicted) for place in used))
+        table.add_row("", "observed", *(cell("observed", deciles[place].observed) for place in used))
     return table
 
 
@@ -206,22 +184,10 @@ def _titled(title: str, table: Table) -> RenderableType:
     return Group(Text(f"\n{title}", style="bold"), table)
 
 
-def _known(value: float) -> float | None:
-    return None if value != value else value  # noqa: PLR0124  NaN alone differs from itself
+def _cells(values: "Mapping[str, float | None]", names: Sequence[str], *, metres: bool = False) -> list[str]:
+    return [cell(name, values[name], metres=metres) for name in names]
 
 
 def _range(ends: Sequence[float | None]) -> str:
     low, high = ends
     return "-" if low is None or high is None else f"{low:.2f} to {high:.2f}"
-
-
-def _counted(value: float | None) -> str:
-    return "-" if value is None else f"{value:.0f}"
-
-
-def _shown(value: float | None, plain: bool = False) -> str:  # noqa: FBT001, FBT002  a flag of this module's own
-    if value is None:
-        return "-"
-    if isinstance(value, int):
-        return str(value)
-    return f"{value:.3f}" if plain else f"{100.0 * value:.2f}"

@@ -1,7 +1,8 @@
-"""`optipmb track`: a dataset through the tracker, in this process; or what a service saved when tracking failed."""
+"""`optipmb track`: a data set, or a dump that a service saved, through the tracker in this process."""
 
 import sys
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,56 +11,69 @@ import typer
 from optipmb_client.commands.options import (
     AsJson,
     Classes,
+    Data,
     DataOptions,
     Full,
+    JobOptions,
     Out,
     Profile,
-    Ray,
-    executor_of,
-    open_sequences,
+    number_or_text,
     print_json,
+    report,
     say,
     warn,
 )
 from optipmb_client.errors import TrackingFailed, UsageError
 from optipmb_client.progress import FrameProgress
-from optipmb_client.results.nuscenes import NUSCENES_MAX_BOXES
 from optipmb_client.table_files import is_table
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence as Many
-
-    from optipmb_client.datasets import DataSequence
     from optipmb_client.tracking import TrackedSequence
 
 
-def track(  # noqa: PLR0913  these are the command's options
-    data: DataOptions,
-    *,
-    out: Out = Path("out/track"),
-    profile: Profile = None,
-    classes: Classes = None,
-    full: Full = False,
+@dataclass(frozen=True, kw_only=True)
+class TrackOptions:
+    """Options of offline tracking."""
+
+    out: Out = Path("out/track")
+    profile: Profile = None
+    classes: Classes = None
+    full: Full = False
     smooth: Annotated[
         bool,
         typer.Option("--smooth", help="Estimate every state from all frames of its track, later ones too: for labels."),
-    ] = False,
+    ] = False
     fuse: Annotated[
         bool,
         typer.Option("--fuse", help="The sensors of a recording feed one density, by turns: by the column sensor."),
-    ] = False,
+    ] = False
     keep_input: Annotated[
         bool, typer.Option("--keep-input", help="Of a bag, with --out FILE.mcap: also copy what is in it.")
-    ] = False,
+    ] = False
     submission: Annotated[
         str | None,
         typer.Option(metavar="[SCORE]", help="Write a submission; of KITTI confirmed tracks from this mean score on."),
-    ] = None,
-    jobs: Annotated[
-        int | None,
-        typer.Option(min=1, help="Recordings at once; default: one for each processor.", show_default=False),
-    ] = None,
-    ray: Ray = None,
+    ] = None
+
+    def check_out(self, data: Data) -> None:
+        """Refuse a file where the results are several; a bag of tracks holds one topic of a bag."""
+        out = self.out
+        if self.submission is not None and (self.full or is_table(out)):
+            raise UsageError("--submission: expected a folder as --out, and no --full: the files are for the benchmark")
+        if out.suffix != ".mcap":
+            return
+        if data.name != "rosbag":
+            raise UsageError(f"--out {out}: expected a folder, or a table: only tracks of a bag are written as a bag")
+        if len(data.sequences) > 1:
+            names = " ".join(data.names)
+            raise UsageError(f"--out {out}: expected one of the bag's topics by --sequences, received {names}")
+
+
+def track(
+    data: DataOptions,
+    *,
+    how: TrackOptions,
+    jobs: JobOptions,
     dump: Annotated[
         Path | None, typer.Option("--dump", help="What a service saved of a stream when tracking it failed.")
     ] = None,
@@ -81,11 +95,13 @@ def track(  # noqa: PLR0913  these are the command's options
         return
     from optipmb_client import offline, tracking  # noqa: PLC0415  loads the tracker and its compiler
 
-    flags = {"keep_input": keep_input and 1, "fuse": fuse and 1, "submission": submission}
-    asked = data.asked(*(f"{name}={given}" for name, given in flags.items() if given))
-    opened, chosen = open_sequences(asked, data.sequences)
-    _check_out(out, asked.name, chosen, alone=submission is not None, full=full)
-    name = profile or opened.profile
+    more: dict[str, float | str] = {name: 1 for name in ("keep_input", "fuse") if getattr(how, name)}
+    if how.submission is not None:
+        more["submission"] = number_or_text(how.submission)
+    opened = data.open(**more)
+    how.check_out(opened)
+    chosen = opened.sequences
+    name = how.profile or opened.dataset.profile
     parameters = offline.profile_for(name, chosen)
     for doubt in offline.doubts(parameters, chosen):
         warn(doubt)
@@ -95,18 +111,14 @@ def track(  # noqa: PLR0913  these are the command's options
     failed = None
     try:
         with (
-            FrameProgress("tracking", sum(map(len, chosen))) as progress,
-            executor_of(jobs, ray, chosen, len(chosen)) as executor,
+            FrameProgress("tracking", opened.frames) as progress,
+            jobs.executor(opened.frames, len(chosen)) as executor,
         ):
             for result in tracking.track(
-                opened,
+                opened.dataset,
                 chosen,
-                out,
-                data=asked,
-                parameters=parameters,
-                classes=classes or (),
-                full=full,
-                smooth=smooth,
+                how.out,
+                tracking.Tracking(parameters, how.classes or (), full=how.full, smooth=how.smooth),
                 executor=executor,
                 on_frame=progress.advance,
                 note=lambda text: progress.note(f"optipmb: {text}"),
@@ -116,12 +128,9 @@ def track(  # noqa: PLR0913  these are the command's options
                     _say_result(result)
     except tracking.RecordingsFailed as error:
         failed = error
-    if as_json:
-        report = {"command": "track", "dataset": asked.name, "profile": name, "out": out, "sequences": results}
-        reasons = {} if failed is None else {name: one.reason for name, one in failed.failures.items()}
-        print_json({**report, "failed": reasons})
-    else:
-        say(f"results in {out}")
+    reasons = {} if failed is None else {name: one.reason for name, one in failed.failures.items()}
+    shown = {"command": "track", "dataset": opened.name, "profile": name, "out": how.out, "sequences": results}
+    report({**shown, "failed": reasons}, f"results in {how.out}", as_json=as_json)
     if failed is not None:
         raise failed
     _complain(results, parameters.name)
@@ -136,7 +145,7 @@ def _say_result(result: "TrackedSequence") -> None:
 
 
 def _complain(results: "list[TrackedSequence]", profile: str) -> None:
-    """Say what was left out; end with status 1 when there were detections and not one track came of them."""
+    """Print the detections that were left out; end with status 1 if there were detections and no tracks."""
     detections = sum(one.detections for one in results)
     left_out: Counter[str] = sum((Counter(one.left_out) for one in results), Counter())
     if left_out:
@@ -147,23 +156,12 @@ def _complain(results: "list[TrackedSequence]", profile: str) -> None:
         warn(f"the motion of the sensor is estimated in {estimated} of {frames} frames: boxes have no poses")
     cut, samples = map(sum, zip(*(one.cut for one in results), strict=True))
     if cut:
+        from optipmb_client.results.nuscenes import NUSCENES_MAX_BOXES  # noqa: PLC0415  of one format
+
         warn(f"{cut} boxes in {samples} samples are not written: a sample of nuScenes has {NUSCENES_MAX_BOXES} at most")
     if detections and not any(one.tracks for one in results):
         warn(f"no tracks came of {detections} detections: do their scores and rate fit profile {profile}?")
         raise typer.Exit(1)
-
-
-def _check_out(out: Path, dataset: str, chosen: "Many[DataSequence]", *, alone: bool, full: bool) -> None:
-    """A submission has files of its own; a bag of tracks is one file, and holds those of one topic of a bag."""
-    if alone and (full or is_table(out)):
-        raise UsageError("--submission: expected a folder as --out, and no --full: the files are for the benchmark")
-    if out.suffix != ".mcap":
-        return
-    if dataset != "rosbag":
-        raise UsageError(f"--out {out}: expected a folder, or a table: only tracks of a bag are written as a bag")
-    if len(chosen) > 1:
-        names = " ".join(sequence.name for sequence in chosen)
-        raise UsageError(f"--out {out}: expected one of the bag's topics by --sequences, received {names}")
 
 
 def _replay_dump(file: Path, *, trace: bool, as_json: bool) -> None:

@@ -1,5 +1,7 @@
 """`optipmb tune`: from detections and labels to a parameter profile."""
 
+from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,12 +14,11 @@ from optipmb_client.commands.ablate import cells_of
 from optipmb_client.commands.options import (
     AsJson,
     Classes,
+    JobOptions,
     LabelledOptions,
     Out,
     Profile,
-    Ray,
-    executor_of,
-    open_sequences,
+    plain_table,
     print_json,
     print_table,
     say,
@@ -31,19 +32,25 @@ if TYPE_CHECKING:
     from optipmb_client.tuning import Curves, Estimate, Refined
 
 SHOWN = ("sAMOTA", "AMOTA", "MOTA", "MOTP", "HOTA", "IDS", "FP", "FN", "GT")
-LEAST_SHOWN = 100
-"""Boxes of tracks from which a tenth of the probabilities is shown."""
+LEAST_SHOWN = 100  # boxes of tracks from which a tenth of the probabilities is shown
 METRICS = ("combination", "samota", "amota", "mota", "hota", "both")
 
 
-def tune(  # noqa: PLR0913  these are the command's options
-    data: LabelledOptions,
-    *,
-    profile: Profile = None,
-    classes: Classes = None,
-    out: Out = Path("out/tune"),
-    name: Annotated[str | None, typer.Option(help="Name of the new profile.", show_default=False)] = None,
-    estimate_only: Annotated[bool, typer.Option("--estimate-only", help="Estimate, and search nothing.")] = False,
+@dataclass(frozen=True, kw_only=True)
+class ProfileOptions:
+    """Options of the profile that is tuned."""
+
+    profile: Profile = None
+    classes: Classes = None
+    out: Out = Path("out/tune")
+    name: Annotated[str | None, typer.Option(help="Name of the new profile.", show_default=False)] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class EstimateOptions:
+    """Options of the estimate."""
+
+    estimate_only: Annotated[bool, typer.Option("--estimate-only", help="Estimate, and search nothing.")] = False
     reference: Annotated[
         str | None,
         typer.Option(
@@ -51,18 +58,38 @@ def tune(  # noqa: PLR0913  these are the command's options
             " the same data are what those of --detections are brought to.",
             show_default=False,
         ),
-    ] = None,
-    metric: Annotated[str, typer.Option(help=f"What is maximised: {', '.join(METRICS)}.")] = "combination",
-    trials: Annotated[int, typer.Option(min=1, help="Trials of the search on all sequences.")] = 120,
-    folds: Annotated[int, typer.Option(min=0, help="Groups of sequences that are left out in turn; 0: none.")] = 3,
+    ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchOptions:
+    """Options of the search."""
+
+    metric: Annotated[str, typer.Option(help=f"What is maximised: {', '.join(METRICS)}.")] = "combination"
+    trials: Annotated[int, typer.Option(min=1, help="Trials of the search on all sequences.")] = 120
+    folds: Annotated[int, typer.Option(min=0, help="Groups of sequences that are left out in turn; 0: none.")] = 3
     fold_trials: Annotated[
         int | None, typer.Option(min=1, help="Trials of the search without a group; default: half of --trials.")
-    ] = None,
-    degrade: Annotated[int, typer.Option(min=0, help="Degraded copies of the detections beside the plain ones.")] = 1,
-    everything: Annotated[bool, typer.Option("--all", help="Search the parameters of the paper's table too.")] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of every random choice.")] = 0,
-    jobs: Annotated[int, typer.Option(min=1, help="Sequences tracked at once.")] = 1,
-    ray: Ray = None,
+    ] = None
+    degrade: Annotated[int, typer.Option(min=0, help="Degraded copies of the detections beside the plain ones.")] = 1
+    everything: Annotated[bool, typer.Option("--all", help="Search the parameters of the paper's table too.")] = False
+    seed: Annotated[int, typer.Option(min=0, help="Seed of every random choice.")] = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class TuneJobs(JobOptions):
+    """Options of tuning in several processes."""
+
+    jobs: Annotated[int, typer.Option(min=1, help="Sequences tracked at once.")] = 1
+
+
+def tune(
+    data: LabelledOptions,
+    *,
+    into: ProfileOptions,
+    estimation: EstimateOptions,
+    search: SearchOptions,
+    jobs: TuneJobs,
     as_json: AsJson = False,
 ) -> None:
     """Estimate the parameters of each class from labelled data, then refine them by tracking.
@@ -72,37 +99,38 @@ def tune(  # noqa: PLR0913  these are the command's options
     from optipmb_client import tuning  # noqa: PLC0415  loads the tracker and its compiler
     from optipmb_client.offline import profile_compared  # noqa: PLC0415  as above
 
-    if not estimate_only:
+    reference, out = estimation.reference, into.out
+    if not estimation.estimate_only:
         needed("optipmb tune", "tune", "optuna")
-    if metric not in METRICS:
-        raise UsageError(f"--metric: one of {', '.join(METRICS)}, received {metric!r}")
-    if reference is not None and not estimate_only:
+    if search.metric not in METRICS:
+        raise UsageError(f"--metric: one of {', '.join(METRICS)}, received {search.metric!r}")
+    if reference is not None and not estimation.estimate_only:
         raise UsageError("--reference: with --estimate-only, which writes a profile that --profile then tunes")
-    asked = data.asked()
-    opened, chosen = open_sequences(asked, data.sequences)
-    parameters = profile_compared(profile or opened.profile, chosen)
+    opened = data.open()
+    asked, chosen = opened.dataset.arguments, opened.sequences
+    parameters = profile_compared(into.profile or opened.dataset.profile, chosen)
     curves: tuning.Curves = {}
     if reference is not None:
-        parameters, curves = tuning.calibrate_scores(asked, reference, chosen, parameters, classes, out, name)
-    source = tuning.Source.of(asked.name, asked.detections, chosen, parameters, classes)
+        parameters, curves = tuning.calibrate_scores(asked, reference, chosen, parameters, into.classes, out, into.name)
+    source = tuning.Source.of(asked.name, asked.detections, chosen, parameters, into.classes)
     estimates = tuning.estimate_all(source, parameters, out)
     if not as_json:
         for one in estimates.values():
             print_table(_estimate(one, {path: tuning.value_of(parameters, one.name, path) for path in one.values}))
-    if estimate_only:
+    if estimation.estimate_only:
         _say_estimates(estimates, curves, reference, out, as_json=as_json)
         return
     plan = tuning.Plan(
-        metric=metric,
-        trials=trials,
-        fold_trials=fold_trials or max(1, trials // 2),
-        folds=folds,
-        copies=degrade,
-        seed=seed,
-        everything=everything,
+        metric=search.metric,
+        trials=search.trials,
+        fold_trials=search.fold_trials or max(1, search.trials // 2),
+        folds=search.folds,
+        copies=search.degrade,
+        seed=search.seed,
+        everything=search.everything,
     )
-    with executor_of(jobs, ray, chosen, jobs) as executor, tuning.TrialDisplay() as display:
-        tuned = tuning.tune_all(source, parameters, plan, out, display, name, executor)
+    with jobs.executor(opened.frames, jobs.jobs) as executor, tuning.TrialDisplay() as display:
+        tuned = tuning.tune_all(source, parameters, plan, out, display, into.name, executor)
     if as_json:
         results: Mapping[str, Any] = {name: one.to_json() for name, one in tuned.classes.items()}
         print_json({"command": "tune", "profile": tuned.profile, "classes": results})
@@ -130,10 +158,7 @@ def _say_estimates(
 
 
 def _estimate(found: "Estimate", before: "Mapping[str, object]") -> Group:
-    table = Table(box=None, pad_edge=False)
-    table.add_column(found.name)
-    table.add_column("profile", justify="right")
-    table.add_column("estimate", justify="right")
+    table = _table(found.name, "profile", "estimate")
     for path, value in found.values.items():
         table.add_row(path, str(before[path]), str(value))
     facts = (
@@ -145,15 +170,19 @@ def _estimate(found: "Estimate", before: "Mapping[str, object]") -> Group:
     return Group(table, Text(facts), Text(scores), Text())
 
 
+def _table(first: str, *others: str) -> Table:
+    table = plain_table((first,), others)
+    for column in table.columns:
+        column.no_wrap = False
+    return table
+
+
 def _share(value: float) -> str:
     return f"{100.0 * value:.1f} %"
 
 
 def _report(refined: "Refined") -> Group:
-    figures = Table(box=None, pad_edge=False)
-    figures.add_column(refined.name)
-    for name in SHOWN:
-        figures.add_column(name, justify="right")
+    figures = _table(refined.name, *SHOWN)
     copies = ("", *(f", degraded {i + 1}" for i in range(refined.plan.copies)))
     for title, rows in (
         ("before", refined.before),
@@ -165,21 +194,16 @@ def _report(refined: "Refined") -> Group:
     for fold in refined.folds:
         figures.add_row(f"without {' '.join(fold.sequences)}: before", *cells_of(fold.before[0], SHOWN))
         figures.add_row(f"without {' '.join(fold.sequences)}: after", *cells_of(fold.after[0], SHOWN))
-    evidence = Table(box=None, pad_edge=False)
-    for column in ("changed", "from", "to", "gain", "+-", "gains"):
-        evidence.add_column(column, justify="left" if column == "changed" else "right")
-    for one in refined.evidence:
+    changes = _table("changed", "from", "to", "gain", "+-", "gains")
+    for one in refined.changes:
         gains = f"{one.positive} of {one.groups}"
-        evidence.add_row(one.path, str(one.start), str(one.value), f"{one.gain:.5f}", f"{one.error:.5f}", gains)
-    ranking = Table(box=None, pad_edge=False)
-    for column in ("tracks ranked by", refined.plan.metric, "gain", "+-", "sAMOTA", "AMOTA", "MOTA"):
-        ranking.add_column(column, justify="left" if column == "tracks ranked by" else "right")
+        changes.add_row(one.path, str(one.start), str(one.value), f"{one.gain:.5f}", f"{one.error:.5f}", gains)
+    ranking = _table("tracks ranked by", refined.plan.metric, "gain", "+-", "sAMOTA", "AMOTA", "MOTA")
     for score in refined.ranking:
-        values = score.figures.to_json()
-        shown = (score.value, score.gain, score.error, *(values[name] for name in ("sAMOTA", "AMOTA", "MOTA")))
-        ranking.add_row(score.score, *(f"{value:.4f}" if value is not None else "-" for value in shown))
+        shown = (score.value, score.gain, score.error, *(score.figures[name] for name in ("sAMOTA", "AMOTA", "MOTA")))
+        ranking.add_row(score.score, *(f"{value:.4f}" if isfinite(value) else "-" for value in shown))
     return Group(
-        figures, Text(), evidence, Text(_objective(refined)), Text(), ranking, Text(_calibration(refined)), Text()
+        figures, Text(), changes, Text(_objective(refined)), Text(), ranking, Text(_calibration(refined)), Text()
     )
 
 

@@ -1,18 +1,24 @@
-"""Datasets: detections, poses, clouds and truth, read or generated, behind one interface."""
+"""Data sets: detections, poses, clouds and truth, read or generated, behind one interface."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
+
+from optipmb_schemas.installation import install_command
 
 from optipmb_client.datasets.interface import (
     Cloud,
     DataSequence,
     Dataset,
+    DatasetArguments,
     DetectionFrame,
+    Preloaded,
     Regions,
     Truth,
+    selected_frames,
 )
+from optipmb_client.errors import ClientError
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Pose
 from optipmb_client.table_files import tables_in
@@ -26,73 +32,57 @@ __all__ = [
     "DatasetError",
     "DetectionFrame",
     "Pose",
+    "Preloaded",
     "Regions",
     "Truth",
     "dataset_at",
     "open_dataset",
+    "selected_frames",
 ]
 
-_ROS2_MCAP = b"\x04\x00\x00\x00ros2"
-"""Profile in the header of an MCAP file of ROS 2."""
-_HEAD = 64
-
 DATASETS = ("kitti", "nuscenes", "scene", "mcap", "rosbag", "table")
-
-
-@dataclass(frozen=True)
-class DatasetArguments:
-    """What `open_dataset` is called with: enough to open the same dataset in another process."""
-
-    name: str
-    root: Path | None = None
-    detections: str | None = None
-    options: tuple[tuple[str, float | str], ...] = ()
-
-    def open(self) -> Dataset:
-        """Open the dataset; raises as `open_dataset` does."""
-        return open_dataset(self.name, self.root, self.detections, **dict(self.options))
+_ROS2_MCAP = b"\x04\x00\x00\x00ros2"  # profile in the header of an MCAP file of ROS 2
+_HEAD = 64
 
 
 def open_dataset(
     name: str, root: Path | str | None = None, detections: str | Path | None = None, **options: float | str
 ) -> Dataset:
-    """Return a dataset by name.
+    """Return a data set by name.
 
     Args:
-        name: one of `DATASETS`.
-        root: the folder of a dataset on disk, the file of a recording; a generated one takes none.
-        detections: the detector whose results are used: its name, its folder or file. None when there is just one, or
-            when only truth, poses and clouds are read.
-        options: of the dataset. kitti: `clouds`, `poses`, `split`, `submission`; nuscenes: `clouds`, `z_bottom`,
+        name: One of `DATASETS`.
+        root: Folder of a data set on disk, or file of a recording; a generated one takes none.
+        detections: Detector whose results are used: its name, its folder or file. None when there is just one, or when
+            only truth, poses and clouds are read.
+        options: Of the data set. kitti: `clouds`, `poses`, `split`, `submission`; nuscenes: `clouds`, `z_bottom`,
             `submission`; scene: the fields of `SceneOptions`; mcap: none; rosbag: `points`, `odometry`, `fixed_frame`,
             `keep_input` and `class.NAME`; table: those of `optipmb_client.datasets.table.OPTIONS`. For table and mcap
             also `fuse`: the sensors of a recording share a density.
 
     Raises:
-        DatasetError: the name, the root, the detector or an option is not known.
-
+        DatasetError: The name, the root, the detector or an option is not known.
     """
-    if name == "scene":
-        if root is not None or detections is not None:
-            raise DatasetError("--root and --detections", "nothing, for scenes are generated", str(root or detections))
-        from optipmb_client.datasets.scene import SceneDataset, scene_options  # noqa: PLC0415 - of one format
-
-        return SceneDataset(scene_options(_numbers(options)))
+    place = None if root is None else Path(root)
+    arguments = DatasetArguments(name, place, None if detections is None else str(detections), tuple(options.items()))
     if name not in DATASETS:
         raise DatasetError("--dataset", " or ".join(DATASETS), repr(name))
-    if root is None:
+    if name == "scene" and (root is not None or detections is not None):
+        raise DatasetError("--root and --detections", "nothing, for scenes are generated", str(root or detections))
+    if name != "scene" and root is None:
         raise DatasetError("--root", "the file or folder of the dataset", "nothing")
     if name in {"table", "mcap", "rosbag"} and detections is not None:
         raise DatasetError("--detections", "nothing, for the file itself has them", repr(str(detections)))
-    fuse = str(options.pop("fuse", "0")) not in {"0", "0.0", "False"}
+    fuse = name != "scene" and str(options.pop("fuse", "0")) not in {"0", "0.0", "False"}
     if fuse and name not in {"table", "mcap"}:
         raise DatasetError("--fuse", "a table with a column `sensor`, or a recording (.mcap)", name)
-    opened = _OPEN[name](Path(root), detections, options)
-    if not fuse:
-        return opened
-    from optipmb_client.datasets.fused import FusedDataset  # noqa: PLC0415 - of one format
+    opened = _OPEN[name](place or Path(), detections, options)
+    if fuse:
+        from optipmb_client.datasets.fused import FusedDataset  # noqa: PLC0415  of one format
 
-    return FusedDataset(opened)
+        opened = FusedDataset(opened)
+    opened.arguments = arguments
+    return opened
 
 
 # Each function imports the modules of its format: a command reads one, and some need packages of extras.
@@ -100,51 +90,77 @@ _Options: TypeAlias = dict[str, float | str]
 
 
 def _kitti(root: Path, detections: str | Path | None, options: _Options) -> Dataset:
-    from optipmb_client.datasets.kitti import KittiDataset  # noqa: PLC0415 - of one format
+    from optipmb_client.datasets.kitti import KittiDataset  # noqa: PLC0415  of one format
 
-    _known(options, {"clouds", "poses", "split", "submission"})
-    text = {name: str(options[name]) for name in ("poses", "split", "submission") if name in options}
-    return KittiDataset(root, detections, clouds=bool(options.get("clouds", True)), **text)
+    _check(options, "clouds", "poses", "split", "submission")
+    texts: dict[str, Any] = {name: str(value) for name, value in options.items() if name != "clouds"}
+    return KittiDataset(root, detections, clouds=bool(options.get("clouds", True)), **texts)
 
 
 def _nuscenes(root: Path, detections: str | Path | None, options: _Options) -> Dataset:
-    from optipmb_client.datasets.nuscenes import NuScenesDataset  # noqa: PLC0415 - of one format
+    from optipmb_client.datasets.nuscenes import NuScenesDataset  # noqa: PLC0415  of one format
 
-    _known(options, {"clouds", "z_bottom", "submission"})
-    z_bottom = bool(options["z_bottom"]) if "z_bottom" in options else None
-    clouds, submission = bool(options.get("clouds", True)), "submission" in options
-    if str(options.get("submission", "default")) != "default":
-        raise DatasetError("--submission", "no score: AMOTA of nuScenes counts all tracks", str(options["submission"]))
-    return NuScenesDataset(root, detections, clouds=clouds, z_bottom=z_bottom, submission=submission)
+    _check(options, "clouds", "submission", "z_bottom")
+    if (score := str(options.get("submission", "default"))) != "default":
+        raise DatasetError("--submission", "no score: AMOTA of nuScenes counts all tracks", score)
+    flags: dict[str, Any] = {name: bool(options[name]) for name in ("clouds", "z_bottom") if name in options}
+    return NuScenesDataset(root, detections, submission="submission" in options, **flags)
 
 
 def _mcap(root: Path, _: str | Path | None, options: _Options) -> Dataset:
-    from optipmb_client.datasets.mcap import RecordedDataset  # noqa: PLC0415 - of one format
+    with _needed("recordings need mcap", "record"):
+        from optipmb_client.datasets.mcap import RecordedDataset  # noqa: PLC0415  of one format
 
-    _known(options, set())
+    _check(options)
     return RecordedDataset(root)
 
 
 def _table(root: Path, _: str | Path | None, options: _Options) -> Dataset:
-    from optipmb_client.datasets.table import TableDataset  # noqa: PLC0415 - of one format
+    from optipmb_client.datasets.table import TableDataset  # noqa: PLC0415  of one format
 
-    return TableDataset(root, {key: str(value) for key, value in options.items()})
+    return TableDataset(root, {option: str(value) for option, value in options.items()})
 
 
 def _rosbag(root: Path, _: str | Path | None, options: _Options) -> Dataset:
-    from optipmb_client.datasets.rosbag import RosbagDataset  # noqa: PLC0415 - of one format
+    with _needed("bags need rosbags", "ros2"):
+        from optipmb_client.datasets.rosbag import RosbagDataset  # noqa: PLC0415  of one format
 
-    return RosbagDataset(root, dict(options))
+    return RosbagDataset(root, options)
 
 
-_OPEN = {"kitti": _kitti, "nuscenes": _nuscenes, "mcap": _mcap, "rosbag": _rosbag, "table": _table}
+def _scene(_root: Path, _: str | Path | None, options: _Options) -> Dataset:
+    from optipmb_client.datasets.scene import SceneDataset, scene_options  # noqa: PLC0415  of one format
+
+    numbers = {}
+    for option, value in options.items():
+        if isinstance(value, str):
+            raise DatasetError(f"option {option}", "a number", repr(value))
+        numbers[option] = value
+    return SceneDataset(scene_options(numbers))
+
+
+_OPEN = {"kitti": _kitti, "nuscenes": _nuscenes, "scene": _scene, "mcap": _mcap, "rosbag": _rosbag, "table": _table}
+
+
+@contextlib.contextmanager
+def _needed(what: str, extra: str) -> Iterator[None]:
+    try:
+        yield
+    except ImportError as error:
+        raise ClientError(f"{what}, which is not installed: {install_command(extra)}") from error
+
+
+def _check(options: _Options, *known: str) -> None:
+    for option in options:
+        if option not in known:
+            raise DatasetError(f"option {option}", f"one of {', '.join(known)}", "an unknown option")
 
 
 def dataset_at(path: Path) -> str:
-    """Return the name of the dataset that a file or folder is by its looks.
+    """Return the name of the data set that a file or folder is by its looks.
 
     Raises:
-        DatasetError: it looks like none.
+        DatasetError: It looks like none.
     """
     if not path.is_dir() and tables_in(path):
         return "table"
@@ -170,16 +186,3 @@ def dataset_at(path: Path) -> str:
 def _is_ros2(path: Path) -> bool:
     with path.open("rb") as file:
         return _ROS2_MCAP in file.read(_HEAD)
-
-
-def _known(options: Mapping[str, object], known: set[str]) -> None:
-    for option in options:
-        if option not in known:
-            raise DatasetError(f"option {option}", f"one of {', '.join(sorted(known))}", "an unknown option")
-
-
-def _numbers(options: _Options) -> dict[str, float | bool]:
-    for option, value in options.items():
-        if isinstance(value, str):
-            raise DatasetError(f"option {option}", "a number", repr(value))
-    return {option: value for option, value in options.items() if not isinstance(value, str)}

@@ -5,78 +5,32 @@ That order is by stamp, equal stamps by the name of the sensor. So the tracks ar
 """
 
 import heapq
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol, TypeGuard
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from optipmb_schemas import Tracks
 
-from optipmb_client.datasets.interface import DataSequence, Dataset, DetectionFrame, Truth
+from optipmb_client.datasets.interface import DataSequence, Dataset, DetectionFrame, chosen, relabelled
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Ints, Pose
-from optipmb_client.results import ResultWriter
-
-__all__ = ["FusedDataset", "FusedSequence"]
 
 
-class OfSensor(DataSequence, Protocol):
-    """A sequence that says of which sensor it is."""
+class FusedSequence(DataSequence):
+    """The sequences of several sensors of one recording as one."""
 
-    @property
-    def recording(self) -> str:
-        """What the sequences of sensors that go together have in common, and their name as one."""
-
-    @property
-    def sensor(self) -> str:
-        """Name of the sensor, by which frames with equal stamps are ordered."""
-
-    @property
-    def columns(self) -> dict[str, str]:
-        """Columns of a table of tracks that are the same for the whole recording; empty: those of every dataset."""
-
-    @property
-    def sensor_column(self) -> str:
-        """The column with the name of the sensor."""
-
-
-class OfTable(OfSensor, Protocol):
-    """A sequence of a table, which has columns of its own."""
-
-    @property
-    def time_column(self) -> str:
-        """The column with the times."""
-
-    @property
-    def times(self) -> NDArray[Any]:
-        """(F,) as the table has them."""
-
-
-def _of_sensor(one: DataSequence) -> TypeGuard[OfSensor]:
-    return bool(getattr(one, "sensor", ""))
-
-
-def _of_table(one: OfSensor) -> TypeGuard[OfTable]:
-    return bool(one.columns)
-
-
-class FusedSequence:
-    """The sequences of several sensors as one.
-
-    Args:
-        sensors: of one recording, by the names of the sensors.
-    """
-
-    def __init__(self, sensors: Sequence[OfSensor]) -> None:
+    def __init__(self, sensors: Sequence[DataSequence]) -> None:
         self.sensors = tuple(sorted(sensors, key=lambda one: one.sensor))
-        self.name = self.sensors[0].recording
-        self.labels = tuple(dict.fromkeys(label for one in self.sensors for label in one.labels))
-        self.has_clouds = any(one.has_clouds for one in self.sensors)
         first = self.sensors[0]
-        if _of_table(first):
-            self.key_columns, self.time_column = first.columns, first.time_column
+        self.name = first.recording
+        self.labels: tuple[str, ...] = tuple(dict.fromkeys(label for one in self.sensors for label in one.labels))
+        self.has_clouds: bool = any(one.has_clouds for one in self.sensors)
+        if first.recording_columns:
+            self.key_columns, self.time_column = first.recording_columns, first.time_column
 
     def __len__(self) -> int:
         return sum(map(len, self.sensors))
@@ -84,8 +38,7 @@ class FusedSequence:
     def frames(self) -> Iterator[DetectionFrame]:
         """Yield every frame in the order in which the service tracks them."""
         for index, (_, _, frame) in enumerate(self._merged()):
-            row_of = np.array([self.labels.index(name) for name in frame.labels], dtype=np.int64)
-            label = row_of[frame.label] if len(frame) else frame.label
+            label = relabelled(frame.label, frame.labels, self.labels)
             yield replace(frame, index=index, labels=self.labels, label=label)
 
     def _merged(self) -> Iterator[tuple[int, int, DetectionFrame]]:
@@ -94,7 +47,7 @@ class FusedSequence:
 
     @cached_property
     def _places(self) -> list[tuple[int, int]]:
-        """The sensor, and the frame of its own, of each frame."""
+        """Sensor and own frame of each frame."""
         return [(number, frame.index) for _, number, frame in self._merged()]
 
     @cached_property
@@ -106,28 +59,19 @@ class FusedSequence:
     @cached_property
     def times(self) -> NDArray[Any]:
         """(F,) as the table has them."""
-        times = [one.times for one in self.sensors if _of_table(one)]
+        times = [one.times for one in self.sensors if one.times is not None]
         return np.array([times[number][index] for number, index in self._places])
 
-    @property
+    @cached_property
     def frame_columns(self) -> dict[str, NDArray[np.str_]]:
-        """Further columns (F,) of a table of tracks: the sensor of each frame."""
+        """The column (F,) with the sensor of each frame."""
         names = np.array([one.sensor for one in self.sensors], dtype=np.str_)
         return {self.sensors[0].sensor_column: names[[number for number, _ in self._places]]}
 
-    def rows(self, frame: int) -> Ints:
-        """Return the rows of the table, or else the places in the frame, of the detections (M,) of a frame."""
+    def rows(self, frame: int) -> Ints | None:
+        """Return the row (M,) of each detection of a frame in the table that it came from."""
         number, index = self._places[frame]
-        rows: Callable[[int], Ints] | None = getattr(self.sensors[number], "rows", None)
-        return self._counted if rows is None else rows(index)
-
-    @cached_property
-    def _counted(self) -> Ints:
-        return np.arange(max((len(frame) for _, _, frame in self._merged()), default=0), dtype=np.int64)
-
-    def truth(self) -> Truth | None:
-        """Return None: truth is given for each sensor."""
-        return None
+        return self.sensors[number].rows(index)
 
 
 def _numbered(number: int, sequence: DataSequence) -> Iterator[tuple[int, int, DetectionFrame]]:
@@ -135,46 +79,33 @@ def _numbered(number: int, sequence: DataSequence) -> Iterator[tuple[int, int, D
         yield frame.stamp_ns, number, frame
 
 
-class FusedDataset:
-    """A dataset whose sensors share a density: one sequence for each recording.
-
-    Args:
-        dataset: its sequences say of which sensor they are.
+class FusedDataset(Dataset):
+    """A data set whose sensors share a density: one sequence for each recording.
 
     Raises:
-        DatasetError: they do not.
+        DatasetError: The sequences of the data set do not say of which sensor they are.
     """
 
     def __init__(self, dataset: Dataset) -> None:
         self._dataset = dataset
         self.name = dataset.name
-        found: dict[str, list[OfSensor]] = {}
+        self.notes: tuple[str, ...] = tuple(dataset.notes)
+        found: dict[str, list[DataSequence]] = {}
         for one in dataset.sequences(["all"]):
-            if not _of_sensor(one):
+            if not one.sensor:
                 raise DatasetError("--fuse", "frames that name their sensor: a column `sensor`, streams", one.name)
             found.setdefault(one.recording, []).append(one)
         self._fused = {name: FusedSequence(sensors) for name, sensors in found.items()}
 
-    @property
+    @cached_property
     def profile(self) -> str:
-        """The parameter profile that fits it."""
+        """Profile of the data set itself."""
         return self._dataset.profile
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What was assumed, a line each."""
-        return tuple(getattr(self._dataset, "notes", ()))
 
     def sequences(self, names: Sequence[str]) -> Sequence[DataSequence]:
         """Return the recordings of these names, or `all`."""
-        chosen: dict[str, DataSequence] = {}
-        for name in names:
-            for one in self._fused if name == "all" else (name.replace("/", "."),):
-                if one not in self._fused:
-                    raise DatasetError("--sequences", f"recordings: {', '.join(self._fused)}", repr(name))
-                chosen[one] = self._fused[one]
-        return list(chosen.values())
+        return chosen(names, self._fused, f"recordings: {', '.join(self._fused)}", lambda one: one.replace("/", "."))
 
-    def writer(self, out: Path, sequence: DataSequence) -> ResultWriter:
-        """Return a writer of the results of a recording."""
-        return self._dataset.writer(out, sequence)
+    def write(self, out: Path, sequence: DataSequence, tracks: Mapping[int, Tracks]) -> Path:
+        """Write the results of a recording."""
+        return self._dataset.write(out, sequence, tracks)

@@ -2,50 +2,36 @@
 
 Of a folder of recordings the name of the file comes first: `monday.garage.robot-1.lidar` is in `monday.mcap`.
 
-What is tracked are the frames that the service would track from the recording: each once, with the clouds that took
-part. Frames must be in the order of their stamps here; a recording in which they are not needs a service that is there
+The frames are those that the service would track from the recording: each once, with the clouds that took part.
+ Frames must be in the order of their stamps here; a recording in which they are not needs a service that is there
 when they come late (`optipmb play`). There is no truth.
 """
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
-from optipmb_schemas import Detections, Points, decode
-from optipmb_schemas.installation import install_command
+from optipmb_schemas import Detections, Points, Tracks, decode
 
 from optipmb_client.camera import synthetic_camera
-from optipmb_client.datasets.interface import Cloud, DataSequence, DetectionFrame, Truth
-from optipmb_client.errors import ClientError
+from optipmb_client.datasets.interface import IDENTITY, Cloud, DataSequence, Dataset, DetectionFrame, relabelled
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Floats, Pose, rotation_of, to_sensor
-from optipmb_client.results import ResultWriter
-from optipmb_client.results.kitti import KittiResultWriter
-
-try:
-    from optipmb_client.mcap_files.plan import StreamPlan, plan, steps
-    from optipmb_client.mcap_files.reading import Recorded, RecordingFile
-except ImportError as error:
-    raise ClientError(f"recordings need mcap, which is not installed: {install_command('record')}") from error
-
-_HERE = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+from optipmb_client.recordings.files import Recorded, RecordingFile
+from optipmb_client.recordings.plan import StreamPlan, plan, steps
+from optipmb_client.results.kitti import write_kitti_results
 
 
-class RecordedSequence:
+class RecordedSequence(DataSequence):
     """One stream of a recording."""
-
-    has_clouds: bool
 
     def __init__(self, name: str, recording: RecordingFile, plan_: StreamPlan) -> None:
         self.name = name
         self.sensor = plan_.stream
-        self.sensor_column = "sensor"
-        self.columns: dict[str, str] = {}
         self.recording = f"{name.removesuffix(plan_.stream.rpartition('/')[2])}fused"
-        self.has_clouds = bool(plan_.with_cloud)
+        self.has_clouds: bool = bool(plan_.with_cloud)
         self._recording = recording
         self._plan = replace(plan_, tracks={})  # they are large, and not needed for tracking
         stamps = list(plan_.frames.values())
@@ -73,14 +59,13 @@ class RecordedSequence:
     def frames(self) -> Iterator[DetectionFrame]:
         """Yield every frame in order."""
         for index, (message, cloud) in enumerate(self._messages(clouds=True)):
-            row_of = np.array([self.labels.index(name) for name in message.labels], dtype=np.int64)
             pose, center, yaw, velocity, covariance = _placed(message)
             yield DetectionFrame(
                 index=index,
                 stamp_ns=message.stamp_ns,
                 pose=pose,
                 labels=self.labels,
-                label=row_of[message.label],
+                label=relabelled(message.label, message.labels, self.labels),
                 center=center,
                 size=message.size,
                 yaw=yaw,
@@ -91,10 +76,6 @@ class RecordedSequence:
                 position_covariance=covariance,
             )
 
-    def truth(self) -> Truth | None:
-        """Return None: nobody annotated it."""
-        return None
-
     def _messages(self, *, clouds: bool) -> Iterator[tuple[Detections, Recorded | None]]:
         messages = self._recording if clouds else (one for one in self._recording if one.topic != "points")
         plans = {self._plan.stream: self._plan if clouds else StreamPlan(self._plan.stream)}
@@ -103,7 +84,7 @@ class RecordedSequence:
                 yield decode(step.detections.payload, Detections, encoding=step.detections.encoding), step.cloud
 
 
-class RecordedDataset:
+class RecordedDataset(Dataset):
     """The streams of one recording, or of all recordings of a folder.
 
     Args:
@@ -122,7 +103,7 @@ class RecordedDataset:
         self._files = {f"{file.stem}." if path.is_dir() else "": RecordingFile(file) for file in files}
         self._planned: tuple[str, dict[str, StreamPlan]] | None = None
 
-    @property
+    @cached_property
     def profile(self) -> str:
         """The profile that was in force when it was recorded, of the first stream that tells."""
         for one in (one for prefix in self._files for one in self._plans(prefix).values()):
@@ -152,7 +133,7 @@ class RecordedDataset:
         return list(chosen.values())
 
     def _plans(self, prefix: str) -> dict[str, StreamPlan]:
-        """Return what one file holds, by the full names of its streams; that of the last one is kept."""
+        """Return the plans of one file by the full names of its streams; the last ones are cached."""
         if self._planned is None or self._planned[0] != prefix:
             recording = self._files[prefix]
             plans = {prefix + stream.replace("/", "."): one for stream, one in plan(recording).items()}
@@ -161,9 +142,9 @@ class RecordedDataset:
             self._planned = prefix, plans
         return self._planned[1]
 
-    def writer(self, out: Path, sequence: DataSequence) -> ResultWriter:
-        """Return a writer of `out/NAME.txt` in the format of KITTI, for a camera in the sensor's place."""
-        return KittiResultWriter(out / f"{sequence.name}.txt", synthetic_camera())
+    def write(self, out: Path, sequence: DataSequence, tracks: Mapping[int, Tracks]) -> Path:
+        """Write `out/NAME.txt` in the format of KITTI, for a camera in the sensor's place."""
+        return write_kitti_results(out / f"{sequence.name}.txt", synthetic_camera(), sequence.poses, tracks)
 
 
 def _is_recording(file: Path) -> bool:
@@ -172,14 +153,14 @@ def _is_recording(file: Path) -> bool:
 
 def _pose(message: Detections | Points) -> Pose:
     if message.frame == "world" or message.pose is None:
-        return _HERE
+        return IDENTITY
     return Pose(message.pose.translation, message.pose.quaternion)
 
 
 def _placed(message: Detections) -> tuple[Pose, Floats, Floats, Floats | None, Floats | None]:
     """Return pose, centres, yaws, velocities and covariances of the centres.
 
-    Those of the world are carried to a sensor with a field of view.
+    Boxes in the world frame are carried to a sensor with a field of view.
     """
     center, yaw, velocity, covariance = message.center, message.yaw, message.velocity, message.position_covariance
     if message.frame == "sensor" or message.pose is None or message.field_of_view is None:

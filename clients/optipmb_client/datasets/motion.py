@@ -17,48 +17,34 @@ if TYPE_CHECKING:
 
     from optipmb_client.datasets.interface import DataSequence
 
-__all__ = ["Moves", "find_moves", "headings_along", "overlapping"]
 
 LEAST_MOVE: Final = 1.5
 LONGEST_CHAIN: Final = 15
 LONGEST_STEP_S: Final = 2.0
-REACH: Final = (1.0, 40.0, 12.0)
-"""Longest link: metres, plus metres per second of the step, up to a limit."""
-DISTINCT: Final = 1.5
-"""A second box of the class must be so many times as far away."""
+REACH: Final = (1.0, 40.0, 12.0)  # longest link: metres, plus metres per second of the step, up to a limit
+DISTINCT: Final = 1.5  # a second box of the class must be so many times as far away
 SURE_MOVES: Final = 10
 LEAST_ALONG: Final = 0.3
 """Moves from which headings are refused or doubted, and the share along them below which they are doubted."""
 MOST_FRAMES: Final = 600
-MOST_BOXES: Final = 300
-"""Boxes of a frame that are looked at; bounds the work."""
-SAME_DIRECTION: Final = np.deg2rad(20.0)
-"""Largest angle between a heading and a move along it."""
-CREW: Final = 4
-"""Links from which neighbouring frames tell a common motion."""
-MOST: Final = 0.5
-"""Share of the links of two frames that make one rigid motion."""
-RIGID: Final = 0.3
-"""Largest distance in metres of a box from where that motion takes it."""
+MOST_BOXES: Final = 300  # boxes of a frame that are looked at; bounds the work
+SAME_DIRECTION: Final = np.deg2rad(20.0)  # largest angle between a heading and a move along it
+CREW: Final = 4  # links from which neighbouring frames tell a common motion
+MOST: Final = 0.5  # share of the links of two frames that make one rigid motion
+RIGID: Final = 0.3  # largest distance in metres of a box from where that motion takes it
 COMMON_SPEED: Final = 2.0
-LEAST_STEP: Final = 0.4
-"""Speed in m/s and step in metres from which a common motion is none of noise."""
-LARGEST_OVERLAP: Final = 2.5
-"""Distance in metres from which the centres of two boxes of a class are two places."""
+LEAST_STEP: Final = 0.4  # speed in m/s and step in metres from which a common motion is none of noise
+LARGEST_OVERLAP: Final = 2.5  # distance in metres from which the centres of two boxes of a class are two places
 
 
 @dataclass(frozen=True)
 class Moves:
     """Moves of boxes, and the motion that boxes have in common."""
 
-    start: Ints
-    """(K,) row of the box at the start."""
-    end: Ints
-    """(K,) row of the same object's box at the end."""
-    step: Floats
-    """(K, 2) displacement, m."""
-    duration: Floats
-    """(K,) s."""
+    start: Ints  # (K,) row of the box at the start
+    end: Ints  # (K,) row of the same object's box at the end
+    step: Floats  # (K, 2) displacement, m
+    duration: Floats  # (K,) s
     common: float
     """Share of pairs of neighbouring frames most of whose boxes make one rigid motion, faster than `COMMON_SPEED`."""
 

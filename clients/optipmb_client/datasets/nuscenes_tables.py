@@ -1,6 +1,6 @@
 """The tables of nuScenes: one JSON list of records per table, joined by tokens.
 
-Tables are read record by record and only what is used is kept, so the largest ones (a gigabyte each in the full
+Tables are read record by record and only used fields are kept, so the largest ones (a gigabyte each in the full
 release) never stand in memory. Conventions as in the dataset: global frame = world, metres, poses map the inner frame
 to the outer one. Stamps are microseconds, as recorded.
 """
@@ -9,7 +9,7 @@ import json
 import re
 from array import array
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -32,8 +32,7 @@ def read_table(folder: Path, table: str, *names: str) -> Iterator[tuple[Any, ...
     """Yield the named fields of every record of a table.
 
     Raises:
-        DatasetError: the file cannot be read or is not a list of records with these fields.
-
+        DatasetError: The file cannot be read or is not a list of records with these fields.
     """
     path = folder / f"{table}.json"
     what = f"the table {table}, a JSON list of records with {', '.join(names)}"
@@ -81,8 +80,7 @@ class SceneSamples:
 
     name: str
     tokens: tuple[str, ...]
-    stamp_us: Ints
-    """(F,)"""
+    stamp_us: Ints  # (F,)
 
     def __len__(self) -> int:
         return len(self.tokens)
@@ -92,38 +90,25 @@ class SceneSamples:
 class Keyframe:
     """Where car and LiDAR were at a keyframe."""
 
-    ego: Pose
-    """World from car, at the time of the scan."""
-    lidar: Pose
-    """World from LiDAR."""
-    filename: str
-    """Of the scan, below the folder of the tables' folder."""
+    ego: Pose  # world from car, at the time of the scan
+    lidar: Pose  # world from LiDAR
+    filename: str  # of the scan, below the folder of the tables' folder
 
 
 @dataclass(frozen=True)
 class Annotations:
     """Annotated boxes of one scene, of all categories, ordered by frame and within a frame as in the table."""
 
-    frame: Ints
-    """(R,)"""
-    instance: Ints
-    """(R,) index of the object in the table of instances."""
-    category: tuple[str, ...]
-    """R names, such as vehicle.car."""
-    center: Floats
-    """(R, 3)"""
-    size: Floats
-    """(R, 3) length, width, height"""
-    rotation: Floats
-    """(R, 4) quaternion w x y z"""
-    velocity: Floats
-    """(R, 2) from the annotations of the same object before and after; NaN where there are none near in time."""
-    lidar_points: Ints
-    """(R,)"""
-    radar_points: Ints
-    """(R,)"""
-    visibility: Ints
-    """(R,) 1: up to 40 %, 2: up to 60 %, 3: up to 80 %, 4: more of it is seen by the cameras; 0: unknown."""
+    frame: Ints  # (R,)
+    instance: Ints  # (R,) index of the object in the table of instances
+    category: tuple[str, ...]  # R names, such as vehicle.car
+    center: Floats  # (R, 3)
+    size: Floats  # (R, 3) length, width, height
+    rotation: Floats  # (R, 4) quaternion w x y z
+    velocity: Floats  # (R, 2) from the annotations of the same object before and after; NaN where none is near in time
+    lidar_points: Ints  # (R,)
+    radar_points: Ints  # (R,)
+    visibility: Ints  # (R,) seen by cameras: 1: up to 40 %, 2: up to 60 %, 3: up to 80 %, 4: more; 0: unknown
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -185,76 +170,62 @@ class NuScenesTables:
 
     def annotations(self, scene: str) -> Annotations:
         """Return the annotations of a scene; there are none in the tables of the test split."""
-        table, place = self._annotations, list(self.scenes).index(scene)
-        start, stop = np.searchsorted(table.scene, [place, place + 1]).tolist()
-        rows = slice(start, stop)
-        return Annotations(
-            frame=table.integers[rows, 0],
-            instance=table.integers[rows, 1],
-            category=tuple(table.categories[i] for i in table.integers[rows, 2].tolist()),
-            center=table.boxes[rows, 0:3],
-            size=table.boxes[rows, 3:6],
-            rotation=table.boxes[rows, 6:10],
-            velocity=table.velocity[rows],
-            lidar_points=table.integers[rows, 4],
-            radar_points=table.integers[rows, 5],
-            visibility=table.integers[rows, 3],
-        )
+        scenes, everything = self._annotations
+        place = list(self.scenes).index(scene)
+        start, stop = np.searchsorted(scenes, [place, place + 1]).tolist()
+        return Annotations(*(getattr(everything, column.name)[start:stop] for column in fields(Annotations)))
 
     @cached_property
-    def _annotations(self) -> "_AnnotationTable":
-        return _read_annotations(self)
-
-
-@dataclass(frozen=True)
-class _AnnotationTable:
-    scene: Ints
-    """(R,) ascending"""
-    integers: Ints
-    """(R, 6) frame, instance, category, visibility, LiDAR points, radar points"""
-    boxes: Floats
-    """(R, 10)"""
-    velocity: Floats
-    """(R, 2)"""
-    categories: tuple[str, ...]
-
-
-def _read_annotations(tables: NuScenesTables) -> _AnnotationTable:
-    folder = tables.folder
-    place = {
-        token: (i, frame) for i, scene in enumerate(tables.scenes.values()) for frame, token in enumerate(scene.tokens)
-    }
-    names = dict(read_table(folder, "category", "token", "name"))
-    categories = tuple(dict.fromkeys(names.values()))
-    code = {token: categories.index(name) for token, name in names.items()}
-    levels = {token: _VISIBILITY.get(level, 0) for token, level in read_table(folder, "visibility", "token", "level")}
-    objects = {
-        token: (i, category)
-        for i, (token, category) in enumerate(read_table(folder, "instance", "token", "category_token"))
-    }
-    integers, boxes = array("q"), array("d")
-    fields = ("token", "sample_token", "instance_token", "visibility_token", "num_lidar_pts", "num_radar_pts")
-    for token, sample, instance, visibility, lidar, radar, *parts in read_table(
-        folder, "sample_annotation", *fields, "translation", "size", "rotation"
-    ):
-        try:
-            number, category = objects[instance]
-            integers.extend((*place[sample], number, code[category], levels.get(visibility, 0), int(lidar), int(radar)))
-            if tuple(map(len, parts)) != _LENGTHS:
-                raise ValueError("translation, size or rotation of another length")  # noqa: TRY301  one place for all
-            for part in parts:
-                boxes.extend(part)
-        except (KeyError, TypeError, ValueError) as error:
-            path = folder / "sample_annotation.json"
-            raise DatasetError(path, f"known tokens and numbers in record {token}", str(error)) from error
-    whole = np.array(integers, dtype=np.int64).reshape(-1, 7)
-    box = np.array(boxes, dtype=np.float64).reshape(-1, 10)[:, [0, 1, 2, 4, 3, 5, 6, 7, 8, 9]]
-    order = np.lexsort((whole[:, 1], whole[:, 0]))
-    whole, box = whole[order], box[order]
-    stamps = [scene.stamp_us for scene in tables.scenes.values()]
-    first = np.cumsum([0, *map(len, stamps)])[whole[:, 0]]
-    stamp = np.concatenate([np.empty(0, dtype=np.int64), *stamps])[first + whole[:, 1]]
-    return _AnnotationTable(whole[:, 0], whole[:, 1:], box, box_velocity(whole[:, 2], stamp, box[:, :2]), categories)
+    def _annotations(self) -> tuple[Ints, Annotations]:
+        """Scene (R,), ascending, of all annotations."""
+        folder = self.folder
+        place = {
+            token: (i, frame)
+            for i, scene in enumerate(self.scenes.values())
+            for frame, token in enumerate(scene.tokens)
+        }
+        names = dict(read_table(folder, "category", "token", "name"))
+        categories = tuple(dict.fromkeys(names.values()))
+        code = {token: categories.index(name) for token, name in names.items()}
+        visibility = read_table(folder, "visibility", "token", "level")
+        levels = {token: _VISIBILITY.get(level, 0) for token, level in visibility}
+        instances = enumerate(read_table(folder, "instance", "token", "category_token"))
+        objects = {token: (i, category) for i, (token, category) in instances}
+        integers, boxes = array("q"), array("d")
+        columns = ("token", "sample_token", "instance_token", "visibility_token", "num_lidar_pts", "num_radar_pts")
+        for token, sample, instance, level, lidar, radar, *parts in read_table(
+            folder, "sample_annotation", *columns, "translation", "size", "rotation"
+        ):
+            try:
+                number, category = objects[instance]
+                integers.extend((*place[sample], number, code[category], levels.get(level, 0), int(lidar), int(radar)))
+                if tuple(map(len, parts)) != _LENGTHS:
+                    raise ValueError("translation, size or rotation of another length")  # noqa: TRY301  one place for all
+                for part in parts:
+                    boxes.extend(part)
+            except (KeyError, TypeError, ValueError) as error:
+                path = folder / "sample_annotation.json"
+                raise DatasetError(path, f"known tokens and numbers in record {token}", str(error)) from error
+        whole = np.array(integers, dtype=np.int64).reshape(-1, 7)
+        box = np.array(boxes, dtype=np.float64).reshape(-1, 10)
+        order = np.lexsort((whole[:, 1], whole[:, 0]))
+        box = box[order]
+        scene, frame, instance, category, level, lidar, radar = whole[order].T
+        stamps = [one.stamp_us for one in self.scenes.values()]
+        first = np.cumsum([0, *map(len, stamps)])[scene]
+        stamp = np.concatenate([np.empty(0, dtype=np.int64), *stamps])[first + frame]
+        return scene, Annotations(
+            frame=frame,
+            instance=instance,
+            category=tuple(categories[i] for i in category.tolist()),
+            center=box[:, 0:3],
+            size=box[:, [4, 3, 5]],
+            rotation=box[:, 6:10],
+            velocity=box_velocity(instance, stamp, box[:, :2]),
+            lidar_points=lidar,
+            radar_points=radar,
+            visibility=level,
+        )
 
 
 def box_velocity(instance: Ints, stamp_us: Ints, position: Floats, longest_s: float = 1.5) -> Floats:
@@ -269,7 +240,6 @@ def box_velocity(instance: Ints, stamp_us: Ints, position: Floats, longest_s: fl
         stamp_us: (R,) microseconds.
         position: (R, 2) metres.
         longest_s: seconds.
-
     """
     order = np.lexsort((stamp_us, instance))
     same = instance[order][1:] == instance[order][:-1]

@@ -17,7 +17,6 @@ Where the paper leaves a choice, the choices are those of its published evaluati
 - Truth boxes that are largely invisible, cut by the image's border, or vans (for cars) do not count, whether they are
   found or not; but boxes that match them do count in MOTP, TP, precision, recall and in the recall points.
 - Unmatched tracks at most 25 pixels high, or with more than half of their image box in a DontCare region, do not count.
-- Persons whom the labels call `Person` are not known: a pedestrian track on one is false.
 - The track of an object changes only between two frames that follow each other in the object's life; both FRAG and the
   share of an object's life that is followed treat the first and the last frame of the life in a way of their own.
 - AMOTA sums MOTA_r as it is, negative too. Among equal values of MOTA the highest threshold is the best one, and if no
@@ -28,13 +27,13 @@ score is rounded, and a box that was matched at one threshold cannot be excused 
 one.
 """
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from optipmb_client.evaluation.assignment import by_frame, most_pairs, uncontested
-from optipmb_client.evaluation.cases import Case, Rules
+from optipmb_client.evaluation.cases import Case, by_frame, most_pairs, uncontested
+from optipmb_client.evaluation.figures import defined
 from optipmb_client.geometry import Floats, Ints
 
 IOU_LIMITS = (0.25, 0.5, 0.7)
@@ -42,28 +41,13 @@ IOU_LIMITS = (0.25, 0.5, 0.7)
 POINTS = 40
 """Recall points (L)."""
 
-_NEIGHBOURS: dict[str, tuple[str, ...]] = {"Car": ("Van",), "Pedestrian": ("Person_sitting",)}
-_MIN_HEIGHT = 25.0
 _MOSTLY = 0.8
 _HARDLY = 0.2
 
 
-def ab3dmot_rules(limit: float = IOU_LIMITS[0]) -> Rules:
-    """Return the rules of the protocol for cases of boxes that match from an intersection over union on."""
-    return Rules(
-        "iou_3d",
-        limit,
-        continuity=False,
-        memory=False,
-        neighbours=_NEIGHBOURS,
-        min_height=_MIN_HEIGHT,
-        regions=True,
-    )
-
-
 @dataclass(frozen=True)
 class Counts:
-    """What is counted when tracks from some score on are kept; counts of several sequences add up."""
+    """Counts of the tracks from some score on; those of several sequences add up."""
 
     truth: int = 0
     """Truth boxes that count (GT)."""
@@ -167,23 +151,24 @@ class Ab3dmotResult:
             "MT": _ratio(best.mostly_tracked, best.objects),
             "ML": _ratio(best.mostly_lost, best.objects),
         }
-        return {name: value if np.isfinite(value) else None for name, value in figures.items()}
+        return {name: defined(value) for name, value in figures.items()}
 
 
 def evaluate_ab3dmot(cases: Sequence[Case], limit: float = IOU_LIMITS[0]) -> Ab3dmotResult:
     """Return the figures of one class.
 
     Args:
-        cases: the class in each sequence, by `ab3dmot_rules` with at most this limit.
+        cases: the class in each sequence, by `cases.ab3dmot_rules` with at most this limit.
         limit: least 3D intersection over union of a match.
 
     """
-    sequences = [_Sequence(_from_overlap(case, limit)) for case in cases]
+    sequences = [_Sequence(case.pairs(case.similarity >= limit)) for case in cases]
     matches = [sequence.match(-np.inf) for sequence in sequences]
-    everything = _total(sequence.counts(-np.inf, match) for sequence, match in zip(sequences, matches, strict=True))
+    counts = (sequence.counts(-np.inf, match) for sequence, match in zip(sequences, matches, strict=True))
+    everything = sum(counts, Counts())
     scores = [sequence.means[match[match >= 0]] for sequence, match in zip(sequences, matches, strict=True)]
     points = tuple(
-        Point(recall, threshold, _total(sequence.counts(threshold) for sequence in sequences))
+        Point(recall, threshold, sum((sequence.counts(threshold) for sequence in sequences), Counts()))
         for threshold, recall in recall_points(
             np.concatenate([np.empty(0), *scores]), everything.true + everything.missed
         )
@@ -229,7 +214,7 @@ class _Sequence:
         self._alone = np.flatnonzero(alone)
         self._contests = [
             _Contest(case, pairs, self.means[case.track_row[pairs]])
-            for pairs in by_frame(case.truth_frame[case.truth_row], np.flatnonzero(~alone))
+            for pairs in by_frame(case.pair_frame, np.flatnonzero(~alone))
         ]
         # Truth rows in the order of objects, and of frames in each object.
         self._order = np.lexsort((case.truth_frame, case.truth_id))
@@ -271,7 +256,7 @@ class _Sequence:
         return float(case.similarity[match[case.truth_row] == case.track_row].sum())
 
     def _lives(self, match: Ints) -> dict[str, int]:
-        """Return what is counted along the lives of objects."""
+        """Return the counts along the lives of objects."""
         match = match[self._order]
         track = np.where(match >= 0, np.append(self._track, -1)[match], -1)
         first, last, ignored = self._first, self._last, self._ignored
@@ -316,20 +301,6 @@ class _Contest:
             taken = most_pairs(case.truth_row[pairs], case.track_row[pairs], case.cost[pairs]) if count else pairs
             self._solved[count] = pairs[taken]
         return self._solved[count]
-
-
-def _from_overlap(case: Case, limit: float) -> Case:
-    """Return the case with only the pairs that overlap enough."""
-    kept = case.similarity >= limit
-    columns = ("truth_row", "track_row", "cost", "similarity")
-    return replace(case, **{name: getattr(case, name)[kept] for name in columns})
-
-
-def _total(parts: Iterable[Counts]) -> Counts:
-    total = Counts()
-    for part in parts:
-        total += part
-    return total
 
 
 def _ratio(part: float, whole: float) -> float:

@@ -1,4 +1,4 @@
-"""Whether the tracker knows how well it knows: covariances and existence probabilities against the truth.
+"""Calibration: covariances and existence probabilities of tracks against the truth.
 
 Conventions: world frame, centres in the plane, metres. For a track that is matched to an object at an offset
 e = (x, y) and whose position has the covariance P, the normalised estimation error squared is
@@ -15,7 +15,7 @@ An existence probability is reliable when, of all tracks that are said to exist 
 are matched to an object. The table has one row for each tenth.
 
 Matches are made in each frame on its own: most pairs up to 2 m apart, then the least total distance. What is ignored in
-`optipmb_client.evaluation.counted` is so here too.
+`optipmb_client.evaluation.cases.counted` is so here too.
 """
 
 from collections.abc import Iterable
@@ -25,9 +25,8 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from optipmb_client.datasets import Truth
-from optipmb_client.evaluation.assignment import assign_frames, most_pairs
-from optipmb_client.evaluation.cases import Rules, prepare
-from optipmb_client.evaluation.counted import counted
+from optipmb_client.evaluation.cases import Rules, assign_frames, counted, most_pairs, prepare
+from optipmb_client.evaluation.figures import defined
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Bools, Floats, Ints
 from optipmb_client.results import ResultTable
@@ -37,7 +36,7 @@ DECILES = 10
 
 _DIMENSIONS = 2
 _LEVEL = 0.95
-_NORMAL = 1.959963984540054
+NORMAL_95 = 1.959963984540054
 """A standard normal variable is between minus and plus this with 95 %."""
 
 
@@ -98,7 +97,7 @@ class CalibrationResult:
             return float("nan"), float("nan")
         sums = np.bincount(self.owner, self.nees - self.mean)
         error = np.sqrt((sums**2).sum() * count / (count - 1)) / len(self.nees)
-        return self.mean - _NORMAL * float(error), self.mean + _NORMAL * float(error)
+        return self.mean - NORMAL_95 * float(error), self.mean + NORMAL_95 * float(error)
 
     @property
     def coverage(self) -> float:
@@ -127,12 +126,12 @@ class CalibrationResult:
     def summary(self) -> dict[str, object]:
         """Return the figures by name; None for those that are not defined."""
         return {
-            "NEES": _plain(self.mean),
-            "band": [_plain(value) for value in self.band],
-            "interval": [_plain(value) for value in self.interval],
-            "coverage": _plain(self.coverage),
-            "error": _plain(_root_mean_square(self.error)),
-            "expected_error": _plain(_root_mean_square(self.spread)),
+            "NEES": defined(self.mean),
+            "band": [defined(value) for value in self.band],
+            "interval": [defined(value) for value in self.interval],
+            "coverage": defined(self.coverage),
+            "error": defined(_root_mean_square(self.error)),
+            "expected_error": defined(_root_mean_square(self.spread)),
             "samples": len(self.nees),
             "objects": len(np.unique(self.owner)),
             "existence": [
@@ -140,8 +139,8 @@ class CalibrationResult:
                     "from": decile.low,
                     "to": decile.high,
                     "count": decile.count,
-                    "predicted": _plain(decile.predicted),
-                    "observed": _plain(decile.observed),
+                    "predicted": defined(decile.predicted),
+                    "observed": defined(decile.observed),
                 }
                 for decile in self.deciles
             ],
@@ -163,10 +162,8 @@ def evaluate_calibration(
 
     """
     none = np.empty(0)
-    total = CalibrationResult(none, np.empty(0, np.int64), none, none, none, np.empty(0, np.bool_))
-    for truth, tracks, full in parts:
-        total += calibration(truth, tracks, full, name, rules)
-    return total
+    start = CalibrationResult(none, np.empty(0, np.int64), none, none, none, np.empty(0, np.bool_))
+    return sum((calibration(truth, tracks, full, name, rules) for truth, tracks, full in parts), start)
 
 
 @dataclass(frozen=True)
@@ -186,12 +183,12 @@ class Sample:
 def sample(truth: Truth, tracks: ResultTable, full: FullTable, name: str, rules: Rules) -> Sample:
     """Match the tracks of one class in one sequence; arguments and errors as for `evaluate_calibration`."""
     case = counted(prepare(truth, tracks, name, rules), rules)
-    taken = assign_frames(case.truth_frame[case.truth_row], case.truth_row, case.track_row, case.cost, most_pairs)
+    taken = assign_frames(case.pair_frame, case.truth_row, case.track_row, case.cost, most_pairs)
     truth_row, track_row = case.truth_row[taken], case.track_row[taken]
-    known = _rows(full.frame, full.id, case.track_frame, case.track_id)
+    known = rows_of(full.frame, full.id, case.track_frame, case.track_id)
     if (known < 0).any():
         raise DatasetError("the tracks with all columns", "the same tracks as in the result file", "others")
-    place = _rows(truth.frame, truth.id, case.truth_frame[truth_row], case.truth_id[truth_row])
+    place = rows_of(truth.frame, truth.id, case.truth_frame[truth_row], case.truth_id[truth_row])
     offset = np.full((len(known), 2), np.nan)
     offset[track_row] = full.center[known[track_row], :2] - truth.center[place, :2]
     owner = np.full(len(known), -1, dtype=np.int64)
@@ -221,7 +218,7 @@ def _nees(offset: Floats, covariance: Floats) -> Floats:
     return np.asarray(np.einsum("ni,ni->n", offset, np.linalg.solve(covariance, offset[..., None])[..., 0]))
 
 
-def _rows(frame: Ints, identity: Ints, frames: Ints, identities: Ints) -> Ints:
+def rows_of(frame: Ints, identity: Ints, frames: Ints, identities: Ints) -> Ints:
     """Return the row of each wanted frame and id in a table, -1 where it has none."""
     place = {key: row for row, key in enumerate(zip(frame.tolist(), identity.tolist(), strict=True))}
     wanted = zip(frames.tolist(), identities.tolist(), strict=True)
@@ -230,7 +227,3 @@ def _rows(frame: Ints, identity: Ints, frames: Ints, identities: Ints) -> Ints:
 
 def _root_mean_square(values: Floats) -> float:
     return float(np.sqrt((values**2).mean())) if len(values) else float("nan")
-
-
-def _plain(value: float) -> float | None:
-    return None if np.isnan(value) else value

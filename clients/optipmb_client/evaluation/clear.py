@@ -9,7 +9,6 @@ figure that would be a quotient by zero is NaN. MT and ML count the truth object
 than 20 % of their frames; FRAG counts how often following one goes on after a break.
 """
 
-from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -17,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from optipmb_client.datasets import Truth
-from optipmb_client.evaluation.assignment import by_frame, most_pairs, uncontested
-from optipmb_client.evaluation.cases import Case, Rules, prepare
+from optipmb_client.evaluation.cases import Case, Rules, by_frame, most_pairs, prepare, uncontested
+from optipmb_client.evaluation.figures import defined
 from optipmb_client.geometry import Bools, Ints
 from optipmb_client.results import ResultTable
 
@@ -50,24 +49,27 @@ class Miss(NamedTuple):
 
 @dataclass(frozen=True)
 class ClearResult:
-    """CLEAR figures of one class, in one sequence or in several together."""
+    """CLEAR figures of one class; those of several sequences add up."""
 
-    truth: int
+    truth: int = 0
     """Truth boxes that count (GT)."""
-    true: int
+    true: int = 0
     """Matched ones (TP)."""
-    false: int
+    false: int = 0
     """Track boxes that match nothing (FP)."""
-    fragments: int
+    fragments: int = 0
     """FRAG"""
-    objects: int
+    objects: int = 0
     """Truth objects of which at least one box counts."""
-    mostly_tracked: int
-    mostly_lost: int
-    similarity: float
+    mostly_tracked: int = 0
+    mostly_lost: int = 0
+    similarity: float = 0.0
     """Sum of the measure over the matched boxes."""
-    switches: tuple[Switch, ...]
-    misses: tuple[Miss, ...]
+    switches: tuple[Switch, ...] = ()
+    misses: tuple[Miss, ...] = ()
+
+    def __add__(self, other: "ClearResult") -> "ClearResult":
+        return ClearResult(**{name: value + getattr(other, name) for name, value in vars(self).items()})
 
     @property
     def missed(self) -> int:
@@ -111,7 +113,7 @@ class ClearResult:
             "ML": self.mostly_lost,
             "objects": self.objects,
         }
-        return {name: None if np.isnan(value) else value for name, value in figures.items()}
+        return {name: defined(value) for name, value in figures.items()}
 
 
 def evaluate_clear(
@@ -140,7 +142,7 @@ def clear(case: Case, rules: Rules) -> ClearResult:
     used[match[hit]] = True
     switches: list[Switch] = []
     fragments = objects = mostly = hardly = 0
-    for rows in _by_id(case.truth_id).values():
+    for rows in by_frame(case.truth_id, np.arange(len(case.truth_id))):
         if not counts[rows].any():
             continue
         objects += 1
@@ -165,20 +167,8 @@ def clear(case: Case, rules: Rules) -> ClearResult:
 
 
 def combine(results: Iterable[ClearResult]) -> ClearResult:
-    """Return the figures of several sequences together: counts add up."""
-    parts = list(results)
-    return ClearResult(
-        truth=sum(part.truth for part in parts),
-        true=sum(part.true for part in parts),
-        false=sum(part.false for part in parts),
-        fragments=sum(part.fragments for part in parts),
-        objects=sum(part.objects for part in parts),
-        mostly_tracked=sum(part.mostly_tracked for part in parts),
-        mostly_lost=sum(part.mostly_lost for part in parts),
-        similarity=sum(part.similarity for part in parts),
-        switches=tuple(switch for part in parts for switch in part.switches),
-        misses=tuple(miss for part in parts for miss in part.misses),
-    )
+    """Return the figures of several sequences together."""
+    return sum(results, ClearResult())
 
 
 @dataclass(frozen=True)
@@ -225,7 +215,7 @@ def match_frames(case: Case, rules: Rules) -> tuple[Ints, np.ndarray]:
     similarity[case.truth_row[alone]] = case.similarity[alone]
     contested = np.flatnonzero(~alone)
     earlier = _earlier_rows(case) if rules.continuity and len(contested) else np.empty(0, dtype=np.int64)
-    for pairs in by_frame(case.truth_frame[case.truth_row], contested):
+    for pairs in by_frame(case.pair_frame, contested):
         truth, track = case.truth_row[pairs], case.track_row[pairs]
         chosen = _kept(case, pairs, match, earlier) if rules.continuity else np.zeros(len(pairs), dtype=np.bool_)
         free = ~np.isin(truth, truth[chosen]) & ~np.isin(track, track[chosen])
@@ -248,8 +238,7 @@ def _kept(case: Case, pairs: Ints, match: Ints, earlier: Ints) -> Bools:
             row = int(earlier[row])
         if row >= 0 and case.track_id[match[row]] == case.track_id[track]:
             frame = int(case.truth_frame[row])
-            rival = since.get(track)
-            if rival is None or frame > rival[0]:
+            if track not in since or frame > since[track][0]:
                 since[track] = frame, place
     kept[[place for _, place in since.values()]] = True
     return kept
@@ -285,14 +274,6 @@ def _fragments(hit: Bools) -> int:
     if not len(first):
         return 0
     return int(np.sum(np.diff(hit[first[0] :].astype(np.int64)) == 1))
-
-
-def _by_id(identity: Ints) -> dict[int, Ints]:
-    """Return the rows of each id, in order."""
-    rows: defaultdict[int, list[int]] = defaultdict(list)
-    for row, value in enumerate(identity.tolist()):
-        rows[value].append(row)
-    return {value: np.array(index, dtype=np.int64) for value, index in rows.items()}
 
 
 def _ratio(part: float, whole: float) -> float:

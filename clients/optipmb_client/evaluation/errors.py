@@ -1,11 +1,11 @@
-"""How far boxes are off, in every direction: those of tracks beside those of the detections that they are made of.
+"""Errors of boxes in every direction: those of tracks beside those of the detections that they are made of.
 
 Conventions: world frame, metres and radians, box minus label. `along` and `across` are offsets of the centre along and
 across the heading of the label, `height` is that of the centre upwards. Headings are compared modulo pi; a box is
 backward when its heading is off by more than half of pi. Tracks count from an existence probability of a half on; only
 boxes with a detection of their own in the frame are compared, so that both columns are of the same objects at the same
 times. Labels and tracks belong together as in `optipmb_client.evaluation.calibration`. Where the dataset was opened
-without the detections that the tracks were made of, the headings alone are judged, and `without` says why.
+without the detections that the tracks were made of, only headings are compared, and `without` has the reason.
 """
 
 import itertools
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from optipmb_client.datasets import DataSequence, DatasetError, Truth
-from optipmb_client.evaluation.calibration import sample
+from optipmb_client.evaluation.calibration import NORMAL_95, rows_of, sample
 from optipmb_client.evaluation.cases import Rules
 from optipmb_client.geometry import Bools, Floats, Ints, stack_poses, to_world, wrap_angle
 from optipmb_client.results import ResultTable
@@ -31,8 +31,6 @@ SPEEDS = (0.0, 1.0, 8.0, np.inf)
 """Speeds of tracks, m/s."""
 _HEADING = 3
 _HALF = 0.5 * np.pi
-_NORMAL = 1.959963984540054
-"""A standard normal variable is between minus and plus this with 95 %."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +81,7 @@ class ErrorResult:
                 "boxes": int(group.sum()),
                 "backward": _backward(self.track[group]),
                 "NEES": _mean(squared),
-                "coverage": _mean(squared <= _NORMAL**2),
+                "coverage": _mean(squared <= NORMAL_95**2),
             },
         }
 
@@ -105,10 +103,7 @@ def evaluate_errors(
 
     """
     none, boxes = np.empty(0), np.empty((0, len(DIRECTIONS)))
-    total = ErrorResult(boxes, boxes, none, none, none)
-    for sequence, truth, tracks, full in parts:
-        total += errors(sequence, truth, tracks, full, name, rules)
-    return total
+    return sum((errors(*part, name, rules) for part in parts), ErrorResult(boxes, boxes, none, none, none))
 
 
 def errors(
@@ -119,16 +114,13 @@ def errors(
     rows, owner = found.row[found.true], found.owner[found.true]
     sure = full.existence[rows] >= CONFIRMED
     rows, owner = rows[sure], owner[sure]
-    place = {key: row for row, key in enumerate(zip(truth.frame.tolist(), truth.id.tolist(), strict=True))}
-    label = np.array(
-        [place[key] for key in zip(full.frame[rows].tolist(), owner.tolist(), strict=True)], dtype=np.int64
-    )
+    label = rows_of(truth.frame, truth.id, full.frame[rows], owner)
     without = ""
+    center, size, yaw = (np.full((len(rows), *tail), np.nan) for tail in ((3,), (3,), ()))
     try:
         center, size, yaw = _detections(sequence, full, rows)
     except DatasetError as error:
         without = str(error)
-        center, size, yaw = (np.full((len(rows), *tail), np.nan) for tail in ((3,), (3,), ()))
     sensor = np.array([sequence.poses[frame].translation[:2] for frame in full.frame[rows].tolist()]).reshape(-1, 2)
     return ErrorResult(
         track=_errors(truth, label, full.center[rows], full.size[rows], full.yaw[rows]),

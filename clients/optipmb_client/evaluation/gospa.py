@@ -20,9 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optipmb_client.evaluation.assignment import assign_frames, best_pairs
-from optipmb_client.evaluation.cases import Case, Rules
-from optipmb_client.evaluation.counted import counted
+from optipmb_client.evaluation.cases import Case, Rules, assign_frames, best_pairs, counted
 from optipmb_client.geometry import Floats
 
 CUTOFF = 2.0
@@ -80,13 +78,12 @@ def gospa(case: Case, frames: int, cutoff: float = CUTOFF, order: float = ORDER)
         order: p, at least 1.
 
     """
-    near = np.flatnonzero(case.cost < cutoff)
-    truth, track = case.truth_row[near], case.track_row[near]
-    power = case.cost[near] ** order
+    near = case.pairs(case.cost < cutoff)
+    power = near.cost**order
     limit = cutoff**order
     # A pair is worth what it saves: either of the two metrics charges c^p for two that are left alone or far apart.
-    taken = assign_frames(case.truth_frame[truth], truth, track, limit - power, best_pairs)
-    when = case.truth_frame[truth[taken]]
+    taken = assign_frames(near.pair_frame, near.truth_row, near.track_row, limit - power, best_pairs)
+    when = near.pair_frame[taken]
     stop = 1 + max(case.truth_frame.max(initial=-1), case.track_frame.max(initial=-1))
     paired = np.bincount(when, minlength=stop)
     objects = np.bincount(case.truth_frame, minlength=stop)

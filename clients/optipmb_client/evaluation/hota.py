@@ -16,6 +16,7 @@ the greatest, where A of an object and a track says how well their whole lives a
 with G and K the numbers of boxes of the object and of the track. Over several sequences boxes are counted together.
 
 The centre HOTA of the OptiPMB paper has S = max(0, 1 - d / 2 m) with d the distance of the centres in the plane.
+KITTI's benchmark ranks by the HOTA of image boxes, with their intersection over union as S.
 """
 
 from collections.abc import Iterable
@@ -23,9 +24,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optipmb_client.evaluation.assignment import assign_frames, best_pairs
-from optipmb_client.evaluation.cases import Case, Rules
-from optipmb_client.evaluation.counted import counted, similarity
+from optipmb_client.evaluation.cases import Case, Rules, assign_frames, best_pairs, counted, similarity
+from optipmb_client.evaluation.figures import defined
 from optipmb_client.geometry import Bools, Floats, Ints
 
 ALPHAS: Floats = np.arange(0.05, 0.99, 0.05)
@@ -36,7 +36,7 @@ _EPSILON = float(np.finfo(np.float64).eps)
 
 @dataclass(frozen=True)
 class HotaResult:
-    """What HOTA is made of, by level; results of several sequences add up."""
+    """Sums of HOTA by level; results of several sequences add up."""
 
     true: Floats
     """(19,) TP"""
@@ -89,7 +89,7 @@ class HotaResult:
     def summary(self) -> dict[str, float | None]:
         """Return the figures by their usual names; None for those that are not defined."""
         figures = {"HOTA": self.hota, "DetA": self.deta, "AssA": self.assa, "LocA": self.loca}
-        return {name: None if np.isnan(value) else value for name, value in figures.items()}
+        return {name: defined(value) for name, value in figures.items()}
 
 
 NOTHING = HotaResult(*(np.zeros(len(ALPHAS)) for _ in range(5)))

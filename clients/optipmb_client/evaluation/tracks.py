@@ -11,7 +11,7 @@ from optipmb_client.datasets import DataSequence, DatasetError, Truth
 from optipmb_client.datasets.kitti import KittiSequence
 from optipmb_client.datasets.nuscenes import NuScenesSequence
 from optipmb_client.datasets.table import TableSequence
-from optipmb_client.datasets.table.truth import ObjectTable, TableOptions, read_objects
+from optipmb_client.datasets.table.dataset import ObjectTable, TableOptions, read_objects
 from optipmb_client.results import ResultTable
 from optipmb_client.results.full import FullTable, full_path, read_full
 from optipmb_client.results.kitti import LEAST_SHOWN, read_kitti_results

@@ -1,8 +1,9 @@
-"""Channels to gateways: any of several will do, and when one goes the next is taken."""
+"""Channels to gateways, and calls on them: any of several will do, and when one goes the next is taken."""
 
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,7 +13,7 @@ from optipmb_schemas.protobuf import tracking_pb2 as pb
 
 from optipmb_client.errors import ClientError, ConnectionFailed, ServiceRefused
 
-__all__ = ["Channels", "from_gateway", "lasting", "refused"]
+__all__ = ["Channels", "ResumedCall", "from_gateway", "lasting"]
 
 SERVICE: Final = pb.DESCRIPTOR.services_by_name["TrackingService"].full_name
 
@@ -113,6 +114,73 @@ class Channels:
         return True
 
 
+class ResumedCall(ABC):
+    """A call that is made anew when it ends, at the next gateway; on a thread of its own.
+
+    Args:
+        channels: to gateways.
+        method: that is called.
+        name: of the thread.
+    """
+
+    def __init__(self, channels: Channels, method: str, name: str) -> None:
+        self._channels = channels
+        self._method = method
+        self._call: Any = None
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+
+    @abstractmethod
+    def _requests(self) -> Iterator[bytes]:
+        """Return the requests of a call."""
+
+    @abstractmethod
+    def _take(self, response: bytes) -> None:
+        """Take a response."""
+
+    @abstractmethod
+    def _fail(self, error: ClientError) -> None:
+        """End: every other call would end in the same way."""
+
+    @abstractmethod
+    def _began(self) -> None:
+        """Take in that a call was made."""
+
+    @abstractmethod
+    def _is_done(self) -> bool:
+        """Return whether a call that ended without an error was the last one."""
+
+    def _cancel(self) -> None:
+        """End the call, and make none any more."""
+        self._over.set()
+        if self._call is not None:
+            self._call.cancel()
+
+    def _run(self) -> None:
+        pause = FIRST_PAUSE_S
+        while not self._over.is_set():
+            try:
+                method, channel = self._channels.call(self._method)
+                self._call = method(self._requests(), metadata=self._channels.metadata)
+                self._began()
+                for response in self._call:
+                    pause = FIRST_PAUSE_S
+                    self._take(response)
+                if self._is_done():
+                    return
+            except grpc.RpcError as error:
+                if lasting(error):
+                    self._fail(ServiceRefused(f"the gateway refused: {error.details()}"))
+                    return
+            except (ConnectionFailed, ValueError) as error:  # the connection, or the channel, was closed
+                self._fail(ConnectionFailed(str(error)))
+                return
+            if not self._over.is_set():
+                self._channels.failed(channel)
+                self._over.wait(pause)
+                pause = min(2 * pause, LONGEST_PAUSE_S)
+
+
 def lasting(error: Any) -> bool:
     """Tell whether another try would end in the same way."""
     return error.code() not in _PASSING
@@ -121,11 +189,6 @@ def lasting(error: Any) -> bool:
 def from_gateway(error: Any) -> bool:
     """Tell whether a gateway said this, and not that there is none."""
     return any(key == SAID_BY for key, _ in error.trailing_metadata() or ())
-
-
-def refused(error: Any) -> ClientError:
-    """Return what a gateway said as an error of this package."""
-    return ServiceRefused(f"the gateway refused: {error.details()}")
 
 
 def _channel(address: str, credentials: grpc.ChannelCredentials | None) -> grpc.Channel:

@@ -23,8 +23,7 @@ from optipmb_schemas.protobuf import tracking_pb2 as pb
 
 from optipmb_client.errors import ClientError, ConnectionFailed
 from optipmb_client.grpc.channels import Channels, from_gateway, lasting
-from optipmb_client.grpc.publishing import GrpcSender, Publishing
-from optipmb_client.grpc.subscribing import GrpcSubscription
+from optipmb_client.grpc.streams import GrpcSender, GrpcSubscription, Publishing
 from optipmb_client.incoming import Answer, Inbox
 
 __all__ = ["GrpcConnection"]

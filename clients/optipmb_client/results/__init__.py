@@ -1,9 +1,5 @@
-"""Result files: what a tracker found, as the benchmarks want it."""
+"""Result files in the formats of the benchmarks, and tables of tracks."""
 
-from optipmb_client.results.rows import ResultTable, ResultWriter, empty_table
+from optipmb_client.results.rows import ResultTable, empty_table
 
-__all__ = [
-    "ResultTable",
-    "ResultWriter",
-    "empty_table",
-]
+__all__ = ["ResultTable", "empty_table"]

@@ -1,4 +1,4 @@
-"""Everything that is known of the tracks of one sequence, beside its result file: `NAME.npz` beside `NAME.txt`.
+"""All columns of the tracks of one sequence, in a file next to its result file: `NAME.npz` next to `NAME.txt`.
 
 Result files of the benchmarks have no room for covariances and probabilities. This one holds every column of the tracks
 as a numpy array, one row per track and frame, in the world frame, ordered by frame and, in a frame, as in the result
@@ -24,24 +24,15 @@ from optipmb_client.results.rows import BoxTable, column_shape, stacked
 class FullTable(BoxTable):
     """All tracks of one sequence in the world frame."""
 
-    velocity: Floats
-    """(R, 2)"""
-    yaw_rate: Floats
-    """(R,)"""
-    acceleration: Floats
-    """(R,) along the heading."""
-    existence: Floats
-    """(R,) probability"""
-    score: Floats
-    """(R,)"""
-    covariance: Floats
-    """(R, 6, 6) of x, y, speed, heading, turn rate, acceleration."""
-    age: Floats
-    """(R,) since the first detection."""
-    time_since_detection: Floats
-    """(R,)"""
-    detection: Ints
-    """(R,) index of the detection in its frame, -1 while missed."""
+    velocity: Floats  # (R, 2)
+    yaw_rate: Floats  # (R,)
+    acceleration: Floats  # (R,) along the heading
+    existence: Floats  # (R,) probability
+    score: Floats  # (R,)
+    covariance: Floats  # (R, 6, 6) of x, y, speed, heading, turn rate, acceleration
+    age: Floats  # (R,) since the first detection
+    time_since_detection: Floats  # (R,)
+    detection: Ints  # (R,) index of the detection in its frame, -1 while missed
 
 
 COLUMNS: Final = tuple(field.name for field in fields(FullTable) if field.name not in {"labels", "frame"})
@@ -77,8 +68,7 @@ def read_full(path: Path) -> FullTable:
     """Return the tracks of a sequence.
 
     Raises:
-        DatasetError: the file is missing, no such file, or lacks a column.
-
+        DatasetError: The file is missing, no such file, or lacks a column.
     """
     what = "a file of tracks with all columns"
     try:

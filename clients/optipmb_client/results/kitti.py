@@ -3,9 +3,9 @@
 A line has 18 fields: frame, id, type, truncated, occluded, alpha, x1, y1, x2, y2, h, w, l, x, y, z, ry, score. Boxes
 are in the rectified camera frame of their own frame (x y z = centre of the bottom), image boxes in pixels, `truncated`
 and `occluded` are -1 (unknown). Every track is written, nothing is thresholded: one that the image shows less
-than half of has the image box 0 0 0 0 and its 3D box as it is. Nobody can annotate what an image does not show, and the
-KITTI evaluation leaves boxes without height out of account, as it does those that are for more than half in unannotated
-regions. Numbers have six decimals, so the same tracks always give the same bytes.
+than half of has the image box 0 0 0 0 and its 3D box as it is: the KITTI evaluation ignores boxes without height, as it
+does boxes that are for more than half in unannotated regions. Numbers have six decimals, so the same tracks always give
+the same bytes.
 
 A submission leaves rows out: the server of the benchmark sweeps no scores, so every false track counts. It has the
 tracks that were confirmed in some frame and whose mean score is at least the threshold of their class, and of these the
@@ -23,10 +23,9 @@ from optipmb_client.camera import Camera, alpha_of, kitti_from_sensor, sensor_fr
 from optipmb_client.class_names import class_like
 from optipmb_client.files import DatasetError, numbers, read_rows, write_whole
 from optipmb_client.geometry import PoseLike, rotation_of, to_sensor
-from optipmb_client.results.rows import ResultTable, ResultWriter
+from optipmb_client.results.rows import ResultTable
 
-LEAST_SHOWN = 0.5
-"""Part of a projected box that must lie in the image for its line to have an image box."""
+LEAST_SHOWN = 0.5  # part of a projected box that must lie in the image for its line to have an image box
 
 SUBMISSION_SCORES = {"Car": 0.55, "Cyclist": 0.6, "Pedestrian": 0.55}
 """Least mean score of a track in a submission, for the highest HOTA of image boxes (`docs/tuning.md`)."""
@@ -35,57 +34,54 @@ _FIELDS = 18
 _TYPE = 2
 
 
-class KittiResultWriter(ResultWriter):
-    """Writes the tracks of one sequence; use it as a context manager, or call `close` at the end.
+def write_kitti_results(
+    path: Path,
+    camera: Camera,
+    poses: Sequence[PoseLike],
+    tracks: Mapping[int, Tracks],
+    least: Mapping[str, float] | None = None,
+) -> Path:
+    """Write the tracks (world frame) of a sequence, by frame index; without any the file is empty.
 
     Args:
-        path: the file.
-        camera: the camera of the image boxes.
-        least: for a submission, the least mean score of a track by class; other classes are refused. None: all tracks.
+        path: The file; returned.
+        camera: Camera of the image boxes.
+        poses: World from sensor, one per frame.
+        tracks: The tracks of each frame.
+        least: For a submission, the least mean score of a track by class; other classes are refused. None: all tracks.
     """
-
-    def __init__(self, path: Path, camera: Camera, least: Mapping[str, float] | None = None) -> None:
-        super().__init__(path)
-        self._camera = camera
-        self._least = least
-        self._lines: list[tuple[int, str, float, bool, str]] = []  # id, class, score, whether the image shows it, text
-        self._confirmed: set[int] = set()
-
-    def add(self, index: int, pose: PoseLike, tracks: Tracks) -> None:
-        """Write the tracks (world frame) of frame `index`, whose sensor stood at `pose`."""
-        center, yaw = to_sensor(
-            rotation_of(np.asarray(pose.quaternion)), np.asarray(pose.translation), tracks.center, tracks.yaw
-        )
-        image, seen = self._camera.boxes(center, tracks.size, yaw, least_shown=LEAST_SHOWN)
-        bottom, hwl, rotation_y = kitti_from_sensor(center, tracks.size, yaw)
-        alpha = alpha_of(bottom, rotation_y)
-        values = np.column_stack([alpha, image, hwl, bottom, rotation_y, tracks.score])
-        # Adding zero turns a rounded -0 into 0, so that equal numbers are written alike.
-        values = np.round(values, 6) + 0.0
-        known = tuple(self._least or ())
-        names = [class_like(name, known) or "" if known else name for name in tracks.labels]
-        if other := [tracks.labels[label] for label in tracks.label.tolist() if not names[label]]:
+    known = tuple(least or ())
+    lines: list[tuple[int, str, float, bool, str]] = []  # id, class, score, whether the image shows it, text
+    confirmed: set[int] = set()
+    for index in sorted(tracks):
+        one, pose = tracks[index], poses[index]
+        rotation, translation = rotation_of(np.asarray(pose.quaternion)), np.asarray(pose.translation)
+        center, yaw = to_sensor(rotation, translation, one.center, one.yaw)
+        image, seen = camera.boxes(center, one.size, yaw, least_shown=LEAST_SHOWN)
+        bottom, hwl, rotation_y = kitti_from_sensor(center, one.size, yaw)
+        values = np.column_stack([alpha_of(bottom, rotation_y), image, hwl, bottom, rotation_y, one.score])
+        values = np.round(values, 6) + 0.0  # turns a rounded -0 into 0, so that equal numbers are written alike
+        names = [class_like(name, known) or "" if known else name for name in one.labels]
+        if other := [one.labels[label] for label in one.label.tolist() if not names[label]]:
             raise DatasetError("--submission", f"--classes of {', '.join(known)}", f"tracks of {other[0]!r}")
-        for identity, label, row, shown in zip(tracks.id.tolist(), tracks.label.tolist(), values, seen, strict=True):
+        for identity, label, row, shown in zip(one.id.tolist(), one.label.tolist(), values, seen, strict=True):
             text = " ".join(f"{value:.6f}" for value in row)
             line = f"{index} {identity} {names[label]} -1 -1 {text}\n"
-            self._lines.append((identity, names[label], float(row[-1]), bool(shown), line))
-        if known and tracks.confirmed is not None:
-            self._confirmed.update(tracks.id[np.asarray(tracks.confirmed, dtype=np.bool_)].tolist())
-
-    def close(self) -> None:
-        """Put the file in its place; a sequence without tracks leaves an empty file."""
-        scores: dict[int, list[float]] = {}
-        for identity, _, score, shown, _ in self._lines:
-            if shown and identity in self._confirmed:
-                scores.setdefault(identity, []).append(score)
-        mean = {identity: fmean(values) for identity, values in scores.items()}
-        lines = (
-            line
-            for identity, name, _, shown, line in self._lines
-            if self._least is None or (shown and mean.get(identity, -1.0) >= self._least[name])
-        )
-        write_whole(self.path, lines)
+            lines.append((identity, names[label], float(row[-1]), bool(shown), line))
+        if known and one.confirmed is not None:
+            confirmed.update(one.id[np.asarray(one.confirmed, dtype=np.bool_)].tolist())
+    scores: dict[int, list[float]] = {}
+    for identity, _, score, shown, _ in lines:
+        if shown and identity in confirmed:
+            scores.setdefault(identity, []).append(score)
+    mean = {identity: fmean(values) for identity, values in scores.items()}
+    kept = (
+        line
+        for identity, name, _, shown, line in lines
+        if least is None or (shown and mean.get(identity, -1.0) >= least[name])
+    )
+    write_whole(path, kept)
+    return path
 
 
 def read_kitti_results(path: Path, labels: Sequence[str] = ()) -> ResultTable:
@@ -98,7 +94,6 @@ def read_kitti_results(path: Path, labels: Sequence[str] = ()) -> ResultTable:
     Raises:
         DatasetError: the file is missing, a line has another number of fields or a field that is no number, a frame is
             negative, or one id stands twice in a frame.
-
     """
     what = "frame id type truncated occluded alpha x1 y1 x2 y2 h w l x y z ry score"
     rows = read_rows(path, "a KITTI result file")

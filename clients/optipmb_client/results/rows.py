@@ -1,12 +1,10 @@
-"""Tracks as tables: what a writer takes and what a reader gives.
+"""Tracks as tables.
 
 Conventions: columns with one row per box; metres, radians, z up; `label` indexes `labels`.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import Any, Final, Self
 
 import numpy as np
@@ -15,59 +13,18 @@ from optipmb_schemas import Tracks
 
 from optipmb_client.geometry import Bools, Floats, Ints, PoseLike, stack_poses, to_sensor, to_world
 
-__all__ = ["BoxTable", "ResultTable", "ResultWriter", "column_shape", "empty_table", "stacked"]
-
-
-class ResultWriter(ABC):
-    """Takes the tracks of one sequence frame by frame; the file appears complete at `close`, or not at all.
-
-    As a context manager it is closed at the end, and after an error discarded.
-
-    Attributes:
-        path: The finished file.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    @abstractmethod
-    def add(self, index: int, pose: PoseLike, tracks: Tracks) -> None:
-        """Write the tracks (world frame) of frame `index`, whose sensor stood at `pose`."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Put the file in its place."""
-
-    def discard(self) -> None:  # noqa: B027  most have written nothing before they are closed
-        """Drop what was written."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: object, error: object, trace: object) -> None:
-        if kind is None:
-            self.close()
-        else:
-            self.discard()
-
 
 @dataclass(frozen=True)
 class BoxTable:
-    """Boxes of one sequence, ordered by frame, in one frame of reference that the maker names."""
+    """Boxes of one sequence, ordered by frame, in one frame of reference."""
 
     labels: tuple[str, ...]
-    frame: Ints
-    """(R,)"""
-    id: Ints
-    """(R,)"""
-    label: Ints
-    """(R,) index into `labels`."""
-    center: Floats
-    """(R, 3)"""
-    size: Floats
-    """(R, 3) length, width, height."""
-    yaw: Floats
-    """(R,)"""
+    frame: Ints  # (R,)
+    id: Ints  # (R,)
+    label: Ints  # (R,) index into `labels`
+    center: Floats  # (R, 3)
+    size: Floats  # (R, 3) length, width, height
+    yaw: Floats  # (R,)
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -99,20 +56,16 @@ class BoxTable:
         return replace(self, center=center, yaw=yaw)
 
 
-_NOT_OF_ROWS: Final = {"labels", "notes", "regions", "labelled"}
-"""Fields of tables of boxes that have no value for each row."""
+_NOT_OF_ROWS: Final = {"labels", "notes", "regions", "labelled"}  # fields that have no value for each row
 
 
 @dataclass(frozen=True)
 class ResultTable(BoxTable):
     """All boxes of all tracks of one sequence."""
 
-    score: Floats
-    """(R,)"""
-    box2d: Floats
-    """(R, 4) x1 y1 x2 y2 in pixels; NaN where there is no image."""
-    notes: tuple[str, ...] = ()
-    """Assumptions about them, a line each."""
+    score: Floats  # (R,)
+    box2d: Floats  # (R, 4) x1 y1 x2 y2 in pixels; NaN where there is no image
+    notes: tuple[str, ...] = ()  # assumptions about them, a line each
 
 
 def empty_table(labels: tuple[str, ...] = ()) -> ResultTable:

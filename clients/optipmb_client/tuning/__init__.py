@@ -1,12 +1,12 @@
-"""Tuning: from a detector's results and labels to a parameter profile, and what each module of the tracker is worth."""
+"""Tuning: from a detector's results and labels to a parameter profile; ablation and parameter sweeps."""
 
 from optipmb_client.tuning.display import TrialDisplay
-from optipmb_client.tuning.estimate import Estimate, estimate
-from optipmb_client.tuning.figures import Figures
-from optipmb_client.tuning.run import Curves, Source, Tuned, calibrate_scores, estimate_all, tune_all
-from optipmb_client.tuning.session import Plan, Refined, refine
+from optipmb_client.tuning.estimate import Estimate
+from optipmb_client.tuning.refine import Plan, Refined
+from optipmb_client.tuning.run import Curves, Source, calibrate_scores, estimate_all, tune_all
+from optipmb_client.tuning.scoring import Figures, plain_figures
 from optipmb_client.tuning.values import value_of
-from optipmb_client.tuning.variants import ROWS, Row, Variant, ablation, measure_variants, sweep
+from optipmb_client.tuning.variants import ROWS, Row, Variant, ablation, measure_variants, sweep, write_sweep
 
 __all__ = [
     "ROWS",
@@ -18,15 +18,14 @@ __all__ = [
     "Row",
     "Source",
     "TrialDisplay",
-    "Tuned",
     "Variant",
     "ablation",
     "calibrate_scores",
-    "estimate",
     "estimate_all",
     "measure_variants",
-    "refine",
+    "plain_figures",
     "sweep",
     "tune_all",
     "value_of",
+    "write_sweep",
 ]

@@ -1,19 +1,24 @@
-"""What tracks may say of themselves: the calibration of one class (`optipmb.calibration`), measured on training data.
+"""The calibration of one class (`optipmb.calibration`) from training data, and the score that ranks its tracks best.
 
 Everything is tracked once for each memory that is tried. Then, of the tracks by their evidence:
 
 - existence: isotonic regression (Barlow et al., 1972) of being matched to an object on the evidence, put in a few
-  knots, one for each range of probability that occurs. The memory is the one that tells sequences that are left out in
-  turn with the least surprise (log loss).
+  knots, one for each range of probability that occurs. The memory is the one with the least log loss in sequences that
+  are left out in turn.
 - along, across: in each fifth of the matched tracks, the standard deviation that has to be added to the filter's for
   the mean squared error to be what is expected, NEES = 2; then both times one factor, so that NEES = 2 in sequences
   that are left out in turn, too, where errors are always a little larger than where they were measured.
 
-Centres within two metres match, as where calibration is judged (`optipmb_client.evaluation.calibration`).
+Centres within two metres match, as in `optipmb_client.evaluation.calibration`.
+
+Benchmarks rank a track by the mean of its scores, on which the averages over recalls and the best threshold depend. The
+same tracks are ranked by several scores that are known when a frame is published: that of the paper,
+x_s = [1 - exp(-x_len)] z_s; the mean of the detections' scores so far; the existence probability; the product and the
+mean of it and x_s; the evidence, and the mean of it and x_s.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
 
@@ -25,19 +30,17 @@ from optipmb_client.evaluation.calibration import CalibrationResult, calibration
 from optipmb_client.geometry import Bools, Floats
 from optipmb_client.results import ResultTable
 from optipmb_client.results.full import FullTable
-from optipmb_client.tuning.folds import deal
-from optipmb_client.tuning.material import Clip, track_fully
-from optipmb_client.tuning.scoring import Scorer
-from optipmb_client.tuning.values import rounded, with_calibration
-
-__all__ = ["calibrate", "cross_calibration", "judge_calibration"]
+from optipmb_client.tuning.clips import Clip, track_fully
+from optipmb_client.tuning.objective import folds_of, standard_error, without_folds
+from optipmb_client.tuning.scoring import Figures, Scorer, metric
+from optipmb_client.tuning.values import rounded, with_calibration, with_values
 
 MEMORIES = (0.3, 0.5, 0.7, 0.8)
 """Tried for the weight that evidence keeps over a nominal period."""
 MISSED = 1.0
 """Log odds that a miss counts for against a track."""
 LEAST_TRACKS, LEAST_MATCHED = 200, 50
-"""With fewer boxes of tracks, or of tracks on objects, nothing is said."""
+"""With fewer boxes of tracks, or of tracks on objects, there is no calibration."""
 _EDGES = (0.0, 0.05, 0.15, 0.3, 0.5, 0.7, 0.85, 0.95, 1.0)
 _LEAST_KNOT = 30
 """Boxes of tracks that a knot stands on."""
@@ -76,7 +79,7 @@ def calibrate(
 
     Args:
         clips: with this class only.
-        scorer: of the class; it says what counts and what is ignored.
+        scorer: of the class.
         parameters: those that the tracks are made with, with this class only.
         memory: the one to take; None tries several.
 
@@ -84,7 +87,7 @@ def calibrate(
     best: tuple[float, float, list[_Rows]] | None = None
     for one in MEMORIES if memory is None else (memory,):
         rows = [_rows(clip, scorer, parameters, one) for clip in clips]
-        loss = 0.0 if memory is not None else _surprise(rows)
+        loss = 0.0 if memory is not None else _log_loss(rows)
         if best is None or loss < best[0]:
             best = (loss, one, rows)
     assert best is not None  # noqa: S101  at least one memory is tried
@@ -94,8 +97,8 @@ def calibrate(
     return _fitted(everything, best[1], _widening(best[2]))
 
 
-def judge_calibration(clips: Sequence[Clip], scorer: Scorer, parameters: Parameters) -> CalibrationResult:
-    """Return how well tracks know themselves in some sequences."""
+def measured_calibration(clips: Sequence[Clip], scorer: Scorer, parameters: Parameters) -> CalibrationResult:
+    """Return the calibration figures of the tracks of some sequences."""
     parts = []
     for clip in clips:
         tracks, full = _tracked(clip, scorer, parameters)
@@ -104,14 +107,14 @@ def judge_calibration(clips: Sequence[Clip], scorer: Scorer, parameters: Paramet
 
 
 def cross_calibration(clips: Sequence[Clip], scorer: Scorer, parameters: Parameters) -> CalibrationResult:
-    """Return how well tracks know themselves where each sequence has the calibration that the others give.
+    """Return the calibration figures where each sequence has the calibration that the others give.
 
     The parameters are those found on all sequences, and so is the memory. With one sequence, or without a calibration,
-    the tracks are judged as they are.
+    the tracks are evaluated as they are.
     """
     calibration = parameters.classes[scorer.name].calibration
     if calibration is None or len(clips) == 1:
-        return judge_calibration(clips, scorer, parameters)
+        return measured_calibration(clips, scorer, parameters)
     rows = [_rows(clip, scorer, parameters, calibration.memory) for clip in clips]
     parts = []
     for i, clip in enumerate(clips):
@@ -119,7 +122,7 @@ def cross_calibration(clips: Sequence[Clip], scorer: Scorer, parameters: Paramet
         everything = reduce(add, rest)
         if everything.true.sum() >= LEAST_MATCHED:
             found = _fitted(everything, calibration.memory, _widening(rest))
-            parts.append(judge_calibration([clip], scorer, with_calibration(parameters, scorer.name, found)))
+            parts.append(measured_calibration([clip], scorer, with_calibration(parameters, scorer.name, found)))
     return reduce(add, parts)
 
 
@@ -155,7 +158,7 @@ def _rows(clip: Clip, scorer: Scorer, parameters: Parameters, memory: float) -> 
     )
 
 
-def _surprise(rows: Sequence[_Rows]) -> float:
+def _log_loss(rows: Sequence[_Rows]) -> float:
     """Return the log loss of sequences that are left out in turn, or of all where there are too few."""
     loss, count = 0.0, 0
     for rest, out in _left_out(rows):
@@ -168,7 +171,7 @@ def _surprise(rows: Sequence[_Rows]) -> float:
 
 def _left_out(rows: Sequence[_Rows]) -> Iterator[tuple[_Rows, _Rows]]:
     """Yield all but one sequence, and the one; where there is one alone, that for both."""
-    for group in deal([int(one.true.sum()) for one in rows], len(rows)) or [tuple(range(len(rows)))]:
+    for group in folds_of([int(one.true.sum()) for one in rows], len(rows)) or [tuple(range(len(rows)))]:
         rest = [one for i, one in enumerate(rows) if i not in group] or rows
         yield reduce(add, rest), reduce(add, [rows[i] for i in group])
 
@@ -257,3 +260,79 @@ def _added(error: Floats, variance: Floats) -> float:
     if excess(0.0) <= 0.0:
         return 0.0
     return float(brentq(excess, 0.0, _WIDEST)) if excess(_WIDEST) < 0.0 else _WIDEST
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """Figures of tracks that are ranked by one score."""
+
+    score: str
+    figures: Figures
+    value: float
+    gain: float
+    """Of the objective over x_s."""
+    error: float
+    """Standard error of the gain."""
+
+
+def rank(clips: Sequence[Clip], scorer: Scorer, parameters: Parameters, objective: str) -> tuple[Ranking, ...]:
+    """Return how well each score ranks the same tracks.
+
+    Args:
+        clips: with the class of the scorer only.
+        scorer: of the class.
+        parameters: of the tracks, with a calibration.
+        objective: one of `optipmb_client.tuning.scoring.METRICS`.
+
+    """
+    probe = with_values(parameters, scorer.name, {"calibration.score_of_evidence": 1.0})
+    tracked = [track_fully(clip, probe) for clip in clips]
+    scores_of = [_scores(clip, full, parameters.nominal_period) for clip, (_, full) in zip(clips, tracked, strict=True)]
+    scores = {
+        name: [replace(tracks, score=one[name]) for (tracks, _), one in zip(tracked, scores_of, strict=True)]
+        for name in scores_of[0]
+    }
+    objects = [len(set(clip.truth.id[~clip.truth.ignored].tolist())) for clip in clips]
+    parts = without_folds(range(len(clips)), objects)
+    found: list[Ranking] = []
+    first: Floats | None = None
+    for name, tables in scores.items():
+        measured = [scorer.measure(clip, table) for clip, table in zip(clips, tables, strict=True)]
+        figures = [scorer.figures([measured[i] for i in part]) for part in parts]
+        values = np.array(
+            [metric(objective, one, sum(objects[i] for i in part)) for one, part in zip(figures, parts, strict=True)]
+        )
+        first = values if first is None else first
+        gains = values - first
+        found.append(Ranking(name, figures[0], float(values[0]), float(gains[0]), standard_error(gains)))
+    return tuple(found)
+
+
+def _scores(clip: Clip, full: FullTable, period: float) -> dict[str, Floats]:
+    detected = np.zeros(len(full))
+    known = {
+        (index, source): score
+        for index, frame in enumerate(clip.frames)
+        for source, score in zip(frame.source.tolist(), frame.score.tolist(), strict=True)
+    }
+    for row in np.flatnonzero(full.detection >= 0).tolist():
+        detected[row] = known[int(full.frame[row]), int(full.detection[row])]
+    paper = (1.0 - np.exp(-1.0 - full.age / period)) * detected
+    return {
+        "x_s": paper,
+        "mean": _mean_so_far(full, detected),
+        "existence": full.existence,
+        "x_s * existence": paper * full.existence,
+        "(x_s + existence) / 2": 0.5 * (paper + full.existence),
+        "(x_s + evidence) / 2": 0.5 * (paper + full.score),
+        "evidence": full.score,
+    }
+
+
+def _mean_so_far(full: FullTable, values: Floats) -> Floats:
+    """Return for each row the mean of its track's values until then."""
+    order = np.lexsort((full.frame, full.id))
+    mean = np.empty(len(values))
+    for rows in np.split(order, np.flatnonzero(np.diff(full.id[order])) + 1) if len(order) else []:
+        mean[rows] = np.cumsum(values[rows]) / np.arange(1, len(rows) + 1)
+    return mean

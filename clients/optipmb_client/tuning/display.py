@@ -1,4 +1,4 @@
-"""How far tuning has come, shown on standard error: rate, time left and the best value so far.
+"""Progress of tuning on standard error: rate, time left and the best score so far.
 
 On a terminal a bar; elsewhere (a log file, CI) a plain line every ten seconds.
 """
@@ -10,14 +10,10 @@ from typing import Self
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from optipmb_client.tuning.watch import Watch
-
-__all__ = ["TrialDisplay"]
-
 PLAIN_PERIOD_S = 10.0
 
 
-class TrialDisplay(Watch):
+class TrialDisplay:
     """Shows the trials of one class after the other; trials that an earlier session has done take no time."""
 
     def __init__(self, *, terminal: bool | None = None) -> None:

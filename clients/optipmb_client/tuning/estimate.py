@@ -1,9 +1,10 @@
-"""What training data say about a class, without tracking anything: noise, motion, births, detections and false ones.
+"""Estimates of a class from training data, without tracking: noise, motion, births, detections and false ones.
 
 Each figure comes from one place: R from detections minus labels, Q from the labels' trajectories, P^0 from the first
 detection of each object, p_d0 and mu_c / A from what is found and what is false. Standard deviations are winsorised
-(`robust.spread`). Estimates are where a search begins, not where it must end: a detector's errors last over frames,
-labels have errors of their own, and a motion model has to cover what it leaves out.
+(`spread`), for detections and labels are wrong in a few places by much. Estimates are where a search begins, not where
+it must end: a detector's errors last over frames, labels have errors of their own, and a motion model has to cover what
+it leaves out.
 """
 
 import math
@@ -15,22 +16,19 @@ import numpy as np
 
 from optipmb import Parameters
 from optipmb_client.evaluation import Rules
-from optipmb_client.geometry import Floats, wrap_angle
-from optipmb_client.tuning.material import Clip
+from optipmb_client.geometry import Floats, Ints, wrap_angle
+from optipmb_client.tuning.clips import Clip
 from optipmb_client.tuning.pairing import (
     Pairs,
     Residuals,
     Trajectory,
-    detected_frames,
+    detected,
     pair_detections,
     residuals,
     trajectories,
 )
-from optipmb_client.tuning.robust import fit_motion, spread, usual
 from optipmb_client.tuning.score_curves import counted_scores
 from optipmb_client.tuning.values import Value, rounded, value_of
-
-__all__ = ["Estimate", "ScoreBin", "estimate", "pair_all"]
 
 WINDOW_S = 1.0
 """Pieces of trajectories in which motion is fitted; at low frame rates four frames."""
@@ -43,6 +41,10 @@ LEAST_PAIRS = 20
 _BINS = 10
 _GAP_QUANTILE = 0.98
 _SMALL = 1e-2
+_NORMAL = 1.482602218505602
+"""Standard deviation of a Gaussian in units of its median absolute value."""
+_REACH = 3.0
+_LEAST_POINTS = 4
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ class ScoreBin:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What was found out about one class. Fields that nothing could be learnt about are NaN."""
+    """Estimates of one class; NaN where there is too little data."""
 
     name: str
     labels: int
@@ -102,13 +104,13 @@ def _plain(value: Any) -> Any:
 
 
 def estimate(clips: Sequence[Clip], name: str, parameters: Parameters, rules: Rules) -> Estimate:
-    """Return what clips with one class say about it.
+    """Return the estimates of one class.
 
     Args:
         clips: of this class only.
         name: the class.
         parameters: their score filter, gate, clutter rate and nominal period are used.
-        rules: of the benchmark: what is ignored and excused.
+        rules: of the benchmark: which labels are ignored and which detections excused.
 
     """
     table = parameters.classes[name]
@@ -231,12 +233,7 @@ def _birth(errors: Residuals, pairs: Sequence[Pairs], paths: Sequence[dict[int, 
     """Return P^0 from the first detection of each object, and from what objects do."""
     first = errors.first
     velocity = errors.velocity[first]
-    starts: list[Floats] = []
-    for found, objects in zip(pairs, paths, strict=True):
-        for identity, path in objects.items():
-            frames = detected_frames(found, identity)
-            if len(frames):
-                starts.append(path.velocity[np.searchsorted(path.frame, frames[0])])
+    starts = [path.velocity[at[0]] for _, path, _, at in detected(pairs, paths)]
     speeds = np.linalg.norm(np.array(starts).reshape(-1, 2), axis=1)
     speeds = speeds[np.isfinite(speeds)]
     return {
@@ -261,12 +258,8 @@ def _lasting(errors: Residuals, period: float) -> float:
 
 def _longest_gap(pairs: Sequence[Pairs], paths: Sequence[dict[int, Trajectory]], period: float) -> float:
     """Return the nominal periods within which nearly all breaks between detections of an object end."""
-    gaps: list[float] = []
-    for found, objects in zip(pairs, paths, strict=True):
-        for identity, path in objects.items():
-            frames = detected_frames(found, identity)
-            time = path.time[np.searchsorted(path.frame, frames)]
-            gaps += [float(one) / period - 1.0 for one in np.diff(time) if one > 1.5 * period]
+    between = [one for _, path, _, at in detected(pairs, paths) for one in np.diff(path.time[at]).tolist()]
+    gaps = [one / period - 1.0 for one in between if one > 1.5 * period]
     return float(np.quantile(gaps, _GAP_QUANTILE)) if gaps else math.nan
 
 
@@ -314,3 +307,81 @@ def _platt(score: Floats, true: np.ndarray) -> tuple[float, float]:
 
 def _ratio(part: float, whole: float) -> float:
     return part / whole if whole else math.nan
+
+
+def usual(errors: Floats) -> float:
+    """Return the standard deviation that a Gaussian with the same median absolute value has; NaN without errors."""
+    return float(_NORMAL * np.median(np.abs(errors))) if errors.size else float("nan")
+
+
+def spread(errors: Floats) -> float:
+    """Return the root mean square of errors of which none counts for more than three usual ones; NaN without errors."""
+    if not errors.size:
+        return float("nan")
+    limit = _REACH * usual(errors)
+    return float(np.sqrt(np.mean(np.minimum(np.abs(errors), limit) ** 2)))
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Motion of an object at the middles of windows of time that do not overlap."""
+
+    time: Floats
+    """(W,) s"""
+    speed: Floats
+    """(W,) along the heading, m/s"""
+    acceleration: Floats
+    """(W,) along the heading, m/s^2"""
+    heading: Floats
+    """(W,) rad, unwrapped"""
+    turn_rate: Floats
+    """(W,) rad/s"""
+    variance: Floats
+    """(W, 4) of the errors of speed, acceleration, heading and turn rate that the scatter of the points leaves"""
+
+
+def fit_motion(time: Floats, position: Floats, yaw: Floats, window: float) -> Motion:
+    """Fit polynomials to pieces of a trajectory: quadratic ones to the position, straight lines to the heading.
+
+    Args:
+        time: (R,) s, ascending.
+        position: (R, 2) m.
+        yaw: (R,) rad.
+        window: length of a piece, s; pieces with fewer than four points are left out.
+
+    """
+    turned = np.unwrap(yaw)
+    piece: Ints = np.floor((time - time[0]) / window + 1e-9).astype(np.int64)
+    rows = []
+    for which in np.unique(piece).tolist():
+        use = piece == which
+        if use.sum() < _LEAST_POINTS:
+            continue
+        middle = time[0] + (which + 0.5) * window
+        rows.append((middle, *_fit(time[use] - middle, position[use], turned[use])))
+    table = np.array(rows, dtype=np.float64).reshape(len(rows), 9)
+    return Motion(table[:, 0], table[:, 1], table[:, 2], table[:, 3], table[:, 4], table[:, 5:])
+
+
+def _fit(time: Floats, position: Floats, yaw: Floats) -> tuple[float, ...]:
+    """Return speed, acceleration, heading, turn rate at time 0, and the variances of the four."""
+    count = len(time)
+    square = np.column_stack([np.ones(count), time, 0.5 * time**2])
+    inverse = np.linalg.inv(square.T @ square)
+    path = inverse @ square.T @ position
+    scatter = float(((position - square @ path) ** 2).sum()) / max(1, 2 * (count - 3))
+    straight = square[:, :2]
+    inverse_yaw = np.linalg.inv(straight.T @ straight)
+    turn = inverse_yaw @ straight.T @ yaw
+    scatter_yaw = float(((yaw - straight @ turn) ** 2).sum()) / max(1, count - 2)
+    ahead = np.array([np.cos(turn[0]), np.sin(turn[0])])
+    return (
+        float(path[1] @ ahead),
+        float(path[2] @ ahead),
+        float(turn[0]),
+        float(turn[1]),
+        scatter * float(inverse[1, 1]),
+        scatter * float(inverse[2, 2]),
+        scatter_yaw * float(inverse_yaw[0, 0]),
+        scatter_yaw * float(inverse_yaw[1, 1]),
+    )

@@ -10,13 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from optipmb_client.evaluation import Rules
-from optipmb_client.evaluation.assignment import assign_frames, most_pairs
-from optipmb_client.evaluation.cases import prepare
+from optipmb_client.evaluation.cases import assign_frames, most_pairs, prepare
 from optipmb_client.geometry import Bools, Floats, Ints, to_sensor, wrap_angle
 from optipmb_client.results import ResultTable
-from optipmb_client.tuning.material import Clip
-
-__all__ = ["Pairs", "Residuals", "Trajectory", "detected_frames", "pair_detections", "residuals", "trajectories"]
+from optipmb_client.tuning.clips import Clip
 
 
 @dataclass(frozen=True)
@@ -115,7 +112,7 @@ def pair_detections(clip: Clip, name: str, least: float, limit: float, rules: Ru
     table = ResultTable((name,), when, rows, np.zeros_like(rows), local, size, turned, score, image)
     near = Rules("distance", limit, neighbours=rules.neighbours, min_height=rules.min_height, regions=rules.regions)
     case = prepare(clip.truth, table, name, near)
-    pairs = assign_frames(case.truth_frame[case.truth_row], case.truth_row, case.track_row, case.cost, most_pairs)
+    pairs = assign_frames(case.pair_frame, case.truth_row, case.track_row, case.cost, most_pairs)
     label, matched = case.truth_row[pairs], case.track_row[pairs]
     owner = np.full(len(when), -1, dtype=np.int64)
     # Labels of a class alike are ignored, and no examples of this one.
@@ -147,8 +144,6 @@ _COLUMNS = ("center", "size", "yaw", "velocity", "score")
 class Residuals:
     """Detections against their labels, ordered by object and then by frame."""
 
-    object: Ints
-    """(H,) a number of the object"""
     gap: Floats
     """(H,) s since the detection before of the same object; NaN for the first"""
     position: Floats
@@ -166,36 +161,25 @@ class Residuals:
 
 def residuals(pairs: Sequence[Pairs], paths: Sequence[dict[int, Trajectory]]) -> Residuals:
     """Return detection minus label of all pairs."""
-    parts = list(_residuals(pairs, paths))
-    if not parts:
-        empty = np.empty(0)
-        return Residuals(np.empty(0, dtype=np.int64), empty, np.empty((0, 2)), empty, np.empty((0, 2)))
-    return Residuals(
-        object=np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts]).astype(np.int64),
-        gap=np.concatenate([part[0] for part in parts]),
-        position=np.concatenate([part[1] for part in parts]),
-        heading=np.concatenate([part[2] for part in parts]),
-        velocity=np.concatenate([part[3] for part in parts]),
-    )
+    parts = [(np.empty(0), np.empty((0, 2)), np.empty(0), np.empty((0, 2)))]
+    parts += [
+        (
+            np.diff(path.time[at], prepend=np.nan),
+            found.position[rows] - path.position[at],
+            wrap_angle(found.yaw[rows] - path.yaw[at]),
+            found.velocity[rows] - path.velocity[at],
+        )
+        for found, path, rows, at in detected(pairs, paths)
+    ]
+    return Residuals(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _residuals(
+def detected(
     pairs: Sequence[Pairs], paths: Sequence[dict[int, Trajectory]]
-) -> Iterator[tuple[Floats, Floats, Floats, Floats]]:
+) -> Iterator[tuple[Pairs, Trajectory, Ints, Ints]]:
+    """Yield each detected object: its recording, its path, and the rows of its detections in both."""
     for found, objects in zip(pairs, paths, strict=True):
         for identity, path in objects.items():
             rows = np.flatnonzero(found.object == identity)
-            if not len(rows):
-                continue
-            at = np.searchsorted(path.frame, found.frame[rows])
-            yield (
-                np.diff(path.time[at], prepend=np.nan),
-                found.position[rows] - path.position[at],
-                wrap_angle(found.yaw[rows] - path.yaw[at]),
-                found.velocity[rows] - path.velocity[at],
-            )
-
-
-def detected_frames(pairs: Pairs, identity: int) -> Ints:
-    """Return the frames in which an object is detected, ascending."""
-    return np.asarray(pairs.frame[pairs.object == identity], dtype=np.int64)
+            if len(rows):
+                yield found, path, rows, np.searchsorted(path.frame, found.frame[rows])

@@ -1,9 +1,9 @@
-"""Tuning a dataset: its classes one after the other, and the files that come of it.
+"""Tuning of a dataset: its classes one after the other, and the files in the output folder.
 
-In the output folder: `estimate.json` and `estimated.toml` (what the data say without tracking), `calibrated.toml` (the
-profile with the curves of scores alone, where a reference was given), `trials.db` (every trial, to go on from),
-`report.json` (figures, folds, evidence) and `tuned.toml`, the profile. The same data, options and versions give the
-same bytes of all but `trials.db`.
+In the output folder: `estimate.json` and `estimated.toml` (without tracking), `calibrated.toml` (the profile with the
+curves of scores alone, where a reference was given), `trials.db` (every trial, to continue from), `report.json`
+(figures, folds, changed values) and `tuned.toml`, the profile. The same data, options and versions give the same bytes
+of all but `trials.db`.
 """
 
 import json
@@ -18,16 +18,13 @@ from optipmb_client.bulk import Executor
 from optipmb_client.datasets import DataSequence, DatasetArguments
 from optipmb_client.errors import UsageError
 from optipmb_client.files import write_whole
+from optipmb_client.tuning.clips import Clip, load, of_class
+from optipmb_client.tuning.display import TrialDisplay
 from optipmb_client.tuning.estimate import Estimate, estimate, pair_all
-from optipmb_client.tuning.material import Clip, load, of_class
+from optipmb_client.tuning.refine import Plan, Refined, refine
 from optipmb_client.tuning.score_curves import score_curve
 from optipmb_client.tuning.scoring import rules_of, scorer_of
-from optipmb_client.tuning.session import Plan, Refined, refine
 from optipmb_client.tuning.values import only, with_classes, with_score_calibration, with_values, write_profile
-from optipmb_client.tuning.watch import Watch
-
-__all__ = ["Curves", "Source", "Tuned", "calibrate_scores", "estimate_all", "tune_all"]
-
 
 Curves = dict[str, ScoreCalibration | None]
 """By class; None where there was too little to measure one."""
@@ -87,7 +84,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Tuned:
-    """What came of it."""
+    """Result of a tuning run."""
 
     profile: Path
     classes: dict[str, Refined]
@@ -167,7 +164,7 @@ def tune_all(
     parameters: Parameters,
     plan: Plan,
     out: Path,
-    watch: Watch,
+    display: TrialDisplay,
     name: str | None = None,
     executor: Executor | None = None,
 ) -> Tuned:
@@ -188,13 +185,15 @@ def tune_all(
             "detected": _sum(source.of_class(label)),
         }
         clips = source.of_class(label)
-        results[label] = refine(clips, scorer, parameters, plan, out / "trials.db", context, watch, executor)
+        results[label] = refine(clips, scorer, parameters, plan, out / "trials.db", context, display, executor)
     _write_json(out / "report.json", {name: one.to_json() for name, one in results.items()})
     scope = "all parameters" if plan.everything else "noise, birth spread, area, forgetting"
-    judged = f"{plan.folds} groups left out in turn" if any(one.folds for one in results.values()) else "none left out"
+    held_out = (
+        f"{plan.folds} groups left out in turn" if any(one.folds for one in results.values()) else "none left out"
+    )
     provenance = (
         f"{_from(parameters, name)}\n{_by('tune')}: {source.title}; classes {' '.join(source.classes)}; {scope}; metric"
-        f" {plan.metric}; {plan.trials} trials; {judged}, {plan.fold_trials} trials each; detections plain and in"
+        f" {plan.metric}; {plan.trials} trials; {held_out}, {plan.fold_trials} trials each; detections plain and in"
         f" {plan.copies} degraded copies; seed {plan.seed}."
     )
     tables = {name: one.parameters for name, one in results.items()}
@@ -214,8 +213,8 @@ def _sum(clips: Sequence[Clip]) -> list[float]:
     ]
 
 
-def _named(parameters: Parameters, what: str) -> str:
-    return parameters.name if parameters.name.endswith(what) else f"{parameters.name}-{what}"
+def _named(parameters: Parameters, suffix: str) -> str:
+    return parameters.name if parameters.name.endswith(suffix) else f"{parameters.name}-{suffix}"
 
 
 def _from(parameters: Parameters, name: str | None = None) -> str:

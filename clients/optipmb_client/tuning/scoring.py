@@ -1,31 +1,70 @@
-"""How well tracks agree with the truth: from a clip and its tracks to something small, and from those to figures.
+"""Figures and scores of tracks: each sequence is measured on its own, and any choice of sequences is summed up.
 
-A scorer measures each sequence on its own, so that processes can share the work, and sums up any choice of sequences:
-all of them, those of a fold, or all but one.
+Conventions: scores of tracks are the mean scores of whole tracks. The averages over recalls are those of AB3DMOT's
+protocol, with 3D overlap for KITTI and with the distance of centres up to two metres elsewhere, and those of the
+nuScenes benchmark for nuScenes. All single figures are those at the threshold with the highest MOTA, `threshold`; HOTA
+is that of centres in the plane, `HOTA, all` that of all tracks.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
 from optipmb_client.datasets import DataSequence
 from optipmb_client.datasets.nuscenes import NuScenesSequence
-from optipmb_client.evaluation import Case, Rules, default_rules
-from optipmb_client.evaluation.ab3dmot import ab3dmot_rules
-from optipmb_client.evaluation.cases import prepare
-from optipmb_client.evaluation.figures import CENTRE_DISTANCE
-from optipmb_client.evaluation.nuscenes_figures import evaluate_class
-from optipmb_client.evaluation.nuscenes_matching import Pairing, pair
-from optipmb_client.evaluation.nuscenes_scene import NuScenesConfig, NuScenesScene, prepare_scene
+from optipmb_client.evaluation import Case, ClearResult, Rules, clear, combine, default_rules
+from optipmb_client.evaluation.ab3dmot import Counts, evaluate_ab3dmot
+from optipmb_client.evaluation.cases import ab3dmot_rules, prepare
+from optipmb_client.evaluation.figures import defined
+from optipmb_client.evaluation.hota import HotaResult, evaluate_hota
+from optipmb_client.evaluation.nuscenes import (
+    NuScenesConfig,
+    NuScenesScene,
+    Pairing,
+    evaluate_class,
+    pair,
+    prepare_scene,
+)
 from optipmb_client.geometry import Bools, to_sensor
 from optipmb_client.results import ResultTable
-from optipmb_client.results.nuscenes_layout import NUSCENES_CLASSES
-from optipmb_client.tuning.figures import Figures, ab3dmot_figures, distance_figures
-from optipmb_client.tuning.material import Clip
+from optipmb_client.results.nuscenes import NUSCENES_CLASSES
+from optipmb_client.tuning.clips import Clip
 
-__all__ = ["BoxScorer", "Measured", "NuScenesScorer", "Scorer", "rules_of", "scorer_of"]
+Figures = dict[str, float]
+"""Figures of one class by their names in `evaluation.FIGURES`; NaN where they are not defined."""
+
+METRICS: Mapping[str, str] = {
+    "combination": "mean of sAMOTA, AMOTA, MOTA and HOTA, less a tenth of the switches per object",
+    "samota": "sAMOTA",
+    "amota": "AMOTA",
+    "mota": "MOTA at the best threshold",
+    "hota": "HOTA of centres at that threshold",
+    "both": "three parts AMOTA, one part the HOTA of all tracks, less a tenth of the switches per object",
+}
+_SINGLE = {"samota": "sAMOTA", "amota": "AMOTA", "mota": "MOTA", "hota": "HOTA"}
+_SWITCH = 0.1
+
+
+def metric(name: str, figures: Figures, objects: int) -> float:
+    """Return one of `METRICS`; figures that are not defined count zero."""
+    known = {key: 0.0 if math.isnan(value) else value for key, value in figures.items()}
+    if name in _SINGLE:
+        return known[_SINGLE[name]]
+    if name == "both":
+        mean = 0.75 * known["AMOTA"] + 0.25 * known["HOTA, all"]
+    else:
+        mean = sum(known[one] for one in _SINGLE.values()) / len(_SINGLE)
+    return mean - _SWITCH * known["IDS"] / max(1, objects)
+
+
+def plain_figures(figures: Figures) -> dict[str, float | int | None]:
+    """Return figures for JSON: whole numbers as such, None for those that are not defined."""
+    return {
+        name: int(value) if (known := defined(value)) is not None and value == int(value) and abs(value) > 1 else known
+        for name, value in figures.items()
+    }
 
 
 @dataclass(frozen=True)
@@ -40,121 +79,89 @@ class Measured:
     """By the rules of the nuScenes benchmark."""
 
 
-class Scorer(Protocol):
+@dataclass(frozen=True)
+class Scorer:
     """Compares tracks with the truth, for one class."""
 
-    @property
-    def name(self) -> str:
-        """The class."""
-
-    @property
-    def rules(self) -> Rules:
-        """What is ignored, and what is excused."""
-
-    @property
-    def near(self) -> Rules:
-        """By the distance of centres."""
-
-    def counts(self, clip: Clip, tracks: ResultTable) -> Bools:
-        """Return which of the tracks of a clip (R,), in the world frame, the benchmark looks at."""
-
-    def measure(self, clip: Clip, tracks: ResultTable) -> Measured:
-        """Compare the tracks of a clip, in the world frame, with its truth."""
-
-    def figures(self, measured: Sequence[Measured]) -> Figures:
-        """Return the figures of some sequences together."""
-
-
-@dataclass(frozen=True)
-class BoxScorer:
-    """The figures of one class by some rules."""
-
     name: str
+    """The class."""
     rules: Rules
+    """Which labels are ignored, and which tracks are excused."""
     near: Rules
-    """By the distance of centres, for HOTA; the same where the rules are so themselves."""
-
-    def counts(self, clip: Clip, tracks: ResultTable) -> Bools:  # noqa: ARG002  part of the protocol
-        """Return which tracks (R,) the benchmark looks at: all."""
-        return np.ones(len(tracks), dtype=np.bool_)
-
-    def measure(self, clip: Clip, tracks: ResultTable) -> Measured:
-        """Compare the tracks of a clip, in the world frame, with its truth."""
-        near = prepare(clip.world, tracks, self.name, self.near, clip.name)
-        if self.rules.measure == "distance":
-            return Measured(near, near)
-        when = tracks.frame
-        center, yaw = to_sensor(clip.rotation[when], clip.translation[when], tracks.center, tracks.yaw)
-        local = replace(tracks, center=center, yaw=yaw)
-        return Measured(prepare(clip.truth, local, self.name, self.rules, clip.name), near)
-
-    def figures(self, measured: Sequence[Measured]) -> Figures:
-        """Return the figures of some sequences together."""
-        near = [one.near for one in measured]
-        if self.rules.measure == "distance":
-            return distance_figures(near, self.near)
-        return ab3dmot_figures([one.case for one in measured], near, self.rules, self.near)
-
-
-@dataclass(frozen=True)
-class NuScenesScorer:
-    """The figures of one class by the nuScenes benchmark; HOTA and sAMOTA by the distance of the centres."""
-
-    boxes: BoxScorer
-    scenes: dict[str, NuScenesScene]
-    config: NuScenesConfig
+    """By the distance of centres, for HOTA."""
+    scenes: Mapping[str, NuScenesScene] | None = None
+    """By sequence, where figures are those of the nuScenes benchmark."""
 
     @property
-    def name(self) -> str:
-        """The class."""
-        return self.boxes.name
-
-    @property
-    def rules(self) -> Rules:
-        """What is ignored, and what is excused."""
-        return self.boxes.rules
-
-    @property
-    def near(self) -> Rules:
-        """By the distance of centres."""
-        return self.boxes.near
+    def config(self) -> NuScenesConfig:
+        """Settings of the nuScenes benchmark with this class only."""
+        return NuScenesConfig(class_range={self.name: NuScenesConfig().class_range[self.name]})
 
     def counts(self, clip: Clip, tracks: ResultTable) -> Bools:
-        """Return which tracks (R,) are within the range of the class."""
-        ego = self.scenes[clip.name].ego[tracks.frame]
-        distance = np.linalg.norm(tracks.center[:, :2] - ego, axis=1)
+        """Return which of the tracks of a clip (R,), in the world frame, are in the range of the benchmark."""
+        if self.scenes is None:
+            return np.ones(len(tracks), dtype=np.bool_)
+        distance = np.linalg.norm(tracks.center[:, :2] - self.scenes[clip.name].ego[tracks.frame], axis=1)
         return np.asarray(distance < self.config.class_range[self.name], dtype=np.bool_)
 
     def measure(self, clip: Clip, tracks: ResultTable) -> Measured:
         """Compare the tracks of a clip, in the world frame, with its truth."""
-        scene = self.scenes[clip.name]
-        label = NUSCENES_CLASSES.index(self.name)
-        found = pair(
-            scene.truth,
-            scene.tracks(tracks, self.config),
-            label,
-            len(scene.stamp_us),
-            self.config.match_distance,
-        )
-        return replace(self.boxes.measure(clip, tracks.take(self.counts(clip, tracks))), official=found)
+        official = None
+        if self.scenes is not None:
+            scene, label = self.scenes[clip.name], NUSCENES_CLASSES.index(self.name)
+            boxes = scene.tracks(tracks, self.config)
+            official = pair(scene.truth, boxes, label, len(scene.stamp_us), self.config.match_distance)
+            tracks = tracks.take(self.counts(clip, tracks))
+        near = prepare(clip.world, tracks, self.name, self.near, clip.name)
+        if self.rules.measure == "distance":
+            return Measured(near, near, official)
+        when = tracks.frame
+        center, yaw = to_sensor(clip.rotation[when], clip.translation[when], tracks.center, tracks.yaw)
+        local = replace(tracks, center=center, yaw=yaw)
+        return Measured(prepare(clip.truth, local, self.name, self.rules, clip.name), near, official)
 
     def figures(self, measured: Sequence[Measured]) -> Figures:
         """Return the figures of some sequences together."""
-        found = evaluate_class([one.official for one in measured if one.official is not None], self.config)
-        best = found.best
-        return replace(
-            self.boxes.figures(measured),
-            amota=found.amota,
-            amotp=found.amotp,
-            mota=best.mota,
-            motp=best.motp,
-            ids=best.ids,
-            frag=best.frag,
-            fp=best.fp,
-            fn=best.fn,
-            gt=best.gt,
-            threshold=best.threshold,
-        )
+        near = [one.near for one in measured]
+        best: ClearResult | Counts
+        if self.rules.measure == "distance":
+            found = evaluate_ab3dmot([replace(one, similarity=1.0 - one.cost / self.near.limit) for one in near], 0.0)
+            amotp = self.near.limit * (1.0 - found.amotp)
+            # Of CLEAR MOT, where changes of identity over breaks count too.
+            best = combine(clear(case.from_score(found.threshold), self.near) for case in near)
+            switches = len(best.switches)
+        else:
+            found = evaluate_ab3dmot([one.case for one in measured], self.rules.limit)
+            amotp, best, switches = found.amotp, found.best, found.best.switches
+        hota = self._hota(near, found.threshold)
+        figures = {
+            "sAMOTA": found.samota,
+            "AMOTA": found.amota,
+            "AMOTP": amotp,
+            "MOTA": best.mota,
+            "MOTP": best.motp,
+            "HOTA": hota.hota,
+            "DetA": hota.deta,
+            "AssA": hota.assa,
+            "IDS": switches,
+            "FRAG": best.fragments,
+            "FP": best.false,
+            "FN": best.missed,
+            "GT": best.truth,
+            "threshold": found.threshold,
+            "HOTA, all": self._hota(near, -math.inf).hota,
+        }
+        if self.scenes is not None:
+            official = [one.official for one in measured if one.official is not None]
+            own = evaluate_class(official, self.config).figures()
+            figures |= {name: own[name.lower()] for name in _OFFICIAL}
+        return figures
+
+    def _hota(self, near: Sequence[Case], threshold: float) -> HotaResult:
+        return evaluate_hota([case.from_score(threshold) for case in near], self.near)
+
+
+_OFFICIAL = ("AMOTA", "AMOTP", "MOTA", "MOTP", "IDS", "FRAG", "FP", "FN", "GT", "threshold")
 
 
 def rules_of(dataset: str) -> Rules:
@@ -164,9 +171,8 @@ def rules_of(dataset: str) -> Rules:
 
 def scorer_of(dataset: str, name: str, sequences: Sequence[DataSequence]) -> Scorer:
     """Return the scorer of a class of a dataset."""
-    boxes = BoxScorer(name, rules_of(dataset), default_rules(dataset, "distance", CENTRE_DISTANCE))
+    scorer = Scorer(name, rules_of(dataset), default_rules(dataset, "distance"))
     scenes = [sequence for sequence in sequences if isinstance(sequence, NuScenesSequence)]
     if not scenes or len(scenes) < len(sequences):
-        return boxes
-    config = NuScenesConfig(class_range={name: NuScenesConfig().class_range[name]})
-    return NuScenesScorer(boxes, {scene.name: prepare_scene(scene, config) for scene in scenes}, config)
+        return scorer
+    return replace(scorer, scenes={scene.name: prepare_scene(scene, scorer.config) for scene in scenes})

@@ -8,23 +8,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel
+
 from optipmb import Calibration, HeadingSign, OptipmbError, Parameters, ScoreCalibration, parse_parameters
 from optipmb_client.errors import UsageError
 from optipmb_client.files import write_whole
-
-__all__ = [
-    "DIGITS",
-    "Value",
-    "only",
-    "rounded",
-    "value_of",
-    "with_calibration",
-    "with_classes",
-    "with_heading_sign",
-    "with_score_calibration",
-    "with_values",
-    "write_profile",
-]
 
 DIGITS = 3
 Value = float | int | bool
@@ -65,26 +53,27 @@ def with_values(parameters: Parameters, name: str, values: Mapping[str, Value | 
     return _parsed(document)
 
 
+def _with_tables(parameters: Parameters, columns: Mapping[str, Mapping[str, BaseModel | None]]) -> Parameters:
+    """Return the parameters with other tables of some classes, such as a `calibration`; None removes one."""
+    document = parameters.model_dump()
+    for name, tables in columns.items():
+        document["classes"][name] |= {key: table.model_dump() if table else None for key, table in tables.items()}
+    return _parsed(document)
+
+
 def with_calibration(parameters: Parameters, name: str, calibration: Calibration | None) -> Parameters:
     """Return the parameters with another calibration of one class."""
-    document = parameters.model_dump()
-    document["classes"][name]["calibration"] = calibration.model_dump() if calibration else None
-    return _parsed(document)
+    return _with_tables(parameters, {name: {"calibration": calibration}})
 
 
 def with_score_calibration(parameters: Parameters, curves: Mapping[str, ScoreCalibration | None]) -> Parameters:
     """Return the parameters with other score calibrations of some classes."""
-    document = parameters.model_dump()
-    for name, curve in curves.items():
-        document["classes"][name]["score_calibration"] = curve.model_dump() if curve else None
-    return _parsed(document)
+    return _with_tables(parameters, {name: {"score_calibration": curve} for name, curve in curves.items()})
 
 
 def with_heading_sign(parameters: Parameters, name: str) -> Parameters:
     """Return the parameters with the usual `heading_sign` of a class that has none."""
-    document = parameters.model_dump()
-    document["classes"][name]["heading_sign"] = document["classes"][name]["heading_sign"] or HeadingSign().model_dump()
-    return _parsed(document)
+    return _with_tables(parameters, {name: {"heading_sign": parameters.classes[name].heading_sign or HeadingSign()}})
 
 
 def only(parameters: Parameters, name: str) -> Parameters:

@@ -4,20 +4,24 @@ All classes are tracked together, as in use. Frames per second are those of the 
 memory: neither reading nor detecting is in them.
 """
 
+import csv
+import io
+import json
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from optipmb import Modules, Parameters, warm_up
-from optipmb_client.tuning.figures import Figures
-from optipmb_client.tuning.material import track_clip
+from optipmb_client.colours import colour_of
+from optipmb_client.evaluation.figures import overall
+from optipmb_client.files import write_whole
+from optipmb_client.tuning.clips import track_clip
 from optipmb_client.tuning.run import Source
-from optipmb_client.tuning.scoring import Scorer, scorer_of
+from optipmb_client.tuning.scoring import Figures, Scorer, plain_figures, scorer_of
 from optipmb_client.tuning.values import with_values
-
-__all__ = ["ROWS", "Row", "Variant", "ablation", "measure_variants", "sweep"]
 
 _ADP, _HABM, _RPP, _OTE = "adp", "habm", "rpp", "ote"
 ROWS: tuple[frozenset[str], ...] = tuple(
@@ -42,7 +46,6 @@ ROWS: tuple[frozenset[str], ...] = tuple(
     )
 )
 """The modules that are on, in the order of the paper's table."""
-_SUMMED = ("ids", "frag", "fp", "fn", "gt")
 
 
 @dataclass(frozen=True)
@@ -67,8 +70,8 @@ class Row:
         """Return the figures as plain values."""
         return {
             "frames_per_second": self.frames_per_second,
-            "overall": self.overall.to_json(),
-            "classes": {name: figures.to_json() for name, figures in self.classes.items()},
+            "overall": plain_figures(self.overall),
+            "classes": {name: plain_figures(figures) for name, figures in self.classes.items()},
         }
 
 
@@ -120,13 +123,63 @@ def _row(source: Source, variant: Variant, scorers: Sequence[Scorer], on_clip: C
             measured[scorer.name].append(scorer.measure(clip, tracks))
         on_clip(len(clip.frames))
     figures = {scorer.name: scorer.figures(measured[scorer.name]) for scorer in scorers}
-    return Row(variant, figures, _overall(list(figures.values())), frames / seconds if seconds else math.nan)
+    return Row(variant, figures, overall(list(figures.values())), frames / seconds if seconds else math.nan)
 
 
-def _overall(figures: Sequence[Figures]) -> Figures:
-    values = {}
-    for item in fields(Figures):
-        known = [value for one in figures if math.isfinite(value := getattr(one, item.name))]
-        total = math.fsum(known)
-        values[item.name] = total if item.name in _SUMMED else total / len(known) if known else math.nan
-    return Figures(**values)
+_DRAWN = ("AMOTA", "HOTA, all")
+
+
+def write_sweep(folder: Path, result: Mapping[str, Any], *, picture: bool) -> None:
+    """Write `sweep.json`, `sweep.csv` and, where matplotlib is installed, `sweep.png`.
+
+    Args:
+        folder: is made where it is not there.
+        result: `sweeps` has for each parameter its `values`, those of the `profile` by class, and `figures`: by class
+            a mapping for each value.
+        picture: whether to draw.
+
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = [
+        {"parameter": one["parameter"], "value": value, "class": label, **figures}
+        for one in result["sweeps"]
+        for label, each in one["figures"].items()
+        for value, figures in zip(one["values"], each, strict=True)
+    ]
+    lines = io.StringIO()
+    table = csv.DictWriter(lines, list(rows[0]), lineterminator="\n")
+    table.writeheader()
+    table.writerows(rows)
+    for name, text in (("sweep.json", json.dumps(result, indent=1) + "\n"), ("sweep.csv", lines.getvalue())):
+        write_whole(folder / name, [text])
+    if picture:
+        _draw(folder / "sweep.png", result["sweeps"])
+
+
+def _draw(path: Path, sweeps: list[dict[str, Any]]) -> None:
+    """Draw a column for each parameter, a row for each figure and a line for each class."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 - matplotlib is an extra
+    from matplotlib.figure import Figure  # noqa: PLC0415 - matplotlib is an extra
+
+    figure = Figure(figsize=(1.0 + 3.6 * len(sweeps), 6.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(len(_DRAWN), len(sweeps), squeeze=False, sharex="col", sharey="row")
+    for column, one in enumerate(sweeps):
+        ticks = list(map(str, one["values"]))
+        for row, name in enumerate(_DRAWN):
+            axes = grid[row][column]
+            for number, (label, figures) in enumerate(one["figures"].items(), start=1):
+                heights = [float("nan") if each[name] is None else each[name] for each in figures]
+                whole = label not in one["profile"]
+                style = {"color": "#222222", "linestyle": "--"} if whole else {"color": colour_of(number)}
+                axes.plot(ticks, heights, marker=".", label=label, **style)
+                if not whole and one["profile"][label] in one["values"]:
+                    place = one["values"].index(one["profile"][label])
+                    axes.plot(ticks[place], heights[place], "o", markersize=10, markerfacecolor="none", **style)
+            axes.grid(visible=True, color="#EEEEEE", linewidth=0.6)
+            axes.set_ylabel(name if column == 0 else "")
+        axes.set_xlabel(one["parameter"])
+    handles, labels = grid[0][0].get_legend_handles_labels()
+    title = "rings: the profile's value"
+    figure.legend(handles, labels, title=title, loc="outside lower center", ncols=len(labels), frameon=False)
+    figure.savefig(path, dpi=110, metadata={"Software": None})

@@ -2,26 +2,43 @@
 
 `from_proto` builds what `decode` builds of msgpack and checks it in the same way, so that both forms have the same
 limits and the same errors. It is total: it returns a model or raises `MessageError`.
+
+`transcode` takes tracks from msgpack to protobuf without a model between them: a service has checked what it has
+published. What is checked is what can be known without looking at the values: the structure, the types, and that each
+column has the rows of the others and the bytes of its shape. A receiver that wants more has `from_proto`.
 """
 
-from collections.abc import Callable, Sequence
-from contextlib import suppress
-from functools import cache
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from math import prod
 from struct import pack
-from typing import Any, Final, TypeVar
+from typing import Any, Final, Self, TypeVar
 
+import msgspec
 import numpy as np
 from google.protobuf import struct_pb2
 from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.json_format import MessageToDict
 from google.protobuf.message import DecodeError
 from google.protobuf.message import Message as ProtoMessage
+from msgspec import UNSET
+from msgspec.structs import asdict
 from numpy.typing import NDArray
 
-from optipmb_schemas.codec import build
-from optipmb_schemas.decoder import DECODERS, REFUSED, Block, checked
+from optipmb_schemas.codec import (
+    DECODERS,
+    DTYPES,
+    MOST_BYTES,
+    REFUSED,
+    build,
+    decode,
+    encoding_of,
+    read_columns,
+)
 from optipmb_schemas.errors import MessageError, invalid
 from optipmb_schemas.limits import DEFAULT, Limits
+from optipmb_schemas.messages import Tracks
 from optipmb_schemas.model import Message
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
@@ -34,7 +51,10 @@ _DTYPE_NAMES: Final[dict[int, str]] = {
 _DTYPES: Final = {code: np.dtype(f"<{name}") for code, name in _DTYPE_NAMES.items()}
 DTYPE_CODES: Final[dict[str, Any]] = {name: code for code, name in _DTYPE_NAMES.items()}
 _FRAMES: Final[dict[int, str]] = {pb.FRAME_WORLD: "world", pb.FRAME_SENSOR: "sensor"}
+_pack: Final = msgspec.msgpack.Encoder().encode
 _FRAME_CODES: Final = {name: code for code, name in _FRAMES.items()}
+_ENCODING: Final = encoding_of(Tracks)
+_SCALARS: Final = tuple(name for name in Tracks.names if name not in Tracks.arrays)
 
 
 def parse(payload: bytes, kind: type[P]) -> P:
@@ -72,10 +92,12 @@ def from_proto(proto: ProtoMessage, kind: type[T], limits: Limits = DEFAULT) -> 
     Raises:
         MessageError: whenever it is not a valid message within the limits.
     """
-    if kind in DECODERS:
-        with suppress(*REFUSED):
-            return checked(_usual_fields(proto), kind, limits)
-    return build(_fields(proto), kind, limits)
+    fields = _fields(proto)
+    if kind in DECODERS and proto.ByteSize() <= MOST_BYTES:
+        message = read_columns(_pack(_with_blocks(fields, kind)), kind, limits)
+        if message is not None:
+            return message
+    return build(fields, kind, limits)
 
 
 def column(array: pb.Array) -> NDArray[Any]:
@@ -96,34 +118,27 @@ def _array(array: NDArray[Any], dtype: str) -> pb.Array:
     return pb.Array(dtype=DTYPE_CODES[dtype], shape=array.shape, data=data)
 
 
-def _usual_fields(proto: ProtoMessage) -> dict[str, Any]:
-    """Return the fields as `checked` takes them. One that has its default value is left out."""
-    readers = _readers(proto.DESCRIPTOR.full_name, _usual_reader)
-    return {(name := field.name): readers[name](value) for field, value in proto.ListFields()}
+def _with_blocks(fields: dict[str, Any], kind: type[Message]) -> dict[str, Any]:
+    """Return the fields with arrays in place of the lists of numbers that protobuf has for arrays of a fixed size."""
+    lists = {name: fields[name] for name in _repeated(kind) & fields.keys()}
+    inner = {name: _with_blocks(fields[name], inner) for name, inner in kind.nested.items() if name in fields}
+    return fields | inner | {name: _doubles(values) for name, values in lists.items()}
 
 
 def _fields(proto: ProtoMessage) -> dict[str, Any]:
     """Return the fields as `build` takes them. An absent one that can tell so is left out."""
-    presence = _presence(proto.DESCRIPTOR.full_name)
     return {
-        name: read(value)
-        for name, read in _readers(proto.DESCRIPTOR.full_name, _reader).items()
-        if (name not in presence or proto.HasField(name)) and (value := getattr(proto, name)) is not None
+        name: read(getattr(proto, name))
+        for name, read, has_presence in _readers(proto.DESCRIPTOR.full_name)
+        if not has_presence or proto.HasField(name)
     }
 
 
 @cache
-def _presence(name: str) -> frozenset[str]:
-    """Return the fields of a message type that can be absent."""
+def _readers(name: str) -> list[tuple[str, Callable[[Any], Any], bool]]:
+    """Return of every field of a message type its name, how to read it, and whether it can be absent."""
     fields = pb.DESCRIPTOR.message_types_by_name[name.rpartition(".")[2]].fields
-    return frozenset(field.name for field in fields if field.has_presence)
-
-
-@cache
-def _readers(name: str, reader: Callable[[FieldDescriptor], Callable[[Any], Any]]) -> dict[str, Callable[[Any], Any]]:
-    """Return how to read every field of a message type."""
-    fields = pb.DESCRIPTOR.message_types_by_name[name.rpartition(".")[2]].fields
-    return {field.name: reader(field) for field in fields}
+    return [(field.name, _reader(field), field.has_presence) for field in fields]
 
 
 def _reader(field: FieldDescriptor) -> Callable[[Any], Any]:
@@ -138,13 +153,6 @@ def _reader(field: FieldDescriptor) -> Callable[[Any], Any]:
     if field.message_type.full_name == struct_pb2.Struct.DESCRIPTOR.full_name:
         return MessageToDict
     return _fields
-
-
-def _usual_reader(field: FieldDescriptor) -> Callable[[Any], Any]:
-    if field.is_repeated and field.type == FieldDescriptor.TYPE_DOUBLE:
-        return _doubles
-    read = _reader(field)
-    return {_block: _usual_block, _fields: _usual_fields}.get(read, read)
 
 
 def _same(value: Any) -> Any:
@@ -163,12 +171,8 @@ def _block(array: pb.Array) -> dict[str, Any]:
     return {"dtype": _DTYPE_NAMES.get(array.dtype, array.dtype), "shape": list(array.shape), "data": array.data}
 
 
-def _usual_block(array: pb.Array) -> Block:
-    return Block(_DTYPE_NAMES[array.dtype], list(array.shape), memoryview(array.data))
-
-
-def _doubles(values: Sequence[float]) -> Block:
-    return Block("f8", [len(values)], memoryview(pack(f"<{len(values)}d", *values)))
+def _doubles(values: list[float]) -> dict[str, Any]:
+    return {"dtype": "f8", "shape": [len(values)], "data": pack(f"<{len(values)}d", *values)}
 
 
 @cache
@@ -181,3 +185,88 @@ def _struct(values: dict[str, Any]) -> struct_pb2.Struct:
     struct = struct_pb2.Struct()
     struct.update(values)
     return struct
+
+
+@dataclass(frozen=True, slots=True)
+class EncodedTracks:
+    """The tracks of one frame in protobuf, and what tells this publication of them from others."""
+
+    stream: str
+    epoch: bytes
+    seq: int
+    stamp_ns: int
+    revision: int
+    run: int
+    payload: bytes
+    """The message `Tracks`, serialized."""
+    sensor: str = ""
+    """Stream of the detections, where several share a session."""
+
+    @classmethod
+    def of(cls, proto: pb.Tracks, columns: bytes = b"") -> Self:
+        """Return the tracks of a message, and of columns that are serialized already."""
+        payload = proto.SerializeToString() + columns
+        place = (proto.stream, proto.epoch, proto.seq, proto.stamp_ns)
+        return cls(*place, proto.revision, proto.delivery.run, payload, proto.sensor)
+
+    def message(self) -> pb.Tracks:
+        """Return the message."""
+        return pb.Tracks.FromString(self.payload)
+
+
+def transcode(payload: bytes, *, encoding: str = "", limits: Limits = DEFAULT) -> EncodedTracks:
+    """Return encoded tracks in protobuf, their columns as they are.
+
+    Args:
+        payload: msgpack or JSON.
+        encoding: the Zenoh encoding of the sample.
+        limits: what is accepted at most.
+
+    Raises:
+        MessageError: they are no tracks within the limits.
+    """
+    if encoding == _ENCODING and len(payload) <= limits.max_bytes:
+        try:
+            tracks = _tracks(DECODERS[Tracks](payload), limits)
+        except REFUSED:
+            tracks = None  # decoding says what is wrong, if anything is
+        if tracks is not None:
+            return tracks
+    return EncodedTracks.of(to_proto(decode(payload, Tracks, encoding=encoding, limits=limits)))
+
+
+def _tracks(fields: Any, limits: Limits) -> EncodedTracks | None:
+    """Return the tracks of fields that are as a service writes them, else None.
+
+    Fields that are not known here are of a newer version, and are left out.
+    """
+    scalars = {name: value for name in _SCALARS if (value := getattr(fields, name)) is not UNSET}
+    if len(fields.labels) > limits.max_labels or None in scalars.values():
+        return None
+    (rows,), (horizons,) = fields.id.shape, fields.horizons.shape or (0,)
+    if not (0 <= rows <= limits.max_tracks and 0 <= horizons <= limits.max_horizons):
+        return None
+    parts: list[bytes] = []
+    for name, shape, size, prefix in _columns(rows, horizons, len(fields.labels)):
+        block = getattr(fields, name)
+        if block.shape is not None:  # else it is absent
+            if block.shape != shape or len(block.data) != size:
+                return None
+            parts += (prefix, block.data)
+    if "delivery" in scalars:
+        scalars["delivery"] = {name: one for name, one in asdict(fields.delivery).items() if one is not UNSET}
+    return EncodedTracks.of(pb.Tracks(**scalars), b"".join(parts))
+
+
+@lru_cache(512)
+def _columns(rows: int, horizons: int, classes: int) -> list[tuple[str, tuple[int, ...], int, bytes]]:
+    """Return of each column name, shape, bytes, and what stands before them in the serialized message."""
+    sizes, columns = {"N": rows, "H": horizons, "C": classes}, []
+    for name, one in Tracks.arrays.items():
+        shape = tuple(length if isinstance(length, int) else sizes[length] for length in one.shape)
+        size = prod(shape) * DTYPES[one.dtype]
+        proto: Any = pb.Tracks()
+        getattr(proto, name).CopyFrom(pb.Array(dtype=DTYPE_CODES[one.dtype], shape=shape, data=bytes(size)))
+        field: bytes = proto.SerializeToString()
+        columns.append((name, shape, size, field[: len(field) - size]))
+    return columns

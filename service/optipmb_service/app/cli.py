@@ -8,24 +8,37 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
+import shutil
 import sys
+import sysconfig
 from importlib import import_module
 from inspect import Parameter, Signature, signature
 from pathlib import Path  # noqa: TC003 - typer reads the annotations at run time
 from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn, TypedDict, Unpack, get_type_hints
 
+import structlog
 import typer
 from optipmb_schemas.installation import install_command
 from typer.main import get_command
 
 from optipmb_service import __version__
-from optipmb_service.app import health_command, nats, router
-from optipmb_service.app.ending import leave_or_restart
+from optipmb_service.app import edges, health_command
+from optipmb_service.app.lifecycle import leave_or_restart
 from optipmb_service.cluster.store import StoreError
-from optipmb_service.observability import logs
-from optipmb_service.settings.forms import DEFAULT_GRPC, DEFAULT_LISTEN, DEFAULT_NATS, address, without_password
-from optipmb_service.settings.loading import Loaded, SettingsInvalidError, load
-from optipmb_service.settings.model import Settings, state_home
+from optipmb_service.settings import (
+    DEFAULT_GRPC,
+    DEFAULT_LISTEN,
+    DEFAULT_NATS,
+    Loaded,
+    Settings,
+    SettingsInvalidError,
+    address,
+    load,
+    state_home,
+    without_password,
+)
+from optipmb_service.telemetry import logs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -33,10 +46,10 @@ if TYPE_CHECKING:
 WRONG_USE: Final = 2
 PASSED_ON: Final = {"allow_extra_args": True, "ignore_unknown_options": True}
 
-app = typer.Typer(
-    add_completion=False,
-    rich_markup_mode=None,
-)
+NATS: Final = "nats-server"
+NATS_PAYLOAD_MB: Final = 8  # largest message; a checkpoint may have three quarters of it; the default of NATS is 1
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
 class RouterOptions(TypedDict, total=False):
@@ -106,7 +119,7 @@ class Options(GatewayOptions, LogOptions, total=False):
 
 
 def _taking(options: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Let a command with `**given` have the options of a class: typer reads a command's signature, and no `Unpack`."""
+    """Give a command with `**given` the options of a class: typer reads a command's signature, and no `Unpack`."""
 
     def spread(command: Callable[..., None]) -> Callable[..., None]:
         own = [
@@ -131,7 +144,14 @@ def run_command(**given: Unpack[Options]) -> None:
     settings = _begin(_load(given))
     if settings.cluster:
         _needed("optipmb_service.cluster.jetstream", "cluster")
-    leave_or_restart(_run_one(settings) if settings.workers == 1 else _run_many(settings))
+    if settings.workers > 1:
+        from optipmb_service.app.workers import supervise  # noqa: PLC0415 - a process that tracks needs none
+
+        leave_or_restart(asyncio.run(supervise(settings)))
+    # It takes the tracker along: 150 MB and seconds.
+    from optipmb_service.app import worker  # noqa: PLC0415 - neither a parent nor a question needs it
+
+    leave_or_restart(worker.run(settings))
 
 
 def _version(value: bool) -> None:  # noqa: FBT001 - the parser calls it so
@@ -187,36 +207,34 @@ def config_command(
 @_taking(RouterOptions)
 def router_command(**given: Unpack[RouterOptions]) -> None:
     """Run a Zenoh router alone, without tracking. SIGINT and SIGTERM end it."""
-    leave_or_restart(asyncio.run(router.run(_begin(_load({**given, "router": True})))))
+    leave_or_restart(asyncio.run(edges.run_router(_begin(_load({**given, "router": True})))))
 
 
 @app.command("grpc")
 @_taking(GatewayOptions)
 def grpc_command(**given: Unpack[GatewayOptions]) -> None:
     """Run a gRPC gateway alone, a client of routers. Prints one line, `ready …`; SIGINT and SIGTERM end it."""
-    settings = _begin(_load(given, grpc=DEFAULT_GRPC, connect=[DEFAULT_LISTEN]))
-    run = _needed("optipmb_service.app.gateway", "grpc").run
-    leave_or_restart(asyncio.run(run(settings.model_copy(update={"router": False, "listen": ()}))))
+    settings = _client(given, grpc=DEFAULT_GRPC)
+    _needed("optipmb_service.grpc.server", "grpc")
+    leave_or_restart(asyncio.run(edges.run_gateway(settings)))
 
 
 @app.command("ros2")
 @_taking(RouterOptions)
 def ros2_command(**given: Unpack[RouterOptions]) -> None:
     """Run a bridge to ROS 2 (rmw_zenoh) alone, a client of routers. SIGINT and SIGTERM end it. See docs/ros2.md."""
-    settings = _begin(_load(given, connect=[DEFAULT_LISTEN]))
+    settings = _client(given)
     if not settings.ros2.streams:
         _wrong("setting ros2.streams: expected a table of streams and their topics in --settings, received none")
-    run = _needed("optipmb_service.app.ros2", "ros2").run
-    leave_or_restart(asyncio.run(run(settings.model_copy(update={"router": False, "listen": ()}))))
+    leave_or_restart(asyncio.run(_needed("optipmb_service.app.ros2", "ros2").run(settings)))
 
 
 @app.command("log")
 @_taking(LogOptions)
 def log_command(**given: Unpack[LogOptions]) -> None:
     """Put detections and tracks into the log of a cluster, a client of routers. SIGINT and SIGTERM end it."""
-    settings = _begin(_load(given, connect=[DEFAULT_LISTEN], cluster=[f"nats://{DEFAULT_NATS}"]))
-    run = _needed("optipmb_service.app.log_bridge", "cluster").run
-    leave_or_restart(asyncio.run(run(settings.model_copy(update={"router": False, "listen": ()}))))
+    settings = _client(given, cluster=[f"nats://{DEFAULT_NATS}"])
+    leave_or_restart(asyncio.run(_needed("optipmb_service.app.log_bridge", "cluster").run(settings)))
 
 
 @app.command("nats")
@@ -231,13 +249,30 @@ def nats_command(
         address(listen)
     except ValueError as error:
         _wrong(f"option listen: {error}")
-    server = nats.program()
+    server = nats_server()
     if server is None:
-        _wrong(f"this needs nats-server, which is not installed: {install_command('cluster')}")
+        _wrong(f"this needs {NATS}, which is not installed: {install_command('cluster')}")
+    folder = (store or state_home() / "nats").absolute()
     try:
-        nats.become(server, listen, (store or state_home() / "nats").absolute())
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "nats.conf").write_text(nats_configuration(listen, folder), encoding="utf-8")
+        # The process becomes the server, so signals and exit status are the server's own.
+        os.execv(server, [server, "--config", str(folder / "nats.conf")])  # noqa: S606 - no shell is wanted
     except OSError as error:
         _wrong(f"{error.filename}: {error.strerror}")
+
+
+def nats_server() -> str | None:
+    """Return the path of the server, from the package beside this one or else from the system; None without one."""
+    return shutil.which(NATS, path=sysconfig.get_path("scripts")) or shutil.which(NATS)
+
+
+def nats_configuration(listen: str, folder: Path) -> str:
+    """Return the configuration of a server, by where it listens and the folder of its files."""
+    return f"""listen: "{listen}"
+max_payload: {NATS_PAYLOAD_MB}MB
+jetstream {{ store_dir: "{folder}" }}
+"""
 
 
 @app.command("copy")
@@ -250,7 +285,7 @@ def copy_command(
     given: dict[str, Any] = {"settings": settings, "cluster": cluster, "store": store and str(store)}
     loaded = _begin(_load(given))
     _needed("optipmb_service.cluster.jetstream", "cluster")
-    from optipmb_service.app.clustering import copy_folder  # noqa: PLC0415 - it takes the tracker along
+    from optipmb_service.app.storage import copy_folder  # noqa: PLC0415 - it takes the tracker along
 
     try:
         copied, known = copy_folder(loaded)
@@ -280,19 +315,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     sys.exit(status if isinstance(status, int) else 0)
 
 
-def _run_one(settings: Settings) -> int:
-    # It takes the tracker along: 150 MB and seconds.
-    from optipmb_service.app.worker import run_alone  # noqa: PLC0415 - neither a parent nor a question needs it
-
-    return run_alone(settings)
-
-
-def _run_many(settings: Settings) -> int:
-    from optipmb_service.app.supervisor import supervise  # noqa: PLC0415 - a process that tracks needs none
-
-    return asyncio.run(supervise(settings))
-
-
 def _load(given: Mapping[str, Any], **defaults: Any) -> Loaded:
     """Return the settings in force with what the command line gives; None and no endpoints: not given."""
     options = {name: value or None if name in {"listen", "connect"} else value for name, value in given.items()}
@@ -304,12 +326,20 @@ def _load(given: Mapping[str, Any], **defaults: Any) -> Loaded:
 
 
 def _begin(loaded: Loaded) -> Settings:
-    """Let logs go where the settings want them."""
+    """Configure the logs, and log what is wrong with the settings but allowed."""
     logs.configure(loaded.settings.log_format, loaded.settings.log_level)
-    logs.unknown_environment(loaded.unknown)
+    log = structlog.get_logger("optipmb_service")
+    if loaded.unknown:
+        log.warning("unknown_environment", names=loaded.unknown)
     if loaded.settings.unprotected:
-        logs.unprotected(loaded.settings.unprotected)
+        log.warning("unprotected", addresses=loaded.settings.unprotected)
     return loaded.settings
+
+
+def _client(given: Mapping[str, Any], **defaults: Any) -> Settings:
+    """Return the settings of a process that is a client of routers."""
+    settings = _begin(_load(given, connect=[DEFAULT_LISTEN], **defaults))
+    return settings.model_copy(update={"router": False, "listen": ()})
 
 
 def _needed(module: str, extra: str) -> Any:

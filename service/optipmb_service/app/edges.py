@@ -1,68 +1,78 @@
-"""The edges beside Zenoh, where the settings ask for them: HTTP for people and monitoring, and gRPC."""
+"""Processes that are edges alone: a Zenoh router, and a gRPC gateway.
+
+The router is the same as the one inside the service, with the same tuning; access control, TLS and limits come from
+the Zenoh configuration file. Health and readiness are those of the service.
+"""
 
 from __future__ import annotations
 
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Protocol
+import asyncio
+from typing import TYPE_CHECKING
 
 import structlog
-from optipmb_schemas.installation import install_command
 
-from optipmb_service.runtime.ports import EdgeError
+from optipmb_service.app import lifecycle
+from optipmb_service.app.lifecycle import say_ready, settle
+from optipmb_service.telemetry.health import Reporter
+from optipmb_service.telemetry.metrics import GATEWAY_METRICS
+from optipmb_service.zenoh import Router
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from optipmb_service.grpc.beside import AddFigures
-    from optipmb_service.http import Source, Watched
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.app.lifecycle import StopRequest
+    from optipmb_service.settings import Settings
+    from optipmb_service.telemetry.health import ProcessHealth
     from optipmb_service.zenoh.client import Client
-
-    class Monitored(Source, Watched, Protocol):
-        """What is served over HTTP."""
-
 
 log = structlog.get_logger("optipmb_service")
 
 
-@contextmanager
-def monitoring(settings: Settings, source: Monitored) -> Iterator[None]:
-    """Answer over HTTP, where that is asked for.
+class ClientReporter(Reporter):
+    """Health of a client of routers."""
 
-    Raises:
-        HttpError: the address cannot be listened on.
-    """
-    if not settings.http:
-        yield
-        return
-    from optipmb_service.http import KnownHosts, Server, application, page  # noqa: PLC0415 - a third of a second that only this needs
+    def __init__(self, client: Client) -> None:
+        self._client = client
 
-    server = Server(KnownHosts(application(source, page(source)), settings.http_hosts), settings.http)
-    log.info("http", address=server.address)
-    try:
-        yield
-    finally:
-        server.close()
+    @property
+    def state(self) -> str:
+        """Ready while there is a router."""
+        return "unlinked" if self._client.failure else "ready"
+
+    @property
+    def failure(self) -> str:
+        """Why there is no router; empty while there is one."""
+        return self._client.failure
 
 
-@contextmanager
-def grpc_edge(settings: Settings, client: Callable[[], Client], add: AddFigures) -> Iterator[None]:
-    """Serve gRPC, where that is asked for.
+async def run_router(settings: Settings) -> int:
+    """Route until SIGINT or SIGTERM; returns the exit status, as `lifecycle.run` does."""
 
-    Args:
-        settings: address and certificates.
-        client: gives what it uses of the network.
-        add: has its figures read with the metrics.
+    async def serve(asked: StopRequest, health: ProcessHealth) -> bool:
+        router = Router(settings)
+        health.report(Reporter())
+        say_ready("router", settings.instance, settings.endpoints)
+        log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
+        await asked.wait()
+        health.ends()
+        await asyncio.to_thread(router.close)
+        return True
 
-    Raises:
-        EdgeError: it cannot be served.
-    """
-    if not settings.grpc:
-        yield
-        return
-    try:
-        from optipmb_service.grpc.beside import serving  # noqa: PLC0415 - an extra that only this needs
-    except ModuleNotFoundError as error:
-        raise EdgeError(f"gRPC needs {error.name}, which is not installed: {install_command('grpc')}") from error
-    with serving(settings, client(), add):
-        yield
+    return await lifecycle.run(settings, serve)
+
+
+async def run_gateway(settings: Settings) -> int:
+    """Serve gRPC until SIGINT or SIGTERM; returns the exit status, as `lifecycle.run` does."""
+    from optipmb_service.grpc.server import Server  # noqa: PLC0415 - an extra that only this needs
+
+    async def serve(asked: StopRequest, health: ProcessHealth, client: Client) -> None:
+        server = Server(settings, client)
+        health.metrics.add(GATEWAY_METRICS, lambda: server.metrics)
+        await server.start()
+        health.report(ClientReporter(client))
+        settle()
+        say_ready("grpc", server.address, settings.connect)
+        log.info("ready", instance=settings.instance, grpc=server.address, connect=settings.connect)
+        await asked.wait()
+        health.ends()
+        await server.stop()
+
+    return await lifecycle.run_client(settings, serve)

@@ -70,7 +70,7 @@ def _address(option: str | None, file: Path | None) -> str:
     """
     address = option or os.environ.get("OPTIPMB_HTTP", "")
     if file is not None and not address:
-        from optipmb_service.settings.loading import load  # noqa: PLC0415 - only this needs the libraries behind it
+        from optipmb_service.settings import load  # noqa: PLC0415 - only this needs the libraries behind it
 
         address = load(file).settings.http
     if not address.rpartition(":")[2].isdecimal():

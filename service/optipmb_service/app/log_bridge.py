@@ -14,23 +14,21 @@ from typing import TYPE_CHECKING, Final
 import optipmb_schemas as schemas
 import structlog
 
-from optipmb_service.app import process
-from optipmb_service.app.clustering import nats_access
-from optipmb_service.app.loops import say_ready, settle
-from optipmb_service.cluster.log_writer import LogWriter
-from optipmb_service.cluster.message_log import LogMessage, MessageLog, Retention
-from optipmb_service.observability.problem_reporter import ProblemReporter, log_problem
+from optipmb_service.app import lifecycle
+from optipmb_service.app.lifecycle import say_ready, settle
+from optipmb_service.app.storage import nats_access
+from optipmb_service.cluster.message_log import LogMessage, LogWriter, MessageLog, Retention
 from optipmb_service.runtime.kept_tracks import order_of
 from optipmb_service.session.problems import problem_of
+from optipmb_service.telemetry.health import Reporter
+from optipmb_service.telemetry.metrics import LOG_METRICS, PROBLEM_METRICS
+from optipmb_service.telemetry.problem_reporter import ProblemReporter, log_problem
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from optipmb_service.app.loops import StopRequest
+    from optipmb_service.app.lifecycle import StopRequest
     from optipmb_service.cluster.message_log import Topic
-    from optipmb_service.observability.health import ProcessHealth
-    from optipmb_service.observability.metrics import Value
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
+    from optipmb_service.telemetry.health import ProcessHealth
     from optipmb_service.zenoh.client import Client, Message
 
 log = structlog.get_logger("optipmb_service")
@@ -41,28 +39,21 @@ DRAIN_POLL_S: Final = 0.01
 MEGABYTE: Final = 2**20
 
 
-class LogBridge:
-    """From a network into the log.
-
-    Args:
-        settings: what is kept, and for how long.
-        client: the network; closed by the caller, after this.
-    """
-
-    stuck: Final = False
+class LogBridge(Reporter):
+    """From a network into the log; the client is closed by the caller, after this."""
 
     def __init__(self, settings: Settings, client: Client) -> None:
         self._client = client
         self._instance = settings.instance
         self._limits = settings.limits.limits()
         self._grace_s = settings.grace_s
-        self._invalid = 0
-        self._reporter = ProblemReporter(client.publish_problem, log_problem)
+        self.invalid = 0
+        self.reporter = ProblemReporter(client.publish_problem, log_problem)
         keep: dict[Topic, Retention] = {"detections": Retention(settings.log_s, settings.log_mb * MEGABYTE)}
         if settings.log_tracks_s:
             keep["tracks"] = Retention(settings.log_tracks_s, settings.log_tracks_mb * MEGABYTE)
         self._log = MessageLog(settings.cluster, settings.prefix, nats_access(settings))
-        self._writer = LogWriter(self._log, keep, self._unlogged)
+        self.writer = LogWriter(self._log, keep, self._unlogged)
         self._subscriptions = [client.subscribe(client.keys.all(topic), self._take) for topic in keep]
 
     @property
@@ -73,36 +64,18 @@ class LogBridge:
     @property
     def failure(self) -> str:
         """Why nothing can be received or written; empty while it can."""
-        why = self._writer.failure
+        why = self.writer.failure
         return self._client.failure or (f"log: {why}" if why else "")
-
-    def status(self) -> None:
-        """Return nothing: a bridge has no streams."""
-
-    def housekeeping(self) -> None:
-        """Do what is due about once a second."""
-        self._reporter.flush(time.monotonic_ns())
 
     def close(self) -> None:
         """Write what was received, within the grace, and end."""
         ends = time.monotonic() + self._grace_s
         for subscription in self._subscriptions:
             subscription.close(CLOSE_S)
-        while not self._writer.idle() and time.monotonic() < ends:
+        while not self.writer.idle() and time.monotonic() < ends:
             time.sleep(DRAIN_POLL_S)
-        self._writer.close()
+        self.writer.close()
         self._log.connection.close(CLOSE_S)
-
-    def figures(self) -> Iterator[Value]:
-        """Return what it counts."""
-        writer = self._writer
-        yield "log_written_total", (), writer.written
-        yield "log_repeated_total", (), writer.repeated
-        yield "log_dropped_total", (), writer.dropped
-        yield "log_invalid_total", (), self._invalid
-        yield "log_waiting_bytes", (), writer.held_bytes
-        for code, count in self._reporter.counts().items():
-            yield "problems_total", (code,), count
 
     def _take(self, message: Message) -> None:
         """Put a valid message into the log; one that is not, who tracks reports."""
@@ -111,17 +84,17 @@ class LogBridge:
             kind = schemas.Detections if message.key.endswith("/detections") else schemas.Tracks
             content = schemas.decode(message.payload, kind, encoding=message.encoding, limits=self._limits)
         except schemas.MessageError:
-            self._invalid += 1
+            self.invalid += 1
             return
         if content.stream != stream:
-            self._invalid += 1
+            self.invalid += 1
             return
         topic: Topic = "detections"
         sensor, order = "", (0, 0)
         if isinstance(content, schemas.Tracks):
             topic, sensor, order = "tracks", content.sensor or "", order_of(content)
         frame = content.epoch, content.seq, content.stamp_ns, sensor
-        self._writer.put(LogMessage(topic, stream, *frame, order, message.payload, message.encoding))
+        self.writer.put(LogMessage(topic, stream, *frame, order, message.payload, message.encoding))
 
     def _unlogged(self, stream: str, why: str) -> None:
         problem = problem_of(
@@ -132,23 +105,23 @@ class LogBridge:
             received=why,
             message=f"Log: a message is not in the log: {why}.",
         )
-        self._reporter.report(problem, time.monotonic_ns())
+        self.reporter.report(problem, time.monotonic_ns())
 
 
 async def run(settings: Settings) -> int:
-    """Write until SIGINT or SIGTERM; returns the exit status, as `process.run` does."""
+    """Write until SIGINT or SIGTERM; returns the exit status, as `lifecycle.run` does."""
 
     async def serve(asked: StopRequest, health: ProcessHealth, client: Client) -> None:
         bridge = LogBridge(settings, client)
-        health.metrics.add(bridge.figures)
+        health.metrics.add(LOG_METRICS | PROBLEM_METRICS, lambda: bridge)
         health.report(bridge)
         settle()
         say_ready("log", settings.instance, settings.connect)
         log.info("ready", instance=settings.instance, connect=settings.connect)
         while not asked.is_set():
             await asked.wait(HOUSEKEEPING_S)
-            bridge.housekeeping()
+            bridge.reporter.flush(time.monotonic_ns())
         health.ends()
         await asyncio.to_thread(bridge.close)
 
-    return await process.run_client(settings, serve)
+    return await lifecycle.run_client(settings, serve)

@@ -19,32 +19,28 @@ from optipmb_schemas.ros2.arrays import CLOUD
 from optipmb_schemas.ros2.tracks import TOPICS
 from optipmb_schemas.ros2.types import own_types
 
-from optipmb_service.app import process
-from optipmb_service.app.loops import say_ready, unless
-from optipmb_service.observability.health import BEAT_S, STUCK_S
+from optipmb_service.app import lifecycle
+from optipmb_service.app.lifecycle import say_ready, unless
 from optipmb_service.ros2 import graph
 from optipmb_service.ros2.bridge import Bridge
 from optipmb_service.ros2.diagnostics import DIAGNOSTICS, diagnostics
 from optipmb_service.ros2.matching import Matching, Wanted
 from optipmb_service.runtime.ports import TransportError
+from optipmb_service.telemetry.health import BEAT_S, STUCK_S, Reporter
 from optipmb_service.zenoh.ros2 import Ros2Node
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from optipmb_service.app.loops import StopRequest
-    from optipmb_service.observability.health import ProcessHealth
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.app.lifecycle import StopRequest
+    from optipmb_service.settings import Settings
+    from optipmb_service.telemetry.health import ProcessHealth
     from optipmb_service.zenoh.client import Message, Outgoing
     from optipmb_service.zenoh.subscription import Subscription
 
 QUEUE: Final = 2048
-QUEUE_BYTES: Final = 2**28
-"""Messages that wait for the working thread, and their bytes."""
-
-CACHE: Final = 400
-"""Detections of a stream kept for a service that restarts: 10 s at 20 Hz."""
-
+QUEUE_BYTES: Final = 2**28  # messages that wait for the working thread, and their bytes
+CACHE: Final = 400  # detections of a stream kept for a service that restarts: 10 s at 20 Hz
 DIAGNOSTICS_S: Final = 1.0
 TICK_S: Final = 0.02
 QUERY_S: Final = 2.0
@@ -60,10 +56,8 @@ ODOMETRY: Final = "nav_msgs/msg/Odometry"
 log = structlog.get_logger("optipmb_service")
 
 
-class _Work:
+class _Work(Reporter):
     """The node, the bridge and what wires them; what the process reports."""
-
-    failure: Final = ""
 
     def __init__(self, settings: Settings, node: Ros2Node) -> None:
         self._settings = settings
@@ -97,9 +91,6 @@ class _Work:
         """Whether the working thread has been at one piece of work for too long."""
         return time.monotonic() - self._turned > STUCK_S
 
-    def status(self) -> None:
-        """Return nothing: the bridge tracks no streams."""
-
     def open(self) -> None:
         """Declare everything."""
         for wanted, receive in self._topics:
@@ -127,7 +118,7 @@ class _Work:
         self._node.close()
 
     def work(self, seconds: float) -> None:
-        """Do what has come in, and what is due, for about so long."""
+        """Handle messages and timers for about so long."""
         ends = time.monotonic() + seconds
         while (left := ends - time.monotonic()) > 0:
             self._filled.wait(min(left, TICK_S))
@@ -164,7 +155,7 @@ class _Work:
         self._node.publish(topic, self._types.write(message))
 
     def listened(self, topic: str) -> bool:
-        """Whether ROS has a subscription to a topic."""
+        """Return whether ROS has a subscription to a topic."""
         return self._node.listened(topic)
 
     def ask(self, stream: str, parameters: schemas.SessionParameters, then: Callable[[], None] | None = None) -> None:
@@ -193,38 +184,26 @@ class _Work:
     def _wanted(self) -> list[tuple[Wanted, Callable[[Any], None] | None]]:
         """Return our endpoints, and what takes the messages of subscriptions; None for publishers."""
         ros2, bridge = self._settings.ros2, self._bridge
+
+        def one(kind: str, topic: str, type_name: str, qos: graph.Qos) -> Wanted:
+            return Wanted(kind, topic, type_name, self._types.hash_of(type_name), qos)
+
+        subscription, publisher = partial(one, graph.SUBSCRIPTION), partial(one, graph.PUBLISHER)
         ours: list[tuple[Wanted, Callable[[Any], None] | None]] = [
-            (self._one(graph.SUBSCRIPTION, "/tf", TF, MOVING), lambda one: bridge.take_transforms(one, static=False)),
-            (
-                self._one(graph.SUBSCRIPTION, "/tf_static", TF, STATIC),
-                lambda one: bridge.take_transforms(one, static=True),
-            ),
+            (subscription("/tf", TF, MOVING), partial(bridge.take_transforms, static=False)),
+            (subscription("/tf_static", TF, STATIC), partial(bridge.take_transforms, static=True)),
         ]
         if ros2.odometry:
-            ours.append((self._one(graph.SUBSCRIPTION, ros2.odometry, ODOMETRY, MOVING), bridge.take_odometry))
+            ours.append((subscription(ros2.odometry, ODOMETRY, MOVING), bridge.take_odometry))
         for name, stream in ros2.streams.items():
-            ours.append(
-                (
-                    self._one(graph.SUBSCRIPTION, stream.detections, stream.type, SENSOR),
-                    partial(bridge.take, name, "detections"),
-                )
-            )
+            take: Any = partial(bridge.take, name)
+            ours.append((subscription(stream.detections, stream.type, SENSOR), partial(take, "detections")))
             if stream.points:
-                ours.append(
-                    (
-                        self._one(graph.SUBSCRIPTION, stream.points, CLOUD, SENSOR),
-                        partial(bridge.take, name, "points"),
-                    )
-                )
-            base = stream.tracks_topic
-            for end, kind in TOPICS.items():
-                ours.append((self._one(graph.PUBLISHER, base + end, kind, OFFERED), None))
+                ours.append((subscription(stream.points, CLOUD, SENSOR), partial(take, "points")))
+            ours += [(publisher(stream.tracks_topic + end, kind, OFFERED), None) for end, kind in TOPICS.items()]
         if ros2.diagnostics:
-            ours.append((self._one(graph.PUBLISHER, ros2.diagnostics, DIAGNOSTICS, OFFERED), None))
+            ours.append((publisher(ros2.diagnostics, DIAGNOSTICS, OFFERED), None))
         return ours
-
-    def _one(self, kind: str, topic: str, type_name: str, qos: graph.Qos) -> Wanted:
-        return Wanted(kind, topic, type_name, self._types.hash_of(type_name), qos)
 
     def _reading(self, wanted: Wanted, receive: Callable[[Any], None]) -> Callable[[graph.TopicKey, bytes], None]:
         """Return what takes the bytes of a topic: those of the right type are read and handed over."""
@@ -237,7 +216,8 @@ class _Work:
 
     def _read(self, wanted: Wanted, payload: bytes, receive: Callable[[Any], None]) -> None:
         try:
-            self._check_size(payload)
+            if len(payload) > (most := self._settings.limits.max_bytes):
+                raise schemas.MessageError("too_large", "", f"at most {most} bytes", f"{len(payload)} bytes")  # noqa: TRY301 - refused as what cannot be read
             receive(self._types.read(wanted.type, payload))
         except schemas.MessageError as error:
             for name, stream in self._settings.ros2.streams.items():
@@ -245,10 +225,6 @@ class _Work:
                     self._bridge.refuse(name, error)
                     return
             log.warning("problem", topic=wanted.topic, message=str(error))
-
-    def _check_size(self, payload: bytes) -> None:
-        if len(payload) > (most := self._settings.limits.max_bytes):
-            raise schemas.MessageError("too_large", "", f"at most {most} bytes", f"{len(payload)} bytes")
 
     def _come_back(self, one: Message) -> None:
         try:
@@ -303,7 +279,7 @@ class _Work:
 
 
 async def run(settings: Settings) -> int:
-    """Bridge until SIGINT or SIGTERM; returns the exit status, as `process.run` does."""
+    """Bridge until SIGINT or SIGTERM; returns the exit status, as `lifecycle.run` does."""
 
     async def serve(asked: StopRequest, health: ProcessHealth) -> bool | None:
         log.info("connecting", endpoints=settings.connect)
@@ -325,4 +301,4 @@ async def run(settings: Settings) -> int:
             await asyncio.to_thread(work.close)
         return True
 
-    return await process.run(settings, serve)
+    return await lifecycle.run(settings, serve)

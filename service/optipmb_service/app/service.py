@@ -1,6 +1,6 @@
 """A service on the network: every part of it, put together, started and ended in order.
 
-Messages go from a thread of the network to a stream's mailbox to the tracking thread.
+Messages go from a thread of the network to a stream's backlog to the tracking thread.
 
 Start: open Zenoh, subscribe, answer queries, say alive. End: withdraw the alive token, let other members take the
 streams over, stop receiving, track what was received as long as the grace lasts, close.
@@ -18,33 +18,35 @@ import structlog
 
 import optipmb
 from optipmb_service import __version__
-from optipmb_service.app.clustering import open_log, open_store
-from optipmb_service.app.ending import CLOSE_S, HANDOVER_S, LAST_S, Deadline, Steps
+from optipmb_service.app.lifecycle import CLOSE_S, HANDOVER_S, LAST_S, Deadline, Steps
+from optipmb_service.app.storage import open_log, open_store
 from optipmb_service.cluster.member import Member
-from optipmb_service.observability import collectors
-from optipmb_service.observability.metrics import Metrics
-from optipmb_service.observability.problem_reporter import ProblemReporter, log_problem
 from optipmb_service.runtime.intake import Intake
-from optipmb_service.runtime.kept_tracks import RecentTracks
-from optipmb_service.runtime.persistence import DAY_S, CheckpointWriter, NoPersistence
+from optipmb_service.runtime.kept_tracks import TrackQuery
+from optipmb_service.runtime.persistence import DAY_S, CheckpointWriter
 from optipmb_service.runtime.ports import TransportError
-from optipmb_service.runtime.registry import Registry
+from optipmb_service.runtime.queries import ServiceQueries, StreamQueries, members_of
 from optipmb_service.runtime.scheduler import Scheduler
-from optipmb_service.runtime.service_queries import ServiceQueries, members_of
-from optipmb_service.runtime.stream_queries import StreamQueries
-from optipmb_service.runtime.track_query import TrackQuery
+from optipmb_service.runtime.streams import Streams
 from optipmb_service.session.problems import problem_of
+from optipmb_service.session.values import SECOND
+from optipmb_service.telemetry.health import Reporter
+from optipmb_service.telemetry.metrics import (
+    NETWORK_METRICS,
+    PROBLEM_METRICS,
+    STREAM_METRICS,
+    Metrics,
+    StreamFigures,
+)
+from optipmb_service.telemetry.problem_reporter import ProblemReporter, log_problem
 from optipmb_service.zenoh import Transport
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
     from pathlib import Path
 
-    from optipmb_service.observability.metrics import Value
-    from optipmb_service.runtime.context import Actor
-    from optipmb_service.runtime.persistence import Persistence
     from optipmb_service.runtime.profiles import Profiles
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
     from optipmb_service.zenoh.client import Client
     from optipmb_service.zenoh.key_numbers import KeyCount
 
@@ -52,23 +54,18 @@ log = structlog.get_logger("optipmb_service")
 
 DRAIN_POLL_S: Final = 0.01
 JOIN_S: Final = 0.3
-SAVE_S: Final = 0.5
-"""The last checkpoints have so long even where messages took all the time."""
-
-NAME_CHECK_NS: Final = 10_000_000_000
-"""How often another process of the same name is looked for."""
-
-LEASES_S: Final = 1.0
-"""What is left at the end to say that the leases are free, however long the checkpoints take."""
+SAVE_S: Final = 0.5  # the last checkpoints have so long even where messages took all the time
+NAME_CHECK_NS: Final = 10_000_000_000  # how often another process of the same name is looked for
+LEASES_S: Final = 1.0  # what is left at the end to say that the leases are free, however long the checkpoints take
 
 
-class Service:
+class Service(Reporter):
     """A service on the network, without signals or a loop of its own: `run` adds these, tests use it as it is.
 
     Args:
         settings: what is in force.
         profiles: the parameters that can be had.
-        arm: has `StreamActor.wake` called at a monotonic time (ns).
+        arm: calls a function at a monotonic time (ns).
         tracker: makes the trackers of sessions; default: trackers bounded as the settings say.
         private: folder that the workers of one parent share; default: this process has no parent.
         metrics: what counts; its own by default.
@@ -82,7 +79,7 @@ class Service:
         self,
         settings: Settings,
         profiles: Profiles,
-        arm: Callable[[Actor, int], None],
+        arm: Callable[[Callable[[], None], int], None],
         tracker: Callable[[optipmb.Parameters], Any] | None = None,
         private: Path | None = None,
         metrics: Metrics | None = None,
@@ -102,44 +99,40 @@ class Service:
         self._reporter = ProblemReporter(self._transport.publish_problem, log_problem)
         self._scheduler = Scheduler()
         self._member = Member(settings.instance, store, settings.lease_s)
-        self._persistence: Persistence = (
-            CheckpointWriter(store, settings.checkpoint_s, self._member, self._unkept, settings.keep_days * DAY_S)
-            if keeps_nothing is None
-            else NoPersistence(keeps_nothing)
+        self._checkpoints = CheckpointWriter(
+            store, settings.checkpoint_s, self._member, self._unkept, settings.keep_days * DAY_S, keeps_nothing
         )
-        recent = RecentTracks(self._transport.recent_tracks, settings.limits.limits())
-        self._missed, logged = open_log(settings)
-        self._registry = Registry(
+        self._log = open_log(settings)
+        self._streams = Streams(
             settings,
             profiles,
-            sink=self._transport,
+            open_publisher=self._transport.open_publisher,
             reporter=self._reporter,
             scheduler=self._scheduler,
             member=self._member,
-            persistence=self._persistence,
-            missed=self._missed,
+            checkpoints=self._checkpoints,
+            log=self._log,
             arm=arm,
             metrics=self._metrics,
             tracker=tracker or profiles.trackers(partial(optipmb.Tracker, max_pairs=settings.max_pairs)),
         )
         self._intake = Intake(
-            self._registry,
+            self._streams,
             self._member,
             self._transport,
             standby=not settings.cluster,
             linger_s=settings.lease_s,
             idle_s=settings.idle_s,
         )
-        self._metrics.add(self._figures)
-        self._stream_queries = StreamQueries(
-            self._registry, TrackQuery([*logged, recent], settings.instance, settings.limits.limits())
-        )
+        self._metrics.add(PROBLEM_METRICS | STREAM_METRICS, self._figures)
+        self._metrics.add(NETWORK_METRICS, self.client)
+        tracks = TrackQuery(self._log, self._transport.recent_tracks, settings.instance, settings.limits.limits())
+        self._stream_queries = StreamQueries(self._streams, tracks)
         self._service_queries = ServiceQueries(
-            self._registry,
+            self._streams,
             status=self.status,
             metrics=self._metrics.text,
             samples=self._metrics.samples,
-            member=self._member,
             hand_over=self._intake.hand_over,
             workers=settings.workers,
         )
@@ -147,8 +140,8 @@ class Service:
     def start(self, *, announce: bool = True) -> None:
         """Receive, answer, and say so."""
         self._transport.watch()
-        self._persistence.start(self._registry.keep)
-        self._member.start(self._intake.changed, self._registry.resume, self._registry.occupied, self.client().linked)
+        self._checkpoints.start(self._streams.keep)
+        self._member.start(self._intake.changed, self._streams.resume, self._streams.occupied, self.client().linked)
         self._intake.start()
         self._transport.serve(self._stream_queries.answer, self._service_queries.answer)
         self._state = "ready"
@@ -156,9 +149,9 @@ class Service:
             self._transport.announce()
 
     def housekeeping(self) -> None:
-        """Do what is due about once a second."""
+        """Report silent streams and summaries of problems; to be called about once a second."""
         now_ns = time.monotonic_ns()
-        self._registry.sweep(now_ns)
+        self._streams.sweep(now_ns)
         self._transport.look_for_returned(self._report_returned)
         if now_ns >= self._name_checked_ns:
             self._name_checked_ns = now_ns + NAME_CHECK_NS
@@ -166,7 +159,7 @@ class Service:
         self._reporter.flush(now_ns)
 
     def stop(self, seconds: float = math.inf) -> bool:
-        """Let others go on, track what was received, within the grace, and close.
+        """Hand the streams over, track what was received, within the grace, and close.
 
         All of it takes a bounded time, so that whoever waits for the end kills nothing that is still being kept; but
         closing the network, before which all that is to be kept is written.
@@ -188,16 +181,17 @@ class Service:
         grace = Deadline(grace_s)
         self._intake.close(JOIN_S)
         steps.do("receiving", partial(self._transport.stop, JOIN_S))
-        if not self._persistence.durable:
-            self._registry.finish()  # else what waits for its cloud comes again from the publishers' caches
-        while self._registry.busy and grace.left():
+        if not self._checkpoints.durable:
+            self._streams.finish()  # else what waits for its cloud comes again from the publishers' caches
+        while self._streams.busy and grace.left():
             time.sleep(DRAIN_POLL_S)
         ended = self._scheduler.close(JOIN_S)
         if ended:
-            self._registry.keep_now()
-        kept = self._persistence.close(max(SAVE_S, ends.left() - LEASES_S))
+            self._streams.keep_now()
+        kept = self._checkpoints.close(max(SAVE_S, ends.left() - LEASES_S))
         self._member.close(ends.left())
-        self._missed.close(JOIN_S)
+        if self._log is not None:
+            self._log.close(JOIN_S)
         self._reporter.flush(time.monotonic_ns())
         unfinished = steps.unfinished(ends.left())
         self._transport.close()
@@ -216,7 +210,7 @@ class Service:
     @property
     def failure(self) -> str:
         """Why the state is `degraded`, `paused` or `unlinked`; empty while it is none of these."""
-        return self._member.failure or self.client().failure or self._persistence.failure
+        return self._member.failure or self.client().failure or self._checkpoints.failure
 
     @property
     def state(self) -> str:
@@ -233,12 +227,12 @@ class Service:
             return "unlinked"
         if self._member.draining:
             return "draining"
-        return "degraded" if self._persistence.failure else "ready"
+        return "degraded" if self._checkpoints.failure else "ready"
 
     def status(self) -> schemas.ServiceStatus:
         """Return the answer to `q/status`."""
         now_ns = time.monotonic_ns()
-        totals = self._registry.totals()
+        totals = self._streams.totals()
         return schemas.ServiceStatus(
             instance=self._settings.instance,
             version=__version__,
@@ -260,7 +254,7 @@ class Service:
 
     def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None]:
         """Hand over what comes on a stream to a viewer, until the result is called."""
-        return self._transport.tap(stream, receive, self._registry.fusion.seen_by(stream))
+        return self._transport.tap(stream, receive, self._streams.fusion.seen_by(stream))
 
     def client(self) -> Client:
         """Return what an edge in this process uses of the network."""
@@ -269,83 +263,63 @@ class Service:
     def _summaries(self, now_ns: int) -> tuple[schemas.SessionSummary, ...]:
         """Return a line for each session; one that cannot be made is a problem of its stream alone."""
         summaries = []
-        for actor in self._registry.actors():
+        for stream in self._streams.tracking():
             try:
-                summary = actor.summary(now_ns)
+                summary = stream.summary(now_ns)
             except Exception as error:
-                log.exception("internal_error", stream=actor.stream)
-                self._report(actor.stream, "the line of a session in the status", f"{type(error).__name__}: {error}")
+                log.exception("internal_error", stream=stream.name)
+                self._internal("the line of a session in the status", stream.name, f"{type(error).__name__}: {error}")
             else:
                 summaries += [summary] if summary is not None else []
         return tuple(summaries)
 
+    def report_certificate(self, why: str) -> None:
+        """Report that a certificate has ended."""
+        self._report("certificate", "certificates that hold", why, message=why)
+
     def _report_returned(self, token: str, due: int, newest: int) -> None:
         expected, received = f"messages numbered from {due} on by Zenoh", f"numbers that began again, now {newest}"
-        problem = problem_of(
-            "numbers_back",
-            stream=schemas.Keys(self._settings.prefix).stream_of(token),
-            instance=self._settings.instance,
-            expected=expected,
-            received=received,
-            message=f"Publisher: expected {expected}, received {received}; remove `id` from its Zenoh configuration.",
-        )
-        self._reporter.report(problem, time.monotonic_ns())
+        message = f"Publisher: expected {expected}, received {received}; remove `id` from its Zenoh configuration."
+        stream = schemas.Keys(self._settings.prefix).stream_of(token)
+        self._report("numbers_back", expected, received, stream=stream, message=message)
 
     def _report_duplicate_name(self) -> None:
         name = self._settings.instance
-        problem = problem_of(
-            "duplicate_name",
-            stream="",
-            instance=name,
-            path="instance",
-            expected="a name that no other process has",
-            received=name,
-            message=f"Setting instance: another process is named {name}, too; give each a name of its own.",
-        )
-        self._reporter.report(problem, time.monotonic_ns())
-
-    def report_certificate(self, why: str) -> None:
-        """Report that a certificate has ended."""
-        problem = problem_of(
-            "certificate",
-            stream="",
-            instance=self._settings.instance,
-            expected="certificates that hold",
-            received=why,
-            message=why,
-        )
-        self._reporter.report(problem, time.monotonic_ns())
+        message = f"Setting instance: another process is named {name}, too; give each a name of its own."
+        self._report("duplicate_name", "a name that no other process has", name, path="instance", message=message)
 
     def _unkept(self, stream: str, why: str) -> None:
         """Report that the state of a stream cannot be kept."""
-        self._report(stream, "a state that can be written down", why)
+        self._internal("a state that can be written down", stream, why)
 
-    def _report(self, stream: str, expected: str, received: str) -> None:
+    def _internal(self, expected: str, stream: str, received: str) -> None:
+        message = f"Stream: expected {expected}, received {received}."
+        self._report("internal", expected, received, stream=stream, message=message)
+
+    def _report(
+        self, code: str, expected: str, received: str, *, message: str, stream: str = "", path: str = ""
+    ) -> None:
         problem = problem_of(
-            "internal",
+            code,
             stream=stream,
             instance=self._settings.instance,
+            path=path,
             expected=expected,
             received=received,
-            message=f"Stream: expected {expected}, received {received}.",
+            message=message,
         )
         self._reporter.report(problem, time.monotonic_ns())
 
-    def _figures(self) -> Iterator[Value]:
-        """Read what `metrics` does not count itself."""
-        sessions = self._summaries(time.monotonic_ns())
-        densities = [session.density for actor in self._registry.actors() if (session := actor.session) is not None]
-        yield from collectors.of_problems(self._reporter.counts())
-        yield from collectors.of_totals(self._registry.totals())
-        yield from collectors.of_durability(
-            self._persistence.written,
-            self._persistence.complete_ns,
-            owned=len(sessions),
+    def _figures(self) -> StreamFigures:
+        now_ns = time.monotonic_ns()
+        sessions, complete_ns = self._summaries(now_ns), self._checkpoints.complete_ns
+        return StreamFigures(
+            self._reporter,
+            self._streams.totals(),
+            sessions,
+            sessions[: self._settings.http_streams],
+            [session.density for one in self._streams.tracking() if (session := one.session) is not None],
             standing_by=self._intake.standing_by,
-            now_ns=time.monotonic_ns(),
+            checkpoints=self._checkpoints.written,
+            checkpoint_age_s=None if complete_ns is None else max(0, now_ns - complete_ns) / SECOND,
         )
-        client = self.client()
-        yield from collectors.of_network(client.key_numbers.declared, linked=client.linked())
-        yield from collectors.of_sessions(sessions)
-        yield from collectors.of_densities(densities)
-        yield from collectors.of_streams(sessions, self._settings.http_streams)

@@ -1,5 +1,8 @@
 """A process that tracks: alone, or as one of the workers of a parent (`python -m optipmb_service.app.worker`).
 
+asyncio runs on the main thread and does little: signals, the deadlines of frames that wait for their clouds, and once a
+second the streams that fell silent and the summaries of problems. Messages never pass through it.
+
 Parent and worker talk in lines of JSON. The parent writes to the worker's stdin what it is to run with; when stdin
 ends, so does the worker: the parent wants it, or is dead. The worker writes events to its stdout: `ready`, and a beat
 twice a second. Logs go to stderr, which both share.
@@ -8,91 +11,172 @@ twice a second. Logs go to stderr, which both share.
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import ctypes
 import fcntl
 import json
+import mmap
 import signal
 import sys
 import threading
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import structlog
 
 import optipmb
-from optipmb_service.app.control_loop import run
-from optipmb_service.app.ending import leave
-from optipmb_service.app.kernels import warm_up
-from optipmb_service.observability import logs
+from optipmb_service.app import lifecycle
+from optipmb_service.app.lifecycle import grpc_edge, leave, say_ready, settle, unless, watch_keys
+from optipmb_service.app.service import Service
 from optipmb_service.runtime.profiles import Profiles
-from optipmb_service.settings.model import Settings
+from optipmb_service.settings import Settings
+from optipmb_service.telemetry import logs
 
 if TYPE_CHECKING:
-    from optipmb_service.app.loops import StopRequest
-    from optipmb_service.app.service import Service
+    from collections.abc import Callable
+
+    from optipmb_service.app.lifecycle import StopRequest
+    from optipmb_service.telemetry.health import ProcessHealth
 
 log = structlog.get_logger("optipmb_service")
 
+HOUSEKEEPING_S: Final = 0.5
 WRONG_USE: Final = 2
-LOCK: Final = "lock"
-"""File that one worker at a time holds while it compiles."""
+LOCK: Final = "lock"  # file that one worker at a time holds while it compiles
+UNUSED: Final = "scipy.linalg"
+COMPILER: Final = "libllvmlite"
+MAPS: Final = Path("/proc/self/maps")
 
 
-class SupervisingParent:
-    """The parent, as a worker sees it.
-
-    Args:
-        index: which worker.
-        private: folder that the workers share.
-    """
-
-    announces: Final = False  # to the network the workers are one instance, and the parent speaks for it
+class Parent:
+    """The parent, as the worker `index` sees it; `private` is a folder that the workers share."""
 
     def __init__(self, index: int, private: Path) -> None:
         self.index = index
         self.private = private
-        self._service: Service | None = None
-        self._writing = threading.Lock()
 
-    def begin(self, asked: StopRequest) -> None:
+    def listen(self, asked: StopRequest) -> None:
         """End when the parent says so, or is gone."""
-        threading.Thread(target=self._listen, args=(asked,), name="parent", daemon=True).start()
 
-    def warm_up(self) -> None:
-        """Compile the kernels, or load them: after an installation one worker compiles, and the others wait for it."""
-        with (self.private / LOCK).open("a") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            warm_up()
+        def read() -> None:
+            for _ in sys.stdin:
+                pass
+            asked.ask_threadsafe("parent")
 
-    def ready(self, service: Service) -> None:
-        """Say that streams are served."""
-        self._service = service
-        self._say(event="ready")
+        threading.Thread(target=read, name="parent", daemon=True).start()
 
-    def beat(self) -> None:
-        """Give a sign of life, unless the tracking thread is stuck: then the parent is to replace this process."""
-        if self._service is not None and not self._service.stuck:
-            self._say(event="beat")
-
-    def _listen(self, asked: StopRequest) -> None:
-        for _ in sys.stdin:
-            pass
-        asked.ask_threadsafe("parent")
-
-    def _say(self, **event: object) -> None:
+    def say(self, event: str) -> None:
+        """Write an event."""
         try:
-            with self._writing:
-                print(json.dumps(event), flush=True)  # noqa: T201 - the parent reads it
+            print(json.dumps({"event": event}), flush=True)  # noqa: T201 - the parent reads it
         except BrokenPipeError:
             log.warning("parent_gone")  # stdin has ended too, or will
 
 
-def run_alone(settings: Settings) -> int:
-    """Track all streams in this process; returns the exit status."""
-    return _run(settings, None)
+def run(settings: Settings, parent: Parent | None = None) -> int:
+    """Track until SIGINT or SIGTERM, or until the parent says so; returns the exit status."""
+    try:
+        profiles = Profiles.read(settings.profile, settings.profiles)
+    except optipmb.ParameterError as error:
+        if parent is None or parent.index == 0:  # of all workers one says it
+            logs.say(f"optipmb-service: {' '.join(str(error).split())}")
+        return WRONG_USE
+
+    async def serve(asked: StopRequest, health: ProcessHealth) -> bool | None:
+        return await _serve(settings, profiles, parent, asked, health)
+
+    return asyncio.run(lifecycle.run(settings, serve, profiles=profiles.names))
+
+
+async def _serve(
+    settings: Settings, profiles: Profiles, parent: Parent | None, asked: StopRequest, health: ProcessHealth
+) -> bool | None:
+    """Run the service until the end is asked for; return whether it ended in order, None when it never began.
+
+    Raises:
+        TransportError: the network cannot be used.
+        StoreError: the store cannot be used, and others use it.
+    """
+    loop = asyncio.get_running_loop()
+    private = None if parent is None else parent.private
+    if parent is not None:
+        parent.listen(asked)
+
+    def arm(wake: Callable[[], None], at_ns: int) -> None:
+        # The loop's time and the deadlines are one clock, the monotonic one.
+        loop.call_soon_threadsafe(loop.call_at, at_ns / 1e9, wake)
+
+    await unless(asked, lambda: warm_up(private))
+    if asked.is_set():
+        return None
+    if not settings.is_router:
+        log.info("connecting", endpoints=settings.connect)
+    service = await unless(asked, lambda: Service(settings, profiles, arm, private=private, metrics=health.metrics))
+    if service is None:
+        return None
+    service.start(announce=parent is None)  # to the network the workers are one instance: the parent speaks for it
+    health.report(service)
+    settle()
+    watching = loop.create_task(watch_keys(asked, lambda: service.key_numbers, settings.restart_keys))
+    with grpc_edge(settings, service.client(), health.metrics):
+        # In this order: who sees the ready line may send at once, and finds this event before those of a session.
+        log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
+        if parent is None:
+            say_ready("instance", settings.instance, (*settings.endpoints, *settings.connect))
+        else:
+            parent.say("ready")
+        while not asked.is_set():
+            await asked.wait(HOUSEKEEPING_S)
+            service.housekeeping()
+            if health.tls is not None and (why := health.tls.failure):
+                service.report_certificate(why)
+            if parent is not None and not service.stuck:  # else the parent is to replace this process
+                parent.say("beat")
+        health.ends()
+    watching.cancel()
+    return await asyncio.to_thread(service.stop, asked.bound.left())
+
+
+def warm_up(private: Path | None = None) -> None:
+    """Compile the kernels, or load them; of workers with a private folder one at a time.
+
+    With its array functions numba loads scipy's linear algebra where that is installed: 15 MB and a seventh of the
+    start, for functions that no kernel uses. It does without where there is none, so it is shown none.
+    """
+    with contextlib.ExitStack() as stack:
+        if private is not None:
+            fcntl.flock(stack.enter_context((private / LOCK).open("a")), fcntl.LOCK_EX)
+        if UNUSED not in sys.modules:
+            sys.modules[UNUSED] = None  # type: ignore[assignment]  # what makes an import fail, as Python has it
+            try:
+                import_module("numba.np.arraymath")
+            finally:
+                del sys.modules[UNUSED]
+        optipmb.warm_up()
+        _release_compiler()
+
+
+def _release_compiler() -> None:
+    """Give back the pages of the compiler's code: 65 MB that were read to load the kernels and are not read again.
+
+    They are a file's, never written to, so the next use, should there be one, reads them anew. Where this is not Linux
+    they stay.
+    """
+    if sys.platform != "linux":
+        return
+    advise = ctypes.CDLL(None).madvise
+    advise.argtypes = (ctypes.c_size_t, ctypes.c_size_t, ctypes.c_int)
+    for line in MAPS.read_text(encoding="utf-8").splitlines():
+        extent, access = line.split(maxsplit=2)[:2]
+        # Code alone: what is only read may hold addresses that were filled in when the library was loaded.
+        if COMPILER in line and access == "r-xp":
+            begin, end = (int(bound, 16) for bound in extent.split("-"))
+            advise(begin, end - begin, mmap.MADV_DONTNEED)
 
 
 def main() -> int:
-    """Be a worker; returns the exit status."""
+    """Run a worker; return the exit status."""
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)
     line = sys.stdin.readline()
     if not line:
@@ -100,17 +184,7 @@ def main() -> int:
     order = json.loads(line)
     settings = Settings(**order["settings"])
     logs.configure(settings.log_format, settings.log_level, order["index"])
-    return _run(settings, SupervisingParent(order["index"], Path(order["private"])))
-
-
-def _run(settings: Settings, parent: SupervisingParent | None) -> int:
-    try:
-        profiles = Profiles.read(settings.profile, settings.profiles)
-    except optipmb.ParameterError as error:
-        if parent is None or parent.index == 0:  # of all workers one says it
-            logs.say(f"optipmb-service: {' '.join(str(error).split())}")
-        return WRONG_USE
-    return asyncio.run(run(settings, profiles, parent))
+    return run(settings, Parent(order["index"], Path(order["private"])))
 
 
 if __name__ == "__main__":

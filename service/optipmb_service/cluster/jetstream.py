@@ -20,23 +20,16 @@ from optipmb_service.cluster.store import KEPT, Record
 if TYPE_CHECKING:
     from collections.abc import Coroutine, Mapping, Sequence
 
-    from optipmb_service.cluster.nats_access import NatsAccess
     from optipmb_service.cluster.store import Fenced, Write
 
 _T = TypeVar("_T")
 
-BATCH: Final = 1024
-"""Records read at once."""
-
+BATCH: Final = 1024  # records read at once
 SAVED_AT_ONCE: Final = 8
 SAVED_IN_A_CALL: Final = 32
-MEMBER_TTL_S: Final = 3600
-"""Age at which the server forgets the record of a member that has ended."""
-
+MEMBER_TTL_S: Final = 3600  # age at which the server forgets the record of a member that has ended
 NOT_THE_NEWEST: Final = 10071
-UNDECIDED: Final = 10164
-"""Several servers have not agreed yet on a write that was asked for before."""
-
+UNDECIDED: Final = 10164  # several servers have not agreed yet on a write that was asked for before
 NOTHING_THERE: Final = 10037
 AGAIN_S: Final = 0.05
 
@@ -50,15 +43,15 @@ class JetStream:
         servers: addresses of NATS servers, as `nats://host:4222`; of one cluster, where there are several.
         prefix: first chunks of every key of the service.
         keep_s: age at which a checkpoint that nobody has replaced is forgotten; 0: never.
-        access: what the servers want to see.
+        options: of NATS' client, as `nats_connection.access` returns them.
     """
 
     remote: Final = True
 
     def __init__(
-        self, servers: Sequence[str], prefix: str, keep_s: float = 0.0, access: NatsAccess | None = None
+        self, servers: Sequence[str], prefix: str, keep_s: float = 0.0, options: Mapping[str, Any] | None = None
     ) -> None:
-        self._connection = NatsConnection(servers, self._lost, access)
+        self._connection = NatsConnection(servers, self._lost, options)
         self._name = f"OPTIPMB_{token(prefix)}"
         self._keep_s = round(keep_s)
         self._there = False
@@ -100,7 +93,7 @@ class JetStream:
         return None if found is None else found[1]
 
     def expire(self, age_s: float) -> int:
-        """Do nothing: the server itself forgets a checkpoint that is old."""
+        """Return 0: the server itself forgets a checkpoint that is old."""
         del age_s
         return 0
 
@@ -121,22 +114,11 @@ class JetStream:
         self._there = False  # the server may come back without its files
 
     async def _ready(self) -> None:
-        """Have the JetStream stream there."""
+        """Create the JetStream stream, unless it is there."""
         client = self._connection.client()
         if not self._there:
             self.max_bytes = client.max_payload * 3 // 4 - 4096  # it is read as base64
-            await self._connection.create(
-                {
-                    "name": self._name,
-                    "subjects": [f"{self._name}.>"],
-                    "storage": "file",
-                    "retention": "limits",
-                    "discard": "old",
-                    "max_msgs_per_subject": KEPT,
-                    "allow_direct": True,
-                    "allow_msg_ttl": True,
-                }
-            )
+            await self._connection.create(self._name, {"max_msgs_per_subject": KEPT, "allow_msg_ttl": True})
             self._there = True
 
     async def _follow(self, after: int) -> list[Record]:

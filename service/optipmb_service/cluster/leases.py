@@ -39,24 +39,14 @@ if TYPE_CHECKING:
 
 PARTITIONS: Final = 64
 ALIVE: Final = "alive"
-DRAINING: Final = "draining"
-"""What the record of a member says that gives its partitions up."""
-UNLINKED: Final = "unlinked"
-"""The same of a member that has no router, so it neither receives nor publishes."""
-
+DRAINING: Final = "draining"  # what the record of a member says that gives its partitions up
+UNLINKED: Final = "unlinked"  # the same of a member that has no router, so it neither receives nor publishes
 NOBODY: Final = ""
 
-LEAVE_LEASES: Final = 4
-"""Leases within which the sessions of a partition that is left must have been kept; then it is left without them."""
-
-WATCHED: Final = 2
-"""A pause between two looks at the records that is longer than a lease divided by this does not count as watching."""
-
-LEFT_AT_ONCE: Final = 8
-"""Partitions that a member leaves at the same time."""
-
-MAX_ENDED: Final = 1024
-"""Members that have ended and are remembered."""
+LEAVE_LEASES: Final = 4  # longest wait for the checkpoints of a partition that is left
+WATCHED: Final = 2  # a longer pause between looks than a lease divided by this is not watching
+LEFT_AT_ONCE: Final = 8  # partitions that a member leaves at the same time
+MAX_ENDED: Final = 1024  # members that have ended and are remembered
 
 
 @lru_cache(65_536)  # as many streams as are known at once; asked about all of them whenever one comes or goes
@@ -96,30 +86,6 @@ class Change(StrEnum):
     """It is held under another fence: the store had lost its record, and nobody else has taken it."""
     LOST = "lost"
     """Another member may continue its streams already: the states here are not the newest, and are not to be kept."""
-
-
-class WriteLease:
-    """The time during which a member may publish and save; read by any thread, written by one.
-
-    Args:
-        length_ns: how long a renewal holds, monotonic time.
-    """
-
-    def __init__(self, length_ns: int) -> None:
-        self._length_ns = length_ns
-        self._until_ns = 0
-
-    def valid(self, now_ns: int) -> bool:
-        """Whether the write lease holds."""
-        return now_ns < self._until_ns
-
-    def renew(self, now_ns: int) -> None:
-        """Let it hold from now."""
-        self._until_ns = now_ns + self._length_ns
-
-    def lapse(self) -> None:
-        """End it."""
-        self._until_ns = 0
 
 
 @dataclass(slots=True)
@@ -178,11 +144,9 @@ class LeaseTable:
     _partitions: dict[int, tuple[int, str]] = field(default_factory=dict)
     _wishes: dict[int, str] = field(default_factory=dict)
     _looked_ns: int | None = None
-    _done_when: str | None = None
-    """Its state when there was nothing to write or to wait for; None: something has changed since."""
 
-    def take_in(self, records: Iterable[Record], now_ns: int) -> None:
-        """Take in what has changed, or that nothing has."""
+    def apply(self, records: Iterable[Record], now_ns: int) -> None:
+        """Apply new records."""
         if self._looked_ns is None or now_ns - self._looked_ns > self.lease_ns // WATCHED:
             # Nobody could renew, or it was not seen: the lease of each is counted from now.
             for one in self._members.values():
@@ -193,17 +157,16 @@ class LeaseTable:
             self.position = max(self.position, record.revision)
             kind, _, name = record.key.partition("/")
             if kind == "member":
-                changed |= self._take_in_member(name, record, now_ns)
+                changed |= self._apply_member(name, record, now_ns)
                 continue
             changed = True
             if kind == "wish":
                 self._wishes[int(name)] = record.value
             elif record.revision > self._partitions.get(int(name), (0, NOBODY))[0]:
                 self._set(int(name), record.revision, record.value)
-        if not changed:
-            return
-        self.changed_ns, self._done_when = now_ns, None
-        self._complete_members(now_ns)
+        if changed:
+            self.changed_ns = now_ns
+            self._complete_members(now_ns)
 
     def _complete_members(self, now_ns: int) -> None:
         """Watch every holder of a partition; forget the first of many members that have ended."""
@@ -214,8 +177,8 @@ class LeaseTable:
         for name in ended[: max(0, len(ended) - MAX_ENDED)]:
             del self._members[name]
 
-    def _take_in_member(self, name: str, record: Record, now_ns: int) -> bool:
-        """Take in the record of a member; return whether it is more than a renewal."""
+    def _apply_member(self, name: str, record: Record, now_ns: int) -> bool:
+        """Apply the record of a member; return whether it is more than a renewal."""
         known = self._members.get(name)
         if name == self.member or (known is not None and record.revision <= known.revision):
             return False
@@ -255,11 +218,11 @@ class LeaseTable:
         ]
 
     def holds(self, partition: int) -> bool:
-        """Whether sessions of a partition may begin here; may be called by any thread."""
+        """Return whether sessions of a partition may begin here; may be called by any thread."""
         return partition in self.held and partition not in self.leaving
 
     def taken(self, partition: int, instance: str | None = None) -> bool:
-        """Whether another living member holds a partition, of any instance or of one."""
+        """Return whether another living member holds a partition, of any instance or of one."""
         _, holder = self._partitions.get(partition, (0, NOBODY))
         known = self._members.get(holder)
         return known is not None and known.alive and instance in {None, instance_of(holder)}
@@ -272,10 +235,11 @@ class LeaseTable:
             occupied: returns the partitions with a stream whose state is not kept yet; asked when one is to be left.
             gone: whether the process of a member has ended for certain.
         """
-        writes = self._endings(now_ns, gone)
-        if not writes and self._done_when == self.state:
-            return []  # the usual case
-        self._done_when = None
+        writes = [
+            Write(member_key(name), ENDED, one.revision)
+            for name, one in self._members.items()
+            if one.alive and (now_ns - one.seen_ns >= self.lease_ns or gone(name))
+        ]
         mine, others = self._wished()
         # What is wished goes before an equal share.
         room = self._share() - len(mine)
@@ -287,8 +251,7 @@ class LeaseTable:
         for partition in [*sorted(wished - self.leaving.keys()), *surplus]:
             if len(self.leaving) < LEFT_AT_ONCE:
                 self.leaving[partition] = now_ns
-        left = bool(self.leaving or wished or surplus)
-        self.moving = room > 0 or left or not mine <= self.held.keys()
+        self.moving = room > 0 or bool(self.leaving or wished or surplus) or not mine <= self.held.keys()
         first = int.from_bytes(blake2b(self.member.encode(), digest_size=8).digest())
         for offset in range(PARTITIONS):  # each begins elsewhere, so that members seldom want the same one
             partition = (first + offset) % PARTITIONS
@@ -300,34 +263,20 @@ class LeaseTable:
                 room -= 1
             revision, _ = self._partitions.get(partition, (0, NOBODY))
             writes.append(Write(partition_key(partition), self.member, revision))
-        writes += self._leavings(now_ns, occupied)
-        if not writes and not left:
-            self._done_when = self.state
+        if self.leaving:
+            kept = occupied()
+            overdue_ns = now_ns - LEAVE_LEASES * self.lease_ns
+            writes += [
+                Write(partition_key(partition), NOBODY, self.held[partition])
+                for partition, since_ns in self.leaving.items()
+                if partition not in kept or since_ns <= overdue_ns
+            ]
         return writes
 
-    def _endings(self, now_ns: int, gone: Callable[[str], bool]) -> list[Write]:
-        return [
-            Write(member_key(name), ENDED, one.revision)
-            for name, one in self._members.items()
-            if one.alive and (now_ns - one.seen_ns >= self.lease_ns or gone(name))
-        ]
-
-    def _leavings(self, now_ns: int, occupied: Callable[[], Container[int]]) -> list[Write]:
-        if not self.leaving:
-            return []
-        kept = occupied()
-        overdue_ns = now_ns - LEAVE_LEASES * self.lease_ns
-        return [
-            Write(partition_key(partition), NOBODY, self.held[partition])
-            for partition, since_ns in self.leaving.items()
-            if partition not in kept or since_ns <= overdue_ns
-        ]
-
     def written(self, write: Write, revision: int | None) -> None:
-        """Take in what became of a write; None: refused, what is there instead comes with `take_in`."""
+        """Apply the result of a write; None: refused, the record that is there comes with `apply`."""
         if revision is None:
             return
-        self._done_when = None
         kind, _, name = write.key.partition("/")
         if kind == "member":
             self._members[name] = _Watched(revision, ENDED, 0)
@@ -335,9 +284,8 @@ class LeaseTable:
             self._set(int(name), revision, write.value)
 
     def gone(self, key: str) -> None:
-        """Take in that the store has lost a record: the next write of it replaces none."""
+        """Note that the store has lost a record: the next write of it replaces none."""
         kind, _, name = key.partition("/")
-        self._done_when = None
         if kind == "partition":
             self._partitions[int(name)] = 0, self._partitions.get(int(name), (0, NOBODY))[1]
         elif name in self._members:

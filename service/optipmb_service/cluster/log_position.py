@@ -1,4 +1,4 @@
-"""What of the log of detections is wanted for a session."""
+"""Parts of the log of detections that a session needs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class _Message(Protocol):
 
 @dataclass(frozen=True)
 class Position:
-    """A frame of a stream, for who looks for those after it.
+    """Frame of a stream, after which others are looked for.
 
     Attributes:
         epochs: publisher epochs before its own.
@@ -33,13 +33,13 @@ class Position:
     tracked: bool
 
     def before(self, message: _Message) -> bool:
-        """Whether a message is not later than this."""
+        """Return whether a message is not later than this."""
         return message.epoch in self.epochs or (message.epoch == self.epoch and message.seq <= self.seq)
 
 
 @dataclass(frozen=True)
 class Missed:
-    """What of the log is wanted for a session.
+    """Part of the log that a session needs.
 
     Attributes:
         streams: whose detections.

@@ -20,7 +20,6 @@ from optipmb_service.cluster.leases import (
     Change,
     LeaseTable,
     MemberLease,
-    WriteLease,
     instance_of,
     member_key,
     partition_key,
@@ -37,33 +36,16 @@ if TYPE_CHECKING:
 log = structlog.get_logger("optipmb_service")
 
 SECOND: Final = 1_000_000_000
-LOOKS_PER_LEASE: Final = 8
-"""Each with a renewal: a request to a store elsewhere takes a millisecond of processor."""
-
-LONGEST_LOOK_S: Final = 0.1
-"""Of a store on the same machine: how late a killed member may be noticed."""
-
-SHORT_LOOK_S: Final = 0.02
-"""While partitions change hands: each is held by nobody for as long."""
-
-RENEWALS_PER_LEASE: Final = 2 * LOOKS_PER_LEASE
-"""At most: so each look that is not a short one renews."""
-
-STRAINED: Final = 4
-"""Part of a lease without a renewal from which on it is late; half a lease is the end of the write lease."""
-
-SLOW_LEASES: Final = 2
-"""Leases in which no renewal was in time: then it is the store that is slow, and waiting does not help."""
-
-UNLINKED_PER_LEASE: Final = 4
-"""Part of a lease without a router from which on others are to have the partitions: most routers are back before."""
-
+LOOKS_PER_LEASE: Final = 8  # each with a renewal: a request to a store elsewhere takes a millisecond of processor
+LONGEST_LOOK_S: Final = 0.1  # of a store on the same machine: how late a killed member may be noticed
+SHORT_LOOK_S: Final = 0.02  # while partitions change hands: each is held by nobody for as long
+RENEWALS_PER_LEASE: Final = 2 * LOOKS_PER_LEASE  # at most: so each look that is not a short one renews
+STRAINED: Final = 4  # part of a lease without a renewal from which on it is late
+SLOW_LEASES: Final = 2  # leases without a renewal in time: then the store is slow, and waiting does not help
+UNLINKED_PER_LEASE: Final = 4  # part of a lease without a router, before the partitions are given up
 WRITE_LEASES_PER_LEASE: Final = 2
-RETRY_S: Final = 0.1
-"""At the end, between two tries to say so."""
-
-FIRST_TURNS: Final = 3
-"""Turns in which who begins has ended those that are gone, and has all that is free."""
+RETRY_S: Final = 0.1  # at the end, between two tries to say so
+FIRST_TURNS: Final = 3  # turns in which who begins has ended those that are gone, and has all that is free
 
 
 class Member:
@@ -83,7 +65,8 @@ class Member:
         self._store = store
         self._clock = clock
         self._lease_ns = round(lease_s * SECOND)
-        self._write_lease = WriteLease(self._lease_ns // WRITE_LEASES_PER_LEASE)
+        self._may_write_until_ns = 0
+        """End of the write lease; read by any thread."""
         look_s = lease_s / LOOKS_PER_LEASE
         self._look_s = look_s if store.remote else min(look_s, LONGEST_LOOK_S)
         self._table = self._joining()
@@ -140,17 +123,17 @@ class Member:
     @property
     def failure(self) -> str:
         """Why nothing may be published at present; empty while it may."""
-        return "" if self._write_lease.valid(self._clock()) else f"leases: {self._error}"
+        return "" if self._clock() < self._may_write_until_ns else f"leases: {self._error}"
 
     @property
     def strained(self) -> bool:
-        """Whether its record is renewed late: what can wait is not to begin now, for it would delay that more.
+        """Whether its renewals are late; optional work is to be deferred.
 
         Where every renewal takes so long, that is so only while nothing may be published.
         """
         now_ns = self._clock()
         late = now_ns - self._renewed_ns > self._lease_ns // STRAINED
-        return late and not (self._slow and self._write_lease.valid(now_ns))
+        return late and not (self._slow and now_ns < self._may_write_until_ns)
 
     @property
     def partitions(self) -> set[int]:
@@ -158,7 +141,7 @@ class Member:
         return set(self._table.held.copy())
 
     def holds(self, stream: str) -> bool:
-        """Whether a session of a stream may begin here."""
+        """Return whether a session of a stream may begin here."""
         return self._table.holds(partition_of(stream))
 
     def fence(self, stream: str) -> int | None:
@@ -166,16 +149,16 @@ class Member:
         return self._table.held.get(partition_of(stream))
 
     def may_write(self, stream: str, fence: int | None) -> bool:
-        """Whether what was made under a fence may be published and saved now."""
+        """Return whether the results of a fence may be published and saved now."""
         held = self._table.held.get(partition_of(stream))
-        return fence is not None and fence == held and self._write_lease.valid(self._clock())
+        return fence is not None and fence == held and self._clock() < self._may_write_until_ns
 
     def look(self) -> None:
-        """Have the member look soon: a state is kept."""
+        """Wake the thread: a state is kept."""
         self._wake.set()
 
     def bring(self, stream: str, timeout: float) -> bool:
-        """Have the partition of a stream brought here, to stay; False when it has not come in time (s).
+        """Get the partition of a stream, to stay; return False when it has not come in time (s).
 
         Raises:
             StoreError: the wish could not be written.
@@ -262,7 +245,7 @@ class Member:
             return
         self._write_again()
         records, now_ns = self._store.follow(self._table.position), self._clock()
-        self._table.take_in(records, now_ns)
+        self._table.apply(records, now_ns)
         # At the same time: after a pause of the machine in between all the others would look frozen.
         for write in self._table.due(now_ns, self._occupied, self._store.gone):
             if not self._keep():
@@ -308,11 +291,11 @@ class Member:
             if found is None:
                 log.error("leases_gone", member=self._table.member, partitions=len(self._table.held))
                 self._gone = set(self._table.held)
-        was = self._write_lease.valid(self._clock())
+        was = self._clock() < self._may_write_until_ns
         if not self._unwritable:
             self._said = value
         self._revision, self._renewed_ns, self._error = revision, sent_ns, "its lease has lapsed"
-        self._write_lease.renew(sent_ns)
+        self._may_write_until_ns = sent_ns + self._lease_ns // WRITE_LEASES_PER_LEASE
         self._time_renewal(sent_ns)
         if self._failing:
             self._failing = False
@@ -331,11 +314,11 @@ class Member:
                 self._table.written(write, revision)
                 self._renewed.add(partition)
             elif (found := self._store.get(write.key)) is not None:
-                self._table.take_in([found], self._clock())
+                self._table.apply([found], self._clock())
             self._gone.discard(partition)
 
     def _time_renewal(self, sent_ns: int) -> None:
-        """See whether a renewal that has just been answered was in time."""
+        """Note whether a renewal that has just been answered was in time."""
         now_ns = self._clock()
         if now_ns - sent_ns <= self._lease_ns // STRAINED:
             self._in_time_ns = now_ns
@@ -363,7 +346,7 @@ class Member:
 
     def _lose(self) -> None:
         """Begin anew: another member has ended this one, and holds what it held, or will."""
-        self._write_lease.lapse()
+        self._may_write_until_ns = 0
         if self._table.held:
             log.error("lease_lost", member=self._table.member, partitions=len(self._table.held))
         self._error = "another member has taken over its partitions"
@@ -381,7 +364,7 @@ class Member:
         self._failing, self._error = True, error
 
     def _settle(self) -> None:
-        """Tell what has changed."""
+        """Report changes of partitions."""
         held, leaving = dict(self._table.held), set(self._table.leaving)
         reported, self._reported = self._reported, held
         if held != reported:
@@ -404,8 +387,8 @@ class Member:
             log.info("partitions_held", held=shown[1], of=PARTITIONS, members=[instance_of(name) for name in shown[0]])
 
     def _end(self) -> None:
-        """Say that this member has ended: its partitions are free then. What is to be kept has been saved."""
-        self._write_lease.lapse()
+        """Write that this member has ended: its partitions are free then. All checkpoints have been saved."""
+        self._may_write_until_ns = 0
         key = member_key(self._table.member)
         if self._revision and self._store.put(Write(key, ENDED, self._revision)) is None:
             found = self._store.get(key)

@@ -5,59 +5,80 @@ are bounded, the oldest messages go. A message has an id, and the server drops w
 not matter how many write the same. Point clouds are never put here.
 
 A reader looks for the beginning of what it wants from the newest message on, backwards by the server's own times, so
-that neither the clocks of machines nor those of sensors are compared with each other.
+that neither the clocks of machines nor those of sensors are compared with each other. What cannot be read is as if it
+were not there: the caches of publishers may still have it. A writer holds messages while the servers are away.
 """
 
 from __future__ import annotations
 
 import asyncio
 import math
+import threading
 import time
+from collections import deque
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
+import structlog
 from nats.errors import Error as NatsError
 
-from optipmb_service.cluster.nats_connection import NatsConnection, NobodyAnswersError, RefusedError, text_of, token
+from optipmb_service.cluster.nats_connection import (
+    ERRORS,
+    NatsConnection,
+    NobodyAnswersError,
+    RefusedError,
+    text_of,
+    token,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from nats.aio.msg import Msg
 
-    from optipmb_service.cluster.nats_access import NatsAccess
+    from optipmb_service.cluster.log_position import Missed, Position
+
+
+log = structlog.get_logger("optipmb_service")
 
 Topic = Literal["detections", "tracks"]
 
-REPEATED_S: Final = 120
-"""Time within which the server drops a message that it has; later a copy is kept, which does no harm."""
-
-BACK_S: Final = 8.0
-"""How far a reader looks back at first; four times as far each time, until what it finds is old enough."""
-
+REPEATED_S: Final = 120  # window in which the server drops a copy; later ones are kept and do no harm
+BACK_S: Final = 8.0  # first look back of a reader; four times as far each time, until a message is old enough
 FURTHER: Final = 4.0
-NEAR_S: Final = 2.0
-"""How near to the first message that is wanted a reader begins."""
-
+NEAR_S: Final = 2.0  # how near to the first message that is wanted a reader begins
 BATCH: Final = 128
 BATCH_BYTES: Final = 2**21
-MISSING_S: Final = 0.1
-"""How long a log that is not there is not looked for again: without one, every new session would ask for it."""
-
+MISSING_S: Final = 0.1  # a missing log is not looked for again for so long: every new session would ask
 NO_LOG: Final = 10059
 TOO_LARGE: Final = 10054
-WRITTEN_NOW: Final = 10158
-"""Another bridge writes the same message, and several servers have not agreed on it yet."""
-
+WRITTEN_NOW: Final = 10158  # another bridge writes the same message, and several servers have not agreed on it yet
 AGAIN_S: Final = 0.05
-TRIES: Final = 40
-"""It is asked about so often before that is a failure."""
-
+TRIES: Final = 40  # it is asked about so often before that is a failure
 ID: Final = "Nats-Msg-Id"
 FRAME: Final = "Optipmb-Frame"
 ENCODING: Final = "Optipmb-Encoding"
 HEADERS: Final = len(b"NATS/1.0\r\n\r\n")
+
+
+READ_AT_ONCE: Final = 16  # streams that are read at once
+READ_S: Final = 3.0  # longest time for one stream, from its turn on
+WAIT_S: Final = 30.0  # longest time in all, with what it waits for its turn
+OUTAGE_S: Final = 30.0
+"""How far a stream is read at most that has a position, by the log's own times, unless one without has it longer.
+
+To track more than that would keep the newest frames waiting for as long as they are of use.
+"""
+
+MOST_BYTES: Final = 2**25  # bytes of a stream that are given at once at most; the oldest frames go
+MOST_FRAMES: Final = 1024  # frames given at once at most, as many as a session holds while some are missing
+LOOK_AGAIN_S: Final = (0.3, 0.7)  # pauses before the log is read again for what has come since
+AT_ONCE: Final = 256  # messages on their way to the servers at once
+HELD_BYTES: Final = 2**28  # bytes that are held at most; the oldest messages go first
+OVERHEAD: Final = 512  # what a message takes beside its payload, nearly
+RETRY_S: Final = 0.5  # between two tries
+ALONE_TRIES: Final = 5  # how often a message is tried alone that is not written by servers that work
 
 
 class NotKeptError(Exception):
@@ -123,25 +144,25 @@ class MessageLog:
     Args:
         servers: addresses of NATS servers.
         prefix: first chunks of every key of the service.
-        access: what the servers want to see.
+        options: of NATS' client, as `nats_connection.access` returns them.
 
     Attributes:
         connection: to the servers; closed by the owner of the log. All methods run on its loop.
     """
 
-    def __init__(self, servers: Sequence[str], prefix: str, access: NatsAccess | None = None) -> None:
+    def __init__(self, servers: Sequence[str], prefix: str, options: Mapping[str, Any] | None = None) -> None:
         self._names = {topic: f"OPTIPMB-{topic.upper()}_{token(prefix)}" for topic in ("detections", "tracks")}
-        self.connection = NatsConnection(servers, self.look_again, access)
+        self.connection = NatsConnection(servers, self.look_again, options)
         self._there: set[str] = set()
         self._missing_until: dict[Topic, float] = {}
 
     def look_again(self) -> None:
-        """Have `ready` ask the servers again: they may have come back without their files."""
+        """Forget which logs are there: the servers may have come back without their files."""
         self._there.clear()
         self._missing_until.clear()
 
     async def ready(self, topic: Topic, keep: Retention) -> None:
-        """Have a log there that keeps so much.
+        """Create a log that keeps so much, or change one.
 
         Raises:
             NatsError: the servers cannot be reached, or do not answer.
@@ -155,17 +176,7 @@ class MessageLog:
             "max_bytes": keep.size,
             "duplicate_window": round(min(REPEATED_S, keep.age_s or REPEATED_S) * 1e9),
         }
-        await self.connection.create(
-            {
-                "name": name,
-                "subjects": [f"{name}.>"],
-                "storage": "file",
-                "retention": "limits",
-                "discard": "old",
-                "allow_direct": True,
-                **bounds,
-            }
-        )
+        await self.connection.create(name, bounds)
         config = (await self.connection.ask(f"STREAM.INFO.{name}", {}))["config"]
         if any(config.get(one) != value for one, value in bounds.items()):
             await self.connection.ask(f"STREAM.UPDATE.{name}", {**config, **bounds})
@@ -181,11 +192,8 @@ class MessageLog:
         """
         subject, headers = self._subject(message.topic, message.stream), message.headers
         # The server closes the connection over a message that is too large with its headers; the client counts without.
-        size = (
-            len(message.payload)
-            + HEADERS
-            + sum(len(f"{name}: {value}\r\n".encode()) for name, value in headers.items())
-        )
+        size = HEADERS + len(message.payload)
+        size += sum(len(f"{name}: {value}\r\n".encode()) for name, value in headers.items())
         if size > (most := self.connection.client().max_payload):
             raise NotKeptError(f"{size} bytes with its headers, and the servers take {most} at once")
         for _ in range(TRIES):
@@ -306,3 +314,281 @@ def _found(topic: Topic, message: Msg) -> _Found:
         return _Found(int(headers["Nats-Sequence"]), at_s, content)
     except (LookupError, ValueError) as error:
         raise NatsError(f"in the log there is something else than messages: {error}") from error
+
+
+class LogReader:
+    """The reader of one process.
+
+    Everything runs on the loop of the connection, a few streams at a time, each for a bounded time and up to a bounded
+    number of bytes.
+
+    Args:
+        message_log: log to read; its connection is closed with the reader.
+        back_s: how far a stream is read that has no position: so long before its newest message.
+    """
+
+    def __init__(self, message_log: MessageLog, back_s: float) -> None:
+        self._log = message_log
+        self._back_s = back_s
+        self._turns = asyncio.Semaphore(READ_AT_ONCE)
+
+    def missed(
+        self, wanted: Missed, take: Callable[[list[LogMessage]], None], again_s: Sequence[float] = LOOK_AGAIN_S
+    ) -> None:
+        """Read what a session has missed, without waiting for it.
+
+        Args:
+            wanted: of which streams, from where on.
+            take: called, on a thread that must not be kept, with what there is, in the order of the log of each stream;
+                then a few times with what has come since. The first time it is called in any case.
+            again_s: pauses after which the log is read again.
+        """
+        self._log.connection.start(self._missed(wanted, take, again_s))
+
+    def tracks(
+        self, stream: str, from_ns: int, take: Callable[[list[LogMessage]], bool], end: Callable[[str], None]
+    ) -> None:
+        """Read the tracks of a stream from a stamp on, without waiting for it.
+
+        Args:
+            stream: its name.
+            from_ns: the stamp; some earlier ones may come, too.
+            take: called, on a thread that must not be kept, with some of them, in the order of the log, until it says
+                that it has enough (False).
+            end: called once afterwards, with the reason when not all could be read.
+        """
+        self._log.connection.start(self._tracks(stream, from_ns, take, end))
+
+    def close(self, timeout: float) -> None:
+        """Close the connection."""
+        self._log.connection.close(timeout)
+
+    async def _missed(self, wanted: Missed, take: Callable[[list[LogMessage]], None], again_s: Sequence[float]) -> None:
+        following: dict[str, int | None] = {}
+        for number, pause_s in enumerate((0.0, *again_s)):
+            await asyncio.sleep(pause_s)
+            messages: list[LogMessage] = []
+            try:
+                async with asyncio.timeout(WAIT_S), self._turns, asyncio.timeout(READ_S):
+                    streams = set(wanted.streams)
+                    if wanted.node:
+                        streams.update(filter(wanted.belongs, await self._log.streams("detections", wanted.node)))
+                    for stream in sorted(streams):
+                        await self._read(stream, wanted.positions.get(stream), following, messages)
+            except ERRORS as error:
+                log.warning("log_unread", streams=sorted(wanted.streams), error=self._log.connection.described(error))
+            except Exception:
+                log.exception("internal_error", streams=sorted(wanted.streams))  # the session waits for what there is
+            if messages or number == 0:
+                take(messages)
+
+    async def _read(
+        self, stream: str, position: Position | None, following: dict[str, int | None], messages: list[LogMessage]
+    ) -> None:
+        """Append the messages of a stream from the number on that follows the last read; note the next one."""
+        before = (lambda _: False) if position is None else position.before
+        number = following.get(stream)
+        if number is None:
+            back_s = max(OUTAGE_S, self._back_s) if position and position.tracked else self._back_s
+            number = await self._log.since("detections", stream, before, back_s)
+        kept: deque[LogMessage] = deque()
+        size = cut = 0
+        try:
+            while number is not None and (found := await self._log.read("detections", stream, number)):
+                number = found[-1][0] + 1
+                for _, message in found:
+                    if before(message):
+                        continue
+                    kept.append(message)
+                    size += len(message.payload)
+                    while len(kept) > MOST_FRAMES or size > MOST_BYTES:
+                        size -= len(kept.popleft().payload)
+                        cut += 1
+        finally:  # what was read before a failure is not read again
+            following[stream] = number
+            messages.extend(kept)
+        if cut:
+            log.warning("log_cut", stream=stream, frames=len(kept) + cut, kept=len(kept))
+
+    async def _tracks(
+        self, stream: str, from_ns: int, take: Callable[[list[LogMessage]], bool], end: Callable[[str], None]
+    ) -> None:
+        failure = ""
+        try:
+            async with asyncio.timeout(WAIT_S), self._turns, asyncio.timeout(READ_S):
+                number = await self._log.since("tracks", stream, lambda one: one.stamp_ns < from_ns)
+                while number is not None and (found := await self._log.read("tracks", stream, number)):
+                    number = found[-1][0] + 1
+                    if not take([message for _, message in found]):
+                        break
+        except ERRORS as error:
+            failure = self._log.connection.described(error)
+        except Exception as error:
+            log.exception("internal_error", stream=stream)
+            failure = f"{type(error).__name__}: {error}"
+        end(failure)
+
+
+class LogWriter:
+    """The writer of one process.
+
+    Args:
+        log: where messages go; closed by the caller, after this.
+        keep: what is kept of which topics.
+        lost: called, on any thread, with the stream of a message that is not in the log, and why.
+        held_bytes: bytes that are held at most.
+    """
+
+    def __init__(
+        self,
+        log: MessageLog,
+        keep: Mapping[Topic, Retention],
+        lost: Callable[[str, str], None],
+        held_bytes: int = HELD_BYTES,
+    ) -> None:
+        self._log = log
+        self._connection = log.connection
+        self._keep = keep
+        self._lost = lost
+        self._most = held_bytes
+        self._lock = threading.Lock()
+        self._waiting: deque[LogMessage] = deque()
+        self._came = asyncio.Event()
+        self.held_bytes = 0
+        """Bytes that wait, nearly."""
+        self._at_once = AT_ONCE
+        self._tries = 0
+        self._tried: LogMessage | None = None
+        self._failure = "the log was not reached yet"
+        self.written = 0
+        """Messages that are in the log by this writer."""
+        self.repeated = 0
+        """Messages that were in the log already."""
+        self.dropped = 0
+        """Messages that are not in the log."""
+        self._running = self._connection.start(self._run())
+
+    @property
+    def failure(self) -> str:
+        """Why nothing can be written at present; empty while it can."""
+        return self._connection.failure or self._failure
+
+    def put(self, message: LogMessage) -> None:
+        """Queue a message; never waits."""
+        with self._lock:
+            wakes = not self._waiting
+            self._waiting.append(message)
+            self.held_bytes += _size(message)
+            dropped = []
+            while self._waiting and self.held_bytes > self._most:
+                dropped.append(self._take())
+        for one in dropped:
+            self._lose(one, f"at most {self._most} bytes waiting for the log")
+        if wakes:
+            self._connection.soon(self._came.set)
+
+    def idle(self) -> bool:
+        """Return whether all messages have been written, or lost."""
+        with self._lock:
+            return not self.held_bytes
+
+    def close(self) -> None:
+        """End; what waits is lost."""
+        self._running.cancel()
+
+    def _take(self) -> LogMessage:
+        """Remove the oldest message from the queue; called with the lock."""
+        message = self._waiting.popleft()
+        self.held_bytes -= _size(message)
+        return message
+
+    def _lose(self, message: LogMessage, why: str) -> None:
+        self.dropped += 1
+        self._lost(message.stream, why)
+
+    # On the loop of the log
+
+    async def _run(self) -> None:
+        while not await self._ready():  # noqa: ASYNC110 - the servers are asked again, nobody else says anything
+            await asyncio.sleep(RETRY_S)
+        self._works()
+        while True:
+            await self._came.wait()
+            self._came.clear()
+            while batch := self._next():
+                failed = await self._write(batch)
+                if self._tries == ALONE_TRIES:
+                    self._tries = 0
+                    self._lose(failed.pop(), self._failure)
+                    self._go_on()
+                with self._lock:
+                    self._waiting.extendleft(reversed(failed))
+                    self.held_bytes -= sum(map(_size, batch)) - sum(map(_size, failed))
+                if failed:
+                    await asyncio.sleep(RETRY_S)
+
+    async def _ready(self) -> bool:
+        try:
+            for topic, keep in self._keep.items():
+                await self._log.ready(topic, keep)
+        except ERRORS as error:
+            self._failed(error)
+            return False
+        return True
+
+    def _next(self) -> list[LogMessage]:
+        """Remove the messages to write at once from the queue; their bytes still count."""
+        with self._lock:
+            return [self._waiting.popleft() for _ in range(min(self._at_once, len(self._waiting)))]
+
+    async def _write(self, batch: list[LogMessage]) -> list[LogMessage]:
+        """Write messages; return those that have to be tried again.
+
+        One message can keep all beside it from being written, by having the connection closed. So after a failure they
+        are tried alone, and the tries of the first one count while the servers say that its log is there.
+        """
+        if not await self._ready():
+            return batch
+        results = await asyncio.gather(*map(self._log.put, batch), return_exceptions=True)
+        failed: list[LogMessage] = []
+        for message, result in zip(batch, results, strict=True):
+            if isinstance(result, NotKeptError):
+                self._lose(message, str(result))
+            elif isinstance(result, ERRORS):
+                self._failed(result)
+                failed.append(message)
+            elif isinstance(result, BaseException):
+                self._lose(message, f"{type(result).__name__}: {result}")
+            else:
+                self.written += result
+                self.repeated += not result
+        if failed:
+            self._log.look_again()
+            alone = batch[0] if len(batch) == 1 else None
+            self._tries = 0 if alone is None else 1 if alone is not self._tried else self._tries + 1
+            self._tried = alone
+            self._at_once = 1
+        else:
+            self._tries = 0
+            self._at_once = min(AT_ONCE, 2 * self._at_once)
+            self._go_on()
+        return failed
+
+    def _go_on(self) -> None:
+        """End the failure, unless the message that failed may still be in the queue."""
+        if self._at_once == AT_ONCE or not self._waiting:
+            self._works()
+
+    def _works(self) -> None:
+        if self._failure:
+            self._failure = ""
+            log.info("log_back")
+
+    def _failed(self, error: BaseException) -> None:
+        if not self._failure:
+            log.error("log_failed", error=str(error))
+        self._failure = self._connection.described(error)
+
+
+def _size(message: LogMessage) -> int:
+    return OVERHEAD + len(message.payload)

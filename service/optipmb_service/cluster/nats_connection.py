@@ -1,4 +1,4 @@
-"""One connection to the NATS servers, for any thread.
+"""One connection to the NATS servers, for any thread, and what opens it: certificates, and a user's credentials.
 
 The client of NATS is asyncio's; it has a loop on a thread of its own, and whoever calls waits for it a bounded time.
 """
@@ -6,50 +6,52 @@ The client of NATS is asyncio's; it has a loop on a thread of its own, and whoev
 from __future__ import annotations
 
 import asyncio
+import base64
+import binascii
 import contextlib
 import json
 import re
+import ssl
 import threading
 from concurrent.futures import CancelledError
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import structlog
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from nats.aio.client import Client
 from nats.errors import Error as NatsError
-from nats.errors import NoRespondersError
 
-from optipmb_service.cluster.nats_access import SecuredClient
 from optipmb_service.cluster.store import StoreError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Mapping, Sequence
     from concurrent.futures import Future
+    from pathlib import Path
 
-    from nats.aio.client import Client
+    from nats.aio.client import Srv
     from nats.aio.msg import Msg
-
-    from optipmb_service.cluster.nats_access import NatsAccess
 
 log = structlog.get_logger("optipmb_service")
 
 _T = TypeVar("_T")
 
-CALL_S: Final = 1.0
-"""How long the servers may take to answer; they take milliseconds."""
-
+CALL_S: Final = 1.0  # how long the servers may take to answer; they take milliseconds
 CONNECT_S: Final = 1
-RETRY_S: Final = 1
-"""Both in whole seconds, as NATS' client has them typed."""
-
-MANY: Final = 3
-"""Servers from which on everything is kept by three of them."""
-
-LEAST: Final = (2, 12)
-"""First version of the server that refuses a checkpoint for its fence."""
-
+RETRY_S: Final = 1  # both in whole seconds, as NATS' client has them typed
+MANY: Final = 3  # servers from which on everything is kept by three of them
+LEAST: Final = (2, 12)  # first version of the server that refuses a checkpoint for its fence
 EXISTS: Final = 10058
-ENDS: Final = frozenset({"204", "404"})
-"""Status that ends a batch: that was all, or there is nothing."""
+ENDS: Final = frozenset({"204", "404"})  # status that ends a batch: that was all, or there is nothing
 NOBODY: Final = "503"
+
+
+CA: Final = "ca.pem"
+CERTIFICATE: Final = "cert.pem"
+KEY: Final = "key.pem"
+
+_JWT: Final = re.compile(r"-+BEGIN NATS USER JWT-+\s+(\S+)\s+-+END")
+_SEED: Final = re.compile(r"-+BEGIN USER NKEY SEED-+\s+(\S+)\s+-+END")
+_SEED_BYTES: Final = 36  # of a user's seed: two that say what it is, the seed, a checksum
 
 
 class RefusedError(Exception):
@@ -64,8 +66,32 @@ class RefusedError(Exception):
         self.code = error.get("err_code")
 
 
+ERRORS: Final = (NatsError, RefusedError, TimeoutError, OSError)  # failures of a request to the servers
+
+
 class NobodyAnswersError(NatsError):
     """There is no JetStream stream of a name, or none that answers now."""
+
+
+class SecuredClient(Client):
+    """NATS' client, but one that says nothing to a server without TLS where the address wants it.
+
+    A server tells in the clear whether it wants TLS, and whoever stands in between could leave that out: the client
+    would go on without, and send the password.
+
+    It also closes a connection that a server ended before it had greeted the client, before it tries the next one.
+    """
+
+    async def _connect_to_server(self, s: Srv) -> None:
+        if self._transport is not None:
+            self._transport.close()  # type: ignore[no-untyped-call]  # NATS' client annotates no `close`
+        await super()._connect_to_server(s)
+
+    def _connect_command(self) -> bytes:
+        server = self._current_server
+        if server is not None and server.uri.scheme == "tls" and not self._server_info.get("tls_required"):
+            raise NatsError("tls:// and the server offers no TLS")
+        return super()._connect_command()
 
 
 class NatsConnection:
@@ -74,16 +100,13 @@ class NatsConnection:
     Args:
         servers: addresses, as `nats://host:4222`; of one cluster, where there are several.
         lost: called on the loop when it is lost.
-        access: what the servers want to see.
-
-    Raises:
-        StoreError: what they want to see cannot be read.
+        options: of NATS' client, as `access` returns them.
     """
 
     def __init__(
-        self, servers: Sequence[str], lost: Callable[[], None] = lambda: None, access: NatsAccess | None = None
+        self, servers: Sequence[str], lost: Callable[[], None] = lambda: None, options: Mapping[str, Any] | None = None
     ) -> None:
-        self._options = access.options() if access else {}
+        self._options = dict(options or {})
         self._servers = list(servers)
         self._lost = lost
         self._client = SecuredClient()
@@ -95,26 +118,21 @@ class NatsConnection:
         self._connecting = self.start(self._connect())
 
     @property
-    def replicas(self) -> int:
-        """How many servers are to keep a JetStream stream."""
-        return MANY if len(self._servers) >= MANY else 1
-
-    @property
     def failure(self) -> str:
         """Why the servers cannot be reached; empty while they can."""
         return "" if self._client.is_connected else self._why
 
     def soon(self, callback: Callable[[], object]) -> None:
-        """Have something called on the loop, without waiting for it."""
+        """Call something on the loop, without waiting for it."""
         with contextlib.suppress(RuntimeError):  # it has closed
             self._loop.call_soon_threadsafe(callback)
 
     def start(self, work: Coroutine[Any, Any, _T]) -> Future[_T]:
-        """Have the loop do something, without waiting for it."""
+        """Run a coroutine on the loop, without waiting for it."""
         return asyncio.run_coroutine_threadsafe(work, self._loop)
 
     def call(self, work: Coroutine[Any, Any, _T], calls: float = 1.0) -> _T:
-        """Have the loop do something that takes as long as so many calls, and wait for it.
+        """Run a coroutine on the loop that takes as long as so many calls, and wait for it.
 
         Raises:
             StoreError: it could not be done in time.
@@ -130,7 +148,7 @@ class NatsConnection:
             raise StoreError("the connection is closed")
         try:
             return self.start(bounded()).result(bound_s + CALL_S)
-        except (NatsError, RefusedError, TimeoutError, CancelledError, OSError) as error:
+        except (*ERRORS, CancelledError) as error:
             raise StoreError(self.described(error)) from error
 
     def described(self, error: BaseException) -> str:
@@ -179,10 +197,19 @@ class NatsConnection:
             raise NatsError(f"NATS {'.'.join(map(str, LEAST))} or newer is needed, this is {version}")
         return client
 
-    async def create(self, config: Mapping[str, Any]) -> None:
-        """Create a JetStream stream, unless there is one of that name."""
+    async def create(self, name: str, bounds: Mapping[str, Any]) -> None:
+        """Create a JetStream stream of what is published below its name, unless there is one."""
+        config = {
+            "name": name,
+            "subjects": [f"{name}.>"],
+            "storage": "file",
+            "retention": "limits",
+            "discard": "old",
+            "allow_direct": True,
+            "num_replicas": MANY if len(self._servers) >= MANY else 1,
+        }
         try:
-            await self.ask(f"STREAM.CREATE.{config['name']}", {**config, "num_replicas": self.replicas})
+            await self.ask(f"STREAM.CREATE.{name}", {**config, **bounds})
         except RefusedError as refused:
             if refused.code != EXISTS:  # somebody who runs the servers may have changed it
                 raise
@@ -207,27 +234,24 @@ class NatsConnection:
     async def read(self, name: str, request: Mapping[str, Any]) -> list[Msg]:
         """Return the messages of a JetStream stream that a request names, from the server that is nearest."""
         client = self.client()
-        if "batch" not in request:
-            try:
-                return _answered(
-                    await client.request(f"$JS.API.DIRECT.GET.{name}", json.dumps(request).encode(), timeout=CALL_S)
-                )
-            except NoRespondersError as error:
-                raise NobodyAnswersError(f"nobody answers for {name}") from error
         inbox = client.new_inbox()
         subscription = await client.subscribe(inbox)
         messages: list[Msg] = []
         try:
             await client.publish(f"$JS.API.DIRECT.GET.{name}", json.dumps(request).encode(), reply=inbox)
-            while True:
+            while not messages or "batch" in request:
                 message = await subscription.next_msg(CALL_S)
-                if (message.headers or {}).get("Status") == NOBODY:
+                status = (message.headers or {}).get("Status")
+                if status in ENDS:
+                    break
+                if status == NOBODY:
                     raise NobodyAnswersError(f"nobody answers for {name}")
-                if not (found := _answered(message)):
-                    return messages
-                messages += found
+                if status is not None:
+                    raise NatsError(f"status {status}")
+                messages.append(message)
         finally:
             await subscription.unsubscribe()
+        return messages
 
     async def _connect(self) -> None:
         await self._client.connect(
@@ -250,18 +274,67 @@ class NatsConnection:
         self._lost()
 
 
-def _answered(message: Msg) -> list[Msg]:
-    """Return the message of an answer; none where its status says that there are no more.
+def access(tls: Path | None, credentials: Path | None) -> dict[str, Any]:
+    """Return the options of NATS' client that open a connection to servers that do not let everybody in.
+
+    Args:
+        tls: folder with the authority of the servers and, where they ask for one, the certificate of this service.
+            None: the authorities of the system.
+        credentials: file with a user's JWT and seed, as NATS' tools write it; or with one line, `user:password` or a
+            token. None: what the addresses say.
 
     Raises:
-        NatsError: the status says something else.
+        StoreError: a file cannot be read, or holds something else.
     """
-    status = (message.headers or {}).get("Status")
-    if status is None:
-        return [message]
-    if status not in ENDS:
-        raise NatsError(f"status {status}")
-    return []
+    options: dict[str, Any] = {}
+    if tls is not None:
+        try:
+            options["tls"] = _context(tls)
+        except OSError as error:  # also one of its contents
+            raise StoreError(f"cluster_tls: {tls}: {error}") from error
+    if credentials is not None:
+        try:
+            options |= _user(credentials)
+        except (OSError, ValueError) as error:
+            raise StoreError(f"cluster_credentials: {credentials}: {error}") from error
+    return options
+
+
+def _context(folder: Path) -> ssl.SSLContext:
+    context = ssl.create_default_context(cafile=str(folder / CA))
+    if (folder / CERTIFICATE).exists():
+        context.load_cert_chain(folder / CERTIFICATE, folder / KEY)
+    return context
+
+
+def _user(file: Path) -> dict[str, Any]:
+    text = file.read_text(encoding="utf-8")
+    if _JWT.search(text):
+        _read(file)  # fails now rather than at every try to connect
+        return {
+            "user_jwt_cb": lambda: bytearray(_read(file)[0].encode()),
+            "signature_cb": lambda nonce: base64.b64encode(_read(file)[1].sign(nonce.encode())),
+        }
+    lines = text.split()
+    if len(lines) != 1:
+        raise ValueError("expected a NATS user's JWT and seed, or one line: user:password, or a token")
+    user, colon, password = lines[0].partition(":")
+    return {"user": user, "password": password} if colon else {"token": lines[0]}
+
+
+def _read(file: Path) -> tuple[str, Ed25519PrivateKey]:
+    """Return the JWT of a user and the key that signs for it; read each time, so that a new file holds at once."""
+    text = file.read_text(encoding="utf-8")
+    jwt, seed = _JWT.search(text), _SEED.search(text)
+    if jwt is None or seed is None:
+        raise ValueError("expected a NATS user's JWT and seed")
+    try:
+        raw = base64.b32decode(seed[1] + "=" * (-len(seed[1]) % 8))
+    except binascii.Error as error:
+        raise ValueError("the seed is not written in base 32") from error
+    if len(raw) != _SEED_BYTES:
+        raise ValueError("the seed has another length")
+    return jwt[1], Ed25519PrivateKey.from_private_bytes(raw[2:34])
 
 
 def token(text: str) -> str:

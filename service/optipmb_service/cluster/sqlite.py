@@ -10,48 +10,43 @@ power cut too, which may only cost the last transactions; the publishers' caches
 transaction would cost several milliseconds of disk time each second for nothing else. Much is written in transactions
 of a bounded size, so that other processes have their turn.
 
-`sqlite_file` opens such a file. Beside the two is the folder of the locks of members (`member_locks`).
+Beside the two is a folder with a file for each member, which it holds a lock on as long as it lives. The kernel gives
+up the lock of a member whose process has ended, however it ended: then it publishes nothing more for certain.
 """
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
+import sqlite3
+import threading
 import time
+from hashlib import blake2b
 from itertools import islice
-from typing import TYPE_CHECKING, Final
+from typing import IO, TYPE_CHECKING, Final
 
 import structlog
 
-from optipmb_service.cluster.member_locks import MEMBERS, MemberLocks, in_use
-from optipmb_service.cluster.sqlite_file import Database, is_damaged
 from optipmb_service.cluster.store import ENDED, KEPT, Fenced, Record, StoreError, Write
 
 if TYPE_CHECKING:
-    import sqlite3
     from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
 
 log = structlog.get_logger("optipmb_service")
 
-ASIDE: Final = 64
-"""Torn checkpoints kept in all; beyond it the oldest go."""
+MEMBERS: Final = "members"  # folder of the files whose locks say that members live
+BUSY_S: Final = 5.0  # how long a transaction waits for those of other processes; each takes milliseconds
+BUSY_PAUSE_S: Final = 0.01
 
-LEASES: Final = "leases.db"
-"""File of the records."""
-
-ENDED_KEPT: Final = 64
-"""Records of ended members that are kept; who has followed none of the later ones was ended itself."""
-
-SLICE: Final = 64
-"""Streams of one transaction."""
-
-SLICE_BYTES: Final = 4 * 2**20
-"""Bytes of checkpoints of one transaction; one checkpoint may have more."""
-
-PAGE_BYTES: Final = 32768
-"""Pages of the file of the checkpoints, each of which has tens of thousands of bytes."""
-
+LOG_BYTES: Final = 4 * 2**20  # size of the write-ahead log from which its pages go into the file, and it begins anew
+ASIDE: Final = 64  # torn checkpoints kept in all; beyond it the oldest go
+LEASES: Final = "leases.db"  # file of the records
+ENDED_KEPT: Final = 64  # records of ended members; who has followed none of the later ones was ended itself
+SLICE: Final = 64  # streams of one transaction
+SLICE_BYTES: Final = 4 * 2**20  # bytes of checkpoints of one transaction; one checkpoint may have more
+PAGE_BYTES: Final = 32768  # pages of the file of the checkpoints, each of which has tens of thousands of bytes
 _RECORDS: Final = """
 CREATE TABLE IF NOT EXISTS records (key TEXT PRIMARY KEY, value TEXT NOT NULL, revision INTEGER NOT NULL) WITHOUT ROWID;
 """
@@ -63,7 +58,6 @@ CREATE TABLE IF NOT EXISTS aside (
     number INTEGER PRIMARY KEY, stream TEXT NOT NULL, reason TEXT NOT NULL, data BLOB NOT NULL
 );
 CREATE TABLE IF NOT EXISTS written (stream TEXT PRIMARY KEY, at REAL NOT NULL);
-DROP TABLE IF EXISTS records;
 """
 
 _OLD_MEMBERS: Final = """
@@ -73,6 +67,252 @@ DELETE FROM records WHERE key LIKE 'member/%' AND value = 'ended' AND revision <
 """
 _NEWEST: Final = "SELECT data FROM checkpoints WHERE stream = ? ORDER BY number DESC LIMIT 1"
 _SILENT: Final = "SELECT stream FROM written WHERE at < ? LIMIT ?"
+
+
+class MemberLocks:
+    """The lock of the member of this process, and those of others, in a folder; None: there are no others."""
+
+    def __init__(self, folder: Path | None) -> None:
+        self._folder = folder
+        self._member = ""
+        self._file: IO[bytes] | None = None
+
+    def is_free(self, member: str) -> bool:
+        """Return whether nobody holds the lock of a member. A file that is missing says nothing about its process."""
+        if member == self._member or self._folder is None:
+            return False
+        try:
+            return not _locked(_lock_of(self._folder, member))
+        except OSError:
+            return False
+
+    def take(self, member: str) -> None:
+        """Take the lock of a member that begins; the one before it in this process has ended.
+
+        Raises:
+            StoreError: the file cannot be made, or is locked.
+        """
+        if self._folder is None or member == self._member:
+            return
+        try:
+            file = _lock_of(self._folder, member).open("xb")
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise StoreError(f"{self._folder}: {error}") from error
+        self.close()
+        self._member, self._file = member, file
+
+    def restore(self) -> None:
+        """Take the lock of this process again: its file was deleted.
+
+        Raises:
+            StoreError: the file cannot be made.
+        """
+        if self._folder is not None and self._member:
+            try:
+                self._folder.mkdir(exist_ok=True)
+                member, self._member = self._member, ""
+                if not _lock_of(self._folder, member).exists():
+                    self.take(member)
+                self._member = member
+            except OSError as error:
+                raise StoreError(f"{self._folder}: {error}") from error
+
+    def leave(self, member: str) -> None:
+        """Remove the lock of a member that has ended."""
+        if self._folder is not None:
+            with contextlib.suppress(OSError):
+                _lock_of(self._folder, member).unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """Give up the lock of this process; may be called twice."""
+        if self._file is not None:
+            self._file.close()
+
+
+def in_use(path: Path) -> bool:
+    """Return whether a member lives that keeps its leases beside a file of checkpoints."""
+    for lock in path.with_name(MEMBERS).glob("*"):
+        with contextlib.suppress(OSError):  # it has gone meanwhile
+            if _locked(lock):
+                return True
+    return False
+
+
+def _lock_of(folder: Path, member: str) -> Path:
+    return folder / blake2b(member.encode(), digest_size=8).hexdigest()
+
+
+def _locked(path: Path) -> bool:
+    with path.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
+
+
+class Database:
+    """One file that processes share and a connection to it; any thread may use it, one at a time.
+
+    SQLite itself goes on writing into a file that was deleted, where nobody finds it again. So before each use it is
+    seen whether the file is still the one that was opened; else it is made again, with all that the deleted one holds.
+
+    Args:
+        path: the file; made when it is not there. None: in memory.
+        schema: of its tables.
+        synchronous: SQLite's setting.
+        page_bytes: size of the pages of a new file; each is read and written by a call of the system.
+        restored: called when the file was deleted and is there again.
+
+    Raises:
+        StoreError: it cannot be opened or written, or is no such file.
+    """
+
+    def __init__(
+        self,
+        path: Path | None,
+        schema: str,
+        synchronous: str,
+        page_bytes: int = 4096,
+        restored: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._path = path
+        self._schema, self._synchronous, self._page_bytes = schema, synchronous, page_bytes
+        self._restored = restored
+        self._lock = threading.Lock()
+        self.connection: sqlite3.Connection | None = None
+        try:
+            self._open()
+        except (sqlite3.Error, OSError) as error:
+            self.close()
+            raise StoreError(f"{path}: {error}") from error
+
+    def _open(self) -> None:
+        connection = self.connection = sqlite3.connect(
+            self._path or ":memory:", timeout=BUSY_S, isolation_level=None, check_same_thread=False
+        )
+        connection.execute(f"PRAGMA page_size = {self._page_bytes}")
+        self._begin_log(connection)
+        connection.execute(f"PRAGMA synchronous = {self._synchronous}")
+        connection.execute(f"PRAGMA journal_size_limit = {64 * 2**20}")
+        (page_bytes,) = connection.execute("PRAGMA page_size").fetchone()  # an older file keeps its own
+        connection.execute(f"PRAGMA wal_autocheckpoint = {LOG_BYTES // page_bytes}")
+        connection.executescript(self._schema)
+        connection.execute("PRAGMA user_version = 3")  # fails here already where nothing can be written
+        self._opened = self._found()
+
+    def _found(self) -> tuple[int, int] | None:
+        """Return what tells the file at the path from others; None without one."""
+        if self._path is None:
+            return 0, 0
+        try:
+            found = self._path.stat()
+        except FileNotFoundError:
+            return None
+        return found.st_dev, found.st_ino
+
+    def _follow(self, connection: sqlite3.Connection) -> sqlite3.Connection:
+        """Return the connection to the file at the path; where the one in use was deleted, it is made again.
+
+        No other process writes into the deleted one meanwhile: each looks for the file when it has the write lock.
+        """
+        path = self._path
+        if path is None or self._found() == self._opened:
+            return connection
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with _exclusive(path.parent):  # of several processes one makes it
+            if self._found() is None:
+                copy = path.with_name(f"{path.name}.new")
+                for one in (copy, *(path.with_name(f"{path.name}{end}") for end in ("-wal", "-shm"))):
+                    one.unlink(missing_ok=True)
+                connection.execute("BEGIN IMMEDIATE")
+                try:
+                    copy.write_bytes(connection.serialize())  # `backup` does not work with the write lock held
+                    copy.rename(path)
+                finally:
+                    connection.execute("ROLLBACK")
+            connection.close()
+            self._open()
+        log.warning("store_deleted", file=str(path))
+        self._restored()
+        return self._connected()
+
+    def _connected(self) -> sqlite3.Connection:
+        if self.connection is None:
+            raise StoreError(f"{self._path}: closed")
+        return self.connection
+
+    @staticmethod
+    def _begin_log(connection: sqlite3.Connection) -> None:
+        """Make the journal a write-ahead log; SQLite itself does not wait there for a process that does the same."""
+        until_s = time.monotonic() + BUSY_S
+        while True:
+            try:
+                connection.execute("PRAGMA journal_mode = WAL")
+            except sqlite3.OperationalError as error:
+                if error.sqlite_errorcode & 0xFF != sqlite3.SQLITE_BUSY or time.monotonic() > until_s:
+                    raise
+                time.sleep(BUSY_PAUSE_S)
+            else:
+                return
+
+    def close(self, timeout: float = 1.0) -> None:
+        """Close the file, unless it is in use for so long (s); may be called twice."""
+        if not self._lock.acquire(timeout=timeout):
+            return  # it hangs, and the process ends
+        try:
+            if self.connection is not None:
+                self.connection.close()
+                self.connection = None
+        finally:
+            self._lock.release()
+
+    @contextlib.contextmanager
+    def use(self) -> Iterator[sqlite3.Connection]:
+        """Use the connection exclusively.
+
+        Raises:
+            StoreError: whatever is wrong with it.
+        """
+        with self._lock:
+            connection = self._connected()
+            try:
+                yield self._follow(connection)
+            except (sqlite3.Error, OSError) as error:
+                raise StoreError(f"{self._path}: {error}") from error
+
+    @contextlib.contextmanager
+    def transaction(self) -> Iterator[sqlite3.Connection]:
+        """Open a transaction; the write lock is taken first, so that no reader has to become a writer halfway."""
+        with self.use() as opened:
+            connection = opened
+            connection.execute("BEGIN IMMEDIATE")
+            if self._found() != self._opened:  # it was deleted while another process had the lock
+                connection.execute("ROLLBACK")
+                connection = self._follow(connection)
+                connection.execute("BEGIN IMMEDIATE")
+            try:
+                yield connection
+                connection.execute("COMMIT")
+            except BaseException:
+                # A full disk may have rolled it back already.
+                if connection.in_transaction:
+                    connection.execute("ROLLBACK")
+                raise
+
+
+def _is_damaged(file: Path) -> bool:
+    """Return whether a file is no database, or not whole."""
+    if not file.exists():
+        return False
+    with contextlib.closing(sqlite3.connect(file, timeout=BUSY_S)) as connection:
+        try:
+            return bool(connection.execute("PRAGMA quick_check(1)").fetchone() != ("ok",))
+        except sqlite3.OperationalError:  # busy, or not readable: it is not known
+            return False
+        except sqlite3.DatabaseError:
+            return True
 
 
 class SqliteStore:
@@ -136,7 +376,7 @@ class SqliteStore:
         return int(last) + 1
 
     def gone(self, member: str) -> bool:
-        """Whether nobody holds the lock of a member. A file that is missing says nothing about its process."""
+        """Return whether nobody holds the lock of a member. A file that is missing says nothing about its process."""
         return self._locks.is_free(member)
 
     def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
@@ -184,11 +424,9 @@ class SqliteStore:
         return tuple(row[0] for row in rows)
 
     def expire(self, age_s: float) -> int:
-        """Forget some streams of which nothing was saved for so long; one of an earlier version counts from now."""
-        now_s = self._clock()
+        """Forget some streams of which nothing was saved for so long; return how many."""
         with self._checkpoints.transaction() as connection:
-            connection.execute("INSERT OR IGNORE INTO written SELECT DISTINCT stream, ? FROM checkpoints", (now_s,))
-            old = connection.execute(_SILENT, (now_s - age_s, SLICE)).fetchall()
+            old = connection.execute(_SILENT, (self._clock() - age_s, SLICE)).fetchall()
             connection.executemany("DELETE FROM checkpoints WHERE stream = ?", old)
             connection.executemany("DELETE FROM written WHERE stream = ?", old)
         return len(old)
@@ -218,7 +456,7 @@ class SqliteStore:
 
 
 def _some(left: Iterator[tuple[str, Fenced]]) -> list[tuple[str, Fenced]]:
-    """Take as many checkpoints as one transaction may have."""
+    """Return as many checkpoints as one transaction may have."""
     some: list[tuple[str, Fenced]] = []
     size = 0
     for one in islice(left, SLICE):
@@ -238,17 +476,22 @@ def _leases_beside(path: Path, restored: Callable[[], None]) -> Database:
     file, members = path.with_name(LEASES), path.with_name(MEMBERS)
     try:
         members.mkdir(exist_ok=True)
-        folder = os.open(members, os.O_RDONLY)
-    except OSError as error:
-        raise StoreError(f"{members}: {error}") from error
-    try:
-        fcntl.flock(folder, fcntl.LOCK_EX)  # of two that begin, one looks and replaces
-        if is_damaged(file) and not in_use(path):
-            log.warning("leases_damaged", file=str(file))
-            for one in (file, *(file.with_name(f"{LEASES}{end}") for end in ("-wal", "-shm"))):
-                one.unlink(missing_ok=True)
-        return Database(file, _RECORDS, "OFF", restored=restored)
+        with _exclusive(members):  # of two that begin, one looks and replaces
+            if _is_damaged(file) and not in_use(path):
+                log.warning("leases_damaged", file=str(file))
+                for one in (file, *(file.with_name(f"{LEASES}{end}") for end in ("-wal", "-shm"))):
+                    one.unlink(missing_ok=True)
+            return Database(file, _RECORDS, "OFF", restored=restored)
     except OSError as error:
         raise StoreError(f"{file}: {error}") from error
+
+
+@contextlib.contextmanager
+def _exclusive(folder: Path) -> Iterator[None]:
+    """Lock a folder against other processes that do the same."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
     finally:
-        os.close(folder)
+        os.close(descriptor)

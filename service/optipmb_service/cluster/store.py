@@ -1,4 +1,4 @@
-"""Where leases and checkpoints are kept: the port `LeaseStore`; its adapters are `sqlite` and `jetstream`.
+"""Store of leases and checkpoints: the port `LeaseStore`; its adapters are `sqlite` and `jetstream`.
 
 A store holds records and bytes and knows nothing of what they mean. Of every stream it keeps the newest two
 checkpoints: when the newest turns out to be torn, it is set aside (kept for whoever wants to know why, never deleted by
@@ -13,11 +13,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeVar
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-KEPT: Final = 2
-"""Checkpoints kept per stream."""
-
-ENDED: Final = "ended"
-"""What the record of a member says at last."""
+KEPT: Final = 2  # checkpoints kept per stream
+ENDED: Final = "ended"  # what the record of a member says at last
 
 
 class StoreError(Exception):
@@ -69,7 +66,7 @@ class LeaseStore(Protocol):
         """Write a record; return its revision, None when the one to be replaced is not the newest."""
 
     def gone(self, member: str) -> bool:
-        """Whether the process of a member that has written its record has ended for certain."""
+        """Return whether the process of a member that has written its record has ended for certain."""
 
     def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
         """Write the newest checkpoints of streams; return those that were refused for their fence."""
@@ -94,14 +91,7 @@ _Torn = TypeVar("_Torn", bound=Exception)
 def load_newest(
     store: LeaseStore, stream: str, read: Callable[[bytes], _T], torn: type[_Torn], on_torn: Callable[[_Torn], None]
 ) -> _T | None:
-    """Return the newest checkpoint of a stream that can be read; what cannot is set aside.
-
-    Args:
-        store: where to look.
-        stream: whose.
-        read: makes the checkpoint of the bytes.
-        torn: what `read` raises.
-        on_torn: called with the error, each time.
+    """Return the newest checkpoint of a stream that `read` can read; one for which it raises `torn` is set aside.
 
     Raises:
         StoreError: the store cannot be read.

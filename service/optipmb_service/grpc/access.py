@@ -6,7 +6,8 @@
 | `service/name` | read and command all streams |
 | `viewer/name` | read all streams |
 
-Without certificates and tokens everybody may do everything, as on a network without access control.
+Without certificates and tokens everybody may do everything, as on a network without access control. The certificates of
+the gateway are read again when their files have changed, so that they can be renewed.
 """
 
 from __future__ import annotations
@@ -15,18 +16,17 @@ import importlib
 import inspect
 import json
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import grpc
+import structlog
 
-from optipmb_service.grpc.status import EndCall
+from optipmb_service.grpc.calls import EndCall
 from optipmb_service.runtime.ports import EdgeError
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
     from pathlib import Path
-
-    from optipmb_service.grpc.calls import Context
 
     Tokens = Callable[[Mapping[str, str], str], str | Awaitable[str | None] | None]
 
@@ -34,6 +34,10 @@ ANYBODY: Final = ""
 """Name of a caller where callers have none."""
 
 NODE_CHUNKS: Final = 2
+
+FILES: Final = ("key.pem", "cert.pem", "ca.pem")
+
+log = structlog.get_logger("optipmb_service")
 
 
 @dataclass(frozen=True)
@@ -91,10 +95,10 @@ class Access:
 
     def __init__(self, *, certificates: bool, names: Path | None = None, tokens: str = "") -> None:
         self._certificates = certificates
-        self._names = None if names is None else _read(names)
+        self._names = None if names is None else _names(names)
         self._tokens = _function(tokens) if tokens else None
 
-    async def caller(self, context: Context) -> Caller:
+    async def caller(self, context: grpc.aio.ServicerContext[Any, Any]) -> Caller:
         """Return who calls.
 
         Raises:
@@ -117,7 +121,7 @@ class Access:
         return Caller(name)
 
 
-def _read(file: Path) -> frozenset[str]:
+def _names(file: Path) -> frozenset[str]:
     try:
         names = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -134,3 +138,41 @@ def _function(path: str) -> Tokens:
     except (ImportError, AttributeError, ValueError) as error:
         raise EdgeError(f"setting grpc_tokens: {path}: {error}") from error
     return function
+
+
+def credentials(folder: Path) -> grpc.ServerCredentials:
+    """Return credentials that demand a certificate of the authority from every client.
+
+    Args:
+        folder: with `key.pem`, `cert.pem` and `ca.pem`, as `docker/security/make.py` makes it.
+
+    Raises:
+        EdgeError: a file cannot be read.
+    """
+    try:
+        state = [_changed(folder)]
+        first = _configuration(folder)
+    except OSError as error:
+        raise EdgeError(f"setting grpc_tls: {error.filename}: {error.strerror}") from error
+
+    def renewed() -> Any:  # the stubs do not know that it may be None
+        try:
+            if (now := _changed(folder)) == state[0]:
+                return None
+            fresh = _configuration(folder)
+        except OSError as error:
+            log.warning("grpc_certificates", error=str(error))
+            return None
+        state[0] = now
+        return fresh
+
+    return grpc.dynamic_ssl_server_credentials(first, renewed, require_client_authentication=True)
+
+
+def _changed(folder: Path) -> tuple[int, ...]:
+    return tuple((folder / name).stat().st_mtime_ns for name in FILES)
+
+
+def _configuration(folder: Path) -> grpc.ServerCertificateConfiguration:
+    key, certificate, authority = ((folder / name).read_bytes() for name in FILES)
+    return grpc.ssl_server_certificate_configuration([(key, certificate)], root_certificates=authority)

@@ -1,70 +1,70 @@
-"""One call: who makes it, what it is given of the gateway, and how its responses are written."""
+"""One call: what it reads, the responses that wait for its reader, and how it ends."""
 
 from __future__ import annotations
 
 import asyncio
+import collections
 import contextlib
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import grpc
-
-from optipmb_service.grpc.status import EndCall
+from google.protobuf import any_pb2
+from google.rpc import error_details_pb2, status_pb2
+from grpc_status import rpc_status
+from optipmb_schemas.protobuf import convert
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Iterator
+    from collections.abc import AsyncIterator, Iterator
 
     import optipmb_schemas as schemas
+    from google.protobuf.message import Message as ProtoMessage
 
     from optipmb_service.grpc.access import Caller
-    from optipmb_service.grpc.feeds import Feeds
-    from optipmb_service.grpc.metrics import CallMetrics
-    from optipmb_service.grpc.outbox import Outbox
-    from optipmb_service.grpc.publishers import Publishers
-    from optipmb_service.zenoh.client import Client
+    from optipmb_service.grpc.server import Server
 
-
-class Context(Protocol):
-    """What is used of gRPC's context of a call."""
-
-    async def read(self) -> Any:
-        """Return the next request, or EOF."""
-
-    async def write(self, message: bytes) -> None:
-        """Send a response."""
-
-    async def send_initial_metadata(self, initial_metadata: Any) -> None:
-        """Send the metadata that precede the first response."""
-
-    async def abort(self, code: Any, details: str, trailing_metadata: Any) -> Any:
-        """End the call with an error."""
-
-    def auth_context(self) -> Any:
-        """Return what is known of the caller's certificate."""
-
-    def invocation_metadata(self) -> Any:
-        """Return the metadata that the caller has sent."""
-
-    def peer(self) -> str:
-        """Return the address of the caller."""
-
+    P = TypeVar("P", bound=ProtoMessage)
 
 FIRST_S: Final = 30.0
 """How long a call may be open before its first message."""
 
+BYTES: Final = 32 * 2**20
+"""Bytes that wait at most for one reader."""
 
-@dataclass(frozen=True)
-class Gateway:
-    """What calls share."""
+CODES: Final[dict[str, grpc.StatusCode]] = {"too_large": grpc.StatusCode.RESOURCE_EXHAUSTED}
+"""Codes of messages that are refused for another reason than that they are not valid."""
 
-    client: Client
-    feeds: Feeds
-    publishers: Publishers
-    instance: str
-    limits: schemas.Limits
-    refused: Callable[[schemas.Problem], None]
-    """Called with the problem of a message that is not valid."""
-    calls: set[Call] = field(default_factory=set)
+_SKIPPED: Final = b"\x18"
+"""Tag of field 3, `skipped`, of all responses of streams: protobuf merges messages that stand one after the other."""
+
+
+class EndCall(Exception):  # noqa: N818 - it ends a call, and need not be an error
+    """Ends the call with a status: a code, one line, and details that name the field at fault, if there is one."""
+
+    def __init__(self, code: grpc.StatusCode, message: str, error: schemas.MessageError | None = None) -> None:
+        super().__init__(message)
+        self.code = code
+        self.message = message
+        self.error = error
+
+    @classmethod
+    def invalid(cls, error: schemas.MessageError) -> EndCall:
+        """Return the end of a call whose request is not valid."""
+        code = CODES.get(error.code, grpc.StatusCode.INVALID_ARGUMENT)
+        return cls(code, str(error), error.with_traceback(None))  # its frames hold the request
+
+    def status(self) -> grpc.Status:
+        """Return the status with its details."""
+        status = status_pb2.Status(code=self.code.value[0], message=self.message)
+        if self.error is not None:
+            violation = error_details_pb2.BadRequest.FieldViolation(
+                field=self.error.path,
+                description=f"expected {self.error.expected}, received {self.error.received}",
+                reason=self.error.code.upper(),
+            )
+            packed = any_pb2.Any()
+            packed.Pack(error_details_pb2.BadRequest(field_violations=[violation]))
+            status.details.append(packed)
+        return rpc_status.to_status(status)
 
 
 class CallerGoneError(Exception):
@@ -86,30 +86,88 @@ def ending_with_caller() -> Iterator[None]:
         raise CallerGoneError from error
 
 
+class Outbox:
+    """Bounded queue of encoded responses to one reader; the newest win. To be used on the loop.
+
+    Streams take turns, so that one of them cannot hide the others.
+
+    Args:
+        per_stream: responses of one stream that may wait.
+    """
+
+    def __init__(self, per_stream: int) -> None:
+        self._per_stream = per_stream
+        self._waiting: dict[str, collections.deque[bytes]] = {}
+        self._bytes = 0
+        self._skipped = 0
+        self._changed = asyncio.Event()
+        self._closed = False
+        self.left_out = 0
+        """Responses left out since the beginning."""
+
+    def put(self, stream: str, response: bytes) -> None:
+        """Add a response."""
+        queue = self._waiting.setdefault(stream, collections.deque())
+        queue.append(response)
+        self._bytes += len(response)
+        while len(queue) > self._per_stream or (self._bytes > BYTES and len(queue) > 1):
+            self._bytes -= len(queue.popleft())
+            self._skipped += 1
+            self.left_out += 1
+        self._changed.set()
+
+    def replace(self, response: bytes) -> None:
+        """Add a response that stands for those of its kind before it, which need not be sent."""
+        queue = self._waiting.setdefault("", collections.deque())
+        self._bytes += len(response) - sum(map(len, queue))
+        queue.clear()
+        queue.append(response)
+        self._changed.set()
+
+    def close(self) -> None:
+        """Say that nothing follows."""
+        self._closed = True
+        self._changed.set()
+
+    async def take(self) -> bytes | None:
+        """Return the next response, waiting for it; None when there is none and nothing follows."""
+        while not self._waiting:
+            if self._closed:
+                return None
+            self._changed.clear()
+            await self._changed.wait()
+        stream, queue = next(iter(self._waiting.items()))
+        response = queue.popleft()
+        self._bytes -= len(response)
+        del self._waiting[stream]
+        if queue:
+            self._waiting[stream] = queue  # behind the others
+        if self._skipped:
+            response += _SKIPPED + varint(self._skipped)
+            self._skipped = 0
+        return response
+
+
 class Call:
     """A call under way.
 
-    Args:
-        gateway: that serves it.
-        context: of gRPC.
-        caller: who makes it.
-        name: of the method.
-        metrics: what counts its messages.
-
     Attributes:
+        gateway: the server of the call.
+        caller: who makes it.
         left_out: responses that the caller was too slow for.
     """
 
-    def __init__(self, gateway: Gateway, context: Context, caller: Caller, name: str, metrics: CallMetrics) -> None:
+    def __init__(
+        self, gateway: Server, context: grpc.aio.ServicerContext[Any, Any], caller: Caller, method: str
+    ) -> None:
         self.gateway = gateway
         self.caller = caller
-        self._ended = asyncio.Event()
         self.left_out = 0
         self._context = context
+        self._method = method
+        self._ended = asyncio.Event()
         self._reading: asyncio.Task[Any] | None = None
         self._outbox: Outbox | None = None
-        self._name = name
-        self._metrics = metrics
 
     def end(self) -> None:
         """Read nothing more; a call that only writes ends."""
@@ -118,6 +176,15 @@ class Call:
             self._reading.cancel()
         elif self._outbox is not None:
             self._outbox.close()
+
+    async def request(self, kind: type[P]) -> P:
+        """Return the only request.
+
+        Raises:
+            EndCall: none comes.
+            MessageError: it is another one.
+        """
+        return convert.parse(await self.first() or b"", kind)
 
     async def first(self) -> bytes | None:
         """Return the first request.
@@ -146,8 +213,9 @@ class Call:
             self._reading = None
         if request is grpc.aio.EOF:
             return None
-        self._metrics.requests[self._name] += 1
-        self._metrics.request_bytes += len(request)
+        metrics = self.gateway.metrics
+        metrics.requests[self._method] += 1
+        metrics.request_bytes += len(request)
         return bytes(request)
 
     async def begin(self) -> None:
@@ -167,7 +235,7 @@ class Call:
         """
         with ending_with_caller():
             await self._context.write(response)
-        self._metrics.responses[self._name] += 1
+        self.gateway.metrics.responses[self._method] += 1
 
     async def drain(self, outbox: Outbox) -> None:
         """Write what comes into an outbox until it is closed."""
@@ -203,3 +271,13 @@ class Call:
         """
         if self._ended.is_set():
             raise EndCall(grpc.StatusCode.UNAVAILABLE, "the gateway ends; call again, at any")
+
+
+def varint(number: int) -> bytes:
+    """Return a number as protobuf writes it."""
+    parts = bytearray()
+    while number > 0x7F:  # noqa: PLR2004 - seven bits in each byte
+        parts.append(number & 0x7F | 0x80)
+        number >>= 7
+    parts.append(number)
+    return bytes(parts)

@@ -5,24 +5,22 @@ from __future__ import annotations
 import asyncio
 import collections
 import contextlib
+import time
 from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_schemas as schemas
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
-from optipmb_service.grpc.feeds import EVERYTHING, Item, problem_item, tracks_item
-from optipmb_service.grpc.flight import Flight
-from optipmb_service.grpc.fresh import Fresh
-from optipmb_service.grpc.outbox import Outbox
+from optipmb_service.grpc.calls import Outbox
+from optipmb_service.grpc.network import Deduplicator, Item, Listener
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterable
 
-    from optipmb_schemas.protobuf.transcode import EncodedTracks
+    from optipmb_schemas.protobuf.convert import EncodedTracks
 
     from optipmb_service.grpc.calls import Call
-    from optipmb_service.grpc.selection import Selection
     from optipmb_service.zenoh.client import Outgoing
 
 CACHE: Final = 400
@@ -37,6 +35,9 @@ INLINE_BYTES: Final = 64 * 2**10
 WINDOW: Final = 64
 """Frames of a `Track` call without tracks; beyond it the gateway reads no further, and the caller feels it."""
 
+STALL_S: Final = 1.0
+"""Frames that are without tracks when nothing has come for so long have been refused, or nobody tracks."""
+
 RESPONSES: Final = 256
 """Responses that may wait for a caller: more than the window, so that none are left out but for others' frames."""
 
@@ -49,8 +50,79 @@ WANTED_S: Final = 1.0
 Input = schemas.Detections | schemas.Points | schemas.Problem | pb.PublishOptions
 
 
-class Incoming:
-    """Reads the messages of one stream, checks them as the service does, and hands them to the network.
+async def track(call: Call) -> None:
+    """Detections and clouds in, tracks and problems back."""
+    inputs, outbox = _Inputs(call, pb.TrackRequest), Outbox(RESPONSES)
+    message = await inputs.next()
+    if message is None:
+        return
+    answers = _Answers(outbox)
+    keys, network = call.gateway.client.keys, call.gateway.network
+    async with (
+        network.subscribed(keys.tracks(inputs.stream), answers.listener),
+        network.subscribed(keys.problems(inputs.stream), answers.listener),
+        inputs.opened(),
+        call.writing(outbox),
+    ):
+        cached = await network.recent(keys.tracks(inputs.stream))
+        known = _already_tracked(cached, message, outbox)
+        answers.begin(cached)
+        while message is not None:
+            if isinstance(message, schemas.Problem):
+                answers.report(message)
+            elif isinstance(message, schemas.Detections | schemas.Points):
+                if isinstance(message, schemas.Detections) and (message.epoch, message.seq) not in known:
+                    answers.in_flight.add(message.epoch, message.seq)
+                await inputs.send(message)
+                await answers.in_flight.below(WINDOW)
+            message = await inputs.next()
+        await answers.in_flight.below(1)
+    call.check_ending()
+
+
+def _already_tracked(cached: Iterable[EncodedTracks], first: Input, outbox: Outbox) -> set[tuple[bytes, int]]:
+    """Answer what a caller that comes back sends again: it may have been tracked, and is not tracked twice."""
+    known: set[tuple[bytes, int]] = set()
+    if not isinstance(first, schemas.Detections | schemas.Points):
+        return known
+    for tracks in cached:
+        if tracks.epoch == first.epoch and tracks.stamp_ns >= first.stamp_ns:
+            known.add((tracks.epoch, tracks.seq))
+            outbox.put(tracks.stream, Item.of_tracks(tracks).response)
+    return known
+
+
+async def publish(call: Call) -> None:
+    """Detections and clouds in, acknowledgements and problems back."""
+    inputs, outbox = _Inputs(call, pb.PublishRequest), Outbox(RESPONSES)
+    message = await inputs.next()
+    if message is None:
+        return
+    acknowledgements, answers = _Acknowledgements(outbox), _Answers(outbox)
+    answers.begin(())
+    problems = call.gateway.client.keys.problems(inputs.stream)
+    async with (
+        call.gateway.network.subscribed(problems, answers.listener),
+        inputs.opened(acknowledgements.send) as outgoing,
+        call.writing(outbox),
+    ):
+        acknowledgements.begin(outgoing)
+        try:
+            while message is not None:
+                if isinstance(message, schemas.Problem):
+                    answers.report(message)
+                elif isinstance(message, schemas.Detections | schemas.Points):
+                    await inputs.send(message)
+                    acknowledgements.add(message)
+                message = await inputs.next()
+            acknowledgements.send()
+        finally:
+            acknowledgements.cancel()
+    call.check_ending()
+
+
+class _Inputs:
+    """Messages of one stream: read, checked as the service does, and handed to the network.
 
     Args:
         call: with the requests.
@@ -65,23 +137,16 @@ class Incoming:
         self._matched = asyncio.Event()
         self._waited = False
         self.stream = ""
-
-    async def first(self) -> Input | None:
-        """Return the first message, which says the stream; None when the caller sends none.
-
-        Raises:
-            EndCall: there is none in time, or it is none of this method, or the caller may not publish this stream.
-        """
-        payload = await self._call.first()
-        return None if payload is None else self._read(payload)
+        """Name of the stream; the first message says it."""
 
     async def next(self) -> Input | None:
         """Return the next message, a problem in the place of one that is not valid, None when all have come.
 
         Raises:
-            EndCall: it is none of this method, or of another stream.
+            EndCall: the first one does not come in time, or the caller may not publish its stream.
+            MessageError: it is none of this method, or of another stream.
         """
-        payload = await self._call.read()
+        payload = await (self._call.read() if self.stream else self._call.first())
         return None if payload is None else self._read(payload)
 
     @contextlib.asynccontextmanager
@@ -102,9 +167,8 @@ class Incoming:
             with contextlib.suppress(RuntimeError):  # the loop has ended
                 loop.call_soon_threadsafe(matched)
 
-        options = self._options
-        key = self.stream, options.cache or CACHE, options.cache_clouds
-        async with self._call.gateway.publishers.opened(key, matching) as outgoing:
+        key = self.stream, self._options.cache or CACHE, self._options.cache_clouds
+        async with self._call.gateway.network.publishing(key, matching) as outgoing:
             self._outgoing = outgoing
             yield outgoing
 
@@ -116,21 +180,19 @@ class Incoming:
         """
         outgoing = self._outgoing
         assert outgoing is not None  # noqa: S101 - opened before: said for the type checker
-        if isinstance(message, schemas.Points) and not await self._points_wanted(outgoing):
-            return
+        if isinstance(message, schemas.Points):
+            if not self._waited and not outgoing.points_wanted:
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(self._matched.wait(), WANTED_S)
+            self._waited = True
+            if not outgoing.points_wanted:
+                return
         put = outgoing.detections if isinstance(message, schemas.Detections) else outgoing.points
-        payload = schemas.encode(message)
+        payload = schemas.encoded(message)
         if len(payload) <= INLINE_BYTES:
             put(payload)
         else:
             await asyncio.to_thread(put, payload)
-
-    async def _points_wanted(self, outgoing: Outgoing) -> bool:
-        if not self._waited and not outgoing.points_wanted:
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._matched.wait(), WANTED_S)
-        self._waited = True
-        return outgoing.points_wanted
 
     def _read(self, payload: bytes) -> Input:
         request = convert.parse(payload, self._kind)
@@ -144,19 +206,19 @@ class Incoming:
             raise schemas.MessageError("invalid_value", f"{name}.stream", self.stream, ascii(message.stream)[:80])
         if name == "options":
             return self._options
+        kind: Any = schemas.Detections if name == "detections" else schemas.Points
         try:
-            if name == "detections":
-                return convert.from_proto(message, schemas.Detections, self._call.gateway.limits)
-            return convert.from_proto(message, schemas.Points, self._call.gateway.limits)
+            checked: Input = convert.from_proto(message, kind, self._call.gateway.limits)
         except schemas.MessageError as error:
             return self._problem(message, error)
+        return checked
 
     def _begin(self, name: str, message: Any) -> None:
         try:
             self._call.gateway.client.keys.detections(message.stream)
             if name == "options":
-                _bounded("cache", message.cache, MAX_CACHE)
-                _bounded("cache_clouds", message.cache_clouds, MAX_CACHE_CLOUDS)
+                _check_bound("cache", message.cache, MAX_CACHE)
+                _check_bound("cache_clouds", message.cache_clouds, MAX_CACHE_CLOUDS)
                 self._options = message
         except schemas.MessageError as error:
             raise error.under(name) from None
@@ -173,128 +235,70 @@ class Incoming:
 
 
 class _Answers:
-    """What comes back of a stream, for the call that publishes it."""
+    """Tracks and problems of a stream for the call that publishes it, each once.
 
-    selection: Selection = EVERYTHING
+    What was published before the call is answered by the call itself.
+
+    Attributes:
+        in_flight: frames of the call without tracks.
+        listener: takes tracks and problems.
+        begin: takes the tracks that the caches hold; what came before waits for it.
+    """
 
     def __init__(self, outbox: Outbox) -> None:
         self._outbox = outbox
-        self._told: collections.deque[tuple[str, str]] = collections.deque(maxlen=RESPONSES)
+        self._reported: collections.deque[tuple[str, str]] = collections.deque(maxlen=RESPONSES)
+        self.in_flight = _InFlight()
+        deduplicator = Deduplicator(self._answer)
+        self.listener, self.begin = Listener(deduplicator.put), deduplicator.begin
 
-    def tell(self, problem: schemas.Problem) -> None:
-        """Tell the caller of a message that was refused here; the problem also comes back from the network."""
-        self._told.append((problem.code, problem.path))
-        self._outbox.put(problem.stream, problem_item(problem).response)
-
-    def passes(self, _tracks: EncodedTracks) -> bool:
-        """Tell whether they are wanted: all are."""
-        return True
-
-    def take(self, item: Item) -> None:
-        """Take tracks, or a problem that the caller does not know."""
-        if item.problem not in self._told:
-            self._outbox.put(item.stream, item.response)
-
-
-class _TracksAnswers(_Answers):
-    """The tracks of the frames on their way, and problems; what was published before the call is answered by it alone.
-
-    Args:
-        outbox: for the caller.
-        flight: of the call.
-    """
-
-    def __init__(self, outbox: Outbox, flight: Flight) -> None:
-        super().__init__(outbox)
-        self._flight = flight
-        self._fresh = Fresh(self._answer)
-        self.begin = self._fresh.begin
-
-    def take(self, item: Item) -> None:
-        """Take tracks or a problem, if they are new."""
-        self._fresh.put(item)
+    def report(self, problem: schemas.Problem) -> None:
+        """Report a message that was refused here; the problem also comes back from the network."""
+        self._reported.append((problem.code, problem.path))
+        self._outbox.put(problem.stream, Item.of_problem(problem).response)
 
     def _answer(self, item: Item) -> None:
         if item.tracks is not None:
-            self._flight.came(item.tracks.epoch, item.tracks.seq)
-        super().take(item)
+            self.in_flight.remove(item.tracks.epoch, item.tracks.seq)
+        if item.problem not in self._reported:
+            self._outbox.put(item.stream, item.response)
 
 
-async def track(call: Call) -> None:
-    """Detections and clouds in, tracks and problems back."""
-    incoming, outbox, flight = Incoming(call, pb.TrackRequest), Outbox(RESPONSES), Flight()
-    message = await incoming.first()
-    if message is None:
-        return
-    answers = _TracksAnswers(outbox, flight)
-    keys, feeds = call.gateway.client.keys, call.gateway.feeds
-    async with (
-        feeds.joined(keys.tracks(incoming.stream), answers),
-        feeds.joined(keys.problems(incoming.stream), answers),
-        incoming.opened(),
-        call.writing(outbox),
-    ):
-        held = await feeds.recent(keys.tracks(incoming.stream))
-        known = _already_tracked(held, message, outbox)
-        answers.begin(held)
-        while message is not None:
-            if isinstance(message, schemas.Problem):
-                answers.tell(message)
-            elif isinstance(message, schemas.Detections | schemas.Points):
-                if isinstance(message, schemas.Detections) and (message.epoch, message.seq) not in known:
-                    flight.sent(message.epoch, message.seq)
-                await incoming.send(message)
-                await flight.below(WINDOW)
-            message = await incoming.next()
-        await flight.below(1)
-    call.check_ending()
+class _InFlight:
+    """Frames of a call that are without tracks; their number bounds the caller's speed. To be used on the loop."""
+
+    def __init__(self) -> None:
+        self._frames: collections.OrderedDict[tuple[bytes, int], None] = collections.OrderedDict()
+        self._progress = time.monotonic()
+        self._changed = asyncio.Event()
+
+    def add(self, epoch: bytes, seq: int) -> None:
+        """Add a frame that goes out."""
+        if not self._frames:
+            self._progress = time.monotonic()
+        self._frames[epoch, seq] = None
+
+    def remove(self, epoch: bytes, seq: int) -> None:
+        """Remove a frame that has tracks; those sent before it that have none will have none, or have them late."""
+        if (epoch, seq) in self._frames:
+            while next(iter(self._frames)) != (epoch, seq):
+                self._frames.popitem(last=False)
+            del self._frames[epoch, seq]
+            self._progress = time.monotonic()
+            self._changed.set()
+
+    async def below(self, most: int) -> None:
+        """Wait until less than so many frames are without tracks; when that stalls, forget them."""
+        while len(self._frames) >= most:
+            self._changed.clear()
+            try:
+                await asyncio.wait_for(self._changed.wait(), self._progress + STALL_S - time.monotonic())
+            except TimeoutError:
+                self._frames.clear()
 
 
-def _already_tracked(held: Iterable[EncodedTracks], first: Input, outbox: Outbox) -> set[tuple[bytes, int]]:
-    """Answer what a caller that comes back sends again: it may have been tracked, and is not tracked twice."""
-    known: set[tuple[bytes, int]] = set()
-    if not isinstance(first, schemas.Detections | schemas.Points):
-        return known
-    for tracks in held:
-        if tracks.epoch == first.epoch and tracks.stamp_ns >= first.stamp_ns:
-            known.add((tracks.epoch, tracks.seq))
-            outbox.put(tracks.stream, tracks_item(tracks).response)
-    return known
-
-
-async def publish(call: Call) -> None:
-    """Detections and clouds in, acknowledgements and problems back."""
-    incoming, outbox = Incoming(call, pb.PublishRequest), Outbox(RESPONSES)
-    message = await incoming.first()
-    if message is None:
-        return
-    progress, answers = _Progress(outbox), _Answers(outbox)
-    async with (
-        call.gateway.feeds.joined(call.gateway.client.keys.problems(incoming.stream), answers),
-        incoming.opened(progress.acknowledge) as outgoing,
-        call.writing(outbox),
-    ):
-        progress.begin(outgoing)
-        try:
-            while message is not None:
-                if isinstance(message, schemas.Problem):
-                    answers.tell(message)
-                elif isinstance(message, schemas.Detections | schemas.Points):
-                    await incoming.send(message)
-                    progress.sent(message)
-                message = await incoming.next()
-            progress.acknowledge()
-        finally:
-            progress.end()
-    call.check_ending()
-
-
-class _Progress:
-    """Says how far a publisher's messages have gone out; the newest acknowledgement stands for those before it.
-
-    Args:
-        outbox: for the caller.
-    """
+class _Acknowledgements:
+    """Acknowledgements of a publisher's messages; the newest stands for those before it."""
 
     def __init__(self, outbox: Outbox) -> None:
         self._outbox = outbox
@@ -305,31 +309,29 @@ class _Progress:
     def begin(self, outgoing: Outgoing) -> None:
         """Acknowledge that the stream is open."""
         self._outgoing = outgoing
-        self.acknowledge()
+        self.send()
 
-    def sent(self, message: schemas.Detections | schemas.Points) -> None:
-        """Take in that a message has gone out; it is acknowledged soon."""
-        if isinstance(message, schemas.Detections):
-            self._newest.detections = message.seq
-        else:
-            self._newest.points = message.seq
+    def add(self, message: schemas.Detections | schemas.Points) -> None:
+        """Acknowledge soon that a message has gone out."""
+        name = "detections" if isinstance(message, schemas.Detections) else "points"
+        setattr(self._newest, name, message.seq)
         if self._due is None:
-            self._due = asyncio.get_running_loop().call_later(ACKNOWLEDGE_S, self.acknowledge)
+            self._due = asyncio.get_running_loop().call_later(ACKNOWLEDGE_S, self.send)
 
-    def acknowledge(self) -> None:
+    def send(self) -> None:
         """Acknowledge all that has gone out, now."""
-        self.end()
+        self.cancel()
         if self._outgoing is not None:
             self._newest.points_wanted = self._outgoing.points_wanted
             self._outbox.replace(pb.PublishResponse(acknowledgement=self._newest).SerializeToString())
 
-    def end(self) -> None:
+    def cancel(self) -> None:
         """Acknowledge nothing later."""
         if self._due is not None:
             self._due.cancel()
             self._due = None
 
 
-def _bounded(name: str, value: int, most: int) -> None:
+def _check_bound(name: str, value: int, most: int) -> None:
     if value > most:
         raise schemas.MessageError("too_large", name, f"at most {most}", str(value))

@@ -1,88 +1,74 @@
-"""`Subscribe` and `QueryTracks`: tracks on their way to a reader."""
+"""`Subscribe` and the queries: tracks on their way to a reader, and answers of the services."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import grpc
 import optipmb_schemas as schemas
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
-from optipmb_schemas.protobuf.transcode import transcode
 
-from optipmb_service.grpc.feeds import tracks_item
-from optipmb_service.grpc.fresh import Fresh, order
-from optipmb_service.grpc.outbox import Outbox
-from optipmb_service.grpc.questions import NOBODY, refusal
+from optipmb_service.grpc.calls import EndCall, Outbox
+from optipmb_service.grpc.network import Deduplicator, Item, Listener
 from optipmb_service.grpc.selection import Pace, Selection
-from optipmb_service.grpc.status import EndCall
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable
 
-    from optipmb_schemas.protobuf.transcode import EncodedTracks
+    from google.protobuf.message import Message as ProtoMessage
+    from optipmb_schemas.protobuf.convert import EncodedTracks
 
     from optipmb_service.grpc.calls import Call
+
+    T = TypeVar("T", bound=schemas.Message)
 
 QUEUE: Final = 16
 MAX_QUEUE: Final = 1024
 
+QUERY_S: Final = 2.0
+"""Longest wait for an answer; a caller's own deadline may be shorter."""
+
 KEPT_S: Final = 15.0
 """Longest wait for kept tracks: a service reads its log for up to 3 s, and several queries in turn."""
 
-
-class _Subscriber:
-    """A listener with a queue of its own.
-
-    Args:
-        asked: what is subscribed to.
-
-    Raises:
-        MessageError: it is not valid.
-    """
-
-    def __init__(self, asked: pb.SubscribeRequest) -> None:
-        self.selection = Selection(asked.filter)
-        self._pace = Pace(asked.max_rate_hz)
-        if asked.queue > MAX_QUEUE:
-            raise schemas.MessageError("too_large", "queue", f"at most {MAX_QUEUE}", str(asked.queue))
-        self.outbox = Outbox(asked.queue or QUEUE)
-        self._fresh = Fresh(lambda item: self.outbox.put(item.stream, item.response))
-        self.take, self.begin = self._fresh.put, self._fresh.begin
-
-    def passes(self, tracks: EncodedTracks) -> bool:
-        return self._pace.passes(tracks.stream, tracks.stamp_ns)
+NOBODY: Final = "no tracking service answers"
 
 
 async def subscribe(call: Call) -> None:
     """Send the tracks of a pattern until the caller or the gateway ends it."""
-    asked = convert.parse(await call.first() or b"", pb.SubscribeRequest)
-    keys, feeds = call.gateway.client.keys, call.gateway.feeds
+    asked = await call.request(pb.SubscribeRequest)
+    keys, network = call.gateway.client.keys, call.gateway.network
     tracks, problems = keys.matching(asked.pattern, "tracks"), keys.matching(asked.pattern, "problems")
     call.caller.may_read(asked.pattern)
-    listener = _Subscriber(asked)
-    async with contextlib.AsyncExitStack() as joined:
-        await joined.enter_async_context(feeds.joined(tracks, listener))
+    selection, pace = Selection(asked.filter), Pace(asked.max_rate_hz)
+    if asked.queue > MAX_QUEUE:
+        raise schemas.MessageError("too_large", "queue", f"at most {MAX_QUEUE}", str(asked.queue))
+    outbox = Outbox(asked.queue or QUEUE)
+    deduplicator = Deduplicator(lambda item: outbox.put(item.stream, item.response))
+    listener = Listener(deduplicator.put, selection, pace.passes)
+    async with contextlib.AsyncExitStack() as subscriptions:
+        await subscriptions.enter_async_context(network.subscribed(tracks, listener))
         if asked.problems:
-            await joined.enter_async_context(feeds.joined(problems, listener))
+            await subscriptions.enter_async_context(network.subscribed(problems, listener))
         await call.begin()
-        history = await feeds.recent(tracks)
+        history = await network.recent(tracks)
         for one in history if asked.history else ():
-            if listener.passes(one):
-                await call.write(tracks_item(one, listener.selection).response)
-        listener.begin(history)
+            if pace.passes(one):
+                await call.write(Item.of_tracks(one, selection).response)
+        deduplicator.begin(history)
         try:
-            await call.drain(listener.outbox)
+            await call.drain(outbox)
         finally:
-            call.left_out += listener.outbox.left_out
+            call.left_out += outbox.left_out
     call.check_ending()
 
 
 async def query_tracks(call: Call) -> None:
     """Send the tracks that the services keep, of the newest revision of each frame."""
-    asked = convert.parse(await call.first() or b"", pb.QueryTracksRequest)
+    asked = await call.request(pb.QueryTracksRequest)
     key = call.gateway.client.keys.matching(asked.pattern, "tracks")
     call.caller.may_read(asked.pattern)
     selection = Selection(asked.filter)
@@ -91,16 +77,91 @@ async def query_tracks(call: Call) -> None:
         to_ns=asked.to_ns if asked.HasField("to_ns") else None,
     )
     if "*" not in asked.pattern:
-        async for tracks in kept(call, asked.pattern, wanted):
-            await call.write(tracks_item(tracks, selection).response)
+        async for tracks in _kept(call, asked.pattern, wanted):
+            await call.write(Item.of_tracks(tracks, selection).response)
         return
     last = 2**63 if wanted.to_ns is None else wanted.to_ns
-    for tracks in newest(await call.gateway.feeds.recent(key)):
+    for tracks in _newest(await call.gateway.network.recent(key)):
         if wanted.from_ns <= tracks.stamp_ns <= last:
-            await call.write(tracks_item(tracks, selection).response)
+            await call.write(Item.of_tracks(tracks, selection).response)
 
 
-async def kept(call: Call, stream: str, wanted: schemas.TracksRequest) -> AsyncIterator[EncodedTracks]:
+async def get_state(call: Call) -> None:
+    """Ask for the state of a session."""
+    asked = await call.request(pb.GetStateRequest)
+    key = call.gateway.client.keys.query(asked.stream, "state")
+    call.caller.may_read(asked.stream)
+    await _answer(call, pb.GetStateResponse(state=await _asked(call, key, None, schemas.SessionState)))
+
+
+async def reset(call: Call) -> None:
+    """Start a session anew, or end it."""
+    asked = await call.request(pb.ResetRequest)
+    key = call.gateway.client.keys.query(asked.stream, "reset")
+    call.caller.may_command(asked.stream)
+    request = schemas.ResetRequest(close=asked.close)
+    await _answer(call, pb.ResetResponse(state=await _asked(call, key, request, schemas.SessionState)))
+
+
+async def set_parameters(call: Call) -> None:
+    """Set parameters of a session, or ask for them."""
+    asked = await call.request(pb.SetParametersRequest)
+    key = call.gateway.client.keys.query(asked.stream, "parameters")
+    call.caller.may_command(asked.stream)
+    asked.parameters.ClearField("values")
+    try:
+        wanted = convert.from_proto(asked.parameters, schemas.SessionParameters)
+    except schemas.MessageError as error:
+        raise error.under("parameters") from None
+    request = None if wanted == schemas.SessionParameters() else wanted
+    parameters = await _asked(call, key, request, schemas.SessionParameters)
+    await _answer(call, pb.SetParametersResponse(parameters=parameters))
+
+
+async def list_streams(call: Call) -> None:
+    """Ask every service for its streams; workers, who answer too, are no services: their parent speaks for them."""
+    asked = await call.request(pb.ListStreamsRequest)
+    client, pattern = call.gateway.client, asked.pattern or call.caller.pattern
+    client.keys.matching(pattern, "tracks")
+    call.caller.may_read(pattern)
+    answers, alive = await asyncio.gather(
+        asyncio.to_thread(client.ask, client.keys.all_status(), timeout=QUERY_S),
+        asyncio.to_thread(client.alive, client.keys.all_alive(), QUERY_S),
+    )
+    services = {client.keys.instance_of(key) for key in alive}
+    listed = []
+    for answer in answers:
+        if answer.good:
+            status = schemas.decode(answer.payload, schemas.ServiceStatus, encoding=answer.encoding)
+            if status.instance in services:
+                listed += [(status.instance, one) for one in status.sessions if _matches(one.stream, pattern)]
+    listed.sort(key=lambda entry: (entry[1].stream, entry[0]))
+    streams = [pb.ListedStream(instance=instance, session=convert.to_proto(one)) for instance, one in listed]
+    await _answer(call, pb.ListStreamsResponse(streams=streams))
+
+
+async def _asked(call: Call, key: str, message: schemas.Message | None, kind: type[T]) -> Any:
+    """Return the first good answer to a query, in protobuf.
+
+    Raises:
+        EndCall: nobody answers, or a service refuses.
+    """
+    payload = b"" if message is None else schemas.encode(message)
+    encoding = "" if message is None else schemas.encoding_of(message)
+    answers = await asyncio.to_thread(call.gateway.client.ask, key, payload, encoding, timeout=QUERY_S)
+    for answer in answers:
+        if answer.good:
+            return convert.to_proto(schemas.decode(answer.payload, kind, encoding=answer.encoding))
+    if not answers:
+        raise EndCall(grpc.StatusCode.UNAVAILABLE, NOBODY)
+    raise _refusal(schemas.decode(answers[0].payload, schemas.Problem, encoding=answers[0].encoding))
+
+
+async def _answer(call: Call, response: ProtoMessage) -> None:
+    await call.write(response.SerializeToString())
+
+
+async def _kept(call: Call, stream: str, wanted: schemas.TracksRequest) -> AsyncIterator[EncodedTracks]:
     """Yield the tracks of one stream, asking the service that has them part by part.
 
     Raises:
@@ -119,29 +180,30 @@ async def kept(call: Call, stream: str, wanted: schemas.TracksRequest) -> AsyncI
         if not problems and len(found) == len(answers):
             raise EndCall(grpc.StatusCode.UNAVAILABLE, "the tracks did not come completely" if found else NOBODY)
         for one in found:
-            yield transcode(one.payload, encoding=one.encoding)
-        next_ns = _rest(next_ns, problems)
+            yield convert.transcode(one.payload, encoding=one.encoding)
+        asked_ns, next_ns = next_ns, None
+        for problem in problems[:1]:
+            if problem.code != "cut" or problem.stamp_ns is None or problem.stamp_ns <= asked_ns:
+                raise _refusal(problem)
+            next_ns = problem.stamp_ns
 
 
-def _rest(asked_ns: int, problems: list[schemas.Problem]) -> int | None:
-    """Return the stamp at which the rest begins, None where there is none.
-
-    Raises:
-        EndCall: there is another problem.
-    """
-    for problem in problems:
-        if problem.code != "cut" or problem.stamp_ns is None or problem.stamp_ns <= asked_ns:
-            raise refusal(problem)
-        return problem.stamp_ns
-    return None
-
-
-def newest(publications: Iterable[EncodedTracks]) -> list[EncodedTracks]:
+def _newest(publications: Iterable[EncodedTracks]) -> list[EncodedTracks]:
     """Return what holds of each frame, by stream and stamp: that of the latest run, and in it the latest revision."""
-    holding: dict[tuple[str, bytes, int], EncodedTracks] = {}
-    for tracks in publications:
-        key = tracks.stream, tracks.epoch, tracks.seq
-        known = holding.get(key)
-        if known is None or order(tracks) >= order(known):
-            holding[key] = tracks
-    return sorted(holding.values(), key=lambda tracks: (tracks.stream, tracks.stamp_ns, tracks.seq))
+    newest: dict[tuple[str, bytes, int], EncodedTracks] = {}
+    for tracks in sorted(publications, key=lambda one: (one.run, one.revision)):
+        newest[tracks.stream, tracks.epoch, tracks.seq] = tracks
+    return sorted(newest.values(), key=lambda tracks: (tracks.stream, tracks.stamp_ns, tracks.seq))
+
+
+def _refusal(problem: schemas.Problem) -> EndCall:
+    """Return the end of a call that a service refused."""
+    code: Any = problem.code if problem.code in schemas.CODES else "invalid_value"
+    error = schemas.MessageError(code, problem.path, problem.expected, problem.received)
+    if problem.code in schemas.CODES:
+        return EndCall.invalid(error)
+    return EndCall(grpc.StatusCode.FAILED_PRECONDITION, problem.message, error)
+
+
+def _matches(stream: str, pattern: str) -> bool:
+    return all(want in {"*", part} for part, want in zip(stream.split("/"), pattern.split("/"), strict=True))

@@ -12,6 +12,7 @@ from optipmb_schemas.protobuf.convert import column, select
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+    from optipmb_schemas.protobuf.convert import EncodedTracks
 
 MAX_CORNERS: Final = 1000
 MAX_NAMES: Final = 256
@@ -77,8 +78,11 @@ class Selection:
             else:
                 rows &= (existence > CONFIRMED_EXISTENCE) & (column(tracks.age) > 0.0)
         if self._area is not None:
-            rows &= inside(column(tracks.center)[:, :2], self._area)
+            rows &= _inside(column(tracks.center)[:, :2], self._area)
         return rows
+
+
+EVERYTHING: Final = Selection(pb.TrackFilter())
 
 
 class Pace:
@@ -99,11 +103,12 @@ class Pace:
         self._period_ns = TOLERANCE * 1e9 / max_rate_hz if max_rate_hz else 0.0
         self._passed: dict[str, collections.deque[int]] = {}
 
-    def passes(self, stream: str, stamp_ns: int) -> bool:
-        """Tell whether the frame of this stamp is sent."""
+    def passes(self, tracks: EncodedTracks) -> bool:
+        """Tell whether the tracks of a frame are sent."""
         if not self._period_ns:
             return True
-        passed = self._passed.setdefault(stream, collections.deque(maxlen=REMEMBERED))
+        stamp_ns = tracks.stamp_ns
+        passed = self._passed.setdefault(tracks.stream, collections.deque(maxlen=REMEMBERED))
         if stamp_ns in passed:
             return True
         if passed and abs(stamp_ns - passed[-1]) < self._period_ns:
@@ -112,7 +117,7 @@ class Pace:
         return True
 
 
-def inside(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _inside(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Tell which points (N, 2) lie in a polygon (K, 2): those from which a ray along x crosses its edges an odd number
     of times.
     """  # noqa: D205 - one sentence

@@ -1,10 +1,13 @@
-"""The gateway as a server: methods, health, reflection, limits of connections, and an end in order."""
+"""The gateway as a server: methods, health, reflection, metrics, limits of connections, and an end in order."""
 
 from __future__ import annotations
 
 import asyncio
+import collections
+import contextlib
 import ctypes
 import resource
+import threading
 import time
 from typing import TYPE_CHECKING, Any, Final
 
@@ -15,23 +18,20 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
-from optipmb_service.grpc import inputs, outputs, questions
-from optipmb_service.grpc.access import Access
-from optipmb_service.grpc.calls import Call, CallerGoneError, Gateway, ending_with_caller
-from optipmb_service.grpc.feeds import Feeds
-from optipmb_service.grpc.metrics import CallMetrics
-from optipmb_service.grpc.publishers import Publishers
-from optipmb_service.grpc.status import EndCall, refused
-from optipmb_service.grpc.tls import credentials
-from optipmb_service.observability.problem_reporter import ProblemReporter, log_problem
+from optipmb_service.grpc import inputs, outputs
+from optipmb_service.grpc.access import Access, credentials
+from optipmb_service.grpc.calls import Call, CallerGoneError, EndCall, ending_with_caller
+from optipmb_service.grpc.network import Network
 from optipmb_service.runtime.ports import EdgeError, TransportError
+from optipmb_service.telemetry.problem_reporter import ProblemReporter, log_problem
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Awaitable, Callable, Iterator
 
-    from optipmb_service.grpc.calls import Context
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
     from optipmb_service.zenoh.client import Client
+
+    Context = grpc.aio.ServicerContext[Any, Any]
 
 SERVICE: Final = pb.DESCRIPTOR.services_by_name["TrackingService"].full_name
 
@@ -40,10 +40,10 @@ METHODS: Final[dict[str, Callable[[Call], Awaitable[None]]]] = {
     "Publish": inputs.publish,
     "Subscribe": outputs.subscribe,
     "QueryTracks": outputs.query_tracks,
-    "GetState": questions.get_state,
-    "Reset": questions.reset,
-    "SetParameters": questions.set_parameters,
-    "ListStreams": questions.list_streams,
+    "GetState": outputs.get_state,
+    "Reset": outputs.reset,
+    "SetParameters": outputs.set_parameters,
+    "ListStreams": outputs.list_streams,
 }
 
 SAID_BY: Final = "optipmb-gateway"
@@ -81,8 +81,22 @@ OPTIONS: Final = (
 log = structlog.get_logger("optipmb_service")
 
 
+class CallMetrics:
+    """Counts of calls; written on the loop, or by one thread each, and read by any."""
+
+    def __init__(self) -> None:
+        self.open: collections.Counter[str] = collections.Counter()
+        self.ended: collections.Counter[tuple[str, str]] = collections.Counter()
+        self.requests: collections.Counter[str] = collections.Counter()
+        self.responses: collections.Counter[str] = collections.Counter()
+        self.skipped: collections.Counter[str] = collections.Counter()
+        self.refused: collections.Counter[str] = collections.Counter()
+        self.request_bytes = 0
+        self.invalid = 0
+
+
 class Server:
-    """A gateway that serves; to be made and used on its loop.
+    """A gateway that serves, and what its calls share; to be made and used on its loop.
 
     Args:
         settings: address, certificates, access, limits.
@@ -94,19 +108,15 @@ class Server:
 
     def __init__(self, settings: Settings, client: Client) -> None:
         self.metrics = CallMetrics()
-        self._client = client
+        self.client = client
+        self.instance = settings.instance
+        self.limits = settings.limits.limits()
+        self.network = Network(client, self._invalid)
+        self._calls: set[Call] = set()
         self._reporter = ProblemReporter(client.publish_problem, log_problem)
         self._most = settings.grpc_calls
         self._access = Access(
             certificates=settings.grpc_tls is not None, names=settings.grpc_names, tokens=settings.grpc_tokens
-        )
-        self._gateway = Gateway(
-            client,
-            Feeds(client, asyncio.get_running_loop(), self._invalid),
-            Publishers(client, asyncio.get_running_loop()),
-            settings.instance,
-            settings.limits.limits(),
-            self._refused,
         )
         most = settings.limits.max_bytes + HEADROOM
         options = (
@@ -132,11 +142,15 @@ class Server:
         if self._watching is not None:
             self._watching.cancel()
         await self._health.enter_graceful_shutdown()
-        for call in tuple(self._gateway.calls):
+        for call in tuple(self._calls):
             call.end()
         await self._server.stop(GRACE_S)
-        self._gateway.feeds.close()
-        self._gateway.publishers.close()
+        self.network.close()
+
+    def refused(self, problem: schemas.Problem) -> None:
+        """Count and report the problem of a message that is not valid."""
+        self.metrics.refused[problem.code] += 1
+        self._reporter.report(problem, time.monotonic_ns())
 
     def _register(self) -> None:
         # On the wire a call with one request is a stream of one: all methods have one kind of handler.
@@ -167,7 +181,7 @@ class Server:
             if self.metrics.request_bytes - trimmed > TRIM_BYTES:
                 trimmed = self.metrics.request_bytes
                 await asyncio.to_thread(_trim)
-            linked = self._client.linked()
+            linked = self.client.linked()
             if linked != known:
                 known = linked
                 status = health_pb2.HealthCheckResponse
@@ -190,7 +204,7 @@ class Server:
                     end.__traceback__ = end.__context__ = end.__cause__ = None
                     code = end.code.name
                     status = end.status()
-                    signed = (*(status.trailing_metadata or ()), (SAID_BY, self._gateway.instance))
+                    signed = (*(status.trailing_metadata or ()), (SAID_BY, self.instance))
                     with ending_with_caller():
                         await context.abort(status.code, status.details, signed)
             except CallerGoneError:
@@ -214,16 +228,15 @@ class Server:
         Raises:
             EndCall: it cannot be served, or ends otherwise than by its end.
         """
-        gateway = self._gateway
-        if len(gateway.calls) >= self._most:
+        if len(self._calls) >= self._most:
             raise EndCall(grpc.StatusCode.RESOURCE_EXHAUSTED, f"{self._most} calls are open; try another gateway")
-        call = Call(gateway, context, await self._access.caller(context), name, self.metrics)
-        gateway.calls.add(call)
+        call = Call(self, context, await self._access.caller(context), name)
+        self._calls.add(call)
         try:
             await METHODS[name](call)
         except schemas.MessageError as error:
             self.metrics.refused[error.code] += 1
-            raise refused(error) from None
+            raise EndCall.invalid(error) from None
         except TransportError as error:
             raise EndCall(grpc.StatusCode.UNAVAILABLE, f"the network cannot be used: {error}") from error
         except (EndCall, CallerGoneError, asyncio.CancelledError):
@@ -232,16 +245,41 @@ class Server:
             log.exception("internal_error", method=name)
             raise EndCall(grpc.StatusCode.INTERNAL, "a fault of the gateway; its log has it") from error
         finally:
-            gateway.calls.discard(call)
+            self._calls.discard(call)
             self.metrics.skipped[name] += call.left_out
-
-    def _refused(self, problem: schemas.Problem) -> None:
-        self.metrics.refused[problem.code] += 1
-        self._reporter.report(problem, time.monotonic_ns())
 
     def _invalid(self, reason: str) -> None:
         self.metrics.invalid += 1
         log.warning("grpc_invalid", reason=reason)
+
+
+@contextlib.contextmanager
+def serving(settings: Settings, client: Client) -> Iterator[CallMetrics]:
+    """Serve meanwhile, on a thread with a loop of its own: neither side waits for the other.
+
+    Raises:
+        EdgeError: the address, the certificates or the access cannot be used.
+    """
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever, name="grpc", daemon=True)
+    thread.start()
+
+    async def begin() -> Server:
+        server = Server(settings, client)
+        await server.start()
+        return server
+
+    server: Server | None = None
+    try:
+        server = asyncio.run_coroutine_threadsafe(begin(), loop).result()
+        log.info("grpc", address=server.address)
+        yield server.metrics
+    finally:
+        if server is not None:
+            with contextlib.suppress(TimeoutError):
+                asyncio.run_coroutine_threadsafe(server.stop(), loop).result(2 * GRACE_S)
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join(GRACE_S)
 
 
 def _trim() -> None:

@@ -1,8 +1,9 @@
 """The page for people: streams, health and the live tracks of one stream, seen from above.
 
-Nothing here costs anything until somebody looks. Those who look at a stream share a tap on its keys, which ends a
-minute after the last of them. Each gets the newest frame at most ten times a second; what a slow viewer cannot take is
-never made. Files and data come from here alone, and a header has the browser accept nothing else.
+Nothing here costs anything until somebody looks. Viewers of a stream share a tap on its keys, which ends a minute after
+the last of them. Each gets the newest frame at most ten times a second, as one line of JSON (world frame, metres,
+radians, seconds; rounded to what can be seen); what a slow viewer cannot take is never made. Files and data come from
+here alone, and a header has the browser accept nothing else.
 """
 
 from __future__ import annotations
@@ -10,34 +11,31 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import importlib.resources
-from typing import TYPE_CHECKING, Final, Protocol
+import json
+import threading
+import time
+from collections import deque
+from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
 import optipmb_schemas as schemas
 from starlette.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from optipmb_service.http.live import Newest, live_frame
 from optipmb_service.runtime.ports import TransportError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator, Callable, Sequence
 
     from starlette.requests import Request
-    from starlette.routing import BaseRoute
     from starlette.types import Receive, Scope, Send
 
-PERIOD_S: Final = 0.1
-"""A viewer gets no more than one frame in this time."""
+    from optipmb_service.telemetry.health import ProcessHealth
 
-KEEP_ALIVE_S: Final = 5.0
-"""A silent stream gets a sign of life, so that nobody in between takes the connection for dead."""
-
-RETRY_MS: Final = 15_000
-"""A viewer whose stream cannot be subscribed to comes back after so long."""
-
-VIEWERS: Final = 16
-"""Those who look at the same time; more are asked to come back."""
-
+PERIOD_S: Final = 0.1  # a viewer gets no more than one frame in this time
+KEEP_ALIVE_S: Final = 5.0  # period of signs of life of a silent stream, for what is in between
+RETRY_MS: Final = 15_000  # a viewer whose stream cannot be subscribed to comes back after so long
+VIEWERS: Final = 16  # those who look at the same time; more are asked to come back
 POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src data:; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -53,30 +51,19 @@ FILES: Final = {"/": "index.html", "/look.js": "look.js", "/look.css": "look.css
 TYPES: Final = {"html": "text/html", "js": "text/javascript", "css": "text/css"}
 
 
-class Watched(Protocol):
-    """What the page shows; every method may be called by any thread and answers at once."""
+_SENSORS: Final = 8  # detections of so many sensors are kept for a viewer of tracks that several share
+_BYTES: Final = 2**22  # and so many bytes of them, or one message
+_MOST: Final = 1000  # tracks, and detections, in one frame at most
 
-    def state(self) -> str:
-        """Return the state of the process."""
-
-    def status(self) -> schemas.ServiceStatus | None:
-        """Return the service's own report; None while it starts."""
-
-    def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None] | None:
-        """Hand over topic, payload and encoding of a stream's detections and tracks until the result is called.
-
-        None while the service starts. `receive` is called by other threads and must return at once.
-
-        Raises:
-            TransportError: the network cannot be used, or too many streams were looked at.
-        """
+Sample = tuple[bytes, str]
+"""Payload and encoding."""
 
 
-def page(watched: Watched) -> list[BaseRoute]:
+def page(health: ProcessHealth) -> list[Route]:
     """Return the routes of the page."""
-    viewers = _Viewers(watched)
+    viewers = _Viewers(health)
     files = [Route(path, _file(name)) for path, name in FILES.items()]
-    return [*files, Route("/status", _status(watched)), Route("/live", viewers.live)]
+    return [*files, Route("/status", _status(health)), Route("/live", viewers.live)]
 
 
 def _file(name: str) -> Callable[[Request], Response]:
@@ -89,11 +76,11 @@ def _file(name: str) -> Callable[[Request], Response]:
     return endpoint  # type: ignore[return-value]  # Starlette takes both kinds
 
 
-def _status(watched: Watched) -> Callable[[Request], Response]:
+def _status(health: ProcessHealth) -> Callable[[Request], Response]:
     def endpoint(_request: Request) -> Response:
-        status = watched.status()
+        status = health.status()
         if status is None:
-            return JSONResponse({"state": watched.state()}, headers=HEADERS)
+            return JSONResponse({"state": health.state()}, headers=HEADERS)
         return Response(schemas.encode_json(status), media_type="application/json", headers=HEADERS)
 
     return endpoint
@@ -117,8 +104,8 @@ class _Counted(StreamingResponse):
 class _Viewers:
     """Those who look at a stream now."""
 
-    def __init__(self, watched: Watched) -> None:
-        self._watched = watched
+    def __init__(self, health: ProcessHealth) -> None:
+        self._health = health
         self._count = 0
 
     async def live(self, request: Request) -> Response:
@@ -139,7 +126,7 @@ class _Viewers:
     async def _events(self, stream: str) -> AsyncIterator[str]:
         loop = asyncio.get_running_loop()
         newest = Newest(loop)
-        tapped = loop.run_in_executor(None, self._watched.tap, stream, newest.put)
+        tapped = loop.run_in_executor(None, self._health.tap, stream, newest.put)
         try:
             release = await asyncio.shield(tapped)
         except TransportError as error:
@@ -151,13 +138,15 @@ class _Viewers:
         if release is None:
             return
         try:
+            heard = time.monotonic()
             yield ": hello\n\n"  # the headers go with the first piece: the viewer knows that it is connected
-            while self._watched.state() != "stopping":
+            while self._health.state() != "stopping":
                 if not await newest.came(PERIOD_S):
-                    if newest.silent_s > KEEP_ALIVE_S:
-                        newest.heard()
+                    if time.monotonic() - heard > KEEP_ALIVE_S:
+                        heard = time.monotonic()
                         yield ": silent\n\n"
                     continue
+                heard = time.monotonic()
                 text = live_frame(*newest.take())
                 if text is not None:
                     yield f"data: {text}\n\n"
@@ -172,3 +161,120 @@ def _undo(tapped: asyncio.Future[Callable[[], None] | None]) -> None:
         return
     with contextlib.suppress(RuntimeError):  # the server ends, and so do its threads
         tapped.get_loop().run_in_executor(None, release)
+
+
+class Newest:
+    """The newest message of each topic for one reader on an event loop; what nobody took is replaced."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self._lock = threading.Lock()
+        self._tracks: Sample | None = None
+        self._detections: deque[Sample] = deque(maxlen=_SENSORS)
+        self._event = asyncio.Event()
+
+    def put(self, topic: str, payload: bytes, encoding: str) -> None:
+        """Take a message, on any thread."""
+        with self._lock:
+            if topic == "detections":
+                self._detections.appendleft((payload, encoding))
+                while len(self._detections) > 1 and sum(len(one) for one, _ in self._detections) > _BYTES:
+                    self._detections.pop()
+                return  # it is shown with its tracks
+            waits = self._tracks is not None
+            self._tracks = (payload, encoding)
+        if not waits and not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self._event.set)
+
+    async def came(self, seconds: float) -> bool:
+        """Wait for tracks, at most so long; tell whether there are any."""
+        try:
+            await asyncio.wait_for(self._event.wait(), seconds)
+        except TimeoutError:
+            return False
+        return True
+
+    def take(self) -> tuple[Sample | None, *tuple[Sample, ...]]:
+        """Return the newest tracks, once, and the newest detections, the latest first."""
+        with self._lock:
+            self._event.clear()
+            tracks, self._tracks = self._tracks, None
+            return tracks, *self._detections
+
+
+def live_frame(tracks: Sample | None, *detections: Sample) -> str | None:
+    """Return what the page draws, as JSON; None for what is no valid message.
+
+    Of detections, the latest first, those of each stream are drawn that come before another of the same stream.
+    """
+    if tracks is None:
+        return None
+    try:
+        message = schemas.decode(tracks[0], schemas.Tracks, encoding=tracks[1])
+    except schemas.MessageError:
+        return None
+    rows = np.column_stack(
+        [
+            message.center[:, :2],
+            message.size[:, :2],
+            message.yaw,
+            message.velocity,
+            message.existence,
+            message.score,
+            message.age,
+            message.time_since_detection,
+            np.ones(len(message.id)) if message.heading_confidence is None else message.heading_confidence,
+        ]
+    )
+    confirmed = np.ones(len(rows), np.bool_) if message.confirmed is None else message.confirmed > 0
+    numbers = np.round(rows[confirmed][:_MOST], 3).tolist()
+    heads = zip(message.id[confirmed].tolist(), message.label[confirmed].tolist(), numbers, strict=False)
+    sensor, found = _seen(detections)
+    frame: dict[str, Any] = {
+        "time": message.stamp_ns / 1e9,
+        "session": message.session,
+        "profile": message.profile,
+        "labels": message.labels,
+        "tracks": [[identity, label, *values] for identity, label, values in heads],
+        "unconfirmed": int((~confirmed).sum()),
+        "sensor": sensor,
+        "detections": found,
+    }
+    return json.dumps(frame, separators=(",", ":"))
+
+
+def _seen(samples: Sequence[Sample]) -> tuple[list[float] | None, list[list[float]]]:
+    """Return x, y, heading of the newest sensor, where it is known, and x, y of all detections, in the world frame."""
+    sensor: list[float] | None = None
+    found: list[list[float]] = []
+    streams: set[str] = set()
+    for number, sample in enumerate(samples):
+        try:
+            message = schemas.decode(sample[0], schemas.Detections, encoding=sample[1])
+        except schemas.MessageError:
+            continue
+        if message.stream in streams:
+            break
+        streams.add(message.stream)
+        place, centers = _placed(message)
+        sensor = sensor if number else place
+        found += centers
+    return sensor, found
+
+
+def _placed(message: schemas.Detections) -> tuple[list[float] | None, list[list[float]]]:
+    """Return x, y, heading of the sensor, where it is known, and x, y of the detections, in the world frame."""
+    center, sensor = message.center[:_MOST], None
+    if message.pose is not None:
+        w, x, y, z = message.pose.quaternion
+        rows = np.array(  # the first two rows of the rotation: what is seen from above
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            ]
+        )
+        place = message.pose.translation[:2]
+        sensor = np.round([*place, np.arctan2(rows[1, 0], rows[0, 0])], 3).tolist()
+        if message.frame == "sensor":
+            center = center @ rows.T + place
+    return sensor, np.round(center[:, :2], 2).tolist()

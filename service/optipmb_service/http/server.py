@@ -1,38 +1,123 @@
-"""The application on a port: uvicorn on a thread with a loop of its own, so that neither side waits for the other."""
+"""HTTP for orchestrators, Prometheus and people: uvicorn on a thread with a loop of its own; neither side waits.
+
+Only requests by a name of this service are answered. A browser that was led to a page of a stranger can be made to ask
+a service of its own network: the stranger lets his name point to its address (DNS rebinding). Such a request carries
+the stranger's name. Addresses, names without a dot (`localhost`, a container, a host of the same network) and the names
+of the settings are answered, others are not. Probes and Prometheus ask by names with a domain
+(`tracker.site.svc.cluster.local`): their paths, which show no tracks, are answered under any name.
+"""
 
 from __future__ import annotations
 
+import ipaddress
 import socket
 import threading
 import time
 from typing import TYPE_CHECKING, Any, Final
 
 import uvicorn
-from starlette.responses import PlainTextResponse
+from starlette.applications import Starlette
+from starlette.datastructures import Headers
+from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from optipmb_service.http.app import PROBES, UNAVAILABLE
+from optipmb_service.http.page import page
 from optipmb_service.runtime.ports import HttpError
+from optipmb_service.telemetry.metrics import CONTENT_TYPE
 
 if TYPE_CHECKING:
     import asyncio
+    from collections.abc import Collection
 
+    from starlette.requests import Request
     from starlette.types import ASGIApp, Receive, Scope, Send
 
-GRACE_S: Final = 1
-"""How long an answer under way may take at the end."""
+    from optipmb_service.telemetry.health import ProcessHealth
 
-CONNECTIONS: Final = 256
-"""Open connections; a further one closes an idle one."""
-
-REQUESTS: Final = 64
-"""Requests answered at once, beside those of probes; more than the viewers of the page."""
-
-HEAD_S: Final = 5.0
-"""Longest time from the begin of a connection until its first request is complete."""
-
+GRACE_S: Final = 1  # how long an answer under way may take at the end
+CONNECTIONS: Final = 256  # open connections; a further one closes an idle one
+REQUESTS: Final = 64  # requests answered at once, beside those of probes; more than the viewers of the page
+HEAD_S: Final = 5.0  # longest time from the begin of a connection until its first request is complete
 KEEP_ALIVE_S: Final = 5
 HEAD_BYTES: Final = 16 * 1024
+
+UNAVAILABLE: Final = 503
+MISDIRECTED: Final = 421
+ANY: Final = "*"
+
+PROBES: Final = frozenset({"/healthz", "/readyz"})  # paths that are answered however many other requests are
+MONITORING: Final = PROBES | {"/metrics"}  # paths that programs ask for, by whatever name the service has for them
+
+
+def application(health: ProcessHealth, names: Collection[str] = ()) -> ASGIApp:
+    """Return the application: health, readiness, metrics, and the page.
+
+    Args:
+        health: of the process.
+        names: names of this service beside addresses and names without a dot; `*`: any.
+    """
+
+    # Coroutines: probes wait for no thread.
+    async def alive(_: Request) -> Response:
+        well = health.alive()
+        return _answer({"alive": well, "beat_age_s": round(health.beat_age_s(), 3)}, well=well)
+
+    async def ready(_: Request) -> Response:
+        well = health.ready()
+        body: dict[str, object] = {"ready": well, "state": health.state()}
+        if failure := health.failure():
+            body["failure"] = failure
+        return _answer(body, well=well)
+
+    # No coroutine: Starlette runs it on a thread, so that making the metrics of many streams delays no other answer.
+    def metrics(_: Request) -> Response:
+        return Response(health.metrics.text(), media_type=CONTENT_TYPE, headers={"cache-control": "no-store"})
+
+    routes = [Route("/healthz", alive), Route("/readyz", ready), Route("/metrics", metrics), *page(health)]
+    return _Guarded(Starlette(routes=routes), names)
+
+
+def _answer(body: dict[str, object], *, well: bool) -> Response:
+    return JSONResponse(body, status_code=200 if well else UNAVAILABLE, headers={"cache-control": "no-store"})
+
+
+class _Guarded:
+    """An application that answers known host names, and a bounded number of requests at once beside those of probes."""
+
+    def __init__(self, application: ASGIApp, names: Collection[str]) -> None:
+        self._application = application
+        self._names = {name.lower().rstrip(".") for name in names}
+        self._requests = 0
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer, or refuse."""
+        answer: Any = self._application
+        path = scope["path"] if scope["type"] == "http" else ""
+        if path in PROBES:
+            await answer(scope, receive, send)
+            return
+        if self._requests >= REQUESTS:
+            answer = PlainTextResponse(f"{REQUESTS} requests are being answered; ask again", status_code=UNAVAILABLE)
+        elif path and path not in MONITORING and not self._knows(Headers(scope=scope).get("host", "")):
+            answer = PlainTextResponse("unknown host; see the setting http_hosts", status_code=MISDIRECTED)
+        self._requests += 1
+        try:
+            await answer(scope, receive, send)
+        finally:
+            self._requests -= 1
+
+    def _knows(self, host: str) -> bool:
+        name = host.lower()
+        name = name[1:].partition("]")[0] if name.startswith("[") else name.partition(":")[0]
+        name = name.rstrip(".")
+        if ANY in self._names or name in self._names or "." not in name:
+            return bool(name) or ANY in self._names
+        try:
+            ipaddress.ip_address(name)
+        except ValueError:
+            return False
+        return True
 
 
 class Server:
@@ -58,7 +143,7 @@ class Server:
         self.address = f"[{bound[0]}]:{bound[1]}" if family == socket.AF_INET6 else f"{bound[0]}:{bound[1]}"
         self._server = uvicorn.Server(
             uvicorn.Config(
-                _Bounded(application),
+                application,
                 loop="asyncio",
                 http=_Connection,
                 lifespan="off",
@@ -113,25 +198,3 @@ class _Connection(H11Protocol):
     def _end_without_request(self) -> None:
         if self.headers is None:  # its type says that it never is
             self.transport.abort()  # type: ignore[unreachable]
-
-
-class _Bounded:
-    """An application that answers so many requests at once, and those of probes beside them."""
-
-    def __init__(self, application: ASGIApp) -> None:
-        self._application = application
-        self._requests = 0
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer, or refuse."""
-        answer: Any = self._application
-        if scope["type"] == "http" and scope["path"] in PROBES:
-            await answer(scope, receive, send)
-            return
-        if self._requests >= REQUESTS:
-            answer = PlainTextResponse(f"{REQUESTS} requests are being answered; ask again", status_code=UNAVAILABLE)
-        self._requests += 1
-        try:
-            await answer(scope, receive, send)
-        finally:
-            self._requests -= 1

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from optipmb_schemas.ros2.types import Types
 
-    from optipmb_service.settings.tables import Ros2Settings, Ros2Stream
+    from optipmb_service.settings import Ros2Settings, Ros2Stream
 
 Kind = Literal["detections", "points"]
 

@@ -1,1 +1,1 @@
-"""Stream actors with their mailboxes, the scheduler that runs them, and what they need of the network and the store."""
+"""Streams: their backlogs, turns, opening and recovery, and what they need of the network and the store."""

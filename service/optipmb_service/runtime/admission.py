@@ -1,39 +1,127 @@
-"""Which streams may have a session, and what is remembered of one between two sessions.
+"""Admission of sessions and messages: limits of the process, quotas of nodes and sites.
 
-Limits are those of the process and the quotas of nodes and sites. May be called by any thread.
+Decisions only, for any thread. Rates are token buckets that hold a second's worth, so that a burst of so much passes.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
-from optipmb_service.runtime.byte_budget import MEGABYTE
-from optipmb_service.runtime.quotas import Quota, Quotas, victim_of
+from optipmb_service.runtime.backlog import MEGABYTE
 from optipmb_service.session.values import SECOND, Incarnation
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
 
-MAX_LIVES: Final = 65_536
-"""Streams without a session whose past is remembered."""
+MAX_OWNERS: Final = 16_384
+"""Nodes and sites whose rates are remembered."""
+
+MAX_ENDED: Final = 65_536
+"""Streams without a session whose incarnation is remembered."""
 
 EVICT_EVERY_NS: Final = SECOND
 """A session is asked to close no more often than this."""
 
 REFUSED_NS: Final = SECOND // 10
-"""How long a stream without room is refused without another look."""
+"""Time for which a stream without room is refused without another look."""
 
 MAX_REFUSED: Final = 256
 """Streams for which that is remembered."""
 
 
+@dataclass(frozen=True, slots=True)
+class Quota:
+    """Limits of one node or site; 0: no limit.
+
+    Attributes:
+        sessions: streams tracked at once.
+        messages: a second.
+        bytes: a second.
+    """
+
+    sessions: int = 0
+    messages: int = 0
+    bytes: int = 0
+
+
+@dataclass(slots=True)
+class _Bucket:
+    messages: float
+    bytes: float
+    at_ns: int
+
+    def take(self, quota: Quota, size: int, now_ns: int) -> bool:
+        """Fill it up to the present and take a message; False when it is empty."""
+        passed_s = max(0, now_ns - self.at_ns) / SECOND
+        messages = min(quota.messages, self.messages + passed_s * quota.messages)
+        filled = min(quota.bytes, self.bytes + passed_s * quota.bytes)
+        taken = (messages >= 1 or not quota.messages) and (filled > 0 or not quota.bytes)
+        self.messages, self.bytes, self.at_ns = messages - taken, filled - taken * size, now_ns
+        return taken
+
+
+class Quotas:
+    """Quotas of all nodes and sites.
+
+    Args:
+        node: of each node, `site/node`.
+        site: of each site.
+    """
+
+    def __init__(self, node: Quota, site: Quota) -> None:
+        self._quotas = {"node": node, "site": site}
+        self._rated = [(at, quota) for at, quota in enumerate((node, site)) if quota.messages or quota.bytes]
+        self._lock = threading.Lock()
+        self._buckets: OrderedDict[str, _Bucket] = OrderedDict()
+        self._sessions: Counter[tuple[str, str]] = Counter()
+
+    def exceeded(self, stream: str, size: int, now_ns: int) -> str:
+        """Take a message of a stream from its quotas; return the one that is used up, empty when none is."""
+        if not self._rated:
+            return ""
+        owners = _owners(stream)
+        with self._lock:
+            for at, quota in self._rated:
+                kind, owner = owners[at]
+                bucket = self._buckets.get(owner) or self._added(owner, quota, now_ns)
+                self._buckets.move_to_end(owner)
+                if not bucket.take(quota, size, now_ns):
+                    return f"{kind} {owner}: at most {_text(quota)} a second"
+        return ""
+
+    def count(self, stream: str, sessions: int) -> None:
+        """Count a session of a stream that begins (1) or ends (-1)."""
+        with self._lock:
+            for owner in _owners(stream):
+                self._sessions[owner] += sessions
+                if not self._sessions[owner]:
+                    del self._sessions[owner]
+
+    def full(self, stream: str) -> str:
+        """Return the quota of sessions that a further stream would exceed; empty when none."""
+        with self._lock:
+            for kind, owner in _owners(stream):
+                most = self._quotas[kind].sessions
+                if most and self._sessions[kind, owner] >= most:
+                    return f"{kind} {owner}: at most {most} streams at once"
+        return ""
+
+    def _added(self, owner: str, quota: Quota, now_ns: int) -> _Bucket:
+        bucket = self._buckets[owner] = _Bucket(quota.messages, quota.bytes, now_ns)
+        if len(self._buckets) > MAX_OWNERS:
+            self._buckets.popitem(last=False)
+        return bucket
+
+
 class Admission:
-    """Who has a session, and who may have one.
+    """Sessions that there are, and room for further ones.
 
     Args:
         settings: the limits.
@@ -54,7 +142,7 @@ class Admission:
         self.exceeded = self._quotas.exceeded
         self._lock = threading.Lock()
         self._sessions = 0
-        self._kept: OrderedDict[str, Incarnation] = OrderedDict()
+        self._ended: OrderedDict[str, Incarnation] = OrderedDict()
         self._refused: dict[str, tuple[int, str]] = {}
         self._evicted: tuple[str, int] = "", 0
 
@@ -71,23 +159,23 @@ class Admission:
         return why
 
     def admit(self, stream: str) -> Incarnation | None:
-        """Count a session that begins; return what the stream had before, None when there is no room."""
+        """Count a session that begins; return the stream's last incarnation, None when there is no room."""
         with self._lock:
             if self._sessions >= self._most:
                 return None
             self._sessions += 1
-            incarnation = self._kept.pop(stream, Incarnation())
+            incarnation = self._ended.pop(stream, Incarnation())
         self._quotas.count(stream, 1)
         return incarnation
 
     def release(self, stream: str, incarnation: Incarnation) -> None:
-        """Count a session that has ended, or was not begun, and remember what a later one has to know."""
+        """Count a session that has ended, or was not begun, and remember its incarnation."""
         with self._lock:
             self._sessions -= 1
             self._refused.clear()  # who was refused may have room now
-            self._kept[stream] = incarnation
-            if len(self._kept) > MAX_LIVES:
-                self._kept.popitem(last=False)
+            self._ended[stream] = incarnation
+            if len(self._ended) > MAX_ENDED:
+                self._ended.popitem(last=False)
         self._quotas.count(stream, -1)
 
     def _look_for_room(self, stream: str, now_ns: int) -> str:
@@ -103,3 +191,38 @@ class Admission:
             self._evicted = victim, now_ns + EVICT_EVERY_NS
             self._evict(victim)
         return "room for another session: one is being closed"
+
+
+def victim_of(stream: str, tracked: Iterable[tuple[str, int, bool]]) -> str | None:
+    """Return the stream whose session makes room for another one; None when none has to.
+
+    The least recently used of those that are silent: they go on from the store. Else, of the site that has the most,
+    its least recently used, if that site has at least two more than the one that asks. So no site keeps the others
+    out, and streams of one frame keep out nobody.
+
+    Args:
+        stream: the one that asks.
+        tracked: streams with a session, when each was last used, and whether it is silent.
+    """
+    used = sorted(tracked, key=lambda one: one[1])
+    for other, _, silent in used:
+        if silent:
+            return other
+    sites = Counter(other.partition("/")[0] for other, _, _ in used)
+    if not sites:
+        return None
+    largest, most = max(sites.items(), key=lambda one: (one[1], one[0]))
+    if most < sites[stream.partition("/")[0]] + 2:
+        return None
+    return next(other for other, _, _ in used if other.partition("/")[0] == largest)
+
+
+@lru_cache(MAX_OWNERS)  # asked about with each message
+def _owners(stream: str) -> tuple[tuple[str, str], tuple[str, str]]:
+    site, _, rest = stream.partition("/")
+    return ("node", f"{site}/{rest.partition('/')[0]}"), ("site", site)
+
+
+def _text(quota: Quota) -> str:
+    parts = [f"{quota.messages} messages"] if quota.messages else []
+    return " and ".join([*parts, f"{quota.bytes} bytes"] if quota.bytes else parts)

@@ -1,6 +1,6 @@
-"""Which streams there are, whoever tracks them: decisions only, no network and no threads of its own.
+"""Directory of all streams, whichever member tracks them: decisions only, no network and no threads of its own.
 
-Who publishes detections with a cache says so by a liveliness token, from before its first message to its end. A
+A publisher of detections with a cache has a liveliness token, from before its first message to its end. A
 publisher without one is noticed by its messages: one member, the *discoverer*, subscribes to the detections of all
 streams, and announces such streams by tokens, so all members know of them.
 """
@@ -20,13 +20,13 @@ MAX_STREAMS: Final = 65_536
 """Streams that are known at once; publishers beyond it are not heard."""
 
 FORGET_NS: Final = 10 * SECOND
-"""How long a stream stays known after its last token: a publisher, or the discoverer, may come back."""
+"""Time for which a stream stays known after its last token: a publisher, or the discoverer, may come back."""
 
 TOKEN_NS: Final = SECOND
-"""How long the token of a publisher whose messages can be recovered may come after its first message."""
+"""Longest delay of the token of a publisher with a cache after its first message."""
 
 BACK_NS: Final = 5 * SECOND
-"""How long a token may come after a session has begun, or back: who lost its router tries every 4 s at least.
+"""Longest delay of a token after a session has begun: a client that lost its router tries every 4 s at least.
 
 Sessions wait no longer than `recovery_wait_s` in any case."""
 
@@ -34,10 +34,10 @@ MAX_UNPROVEN_ANNOUNCED: Final = 256
 """Streams without a session that this instance announces at once: each costs members a token and subscriptions."""
 
 UNPROVEN_NS: Final = 30 * SECOND
-"""How long a stream is announced that gets no session; after that others have their turn before it is again."""
+"""Time for which a stream without a session is announced; then others have their turn before it is again."""
 
 QUEUED_NS: Final = 120 * SECOND
-"""How long after its last message a stream waits for its turns: as long as first frames are kept."""
+"""Time after its last message for which a stream waits for its turn: as long as first frames are kept."""
 
 
 def node_of(stream: str) -> str:
@@ -56,11 +56,11 @@ class _Known:
     seen_ns: int = 0
     """When this instance noticed a message last; of those that it announces."""
     left_ns: int | None = None
-    """Since when there is no token; None while there is one."""
+    """Monotonic time at which the last token went; None while there is one."""
 
 
 class StreamDirectory:
-    """What is known of the streams, for any thread.
+    """Known streams, for any thread.
 
     Args:
         instance: the name of this one.
@@ -70,7 +70,7 @@ class StreamDirectory:
 
     def __init__(self, instance: str, idle_ns: int, has_session: Callable[[str], bool]) -> None:
         self.began_ns = 0
-        """Since when tokens are heard of, monotonic; set by whoever hears them."""
+        """Monotonic time since which tokens are received; set by the receiver."""
         self._instance = instance
         self._idle_ns = idle_ns
         self._has_session = has_session
@@ -83,7 +83,7 @@ class StreamDirectory:
         self._awaited: dict[str, int] = {}
 
     def published(self, stream: str, token: str, now_ns: int, *, present: bool) -> bool:
-        """Take in the token of a publisher; True: that changes what is known."""
+        """Note the token of a publisher; True: that changes what is known."""
         with self._lock:
             known = self._found(stream) if present else self._streams.get(stream)
             if known is None or (token in known.tokens) is present:
@@ -93,7 +93,7 @@ class StreamDirectory:
             return self._settled(known, now_ns)
 
     def discovered(self, stream: str, token: str, now_ns: int, *, present: bool) -> bool:
-        """Take in that a token announces a stream, or does so no longer; True: that changes what is known."""
+        """Note that a token announces a stream, or no longer does; True: that changes what is known."""
         with self._lock:
             known = self._found(stream) if present else self._streams.get(stream)
             if known is None or (token in known.announcements) is present:
@@ -104,7 +104,7 @@ class StreamDirectory:
             return self._settled(known, now_ns)
 
     def noticed(self, stream: str, now_ns: int, *, recoverable: bool) -> bool:
-        """Take in a message that the discoverer received; True: its publisher has no token.
+        """Note a message that the discoverer received; True: its publisher has no token.
 
         While too many streams wait for a session, a new one is announced when it is its turn.
 
@@ -201,7 +201,7 @@ class StreamDirectory:
         return True
 
     def admit(self, now_ns: int) -> None:
-        """See which streams have got a session, forget those that have waited too long, and announce the next."""
+        """Announce the next streams in place of those that have got a session, or have waited too long for one."""
         with self._lock:
             self._admit(now_ns)
 

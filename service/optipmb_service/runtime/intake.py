@@ -1,6 +1,6 @@
-"""What a member receives: the streams of its partitions, and of others what somebody has to receive.
+"""Intake: the subscriptions of a member.
 
-From the partitions that are held and the streams that are known follows a set of subscriptions, whatever came before:
+They follow from the partitions that it holds and the streams that are known, whatever came before:
 
 - all detections and all clouds, where this member holds all partitions;
 - else detections and clouds of each stream of its partitions, and of those that it left just now, for who has them
@@ -11,7 +11,8 @@ From the partitions that are held and the streams that are known follows a set o
   tokens are dropped unread. It alone watches who tracks which stream.
 
 New subscriptions are declared before old ones are withdrawn. A stream that comes here from another member is held until
-the others have answered what they have received of it lately; then its session goes on with that.
+the others have answered what they have received of it lately; then its session goes on with that. The member that has a
+partition asks once for each session, and the end of a process waits, for a moment, until all was asked for.
 """
 
 from __future__ import annotations
@@ -26,15 +27,14 @@ import structlog
 
 from optipmb_service.cluster.leases import PARTITIONS, Change, partition_of
 from optipmb_service.runtime.directory import StreamDirectory, node_of
-from optipmb_service.runtime.handover import Handover, Others
 from optipmb_service.session.values import SECOND
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Sequence
 
     from optipmb_service.cluster.member import Member
     from optipmb_service.runtime.ports import Packet
-    from optipmb_service.runtime.registry import Registry
+    from optipmb_service.runtime.streams import Streams
 
 log = structlog.get_logger("optipmb_service")
 
@@ -52,15 +52,20 @@ What those without a cache sent is asked for before the next are taken in.
 """
 
 REST: Final = 2.0
-"""How many times as long as a step took of the processor the thread rests before the next one."""
+"""Rest after a step, in times of the processor time that it took."""
 
 MOST_REST_S: Final = 0.5
+
+DRAIN_S: Final = 0.5
+"""Longest wait, before messages are given to another member, for those that are on their way through this process."""
+
+DRAIN_POLL_S: Final = 0.005
 
 Kind = Literal["detections", "points", "discovery"]
 
 
 class Input(NamedTuple):
-    """A subscription: what of a stream, or of all of them, and whether what was lost is recovered from a cache."""
+    """A subscription to a stream, or to all of them; `cached`: lost messages are recovered from a cache."""
 
     kind: Kind
     stream: str = ALL
@@ -68,14 +73,14 @@ class Input(NamedTuple):
 
 
 def _inputs(streams: Iterable[str]) -> set[Input]:
-    """Return all subscriptions that there may be of these streams, and those that are of no single one."""
+    """Return all possible subscriptions to these streams, and those to all streams."""
     kinds: tuple[Kind, Kind] = ("detections", "points")
     of_all = {Input("discovery"), Input("detections"), Input("points")}
     return of_all | {Input(kind, stream, cached) for stream in streams for kind in kinds for cached in (False, True)}
 
 
-class Inputs(Others, Protocol):
-    """What is needed of the network."""
+class Inputs(Protocol):
+    """Subscriptions, tokens and questions to other members, on the network."""
 
     def receive(
         self,
@@ -85,7 +90,7 @@ class Inputs(Others, Protocol):
         passed_by: Callable[[str, int], None],
         answered: Callable[[str], None],
     ) -> None:
-        """Say where messages go, who decides which of those discovered do, who counts the rest, who hears of caches."""
+        """Register the receivers of messages, of discovered keys, of those that are dropped, and of complete caches."""
 
     def subscribe(self, kind: Kind, stream: str, *, cached: bool) -> None:
         """Receive a stream, or all of them; what was lost comes from the cache of the publisher where it has one."""
@@ -96,10 +101,10 @@ class Inputs(Others, Protocol):
     def watch_streams(
         self, published: Callable[[str, str, bool], None], discovered: Callable[[str, bool], None]
     ) -> None:
-        """Tell of the tokens of publishers, and of streams that others announce; each True: it is there."""
+        """Report tokens of publishers, and streams that others announce; True: it is there, False: it has gone."""
 
     def watch_owners(self, on_owner: Callable[[str, str, bool], None] | None) -> None:
-        """Tell which instance tracks which stream, or does so no longer (False), from now on; None: nobody any more."""
+        """Report from now on which instance tracks which stream (False: no longer); None: stop."""
 
     def discover(self, streams: set[str]) -> None:
         """Announce these streams, and no others."""
@@ -107,13 +112,19 @@ class Inputs(Others, Protocol):
     def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]], bool], None]) -> None:
         """Call `then` soon with what the caches of a stream hold, all frames, and with whether all have answered."""
 
+    def ask_recent(self, sessions: Sequence[str]) -> list[tuple[Packet, bool]]:
+        """Return what other instances have received lately of sessions, each packet with whether it is a frame."""
+
+    def pass_through(self, then: Callable[[], None]) -> None:
+        """Call `then` when all that has come until now is handed over."""
+
 
 class Intake:
     """Decides what is received, on a thread of its own.
 
     Args:
-        registry: where messages go.
-        member: says which partitions are held.
+        streams: take the messages.
+        member: knows which partitions are held.
         inputs: the network.
         standby: whether detections that no cache holds are received for a takeover.
         linger_s: how long streams are received whose partition was left, unless its holder has asked before.
@@ -121,23 +132,23 @@ class Intake:
     """
 
     def __init__(
-        self, registry: Registry, member: Member, inputs: Inputs, *, standby: bool, linger_s: float, idle_s: float
+        self, streams: Streams, member: Member, inputs: Inputs, *, standby: bool, linger_s: float, idle_s: float
     ) -> None:
-        self._registry = registry
+        self._streams = streams
         self._member = member
         self._inputs = inputs
         self._standby = standby
         self._linger_ns = round(linger_s * SECOND)
-        session_of = registry.fusion.session_of
+        session_of = streams.fusion.session_of
         self._directory = StreamDirectory(
-            registry.instance, round(idle_s * SECOND), lambda stream: registry.tracked(session_of(stream))
+            streams.instance, round(idle_s * SECOND), lambda stream: streams.tracked(session_of(stream))
         )
-        registry.caches = self
+        streams.caches = self
         self._subscribed: set[Input] = set()
         self._known: dict[str, bool] = {}
         """The streams whose inputs are in line, each with whether its publisher has a cache."""
         self._aligned: object = None
-        """What they follow from beside the streams: where it changes, all are looked at."""
+        """Inputs of the last step other than streams: when they change, all streams are looked at."""
         self._announced: set[str] = set()
         self._watching = False
         """Whether owners are watched."""
@@ -145,7 +156,9 @@ class Intake:
         self._came: set[int] = set()
         self._left: dict[int, int] = {}
         self._received: set[int] = set()
-        self._handover = Handover(registry, member, inputs)
+        self._owed: set[str] = set()
+        """Sessions that have left, as long as the member that has them has not asked for what is held of them."""
+        self._given = threading.Condition()
         self._wake = threading.Event()
         self._hurry = threading.Event()
         self._expires_ns = 0
@@ -154,10 +167,8 @@ class Intake:
 
     def start(self) -> None:
         """Receive from now on what is to be received."""
-        registry = self._registry
-        self._inputs.receive(
-            registry.frame, registry.cloud, self._noticed, registry.passed_by, registry.caches_answered
-        )
+        streams = self._streams
+        self._inputs.receive(streams.receive, streams.receive, self._noticed, streams.passed_by, streams.cache_answered)
         self._directory.began_ns = time.monotonic_ns()  # a start may take long before
         self._inputs.watch_streams(self._published, self._discovered)
         self._step()
@@ -172,8 +183,8 @@ class Intake:
             self._thread.join(timeout)
 
     def changed(self, partition: int, change: Change) -> None:
-        """Take in what has become of a partition."""
-        self._registry.changed(partition, change)
+        """Follow a change of a partition."""
+        self._streams.changed(partition, change)
         with self._lock:
             if change is Change.HELD:
                 self._came.add(partition)
@@ -181,25 +192,39 @@ class Intake:
             elif change is Change.LOST:
                 self._came.discard(partition)
                 self._left[partition] = time.monotonic_ns() + self._linger_ns
-        (self._handover.lost if change is Change.LOST else self._handover.kept)(partition)
+        held = self._streams.held({partition})
+        with self._given:
+            (self._owed.update if change is Change.LOST else self._owed.difference_update)(held)
         self._hurry.set()
         self._wake.set()
 
     @property
     def standing_by(self) -> int:
         """Streams that are known here and tracked elsewhere."""
-        session_of = self._registry.fusion.session_of
+        session_of = self._streams.fusion.session_of
         return sum(not self._member.holds(session_of(stream)) for stream in self._directory.streams())
 
     def hand_over(self, sessions: Iterable[str], give: Callable[[Packet], None]) -> None:
         """Give what was received lately of sessions that are tracked elsewhere now, the oldest first."""
-        given = self._handover.give(
-            list(sessions), lambda one: DISCOVERY in self._received or one in self._received, give
-        )
+        sessions = list(sessions)
+        if asked := [session for session in sessions if self._may_have(session)]:
+            self._drain(asked)
+            for packet in self._streams.recent(asked):
+                give(packet)
+            with self._given:
+                self._owed.difference_update(asked)
+                self._given.notify_all()
+        # Who asks has subscribed already.
+        still = {partition_of(session) for session in self._owed.copy()}
         with self._lock:
-            for partition in given:
+            for partition in {partition_of(session) for session in sessions} - still:
                 self._left.pop(partition, None)
         self._wake.set()
+
+    def handed_over(self, timeout: float) -> bool:
+        """Wait until who has the partitions that were left has asked, at most so long (s); False when that was it."""
+        with self._given:
+            return self._given.wait_for(lambda: not self._owed, timeout)
 
     def awaited(self, session: str, sensors: Iterable[str]) -> dict[str, bool]:
         """Return the streams of a session whose caches may hold something, each with whether its publisher is there.
@@ -208,30 +233,26 @@ class Intake:
             session: its name.
             sensors: streams that were there before; their publishers may come back.
         """
-        session_of = self._registry.fusion.session_of
+        session_of = self._streams.fusion.session_of
         node = node_of(session)
         return self._directory.awaited(node, lambda one: session_of(one) == session, sensors, time.monotonic_ns())
 
-    def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]], bool], None]) -> None:
+    def ask_cache(self, stream: str, then: Callable[[list[Packet], bool], None]) -> None:
         """Call `then` soon with what the caches of a stream hold, all frames, and with whether all have answered.
 
         It is called on a thread that it must not keep.
         """
-        self._inputs.ask_cache(stream, then)
-
-    def handed_over(self, timeout: float) -> bool:
-        """Wait until who has the partitions that were left has asked, at most so long (s); False when that was it."""
-        return self._handover.wait(timeout)
+        self._inputs.ask_cache(stream, lambda found, complete: then([packet for packet, _ in found], complete))
 
     # From the network
 
     def _stream(self, key: str) -> str | None:
         """Return the stream of a token's key; None when it is none that may publish."""
         try:
-            stream = self._registry.keys.stream_of(key)
+            stream = self._streams.keys.stream_of(key)
         except schemas.MessageError:
             return None
-        return None if self._registry.fusion.is_session(stream) else stream
+        return None if self._streams.fusion.is_session(stream) else stream
 
     def _published(self, key: str, token: str, present: bool) -> None:  # noqa: FBT001 - as the network calls it
         stream = self._stream(key)
@@ -240,21 +261,21 @@ class Intake:
 
     def _discovered(self, key: str, present: bool) -> None:  # noqa: FBT001 - as the network calls it
         now_ns = time.monotonic_ns()
-        for stream in self._registry.keys.discovered_streams(key):
-            if self._registry.fusion.is_session(stream):
+        for stream in self._streams.keys.discovered_streams(key):
+            if self._streams.fusion.is_session(stream):
                 continue
             if self._directory.discovered(stream, key, now_ns, present=present):
                 self._wake.set()
 
     def _noticed(self, key: str, recoverable: bool) -> bool:  # noqa: FBT001 - as the network calls it
-        """Take in detections of whatever stream; False: the publisher has a token, and its member receives them."""
+        """Note detections of any stream; False: the publisher has a token, and its member receives them."""
         try:
-            stream, _ = self._registry.parsed(key)
+            stream, _ = self._streams.parsed(key)
         except schemas.MessageError:
             return True  # to be reported
         is_raw = self._directory.noticed(stream, time.monotonic_ns(), recoverable=recoverable)
         if is_raw and stream not in self._known:
-            self._registry.untracked.expect(self._registry.fusion.session_of(stream))
+            self._streams.expect(self._streams.fusion.session_of(stream))
             if self._directory.announces(stream):
                 self._wake.set()
         return is_raw
@@ -277,7 +298,7 @@ class Intake:
             self._hurry.wait(min(MOST_REST_S, REST * (time.thread_time() - began_s)))
 
     def _step(self) -> None:
-        """See what is held and known now, and act on it; the next step does again what failed in this one."""
+        """Bring the subscriptions in line with what is held and known; what fails is done again in the next step."""
         now_ns = time.monotonic_ns()
         with self._lock:
             came, self._came = self._came, set()
@@ -295,7 +316,7 @@ class Intake:
             raise
 
     def _align(self, came: set[int], held: set[int], received: set[int], now_ns: int) -> None:
-        """Bring the subscriptions in line, and take up what came here."""
+        """Declare and withdraw subscriptions, and take up sessions that came here."""
         everything = len(held) == PARTITIONS
         discovering = DISCOVERY in held
         if now_ns >= self._expires_ns:
@@ -318,7 +339,7 @@ class Intake:
             looked = {stream: cached for stream, cached in looked.items() if stream not in later}
         coming = self._coming(looked, came, held)
         for session in coming:
-            self._registry.untracked.hold(session)
+            self._streams.hold(session)
         wanted = self._wanted(looked, received, everything=everything, discovering=discovering)
         before = self._subscribed if anew else self._subscribed & _inputs(looked.keys() | gone)
         for one in sorted(wanted - before):
@@ -328,24 +349,52 @@ class Intake:
         self._inputs.unsubscribe((one.kind, one.stream, one.cached) for one in sorted(left))
         self._subscribed -= left
         if not everything and any(one.kind == "detections" for one in left):
-            self._registry.untracked.forget_caches({one.stream for one in self._subscribed if one.kind == "detections"})
+            self._streams.forget_caches({one.stream for one in self._subscribed if one.kind == "detections"})
         self._announce(self._directory.announced(), strained=strained)
         for stream in later:
             del streams[stream]
         self._known = streams
         if coming:
-            self._handover.take(coming)
+            self._take_up(coming)
+
+    def _take_up(self, sessions: Sequence[str]) -> None:
+        """Go on with sessions that came here, each with what others have received of it lately."""
+        packets: dict[str, list[Packet]] = {session: [] for session in sessions}
+        try:
+            for packet, _ in self._inputs.ask_recent(sessions):
+                _, session = self._streams.parsed(packet.key)
+                if session in packets:
+                    packets[session].append(packet)
+        finally:
+            for session, found in packets.items():
+                self._streams.take_up(session, found)
+
+    def _may_have(self, session: str) -> bool:
+        """Whether something of a session that is tracked elsewhere may have come, or be on its way through here."""
+        if self._member.holds(session):
+            return False
+        received = DISCOVERY in self._received or partition_of(session) in self._received
+        return received or self._streams.keeps(session)
+
+    def _drain(self, sessions: list[str]) -> None:
+        """Wait for what is on its way through this process, for a moment at most."""
+        ends = time.monotonic() + DRAIN_S
+        passed = threading.Event()
+        self._inputs.pass_through(passed.set)
+        passed.wait(DRAIN_S)
+        while any(self._streams.waits(session) for session in sessions) and time.monotonic() < ends:
+            time.sleep(DRAIN_POLL_S)
 
     def _watch_owners(self, *, discovering: bool) -> None:
-        if discovering is not self._watching or (discovering and self._registry.doubts_owners):
-            self._inputs.watch_owners(self._registry.on_owner() if discovering else None)
+        if discovering is not self._watching or (discovering and self._streams.doubts_owners):
+            self._inputs.watch_owners(self._streams.on_owner() if discovering else None)
             self._watching = discovering
 
     def _later(
         self, looked: dict[str, bool], came: set[int], held: set[int], *, everything: bool, strained: bool
     ) -> set[str]:
         """Return the new streams that are to be taken in by a later step."""
-        session_of = self._registry.fusion.session_of
+        session_of = self._streams.fusion.session_of
         new = [
             stream
             for stream, cached in looked.items()
@@ -372,7 +421,7 @@ class Intake:
             return {Input("detections"), Input("points")}
         wanted = {Input("discovery")} if discovering else set()
         for stream, cached in streams.items():
-            own = partition_of(self._registry.fusion.session_of(stream)) in received
+            own = partition_of(self._streams.fusion.session_of(stream)) in received
             if own:
                 wanted.add(Input("points", stream, cached))
             # What has no cache the discoverer has by its subscription to all.
@@ -382,13 +431,13 @@ class Intake:
 
     def _coming(self, streams: dict[str, bool], came: set[int], held: set[int]) -> list[str]:
         """Return the sessions that others may have received something of: those that came here, and new streams."""
-        session_of = self._registry.fusion.session_of
+        session_of = self._streams.fusion.session_of
         coming = {session_of(stream) for stream in streams if came and partition_of(session_of(stream)) in came}
         coming |= {
             session
             for stream, cached in streams.items()
             if not cached and stream not in self._known and not self._directory.announces(stream)
             and partition_of(session := session_of(stream)) in held
-            and self._registry.actor(session) is None
+            and self._streams.of(session) is None
         }  # fmt: skip
-        return sorted(coming | self._registry.untracked.of_partitions(came) if came else coming)
+        return sorted(coming | self._streams.held(came) if came else coming)

@@ -1,20 +1,30 @@
-"""Tracks of a time that has passed: from the log, or from what is kept for subscribers that come late.
+"""Answers to `q/tracks`: tracks of a range of stamps, from the log or from publishers' caches.
 
 Messages are given as they were published. Of a frame that was published several times the tracks that hold are given.
 """
 
 from __future__ import annotations
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 import optipmb_schemas as schemas
+import structlog
 
 from optipmb_service.runtime.ports import TransportError
+from optipmb_service.session.problems import problem_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from optipmb_service.cluster.log_reader import LogReader
+    from optipmb_service.runtime.ports import Request
+    from optipmb_service.runtime.recovery import Log
+
+log = structlog.get_logger("optipmb_service")
+
+AT_ONCE: Final = 16
+"""Queries that are answered at once; further ones are refused."""
 
 MOST: Final = 256
 """Frames of an answer, unless more have one stamp."""
@@ -23,53 +33,30 @@ MOST_BYTES: Final = 2**22
 """Bytes of an answer, but for its first stamp."""
 
 LATE_NS: Final = 5_000_000_000
-"""How much later in the log the tracks of a frame may be corrected; by stamps. Frames are inserted for a second."""
+"""Longest distance, by stamps, of a correction from the tracks of a frame. Frames are inserted for a second."""
 
 
-class Published(Protocol):
-    """Tracks as they were published, and what they are of."""
-
-    @property
-    def epoch(self) -> bytes:
-        """Epoch of the frame."""
+class _Published(Protocol):
+    """Tracks as they were published; the higher `order` of a frame holds."""
 
     @property
-    def seq(self) -> int:
-        """Number of the frame."""
-
+    def epoch(self) -> bytes: ...
     @property
-    def sensor(self) -> str:
-        """Whose frame it is, in a session of several sensors; else empty."""
-
+    def seq(self) -> int: ...
     @property
-    def stamp_ns(self) -> int:
-        """Stamp of the frame."""
-
+    def sensor(self) -> str: ...
     @property
-    def order(self) -> tuple[int, int]:
-        """Higher in the tracks of a frame that hold."""
-
+    def stamp_ns(self) -> int: ...
     @property
-    def payload(self) -> bytes:
-        """Their bytes."""
-
+    def order(self) -> tuple[int, int]: ...
     @property
-    def encoding(self) -> str:
-        """Their Zenoh encoding."""
-
-
-class KeptTracks(Protocol):
-    """Where tracks are kept."""
-
-    def find(self, stream: str, wanted: TracksRange, then: Callable[[str], None]) -> None:
-        """Put what is kept into a range, and call `then` with the reason when it cannot be read.
-
-        It is called on a thread that it must not keep.
-        """
+    def payload(self) -> bytes: ...
+    @property
+    def encoding(self) -> str: ...
 
 
 class TracksRange:
-    """The tracks with stamps from one to another, as many as an answer takes.
+    """Tracks with stamps from one to another, as many as an answer takes.
 
     Args:
         from_ns: first stamp.
@@ -87,9 +74,9 @@ class TracksRange:
         self._to_ns = to_ns
         self._most = most
         self._most_bytes = most_bytes
-        self._frames: dict[tuple[bytes, int, str], Published] = {}
+        self._frames: dict[tuple[bytes, int, str], _Published] = {}
 
-    def add(self, messages: Iterable[Published]) -> bool:
+    def add(self, messages: Iterable[_Published]) -> bool:
         """Take messages in the order of their publication; False: no later one belongs here."""
         latest_ns = 0
         for one in messages:
@@ -104,7 +91,7 @@ class TracksRange:
         self._cut()
         return self._to_ns is None or latest_ns <= self._to_ns + LATE_NS
 
-    def messages(self) -> list[Published]:
+    def messages(self) -> list[_Published]:
         """Return the messages by their stamps."""
         return sorted(self._frames.values(), key=lambda one: (one.stamp_ns, one.sensor, one.seq))
 
@@ -121,52 +108,6 @@ class TracksRange:
                 return
 
 
-class RecentTracks:
-    """What is kept for subscribers that come late: the newest tracks of those who track the stream now.
-
-    Args:
-        recent: returns what the caches hold for a stream, each message with its encoding.
-        limits: of messages.
-    """
-
-    def __init__(self, recent: Callable[[str], Sequence[tuple[bytes, str]]], limits: schemas.Limits) -> None:
-        self._recent = recent
-        self._limits = limits
-
-    def find(self, stream: str, wanted: TracksRange, then: Callable[[str], None]) -> None:
-        """Ask the caches."""
-        try:
-            found = [self._read(*one) for one in self._recent(stream)]
-        except TransportError as error:
-            then(str(error))
-            return
-        wanted.add(one for one in found if one is not None)
-        then("")
-
-    def _read(self, payload: bytes, encoding: str) -> _Recent | None:
-        try:
-            tracks = schemas.decode(payload, schemas.Tracks, encoding=encoding, limits=self._limits)
-        except schemas.MessageError:  # of somebody else
-            return None
-        frame = tracks.epoch, tracks.seq, tracks.sensor or "", tracks.stamp_ns
-        return _Recent(*frame, order_of(tracks), payload, encoding)
-
-
-class LoggedTracks:
-    """What is in the log.
-
-    Args:
-        reader: reads the log.
-    """
-
-    def __init__(self, reader: LogReader) -> None:
-        self._reader = reader
-
-    def find(self, stream: str, wanted: TracksRange, then: Callable[[str], None]) -> None:
-        """Read the log."""
-        self._reader.tracks(stream, max(0, wanted.from_ns - LATE_NS), wanted.add, then)
-
-
 class _Recent(NamedTuple):
     epoch: bytes
     seq: int
@@ -178,5 +119,129 @@ class _Recent(NamedTuple):
 
 
 def order_of(tracks: schemas.Tracks) -> tuple[int, int]:
-    """Return what is higher in the tracks of a frame that hold."""
+    """Return the order among the tracks of one frame: the highest hold."""
     return tracks.delivery.run if tracks.delivery else 0, tracks.revision
+
+
+class TrackQuery:
+    """Answers queries for tracks, on a thread that neither tracks nor sorts queries.
+
+    Args:
+        logged: the log, if there is one.
+        recent: returns what caches hold for a stream, each message with its encoding; asked where the log has nothing.
+        instance: name of the service.
+        limits: of messages.
+    """
+
+    def __init__(
+        self,
+        logged: Log | None,
+        recent: Callable[[str], Sequence[tuple[bytes, str]]],
+        instance: str,
+        limits: schemas.Limits,
+    ) -> None:
+        self._logged = logged
+        self._recent = recent
+        self._instance = instance
+        self._limits = limits
+        self._pool = ThreadPoolExecutor(1, "tracks")
+        self._room = threading.BoundedSemaphore(AT_ONCE)
+
+    def answer(self, request: Request, stream: str) -> None:
+        """Take a query; it is finished later."""
+        try:
+            asked = self._asked(request)
+        except schemas.MessageError as error:
+            self._finish(request, self._problem(error.code, stream, error.path, error.expected, error.received))
+            return
+        wanted = TracksRange(asked.from_ns, asked.to_ns)
+
+        def answer(failure: str) -> None:
+            self._pool.submit(self._answer, request, stream, asked, wanted, failure)
+
+        if self._logged is None:
+            answer("")
+        else:
+            from_ns = max(0, wanted.from_ns - LATE_NS)
+            self._pool.submit(self._guarded, stream, answer, self._logged.tracks, stream, from_ns, wanted.add, answer)
+
+    def _asked(self, request: Request) -> schemas.TracksRequest:
+        """Return what a query asks for, and take the room for its answer."""
+        asked, payload = schemas.TracksRequest(), request.payload
+        if payload:
+            asked = schemas.decode(payload, schemas.TracksRequest, encoding=request.encoding, limits=self._limits)
+        if asked.to_ns is not None and asked.to_ns < asked.from_ns:
+            raise schemas.MessageError("invalid_value", "to_ns", "`from_ns` or later", str(asked.to_ns))
+        if not self._room.acquire(blocking=False):
+            raise schemas.MessageError("too_large", "key", f"at most {AT_ONCE} such queries at a time", "more")
+        return asked
+
+    @staticmethod
+    def _guarded(stream: str, failed: Callable[[str], object], work: Callable[..., None], *arguments: object) -> None:
+        try:
+            work(*arguments)
+        except Exception as error:
+            log.exception("internal_error", stream=stream)
+            failed(f"{type(error).__name__}: {error}")
+
+    def _answer(
+        self, request: Request, stream: str, asked: schemas.TracksRequest, wanted: TracksRange, failure: str
+    ) -> None:
+        """Answer with what the log has, or caches where it knows nothing of the stream."""
+        failures = [failure] if failure else []
+        if not (failure or wanted.known):
+            self._guarded(stream, failures.append, self._add_recent, stream, wanted, failures)
+        self._room.release()
+        failure, last = "".join(failures), None
+        try:
+            for one in () if failure else wanted.messages():
+                request.answer_text(request.key, one.payload, one.encoding)
+            if not failure and wanted.cut_ns is None:
+                request.answer(request.key, asked)
+        except TransportError as error:
+            log.warning("reply_failed", key=request.key, error=str(error))
+        if failure:
+            last = self._problem("unlogged", stream, "", "a log that can be read", failure)
+        elif wanted.cut_ns is not None:
+            received = f"more, from the stamp {wanted.cut_ns} on"
+            last = self._problem("cut", stream, "", "as many tracks as one answer takes", received, wanted.cut_ns)
+        self._finish(request, last)
+
+    def _add_recent(self, stream: str, wanted: TracksRange, failures: list[str]) -> None:
+        try:
+            found = [self._read(*one) for one in self._recent(stream)]
+        except TransportError as error:
+            failures.append(str(error))
+        else:
+            wanted.add(one for one in found if one is not None)
+
+    def _read(self, payload: bytes, encoding: str) -> _Recent | None:
+        try:
+            tracks = schemas.decode(payload, schemas.Tracks, encoding=encoding, limits=self._limits)
+        except schemas.MessageError:  # of somebody else
+            return None
+        frame = tracks.epoch, tracks.seq, tracks.sensor or "", tracks.stamp_ns
+        return _Recent(*frame, order_of(tracks), payload, encoding)
+
+    def _finish(self, request: Request, problem: schemas.Problem | None) -> None:
+        try:
+            if problem is not None:
+                request.refuse(problem)
+        except TransportError as error:
+            log.warning("reply_failed", key=request.key, error=str(error))
+        finally:
+            request.finish()
+
+    def _problem(
+        self, code: str, stream: str, path: str, expected: str, received: str, stamp_ns: int | None = None
+    ) -> schemas.Problem:
+        return problem_of(
+            code,
+            stream=stream,
+            instance=self._instance,
+            path=path,
+            expected=expected,
+            received=received,
+            message=f"Query: {path or 'tracks'}: expected {expected}, received {received}.",
+            stamp_ns=stamp_ns,
+        )

@@ -12,10 +12,14 @@ service is `degraded`, and every interval tries again with the newest state.
 from __future__ import annotations
 
 import contextlib
+import os
+import re
+import tempfile
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Final, Protocol, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import structlog
 
@@ -26,14 +30,21 @@ from optipmb_service.session.checkpoint import Checkpoint, CheckpointError, deco
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from optipmb_service.cluster.member import Member
     from optipmb_service.cluster.store import LeaseStore
 
 log = structlog.get_logger("optipmb_service")
 
+DUMPS: Final = "quarantine"
+"""Folder of the dumps of sessions whose step raised."""
+
+DUMP_SUFFIX: Final = ".dump"
+MAX_DUMPS: Final = 32
+
 _T = TypeVar("_T")
 
 FAILED_NS: Final = 60 * 1_000_000_000
-"""How long after the last failure a stream's checkpoint is called failing; it is tried every second while it sends."""
+"""Time after the last failure for which a stream's checkpoint counts as failing."""
 
 DAY_S: Final = 86_400.0
 EXPIRE_EVERY_NS: Final = 3600 * 1_000_000_000
@@ -42,7 +53,7 @@ MAX_FAILED: Final = 1024
 """Streams whose failure is remembered."""
 
 SHOWN: Final = 3
-"""Of these, how many are named at once."""
+"""Failing streams that are named at once."""
 
 SETTLE_S: Final = 0.25
 """Between a checkpoint and its writing, time for the tracks to leave."""
@@ -60,156 +71,61 @@ PAUSE_S: Final = 0.003
 """Between two checkpoints that are encoded; less where there are so many that it would take half the interval."""
 
 
-class Persistence(Protocol):
-    """What the service needs of a checkpoint writer."""
-
-    @property
-    def failure(self) -> str:
-        """Why the store fails at present; empty while it does not."""
-
-    @property
-    def durable(self) -> bool:
-        """Whether what is put is there after a restart."""
-
-    @property
-    def written(self) -> int:
-        """Checkpoints written since the start."""
-
-    @property
-    def complete_ns(self) -> int | None:
-        """Monotonic time at which the store last had all that it should; None when nothing is to be kept."""
-
-    def start(self, gather: Callable[[], None]) -> None:
-        """Begin the rounds; `gather` has every session that changed give its checkpoint to `put`, soon."""
-
-    def put(self, checkpoint: Checkpoint, fence: int | None, then: Callable[[], None] | None = None) -> None:
-        """Have a checkpoint written under a fence, and `then` called when that was tried."""
-
-    def recall(
-        self,
-        stream: str,
-        restore: Callable[[Checkpoint], _T],
-        then: Callable[[_T | None], None],
-        refused: Callable[[CheckpointError], None] = lambda _: None,
-    ) -> None:
-        """Call `then` with what `restore` makes of the newest checkpoint of a stream, None without one.
-
-        `refused` is called before with the error of each that cannot be read. All are called on another thread, soon:
-        whoever tracks does not wait for the store.
-        """
-
-    def forget(self, stream: str) -> None:
-        """Drop what is still to be written for a stream: another instance goes on from what it has."""
-
-    def close(self, timeout: float) -> bool:
-        """Write what is pending and end; False when not all of it is written."""
-
-
-class NoPersistence:
-    """Keeps nothing.
-
-    Args:
-        failure: why nothing can be kept; empty when nothing is to be.
-    """
-
-    durable = False
-    written = 0
-
-    def __init__(self, failure: str = "") -> None:
-        self.failure = failure
-        self.complete_ns = time.monotonic_ns() if failure else None
-
-    def start(self, gather: Callable[[], None]) -> None:
-        """Do without rounds."""
-
-    def put(self, checkpoint: Checkpoint, fence: int | None, then: Callable[[], None] | None = None) -> None:
-        """Forget the checkpoint."""
-        del checkpoint, fence
-        if then is not None:
-            then()
-
-    def recall(
-        self,
-        stream: str,
-        restore: Callable[[Checkpoint], _T],
-        then: Callable[[_T | None], None],
-        refused: Callable[[CheckpointError], None] = lambda _: None,
-    ) -> None:
-        """Remember nothing."""
-        del stream, restore, refused
-        then(None)
-
-    def forget(self, stream: str) -> None:
-        """Nothing is to be written."""
-
-    def close(self, timeout: float) -> bool:
-        """Tell whether nothing was to be written."""
-        del timeout
-        return not self.failure
-
-
-class Leases(Protocol):
-    """What it needs of the member."""
-
-    def fence(self, stream: str) -> int | None:
-        """Return the fence of the lease under which a stream is tracked here; None without one."""
-
-    def may_write(self, stream: str, fence: int | None) -> bool:
-        """Whether what was made under a fence may be saved now."""
-
-
 class CheckpointWriter:
     """Writes and reads the checkpoints of one process.
 
     Args:
         store: where they go.
         interval_s: time between two rounds.
-        leases: says what may be written, and under which fence.
+        member: knows what may be written, and under which fence.
         report: called with a stream whose checkpoint cannot be made, and why.
         keep_s: age at which the checkpoints of a stream go; 0: never.
+        off: why none are kept, empty when none are to be; None: they are kept.
     """
-
-    durable = True
 
     def __init__(
         self,
         store: LeaseStore,
         interval_s: float,
-        leases: Leases,
+        member: Member,
         report: Callable[[str, str], None] = lambda *_: None,
         keep_s: float = 0.0,
+        off: str | None = None,
     ) -> None:
         self._keep_s = keep_s
         self._expires_ns = time.monotonic_ns()
         self._report = report
         self._store = store
+        self.durable = off is None
+        """Whether checkpoints are there after a restart."""
         self._interval_s = interval_s
         self._gather: Callable[[], None] = lambda: None
-        self._leases = leases
+        self._member = member
         self._lock = threading.Lock()
         self._pending: dict[str, tuple[Checkpoint, int | None]] = {}
         self._writing: dict[str, tuple[Checkpoint, int | None]] = {}
         self._thens: list[tuple[str, Callable[[], None]]] = []
-        self._reading = ThreadPoolExecutor(READ_AT_ONCE if store.remote else 1, "restore")
+        self._reading = ThreadPoolExecutor(READ_AT_ONCE if off is None and store.remote else 1, "restore")
         self._hurry = threading.Event()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="checkpoints", daemon=True)
         self._whole = True
-        self._store_failure = ""
+        self._store_failure = off or ""
         self._failed_streams: dict[str, tuple[int, str]] = {}
         self.written = 0
         """Checkpoints written since the start."""
-        self.complete_ns = time.monotonic_ns()
-        """When the store last had all that it should, monotonic."""
+        self.complete_ns = time.monotonic_ns() if off != "" else None
+        """Monotonic time at which the store last had all that it should; None when nothing is to be kept."""
 
     def start(self, gather: Callable[[], None]) -> None:
         """Begin the rounds."""
         self._gather = gather
-        self._thread.start()
+        if self.durable:
+            self._thread.start()
 
     @property
     def failure(self) -> str:
-        """Why the store, or the checkpoint of a stream, fails at present; empty while nothing does."""
+        """Present failure of the store, or of the checkpoint of a stream; empty while there is none."""
         if self._store_failure:
             return self._store_failure
         lately_ns = time.monotonic_ns() - FAILED_NS
@@ -222,6 +138,10 @@ class CheckpointWriter:
 
     def put(self, checkpoint: Checkpoint, fence: int | None, then: Callable[[], None] | None = None) -> None:
         """Have a checkpoint written in this round; with `then`, soon, and `then` called when that was tried."""
+        if not self.durable:
+            if then is not None:
+                then()
+            return
         with self._lock:
             self._pending[checkpoint.stream] = checkpoint, fence
             if then is not None:
@@ -236,7 +156,14 @@ class CheckpointWriter:
         then: Callable[[_T | None], None],
         refused: Callable[[CheckpointError], None] = lambda _: None,
     ) -> None:
-        """Read the newest checkpoint of a stream on a thread that does so, and go on there with `then`."""
+        """Call `then` with what `restore` makes of the newest checkpoint of a stream, None without one.
+
+        `refused` is called before with the error of each that cannot be read. All are called on another thread, soon:
+        the tracking thread does not wait for the store.
+        """
+        if not self.durable:
+            then(None)
+            return
 
         def read() -> None:
             restored = None
@@ -272,7 +199,7 @@ class CheckpointWriter:
 
         with self._lock:
             pending, fence = self._pending.get(stream) or self._writing.get(stream) or (None, None)
-        if pending is not None and fence == self._leases.fence(stream):
+        if pending is not None and fence == self._member.fence(stream):
             return restore(pending)
         while True:
             try:
@@ -285,7 +212,7 @@ class CheckpointWriter:
                 )
             except StoreError as error:
                 self._failed(error)
-                waits = self._store.remote and self._leases.fence(stream) is not None
+                waits = self._store.remote and self._member.fence(stream) is not None
                 if not waits or self._ended.wait(RETRY_S):
                     return None
 
@@ -295,6 +222,8 @@ class CheckpointWriter:
         Returns:
             Whether all is written that is still this member's.
         """
+        if not self.durable:
+            return not self._store_failure
         self._ended.set()
         self._hurry.set()
         self._reading.shutdown(wait=False, cancel_futures=True)
@@ -352,12 +281,12 @@ class CheckpointWriter:
             streams = {stream for stream, _ in thens} if waited_for else self._pending.keys()
             taken = self._writing = {stream: one for stream, one in self._pending.items() if stream in streams}
             self._pending = {stream: one for stream, one in self._pending.items() if stream not in streams}
-        mine = {stream: one for stream, one in taken.items() if self._leases.may_write(stream, one[1])}
+        mine = {stream: one for stream, one in taken.items() if self._member.may_write(stream, one[1])}
         # A lease that lapsed is renewed, or the stream is lost: until that is known its newest state is kept.
         lapsed = {
             stream: one
             for stream, one in taken.items()
-            if stream not in mine and one[1] == self._leases.fence(stream) is not None
+            if stream not in mine and one[1] == self._member.fence(stream) is not None
         }
         later = {} if self._ended.is_set() else lapsed
         try:
@@ -397,7 +326,7 @@ class CheckpointWriter:
         """Encode one after the other, with pauses between them.
 
         Encoding holds the interpreter's lock for a millisecond. Forty in a row are forty milliseconds in which frames
-        only get what the interpreter takes away from this thread; a pause gives the lock to whoever waits for it.
+        only get what the interpreter takes away from this thread; a pause gives the lock to threads that wait for it.
         """
         pause_s = 0.0 if self._ended.is_set() else min(PAUSE_S, self._interval_s / 2 / len(checkpoints))
         encoded = {}
@@ -428,3 +357,43 @@ class CheckpointWriter:
         if not self._store_failure:
             log.error("store_failed", error=str(error))
         self._store_failure = str(error)
+
+
+def save_dump(state: Path | None, stream: str, dump: bytes) -> str:
+    """Write a dump into the folder of the state, whole or not at all; of too many the oldest go.
+
+    Returns:
+        The file: the name of the stream and a number that counts up. Empty where nothing is kept or can be written.
+    """
+    if state is None:
+        return ""
+    try:
+        return str(_write_dump(state / DUMPS, stream, dump))
+    except OSError as error:
+        log.warning("store_failed", error=str(error))
+        return ""
+
+
+def _write_dump(folder: Path, stream: str, dump: bytes) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    number = 1 + max((_number_of(file) for file in folder.glob(f"*{DUMP_SUFFIX}")), default=0)
+    name = re.sub(r"[^A-Za-z0-9_.-]", "_", stream)
+    handle, temporary = tempfile.mkstemp(dir=folder)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(dump)
+            file.flush()
+            os.fsync(file.fileno())
+        target = folder / f"{name}-{number:06d}{DUMP_SUFFIX}"
+        Path(temporary).replace(target)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+    for old in sorted(folder.glob(f"*{DUMP_SUFFIX}"), key=_number_of)[:-MAX_DUMPS]:
+        old.unlink(missing_ok=True)
+    return target
+
+
+def _number_of(file: Path) -> int:
+    match = re.search(r"-(\d+)$", file.name.removesuffix(DUMP_SUFFIX))
+    return int(match[1]) if match else 0

@@ -1,4 +1,4 @@
-"""What the service needs of the network, as plain values and protocols; `transport` implements them over Zenoh."""
+"""Values and protocols between streams and the network; `transport` implements them over Zenoh."""
 
 from __future__ import annotations
 
@@ -6,13 +6,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Protocol
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
     import optipmb_schemas as schemas
 
 
 PACKET_BYTES: Final = 512
-"""What a message takes beside its payload, nearly."""
+"""Bytes of a message beside its payload, nearly."""
 
 
 @dataclass(slots=True)
@@ -27,6 +25,7 @@ class Packet:
         wall_ns: arrival by the wall clock, ns since 1970; only reported, never decided by.
         now_ns: arrival by the monotonic clock, ns.
         origin: what tells the stream: the key without its topic.
+        frame: whether it holds detections.
         held: bytes that it takes while it waits.
     """
 
@@ -37,32 +36,13 @@ class Packet:
     wall_ns: int
     now_ns: int
     origin: str = field(init=False)
+    frame: bool = field(init=False)
     held: int = field(init=False)
 
     def __post_init__(self) -> None:
-        self.origin = self.key.rpartition("/")[0]
+        self.origin, _, topic = self.key.rpartition("/")
+        self.frame = topic == "detections"
         self.held = PACKET_BYTES + (0 if self.payload is None else self.size)
-
-
-class Caches(Protocol):
-    """What publishers keep of their detections."""
-
-    def awaited(self, session: str, sensors: Iterable[str]) -> dict[str, bool]:
-        """Return the streams of a session whose caches may hold something, each with whether its publisher is there.
-
-        Args:
-            session: its name.
-            sensors: streams that were there before; their publishers may come back.
-        """
-
-    def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]], bool], None]) -> None:
-        """Call `then` soon, on a thread that it must not keep, with what the caches of a stream hold, all frames.
-
-        It is called, too, with whether all caches have answered in time.
-
-        Raises:
-            TransportError: the network is closed.
-        """
 
 
 class Publisher(Protocol):
@@ -75,16 +55,6 @@ class Publisher(Protocol):
         """Withdraw the publisher."""
 
 
-class MessageSink(Protocol):
-    """Where results go."""
-
-    def open_publisher(self, stream: str) -> Publisher:
-        """Open the publisher of a stream that this instance owns."""
-
-    def publish_problem(self, problem: schemas.Problem) -> None:
-        """Send a problem on its stream's key; never waits for a receiver."""
-
-
 class Request(Protocol):
     """A query that waits for its replies; every request must be finished, on any thread."""
 
@@ -94,14 +64,14 @@ class Request(Protocol):
 
     @property
     def payload(self) -> bytes | None:
-        """What was sent along."""
+        """The payload of the query."""
 
     @property
     def encoding(self) -> str:
         """The encoding of the payload."""
 
     def matches(self, key: str) -> bool:
-        """Tell whether the key expression that was asked includes a key."""
+        """Return whether the key expression that was asked includes a key."""
 
     def answer(self, key: str, message: schemas.Message) -> None:
         """Reply."""
@@ -113,7 +83,7 @@ class Request(Protocol):
         """Reply with an error."""
 
     def finish(self) -> None:
-        """Tell the asker that nothing follows."""
+        """End the replies."""
 
 
 class TransportError(Exception):

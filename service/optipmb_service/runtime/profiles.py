@@ -1,21 +1,24 @@
-"""Which parameters a stream is tracked with: the profiles that the settings name, chosen by patterns of stream names.
+"""Settings by stream name: its profile, and the session that it shares with others.
 
 All profiles are read once, at the start, so that a bad file ends the start and not a session. Over the network only
 these and the profiles that come with the tracker can be asked for, never a path.
+
+The sensors of a node that the setting `fuse` names share a session, `site/node/fused`: its tracks, queries, owner and
+checkpoint are found by that name, as if it were a stream's.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import optipmb_schemas as schemas
 
 import optipmb
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from optipmb_service.session.values import Steps
 
@@ -88,3 +91,39 @@ def _loaded(name: str) -> optipmb.Parameters:
     except schemas.MessageError as error:
         raise optipmb.ParameterError(f"profile {name}: name", error.expected, error.received) from error
     return parameters
+
+
+FUSED: Final = "fused"
+"""The sensor in the name of such a session."""
+
+
+@dataclass(frozen=True)
+class Fusion:
+    """Streams that share sessions.
+
+    Attributes:
+        patterns: of streams, `site/node/sensor`, each part with `*` for any text.
+    """
+
+    patterns: Sequence[str] = ()
+
+    def session_of(self, stream: str) -> str:
+        """Return the name of the session that a stream feeds: its own, or that of its node."""
+        if not self.patterns:
+            return stream
+        parts = tuple(stream.split("/"))
+        matched = any(_matches(parts, pattern) for pattern in self.patterns)
+        return f"{parts[0]}/{parts[1]}/{FUSED}" if matched else stream
+
+    def is_session(self, name: str) -> bool:
+        """Whether a name is that of a session of several streams; no sensor may have it."""
+        site, node, sensor = name.split("/")
+        return sensor == FUSED and any(_matches((site, node), pattern) for pattern in self.patterns)
+
+    def seen_by(self, name: str) -> str:
+        """Return the pattern of the streams whose detections belong to the tracks of a session, in Zenoh's words."""
+        return f"{name.rpartition('/')[0]}/*" if self.is_session(name) else name
+
+
+def _matches(parts: tuple[str, ...], pattern: str) -> bool:
+    return all(fnmatchcase(part, wanted) for part, wanted in zip(parts, pattern.split("/"), strict=False))

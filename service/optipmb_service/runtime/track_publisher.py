@@ -1,4 +1,4 @@
-"""The tracks of one stream on their way out: delivery, encoding, publisher, and what must wait for a write lease.
+"""Publication of a stream's tracks: delivery, encoding, publisher, and waiting for a write lease.
 
 Used by the tracking thread alone.
 """
@@ -6,7 +6,7 @@ Used by the tracking thread alone.
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 import structlog
 
@@ -15,10 +15,13 @@ from optipmb_service.runtime.ports import TransportError
 from optipmb_service.session.values import SECOND
 
 if TYPE_CHECKING:
-    from optipmb_service.observability.metrics import Metrics
-    from optipmb_service.observability.stream_meter import StreamMeter
-    from optipmb_service.runtime.ports import MessageSink, Publisher
+    from collections.abc import Callable
+
+    from optipmb_service.cluster.member import Member
+    from optipmb_service.runtime.ports import Publisher
     from optipmb_service.session.values import Tracked
+    from optipmb_service.telemetry.metrics import Metrics
+    from optipmb_service.telemetry.stream_meter import StreamMeter
 
 log = structlog.get_logger("optipmb_service")
 
@@ -27,18 +30,11 @@ MILLISECOND: Final = 1e6
 
 @record
 class Arrival:
-    """What is known of a frame's way when its tracks come out."""
+    """Times of a frame's arrival, and of its decoding."""
 
     wall_ns: int
     now_ns: int
     decode_ns: int
-
-
-class WriteLeaseHolder(Protocol):
-    """What it needs of the member."""
-
-    def may_write(self, stream: str, fence: int | None) -> bool:
-        """Whether what was made under a fence may be published now."""
 
 
 class TrackPublisher:
@@ -47,30 +43,30 @@ class TrackPublisher:
     Args:
         stream: `site/node/sensor`.
         instance: name of the service.
-        sink: the network.
-        meter: the figures of the stream, which count every publication.
-        metrics: the figures of the process, which do so too.
-        member: says whether the write lease holds; tracks wait while it does not.
+        open_publisher: opens the publisher of a stream.
+        meter: counts publications of the stream.
+        metrics: counts those of the process.
+        member: knows whether the write lease holds; tracks wait while it does not.
     """
 
     def __init__(
         self,
         stream: str,
         instance: str,
-        sink: MessageSink,
+        open_publisher: Callable[[str], Publisher],
         meter: StreamMeter,
         metrics: Metrics,
-        member: WriteLeaseHolder,
+        member: Member,
     ) -> None:
         self._stream = stream
         self._instance = instance
-        self._sink = sink
+        self._open_publisher = open_publisher
         self._meter = meter
         self._metrics = metrics
         self._member = member
         self._publisher: Publisher | None = None
         self.waiting: list[tuple[bytes, Arrival, int, int]] = []
-        """What waits for the write lease."""
+        """Encoded tracks that wait for the write lease."""
         self._ids = b""
         self._fence: int | None = None
 
@@ -78,7 +74,7 @@ class TrackPublisher:
         """Open the publisher, for what is made under a fence."""
         self._fence = fence
         try:
-            self._publisher = self._sink.open_publisher(self._stream)
+            self._publisher = self._open_publisher(self._stream)
         except TransportError as error:
             log.warning("publisher_failed", stream=self._stream, error=str(error))
 

@@ -17,8 +17,9 @@ import math
 import platform
 import traceback
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import fields, replace
 from importlib.metadata import version
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
@@ -42,6 +43,8 @@ GIVE_UP_NS: Final = SECOND
 
 MAX_TRACE: Final = 100_000
 
+_COUNTS: Final = tuple(field.name for field in fields(FrameCounts))
+_counts_in: Final = attrgetter(*_COUNTS)
 _OPENING: Final = frozenset({Verdict.NEW_EPOCH, Verdict.RESTART})
 
 
@@ -350,7 +353,12 @@ def _counted(state: FilterState, frame: ProcessedFrame, **more: int) -> FrameCou
     # In a session of several sensors each has its epochs; how one follows another follows from the frames before.
     succeeds = bool(frame_id.sensor) and state.sensor(frame_id.sensor).cursor.epoch not in {None, frame_id.epoch}
     more |= {"new_epochs": frame.place.opens in _OPENING or succeeds, "clouds_missed": frame.missed}
-    return replace(before, **{name: total(getattr(before, name), count) for name, count in more.items() if count})
+    counts = list(_counts_in(before))
+    for name, count in more.items():
+        if count:
+            at = _COUNTS.index(name)
+            counts[at] = total(counts[at], count)
+    return FrameCounts(*counts)
 
 
 def set_clock(density: optipmb.Density, stamp_ns: int) -> optipmb.Density:

@@ -3,7 +3,7 @@
 Conventions: payloads are bytes, keys are text. Rules that avoid Zenoh's known traps:
 
 - What a member receives of streams is handed over on the thread of Zenoh that brings it (`inputs`): what is called
-  there puts the message into a mailbox and does not wait. Queries, tokens, links and all other subscriptions have a
+  there puts the message into a backlog and does not wait. Queries, tokens, links and all other subscriptions have a
   channel each, which one thread always drains. It reads the channel, not the subscription: a subscription that is being
   read cannot be undeclared.
 - The callback of a subscription is given with something to read (`handles.directly`): with a callback alone Zenoh does

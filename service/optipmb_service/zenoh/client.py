@@ -22,7 +22,7 @@ from optipmb_service.zenoh.subscription import Subscription
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
     from optipmb_service.zenoh.handles import Putting
     from optipmb_service.zenoh.key_numbers import KeyCount
 

@@ -24,7 +24,7 @@ from optipmb_service.runtime.ports import TransportError
 from optipmb_service.zenoh import key_numbers
 
 if TYPE_CHECKING:
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
 
 WAIT_BEFORE_DROP_US: Final = 50_000
 WAIT_BEFORE_DROP_FRAGMENTS_US: Final = 500_000

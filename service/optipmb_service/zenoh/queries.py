@@ -11,7 +11,7 @@ import optipmb_schemas as schemas
 import zenoh
 
 from optipmb_service.runtime.ports import TransportError
-from optipmb_service.runtime.requests import problem_with
+from optipmb_service.runtime.queries import problem_with
 from optipmb_service.zenoh.connection import line
 from optipmb_service.zenoh.handles import Channel, directly
 

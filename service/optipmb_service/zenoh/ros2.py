@@ -23,7 +23,7 @@ from optipmb_service.zenoh.handles import Readers, undeclare
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
     from optipmb_service.zenoh.handles import Undeclared
 
 CHANNEL: Final = 1024

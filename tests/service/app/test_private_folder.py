@@ -8,14 +8,14 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from optipmb_service.app.private_folder import HELD, private_folder
+from optipmb_service.app.workers import HELD, private_folder
 
 if TYPE_CHECKING:
     import pytest
 
 HOLDS = """
 import sys
-from optipmb_service.app.private_folder import private_folder
+from optipmb_service.app.workers import private_folder
 
 with private_folder() as folder:
     print(folder, flush=True)

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from optipmb_service.app.ros2 import _Work
-from optipmb_service.settings.loading import load
+from optipmb_service.settings import load
 
 if TYPE_CHECKING:
     import pytest

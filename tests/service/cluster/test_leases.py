@@ -16,7 +16,7 @@ from nats_process import NatsProcess, NatsTrio
 from optipmb_service.cluster import member as members_module
 from optipmb_service.cluster import nats_connection
 from optipmb_service.cluster.jetstream import JetStream
-from optipmb_service.cluster.leases import LEFT_AT_ONCE, PARTITIONS, Change, WriteLease, partition_key, partition_of
+from optipmb_service.cluster.leases import LEFT_AT_ONCE, PARTITIONS, Change, partition_key, partition_of
 from optipmb_service.cluster.member import Member
 from optipmb_service.cluster.sqlite import SqliteStore
 from optipmb_service.cluster.store import ENDED, Fenced, Record, StoreError, Write
@@ -405,17 +405,6 @@ def test_a_full_disk_costs_no_lease(tmp_path: Path) -> None:
     assert [one.member._table.held for one in members] == held
     for store in stores:
         store.close()
-
-
-def test_a_write_lease_ends_by_itself() -> None:
-    """A write lease holds for its length after a renewal, and not at all before the first one or after a lapse."""
-    write_lease = WriteLease(SECOND)
-    assert not write_lease.valid(1)
-    write_lease.renew(5 * SECOND)
-    assert write_lease.valid(6 * SECOND - 1)
-    assert not write_lease.valid(6 * SECOND)
-    write_lease.lapse()
-    assert not write_lease.valid(5 * SECOND)
 
 
 def test_a_server_that_is_killed(tmp_path_factory: pytest.TempPathFactory) -> None:

@@ -10,12 +10,11 @@ from unittest.mock import AsyncMock, Mock
 import pytest
 from nats_process import NatsProcess
 from optipmb_schemas import Keys
-from optipmb_service.cluster import log_reader
+from optipmb_service.cluster import message_log
 from optipmb_service.cluster.log_position import Missed, Position
-from optipmb_service.cluster.log_reader import LogReader
-from optipmb_service.cluster.message_log import LogMessage, MessageLog, Retention
-from optipmb_service.runtime.fusion import Fusion
-from optipmb_service.runtime.missed_frames import LoggedFrames
+from optipmb_service.cluster.message_log import LogMessage, LogReader, MessageLog, Retention
+from optipmb_service.runtime.profiles import Fusion
+from optipmb_service.runtime.recovery import Log
 from optipmb_service.session.checkpoint import forgotten
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Policy
@@ -79,19 +78,19 @@ def test_the_newest_frames_are_given(filled: MessageLog, monkeypatch: pytest.Mon
     """All that came after a position, but no more than a session takes, nor what is older than of use."""
     reader = LogReader(filled, 0.0)
     assert missed(reader) == list(range(TRACKED + 1, FRAMES))
-    monkeypatch.setattr(log_reader, "MOST_FRAMES", 5)
+    monkeypatch.setattr(message_log, "MOST_FRAMES", 5)
     assert missed(reader) == list(range(FRAMES - 5, FRAMES))
-    monkeypatch.setattr(log_reader, "MOST_BYTES", 300)
+    monkeypatch.setattr(message_log, "MOST_BYTES", 300)
     assert missed(reader) == list(range(FRAMES - 3, FRAMES))
     monkeypatch.undo()
-    monkeypatch.setattr(log_reader, "OUTAGE_S", 0.0)
+    monkeypatch.setattr(message_log, "OUTAGE_S", 0.0)
     assert missed(reader) == [FRAMES - 1]
 
 
 def test_the_time_for_a_stream_begins_with_its_turn(filled: MessageLog, monkeypatch: pytest.MonkeyPatch) -> None:
     """A stream that waits until another one has used up its time is read all the same."""
-    monkeypatch.setattr(log_reader, "AT_ONCE", 1)
-    monkeypatch.setattr(log_reader, "READ_S", 2.0)
+    monkeypatch.setattr(message_log, "READ_AT_ONCE", 1)
+    monkeypatch.setattr(message_log, "READ_S", 2.0)
     since, stuck = filled.since, threading.Event()
 
     async def once_stuck(*what: Any) -> int | None:
@@ -115,7 +114,7 @@ def test_a_session_begins_whatever_the_log_says(filled: MessageLog, monkeypatch:
 
     found: list[Sequence[object]] = []
     monkeypatch.setattr(reader, "missed", Mock(side_effect=ValueError("a mistake")))
-    LoggedFrames(reader, Keys(), Fusion(())).fetch(STREAM, None, found.append, found.append)
+    Log(reader, Keys(), Fusion(())).fetch(STREAM, None, found.append, found.append)
     assert found == [[]]
 
 
@@ -130,7 +129,7 @@ def test_what_was_closed_does_not_come_back(filled: MessageLog) -> None:
         found.append(packets)
         came.set()
 
-    frames = LoggedFrames(LogReader(filled, 600.0), Keys(), Fusion(("a/*/*",)))
+    frames = Log(LogReader(filled, 600.0), Keys(), Fusion(("a/*/*",)))
     for checkpoint in (None, closed):
         came.clear()
         frames.fetch("a/b/fused", checkpoint, take, lambda _: None)

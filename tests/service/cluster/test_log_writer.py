@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 import structlog
 from nats_process import NatsProcess, NatsTrio, started
-from optipmb_service.app.nats import program
-from optipmb_service.cluster.log_writer import OVERHEAD, TRIES, LogWriter
-from optipmb_service.cluster.message_log import LogMessage, MessageLog, Retention
+from optipmb_service.app.cli import nats_server
+from optipmb_service.cluster.message_log import ALONE_TRIES, OVERHEAD, LogMessage, LogWriter, MessageLog, Retention
 from optipmb_service.cluster.nats_connection import RefusedError
 from router import until
 from routers import free_endpoint
@@ -103,7 +102,7 @@ def test_a_message_that_may_not_be_published_is_given_up(tmp_path: Path) -> None
             {{ user: one, password: one, permissions: {{ publish: {{ deny: "*.a.b.c" }} }} }}
         ] }}
     """)
-    server = program()
+    server = nats_server()
     assert server is not None
     process = started([server, "--config", str(file)], address, tmp_path / "nats.log")
     log = MessageLog([f"nats://one:one@{address}"], "optipmb")
@@ -149,8 +148,8 @@ def test_a_message_that_lets_no_other_be_written_is_given_up(log: MessageLog, mo
     until(writer.idle, "nothing waits")
     writer.close()
     assert (writer.written, writer.dropped) == (2 * ROOM - 1, 1)
-    assert tries.count(1) >= TRIES
-    assert len(tries) <= 3 * TRIES
+    assert tries.count(1) >= ALONE_TRIES
+    assert len(tries) <= 3 * ALONE_TRIES
 
 
 def test_servers_that_are_away_cost_no_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -172,7 +171,7 @@ def test_servers_that_are_away_cost_no_message(tmp_path: Path, monkeypatch: pyte
             nats.kill()
             for seq in range(1, ROOM):
                 writer.put(message(seq, 100))
-            until(lambda: len(asked) > 2 * TRIES, "it was tried more often than a message would be")
+            until(lambda: len(asked) > 2 * ALONE_TRIES, "it was tried more often than a message would be")
             nats.start()
             until(writer.idle, "all are written")
             assert (writer.written, writer.dropped, writer.failure) == (ROOM, 0, "")

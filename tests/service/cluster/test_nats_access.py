@@ -15,11 +15,11 @@ from lease_log import Alone
 from log_process import LogProcess
 from nats_process import started
 from optipmb_client import Connection, kept_tracks
-from optipmb_service.app.nats import program
+from optipmb_service.app.cli import nats_server
 from optipmb_service.cluster.jetstream import JetStream
-from optipmb_service.cluster.nats_access import NatsAccess
+from optipmb_service.cluster.nats_connection import access
 from optipmb_service.cluster.store import StoreError
-from optipmb_service.settings.loading import SettingsInvalidError, load
+from optipmb_service.settings import SettingsInvalidError, load
 from protected import MAKE, make
 from router import Node, Sensor, until
 from routers import free_endpoint, open_router
@@ -54,7 +54,7 @@ def serve(tmp_path: Path) -> Iterator[Serve]:
         file = tmp_path / f"{len(processes)}.conf"
         store = tmp_path / f"{len(processes)}"
         file.write_text(f'listen: "{address}"\njetstream {{ store_dir: "{store}" }}\n{more}\n')
-        server = program()
+        server = nats_server()
         assert server is not None
         processes.append(started([server, "--config", str(file)], address, tmp_path / "nats.log"))
         return address.replace("127.0.0.1", "localhost")
@@ -72,9 +72,9 @@ def protected(certificates: Path, *, asks: bool) -> str:
     return f"tls {{ {files}, verify: {json.dumps(asks)} }}\n"
 
 
-def keeps(server: str, access: NatsAccess | None) -> None:
+def keeps(server: str, options: dict[str, Any] | None) -> None:
     """A member that has this access keeps checkpoints there."""
-    store = JetStream([server], "test", access=access)
+    store = JetStream([server], "test", options=options)
 
     def kept() -> bool:
         try:
@@ -86,9 +86,9 @@ def keeps(server: str, access: NatsAccess | None) -> None:
     store.close(5.0)
 
 
-def refused(server: str, access: NatsAccess | None, why: str) -> None:
+def refused(server: str, options: dict[str, Any] | None, why: str) -> None:
     """Who has this access is not let in, and learns why; nothing secret is said."""
-    store, said = JetStream([server], "test", access=access), [""]
+    store, said = JetStream([server], "test", options=options), [""]
 
     def told() -> bool:
         with pytest.raises(StoreError) as error:
@@ -114,9 +114,9 @@ def test_certificates_are_looked_at_on_both_sides(certificates: Path, serve: Ser
     without = tmp_path / "without"
     without.mkdir()
     (without / "ca.pem").write_bytes((own / "ca.pem").read_bytes())
-    keeps(server, NatsAccess(own))
+    keeps(server, access(own))
     refused(server, None, "certificate verify failed")
-    refused(server, NatsAccess(without), "certificate required")
+    refused(server, access(without), "certificate required")
 
 
 @pytest.mark.parametrize(
@@ -132,9 +132,9 @@ def test_a_user_or_token_in_a_file(
     """One line in a file lets in, over TLS; another one does not, nor does none."""
     server = f"tls://{serve(protected(certificates, asks=False) + users)}"
     folder = certificates / "service" / "tracker"
-    keeps(server, NatsAccess(folder, file_of(tmp_path, "right", right)))
-    refused(server, NatsAccess(folder, file_of(tmp_path, "wrong", wrong)), "Authorization Violation")
-    refused(server, NatsAccess(folder), "Authorization Violation")
+    keeps(server, access(folder, file_of(tmp_path, "right", right)))
+    refused(server, access(folder, file_of(tmp_path, "wrong", wrong)), "Authorization Violation")
+    refused(server, access(folder), "Authorization Violation")
 
 
 def test_nothing_is_said_to_a_server_without_tls(tmp_path: Path) -> None:
@@ -152,8 +152,8 @@ def test_nothing_is_said_to_a_server_without_tls(tmp_path: Path) -> None:
 
         thread = threading.Thread(target=pose)
         thread.start()
-        access = NatsAccess(None, file_of(tmp_path, "user", "tracker:secret"))
-        store = JetStream([f"tls://127.0.0.1:{listener.getsockname()[1]}"], "test", access=access)
+        options = access(None, file_of(tmp_path, "user", "tracker:secret"))
+        store = JetStream([f"tls://127.0.0.1:{listener.getsockname()[1]}"], "test", options=options)
         thread.join(60.0)
         assert not thread.is_alive()
         store.close(5.0)
@@ -214,8 +214,8 @@ def test_credentials_of_a_user(certificates: Path, serve: Serve, tmp_path: Path)
         return file_of(tmp_path, name, text)
 
     folder = certificates / "service" / "tracker"
-    keeps(server, NatsAccess(folder, credentials("right", user.seed)))
-    refused(server, NatsAccess(folder, credentials("wrong", account.seed)), "Authorization Violation")
+    keeps(server, access(folder, credentials("right", user.seed)))
+    refused(server, access(folder, credentials("wrong", account.seed)), "Authorization Violation")
 
 
 def test_a_service_with_certificates_and_a_password(certificates: Path, serve: Serve, tmp_path: Path) -> None:
@@ -273,7 +273,7 @@ def test_what_is_wrong_is_said_in_one_line(certificates: Path, tmp_path: Path) -
             load(None, options)
     for text, why in (("two words", "one line"), ("-----BEGIN NATS USER JWT-----\nx\n-----END", "JWT and seed")):
         with pytest.raises(StoreError, match=f"^cluster_credentials: .*{why}"):
-            NatsAccess(None, file_of(tmp_path, "file", text)).options()
+            access(None, file_of(tmp_path, "file", text))
     file_of(tmp_path, "ca.pem", "no certificate")
     with pytest.raises(StoreError, match=r"^cluster_tls: "):
-        NatsAccess(tmp_path).options()
+        access(tmp_path)

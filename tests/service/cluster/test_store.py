@@ -12,9 +12,17 @@ from typing import TYPE_CHECKING
 
 import pytest
 from lease_log import Alone
-from optipmb_service.cluster.member_locks import MEMBERS
-from optipmb_service.cluster.sqlite import ASIDE, ENDED_KEPT, LEASES, PAGE_BYTES, SLICE, SLICE_BYTES, SqliteStore
-from optipmb_service.cluster.sqlite_file import LOG_BYTES
+from optipmb_service.cluster.sqlite import (
+    ASIDE,
+    ENDED_KEPT,
+    LEASES,
+    LOG_BYTES,
+    MEMBERS,
+    PAGE_BYTES,
+    SLICE,
+    SLICE_BYTES,
+    SqliteStore,
+)
 from optipmb_service.cluster.store import ENDED, StoreError, Write, load_newest
 
 if TYPE_CHECKING:

@@ -14,30 +14,28 @@ import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from optipmb_schemas import Keys, ServiceStatus
 from optipmb_service.app.health_command import ask
-from optipmb_service.http import KnownHosts, Server, application
+from optipmb_service.http import Server, application
 from optipmb_service.http.server import CONNECTIONS, REQUESTS
-from optipmb_service.observability.metrics import NAMESPACE, SERVICE_METRICS
 from optipmb_service.runtime.ports import HttpError
+from optipmb_service.telemetry.metrics import NAMESPACE, SERVICE_METRICS
 from optipmb_service.zenoh.taps import BURST
 from prometheus_client.parser import text_string_to_metric_families
 from router import Node, Sensor, until
 from routers import free_endpoint, open_router
 from service_process import ServiceProcess
-from starlette.responses import PlainTextResponse
-from starlette.routing import Route
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from concurrent.futures import Future
     from pathlib import Path
 
-    from starlette.requests import Request
 
 KEYS = Keys()
 SENSOR = Sensor()
@@ -55,6 +53,7 @@ class Said:
     age_s: float = 0.1
     now: str = "ready"
     why: str = ""
+    metrics: Any = field(default_factory=lambda: SimpleNamespace(text=lambda: b"one 1\n"))
 
     def failure(self) -> str:
         """As told."""
@@ -80,10 +79,6 @@ class Said:
         """Nothing."""
         return None
 
-    def text(self) -> bytes:
-        """One figure."""
-        return b"one 1\n"
-
 
 def get(address: str, path: str) -> tuple[int, str]:
     """Status and body of an answer."""
@@ -99,9 +94,9 @@ def get(address: str, path: str) -> tuple[int, str]:
 
 
 @contextmanager
-def served(source: Said, *routes: Route) -> Iterator[str]:
+def served(source: Any) -> Iterator[str]:
     """The application on a free port; gives its address."""
-    server = Server(KnownHosts(application(source, routes), ["tracker.example.org"]), "127.0.0.1:0")
+    server = Server(application(source, ["tracker.example.org"]), "127.0.0.1:0")
     try:
         yield server.address
     finally:
@@ -149,11 +144,10 @@ def test_health_follows_the_heartbeat() -> None:
 )
 def test_a_host_that_is_not_the_service_s_is_refused(host: str, status: int) -> None:
     """A name that a stranger lets point here gets no answer; addresses, plain names and those of the settings do."""
-    page = Route("/page", lambda _request: PlainTextResponse("a page"))
-    with served(Said(), page) as address:
+    with served(Said()) as address:
         name, _, port = address.rpartition(":")
         connection = http.client.HTTPConnection(name, int(port), timeout=10)
-        connection.request("GET", "/page", headers={"host": host})
+        connection.request("GET", "/", headers={"host": host})
         assert connection.getresponse().status == status
         connection.close()
 
@@ -191,17 +185,17 @@ def test_slow_requests_keep_no_probe_out() -> None:
     gate = threading.Event()
     hanging: list[Future[tuple[int, str]]] = []
 
-    def hang(_request: Request) -> PlainTextResponse:
+    def hang() -> bytes:
         gate.wait()
-        return PlainTextResponse("late", headers={"cache-control": "no-store"})
+        return b"late 1\n"
 
     def all_busy() -> bool:
         """Whether a further request is refused; one that took the place of a hanging request is made up for."""
         hanging[:] = [one for one in hanging if not one.done()]
-        hanging.extend(pool.submit(get, address, "/hang") for _ in range(REQUESTS - len(hanging)))
+        hanging.extend(pool.submit(get, address, "/metrics") for _ in range(REQUESTS - len(hanging)))
         return get(address, "/nothing")[0] == 503
 
-    with served(Said(), Route("/hang", hang)) as address, ThreadPoolExecutor(REQUESTS) as pool:
+    with served(Said(metrics=SimpleNamespace(text=hang))) as address, ThreadPoolExecutor(REQUESTS) as pool:
         try:
             until(all_busy, "all are busy")
             assert get(address, "/healthz")[0] == get(address, "/readyz")[0] == 200
@@ -224,24 +218,22 @@ def test_readiness_follows_the_state(state: str) -> None:
         assert get(address, "/healthz")[0] == 200
 
 
-def test_more_routes_are_served() -> None:
-    """Routes that are handed in are served beside its own; what nobody serves is 404."""
-
-    def page(_request: Request) -> PlainTextResponse:
-        return PlainTextResponse("a page", headers={"cache-control": "no-store"})
-
-    with served(Said(), Route("/", page)) as address:
-        assert get(address, "/") == (200, "a page")
+def test_what_nobody_serves_is_not_found() -> None:
+    """The page and the metrics are served at their paths; any other is 404."""
+    with served(Said()) as address:
+        assert get(address, "/")[1].startswith("<!")
         assert get(address, "/metrics") == (200, "one 1\n")
         assert get(address, "/nothing")[0] == 404
 
 
 def test_an_address_in_use_is_one_error() -> None:
     """A port that somebody listens on gives one line that names the address."""
+    source: Any = Said()
+    served_here = application(source)
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"127.0.0.1:{taken.getsockname()[1]}"
         with pytest.raises(HttpError, match=f"cannot listen on {address} for HTTP: Address already in use"):
-            Server(application(Said()), address)
+            Server(served_here, address)
         with ServiceProcess("--http", address) as service:
             assert service.wait_end() == 1
             assert service.errors.splitlines()[-1].startswith("optipmb-service: cannot listen on")

@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from optipmb_schemas import Detections, Pose, ServiceStatus, Tracks, encode, encode_json, encoding_of
-from optipmb_service.http import Server, page
-from optipmb_service.http.live import Newest, live_frame
-from optipmb_service.http.page import VIEWERS
+from optipmb_service.http import Server
+from optipmb_service.http.page import VIEWERS, Newest, live_frame, page
 from starlette.applications import Starlette
 
 if TYPE_CHECKING:

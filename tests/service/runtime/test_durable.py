@@ -15,13 +15,13 @@ import pytest
 import zenoh.ext
 from lease_log import Alone
 from optipmb_schemas import Keys, ServiceStatus, SessionState, encode
-from optipmb_service.app.clustering import STORE_FILE
-from optipmb_service.app.ending import longest_end_s
+from optipmb_service.app.lifecycle import longest_end_s
+from optipmb_service.app.storage import STORE_FILE
 from optipmb_service.cluster.leases import ALIVE, member_key
 from optipmb_service.cluster.sqlite import SqliteStore
 from optipmb_service.cluster.store import StoreError, Write
 from optipmb_service.runtime.persistence import CheckpointWriter
-from optipmb_service.runtime.stream_actor import StreamActor
+from optipmb_service.runtime.stream import Stream
 from optipmb_service.session.session import Session
 from router import Node, Sensor, plain, until
 
@@ -99,10 +99,10 @@ def test_a_closed_stream_that_moves_stays_closed(start: Callable[..., Any], tmp_
         node.send(*(SENSOR.detections(seq) for seq in range(5)))
         before = node.tracks(SENSOR.stream, 5)[-1]
         assert node.ask(KEYS.query(SENSOR.stream, "reset"), SessionState, b'{"close": true}').state == "closed"
-        until(lambda: not service._registry.waits(SENSOR.stream), "its state is kept")
-        service._registry.untracked.hold(SENSOR.stream)
-        service._registry.take_up(SENSOR.stream, [])
-        until(lambda: not service._registry.waits(SENSOR.stream), "it is taken up, and no session is there")
+        until(lambda: not service._streams.waits(SENSOR.stream), "its state is kept")
+        service._streams.hold(SENSOR.stream)
+        service._streams.take_up(SENSOR.stream, [])
+        until(lambda: not service._streams.waits(SENSOR.stream), "it is taken up, and no session is there")
         node.send(*(SENSOR.detections(seq) for seq in range(5, 10)))
         after = node.tracks(SENSOR.stream, 10)[-1]
     assert after.seq == 9
@@ -318,10 +318,10 @@ def test_overload_costs_the_stream_that_is_overloaded(start: Callable[..., Any])
     assert latency[SENSOR.stream] < latency[heavy.stream] / 2
 
 
-def parts_of(prefixes: tuple[str, ...]) -> list[StreamActor | Session]:
-    """Actors and sessions, of streams with these prefixes, that something still holds."""
-    parts = [one for one in gc.get_objects() if type(one) in {StreamActor, Session}]
-    return [one for one in parts if one.stream.startswith(prefixes)]
+def parts_of(prefixes: tuple[str, ...]) -> list[Stream | Session]:
+    """Streams and sessions, with these prefixes, that something still holds."""
+    parts = [one for one in gc.get_objects() if type(one) in {Stream, Session}]
+    return [one for one in parts if (one.name if isinstance(one, Stream) else one.stream).startswith(prefixes)]
 
 
 def test_many_streams_come_and_go(start: Callable[..., Any], tmp_path: Path) -> None:
@@ -351,7 +351,7 @@ def test_many_streams_come_and_go(start: Callable[..., Any], tmp_path: Path) -> 
 
     def all_gone() -> bool:
         service.housekeeping()
-        return len(parts_of(("first", "wave"))) <= 1  # the thread that tracks holds the actor that it ran last
+        return len(parts_of(("first", "wave"))) <= 1  # the thread that tracks holds the stream that it ran last
 
     until(all_gone, "no part of them is left", 20.0)
     # Of a closed session 300 bytes are remembered here, and about 5 kB in Zenoh, which forgets no key that a client has

@@ -7,19 +7,17 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import optipmb_service.runtime.awaited_caches
 import optipmb_service.runtime.directory
+import optipmb_service.runtime.recovery
 import pytest
 from fusing import FRONT, FUSED, REAR, drive
 from optipmb_schemas import Keys, SessionParameters, SessionState, Tracks, decode
 from optipmb_service.cluster.leases import partition_of
-from optipmb_service.runtime.fusion import Fusion
-from optipmb_service.runtime.mailbox import Mailbox
-from optipmb_service.runtime.ports import Packet
+from optipmb_service.runtime.profiles import Fusion
 from optipmb_service.session.checkpoint import digest_of
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import SECOND, Policy
-from optipmb_service.settings.loading import SettingsInvalidError, load
+from optipmb_service.settings import SettingsInvalidError, load
 from router import Node, Sensor, until
 from sessions import Merged, tracks
 
@@ -127,7 +125,7 @@ def test_a_sensor_that_is_heard_of_after_the_session_began_loses_no_frame(
 ) -> None:
     """While its token may be on its way, what a cache holds of another sensor goes no second ahead of its frames."""
     monkeypatch.setattr(optipmb_service.runtime.directory, "BACK_NS", 0)
-    monkeypatch.setattr(optipmb_service.runtime.awaited_caches, "BACK_NS", 600 * SECOND)
+    monkeypatch.setattr(optipmb_service.runtime.recovery, "BACK_NS", 600 * SECOND)
     frames = drive(40)
     service, endpoint = start(fuse=["site/node/*"], recovery_wait_s=60)
     with Node(endpoint) as node:
@@ -144,7 +142,7 @@ def test_a_sensor_that_is_heard_of_after_the_session_began_loses_no_frame(
         until(lambda: heard_of(REAR.stream) and reached(1), "the rear sensor is heard of")
         node.send(*(one for one in frames if one.stream == FRONT.stream))
         until(lambda: heard_of(FRONT.stream, REAR.stream), "the front sensor is heard of")
-        monkeypatch.setattr(optipmb_service.runtime.awaited_caches, "BACK_NS", 0)
+        monkeypatch.setattr(optipmb_service.runtime.recovery, "BACK_NS", 0)
         until(lambda: reached(80), "all are tracked")
         state = node.ask(KEYS.query(FUSED, "state"), SessionState)
     assert (state.digest, state.late, state.gaps) == (undisturbed_digest(frames), 0, 0)
@@ -190,29 +188,6 @@ def test_what_is_wrong_is_said_to_the_sensor(start: Callable[..., Any]) -> None:
         node.send_raw(KEYS.detections(FUSED), b"")  # the name of the tracks is none of a sensor
         until(lambda: node.ask(KEYS.query(FUSED, "state"), SessionState).frames >= 3, "nobody is harmed")
         assert not [key for key, _, _ in node.problems_seen.items if key == KEYS.problems(FRONT.stream)]
-
-
-def test_no_sensor_takes_the_room_of_another() -> None:
-    """A sensor that floods the mailbox loses its own frames and clouds, and what is lost is counted for it."""
-
-    def packet(origin: str, number: int, *, topic: str = "detections", size: int = 10) -> Packet:
-        return Packet(f"p/{origin}/{topic}", bytes(size), size, "", number, number)
-
-    box = Mailbox(3, 2, 4000)
-    box.offer_frame(packet("a/b/slow", 0))
-    box.offer_cloud(packet("a/b/slow", 0, topic="points"))
-    for number in range(9):
-        box.offer_frame(packet("a/b/fast", number))
-        box.offer_cloud(packet("a/b/fast", number, topic="points"))
-    box.offer_frame(packet("a/b/fast", 9, size=3000))
-    assert box.counts()[0] > 0
-    assert box.shed_since().keys() == {"p/a/b/fast"}
-    assert not box.shed_since()
-    taken = []
-    while (one := box.take()) is not None:
-        taken.append((one[0], getattr(one[1], "origin", "")))
-    assert {("frame", "p/a/b/slow"), ("cloud", "p/a/b/slow")} <= set(taken)
-    assert box.counts()[1] == 0
 
 
 def test_the_sensors_of_a_session_have_one_owner() -> None:

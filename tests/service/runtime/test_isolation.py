@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from lease_log import Alone
 from optipmb_schemas import (
     Detections,
@@ -24,21 +22,19 @@ from optipmb_schemas import (
     encode,
     encoding_of,
 )
-from optipmb_service.app.clustering import STORE_FILE
+from optipmb_service.app.storage import STORE_FILE
 from optipmb_service.cluster.leases import PARTITIONS
 from optipmb_service.cluster.member import Member
 from optipmb_service.cluster.sqlite import SqliteStore
-from optipmb_service.observability.health import ProcessHealth
-from optipmb_service.runtime import persistence, stream_queries
-from optipmb_service.runtime.byte_budget import ByteBudget
-from optipmb_service.runtime.mailbox import Mailbox
-from optipmb_service.runtime.missed_frames import NoLog
+from optipmb_service.runtime import persistence, queries
+from optipmb_service.runtime.backlog import Backlog
 from optipmb_service.runtime.persistence import CheckpointWriter
-from optipmb_service.runtime.ports import PACKET_BYTES, Packet
-from optipmb_service.runtime.takeover_buffer import TakeoverBuffer
+from optipmb_service.runtime.ports import Packet
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import MAX_COUNT, SECOND
-from optipmb_service.settings.tables import LimitSettings
+from optipmb_service.session.values import MAX_COUNT
+from optipmb_service.settings import LimitSettings
+from optipmb_service.telemetry.health import ProcessHealth
+from optipmb_service.telemetry.metrics import Metrics
 from router import Node, Sensor, until
 
 import optipmb
@@ -47,7 +43,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from optipmb_service.runtime.missed_frames import Take
+    from optipmb_service.runtime.recovery import Take
 
 
 KEYS = Keys()
@@ -160,13 +156,17 @@ def test_catching_up_from_the_log_keeps_no_other_waiting(
     missed, newest = 200, 203
     reached, gate, steps = threading.Event(), threading.Event(), []
 
-    def fetch(_: NoLog, session: str, checkpoint: object, first: Take, later: Take) -> None:
-        del checkpoint, later
-        frames = [CARELESS.detections(seq) for seq in range(missed if session == CARELESS.stream else 0)]
-        key, now_ns = KEYS.detections(session), time.monotonic_ns()
-        payloads = [encode(one) for one in frames]
-        encoding = encoding_of(Detections)
-        first([(Packet(key, one, len(one), encoding, time.time_ns(), now_ns), True) for one in payloads])
+    class Log:
+        def fetch(self, session: str, checkpoint: object, first: Take, later: Take) -> None:
+            del checkpoint, later
+            frames = [CARELESS.detections(seq) for seq in range(missed if session == CARELESS.stream else 0)]
+            key, now_ns = KEYS.detections(session), time.monotonic_ns()
+            payloads = [encode(one) for one in frames]
+            encoding = encoding_of(Detections)
+            first([Packet(key, one, len(one), encoding, time.time_ns(), now_ns) for one in payloads])
+
+        def close(self, timeout: float) -> None:
+            """Nothing is open."""
 
     class Noted:
         def __init__(self, parameters: optipmb.Parameters) -> None:
@@ -179,7 +179,7 @@ def test_catching_up_from_the_log_keeps_no_other_waiting(
                 assert gate.wait(60)
             return self._tracker.step(density, frame)
 
-    monkeypatch.setattr(NoLog, "fetch", fetch)
+    monkeypatch.setattr("optipmb_service.app.service.open_log", lambda _: Log())
     service, endpoint = start(tracker=Noted)
     with Node(endpoint) as node:
         node.send(CAREFUL.detections(0))
@@ -187,7 +187,7 @@ def test_catching_up_from_the_log_keeps_no_other_waiting(
         node.send(CARELESS.detections(missed))
         assert reached.wait(60)
         node.send(CAREFUL.detections(1), *(CARELESS.detections(seq) for seq in range(missed + 1, newest)))
-        queues = {CAREFUL.stream: 1, CARELESS.stream: 2}
+        queues = {CAREFUL.stream: 1, CARELESS.stream: 3}  # with the one that began its session
         until(lambda: {one.stream: one.queue for one in service.status().sessions} == queues, "frames wait")
         gate.set()
         assert [one.seq for one in node.tracks(CARELESS.stream, newest)] == list(range(newest))
@@ -209,7 +209,7 @@ def test_a_tracking_thread_that_is_stuck_is_not_healthy(start: Callable[..., Any
             return self._tracker.step(density, frame)
 
     service, endpoint = start(tracker=Stuck, stuck_s=1.0)
-    health = ProcessHealth("test")
+    health = ProcessHealth("test", Metrics())
     health.report(service)
     with Node(endpoint) as node:
         node.send(CARELESS.detections(0))
@@ -280,19 +280,19 @@ def test_a_stream_goes_on_when_its_lease_holds_again_in_the_middle_of_a_turn(
     start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A turn that has found the lease lapsed, and is asked for again before it takes messages, leaves none behind."""
-    lapsed, may_write, take = threading.Event(), Member.may_write, Mailbox.take
+    lapsed, may_write, take = threading.Event(), Member.may_write, Backlog.take
 
     def lapses(self: Member, stream: str, fence: int | None) -> bool:
         return not lapsed.is_set() and may_write(self, stream, fence)
 
-    def renewed_meanwhile(self: Mailbox, *, urgent: bool = False) -> Any:
+    def renewed_meanwhile(self: Backlog, *, urgent: bool = False) -> Any:
         if urgent:
             lapsed.clear()
-            assert not self.ring()
+            self.wake()
         return take(self, urgent=urgent)
 
     monkeypatch.setattr(Member, "may_write", lapses)
-    monkeypatch.setattr(Mailbox, "take", renewed_meanwhile)
+    monkeypatch.setattr(Backlog, "take", renewed_meanwhile)
     _, endpoint = start()
     with Node(endpoint) as node:
         node.send(CAREFUL.detections(0))
@@ -308,14 +308,14 @@ def test_a_question_about_the_state_keeps_no_frame_waiting(
 ) -> None:
     """The digest of a state, as a reset answers with it too, is made on a thread of its own: frames are tracked."""
     gate, asked = threading.Event(), threading.Event()
-    digest = stream_queries.digest_of
+    digest = queries.digest_of
 
     def slow(checkpoint: Any) -> str:
         asked.set()
         assert gate.wait(20)
         return digest(checkpoint)
 
-    monkeypatch.setattr(stream_queries, "digest_of", slow)
+    monkeypatch.setattr(queries, "digest_of", slow)
     _, endpoint = start()
     with Node(endpoint) as node, ThreadPoolExecutor(1) as asking:
         node.send(CAREFUL.detections(0))
@@ -420,43 +420,8 @@ def test_instances_without_a_common_store_are_told_of_each_other(start: Callable
         assert "`cluster`" in node.problem(CAREFUL.stream, "contested").expected
 
 
-@given(st.lists(st.tuples(st.integers(1, 50), st.booleans(), st.floats(0, 2)), max_size=60))
-def test_what_waits_for_a_takeover_is_bounded(arrivals: list[tuple[int, bool, float]]) -> None:
-    """By bytes over all streams and by age; what is left comes in order, clouds go before frames."""
-    most = 4 * PACKET_BYTES
-    budget = ByteBudget(most)
-    waiting = [TakeoverBuffer(5 * SECOND, budget), TakeoverBuffer(5 * SECOND, budget)]
-    now_s = 0.0
-    for number, (size, frame, pause_s) in enumerate(arrivals):
-        now_s += pause_s
-        waiting[number % 2].add(packet(size, now_s), frame=frame)
-        assert 0 <= budget.used <= most
-    for one in waiting:
-        one.trim(round(now_s * SECOND))
-        taken = one.take()
-        times = [entry.now_ns for entry, _ in taken]
-        assert times == sorted(times)
-        assert all(now_s * SECOND - at <= 5 * SECOND + 1 for at in times)
-        assert not one
-    assert budget.used == 0
-
-
-def test_clouds_go_first() -> None:
-    """When there is no room a stream gives up its clouds, then its oldest frames."""
-    one = TakeoverBuffer(5 * SECOND, ByteBudget(6 * PACKET_BYTES))
-    for number in range(5):
-        one.add(packet(10, number / 10), frame=True)
-        one.add(packet(30, number / 10), frame=False)
-    assert sum(frame for _, frame in one.take()) == 5
-
-
-def packet(size: int, at_s: float) -> Packet:
-    """A packet that arrived at a time."""
-    return Packet("k", bytes(size), size, "", 0, round(at_s * SECOND))
-
-
 def test_messages_that_wait_are_bounded_in_bytes(start: Callable[..., Any]) -> None:
-    """A hundred messages of 1 MB while a step does not end: the mailbox keeps what it may, the rest is shed."""
+    """A hundred messages of 1 MB while a step does not end: the queue keeps what it may, the rest is shed."""
     gate, entered = threading.Event(), threading.Event()
 
     class Waits:
@@ -469,18 +434,18 @@ def test_messages_that_wait_are_bounded_in_bytes(start: Callable[..., Any]) -> N
             return self._tracker.step(density, frame)
 
     service, endpoint = start(tracker=Waits, stream_mb=16, memory_mb=16)
-    mailboxes = service._registry._mailboxes
+    queued = service._streams.queued
     with Node(endpoint) as node:
         node.send(CARELESS.detections(0))
         assert entered.wait(20)
         for number in range(100):
             node.send_raw(KEYS.detections(CARELESS.stream), bytes([number]) * 2**20)
-        until(lambda: mailboxes.used > 2 * 2**20, "they came")
+        until(lambda: queued.used > 2 * 2**20, "they came")
         node.send(CARELESS.detections(1))
-        assert mailboxes.used <= 4 * 2**20
+        assert queued.used <= 4 * 2**20
         gate.set()
         node.tracks(CARELESS.stream, 2)
-        until(lambda: mailboxes.used == 0, "all is worked off")
+        until(lambda: queued.used == 0, "all is worked off")
     assert service.status().shed > 0
 
 
@@ -489,7 +454,7 @@ def test_the_first_frames_of_many_new_streams_wait_for_room(
 ) -> None:
     """Three times as many streams as may be new at once begin while a step does not end: each is tracked afterwards."""
     gate, entered, most = threading.Event(), threading.Event(), 16
-    monkeypatch.setattr("optipmb_service.runtime.actor_table.MAX_UNPROVEN_ACTORS", most)
+    monkeypatch.setattr("optipmb_service.runtime.streams.MAX_UNPROVEN", most)
 
     class Waits:
         def __init__(self, parameters: optipmb.Parameters) -> None:
@@ -501,28 +466,13 @@ def test_the_first_frames_of_many_new_streams_wait_for_room(
             return self._tracker.step(density, frame)
 
     service, _ = start(tracker=Waits)
-    registry = service._registry
+    streams = service._streams
     for sensor in [CARELESS, *(Sensor(f"s{number}/node/lidar") for number in range(3 * most))]:
         now_ns, payload = time.monotonic_ns(), encode(sensor.detections(0))
         key = KEYS.detections(sensor.stream)
-        registry.frame(Packet(key, payload, len(payload), encoding_of(Detections), time.time_ns(), now_ns))
+        streams.receive(Packet(key, payload, len(payload), encoding_of(Detections), time.time_ns(), now_ns))
         assert entered.wait(60)
     gate.set()
     until(lambda: service.status().frames == 1 + 3 * most, "all are tracked")
     status = service.status()
-    assert (status.refused, status.shed, len(registry.actors())) == (0, 0, 1 + 3 * most)
-
-
-def test_a_mailbox_gives_back_what_it_took() -> None:
-    """Frames and clouds beyond the bytes go, the oldest clouds first; what is larger than all is not taken."""
-    budget = ByteBudget(10 * PACKET_BYTES)
-    mailbox = Mailbox(100, 100, 6 * PACKET_BYTES, budget)
-    for number in range(4):
-        mailbox.offer_cloud(Packet("key", b"", 0, "", number, 0))
-    for number in range(4):
-        mailbox.offer_frame(Packet("key", b"", 0, "", number, 0))
-    assert (mailbox.shed_clouds, mailbox.shed_frames, budget.used) == (2, 0, 6 * PACKET_BYTES)
-    large = bytes(7 * PACKET_BYTES)
-    mailbox.offer_frame(Packet("key", large, len(large), "", 9, 0))
-    assert (mailbox.shed_clouds, mailbox.shed_frames, budget.used) == (4, 5, 0)
-    assert mailbox.take() is None
+    assert (status.refused, status.shed, len(streams.tracking())) == (0, 0, 1 + 3 * most)

@@ -17,10 +17,11 @@ from nats_process import NatsProcess
 from optipmb_client import Connection, ServiceRefused, ServiceUnavailable, kept_tracks
 from optipmb_client.table_files import read_table
 from optipmb_schemas import Keys, Limits, Tracks, TracksRequest, decode, encode, encoding_of
-from optipmb_service.cluster.log_reader import LogReader
-from optipmb_service.cluster.message_log import MessageLog
-from optipmb_service.runtime import track_query
-from optipmb_service.runtime.kept_tracks import LATE_NS, LoggedTracks, RecentTracks, TracksRange
+from optipmb_service.cluster.message_log import LogReader, MessageLog
+from optipmb_service.runtime import kept_tracks as service_tracks
+from optipmb_service.runtime.kept_tracks import LATE_NS, TracksRange
+from optipmb_service.runtime.profiles import Fusion
+from optipmb_service.runtime.recovery import Log
 from router import Node, Sensor, plain, until
 from routers import free_endpoint, open_client, open_router
 
@@ -154,11 +155,11 @@ def test_an_answer_that_breaks_off_is_an_error(payload: bytes) -> None:
 
 def test_a_search_that_fails_takes_no_room(monkeypatch: pytest.MonkeyPatch) -> None:
     """A query that fails by an error that nobody foresaw is answered, and so is the next."""
-    monkeypatch.setattr(track_query, "AT_ONCE", 1)
+    monkeypatch.setattr(service_tracks, "AT_ONCE", 1)
     kept, refused = Mock(), queue.SimpleQueue[Any]()
-    kept.find.side_effect = ValueError("a mistake")
-    query = track_query.TrackQuery([kept], "test", Limits())
-    for _ in range(track_query.AT_ONCE + 1):
+    kept.tracks.side_effect = ValueError("a mistake")
+    query = service_tracks.TrackQuery(kept, Mock(), "test", Limits())
+    for _ in range(service_tracks.AT_ONCE + 1):
         query.answer(Mock(payload=b"", refuse=refused.put), SENSOR.stream)
         problem = refused.get(timeout=60.0)
         assert (problem.code, problem.received) == ("unlogged", "ValueError: a mistake")
@@ -176,8 +177,7 @@ def test_caches_that_do_not_answer_keep_nothing_of_the_log_waiting(tmp_path: Pat
     with NatsProcess(tmp_path) as nats:
         reader = LogReader(log := MessageLog([nats.url], KEYS.prefix), 1.0)
         until(lambda: not log.connection.failure, "it is connected")
-        kept = [LoggedTracks(reader), RecentTracks(recent, Limits())]
-        query = track_query.TrackQuery(kept, "test", Limits())
+        query = service_tracks.TrackQuery(Log(reader, KEYS, Fusion()), recent, "test", Limits())
         try:
             query.answer(Mock(payload=b"", finish=finished.set), SENSOR.stream)
             assert asked.wait(60.0)
@@ -192,7 +192,7 @@ def test_the_client_asks_part_by_part(
     start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """`kept_tracks` and `optipmb tracks` give all frames of a range, however few an answer takes."""
-    monkeypatch.setattr(track_query, "TracksRange", partial(TracksRange, most=3))
+    monkeypatch.setattr(service_tracks, "TracksRange", partial(TracksRange, most=3))
     _, endpoint = start()
     with Node(endpoint) as node, Connection(endpoint) as connection:
         node.send(*(SENSOR.detections(seq) for seq in range(10)))

@@ -5,8 +5,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any
 
-from optipmb_service.runtime.missed_frames import NoLog
-from registries import Around, packet_of, registry_of
+from registries import Around, packet_of, streams_of
 from router import Sensor
 
 if TYPE_CHECKING:
@@ -18,11 +17,15 @@ SENSORS = [Sensor(stream=f"yard/{number}/lidar") for number in range(100)]
 LEASE_NS = 2 * 10**9
 
 
-class Log(NoLog):
+class Log:
     """A log with nothing new, whose answers come when they are asked for."""
 
     def __init__(self) -> None:
         self.asked: list[tuple[str, Callable[[list[Any]], None]]] = []
+
+    def fetch(self, _: str, __: object, first: Callable[[list[Any]], None], ___: object) -> None:
+        """Have nothing at the start."""
+        first([])
 
     def look(self, checkpoint: Checkpoint, then: Callable[[list[Any]], None]) -> None:
         """Take a question."""
@@ -32,18 +35,18 @@ class Log(NoLog):
 def test_many_silent_streams_read_the_log_a_few_at_a_time() -> None:
     """Each of them has its turn, and reads seldom while it is silent for long; one that has frames reads none."""
     around, log = Around(), Log()
-    registry = registry_of(around, missed=log, cluster=("nats://127.0.0.1:1",), lease_s=2)
+    streams = streams_of(around, log=log, cluster=("nats://127.0.0.1:1",), lease_s=2)
     now_ns = time.monotonic_ns()  # before the frames, however long it takes to track them
     for sensor in SENSORS:
-        registry.frame(packet_of(sensor.detections(0)))
+        streams.receive(packet_of(sensor.detections(0)))
     around.run()
-    registry.sweep(now_ns + 10**9)
+    streams.sweep(now_ns + 10**9)
     around.run()
     assert not log.asked
     most, seen, reads = 0, set(), 0
     for _ in range(400):
         now_ns += LEASE_NS
-        registry.sweep(now_ns)
+        streams.sweep(now_ns)
         around.run()
         most, reads = max(most, len(log.asked)), reads + len(log.asked)
         seen |= {stream for stream, _ in log.asked}

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import optipmb_schemas as schemas
 import pytest
-from optipmb_service.runtime.byte_budget import MEGABYTE
-from optipmb_service.runtime.sweep import Sweep
+from optipmb_service.runtime.backlog import MEGABYTE
 from optipmb_service.session.session import Session
 from optipmb_service.session.state import size_of
 from optipmb_service.zenoh.transport import TRACKS_CACHE
+from registries import Around, streams_of
 from router import Node, Sensor
 from service_process import ServiceProcess
 
@@ -85,13 +85,13 @@ def test_sessions_that_keep_little_are_not_closed_for_memory() -> None:
     """Beyond the memory sessions are closed, the least recently used first, but for those that keep next to nothing."""
     kept_mb = [0.0, 0.01, 6.0, 0.2, 4.0, 9.0]  # the least recently used first; 10 MB may be kept
     named = zip(map(str, range(6)), kept_mb, strict=True)
-    actors: Any = [
-        SimpleNamespace(stream=name, held_bytes=round(mb * MEGABYTE), meter=SimpleNamespace(active_ns=int(name)))
+    streams: Any = [
+        SimpleNamespace(name=name, held_bytes=round(mb * MEGABYTE), meter=SimpleNamespace(active_ns=int(name)))
         for name, mb in named
     ]
-    closed, settings = list[str](), SimpleNamespace(stale_s=1.0, idle_s=1.0, memory_mb=20, cluster=())
-    parts: Any = settings, None, None, None, lambda stream, *_, **__: closed.append(stream), lambda *_: None
-    Sweep(*parts)._evict(actors)
+    closed, table = list[str](), streams_of(Around(), memory_mb=20)
+    table.command = lambda name, *_, **__: closed.append(name)  # type: ignore[assignment,method-assign,func-returns-value]
+    table._evict(streams)
     assert closed == ["2", "3", "4"]
 
 

@@ -5,24 +5,21 @@ from __future__ import annotations
 import random
 import time
 from collections import Counter
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from optipmb_schemas import Keys
 from optipmb_service.cluster.leases import PARTITIONS, Change, partition_of
-from optipmb_service.runtime import directory
-from optipmb_service.runtime.actor_table import ActorTable
-from optipmb_service.runtime.byte_budget import ByteBudget
-from optipmb_service.runtime.fusion import Fusion
+from optipmb_service.runtime import directory, streams
+from optipmb_service.runtime.backlog import UNASKED_NS
 from optipmb_service.runtime.intake import ALL, NEW_STREAMS, Intake
 from optipmb_service.runtime.ports import Packet, TransportError
-from optipmb_service.runtime.registry import Registry
-from optipmb_service.runtime.sweep import Sweep
-from optipmb_service.runtime.takeover_buffer import UNASKED_NS, TakeoverBuffer
-from optipmb_service.runtime.untracked import UntrackedMessages
+from optipmb_service.runtime.profiles import Fusion
 from optipmb_service.session.values import SECOND
-from router import until
+from registries import Around, packet_of, streams_of
+from router import Sensor, until
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -117,23 +114,25 @@ class Holding:
 
 def member_of(network: Network, held: set[int]) -> tuple[Intake, Any]:
     """Return the intake of a member that holds some partitions and tracks nothing yet."""
-    registry = SimpleNamespace(
+    streams = SimpleNamespace(
         on_owner=lambda: None,
         doubts_owners=False,
         instance="m",
         keys=KEYS,
         fusion=Fusion(),
-        frame=None,
-        cloud=None,
+        receive=None,
         passed_by=None,
-        caches_answered=None,
-        actor=lambda _: None,
-        untracked=UntrackedMessages(lambda _: True, lambda: TakeoverBuffer(0, ByteBudget(0)), lambda *_: None),
+        cache_answered=None,
+        of=lambda _: None,
+        held=lambda _: set(),
+        expect=lambda _: None,
+        hold=lambda _: None,
+        forget_caches=lambda _: None,
         take_up=lambda *_: None,
         changed=lambda *_: None,
     )
-    untyped: Any = registry, Holding(held), network
-    return Intake(*untyped, standby=False, linger_s=10.0, idle_s=3600.0), registry
+    untyped: Any = streams, Holding(held), network
+    return Intake(*untyped, standby=False, linger_s=10.0, idle_s=3600.0), streams
 
 
 class Turning:
@@ -244,9 +243,9 @@ def test_subscriptions_are_those_of_who_begins_now(monkeypatch: pytest.MonkeyPat
     chance = random.Random(seed)
     held = set(range(PARTITIONS if seed == 0 else 30))
     network = Following()
-    intake, registry = member_of(network, held)
+    intake, member = member_of(network, held)
     answered = set[str]()
-    registry.untracked.forget_caches = answered.intersection_update
+    member.forget_caches = answered.intersection_update
     seen = set()
     for _ in range(300):
         for stream in chance.sample(STREAMS[:60], chance.randrange(5)):
@@ -280,11 +279,11 @@ def test_subscriptions_are_those_of_who_begins_now(monkeypatch: pytest.MonkeyPat
 def test_a_step_that_fails_is_done_again(monkeypatch: pytest.MonkeyPatch, fails: str) -> None:
     """Sessions that are held while their streams come here are taken up, whatever raised in between."""
     network, held = Network(announced=STREAMS[:5], published=STREAMS[5:10]), set[int]()
-    intake, registry = member_of(network, held)
+    intake, member = member_of(network, held)
     kept, taken, failed = set[str](), set[str](), list[str]()
-    registry.untracked.hold = kept.add
-    registry.take_up = lambda session, _: (kept.discard(session), taken.add(session))
-    where: Any = registry if fails == "take_up" else network
+    member.hold = kept.add
+    member.take_up = lambda session, _: (kept.discard(session), taken.add(session))
+    where: Any = member if fails == "take_up" else network
     works = getattr(where, fails)
 
     def failing(*arguments: Any, **named: Any) -> object:
@@ -305,158 +304,134 @@ def test_a_step_that_fails_is_done_again(monkeypatch: pytest.MonkeyPatch, fails:
         intake.close(WAIT_S)
 
 
-@pytest.mark.parametrize("new", [True, False], ids=["new", "known"])
-def test_the_first_frame_of_a_new_stream_is_kept_until_it_is_asked_for(*, new: bool) -> None:
-    """What a new stream sent is kept beyond the usual time until its member has asked; no other stream's is."""
-    budget, keep_ns = ByteBudget(1 << 20), 10 * SECOND
-    untracked = UntrackedMessages(lambda _: False, lambda: TakeoverBuffer(keep_ns, budget), lambda *_: None)
-    stream, at_ns = STREAMS[0], 0
-    if new:
-        untracked.expect(stream)
-    assert untracked.keep(stream, Packet(KEYS.detections(stream), b"1", 1, "", at_ns, at_ns), frame=True)
-    untracked.trim(UNASKED_NS, 3600 * SECOND)
-    assert len(untracked.recent([stream])) == new
-    untracked.trim(keep_ns + 1, 3600 * SECOND)
-    assert not untracked.recent([stream])
+class Others(Around):
+    """Everything around the streams of a member that may hold none, and whose lease may be renewed late."""
 
+    def __init__(self) -> None:
+        super().__init__()
+        self.holding = True
+        self.problems: list[str] = []
 
-class Streams(ActorTable):
-    """The actors of a member, of which none is made."""
+    def holds(self, _: str) -> bool:
+        """Return whether this member has the streams."""
+        return self.holding
 
-    def __init__(self, kept: Kept) -> None:
-        none: Any = SimpleNamespace()
-        super().__init__(none, none, none)
-        self._kept = kept
-
-    def has_room(self) -> bool:
-        """Whether another stream may be new: as the test says."""
-        return not self._kept.crowded
-
-    def offer(self, *_: object, **__: object) -> bool:
-        """Take it, or not."""
-        return self.has_room()
+    def report(self, problem: Any, _: int) -> None:
+        """Note a problem."""
+        self.problems.append(problem.code)
 
 
 class Kept:
-    """The registry of a member, with what it keeps, and the quotas and counters that this concerns."""
+    """The streams of a member that has room for no new ones."""
 
-    def __init__(self, standby: int = 1 << 20, keep_ns: int = 10 * SECOND) -> None:
-        registry: Any = Registry.__new__(Registry)
-        budget = ByteBudget(standby)
-        self.registry, self.crowded, self.holds = registry, True, True
-        self.metrics: Counter[str] = Counter()
-        self.problems: list[str] = []
-        self.offered: list[list[Packet]] = []
-        registry._actors = Streams(self)
-        registry._member = SimpleNamespace(holds=lambda _: self.holds, strained=False)
-        registry.untracked = UntrackedMessages(
-            lambda _: self.holds, lambda: TakeoverBuffer(keep_ns, budget), registry._lose
-        )
-        registry._report = lambda code, *_: self.problems.append(code)
-        settings: Any = SimpleNamespace(idle_s=3600.0, stale_s=3600.0, memory_mb=1, cluster=())
-        registry._sweep = Sweep(
-            settings, registry._actors, registry._member, registry.untracked, registry.command, registry._report
-        )
-        registry._take_up = lambda _, packets, __: self.offered.append([packet for packet, _ in packets])
-        registry._rivals = SimpleNamespace(contested=lambda *_: [])
-        registry._admission = SimpleNamespace(exceeded=lambda *_: self.exceeded)
-        self.exceeded = ""
-        registry._metrics = SimpleNamespace(
-            received=lambda topic, _: self.metrics.update([f"received {topic}"]),
-            foreign=lambda topic, _: self.metrics.update([f"foreign {topic}"]),
-        )
-        registry.parsed = lambda key: (key, key)
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, **settings: Any) -> None:
+        self.others = Others()
+        self._patch = monkeypatch
+        self.crowded(True)
+        self.streams = streams_of(self.others, reporter=self.others, **settings)
+
+    def crowded(self, crowded: bool) -> None:  # noqa: FBT001 - the state itself
+        """Say whether too many streams are new."""
+        self._patch.setattr(streams, "MAX_UNPROVEN", 0 if crowded else 256)
+
+    def tracked(self) -> list[int]:
+        """Return the counts of frames, by session, after all turns."""
+        self.others.run()
+        return [state.frames for one in self.streams.tracking() if (state := one.state()) is not None]
 
 
-def detections(number: int, size: int = 10) -> Packet:
-    """Return a packet of a stream, its own by the number."""
-    return Packet(STREAMS[0], bytes([number]) * size, size, "", number, time.monotonic_ns())
+SENSOR = Sensor(STREAMS[0])
 
 
-def test_what_others_received_reaches_a_stream_that_was_let_in() -> None:
+def detections(number: int) -> Packet:
+    """Return a frame of a stream."""
+    return packet_of(SENSOR.detections(number))
+
+
+def test_what_others_received_reaches_a_stream_that_was_let_in(monkeypatch: pytest.MonkeyPatch) -> None:
     """A stream that is let in while others are asked for what they received of it gets that as well."""
-    kept = Kept()
-    kept.registry.frame(detections(0))
-    kept.crowded = False
-    kept.registry._let_in()
-    found = [(detections(1), True), (detections(2), True)]
-    kept.registry.take_up(STREAMS[0], found)
-    assert [packet.wall_ns for offered in kept.offered for packet in offered] == [0, 1, 2]
+    kept = Kept(monkeypatch)
+    kept.streams.receive(detections(0))
+    assert kept.tracked() == []
+    kept.crowded(False)
+    kept.streams.sweep(0)
+    kept.streams.take_up(STREAMS[0], [detections(1), detections(2)])
+    assert kept.tracked() == [3]
 
 
-def test_a_stream_that_the_intake_holds_is_not_let_in() -> None:
+def test_a_stream_that_the_intake_holds_is_not_let_in(monkeypatch: pytest.MonkeyPatch) -> None:
     """A stream that the intake holds while room is made stays held until the intake has asked the others."""
-    kept = Kept()
-    kept.registry.frame(detections(0))
-    kept.crowded = False
-    free = kept.registry.untracked._lock
-
-    class Held:
-        """The lock: the intake holds the stream as soon as it has been let go."""
-
-        def __enter__(self) -> None:
-            free.acquire()
-
-        def __exit__(self, *_: object) -> None:
-            free.release()
-            kept.registry.untracked._lock = free
-            kept.registry.untracked.hold(STREAMS[0])
-
-    kept.registry.untracked._lock = Held()
-    kept.registry._let_in()
-    kept.registry.take_up(STREAMS[0], [(detections(1), True)])
-    assert [packet.wall_ns for offered in kept.offered for packet in offered] == [0, 1]
-    assert STREAMS[0] not in kept.registry.untracked
+    kept = Kept(monkeypatch)
+    kept.streams.receive(detections(1))
+    kept.crowded(False)
+    kept.streams.sweep(0)
+    kept.streams.hold(STREAMS[0])
+    assert kept.tracked() == []
+    kept.streams.take_up(STREAMS[0], [detections(0)])
+    assert kept.tracked() == [2]
+    assert kept.streams.totals().inserted == 0
+    assert not kept.streams.keeps(STREAMS[0])
 
 
-def test_what_is_put_off_counts_as_received() -> None:
+def test_what_is_put_off_counts_as_received(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each message of a stream that waits for room counts as received once, and none as another member's."""
-    kept = Kept()
+    kept = Kept(monkeypatch)
+    counted: Counter[str] = Counter()
+    monkeypatch.setattr(kept.streams.metrics, "received", lambda topic, _: counted.update([f"received {topic}"]))
+    monkeypatch.setattr(kept.streams.metrics, "foreign", lambda topic, _: counted.update([f"foreign {topic}"]))
     for number in range(5):
-        kept.registry.frame(detections(number))
-    assert kept.metrics == {"received detections": 5}
-    kept.crowded = False
-    kept.registry._let_in()
-    assert [len(offered) for offered in kept.offered] == [5]
+        kept.streams.receive(detections(number))
+    kept.crowded(False)
+    kept.streams.sweep(0)
+    assert kept.tracked() == [5]
+    assert counted == {"received detections": 5}
 
 
-def test_what_is_put_off_and_dropped_is_shed() -> None:
-    """What the buffers have no room for, and what has waited for too long, counts as shed, with a problem."""
-    kept = Kept(standby=3 * detections(0, 1000).held)
-    registry = kept.registry
-    for number in range(50):
-        registry.frame(detections(number, 1000))
-    assert (len(registry.untracked._buffers[STREAMS[0]]), registry.totals().shed) == (3, 47)
-    registry.cloud(detections(50, 1000))
-    assert registry.totals().clouds_shed == 1
-    registry.sweep(time.monotonic_ns() + UNASKED_NS + SECOND)
-    assert (registry.totals().received, registry.totals().shed) == (50, 50)
-    assert set(kept.problems) == {"shed"}
+def test_what_is_put_off_and_dropped_is_shed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the backlogs have no room for, and what has waited for too long, counts as shed, with a problem."""
+    kept = Kept(monkeypatch, standby_mb=1)
+    large = packet_of(SENSOR.detections(0, objects=1000))
+    room = 2**20 // large.held
+    for _ in range(room + 10):
+        kept.streams.receive(replace(large))
+    assert kept.streams.totals().shed == 10
+    kept.streams.receive(packet_of(SENSOR.points(0)))
+    kept.streams.sweep(time.monotonic_ns() + UNASKED_NS + SECOND)
+    totals = kept.streams.totals()
+    assert (totals.received, totals.shed, totals.clouds_shed) == (room + 10, room + 10, 1)
+    assert set(kept.others.problems) == {"shed"}
 
 
-def test_what_is_put_off_is_within_the_quota() -> None:
+def test_what_is_put_off_is_within_the_quota(monkeypatch: pytest.MonkeyPatch) -> None:
     """The quotas of a node and a site hold for a stream that waits for room as for any other."""
-    kept = Kept()
-    kept.registry.frame(detections(0))
-    kept.exceeded = "a message"
-    kept.registry.frame(detections(1))
-    assert (len(kept.registry.untracked._buffers[STREAMS[0]]), kept.registry.totals().refused) == (1, 1)
-    assert kept.problems == ["quota"]
+    kept = Kept(monkeypatch, node_rate=1)
+    for number in range(2):
+        kept.streams.receive(detections(number))
+    assert (kept.streams.totals().refused, kept.others.problems) == (1, ["quota"])
+    kept.crowded(False)
+    kept.streams.sweep(0)
+    assert kept.tracked() == [1]
 
 
 @pytest.mark.parametrize("asked", [True, False])
-def test_what_a_session_passes_on_is_kept_until_it_is_asked_for(*, asked: bool) -> None:
+def test_what_a_session_passes_on_is_kept_until_it_is_asked_for(
+    monkeypatch: pytest.MonkeyPatch, *, asked: bool
+) -> None:
     """Frames of a session that leaves are kept also where `standby_s` is 0, and count as shed if nobody asks."""
-    kept = Kept(keep_ns=0)
-    kept.holds = False
-    registry, passed = kept.registry, [detections(0), detections(1)]
-    for packet in passed:
-        registry._keep(STREAMS[0], packet, frame=True)
-    registry.frame(detections(2))
-    assert registry.untracked.of_partitions(range(PARTITIONS)) == {STREAMS[0]}
+    kept = Kept(monkeypatch, standby_s=0)
+    kept.crowded(False)
+    held = [packet_of(SENSOR.detections(number, has_points=True)) for number in range(2)]
+    for packet in held:
+        kept.streams.receive(packet)
+    assert kept.tracked() == [0]
+    kept.others.holding = False
+    kept.streams.changed(partition_of(STREAMS[0]), Change.RECALLED)
+    kept.others.run()
+    kept.streams.receive(detections(2))
+    assert kept.streams.held(range(PARTITIONS)) == {STREAMS[0]}
     if asked:
-        assert registry.untracked.recent([STREAMS[0]])[:2] == passed
-    registry.sweep(time.monotonic_ns() + UNASKED_NS + SECOND)
-    assert not registry.untracked._buffers[STREAMS[0]]
-    assert registry.totals().shed == (0 if asked else 2)
-    assert kept.metrics == {"foreign detections": 1}
+        recent = kept.streams.recent([STREAMS[0]])
+        assert [one.payload for one in recent[:2]] == [one.payload for one in held]
+    kept.streams.sweep(time.monotonic_ns() + UNASKED_NS + SECOND)
+    assert not kept.streams.recent([STREAMS[0]])
+    assert kept.streams.totals().shed == (0 if asked else 2)

@@ -1,4 +1,4 @@
-"""The small parts: mailboxes, turns, problems, figures, profiles, settings, and what imports what."""
+"""The small parts: turns, problems, figures, profiles, settings, and what imports what."""
 
 from __future__ import annotations
 
@@ -10,17 +10,13 @@ from typing import TYPE_CHECKING
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_service.observability.problem_reporter import LOGGED_PER_SECOND, PUBLISHED_PER_SECOND, ProblemReporter
-from optipmb_service.observability.stream_meter import StreamMeter
-from optipmb_service.runtime.mailbox import Mailbox
-from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.profiles import Profiles
 from optipmb_service.runtime.scheduler import Scheduler
 from optipmb_service.session.pending import CloudBuffer
 from optipmb_service.session.problems import problem_of
-from optipmb_service.settings.loading import SettingsInvalidError, load
-from optipmb_service.settings.model import Settings
-from optipmb_service.settings.tables import LimitSettings
+from optipmb_service.settings import SettingsInvalidError, load
+from optipmb_service.telemetry.problem_reporter import LOGGED_PER_SECOND, PUBLISHED_PER_SECOND, ProblemReporter
+from optipmb_service.telemetry.stream_meter import StreamMeter
 from router import SECOND, Sensor
 
 import optipmb
@@ -31,64 +27,7 @@ if TYPE_CHECKING:
 SENSOR = Sensor()
 
 
-def packet(number: int) -> Packet:
-    """A packet known by its size."""
-    return Packet("key", b"", number, "", 0, 0)
-
-
-# Mailboxes and turns
-
-
-@settings(deadline=None)
-@given(st.lists(st.integers(0, 2), max_size=60), st.integers(1, 5), st.integers(1, 5))
-def test_a_mailbox_is_bounded_ordered_and_counts(kinds: list[int], frames: int, clouds: int) -> None:
-    """The newest frames and clouds stay, in order, clouds first; commands are never lost; the rest is counted."""
-    mailbox, ran = Mailbox(frames, clouds), []
-    for number, kind in enumerate(kinds):
-        if kind == 0:
-            mailbox.offer_frame(packet(number))
-        elif kind == 1:
-            mailbox.offer_cloud(packet(number))
-        else:
-            mailbox.offer_command(lambda number=number: ran.append(number), urgent=False)  # type: ignore[misc]  # bound now
-    taken: dict[str, list[int]] = {"frame": [], "cloud": []}
-    order = []
-    while (item := mailbox.take()) is not None:
-        order.append(item[0])
-        if isinstance(item[1], Packet):
-            taken[item[0]].append(item[1].size)
-        else:
-            item[1]()
-    sent = [[number for number, kind in enumerate(kinds) if kind == wanted] for wanted in range(3)]
-    assert taken["frame"] == sent[0][-frames:]
-    assert taken["cloud"] == sent[1][-clouds:]
-    assert ran == sent[2]
-    assert (mailbox.shed_frames, mailbox.shed_clouds) == (max(0, len(sent[0]) - frames), max(0, len(sent[1]) - clouds))
-    assert order == sorted(order, key=lambda kind: kind != "cloud")
-
-
-def test_a_mailbox_asks_for_one_turn() -> None:
-    """Only the first offer asks for a turn, until that one ends; a closed mailbox takes nothing."""
-    mailbox = Mailbox(4, 4)
-    assert [mailbox.offer_frame(packet(0)), mailbox.offer_cloud(packet(1)), mailbox.ring()] == [True, False, False]
-    mailbox.take()
-    assert mailbox.leave(close=True) is True
-    mailbox.take()
-    assert mailbox.leave(close=False) is False
-    assert mailbox.offer_frame(packet(2)) is True
-    mailbox.take()
-    assert mailbox.leave(close=True) is None
-    assert mailbox.offer_frame(packet(3)) is None
-    assert mailbox.offer_command(print, urgent=True) is None
-
-
-def test_urgent_commands_go_first() -> None:
-    """A question overtakes the frames that wait, an ordinary command does not."""
-    mailbox, ran = Mailbox(4, 4), []
-    mailbox.offer_frame(packet(0))
-    mailbox.offer_command(lambda: ran.append("later"), urgent=False)
-    mailbox.offer_command(lambda: ran.append("now"), urgent=True)
-    assert [item[0] for item in iter(mailbox.take, None)] == ["command", "frame", "command"]
+# Turns
 
 
 def test_workers_take_turns() -> None:
@@ -114,9 +53,9 @@ def test_workers_take_turns() -> None:
         def work(self) -> bool:
             return gate.wait(60) and False
 
-    scheduler.submit(Gate())
-    scheduler.submit(Work("long", 3))
-    scheduler.submit(Work("short", 2))
+    scheduler.submit(Gate().work)
+    scheduler.submit(Work("long", 3).work)
+    scheduler.submit(Work("short", 2).work)
     gate.set()
     assert done.wait(60)
     assert turns == ["long", "short", "long", "short", "long"]
@@ -137,8 +76,8 @@ def test_an_error_does_not_end_the_tracking_thread() -> None:
             return False
 
     scheduler = Scheduler()
-    scheduler.submit(Broken())
-    scheduler.submit(Sound())
+    scheduler.submit(Broken().work)
+    scheduler.submit(Sound().work)
     assert gate.wait(60)
     assert scheduler.close(5)
 
@@ -153,7 +92,7 @@ def test_a_step_that_does_not_end_does_not_keep_the_scheduler() -> None:
             return gate.wait(60) and False
 
     scheduler = Scheduler()
-    scheduler.submit(Stuck())
+    scheduler.submit(Stuck().work)
     assert entered.wait(60)
     assert not scheduler.close(0.05)
     gate.set()
@@ -357,12 +296,6 @@ def test_router_or_client() -> None:
     assert (router.is_router, router.endpoints) == (True, ("tcp/127.0.0.1:7447",))
     assert (client.is_router, client.endpoints) == (False, ())
     assert (both.is_router, both.endpoints) == (True, ("tcp/127.0.0.1:7447",))
-
-
-def test_every_setting_is_described() -> None:
-    """No setting without a word on what it does."""
-    for model in (Settings, LimitSettings):
-        assert all(field.description for field in model.model_fields.values())
 
 
 def test_streams_of_a_profile_share_a_tracker() -> None:

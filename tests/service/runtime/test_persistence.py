@@ -10,9 +10,9 @@ from lease_log import Alone
 from optipmb_service.cluster.sqlite import SqliteStore
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.runtime.persistence import CheckpointWriter
-from optipmb_service.runtime.registry import KEPT_AT_ONCE
+from optipmb_service.runtime.streams import KEPT_AT_ONCE
 from optipmb_service.session.session import Session
-from registries import Around, packet_of, registry_of
+from registries import Around, packet_of, streams_of
 from router import Sensor, until
 
 import optipmb
@@ -207,23 +207,23 @@ def test_the_end_says_when_a_state_cannot_be_written() -> None:
 def test_states_are_given_for_a_few_streams_at_a_time() -> None:
     """Those of the sessions that changed, in pieces between which a frame that comes has its turn."""
     around = Around()
-    registry = registry_of(around)
+    streams = streams_of(around)
     sensors = [replace(FIRST, stream=f"site/node{number:02d}/lidar") for number in range(2 * KEPT_AT_ONCE + 3)]
     for seq in range(2):
         for sensor in sensors:
-            registry.frame(packet_of(sensor.detections(seq)))
+            streams.receive(packet_of(sensor.detections(seq)))
     around.run()
-    registry.keep()
-    registry.frame(packet_of(sensors[0].detections(2)))
+    streams.keep()
+    streams.receive(packet_of(sensors[0].detections(2)))
     kept = []
     while around.turn():
-        kept.append((len(around.kept), registry.totals().frames))
+        kept.append((len(around.kept), streams.totals().frames))
     frames = 2 * len(sensors)
     few, more = KEPT_AT_ONCE, 2 * KEPT_AT_ONCE
     assert kept == [(few, frames), (few, frames + 1), (more, frames + 1), (len(sensors), frames + 1)]
     around.kept.clear()
-    registry.keep()
+    streams.keep()
     around.run()
     assert around.kept.keys() == {sensors[0].stream}
-    registry.keep()
+    streams.keep()
     assert not around.turn()

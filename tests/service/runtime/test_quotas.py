@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from hypothesis import given
 from hypothesis import strategies as st
 from optipmb_schemas import Keys
-from optipmb_service.observability.stream_meter import StreamMeter
-from optipmb_service.runtime.quotas import Quota, Quotas, victim_of
+from optipmb_service.runtime.admission import Quota, Quotas, victim_of
+from optipmb_service.telemetry.stream_meter import StreamMeter
 from router import SECOND, Node, Sensor, until
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def test_strangers_of_one_frame_evict_nobody_who_sends(start: Callable[..., Any]
             strangers = [Sensor(f"stranger-{seq}-{number}/node/lidar") for number in range(3)]
             node.send_plain(*(sensor.detections(0) for sensor in strangers if seq > 1))
             received = 4 * (seq + 1) + 3 * max(0, seq - 1)
-            until(lambda received=received: service._registry.totals().received >= received, "it is received")  # type: ignore[misc]
+            until(lambda received=received: service._streams.totals().received >= received, "it is received")  # type: ignore[misc]
             time.sleep(0.05)  # a period of the regular streams
         for sensor in regular:
             assert [tracks.seq for tracks in node.tracks(sensor.stream, frames)] == list(range(frames))
@@ -106,7 +106,7 @@ def test_one_site_does_not_keep_the_others_out(start: Callable[..., Any]) -> Non
             node.send(modest.detections(seq))
             if any(key == KEYS.tracks(modest.stream) for key, _, _ in list(node.tracks_seen.items)):
                 break
-            until(lambda seq=seq: service._registry.totals().received > 3 + seq, "it is received")  # type: ignore[misc]
+            until(lambda seq=seq: service._streams.totals().received > 3 + seq, "it is received")  # type: ignore[misc]
         node.tracks(modest.stream, 1)
         assert node.problem(greedy[0].stream, "refused").expected == "at most 3 streams at once"
         node.send(greedy[0].detections(1))

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from optipmb_client import dumps as client
 from optipmb_client.cli import run
 from optipmb_client.errors import UsageError
-from optipmb_service.runtime.dumps import FOLDER, MOST, save
+from optipmb_service.runtime.persistence import DUMPS, MAX_DUMPS, save_dump
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Policy
@@ -182,12 +182,12 @@ def test_what_is_no_dump_is_refused(data: bytes) -> None:
 
 def test_dumps_are_written_whole_and_bounded(tmp_path: Path) -> None:
     """The newest stay, nothing else is left in the folder, and names say which stream it was."""
-    files = [Path(save(tmp_path, "a/b/c", b"%d" % number)) for number in range(MOST + 2)]
-    assert [file.name for file in sorted((tmp_path / FOLDER).iterdir())] == [file.name for file in files[2:]]
+    files = [Path(save_dump(tmp_path, "a/b/c", b"%d" % number)) for number in range(MAX_DUMPS + 2)]
+    assert [file.name for file in sorted((tmp_path / DUMPS).iterdir())] == [file.name for file in files[2:]]
     assert files[4].name == "a_b_c-000005.dump"
     assert files[4].read_bytes() == b"4"
     (tmp_path / "file").touch()
-    assert save(None, "a/b/c", b"") == save(tmp_path / "file", "a/b/c", b"") == ""
+    assert save_dump(None, "a/b/c", b"") == save_dump(tmp_path / "file", "a/b/c", b"") == ""
 
 
 def test_the_command_replays_a_dump(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from optipmb_schemas import Keys, Tracks
-from optipmb_service.settings.loading import load
+from optipmb_service.settings import load
 from optipmb_service.zenoh.connection import opened
 from optipmb_service.zenoh.handles import Publisher, cached_publisher
 from optipmb_service.zenoh.subscription import Subscription

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 import optipmb_service.zenoh.queries
 import pytest
 from optipmb_schemas import Keys, Problem, SessionState, decode
-from optipmb_service.runtime import stream_queries
-from optipmb_service.runtime.stream_queries import StreamQueries
+from optipmb_service.runtime import queries
+from optipmb_service.runtime.queries import StreamQueries
 from router import Node, Sensor, until
 
 if TYPE_CHECKING:
@@ -34,9 +34,9 @@ def test_a_query_about_many_streams_whose_state_fails_gives_its_room_back(
         node.tracks(SENSOR.stream, 1)
         with monkeypatch.context() as broken:
             broken.setattr(StreamQueries, "_state", lambda *_: 1 / 0)
-            assert [node.query(key, None, ASK_S) for _ in range(2 * stream_queries.MOST_WILDCARDS)] == [
+            assert [node.query(key, None, ASK_S) for _ in range(2 * queries.MOST_WILDCARDS)] == [
                 []
-            ] * 2 * stream_queries.MOST_WILDCARDS
+            ] * 2 * queries.MOST_WILDCARDS
         assert [ok for ok, _, _ in node.query(key, None, ASK_S)] == [True]
 
 
@@ -44,7 +44,7 @@ def test_a_query_about_many_streams_whose_state_fails_gives_its_room_back(
     ("module", "name", "key"),
     [
         (optipmb_service.zenoh.queries, "MOST_OPEN", KEYS.query(SENSOR.stream, "state")),
-        (stream_queries, "MOST_WILDCARDS", f"{KEYS.prefix}/*/*/*/q/state"),
+        (queries, "MOST_WILDCARDS", f"{KEYS.prefix}/*/*/*/q/state"),
     ],
     ids=["of one stream", "of many"],
 )
@@ -52,13 +52,13 @@ def test_queries_beyond_those_that_may_be_open_are_refused(
     start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, module: Any, name: str, key: str
 ) -> None:
     """Answers take a while: as many queries as may be open wait, others are refused at once, frames are tracked."""
-    gate, digest = threading.Event(), stream_queries.digest_of
+    gate, digest = threading.Event(), queries.digest_of
 
     def slow(checkpoint: Any) -> str:
         assert gate.wait(ASK_S)
         return digest(checkpoint)
 
-    monkeypatch.setattr(stream_queries, "digest_of", slow)
+    monkeypatch.setattr(queries, "digest_of", slow)
     monkeypatch.setattr(module, name, MOST)
     _, endpoint = start()
     with Node(endpoint) as node, ThreadPoolExecutor(ASKED) as asking:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 import optipmb_service.zenoh.transport
 import pytest
 from optipmb_schemas import Detections, Keys, Tracks
-from optipmb_service.settings.loading import load
+from optipmb_service.settings import load
 from optipmb_service.zenoh.client import Client
 from optipmb_service.zenoh.handles import Channel, cached_publisher
 from optipmb_service.zenoh.inputs import Topic

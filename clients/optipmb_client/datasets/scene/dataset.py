@@ -1,27 +1,26 @@
 """Generated traffic scenes as a dataset: detections, clouds and truth for people without data.
 
 Conventions: the sensor is a LiDAR on the roof of a car that drives along; its frame is x forward, y left, z up, level,
-1.75 m above the ground. The world has the crossing at its origin and the ground at z = 0. The same options give the
-same bytes, whatever was asked for before and in whichever order.
+1.75 m above the ground. The world has its origin in the middle of the block and the ground at z = 0. The same options
+give the same bytes, whatever was asked for before and in whichever order.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from optipmb_schemas import Tracks
 
 from optipmb_client.camera import synthetic_camera
-from optipmb_client.datasets.interface import Cloud, DataSequence, DetectionFrame, Regions, Truth
+from optipmb_client.datasets.interface import Cloud, DataSequence, Dataset, DetectionFrame, Regions, Truth
 from optipmb_client.datasets.scene.detector import CLASSES, Found, Seen, detect
 from optipmb_client.datasets.scene.lidar import Scan, scan
-from optipmb_client.datasets.scene.roads import fixed_boxes
-from optipmb_client.datasets.scene.world import Crowd, World, build_world
+from optipmb_client.datasets.scene.traffic import World, build_world, fixed_boxes
 from optipmb_client.files import DatasetError
-from optipmb_client.geometry import Bools, Floats, Ints, Pose, planar_pose, wrap_angle
-from optipmb_client.results import ResultWriter
-from optipmb_client.results.kitti import KittiResultWriter
+from optipmb_client.geometry import Bools, Floats, Ints, Pose, planar_pose, rotation_of, to_sensor, wrap_angle
+from optipmb_client.results.kitti import write_kitti_results
 
 HEIGHT = 1.75
 """Of the sensor above the ground."""
@@ -39,7 +38,7 @@ _NAME_DIGITS = 4
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """What kind of scenes are generated."""
+    """Options of generated scenes."""
 
     seed: int = 0
     frames: int = 200
@@ -71,7 +70,7 @@ _BOUNDS = (
 )
 
 
-class SceneSequence:
+class SceneSequence(DataSequence):
     """One generated scene; it is driven through at the first use, each frame is scanned when it is asked for."""
 
     labels = CLASSES
@@ -84,7 +83,7 @@ class SceneSequence:
     def __len__(self) -> int:
         return self._options.frames
 
-    @property
+    @cached_property
     def has_clouds(self) -> bool:
         """Whether frames have point clouds."""
         return self._options.clouds
@@ -94,13 +93,9 @@ class SceneSequence:
         return np.random.Generator(np.random.PCG64([self._options.seed, int(self.name), *purpose]))
 
     @cached_property
-    def _times(self) -> Floats:
-        return np.arange(self._options.frames) / self._options.rate
-
-    @cached_property
     def _world(self) -> World:
-        options = self._options
-        return build_world(Crowd(options.vehicles, options.pedestrians, options.cyclists), self._times, self._chance(0))
+        counts = self._options.vehicles, self._options.pedestrians, self._options.cyclists
+        return build_world(counts, np.arange(self._options.frames) / self._options.rate, self._chance(0))
 
     @cached_property
     def poses(self) -> tuple[Pose, ...]:
@@ -109,13 +104,8 @@ class SceneSequence:
 
     def _local(self, frame: int, center: Floats, yaw: Floats) -> tuple[Floats, Floats]:
         """Carry boxes from the world to the sensor frame."""
-        x, y, turn = self._world.carrier[frame]
-        cos, sin = np.cos(turn), np.sin(turn)
-        offset = center - np.array([x, y, HEIGHT])
-        local = np.column_stack(
-            [cos * offset[:, 0] + sin * offset[:, 1], cos * offset[:, 1] - sin * offset[:, 0], offset[:, 2]]
-        )
-        return local, wrap_angle(yaw - turn)
+        pose = self.poses[frame]
+        return to_sensor(rotation_of(pose.quaternion), pose.translation, center, yaw)
 
     def _scan(self, frame: int) -> Scan:
         """Return the scan of a frame; its first boxes are the objects, the others what only hides them."""
@@ -141,22 +131,19 @@ class SceneSequence:
         view = self._scan(frame)
         rows = self._in_range(frame)
         center, yaw = self._local(frame, world.center[frame, rows], world.yaw[frame, rows])
-        turn = world.carrier[frame, 2]
-        east, north = world.velocity[frame, rows].T
-        velocity = np.column_stack(
-            [np.cos(turn) * east + np.sin(turn) * north, np.cos(turn) * north - np.sin(turn) * east]
-        )
+        ahead = rotation_of(self.poses[frame].quaternion)[:2, :2]
         seen = Seen(
             index=rows,
             label=world.label[rows],
             center=center,
             size=world.size[rows],
             yaw=yaw,
-            velocity=velocity,
+            velocity=world.velocity[frame, rows] @ ahead,
             points=view.points[rows],
             ease=world.ease[frame, rows],
         )
-        sites, _ = self._local(frame, fixed_boxes()[0], np.zeros(len(fixed_boxes()[0])))
+        place, _ = fixed_boxes()
+        sites, _ = self._local(frame, place, np.zeros(len(place)))
         return view, detect(seen, sites[:, :2], RADIUS, HEIGHT, self._chance(2, frame))
 
     def frames(self) -> Iterator[DetectionFrame]:
@@ -180,12 +167,11 @@ class SceneSequence:
     def truth(self) -> Truth:
         """Return the objects in range, from when they are first seen; one that was away or hidden long is a new one."""
         world = self._world
-        for frame in range(len(self)):
-            if frame not in self._scanned:
-                self._scan(frame)
         inside = np.zeros(world.yaw.shape, dtype=np.bool_)
         for frame in range(len(self)):
             inside[frame, self._in_range(frame)] = True
+            if frame not in self._scanned:
+                self._scan(frame)
         returns = np.stack([self._scanned[i][0] for i in range(len(self))])
         identity = visits(inside & (returns > 0), round(HIDDEN_S * self._options.rate))
         when, which = np.nonzero(inside & (identity >= 0))
@@ -232,7 +218,7 @@ def visits(inside: Bools, absence: int) -> Ints:
     return identity
 
 
-class SceneDataset:
+class SceneDataset(Dataset):
     """Generated scenes; sequences are named by four digits, and each is another scene."""
 
     name = "scene"
@@ -258,9 +244,9 @@ class SceneDataset:
             raise DatasetError("--sequences", "at least one sequence", "none")
         return [SceneSequence(name, self._options) for name in wanted]
 
-    def writer(self, out: Path, sequence: DataSequence) -> ResultWriter:
-        """Return a writer of `out/SSSS.txt` in the format of KITTI, for a camera in the sensor's place."""
-        return KittiResultWriter(out / f"{sequence.name}.txt", synthetic_camera())
+    def write(self, out: Path, sequence: DataSequence, tracks: Mapping[int, Tracks]) -> Path:
+        """Write `out/SSSS.txt` in the format of KITTI, for a camera in the sensor's place."""
+        return write_kitti_results(out / f"{sequence.name}.txt", synthetic_camera(), sequence.poses, tracks)
 
 
 def scene_options(options: dict[str, float | bool]) -> SceneOptions:

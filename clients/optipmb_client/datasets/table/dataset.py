@@ -1,46 +1,204 @@
-"""Tables of detections as a dataset: a file is one recording, or several by a column that names them.
+"""Tables of detections as a data set: a file is one recording, or several by a column that names them.
 
 The truth is a table of the same kind with a column of object ids; a table of detections that has such a column is its
-own truth.
+own truth. A row of a table of objects, truth or tracks, belongs to the frame that is nearest in time, within half a
+frame. Of several rows of an object at a frame the nearest one counts. A frame without a row has no object or no label:
+where the frames with rows lie `SPARSE` times as far apart as all frames, only these are labelled.
 """
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
+from optipmb_schemas import Tracks
 
-from optipmb_client.datasets.interface import DataSequence, DetectionFrame, Truth
+from optipmb_client.datasets.interface import IDENTITY, DataSequence, Dataset, DetectionFrame, Truth, chosen
 from optipmb_client.datasets.table.names import ALIASES
-from optipmb_client.datasets.table.rows import Boxes, read_tables
-from optipmb_client.datasets.table.truth import ObjectTable, TableOptions, read_objects, truth_at
+from optipmb_client.datasets.table.rows import NO_ID, Boxes, read_tables
 from optipmb_client.datasets.table.values import Finding, Reading
 from optipmb_client.files import DatasetError
-from optipmb_client.geometry import Ints, Pose
-from optipmb_client.results import ResultWriter
-from optipmb_client.results.table import TableResultWriter
-from optipmb_client.table_files import SUFFIXES, tables_in
+from optipmb_client.geometry import Bools, Floats, Ints, Pose, stack_poses, to_world
+from optipmb_client.results.output import track_columns
+from optipmb_client.table_files import SUFFIXES, line_of, read_table, tables_in, write_table
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-__all__ = ["OPTIONS", "TableDataset", "TableSequence"]
-
+# Options beside `column.MEANING=NAME` and `class.NAME=NAME`; `tracks` are tables that are yet to be read by them
 OPTIONS: Final = (
     *("time", "rate", "group", "yaw", "heading", "quaternion", "sizes", "axes", "velocity", "score", "invalid"),
     *("poses", "truth", "tracks", "decimal", "encoding", "date"),
 )
-"""Options beside `column.MEANING=NAME` and `class.NAME=NAME`; `tracks` are tables that are yet to be read by them."""
 GAP: Final = 1.5
-_HERE: Final = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+SPARSE: Final = 1.5
+_WRITTEN: Final = frozenset({"existence", "confirmed", "age", "time_since_detection", "detection_row"})
+"""Columns by which a table of tracks that OptiPMB wrote is known."""
+_HEAD: Final = 4096
+_UNITS: Final = {"yaw": "radians", "heading": "x", "sizes": "lwh", "axes": "z-up"}
+"""Options that such a table is read with, beside those of the user about its times and classes."""
+_PLACES: Final = ("time", "rate", "column.stamp", "column.frame", "column.recording", "column.sensor")
 
 
-class TableSequence:
+@dataclass
+class TableOptions:
+    """Options by which all tables of a dataset are read: detections, truth and tracks."""
+
+    options: Mapping[str, str] = field(default_factory=dict)
+    recordings: set[str] = field(default_factory=set)  # names and keys of all recordings
+    named: dict[str, DatasetError | None] = field(default_factory=dict)  # as `Reading.named`, of all tables
+
+    def check(self) -> None:
+        """Raise for an option that names a column or class of no table."""
+        for error in filter(None, self.named.values()):
+            raise error
+
+
+@dataclass(frozen=True)
+class ObjectTable:
+    """A table of objects with ids, and the assumptions about it."""
+
+    path: Path
+    boxes: Boxes
+    options: Mapping[str, str]
+    notes: tuple[str, ...] = ()
+
+    def at(self, key: str, stamps: Ints, numbers: NDArray[Any] | None) -> tuple[Ints, Ints, Bools, list[str]]:
+        """Return the boxes of a recording at the frames of a sequence.
+
+        Args:
+            key: of the recording.
+            stamps: (F,) of the frames.
+            numbers: (F,) of the frames, by which tables without stamps are matched.
+
+        Returns:
+            Boxes (R,) ordered by frame; their frames (R,), -1 where at none; the frames (F,) with rows; notes.
+
+        Raises:
+            DatasetError: The table has no ids, or one id twice at a stamp.
+        """
+        boxes, times, frames = self.boxes, self.boxes.frame_stamp, stamps
+        if boxes.id is None:
+            raise DatasetError(self.path, "a column of ids (id, track_id …; --option column.id=NAME)", "none")
+        counted = [one for one in (boxes.frame_number, numbers) if one is not None and one.dtype.kind in "if"]
+        if len(counted) > 1 and np.array_equal(counted[0], boxes.frame_time):
+            times, frames = counted
+        rows = np.flatnonzero(boxes.frame_key[boxes.row] == key)
+        known = boxes.id[rows] != NO_ID
+        notes = [] if known.all() else [f"{self.path}: {int((~known).sum())} rows with no id, or -1, are left out"]
+        rows = rows[known]
+        time, identity = times[boxes.row[rows]], boxes.id[rows]
+        order = np.lexsort((identity, time))
+        twice = order[1:][(np.diff(time[order]) == 0) & (np.diff(identity[order]) == 0)]
+        if len(twice):
+            line = self.line(int(rows[twice.min()]))
+            raise DatasetError(self.path, "an id once per frame", "an id again at the same stamp", line=line)
+        frame = match_stamps(frames, time)
+        order = np.lexsort((np.abs(np.append(frames, 0)[frame] - time), identity, frame))
+        again = (np.diff(frame[order]) == 0) & (np.diff(identity[order]) == 0) & (frame[order[1:]] >= 0)
+        if again.any():
+            notes.append(f"{self.path}: of several rows of an object at a frame the nearest counts, in time")
+        kept = np.sort(order[np.append(True, ~again)[: len(order)]])
+        kept = kept[np.argsort(frame[kept], kind="stable")]
+        seen = np.isin(np.arange(len(frames)), match_stamps(frames, times[boxes.frame_key == key]))
+        return rows[kept], frame[kept], seen, notes
+
+    def line(self, box: int) -> int:
+        """Return the line of a box, counted from 1."""
+        return line_of(self.path, int(self.boxes.row[box]), self.options)
+
+    def in_world(self, rows: Ints) -> tuple[Floats, Floats, Floats]:
+        """Return centre (R, 3), yaw (R,) and velocity (R, 2) of some boxes in the world frame."""
+        boxes = self.boxes
+        center, yaw = boxes.center[rows], boxes.yaw[rows]
+        velocity = np.full((len(rows), 2), np.nan) if boxes.velocity is None else boxes.velocity[rows]
+        if boxes.frame_pose is not None:
+            pose = boxes.frame_pose[boxes.row[rows]]
+            rotation, translation = stack_poses([Pose(row[:3], row[3:]) for row in pose])
+            center, yaw = to_world(rotation, translation, center, yaw)
+            velocity = np.einsum("nij,nj->ni", rotation[:, :2, :2], velocity)
+        return center, yaw, velocity
+
+
+def read_objects(path: Path, files: Sequence[Path], tables: TableOptions) -> list[ObjectTable]:
+    """Return the tables of truth or tracks that a file or folder is, judged together.
+
+    Tables that OptiPMB wrote have known units and columns: only options of times and classes apply to them.
+
+    Raises:
+        DatasetError: A column is missing or a value is wrong; names the line.
+    """
+    options = tables.options
+    columns = {file: read_table(file, {} if _is_written(file) else options) for file in files}
+    written = all(one.keys() >= _WRITTEN for one in columns.values())
+    if written:
+        results = {f"class.{value}" for name, value in options.items() if name.startswith("class.")}
+        kept = {*_PLACES, *(name for name in options.keys() - results if name.startswith("class."))}
+        options = _UNITS | {name: value for name, value in options.items() if name in kept}
+    reading = Reading(path, options, named=tables.named)
+    found = read_tables(files, reading, scored=False, loaded=columns)
+    notes = () if written else tuple(f"{path}: {note}" for note in reading.notes)
+    return [ObjectTable(file, boxes, options, notes) for file, boxes in found]
+
+
+def _is_written(file: Path) -> bool:
+    """Tell by its first bytes whether a file is a text table that OptiPMB wrote, in its own encoding."""
+    if not file.is_file():
+        return False
+    with file.open("rb") as opened:
+        head = opened.read(_HEAD)
+    return all(name.encode() in head for name in _WRITTEN)
+
+
+def match_stamps(stamps: NDArray[Any], wanted: NDArray[Any]) -> Ints:
+    """Return the frame nearest to each `wanted` stamp (R,), -1 where it is more than half a frame away."""
+    if not len(stamps):
+        return np.full(len(wanted), -1, dtype=np.int64)
+    period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 2e9
+    after = np.clip(np.searchsorted(stamps, wanted), 1, max(1, len(stamps) - 1))
+    before = after - 1
+    after = np.minimum(after, len(stamps) - 1)
+    nearest = np.where(abs(stamps[after] - wanted) < abs(wanted - stamps[before]), after, before)
+    return np.where(abs(stamps[nearest] - wanted) <= 0.5 * period, nearest, -1)
+
+
+def truth_at(name: str, stamps: Ints, numbers: NDArray[Any] | None, table: ObjectTable, key: str) -> Truth:
+    """Return the objects of a recording at the frames of its detections; arguments as for `ObjectTable.at`.
+
+    Raises:
+        DatasetError: None of them is at a frame, or as for `ObjectTable.at`.
+    """
+    boxes, path = table.boxes, table.path
+    rows, frame, seen, notes = table.at(key, stamps, numbers)
+    outside, count, steps = int((frame < 0).sum()), int(seen.sum()), np.diff(stamps[seen])
+    if outside == len(rows) and outside and len(stamps):
+        raise DatasetError(path, f"boxes at the stamps of {name}", "none of its stamps")
+    if outside:
+        notes.append(f"{path}: {outside} rows are at no frame of {name}: left out")
+    rows, frame = rows[outside:], frame[outside:]
+    sparse = 0 < count < len(stamps) and (not len(steps) or np.median(steps) >= SPARSE * np.median(np.diff(stamps)))
+    if count < len(stamps):
+        meaning = "only these are compared" if sparse else "the others count as frames without objects"
+        notes.append(f"{path}: truth has {count} of {len(stamps)} frames of {name}: {meaning}")
+    center, yaw, velocity = table.in_world(rows)
+    labels = tuple(dict.fromkeys(boxes.name[rows].tolist()))
+    return Truth.of(
+        labels,
+        frame,
+        id=np.zeros(len(rows), dtype=np.int64) if boxes.id is None else boxes.id[rows],
+        label=np.array([labels.index(one) for one in boxes.name[rows].tolist()], dtype=np.int64),
+        center=center,
+        size=boxes.size[rows],
+        yaw=yaw,
+        velocity=velocity,
+        labelled=seen if sparse else None,
+        notes=tuple(notes),
+    )
+
+
+class TableSequence(DataSequence):
     """The boxes of one recording and sensor."""
-
-    has_clouds = False
 
     tables: TableOptions
 
@@ -48,22 +206,21 @@ class TableSequence:
         self, name: str, stem: str, boxes: Boxes, key: str, truth: tuple[ObjectTable, str] | None, origin: int = 0
     ) -> None:
         self.name = name
-        self.key_columns: dict[str, str] = dict(zip(boxes.key_columns, boxes.keys[key], strict=True))
+        self.key_columns = dict(zip(boxes.key_columns, boxes.keys[key], strict=True))
         self.time_column = boxes.time_column
         self.sensor_column = boxes.sensor_column
         self.sensor = self.key_columns.get(boxes.sensor_column, "")
-        self.columns = {column: value for column, value in self.key_columns.items() if column != boxes.sensor_column}
-        self.recording = ".".join(map(_plain, self.columns.values())) or stem
+        self.recording_columns = {
+            column: value for column, value in self.key_columns.items() if column != boxes.sensor_column
+        }
+        self.recording = ".".join(map(_plain, self.recording_columns.values())) or stem
         self._boxes = boxes
         self._truth = truth
         self._origin = origin
-        member = boxes.frame_key == key
-        rows = np.flatnonzero(member)
+        rows = np.flatnonzero(boxes.frame_key == key)
         self._stamps, first, frame = np.unique(boxes.frame_stamp[rows], return_index=True, return_inverse=True)
         self.times: NDArray[Any] = boxes.frame_time[rows[first]]
-        """(F,) as the table has them."""
         self.numbers = None if boxes.frame_number is None else boxes.frame_number[rows[first]]
-        """(F,) numbers of the frames as the table has them, None where it has none."""
         self._poses = None if boxes.frame_pose is None else boxes.frame_pose[rows[first]]
         frame_of_row = np.full(len(boxes.frame_stamp), -1, dtype=np.int64)
         frame_of_row[rows] = frame
@@ -87,7 +244,7 @@ class TableSequence:
     def poses(self) -> Sequence[Pose]:
         """World from sensor of each frame; the identity where the table has none."""
         if self._poses is None:
-            return [_HERE] * len(self)
+            return [IDENTITY] * len(self)
         return [Pose(row[:3], row[3:]) for row in self._poses]
 
     def rows(self, frame: int) -> Ints:
@@ -101,40 +258,40 @@ class TableSequence:
         """Yield every frame in order."""
         boxes = self._boxes
         for index in range(len(self)):
-            chosen = self._of(index)
+            rows = self._of(index)
             yield DetectionFrame(
                 index=index,
                 stamp_ns=int(self._stamps[index]) - self._origin,
                 pose=self.poses[index],
                 labels=self.labels,
                 label=self._label[self._start[index] : self._start[index + 1]],
-                center=boxes.center[chosen],
-                size=boxes.size[chosen],
-                yaw=boxes.yaw[chosen],
-                score=boxes.score[chosen],
-                velocity=None if boxes.velocity is None else boxes.velocity[chosen],
-                position_covariance=None if boxes.position_covariance is None else boxes.position_covariance[chosen],
+                center=boxes.center[rows],
+                size=boxes.size[rows],
+                yaw=boxes.yaw[rows],
+                score=boxes.score[rows],
+                velocity=None if boxes.velocity is None else boxes.velocity[rows],
+                position_covariance=None if boxes.position_covariance is None else boxes.position_covariance[rows],
             )
 
     def truth(self) -> Truth | None:
         """Return the objects of the table of truth, at the stamps of these frames.
 
         Raises:
-            DatasetError: as `truth_at`.
+            DatasetError: As `truth_at`.
         """
         return None if self._truth is None else truth_at(self.name, self._stamps, self.numbers, *self._truth)
 
 
-class TableDataset:
+class TableDataset(Dataset):
     """The recordings of a table, or of all tables of a folder.
 
     Args:
         path: the file or folder.
         options: see `OPTIONS`.
-        lenient: whether what is wrong becomes a finding (`Reading`), where nothing is to be tracked.
+        lenient: Whether errors become findings (`Reading`), where nothing is to be tracked.
 
     Raises:
-        DatasetError: a file, a column, a value or an option is wrong; says where.
+        DatasetError: A file, a column, a value or an option is wrong.
         ClientError: pyarrow is not installed.
     """
 
@@ -151,23 +308,22 @@ class TableDataset:
         truth = options.pop("truth", None)
         files = _tables(path)
         self._sequences: dict[str, TableSequence] = {}
-        self._notes: list[str] = []
+        notes: list[str] = []
         self.path = path
         shared, tracks = TableOptions(options), options.pop("tracks", None)
         others = read_objects(Path(truth), _tables(Path(truth)), shared) if truth is not None else []
-        self._notes += [note for one in others for note in one.notes]
+        notes += [note for one in others for note in one.notes]
         reading = Reading(path, options, lenient, named=shared.named)
         tables = read_tables(files, reading, scored=True)
-        self.findings: tuple[Finding, ...] = tuple(reading.findings)
-        """What was assumed about the table, and what is wrong with it."""
-        self._notes += [f"{path}: {note}" for note in reading.notes]
+        self.findings: tuple[Finding, ...] = tuple(reading.findings)  # assumptions and errors
+        notes += [f"{path}: {note}" for note in reading.notes]
         origin = min(int(boxes.frame_stamp.min(initial=0)) for _, boxes in tables)
         if not any(len(boxes.frame_stamp) for _, boxes in tables):
             raise DatasetError(path, "rows", "none")
         for file, boxes in tables:
             own = [ObjectTable(file, boxes, options)] if boxes.id is not None else []
             if not len(boxes.frame_stamp):
-                self._notes.append(f"{file}: no rows, a recording without frames")
+                notes.append(f"{file}: no rows, a recording without frames")
             for key in dict.fromkeys(boxes.frame_key.tolist()) or boxes.keys:
                 name = _plain(".".join(part for part in (_stem(file), key) if part))
                 if len(files) == 1 and key:
@@ -178,30 +334,22 @@ class TableDataset:
                 if name in self._sequences:
                     raise DatasetError(file, "names of recordings that differ", f"{name!r} twice")
                 self._sequences[name] = sequence
-                self._notes += _gaps(sequence)
+                notes += _gaps(sequence)
                 shared.recordings |= {name, key}
         if tracks is None:
             shared.check()
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What was assumed, a line each."""
-        return tuple(dict.fromkeys(self._notes))
+        self.notes: tuple[str, ...] = tuple(dict.fromkeys(notes))
 
     def sequences(self, names: Sequence[str]) -> Sequence[DataSequence]:
         """Return the recordings of these names, or `all`."""
-        chosen: dict[str, DataSequence] = {}
-        for name in names:
-            for one in self._sequences if name == "all" else (name,):
-                if one not in self._sequences:
-                    raise DatasetError("--sequences", f"recordings: {', '.join(self._sequences)}", repr(one))
-                chosen[one] = self._sequences[one]
-        return list(chosen.values())
+        return chosen(names, self._sequences, f"recordings: {', '.join(self._sequences)}")
 
-    def writer(self, out: Path, sequence: DataSequence) -> ResultWriter:
-        """Return a writer of `out/NAME.csv`, or of the format of the detections."""
+    def write(self, out: Path, sequence: DataSequence, tracks: Mapping[int, Tracks]) -> Path:
+        """Write `out/NAME.csv`, or the format of the detections."""
         suffix = self.path.suffix if self.path.is_file() and self.path.suffix.lower() in SUFFIXES else ".csv"
-        return TableResultWriter(out / f"{sequence.name}{suffix}", sequence)
+        path = out / f"{sequence.name}{suffix}"
+        write_table(path, track_columns(sequence.name, tracks, sequence))
+        return path
 
 
 def _tables(path: Path) -> list[Path]:
@@ -234,7 +382,7 @@ def _truth_of(tables: Sequence[ObjectTable], key: str, file: Path) -> tuple[Obje
 
 
 def _gaps(sequence: TableSequence) -> list[str]:
-    """Say where frames seem to be missing: without a row, nobody knows that the detector found nothing."""
+    """Return a note if frames seem to be missing: without a row, an empty frame is unknown."""
     steps = np.diff(sequence.stamps)
     if not len(steps):
         return []

@@ -1,7 +1,7 @@
 """Which column of a table means what, by its name.
 
 Names are compared in lower case, with every run of other characters as one underscore, and without a unit at the end
-(`yaw_deg`, `x [m]`). What a name says about units is kept.
+(`yaw_deg`, `x [m]`). Units in names are kept.
 """
 
 import re
@@ -9,24 +9,16 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from optipmb_client.detector_files import BOX_LISTS
-
-__all__ = ["ALIASES", "Column", "find_columns"]
+from optipmb_client.table_files import BOX_LISTS
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column that was found.
+    """A column of a table."""
 
-    Attributes:
-        name: as the table has it.
-        unit: that its name states: `deg`, `rad`, `s`, `ms`, `us`, `ns`, or None.
-        base: its name without the unit, normalised.
-    """
-
-    name: str
-    unit: str | None
-    base: str
+    name: str  # as the table has it
+    unit: str | None  # in its name: `deg`, `rad`, `s`, `ms`, `us`, `ns`
+    base: str  # its name without the unit, normalised
 
 
 def _vector(bases: str, part: str, place: int) -> tuple[str, ...]:
@@ -95,8 +87,7 @@ ALIASES: Final[Mapping[str, tuple[str, ...]]] = {
 }  # fmt: skip
 """Names of each column, the most telling first."""
 
-_LISTED: Final = ("x", "y", "z", "l", "w", "h", "yaw", "vx", "vy")
-"""Meanings of the numbers of a list of `BOX_LISTS`."""
+_LISTED: Final = ("x", "y", "z", "l", "w", "h", "yaw", "vx", "vy")  # meanings of the numbers of a list of `BOX_LISTS`
 _UNITS: Final[Mapping[str, str]] = {
     "deg": "deg", "degree": "deg", "degrees": "deg", "rad": "rad", "radian": "rad", "radians": "rad",
     "s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "us": "us", "usec": "us",
@@ -106,12 +97,7 @@ _LENGTHS: Final = {"m", "meter", "meters", "metre", "metres", "mps"}
 
 
 def find_columns(names: Iterable[str], chosen: Mapping[str, str]) -> dict[str, Column]:
-    """Return the column of each meaning that the table has.
-
-    Args:
-        names: of all columns.
-        chosen: meanings whose column the user has named.
-    """
+    """Return the column of each meaning among `names`; `chosen` are meanings whose column the user has named."""
     known = [_normalised(name) for name in names]
     taken: dict[str, Column] = {}
     used = set(chosen.values())

@@ -1,6 +1,6 @@
 """Tables of boxes, one row per box: read, checked, in nanoseconds, metres and radians with z up."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -32,63 +32,42 @@ from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Bools, Floats, Ints
 from optipmb_client.table_files import Columns, read_table
 
-__all__ = ["NO_CLASS", "NO_ID", "Boxes", "read_boxes", "read_tables"]
-
-NO_CLASS: Final = "object"
-"""Class of all boxes of a table without classes."""
-NO_ID: Final = -1
-"""Id of a box that has none."""
+NO_CLASS: Final = "object"  # class of all boxes of a table without classes
+NO_ID: Final = -1  # id of a box that has none
 _UNIT: Final = 1e-3
 _MOST_SHOWN: Final = 6
-_CROWDED: Final = 0.5
-"""Share of boxes that share their place with another one from which their stamps cannot be right."""
-_LONGEST: Final = 30.0
-"""Boxes that are longer, in metres, are suspicious."""
+_CROWDED: Final = 0.5  # share of boxes that share their place with another one from which their stamps cannot be right
+_LONGEST: Final = 30.0  # boxes that are longer, in metres, are suspicious
 LEAST_VARIANCE: Final = 1e-8
-LARGEST_VARIANCE: Final = 1e8
-"""Variances of a position along any axis, m^2, as `Detections` have them."""
+LARGEST_VARIANCE: Final = 1e8  # variances of a position along any axis, m^2, as `Detections` have them
 _POSE: Final = ("pose_x", "pose_y", "pose_z")
 _TURNS: Final = ("w", "x", "y", "z")
 
 
 @dataclass(frozen=True)
 class Boxes:
-    """The rows of one table; those of a row that stands for an empty frame are left out of all but the frames."""
+    """Rows of one table; a row that stands for an empty frame is left out of all but the frames."""
 
-    frame_stamp: Ints
-    """(R,) ns, of every row, also those without a box."""
-    frame_key: NDArray[np.str_]
-    """(R,) recording and sensor of every row."""
+    frame_stamp: Ints  # (R,) ns, of every row, also those without a box
+    frame_key: NDArray[np.str_]  # (R,) recording and sensor of every row
     frame_pose: Floats | None
     """(R, 7) translation and quaternion, world from sensor; None where boxes are in the world frame."""
-    frame_time: NDArray[Any]
-    """(R,) time as the table has it."""
-    frame_number: NDArray[Any] | None
-    """(R,) number of the frame as the table has it; None where it has none."""
-    row: Ints
-    """(B,) row of each box, counted from 0."""
-    center: Floats
-    """(B, 3)"""
-    size: Floats
-    """(B, 3); NaN in a table of objects that has neither l nor w."""
-    yaw: Floats
-    """(B,); NaN in a table of objects that has none."""
-    velocity: Floats | None
-    """(B, 2); rows of NaN where unknown."""
+    frame_time: NDArray[Any]  # (R,) time as the table has it
+    frame_number: NDArray[Any] | None  # (R,) number of the frame as the table has it; None where it has none
+    row: Ints  # (B,) row of each box, counted from 0
+    center: Floats  # (B, 3)
+    size: Floats  # (B, 3); NaN in a table of objects that has neither l nor w
+    yaw: Floats  # (B,); NaN in a table of objects that has none
+    velocity: Floats | None  # (B, 2); rows of NaN where unknown
     position_covariance: Floats | None
     """(B, 3, 3) of the errors of the centres along the axes of the boxes, m^2; of NaN where unknown, None without."""
-    score: Floats
-    """(B,) in (0, 1]"""
-    name: NDArray[np.str_]
-    """(B,) class"""
-    id: Ints | None
-    """(B,) object, `NO_ID` where the cell has none; None where the table has no such column."""
+    score: Floats  # (B,) in (0, 1]
+    name: NDArray[np.str_]  # (B,) class
+    id: Ints | None  # (B,) object, `NO_ID` where the cell has none; None where the table has no such column
     time_column: str
     key_columns: tuple[str, ...]
-    sensor_column: str
-    """That of `key_columns` which names the sensor; empty: none does."""
-    keys: Mapping[str, tuple[str, ...]]
-    """Key -> values of the columns that it stands for."""
+    sensor_column: str  # one of `key_columns`, with the sensor; empty: none
+    keys: Mapping[str, tuple[str, ...]]  # key -> values of the columns that it stands for
 
     def rows(self, first: int, last: int) -> "Boxes":
         """Return the table of the rows from `first` up to `last`, which are counted from 0 again."""
@@ -121,9 +100,9 @@ def read_boxes(reading: Reading, *, scored: bool) -> Boxes:
 def read_tables(
     paths: Sequence[Path], reading: Reading, *, scored: bool, loaded: Mapping[Path, Columns] | None = None
 ) -> list[tuple[Path, Boxes]]:
-    """Read the tables of a recording; units and conventions are those of all tables with the same columns together.
+    """Read the tables of a recording; tables with the same columns share units and conventions.
 
-    Tables without rows give no boxes; those that were `loaded` are not read again. Raises as `read_boxes` does.
+    Tables without rows give no boxes; `loaded` ones are not read again. Raises as `read_boxes` does.
     """
     tables = loaded or {path: read_table(path, reading.options) for path in paths}
     groups: dict[tuple[str, ...], list[Path]] = {}
@@ -230,7 +209,8 @@ class _Table:
             center, size, yaw = sensor_from_kitti(center, np.ascontiguousarray(size[:, ::-1]), yaw)
             yaw_unit = "rad"
         read_digits(reading, center)
-        stamp = self._grouped(stamp, series, row, center, size, kind, scored=scored)
+        plane, sides = center[:, :2], size
+        stamp = self._grouped(stamp, series, row, lambda frame: overlapping(frame, plane, sides, kind), scored=scored)
         pose = self._poses(stamp)
         moves = find_moves(series[row], stamp[row] / 1e9, _world(center, row, pose)[:, :2], kind)
         motion = _Motion(row, pose, moves)
@@ -329,16 +309,14 @@ class _Table:
             reading.note("time", f"column {column.name} counts frames, {rate:g} a second")
         return np.round(numbers * (1e9 / rate)).astype(np.int64), self._columns[column.name], column.name
 
-    def _grouped(
-        self, stamp: Ints, series: Ints, row: Ints, center: Floats, size: Floats, kind: Ints, *, scored: bool
-    ) -> Ints:
+    def _grouped(self, stamp: Ints, series: Ints, row: Ints, overlap: Callable[[Ints], Bools], *, scored: bool) -> Ints:
         """Return the stamps (R,) of frames: equal for boxes of a frame that have stamps of their own."""
         reading = self._reading
 
         def crowded(stamps: Ints) -> float:
             place = np.unique(stamps[row], return_inverse=True)[1]
             frame = np.unique(series[row] * len(stamps) + place, return_inverse=True)[1].astype(np.int64)
-            return float(np.mean(overlapping(frame, center[:, :2], size, kind))) if len(row) else 0.0
+            return float(np.mean(overlap(frame))) if len(row) else 0.0
 
         asked = _positive(reading.options, "group", "seconds", zero=True)
         if asked is not None:
@@ -462,7 +440,7 @@ class _Table:
         return np.where(np.isin(texts, ("", "nan", "-1", "-1.0")), NO_ID, numbers)
 
     def _poses(self, stamp: Ints) -> Floats | None:
-        """Return the poses (R, 7) of the table, or those of another one at its stamps."""
+        """Return the poses (R, 7) of the table, or of another one at its stamps."""
         reading = self._reading
         if "poses" in reading.options:
             return _poses_at(reading, Path(reading.options["poses"]), stamp)
@@ -574,7 +552,7 @@ class _Motion:
 
 
 _FORWARD: Final = 0.8
-"""Share of moves that go forward from which boxes with a common motion are those of traffic, not of a moving sensor."""
+"""Share of forward moves from which a common motion is that of traffic, not of the sensor."""
 _LEAST_TURN: Final = 1e-6
 _INVERSE: Final = np.array([1.0, -1.0, -1.0, -1.0])
 

@@ -18,58 +18,28 @@ from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Floats, Ints, wrap_angle
 from optipmb_client.table_files import line_of
 
-__all__ = [
-    "COUNTED_HZ",
-    "HEADINGS",
-    "SECONDS",
-    "Finding",
-    "Reading",
-    "frame_starts",
-    "group_stamps",
-    "median_step",
-    "read_angle",
-    "read_axes",
-    "read_digits",
-    "read_heading",
-    "read_scores",
-    "read_sizes",
-    "read_stamps",
-    "read_turn",
-    "read_velocity",
-]
-
 SECONDS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-DATED: Final = (1e8, 4.2e9)
-"""Seconds since 1970 that are taken for a date: 1973 to 2103."""
-PERIODS: Final = (0.005, 10.0)
-"""Shortest and longest time between frames that is plausible, s."""
-COUNTED_HZ: Final = 10.0
-"""Rate of frames that are counted and not stamped, where nobody says another."""
-APART: Final = 3.0
-"""Ratio of the shortest step between frames to the longest step inside of one."""
-UPRIGHT: Final = 0.3
-"""Largest x and y of the quaternion of a box that stands upright."""
+DATED: Final = (1e8, 4.2e9)  # seconds since 1970 that are taken for a date: 1973 to 2103
+PERIODS: Final = (0.005, 10.0)  # shortest and longest time between frames that is plausible, s
+COUNTED_HZ: Final = 10.0  # default rate of frames that are counted and not stamped
+APART: Final = 3.0  # ratio of the shortest step between frames to the longest step inside of one
+UPRIGHT: Final = 0.3  # largest x and y of the quaternion of a box that stands upright
 FULL_TURN: Final = 6.4
 PERCENT: Final = 100.0
 SPREAD: Final = 8.0
-LOGIT: Final = 30.0
-"""Beyond it a sigmoid is 0 or 1 in six decimals; scores beyond it are no logits."""
-ROUNDING: Final = 1e-3
-"""Scores up to so much above 1 are 1."""
-FEW: Final = 0.05
-"""Share of scores outside 0 to 1 up to which they are mistakes and not of another kind."""
-ENOUGH_MOVES: Final = 5
-"""Moves from which headings are compared with motion."""
-AGREED: Final = 0.5
-"""Share of moves along headings of another convention from which it is likely."""
+LOGIT: Final = 30.0  # beyond it a sigmoid is 0 or 1 in six decimals; scores beyond it are no logits
+ROUNDING: Final = 1e-3  # scores up to so much above 1 are 1
+FEW: Final = 0.05  # share of scores outside 0 to 1 up to which they are mistakes and not of another kind
+ENOUGH_MOVES: Final = 5  # moves from which headings are compared with motion
+AGREED: Final = 0.5  # share of moves along headings of another convention from which it is likely
 DOUBTFUL: Final = 0.7
 CERTAIN: Final = 0.8
 """Headings are in degrees where fewer moves than the first share are along them in radians, more than the second go
 forward along them in degrees."""
 SINGLE: Final = 0.1
-FAR: Final = 1e5
-"""Coordinates in metres beyond which single precision loses centimetres."""
+FAR: Final = 1e5  # coordinates in metres beyond which single precision loses centimetres
 
+# Axis from which a heading is measured, counter-clockwise if not said otherwise -> (sign, offset) of the yaw
 HEADINGS: Final[Mapping[str, tuple[float, float]]] = {
     "x": (1.0, 0.0),
     "y": (1.0, 0.5 * np.pi),
@@ -80,36 +50,28 @@ HEADINGS: Final[Mapping[str, tuple[float, float]]] = {
     "-x-clockwise": (-1.0, np.pi),
     "-y-clockwise": (-1.0, -0.5 * np.pi),
 }
-"""Axis from which a heading is measured, counter-clockwise if not said otherwise -> (sign, offset) of the yaw."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """An assumption about a recording, or what is wrong with it.
+    """An assumption about a recording, or an error in it."""
 
-    Attributes:
-        topic: what it is about: `time`, `yaw`, `scores` …
-        text: one line.
-        option: the option that changes it; empty: none does.
-        wrong: whether `optipmb track` refuses the recording for it.
-    """
-
-    topic: str
-    text: str
-    option: str = ""
-    wrong: bool = False
+    topic: str  # `time`, `yaw`, `scores` …
+    text: str  # one line
+    option: str = ""  # that changes it
+    wrong: bool = False  # whether `optipmb track` refuses the recording for it
 
 
 @dataclass
 class Reading:
-    """The files of a recording, the options of the user, and the findings.
+    """Files of a recording, options of the user, and findings.
 
     Attributes:
-        path: the file, or the folder of several.
-        options: of the dataset.
-        lenient: what is wrong becomes a finding; the reader goes on as if nothing were known.
-        files: each file with the first of its rows; empty: all rows are those of `path`.
-        named: options `column.*` and `class.*`, with the error where they name nothing in the tables read so far.
+        path: The file, or the folder of several.
+        options: Options of the data set.
+        lenient: Errors become findings; the reader goes on as if nothing were known.
+        files: Each file with the first of its rows; empty: all rows are in `path`.
+        named: Options `column.*` and `class.*`, with the error if they name nothing in the tables read so far.
     """
 
     path: Path
@@ -154,7 +116,7 @@ class Reading:
         """Return the value of an option; None where it is not given.
 
         Raises:
-            DatasetError: it is not one of `known`.
+            DatasetError: It is not one of `known`.
         """
         value = self.options.get(name)
         if value is not None and value not in known:
@@ -219,16 +181,10 @@ def _longest_inside(steps: np.ndarray) -> float:
 
 
 def read_stamps(reading: Reading, numbers: np.ndarray, key: Ints, unit: str | None) -> Ints:
-    """Return stamps (R,) in nanoseconds.
-
-    Args:
-        reading: with options.
-        numbers: (R,) time of each row.
-        key: (R,) recording of each row.
-        unit: that the name of the column states.
+    """Return stamps (R,) in nanoseconds of times (R,) of recordings `key` (R,); `unit` is in the name of the column.
 
     Raises:
-        DatasetError: the values count frames, or no unit fits them.
+        DatasetError: The values count frames, or no unit fits them.
     """
     asked = reading.chosen("time", SECONDS)
     period = median_step(numbers, key)
@@ -261,7 +217,7 @@ _WORDS: Final = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns
 
 
 def read_angle(reading: Reading, name: str, values: Floats, unit: str | None) -> Floats:
-    """Return the angles of a pose in radians; the unit is told by the name of the column and by their range."""
+    """Return the angles of a pose in radians; the unit follows from the name of the column and their range."""
     chosen = reading.chosen("yaw", ("degrees", "radians")) or _UNITS.get(unit or "")
     most = float(np.abs(values).max(initial=0.0))
     if chosen is None:
@@ -274,14 +230,7 @@ _UNITS: Final = {"deg": "degrees", "rad": "radians"}
 
 
 def read_turn(reading: Reading, topic: str, parts: Floats, *, named: bool) -> Floats:
-    """Return quaternions (R, 4) as w, x, y, z.
-
-    Args:
-        reading: with options.
-        topic: for findings.
-        parts: (R, 4) in the order of the columns; `named` where these say which is which.
-        named: see `parts`.
-    """
+    """Return quaternions (R, 4) as w, x, y, z from `parts`, in the order of the columns unless these are `named`."""
     order = reading.chosen("quaternion", ("wxyz", "xyzw"))
     if order is None and not named and len(parts):
         level = np.nanmax(np.abs(parts), axis=0) < UPRIGHT
@@ -307,12 +256,12 @@ def read_heading(
     """Return headings (B,) in radians, counter-clockwise from x.
 
     Args:
-        reading: with options.
+        reading: Gets the findings.
         values: (B,) of the table.
-        unit: that the name of the column states; `quaternion` where the values come from one.
-        moves: of the boxes, in the world.
-        carry: returns headings in the world from headings (K,) and the rows (K,) of their boxes.
-        strict: whether headings that disagree with the motion are refused, and not only noted.
+        unit: Unit in the name of the column; `quaternion` where the values come from one.
+        moves: Moves of the boxes, in the world.
+        carry: Returns headings in the world from headings (K,) and the rows (K,) of their boxes.
+        strict: Whether headings that disagree with the motion are refused, and not only noted.
     """
     asked = reading.chosen("yaw", ("degrees", "radians"))
     zero = reading.chosen("heading", HEADINGS)
@@ -361,14 +310,9 @@ def _shares(yaw: Floats, moves: Moves, carry: Callable[[Floats, Ints], Floats]) 
 def read_velocity(
     reading: Reading, velocity: Floats, moves: Moves, carry: Callable[[Floats, Ints], Floats], *, posed: bool
 ) -> str:
-    """Return the axes along which velocities (B, 2) are: `sensor`, or `world` where boxes have a pose.
+    """Return the axes of velocities (B, 2), m/s, NaN where unknown: `sensor`, or `world` where boxes are `posed`.
 
-    Args:
-        reading: with options.
-        velocity: (B, 2) m/s, NaN where unknown.
-        moves: of the boxes, in the world.
-        carry: see `read_heading`.
-        posed: whether boxes are in the frame of a sensor whose pose is known.
+    The other arguments are as for `read_heading`.
     """
     asked = reading.chosen("velocity", ("sensor", "world"))
     known = moves.take(np.asarray(np.isfinite(velocity[moves.start]).all(axis=1)))
@@ -390,21 +334,14 @@ def read_velocity(
     return axes
 
 
-SLOW: Final = 0.5
-"""Differences of velocities up to it say nothing, m/s."""
+SLOW: Final = 0.5  # differences of velocities up to it say nothing, m/s
 
 
 def read_sizes(reading: Reading, sizes: Floats, names: np.ndarray, *, stated: bool) -> Floats:
-    """Return length, width, height.
+    """Return length, width, height of sizes (B, 3) in the order of the columns, whose names may be `stated`.
 
-    The order is told by vehicles, whose median length exceeds their width by far, and is height, width, length when the
-    longest comes last.
-
-    Args:
-        reading: with options.
-        sizes: (B, 3) in the order of the columns.
-        names: (B,) classes.
-        stated: whether the names of the columns say which is which.
+    The order follows from vehicles, whose median length exceeds their width by far, and is height, width, length when
+    the longest comes last.
     """
     order = reading.chosen("sizes", ("lwh", "wlh", "hwl"))
     if order is None:
@@ -432,7 +369,7 @@ def read_axes(reading: Reading, center: Floats) -> bool:
     """Return whether boxes have the axes of a camera.
 
     Raises:
-        DatasetError: the axes look like those of a camera, and no option says so.
+        DatasetError: The axes look like a camera's, and no option says so.
     """
     axes = reading.chosen("axes", ("z-up", "camera"))
     if axes is None and len(center) > 1:
@@ -466,10 +403,10 @@ def read_digits(reading: Reading, center: Floats) -> None:
 
 
 def read_scores(reading: Reading, scores: Floats, rows: Ints) -> Floats:
-    """Return scores (B,), those of boxes in `rows` of the table, as probabilities; NaN where one is to be left out.
+    """Return scores (B,) of the boxes in `rows` of the table as probabilities; NaN where one is to be left out.
 
     Raises:
-        DatasetError: some are outside of 0 to 1, and no kind of score fits all.
+        DatasetError: Some are outside of 0 to 1, and no kind of score fits all.
     """
     kind = reading.chosen("score", ("probability", "logit", "percent"))
     rounded = (scores > 1.0) & (scores <= 1.0 + ROUNDING)

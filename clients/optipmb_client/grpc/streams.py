@@ -1,0 +1,291 @@
+"""A stream on its way to a gateway, and the tracks of a pattern on their way back: resumed at the next when it goes."""
+
+import collections
+import itertools
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, TypeVar
+
+from optipmb_schemas import Keys, Message
+from optipmb_schemas.protobuf import convert
+from optipmb_schemas.protobuf import tracking_pb2 as pb
+
+from optipmb_client.errors import ClientError, ConnectionFailed
+from optipmb_client.grpc.channels import Channels, ResumedCall
+from optipmb_client.incoming import Arrival, Inbox
+
+__all__ = ["GrpcSender", "GrpcSubscription", "Publishing"]
+
+T = TypeVar("T", bound=Message)
+
+CLOSE_S: Final = 5.0
+CLOUDS: Final = 4
+"""Clouds that may wait for a gateway in any case."""
+WAITING_BYTES: Final = 64 * 2**20
+"""Bytes of a topic that may wait for a gateway beyond that: some seconds of a sensor's clouds."""
+
+_Numbered = tuple[int, bytes]
+
+
+class Publishing(ResumedCall):
+    """The detections and clouds of one stream in a `Publish` call, opened anew at the next gateway when it fails.
+
+    The newest messages are kept and sent again then: nobody knows which of them the old gateway had passed on, and
+    whoever has them already drops them.
+
+    Args:
+        channels: to gateways.
+        stream: its name.
+        cache: detections that are kept.
+        cache_clouds: clouds that are kept; without any they are sent only while somebody subscribes.
+        timeout: seconds to wait until the stream is open.
+
+    Raises:
+        ConnectionFailed: it is not open in time.
+        ServiceRefused: the gateway does not take it.
+    """
+
+    def __init__(self, channels: Channels, stream: str, cache: int, cache_clouds: int, timeout: float) -> None:
+        super().__init__(channels, "Publish", f"publish {stream}")
+        options = pb.PublishOptions(stream=stream, cache=cache, cache_clouds=cache_clouds)
+        self._options = pb.PublishRequest(options=options).SerializeToString()
+        self._waiting = {"detections": _Waiting(max(cache, 1)), "points": _Waiting(CLOUDS)}
+        self._kept: dict[str, collections.deque[_Numbered]] = {
+            "detections": collections.deque(maxlen=max(cache, 1)),
+            "points": collections.deque(maxlen=cache_clouds),
+        }
+        self._keeps_clouds = cache_clouds > 0
+        self._number = itertools.count()
+        self._calls = 0
+        self._changed = threading.Condition()
+        self._closing = False
+        self._opened = False
+        self._senders = 2
+        self.points_wanted = self._keeps_clouds
+        self.error: ClientError | None = None
+        self._thread.start()
+        with self._changed:
+            self._changed.wait_for(lambda: self._opened or self.error is not None, timeout)
+        if self._opened:
+            return
+        self.release(self._senders)
+        raise self.error or ConnectionFailed(f"no gRPC gateway took the stream {stream} within {timeout:g} s")
+
+    def put(self, topic: str, payload: bytes) -> None:
+        """Send a message; waits for nobody.
+
+        Raises:
+            ConnectionFailed: after the end.
+            ServiceRefused: the gateway does not take the stream any more.
+        """
+        with self._changed:
+            if self.error is not None:
+                raise self.error
+            if self._closing:
+                raise ConnectionFailed("this publisher has been closed")
+            self._waiting[topic].append((next(self._number), payload))
+            self._changed.notify_all()
+
+    def release(self, senders: int = 1) -> None:
+        """Send what waits, and end, when all senders are closed."""
+        with self._changed:
+            self._senders -= senders
+            if self._senders > 0 or self._closing:
+                return
+            self._closing = True
+            self._changed.notify_all()
+        self._thread.join(CLOSE_S)
+        self._cancel()
+
+    def _take(self, response: bytes) -> None:
+        said = pb.PublishResponse.FromString(response)
+        if said.WhichOneof("response") == "acknowledgement":
+            with self._changed:
+                self.points_wanted = self._keeps_clouds or said.acknowledgement.points_wanted
+                self._opened = True
+                self._changed.notify_all()
+
+    def _began(self) -> None:
+        """Wait for the first acknowledgement."""
+
+    def _is_done(self) -> bool:
+        return self._closing
+
+    def _fail(self, error: ClientError) -> None:
+        with self._changed:
+            self.error = error
+            self._changed.notify_all()
+
+    def _requests(self) -> Iterator[bytes]:
+        """Iterate over the options, what is kept, and what comes, until the next call; run by a thread of gRPC."""
+        with self._changed:
+            self._calls += 1
+            call = self._calls
+            self._changed.notify_all()
+            for topic, kept in self._kept.items():
+                self._waiting[topic].prepend(kept)
+                kept.clear()
+        yield self._options
+        while (payload := self._next(call)) is not None:
+            yield payload
+
+    def _next(self, call: int) -> bytes | None:
+        """Return the oldest message that waits, detections and clouds in their order; None when the call is over."""
+        with self._changed:
+            self._changed.wait_for(lambda: any(self._waiting.values()) or self._closing or self._calls != call)
+            waiting = [topic for topic, queue in self._waiting.items() if queue]
+            if self._calls != call or not waiting:
+                return None
+            topic = min(waiting, key=lambda one: self._waiting[one].number)
+            message = self._waiting[topic].popleft()
+            self._kept[topic].append(message)
+            return message[1]
+
+
+class _Waiting:
+    """Messages that no call was given yet: so many, or so many bytes, of the newest."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._messages: collections.deque[_Numbered] = collections.deque()
+        self._bytes = 0
+
+    def __bool__(self) -> bool:
+        return bool(self._messages)
+
+    @property
+    def number(self) -> int:
+        """Number of the oldest."""
+        return self._messages[0][0]
+
+    def append(self, message: _Numbered) -> None:
+        """Add the newest; the oldest go when there are too many."""
+        self._messages.append(message)
+        self._bytes += len(message[1])
+        while len(self._messages) > self._most and self._bytes > WAITING_BYTES:
+            self.popleft()
+
+    def prepend(self, messages: Sequence[_Numbered]) -> None:
+        """Add what was given to a call that failed."""
+        self._messages.extendleft(reversed(messages))
+        self._bytes += sum(len(payload) for _, payload in messages)
+
+    def popleft(self) -> _Numbered:
+        """Take the oldest."""
+        message = self._messages.popleft()
+        self._bytes -= len(message[1])
+        return message
+
+
+class GrpcSender:
+    """Sends the messages of one topic of a stream."""
+
+    def __init__(self, publishing: Publishing, topic: str) -> None:
+        self._publishing = publishing
+        self._topic = topic
+        self._closed = False
+
+    @property
+    def wanted(self) -> bool:
+        """Whether anybody takes the messages."""
+        return self._topic == "detections" or self._publishing.points_wanted
+
+    def pack(self, message: Message) -> bytes:
+        """Return a message as it is sent."""
+        request = pb.PublishRequest(**{self._topic: convert.to_proto(message)})
+        return request.SerializeToString()
+
+    def put(self, payload: bytes) -> None:
+        """Send a packed message."""
+        self._publishing.put(self._topic, payload)
+
+    def close(self) -> None:
+        """Withdraw; what was sent before goes out."""
+        if not self._closed:
+            self._closed = True
+            self._publishing.release()
+
+
+QUEUE: Final = 1024
+"""Messages of a stream that may wait in the gateway: the most that it allows."""
+
+
+@dataclass(frozen=True)
+class _ProtoArrival(Arrival):
+    """A message that came in protobuf."""
+
+    proto: Any = field(kw_only=True)
+
+    def read(self, kind: type[T]) -> T:
+        """Return the message, checked.
+
+        Raises:
+            MessageError: it is not valid.
+        """
+        return convert.from_proto(self.proto, kind)
+
+
+class GrpcSubscription(ResumedCall):
+    """A `Subscribe` call, made anew when it ends; what the services keep comes first each time.
+
+    Args:
+        channels: to gateways.
+        pattern: of streams.
+        inbox: for what comes.
+        keys: of the network, for the names of arrivals.
+        problems: whether problems come too.
+        timeout: seconds to wait until it is in force.
+
+    Raises:
+        ConnectionFailed: it is not in force in time.
+        ServiceRefused: the gateway does not allow it.
+    """
+
+    def __init__(
+        self, channels: Channels, pattern: str, inbox: Inbox, keys: Keys, *, problems: bool, timeout: float
+    ) -> None:
+        super().__init__(channels, "Subscribe", f"subscribe {pattern}")
+        request = pb.SubscribeRequest(pattern=pattern, queue=QUEUE, history=True, problems=problems)
+        self._request = request.SerializeToString()
+        self._inbox = inbox
+        self._keys = keys
+        self._settled = threading.Event()
+        self._error: ClientError | None = None
+        self._thread.start()
+        if not self._settled.wait(timeout):
+            self._error = ConnectionFailed(f"no gRPC gateway took the subscription within {timeout:g} s")
+        if self._error is not None:
+            self.close()
+            raise self._error
+
+    def close(self) -> None:
+        """End it; what is in the inbox stays readable."""
+        self._cancel()
+        self._thread.join(CLOSE_S)
+
+    def _requests(self) -> Iterator[bytes]:
+        return iter((self._request,))
+
+    def _began(self) -> None:
+        self._call.initial_metadata()  # it is in force
+        if self._call.is_active():
+            self._settled.set()
+
+    def _is_done(self) -> bool:
+        return False
+
+    def _fail(self, error: ClientError) -> None:
+        self._error = error
+        self._settled.set()
+        if not self._over.is_set():
+            self._inbox.close()  # nothing will come any more
+
+    def _take(self, response: bytes) -> None:
+        said = pb.SubscribeResponse.FromString(response)
+        self._inbox.dropped += said.skipped
+        tracks = said.WhichOneof("response") == "tracks"
+        proto = said.tracks if tracks else said.problem
+        key = self._keys.tracks(proto.stream) if tracks else self._keys.problems(proto.stream)
+        self._inbox.put(_ProtoArrival(key, b"", "application/protobuf", time.monotonic_ns(), proto=proto))

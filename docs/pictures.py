@@ -1,0 +1,120 @@
+"""Pictures of docs/concepts.md: `python docs/pictures.py docs/images`. Needs the extra `plot`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+
+import optipmb
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+CAR, GHOST, TRUTH, TRACK = "#0072B2", "#D55E00", "#B5B5B5", "#0072B2"
+RATE = 10
+FRAMES = 70
+MISSED = range(30, 40)
+GHOST_FRAMES = (5, 7)
+
+
+def place_of(frame: int) -> tuple[float, float]:
+    """Return where the car is: it turns to the left at a crossing."""
+    angle = np.clip((frame - 15) / 40, 0.0, 1.0) * np.pi / 2
+    before, after = min(frame, 15) * 0.5, max(frame - 55, 0) * 0.5
+    return float(before + 12.7 * np.sin(angle)), float(12.7 * (1.0 - np.cos(angle)) + after)
+
+
+def scene() -> tuple[list[optipmb.OnlineTracks], list[tuple[int, float, float]]]:
+    """Return the tracks of each frame, and the detections of the car as (frame, x, y)."""
+    rng = np.random.default_rng(3)
+    tracker = optipmb.OnlineTracker("generic")
+    tracks, found = [], []
+    for frame in range(FRAMES):
+        boxes = []
+        (x, y), (ahead_x, ahead_y) = place_of(frame), place_of(frame + 1)
+        heading = float(np.arctan2(ahead_y - y, ahead_x - x))
+        if frame not in MISSED:
+            x, y = np.array((x, y)) + rng.normal(0.0, 0.12, 2)
+            boxes.append((float(x), float(y), heading, 0.8))
+            found.append((frame, float(x), float(y)))
+        if frame in GHOST_FRAMES:
+            boxes.append((4.0, 9.0, 0.3, 0.35))
+        names = ("x", "y", "yaw", "score", "l", "w", "class")
+        cars = [dict(zip(names, (*box, 4.5, 1.9, "car"), strict=True)) for box in boxes]
+        tracks.append(tracker.update(cars, t=frame / RATE))
+    return tracks, found
+
+
+def row_of(tracks: optipmb.OnlineTracks, identity: int) -> int | None:
+    """Return the row of a track, None where it is not there."""
+    rows = np.flatnonzero(tracks.id == identity)
+    return int(rows[0]) if len(rows) else None
+
+
+def draw_track(axes: Axes, tracks: list[optipmb.OnlineTracks], found: list[tuple[int, float, float]]) -> None:
+    """Draw the true path, detections and the track."""
+    axes.plot(*np.array([place_of(k) for k in range(FRAMES)]).T, color=TRUTH, linewidth=5, label="true path")
+    axes.plot(*np.array(found)[:, 1:].T, "x", color="#222222", markersize=4, label="detections")
+    rows = [(one, row_of(one, 1)) for one in tracks]
+    path = [one.center[i, :2] if i is not None else (np.nan, np.nan) for one, i in rows]
+    axes.plot(*np.array(path).T, color=TRACK, linewidth=1.5, label="track 1")
+    axes.annotate("a second without\ndetections", place_of(35), (8, 9), arrowprops={"arrowstyle": "->"}, fontsize=9)
+
+
+def draw_ellipses(axes: Axes, tracks: list[optipmb.OnlineTracks], found: list[tuple[int, float, float]]) -> None:
+    """Draw the ellipse of two standard deviations around the gap."""
+    for frame in (24, 27, 29, 30, 31, 32, 40, 41, 44):
+        one = tracks[frame]
+        values, vectors = np.linalg.eigh(one.covariance[0, :2, :2])
+        angle = float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))
+        missed = frame in MISSED
+        colour = GHOST if missed else CAR
+        width, height = (4.0 * np.sqrt(values[::-1])).tolist()
+        place = (float(one.center[0, 0]), float(one.center[0, 1]))
+        label = {24: "after a detection", 30: "predicted"}.get(frame, "_")
+        axes.add_patch(Ellipse(place, width, height, angle=angle, facecolor=colour, alpha=0.3, label=label))
+        axes.plot(*place, ".", color=colour)
+    near = np.array([(x, y) for frame, x, y in found if frame >= min(MISSED) - 8 and frame <= max(MISSED) + 6])
+    axes.plot(*near.T, "x", color="#222222", markersize=4, label="detections")
+
+
+def draw_existence(axes: Axes, tracks: list[optipmb.OnlineTracks]) -> None:
+    """Draw the existence of the car and of the false detection."""
+    ghost = next(int(i) for one in tracks for i in one.id if i != 1)
+    for identity, colour, name in ((1, CAR, "car, missed from 3.0 s to 3.9 s"), (ghost, GHOST, "two false detections")):
+        rows = [row_of(one, identity) for one in tracks]
+        values = [np.nan if i is None else one.existence[i] for one, i in zip(tracks, rows, strict=True)]
+        axes.plot(np.arange(FRAMES) / RATE, values, color=colour, label=name)
+    axes.axhline(0.5, color=TRUTH, linestyle="--", label="confirmed from here on")
+    axes.set_ylim(0.0, 1.05)
+    axes.set_xlabel("time (s)")
+    axes.set_ylabel("existence")
+
+
+def main(folder: Path) -> None:
+    """Write the pictures into a folder."""
+    tracks, found = scene()
+    for name, size in (("track", (6.0, 4.2)), ("ellipse", (6.0, 4.2)), ("existence", (6.0, 3.0))):
+        figure = Figure(figsize=size, layout="constrained")
+        FigureCanvasAgg(figure)
+        axes = figure.subplots()
+        if name == "existence":
+            draw_existence(axes, tracks)
+        else:
+            (draw_track if name == "track" else draw_ellipses)(axes, tracks, found)
+            axes.set_aspect("equal")
+            axes.set_xlabel("x (m)")
+            axes.set_ylabel("y (m)")
+        axes.grid(visible=True, color="#EEEEEE")
+        axes.legend(frameon=False, fontsize=9)
+        figure.savefig(folder / f"concepts-{name}.png", dpi=110, metadata={"Software": None})
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

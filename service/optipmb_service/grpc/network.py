@@ -1,0 +1,304 @@
+"""The network as calls use it: subscriptions that they share, and publishers that they use in turn.
+
+What is wanted by many calls is received, decoded and encoded once. What no call has any more is kept for the next one,
+because Zenoh never gives back the number of a key.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import contextlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Generic, Protocol, TypeVar
+
+import optipmb_schemas as schemas
+from optipmb_schemas.protobuf import convert
+from optipmb_schemas.protobuf import tracking_pb2 as pb
+
+from optipmb_service.grpc.calls import varint
+from optipmb_service.grpc.selection import EVERYTHING
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable, Hashable, Iterable
+
+    from optipmb_schemas.protobuf.convert import EncodedTracks
+
+    from optipmb_service.grpc.selection import Selection
+    from optipmb_service.zenoh.client import Client, Message, Outgoing
+    from optipmb_service.zenoh.subscription import Subscription
+
+IDLE_S: Final = 60.0
+"""Time after which a subscription or publisher that no call has taken is closed."""
+
+IDLE_SUBSCRIPTIONS: Final = 256
+IDLE_PUBLISHERS: Final = 64
+"""How many are kept; a publisher is kept with what it caches."""
+
+HISTORY_S: Final = 2.0
+"""Longest wait for the caches of the services."""
+
+MAX_EARLY: Final = 1024
+"""Most items that wait until it is known what the caches hold."""
+
+_TRACKS: Final = b"\x0a"
+"""Tag of field 1, `tracks`, of all responses with tracks."""
+
+PublisherKey = tuple[str, int, int]
+"""Stream, cached detections, cached clouds."""
+
+
+class _Closable(Protocol):
+    def close(self) -> None:
+        """Release it."""
+
+
+R = TypeVar("R", bound=_Closable)
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """Something that came, as a response of any streaming method.
+
+    Attributes:
+        tracks: of which it is, if it is of any.
+        problem: its code and path, if it is one.
+    """
+
+    stream: str
+    response: bytes
+    tracks: EncodedTracks | None = None
+    problem: tuple[str, str] | None = None
+
+    @classmethod
+    def of_tracks(cls, tracks: EncodedTracks, selection: Selection = EVERYTHING) -> Item:
+        """Return what is wanted of tracks as a response."""
+        payload = selection.of(tracks.message()).SerializeToString() if selection.key else tracks.payload
+        return cls(tracks.stream, b"".join((_TRACKS, varint(len(payload)), payload)), tracks)
+
+    @classmethod
+    def of_problem(cls, problem: schemas.Problem) -> Item:
+        """Return a problem as a response."""
+        response = pb.SubscribeResponse(problem=convert.to_proto(problem))
+        return cls(problem.stream, response.SerializeToString(), problem=(problem.code, problem.path))
+
+
+@dataclass(eq=False, frozen=True)
+class Listener:
+    """A call that takes what comes.
+
+    Attributes:
+        take: takes something; called on the loop.
+        selection: what it wants of tracks.
+        passes: whether it wants the tracks of a frame; called on a thread of the subscription.
+    """
+
+    take: Callable[[Item], None]
+    selection: Selection = EVERYTHING
+    passes: Callable[[EncodedTracks], bool] = lambda _: True
+
+
+class Deduplicator:
+    """Passes on what the caches did not hold when they were asked.
+
+    At the next heartbeat of a publisher, recovery sends a subscriber that has heard nothing yet all that is cached.
+
+    Args:
+        take: called with what is new.
+    """
+
+    def __init__(self, take: Callable[[Item], None]) -> None:
+        self._take = take
+        self._known: set[tuple[object, ...]] = set()
+        self._early: list[Item] | None = []  # what came before it was known what the caches hold
+
+    def put(self, item: Item) -> None:
+        """Pass on an item, now or when the caches have been asked, or leave it out."""
+        if self._early is not None and len(self._early) < MAX_EARLY:
+            self._early.append(item)
+        elif item.tracks is None or _publication(item.tracks) not in self._known:
+            self._take(item)
+
+    def begin(self, held: Iterable[EncodedTracks]) -> None:
+        """Take in what the caches hold, and pass on what else came while they were asked."""
+        self._known = {_publication(tracks) for tracks in held}
+        early, self._early = self._early or [], None
+        for item in early:
+            self.put(item)
+
+
+def _publication(tracks: EncodedTracks) -> tuple[object, ...]:
+    return tracks.stream, tracks.sensor, tracks.epoch, tracks.seq, tracks.run, tracks.revision
+
+
+class _IdlePool(Generic[R]):
+    """Idle resources by key, each closed after `IDLE_S`; beyond `most` the oldest is closed."""
+
+    def __init__(self, most: int) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._most = most
+        self._idle: collections.OrderedDict[Hashable, tuple[asyncio.TimerHandle, R]] = collections.OrderedDict()
+
+    def keep(self, key: Hashable, resource: R) -> bool:
+        """Add a resource; False when there is one of this key."""
+        if key in self._idle:
+            return False
+        self._idle[key] = self._loop.call_later(IDLE_S, self._end, key), resource
+        if len(self._idle) > self._most:
+            self._end(next(iter(self._idle)))
+        return True
+
+    def take(self, key: Hashable) -> R | None:
+        """Remove and return the resource of a key, None when there is none."""
+        timer, resource = self._idle.pop(key, (None, None))
+        if timer is not None:
+            timer.cancel()
+        return resource
+
+    def close(self) -> None:
+        """Close all resources."""
+        for key in list(self._idle):
+            self._end(key)
+
+    def _end(self, key: Hashable) -> None:
+        if (resource := self.take(key)) is not None:
+            self._loop.run_in_executor(None, resource.close)
+
+
+class _Feed:
+    """A subscription and its listeners."""
+
+    def __init__(self) -> None:
+        self.listeners: tuple[Listener, ...] = ()
+        self.subscription: Subscription | None = None
+
+    def close(self) -> None:
+        """Withdraw the subscription."""
+        if self.subscription is not None:
+            self.subscription.close()
+
+
+class Network:
+    """Subscriptions and publishers of a gateway; to be used on its loop.
+
+    Args:
+        client: of the network.
+        invalid: called for what comes and is no valid message, on any thread.
+    """
+
+    def __init__(self, client: Client, invalid: Callable[[str], None]) -> None:
+        self._client = client
+        self._loop = asyncio.get_running_loop()
+        self._invalid = invalid
+        self._feeds: dict[str, _Feed] = {}
+        self._idle_feeds: _IdlePool[_Feed] = _IdlePool(IDLE_SUBSCRIPTIONS)
+        self._idle_publishers: _IdlePool[Outgoing] = _IdlePool(IDLE_PUBLISHERS)
+        self._arrived: collections.deque[tuple[Listener, Item]] = collections.deque()
+        self._waking = False
+
+    def close(self) -> None:
+        """Withdraw what no call has any more."""
+        self._idle_feeds.close()
+        self._idle_publishers.close()
+
+    @contextlib.asynccontextmanager
+    async def subscribed(self, key: str, listener: Listener) -> AsyncIterator[None]:
+        """Have a listener take what is published under a key expression.
+
+        Raises:
+            TransportError: the network cannot be used.
+        """
+        feed = self._feeds.get(key)
+        if feed is None:
+            feed = self._feeds[key] = self._idle_feeds.take(key) or _Feed()
+        feed.listeners = (*feed.listeners, listener)
+        try:
+            if feed.subscription is None:
+                feed.subscription = self._client.subscribe(key, lambda message: self._receive(feed, message))
+            yield
+        finally:
+            feed.listeners = tuple(one for one in feed.listeners if one is not listener)
+            if not feed.listeners:
+                del self._feeds[key]
+                if feed.subscription is not None:
+                    self._idle_feeds.keep(key, feed)
+
+    @contextlib.asynccontextmanager
+    async def publishing(self, key: PublisherKey, wanted: Callable[[], None]) -> AsyncIterator[Outgoing]:
+        """Give the publishers of a stream to a call alone; `wanted` as for `Outgoing`.
+
+        Raises:
+            TransportError: the network cannot be used, or too many were opened.
+        """
+        outgoing = self._idle_publishers.take(key)
+        if outgoing is None:
+            outgoing = self._client.publish(*key, wanted)
+        outgoing.wanted = wanted
+        try:
+            yield outgoing
+        finally:
+            outgoing.wanted = _nobody
+            # Cached clouds take much memory; another call may have left its own publishers.
+            if key[2] or not self._idle_publishers.keep(key, outgoing):
+                await asyncio.shield(asyncio.to_thread(outgoing.close))
+
+    async def recent(self, key: str) -> list[EncodedTracks]:
+        """Return the tracks that the services keep under a key expression, each stream's as they were published.
+
+        Raises:
+            TransportError: the network cannot be used.
+        """
+
+        def read() -> list[EncodedTracks]:
+            messages = self._client.recent(key, HISTORY_S)
+            return [tracks for one in messages if (tracks := self._tracks(one)) is not None]
+
+        return await asyncio.to_thread(read)
+
+    def _receive(self, feed: _Feed, message: Message) -> None:
+        """Take a message on the thread of its subscription."""
+        if not (listeners := feed.listeners):
+            return
+        arrived: list[tuple[Listener, Item]] = []
+        if message.key.endswith("/problems"):
+            problem = self._problem(message)
+            if problem is not None:
+                item = Item.of_problem(problem)
+                arrived = [(listener, item) for listener in listeners]
+        else:
+            tracks = self._tracks(message)
+            if tracks is not None:
+                wanting = [one for one in listeners if one.passes(tracks)]
+                selections = {one.selection.key: one.selection for one in wanting}
+                items = {key: Item.of_tracks(tracks, selection) for key, selection in selections.items()}
+                arrived = [(one, items[one.selection.key]) for one in wanting]
+        self._arrived.extend(arrived)
+        if arrived and not self._waking:  # what is added after this was seen is still handed over
+            self._waking = True
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                self._loop.call_soon_threadsafe(self._hand_over)
+
+    def _hand_over(self) -> None:
+        """Hand over all that has come, on the loop, which is woken once for it."""
+        self._waking = False
+        while self._arrived:
+            listener, item = self._arrived.popleft()
+            listener.take(item)
+
+    def _tracks(self, message: Message) -> EncodedTracks | None:
+        try:
+            return convert.transcode(message.payload, encoding=message.encoding)
+        except schemas.MessageError as error:
+            self._invalid(str(error))
+            return None
+
+    def _problem(self, message: Message) -> schemas.Problem | None:
+        try:
+            return schemas.decode(message.payload, schemas.Problem, encoding=message.encoding)
+        except schemas.MessageError as error:
+            self._invalid(str(error))
+            return None
+
+
+def _nobody() -> None:
+    """Tell nobody."""

@@ -1,0 +1,504 @@
+"""The settings of the service, and where their values come from.
+
+A TOML file, over it the environment, over that the options of the command line. Environment variables are ``OPTIPMB_``
+and the name in capitals, nested names after ``__`` (``OPTIPMB_LIMITS__MAX_BYTES``); lists are written with commas
+there, tables as JSON.
+
+Times are in seconds. Every setting is described by its docstring, which `docs/reference.md` prints.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+import os
+import re
+import secrets
+import socket
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+from optipmb_schemas import DEFAULT, Keys, Limits, MessageError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic_settings import (
+    BaseSettings,
+    EnvSettingsSource,
+    NoDecode,
+    PydanticBaseSettingsSource,
+    SettingsConfigDict,
+    SettingsError,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+PREFIX: Final = "OPTIPMB_"  # of environment variables
+RUN: Final = secrets.token_hex(3)  # tells this process from one with its number in a container of the same host name
+HOST_CHARACTERS: Final = 40
+
+DEFAULT_LISTEN: Final = "tcp/127.0.0.1:7447"
+DEFAULT_GRPC: Final = "127.0.0.1:50051"
+DEFAULT_NATS: Final = "127.0.0.1:4222"
+
+
+def _form(pattern: str, expected: str) -> AfterValidator:
+    """Return the check of a text: it matches a regular expression in full, or the error says what was expected."""
+
+    def check(value: str) -> str:
+        if not re.fullmatch(pattern, value):
+            raise ValueError(f"{expected}, received {value!r}")
+        return value
+
+    return AfterValidator(check)
+
+
+def address(value: str) -> str:
+    """Return an address as it is, `host:port` or nothing.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if value and not re.fullmatch(r"([A-Za-z0-9_.-]+|\[[0-9A-Fa-f:.%]+\]):\d{1,5}", value):
+        raise ValueError(f"an address looks like 127.0.0.1:8080, received {value!r}")
+    return value
+
+
+def without_password(server: str) -> str:
+    """Return the address of a server as it may be shown."""
+    return re.sub(r"(?<=//)[^/@]*@", "***@", server)
+
+
+def _listed(value: Any) -> Any:
+    """Return the list that a text holds: JSON, or names separated by commas."""
+    if not isinstance(value, str):
+        return value
+    if not value.startswith("["):
+        return [part.strip() for part in value.split(",") if part.strip()]
+    try:
+        return json.loads(value)
+    except ValueError as error:
+        raise ValueError(f"names separated by commas, or a JSON list, received {value!r}") from error
+
+
+Prefix = Annotated[str, _form(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*", "chunks of [A-Za-z0-9_.-] separated by '/'")]
+Address = Annotated[str, AfterValidator(address)]
+Pattern = Annotated[
+    str, _form(r"[A-Za-z0-9_.*-]+(/[A-Za-z0-9_.*-]+){2}", "a pattern of streams looks like site/*/lidar*")
+]
+Server = Annotated[str, _form(r"(nats|tls)://\S+", "a NATS server looks like nats://127.0.0.1:4222")]
+Endpoint = Annotated[
+    str,
+    _form(r"[a-z0-9]+/[^\s/#?]+:\d+([?#]\S*)?|[a-z0-9-]+/\S+", f"an endpoint looks like {DEFAULT_LISTEN}"),
+]
+Names = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_listed)]
+Patterns = Annotated[tuple[Pattern, ...], NoDecode, BeforeValidator(_listed)]
+Servers = Annotated[tuple[Server, ...], NoDecode, BeforeValidator(_listed)]
+Endpoints = Annotated[tuple[Endpoint, ...], NoDecode, BeforeValidator(_listed)]
+
+
+class LimitSettings(BaseModel):
+    """Bounds on what one message may hold; what is larger is refused before memory is taken for it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    max_bytes: int = Field(default=DEFAULT.max_bytes, ge=1024, le=2**30)
+    """bytes of a msgpack payload"""
+    max_json_bytes: int = Field(default=2**21, ge=1024, le=2**30)
+    """bytes of a JSON payload"""
+    max_values: int = Field(default=2**17, ge=64)
+    """values of one message, each number of a list among them"""
+    max_points: int = Field(default=DEFAULT.max_points, ge=0)
+    """points of one cloud"""
+    max_detections: int = Field(default=DEFAULT.max_detections, ge=1)
+    """detections of one frame"""
+
+    def limits(self) -> Limits:
+        """Return the limits for the decoder."""
+        return Limits(**self.model_dump())
+
+
+Topic = Annotated[str, _form(r"((/[A-Za-z_][A-Za-z0-9_]*)+)?", "a topic looks like /lidar/points")]
+
+
+class Ros2Stream(BaseModel):
+    """The topics of one stream."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    detections: Topic = Field(min_length=1)
+    """topic of the detections"""
+    type: Literal[
+        "vision_msgs/msg/Detection3DArray",
+        "autoware_perception_msgs/msg/DetectedObjects",
+        "autoware_auto_perception_msgs/msg/DetectedObjects",
+    ] = "vision_msgs/msg/Detection3DArray"
+    """type of the detections"""
+    points: Topic = ""
+    """topic of the point clouds"""
+    tracks: Topic = ""
+    """topic of the tracks; default: `/tracks` below that of the detections"""
+    classes: dict[str, str] = Field(default_factory=dict)
+    """class names by those in the messages"""
+    covariance: bool = False
+    """use the covariances of the detections' positions"""
+    fixed: bool = False
+    """the sensor does not move and its frame is the world"""
+
+    @property
+    def tracks_topic(self) -> str:
+        """Topic of the tracks."""
+        return self.tracks or f"{self.detections}/tracks"
+
+
+def _streams(value: dict[str, Ros2Stream]) -> dict[str, Ros2Stream]:
+    for name in value:
+        try:
+            Keys().detections(name)
+        except MessageError as error:
+            raise ValueError(f"a stream is named {error.expected}, received {error.received}") from None
+    return value
+
+
+class Ros2Settings(BaseModel):
+    """Topics of a ROS 2 system whose middleware is rmw_zenoh; used by `optipmb-service ros2`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    domain: int = Field(default=0, ge=0, le=232)
+    """`ROS_DOMAIN_ID` of the system"""
+    node: str = Field(default="optipmb", pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")
+    """name of the ROS 2 node"""
+    fixed_frame: str = ""
+    """frame of the tracks; default: the root of tf"""
+    odometry: Topic = ""
+    """topic of `nav_msgs/Odometry`, for poses that tf has not"""
+    tf_wait_s: float = Field(default=0.5, ge=0, le=60)
+    """longest wait of a message for its transform"""
+    diagnostics: Topic = "/diagnostics"
+    """topic of `diagnostic_msgs/DiagnosticArray`"""
+    streams: Annotated[dict[str, Ros2Stream], AfterValidator(_streams)] = Field(default_factory=dict)
+    """topics by stream (`site/node/sensor`)"""
+
+
+def _default_instance() -> str:
+    """Return a name that two services do not share."""
+    host = re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname()[:HOST_CHARACTERS]) or "host"
+    return f"{host}-{os.getpid()}-{RUN}"
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def state_home() -> Path:
+    """Return the folder below which state is kept that no setting gives a place."""
+    state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
+    home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    return Path(state or Path(home) / "optipmb")
+
+
+class Settings(BaseSettings):
+    """What the service runs with."""
+
+    model_config = SettingsConfigDict(
+        frozen=True, extra="forbid", env_prefix=PREFIX, env_nested_delimiter="__", allow_inf_nan=False
+    )
+
+    instance: str = Field(default_factory=_default_instance, pattern=r"^[A-Za-z0-9_.-]{1,64}$")
+    """name of this instance; default: the host's name, the process number and six random digits"""
+    prefix: Prefix = "optipmb/v1"
+    """first chunks of every key"""
+    router: bool | None = None
+    """run a Zenoh router in this process; default: yes unless `connect` is given"""
+    listen: Endpoints | None = None
+    """endpoints to listen on; default: `tcp/127.0.0.1:7447` as a router, none as a client"""
+    connect: Endpoints = ()
+    """endpoints of routers to connect to; retried without end"""
+    zenoh_config: Path | None = None
+    """Zenoh configuration file (JSON5): TLS, access control, limits of a router; settings override it"""
+    shared_memory: bool = False
+    """Zenoh's shared memory: faster for clouds on one host, but may lose messages, and leaves files in /dev/shm after a
+    kill"""
+    profile: str = Field(default="generic", min_length=1)
+    """profile name or TOML file, where no pattern matches"""
+    profiles: dict[str, str] = Field(default_factory=dict)
+    """profiles by stream pattern (as `site/*/lidar*`); the first match applies"""
+    fuse: Patterns = ()
+    """patterns of streams (as `site/*/lidar*`) that feed one session per node, `site/node/fused`"""
+    cloud_wait_s: float = Field(default=0.1, ge=0, le=60)
+    """longest wait of a frame for its cloud"""
+    cloud_memory_s: float = Field(default=2.0, ge=0, le=3600)
+    """frames without `has_points` wait for a cloud if one came within this time, in stamps"""
+    gap_limit_s: float = Field(default=5.0, gt=0, le=86400)
+    """a larger step of the stamps, forward or back, on which three frames agree, restarts the session"""
+    rewind_s: float = Field(default=1.0, ge=0, le=60)
+    """sensor time within which a late frame is inserted and tracks are corrected; 0: never"""
+    late_clouds: bool = False
+    """a cloud that comes after its frame was tracked corrects the tracks"""
+    recovery_wait_s: float = Field(default=2.0, ge=0, le=60)
+    """longest wait for the publisher's cache after a restart"""
+    max_speed: float = Field(default=100.0, ge=0, le=1e6)
+    """highest speed of a sensor, m/s; poses beyond it are refused; 0: no check"""
+    queue_frames: int = Field(default=1024, ge=1, le=65536)
+    """frames waiting per stream, as many as a publisher's cache may send at once after an outage; then the oldest is
+    dropped"""
+    queue_clouds: int = Field(default=16, ge=1, le=1024)
+    """clouds waiting per stream, and as many in its session; then the oldest is dropped"""
+    workers: int = Field(default=1, ge=1, le=64)
+    """processes that share the streams; 1: this process alone"""
+    max_pairs: int = Field(default=20_000, ge=100, le=10_000_000)
+    """pairs of nearby objects in a frame, a microsecond each; a frame with more is refused"""
+    step_limit_s: float = Field(default=0.5, gt=0, le=60)
+    """processor time of a message; a stream that takes more is refused for nine times as long"""
+    stream_mb: int = Field(default=128, ge=4, le=65536)
+    """megabytes per stream, a quarter each for waiting messages, clouds, held frames and the window; then the oldest
+    are dropped"""
+    memory_mb: int = Field(default=1024, ge=16, le=1_048_576)
+    """megabytes of messages per process, half of them waiting; then messages are dropped, and the least recently used
+    sessions closed"""
+    max_sessions: int = Field(default=1000, ge=1, le=10_000)
+    """streams tracked at once; further ones are refused"""
+    node_sessions: int = Field(default=64, ge=0, le=100_000)
+    """the same of one node (`site/node`); 0: no limit"""
+    node_rate: int = Field(default=2000, ge=0, le=1_000_000)
+    """messages a second of one node; 0: no limit"""
+    node_mb_s: int = Field(default=500, ge=0, le=100_000)
+    """megabytes a second of one node; 0: no limit"""
+    site_sessions: int = Field(default=0, ge=0, le=100_000)
+    """the same of one site; 0: no limit"""
+    site_rate: int = Field(default=0, ge=0, le=1_000_000)
+    """messages a second of one site; 0: no limit"""
+    site_mb_s: int = Field(default=0, ge=0, le=100_000)
+    """megabytes a second of one site; 0: no limit"""
+    keep_days: float = Field(default=30.0, ge=0, le=36_500)
+    """checkpoints of a stream silent for this long are deleted; 0: never"""
+    idle_s: float = Field(default=600.0, gt=0)
+    """a session without messages for this long is freed"""
+    cluster: Servers = ()
+    """NATS servers, as `nats://10.0.0.1:4222`, by which instances on many machines share streams"""
+    cluster_tls: Path | None = None
+    """folder with `ca.pem`, the authority of `tls://` servers, and `cert.pem` and `key.pem` where they ask for a
+    certificate; default: the system's authorities"""
+    cluster_credentials: Path | None = None
+    """file with the credentials of a NATS user (`.creds`), `user:password`, or a token"""
+    store: str = ""
+    """folder of checkpoints and quarantined sessions; `none`: nothing is kept; default: one named after prefix and
+    endpoint in `$STATE_DIRECTORY`, else in `optipmb` under `$XDG_STATE_HOME` or `~/.local/state`"""
+    checkpoint_s: float = Field(default=1.0, ge=0.05, le=3600)
+    """time between checkpoints of a changed session"""
+    lease_s: float = Field(default=3.0, ge=0.5, le=60)
+    """a process that is frozen or cut off for this long loses its streams to the others"""
+    standby_s: float = Field(default=10.0, ge=0, le=600)
+    """how long messages of streams that others track are kept for a takeover; longer than `lease_s` and `checkpoint_s`
+    together; with `cluster` also how far back the log is read without a checkpoint"""
+    standby_mb: int = Field(default=256, ge=1, le=65536)
+    """megabytes kept so; clouds are dropped first"""
+    log_s: float = Field(default=600.0, ge=10, le=864_000)
+    """age up to which `optipmb-service log` keeps detections, for a successor"""
+    log_mb: int = Field(default=1024, ge=16, le=1_048_576)
+    """megabytes of these; the oldest go first"""
+    log_tracks_s: float = Field(default=3600.0, ge=0, le=8_640_000)
+    """age up to which it keeps tracks, for `q/tracks`; 0: none"""
+    log_tracks_mb: int = Field(default=1024, ge=16, le=1_048_576)
+    """megabytes of these; the oldest go first"""
+    stale_s: float = Field(default=2.0, gt=0)
+    """a stream without frames for this long is logged as stale"""
+    stuck_s: float = Field(default=5.0, ge=1, le=600)
+    """a thread busy with one task, or a worker silent, for this long is stuck: the process is not healthy, the worker
+    is replaced"""
+    restart_keys: int = Field(default=50_000, ge=100, le=60_000)
+    """keys declared on the network after which a process restarts, its sessions continue from the store: Zenoh has
+    65,535 for the life of a process, and each stream that opens takes up to 5"""
+    grace_s: float = Field(default=1.0, ge=0, le=60)
+    """at shutdown, time for frames already received"""
+    http: Address = ""
+    """address of health, metrics and live page, as `127.0.0.1:8080`"""
+    http_hosts: Names = ()
+    """host names with a dot by which the page may be asked for, besides addresses and names without; `*`: any"""
+    http_streams: int = Field(default=100, ge=0, le=10_000)
+    """streams with series of their own in the metrics, by name"""
+    grpc: Address = ""
+    """address of the gRPC server, as `127.0.0.1:50051`"""
+    grpc_tls: Path | None = None
+    """folder with `key.pem`, `cert.pem` and `ca.pem` for gRPC: callers need a certificate of that authority, by whose
+    name they have rights; default: no TLS, all may do everything"""
+    grpc_names: Path | None = None
+    """JSON list of the names that may call; default: all with a certificate or token"""
+    grpc_tokens: str = Field(default="", pattern=r"^([A-Za-z_][\w.]*:[A-Za-z_]\w*)?$")
+    """`module:function` that finds the caller's name in the metadata of a call"""
+    grpc_calls: int = Field(default=1000, ge=1, le=100_000)
+    """gRPC calls open at once; further ones are refused"""
+    grpc_connections: int = Field(default=10_000, ge=1, le=1_000_000)
+    """gRPC connections open at once, fewer by the limit of open files; further ones are closed"""
+    log_format: Literal["console", "json"] = "console"
+    """form of the log lines on stderr"""
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    """lowest level that is logged"""
+    ros2: Ros2Settings = Ros2Settings()
+    """topics of ROS 2, for `optipmb-service ros2`"""
+    limits: LimitSettings = LimitSettings()
+    """bounds on what one message may hold"""
+
+    @property
+    def is_router(self) -> bool:
+        """Whether this process routes for others."""
+        return not self.connect if self.router is None else self.router
+
+    @property
+    def endpoints(self) -> tuple[str, ...]:
+        """Endpoints to listen on."""
+        if self.listen is not None:
+            return self.listen
+        return (DEFAULT_LISTEN,) if self.is_router else ()
+
+    @property
+    def unprotected(self) -> tuple[str, ...]:
+        """Addresses beyond this machine where everybody who reaches them may publish and command."""
+        endpoints = () if self.zenoh_config else self.endpoints
+        addresses = [(one, one.partition("/")[2].partition("?")[0].partition("#")[0]) for one in endpoints]
+        if self.grpc_tls is None and not self.grpc_tokens and self.grpc:
+            addresses.append((f"grpc {self.grpc}", self.grpc))
+        hosts = [(said, address.rpartition(":")[0].strip("[]")) for said, address in addresses]
+        return tuple(said for said, host in hosts if host and host != "localhost" and not _is_loopback(host))
+
+    @property
+    def folder(self) -> Path | None:
+        """Where state is kept; None: nowhere."""
+        if self.store == "none":
+            return None
+        if self.store:
+            return Path(self.store).expanduser()
+        # Instances on one network share the state, other networks of the same host have their own.
+        where = re.sub(r"[^A-Za-z0-9_.]+", "-", f"{self.prefix} {(*self.connect, *self.endpoints)[0]}")
+        return state_home() / where
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """Take values given to the constructor alone: `load` reads the file and the environment in its order."""
+        del settings_cls, env_settings, dotenv_settings, file_secret_settings
+        return (init_settings,)
+
+
+Source = Literal["option", "environment", "file", "default"]
+
+TABLES: Final = frozenset(
+    name
+    for name, field in Settings.model_fields.items()
+    if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
+)
+"""The settings that are tables of settings and merged name by name; `profiles` is one value, whose order matters."""
+
+
+class SettingsInvalidError(ValueError):
+    """The settings cannot be used; the text is one clear line."""
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """Settings and, for every one of them, where its value came from."""
+
+    settings: Settings
+    sources: dict[str, Source]
+    unknown: tuple[str, ...] = ()
+    """Environment variables that look like settings and are none."""
+
+
+def load(
+    file: Path | None = None, options: Mapping[str, Any] | None = None, defaults: Mapping[str, Any] | None = None
+) -> Loaded:
+    """Merge the defaults of a command, the file, the environment and the options (None: not given); check the result.
+
+    Raises:
+        SettingsInvalidError: the file cannot be read, or a value is not allowed.
+    """
+    layers: list[tuple[Source, dict[str, Any]]] = [
+        ("default", dict(defaults or {})),
+        ("file", _read(file) if file is not None else {}),
+        ("environment", _environment()),
+        ("option", {name: value for name, value in (options or {}).items() if value is not None}),
+    ]
+    values: dict[str, Any] = {}
+    sources: dict[str, Source] = dict.fromkeys(Settings.model_fields, "default")
+    for source, layer in layers:
+        for name, value in layer.items():
+            old = values.get(name)
+            if name in TABLES and isinstance(old, dict) and isinstance(value, dict):
+                values[name] = {**old, **value}
+            else:
+                values[name] = value
+            sources[name] = source
+    try:
+        settings = Settings(**values)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        path = ".".join(str(part) for part in first["loc"]) or "settings"
+        source = sources.get(str(first["loc"][0]) if first["loc"] else "", "default")
+        where = f" (from the {source})" if source != "default" else ""
+        message = first["msg"].removeprefix("Value error, ")
+        raise SettingsInvalidError(f"setting {path}{where}: {message}") from error
+    if not settings.endpoints and not settings.connect:
+        raise SettingsInvalidError("setting listen: neither an endpoint to listen on nor one to connect to")
+    if settings.fuse and not settings.rewind_s:
+        raise SettingsInvalidError("setting fuse: sensors do not come in order of their stamps: rewind_s must not be 0")
+    _check_cluster(settings)
+    if settings.workers > 1 and settings.zenoh_config is not None and settings.is_router:
+        # Its access control would be deaf to the workers, which come over a socket and without a certificate.
+        raise SettingsInvalidError(
+            "setting workers: with zenoh_config, a router of its own: start `optipmb-service router` and connect to it"
+        )
+    known = {f"{PREFIX}{name.upper()}" for name in Settings.model_fields}
+    unknown = (name for name in os.environ if name.startswith(PREFIX) and name.split("__")[0] not in known)
+    return Loaded(settings, sources, tuple(sorted(unknown)))
+
+
+def _check_cluster(settings: Settings) -> None:
+    """Refuse files for NATS servers that are not there or not used.
+
+    Raises:
+        SettingsInvalidError: there are such.
+    """
+    folder, file = settings.cluster_tls, settings.cluster_credentials
+    for name, value in (("cluster_tls", folder), ("cluster_credentials", file)):
+        if value is not None and not settings.cluster:
+            raise SettingsInvalidError(f"setting {name}: without servers in `cluster`")
+    if folder is not None:
+        if any(not server.startswith("tls://") for server in settings.cluster):
+            raise SettingsInvalidError("setting cluster_tls: servers in `cluster` as tls://host:4222 expected")
+        if not (folder / "ca.pem").is_file():
+            raise SettingsInvalidError(f"setting cluster_tls: {folder}: no file ca.pem in it")
+        if (folder / "cert.pem").is_file() is not (folder / "key.pem").is_file():
+            raise SettingsInvalidError(f"setting cluster_tls: {folder}: cert.pem and key.pem belong together")
+    if file is not None and not file.is_file():
+        raise SettingsInvalidError(f"setting cluster_credentials: {file}: no such file")
+
+
+def _read(file: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8"
+        raise SettingsInvalidError(f"settings file {file}: {reason}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise SettingsInvalidError(f"settings file {file}: not TOML: {error}") from error
+
+
+def _environment() -> dict[str, Any]:
+    try:
+        return EnvSettingsSource(Settings)()
+    except SettingsError as error:
+        match = re.search(r'field "(\w+)"', str(error))
+        name = f"{PREFIX}{match[1].upper()}" if match else "environment"
+        example = '{"site/*/*": "kitti"}'
+        raise SettingsInvalidError(f"{name}: tables are written as JSON, as '{example}'") from error

@@ -1,0 +1,82 @@
+"""The certificates that a process uses: how long they hold, in metrics and log, and which of them has ended.
+
+A listener of Zenoh has the certificate that its file had at the start. Links of a client, gRPC and NATS read the file
+again, so that one that is renewed holds without a restart.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Final
+
+import structlog
+from optipmb_schemas.certificates import end_of, ended
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+LOOK_S: Final = 5.0  # files are read again after so long
+WARN_DAYS: Final = 7.0
+DAY_S: Final = 86_400.0
+
+log = structlog.get_logger("optipmb_service")
+
+
+class Certificates:
+    """The certificates of one process.
+
+    Args:
+        files: certificates by use.
+        fixed: the use whose certificate stays the one of the start.
+    """
+
+    def __init__(self, files: Mapping[str, Path], fixed: str) -> None:
+        self._files = files
+        self._fixed = fixed
+        self._ends: dict[str, datetime] = {}
+        self._looked = -LOOK_S
+        self._look()
+
+    def days(self) -> dict[str, float]:
+        """Return how many days each certificate still holds, by its use."""
+        now = datetime.now(UTC)
+        return {use: (end - now).total_seconds() / DAY_S for use, end in self._look().items()}
+
+    @property
+    def failure(self) -> str:
+        """Which certificates have ended; empty while all hold."""
+        return "; ".join(self._ended())
+
+    @property
+    def cut_off(self) -> bool:
+        """Whether one of Zenoh's has ended: there is no link to the network."""
+        return any("zenoh" in use for use in self._ended().values())
+
+    async def watch(self) -> None:
+        """Log certificates that end soon once a day, and each that has ended, for ever."""
+        warned = -DAY_S
+        told: set[str] = set()
+        while True:
+            now_ended = self._ended().keys()
+            for why in now_ended - told:
+                log.error("certificate_ended", error=why)
+            told = set(now_ended)
+            soon = {use: round(days, 1) for use, days in self.days().items() if 0 < days < WARN_DAYS}
+            if soon and time.monotonic() - warned >= DAY_S:
+                warned = time.monotonic()
+                log.warning("certificate_ends", days=soon)
+            await asyncio.sleep(LOOK_S)
+
+    def _ended(self) -> dict[str, str]:
+        """Return one line for each certificate that has ended, with its use."""
+        return {why: use for use, end in self._look().items() if (why := ended(self._files[use], end))}
+
+    def _look(self) -> dict[str, datetime]:
+        if (now := time.monotonic()) - self._looked >= LOOK_S:
+            found = {use: end for use, file in self._files.items() if (end := end_of(file)) is not None}
+            kept = {use: end for use, end in self._ends.items() if use == self._fixed}
+            self._ends, self._looked = found | kept, now
+        return self._ends

@@ -1,0 +1,125 @@
+"""State of the process, for those who ask from outside: from before the service exists until after its end.
+
+The control loop beats; whoever asks sees for how long it has not. States: `starting`, then what the service says
+(`ready`, `degraded` when it works with a part missing, `paused` when it may not publish, `unlinked` without a router,
+or `draining` when others track its streams), then `stopping`.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Final
+
+from optipmb_service.telemetry.metrics import PROCESS_METRICS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import optipmb_schemas as schemas
+
+    from optipmb_service.telemetry.certificates import Certificates
+    from optipmb_service.telemetry.metrics import Metrics
+
+
+BEAT_S: Final = 0.5
+STUCK_S: Final = 10.0  # a loop that has not turned for so long is stuck
+USABLE: Final = frozenset({"ready", "degraded"})
+
+
+class Reporter:
+    """Part of a process that does its work, and reports how it is; by default one without streams that always works."""
+
+    @property
+    def state(self) -> str:
+        """State of the process while this works."""
+        return "ready"
+
+    @property
+    def failure(self) -> str:
+        """Why it cannot be used, or works with a part missing; empty while it works."""
+        return ""
+
+    @property
+    def stuck(self) -> bool:
+        """Whether the thread that works has stopped working."""
+        return False
+
+    @property
+    def usable(self) -> bool:
+        """Whether it can be used in a state that can."""
+        return True
+
+    def status(self) -> schemas.ServiceStatus | None:
+        """Return its report; None when it makes none."""
+        return None
+
+    def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None] | None:
+        """Hand over topic, payload and encoding of a stream's detections and tracks until the result is called.
+
+        `receive` is called by other threads and must return at once. None: there are no streams.
+
+        Raises:
+            TransportError: the network cannot be used, or too many streams were looked at.
+        """
+        del stream, receive
+        return None
+
+
+class ProcessHealth:
+    """Health of one process; every method may be called by any thread and answers at once."""
+
+    def __init__(self, instance: str, metrics: Metrics) -> None:
+        self.instance = instance
+        self.metrics = metrics
+        self.tls: Certificates | None = None
+        """The certificates of the process; None while they are not read."""
+        self._service: Reporter | None = None
+        self._ending = False
+        self._beat_ns = time.monotonic_ns()
+        metrics.add(PROCESS_METRICS, lambda: self)
+
+    def beat(self) -> None:
+        """Note that the control loop turns."""
+        self._beat_ns = time.monotonic_ns()
+
+    def report(self, service: Reporter) -> None:
+        """Report the state of this part from now on."""
+        self._service = service
+
+    def ends(self) -> None:
+        """Report the end from now on."""
+        self._ending = True
+
+    def beat_age_s(self) -> float:
+        """Return the seconds since the control loop last turned."""
+        return (time.monotonic_ns() - self._beat_ns) / 1e9
+
+    def alive(self) -> bool:
+        """Return whether the control loop turns and the working thread is not stuck."""
+        return self.beat_age_s() < STUCK_S and not (self._service is not None and self._service.stuck)
+
+    def failure(self) -> str:
+        """Return why the service cannot be used, or works with a part missing; empty while it works."""
+        return "; ".join(
+            source.failure for source in (self.tls, self._service) if source is not None and source.failure
+        )
+
+    def state(self) -> str:
+        """Return the state of the process."""
+        if self._ending:
+            return "stopping"
+        state = "starting" if self._service is None else self._service.state
+        return "degraded" if state == "ready" and self.tls is not None and self.tls.failure else state
+
+    def ready(self) -> bool:
+        """Return whether the service can be used."""
+        usable = self._service is not None and self._service.usable and self.alive()
+        return usable and self.state() in USABLE and not (self.tls is not None and self.tls.cut_off)
+
+    def status(self) -> schemas.ServiceStatus | None:
+        """Return the service's own report; None while it starts."""
+        return None if self._service is None else self._service.status()
+
+    def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None] | None:
+        """Hand over what comes on a stream to a viewer (`Reporter.tap`); None while the service starts."""
+        return None if self._service is None else self._service.tap(stream, receive)

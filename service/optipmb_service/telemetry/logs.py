@@ -1,0 +1,279 @@
+"""Logs: one line per event that an operator can act on, on stderr; stdout holds nothing but the ready line.
+
+A thread of its own writes the lines: whoever logs does not wait for the reader of stderr, which may have stopped
+reading. Lines beyond the bound of the queue are dropped and counted.
+"""
+
+from __future__ import annotations
+
+import atexit
+import logging
+import os
+import sys
+import threading
+import time
+from collections import Counter, deque
+from typing import TYPE_CHECKING, Final, Literal, TextIO, cast
+
+import structlog
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from structlog.typing import EventDict, Processor, WrappedLogger
+
+EVENTS: Final = {
+    "log_lines_dropped": "Whoever reads stderr reads too slowly, or not at all: `count` lines were not written.",
+    "starting": "The service compiles or loads its kernels.",
+    "connecting": "Waits for a router. If this lasts, check `connect`.",
+    "http": "Health, metrics and the live page are served at `address`.",
+    "ready": "Streams and queries are served.",
+    "keys_used_up": "The process has declared `restart_keys` keys: it ends in order, and begins again in its place.",
+    "grpc": "gRPC is served at `address`.",
+    "grpc_call": "A call has ended (level debug).",
+    "grpc_connections": "The limit of open files allows fewer connections than the setting.",
+    "grpc_invalid": "An invalid message from the network was not forwarded to callers.",
+    "grpc_certificates": "Renewed certificates cannot be read; the previous ones stay in use.",
+    "certificate_ends": "Certificates that end within a week, and the `days` that they hold: renew them.",
+    "certificate_ended": "A certificate has ended: no link with it can be opened. Renew it, and restart what listens"
+    " with it.",
+    "unprotected": "Everybody who reaches these `addresses` may publish, read and command: there is neither TLS nor"
+    " access control. See `security.md`.",
+    "unknown_environment": "Variables `OPTIPMB_…` that are not settings, usually misspelt.",
+    "peer_connected": "A node, router or service has connected.",
+    "tracker_message": "A `text` of the tracker: it compiles, for up to a minute.",
+    "leases_gone": "The store has lost its records, as by a purge in NATS; the member writes its own again.",
+    "store_deleted": "A `file` of the store was deleted while in use, and was made again with all that it held.",
+    "peer_lost": "A connection is lost. A client reconnects and recovers what the caches hold.",
+    "session_opened": "A stream's first valid message came, or parameters were set for it.",
+    "session_restored": "A session continues from its checkpoint; missed frames are requested from publishers.",
+    "profile_differs": "A session continues with the `profile` of its checkpoint, and the settings name `configured`,"
+    " or have other values for it. `optipmb set STREAM --profile NAME --restart` changes it.",
+    "session_begun": "A density began: `first` frame, `publisher` restarted with a jump, a `jump` of stamps, `reset`, "
+    "`parameters`, an implausible `pose`, too much `effort`, the end of a `quarantine`. Repeated jumps: check"
+    " the sensor's clock.",
+    "session_quarantined": "Tracking a stream raised `error`. Its last frames are saved; see the problem `internal`.",
+    "stream_degraded": "A message took `took_s` of processor time; its stream is refused for `refused_s`.",
+    "session_closed": "A session was freed: `idle` for long, by a `query`, `moved` elsewhere, lacking `memory`,"
+    " `evicted` for a stream of another site, or `superseded` by another instance.",
+    "checkpoint_torn": "A checkpoint cannot be read, for `reason`: it is set aside, the one before it is used."
+    " Where `reason` names another version, start the release that wrote it.",
+    "checkpoint_refused": "A checkpoint was not written: another instance has taken the stream over.",
+    "checkpoints_expired": "Checkpoints older than `keep_days` were deleted.",
+    "checkpoint_failed": "The checkpoint of one stream cannot be made: a bug, report it."
+    " The stream continues, other checkpoints are written; the state is `degraded`.",
+    "store_failed": "Checkpoints cannot be written (disk full, read-only): tracking goes on, the state is `degraded`.",
+    "store_back": "Checkpoints are written again.",
+    "partitions_held": "Number of partitions that this member holds, and the `members`.",
+    "leases_damaged": "The `file` of the leases was damaged, as by a power cut, and made anew: nobody used it.",
+    "lease_lost": "This member was frozen, starved or cut off for `lease_s`, and others continue its streams. It joins"
+    " again at once.",
+    "leases_failed": "The servers of `cluster`, or the folder `store`, cannot be used, for `error`: after half of"
+    " `lease_s` nothing is published, and the state is `paused`.",
+    "leases_back": "They can be used again.",
+    "leases_slow": "Each renewal of the lease has taken more than a quarter of `lease_s`, the last one `took_s`: new"
+    " streams begin late. Look for a slow disk or network, or raise `lease_s`.",
+    "leases_in_time": "A renewal of the lease was in time again.",
+    "log_failed": "The log cannot be written, for `error`: the bridge holds 256 MB of messages and tries again.",
+    "log_back": "The log can be written.",
+    "log_unread": "The log could not be read for the session of `streams`: frames may be missing.",
+    "log_cut": "A session missed more of the log than it takes at once: the oldest frames are left out.",
+    "stream_stale": "No frame for `stale_s`: check the publisher.",
+    "stream_back": "Frames arrive again.",
+    "problem": "`count` messages were refused or lost since the last line: see the table of problems.",
+    "ros2_mismatch": "An endpoint has another type, definition or quality of service; `message` says which.",
+    "publisher_failed": "The tracks of a stream cannot be published; the network is closing.",
+    "publish_failed": "Tracks cannot be passed to Zenoh; the network is closing.",
+    "reply_failed": "The client of a query had left before the reply.",
+    "query": "A query was answered (level debug).",
+    "internal_error": "A bug, with its traceback: report it. The stream continues.",
+    "worker_started": "The parent has started a worker.",
+    "worker_ended": "A worker has ended by itself, with this status (below 0: by this signal). It is restarted"
+    " after `again_s`; until then the state is `degraded`.",
+    "worker_restarts": "A worker has declared `restart_keys` keys and ended in order; it is started again at once.",
+    "worker_stuck": "A worker has not responded for `silent_s`; it is killed and restarted.",
+    "worker_killed": "A worker did not end or respond in time and was killed.",
+    "metrics_unreadable": "The metrics of a worker cannot be read and are left out.",
+    "parent_gone": "The parent has died; its worker ends.",
+    "stop_asked": "SIGINT or SIGTERM, or the parent ends its worker; it stops within 8 s + `grace_s`, a parent of"
+    " workers within 10 s + `grace_s`.",
+    "stop_asked_again": "Another signal, which has no effect.",
+    "step_hangs": "`steps` of the end do not return, as in Zenoh; checkpoints are written all the same, unless"
+    " `store_failed` says otherwise. The exit status is 1.",
+    "end_hangs": "The end took too long, and the process was ended with status 1. `threads` is where each thread was,"
+    " the innermost call first.",
+    "end_unbounded": "No thread can be started (a limit of processes or memory): the end may take any time.",
+    "stopped": "The service has stopped; `drained` is false when a step was abandoned, or not all checkpoints"
+    " are written.",
+}
+"""Every event that is logged, and what an operator makes of it."""
+
+
+BURST: Final = 50  # lines of one event that are written at once
+LINES_PER_SECOND: Final = 5.0  # lines of one event that are written in the long run
+
+
+class Limiter:
+    """Drops lines of an event that comes too often; the next one that is written says how many (`suppressed`).
+
+    A thousand streams that fall silent together must neither fill a disk nor hide what else happens.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._left: dict[str, tuple[float, float]] = {}
+        self._dropped: Counter[str] = Counter()
+
+    def __call__(self, _logger: WrappedLogger, _method: str, event: EventDict) -> EventDict:
+        """Return a line, or drop it.
+
+        Raises:
+            structlog.DropEvent: it is one too many.
+        """
+        name = str(event.get("event"))
+        now = self._clock()
+        with self._lock:
+            left, before = self._left.get(name, (float(BURST), now))
+            left = min(BURST, left + (now - before) * LINES_PER_SECOND)
+            self._left[name] = (left - 1 if left >= 1 else left, now)
+            if left < 1:
+                self._dropped[name] += 1
+                raise structlog.DropEvent
+            if suppressed := self._dropped.pop(name, 0):
+                event["suppressed"] = suppressed
+        return event
+
+
+QUEUE_BYTES: Final = 4 * 2**20  # lines that wait for the reader of stderr
+CLOSE_S: Final = 0.5  # how long the end of a process waits for the last lines to be written
+
+
+class LineWriter:
+    """Bounded queue of lines that a thread writes to a file; implements what structlog uses of a file.
+
+    Args:
+        file: where the lines go. Its descriptor is written to directly: a write that blocks holds no lock of the file.
+    """
+
+    def __init__(self, file: TextIO) -> None:
+        self.file = file
+        self._changed = threading.Condition()
+        self._lines: deque[bytes] = deque()
+        self._bytes = 0
+        self._unreported = 0
+        self.dropped = 0
+        """Lines that were not written."""
+        threading.Thread(target=self._run, name="log", daemon=True).start()
+
+    def write(self, text: str) -> None:
+        """Queue a line, or drop it; never waits."""
+        line = text.encode(errors="backslashreplace")
+        with self._changed:
+            if self._bytes + len(line) > QUEUE_BYTES:
+                self.dropped += 1
+                self._unreported += 1
+                return
+            self._lines.append(line)
+            self._bytes += len(line)
+            self._changed.notify_all()
+
+    def flush(self) -> None:
+        """Have no effect: the thread writes each line as soon as it can."""
+
+    def finish(self, seconds: float = CLOSE_S) -> None:
+        """Wait until all lines are written, at most so long."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._bytes, seconds)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._lines)
+                line = self._lines.popleft()
+            try:
+                self._write(line)
+            except OSError:  # nobody reads any more
+                with self._changed:
+                    self.dropped += 1
+            with self._changed:
+                self._bytes -= len(line)
+                self._changed.notify_all()
+                dropped, self._unreported = (0, self._unreported) if self._lines else (self._unreported, 0)
+            if dropped:
+                structlog.get_logger("optipmb_service").warning("log_lines_dropped", count=dropped)
+
+    def _write(self, line: bytes) -> None:
+        try:
+            descriptor = self.file.fileno()
+        except OSError:  # of a test, which has put another object in its place
+            self.file.write(line.decode())
+            return
+        while line:
+            try:
+                line = line[os.write(descriptor, line) :]
+            except BlockingIOError:  # somebody has made the pipe non-blocking
+                time.sleep(0.01)
+
+
+_writer: LineWriter | None = None
+
+
+def say(line: str) -> None:
+    """Write a line to stderr as it is, after those of the log."""
+    if _writer is None or _writer.file is not sys.stderr:
+        print(line, file=sys.stderr)  # noqa: T201 - the one line of a failed start
+    else:
+        _writer.write(f"{line}\n")
+
+
+def finish() -> None:
+    """Wait, for a moment at most, until all lines are written; to be called before the process ends."""
+    if _writer is not None:
+        _writer.finish()
+
+
+def lines_dropped() -> int:
+    """Return how many lines this process could not write."""
+    return 0 if _writer is None else _writer.dropped
+
+
+def configure(form: Literal["console", "json"], level: str, worker: int | None = None) -> None:
+    """Send the log lines to stderr, as coloured text on a terminal, plain text elsewhere, or JSON.
+
+    Args:
+        form: text or JSON.
+        level: the least that is logged.
+        worker: number of the worker process, written into every line; None: it is none.
+    """
+    global _writer  # noqa: PLW0603 - a process has one stderr
+    if _writer is None:
+        atexit.register(finish)
+    _writer = LineWriter(sys.stderr)
+    processors: list[Processor] = [] if worker is None else [lambda _logger, _name, event: {**event, "worker": worker}]
+    processors += [
+        Limiter(),
+        structlog.contextvars.merge_contextvars,
+        structlog.processors.add_log_level,
+        structlog.processors.TimeStamper(fmt="iso", utc=True),
+    ]
+    if form == "json":
+        processors += [structlog.processors.dict_tracebacks, structlog.processors.JSONRenderer()]
+    else:
+        plain = structlog.dev.plain_traceback
+        colors = sys.stderr.isatty()
+        processors.append(structlog.dev.ConsoleRenderer(colors=colors, pad_event_to=0, exception_formatter=plain))
+    structlog.configure(
+        processors=processors,
+        wrapper_class=structlog.make_filtering_bound_logger(logging.getLevelNamesMapping()[level.upper()]),
+        logger_factory=structlog.WriteLoggerFactory(file=cast("TextIO", _writer)),
+    )
+    logging.getLogger("optipmb").handlers = [_Library()]
+
+
+class _Library(logging.Handler):
+    """Logs the warnings of the tracker, which uses Python's own logging."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Log one of them."""
+        structlog.get_logger("optipmb_service").warning("tracker_message", text=record.getMessage())

@@ -1,0 +1,105 @@
+"""The live view: rates from differences, the worst on top, what vanished still seen."""
+
+import io
+from typing import Any
+
+import pytest
+from optipmb_client.terminal import StatusView
+from optipmb_schemas import Problem, ServiceStatus, SessionSummary
+from rich.console import Console
+
+HEIGHT = 40
+
+
+def session(stream: str, **changes: Any) -> SessionSummary:
+    """A stream that is well, but for changes."""
+    fields = {"profile": "nuscenes", "state": "running", "rate_hz": 10.0, "latency_p50_ms": 2.0, "latency_p99_ms": 5.0}
+    return SessionSummary(stream=stream, frames=100, tracks=7, age_s=0.1, **fields | changes)
+
+
+def service(instance: str = "one", *sessions: SessionSummary, **changes: Any) -> ServiceStatus:
+    """An instance that is well, but for changes."""
+    fields = {"version": "1", "started_ns": 1, "uptime_s": 60.0, "state": "ready"}
+    return ServiceStatus(instance=instance, sessions=sessions, **fields | changes)
+
+
+def text(view: StatusView, height: int = HEIGHT, width: int = 140) -> str:
+    """The view as a terminal would show it, without colours."""
+    console = Console(width=width, record=True, file=io.StringIO())
+    console.print(view.render(height, width))
+    return console.export_text()
+
+
+def test_rates_are_those_of_the_last_interval() -> None:
+    """Frames and losses per second are differences of counters, not means since the start."""
+    view = StatusView("here")
+    view.take([service("one", session("a/b/c", shed=50), frames=5000)], 10.0)
+    view.take([service("one", session("a/b/c", shed=54), frames=5040)], 12.0)
+    title = text(view).splitlines()[0]
+    assert "1 service, 1 stream, 20 frames/s, 2.0 lost/s" in title
+
+
+def test_a_restart_is_no_negative_rate() -> None:
+    """Counters that begin again after a restart are not compared with those before it."""
+    view = StatusView("here")
+    view.take([service("one", session("a/b/c"), frames=5000)], 10.0)
+    view.take([service("one", session("a/b/c"), frames=3, started_ns=2)], 11.0)
+    assert "0 frames/s, 0.0 lost/s" in text(view)
+
+
+def test_the_worst_come_first_and_the_rest_is_counted() -> None:
+    """With more streams than lines those that lose frames, then the silent, then the late are shown."""
+    well = [session(f"a/b/well-{number:02}") for number in range(50)]
+    late, silent = session("z/z/late", latency_p99_ms=300.0), session("z/z/silent", state="stale")
+    view = StatusView("here")
+    view.take([service("one", *well, late, silent, session("z/z/losing", shed=1))], 1.0)
+    view.take([service("one", *well, late, silent, session("z/z/losing", shed=9))], 2.0)
+    lines = text(view, 20).splitlines()
+    assert len(lines) <= 20
+    streams = [line.split()[0] for line in lines if "/" in line.split(" ")[0]]
+    assert streams[:4] == ["z/z/losing", "z/z/silent", "z/z/late", "a/b/well-00"]
+    assert f"and {53 - len(streams)} more in better state" in text(view, 20)
+
+
+def test_an_instance_that_vanished_is_shown_for_a_while() -> None:
+    """It is marked as gone for a minute, then forgotten; the others go on."""
+    view = StatusView("here")
+    view.take([service("one", session("a/b/c")), service("two")], 1.0)
+    view.take([service("two", session("a/b/c"))], 21.0)
+    (line,) = [line for line in text(view).splitlines() if line.startswith("one")]
+    assert "gone for 20.0 s" in line
+    view.take([service("two")], 90.0)
+    assert "one" not in [line.split(" ")[0] for line in text(view).splitlines()]
+
+
+def test_problems_are_shown_once_with_their_age() -> None:
+    """A problem that every sample repeats is one line, which says how long ago it came."""
+    problem = Problem(stream="a/b/c", instance="one", code="late", message="Frame 7: late.", count=3)
+    view = StatusView("here")
+    for second in range(5):
+        view.take([service("one", session("a/b/c"), problems=(problem,))], float(second))
+    lines = [line for line in text(view).splitlines() if "Frame 7" in line]
+    assert len(lines) == 1
+    assert lines[0].split()[:4] == ["4.0", "s", "ago", "late"]
+    assert "(3 times)" in lines[0]
+
+
+@pytest.mark.parametrize("width", [80, 140])
+def test_a_narrow_terminal_shows_fewer_columns(width: int) -> None:
+    """Names and what says that something is wrong are whole at any width; what matters less needs a wide terminal."""
+    view = StatusView("tcp/127.0.0.1:7447")
+    for second in range(60):
+        view.take([service("edge-1", session("garage/robot-1/lidar-front"), state="degraded")], float(second))
+    lines = text(view, width=width).splitlines()
+    assert max(map(len, lines)) <= width
+    assert not any("…" in line for line in lines)
+    for word in ("edge-1", "degraded", "garage/robot-1/lidar-front", "running", "p99 ms", "lost/s"):
+        assert any(word in line for line in lines)
+    assert any("nuscenes" in line for line in lines) == (width > 80)
+
+
+def test_nothing_there_is_said() -> None:
+    """Without any service the view says so."""
+    view = StatusView("here")
+    view.take([], 1.0)
+    assert "no service answers" in text(view)

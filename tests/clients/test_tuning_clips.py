@@ -1,0 +1,172 @@
+"""What tuning works on: the same tracks and figures as everywhere else, and detections made worse by a seed."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from optipmb_client import offline
+from optipmb_client.datasets import Dataset, open_dataset
+from optipmb_client.datasets.scene.lidar import Scan, scan
+from optipmb_client.evaluation.ab3dmot import evaluate_ab3dmot
+from optipmb_client.evaluation.cases import ab3dmot_rules, prepare
+from optipmb_client.evaluation.evaluate import evaluate_figures, load_recordings
+from optipmb_client.evaluation.nuscenes import NuScenesConfig, evaluate_nuscenes, evaluate_scenes, prepare_scene
+from optipmb_client.results.kitti import read_kitti_results
+from optipmb_client.tracking import Tracking, track
+from optipmb_client.tuning.clips import Clip, Degradation, degrade, load, of_class, track_clip
+from optipmb_client.tuning.objective import folds_of
+from optipmb_client.tuning.scoring import rules_of, scorer_of
+from optipmb_client.tuning.values import only
+from real_data import kitti_root, nuscenes_root
+from tuning_cases import Habits, recorded
+
+import optipmb
+
+PARAMETERS = optipmb.load_profile("kitti")
+
+
+def clip_of(habits: Habits | None = None, seed: int = 0) -> Clip:
+    """Make a clip of cars."""
+    return load(recorded(habits or Habits(), seed, frames=40), PARAMETERS, rules_of("scene"))
+
+
+def test_a_class_alone_is_tracked_as_among_others() -> None:
+    """The boxes of a class are the same, to the bit, whether the others are tracked with it or not."""
+    rules = rules_of("scene")
+    (sequence,) = open_dataset("scene", frames=40, clouds=False).sequences(["0000"])
+    clip = load(sequence, PARAMETERS, rules)
+    everything = track_clip(clip, PARAMETERS)
+    for name in PARAMETERS.labels:
+        alone = track_clip(of_class(clip, name, rules), only(PARAMETERS, name))
+        together = everything.of_class(name)
+        assert len(alone) > 0
+        order, other = (np.lexsort((one.center[:, 0], one.frame)) for one in (alone, together))
+        for column in ("frame", "center", "size", "yaw", "score"):
+            assert np.array_equal(getattr(alone, column)[order], getattr(together, column)[other])
+
+
+def test_a_generated_scene_is_scanned_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Detections and truth come from the same scan of each frame."""
+    taken = []
+
+    def counted(*arguments: Any) -> Scan:
+        taken.append(1)
+        return scan(*arguments)
+
+    monkeypatch.setattr("optipmb_client.datasets.scene.dataset.scan", counted)
+    (sequence,) = open_dataset("scene", frames=3, clouds=False).sequences(["0000"])
+    load(sequence, PARAMETERS, rules_of("scene"))
+    assert len(taken) == 3
+
+
+def test_frames_in_which_nothing_can_happen_are_left_out_without_effect() -> None:
+    """Tracks are the same whether empty frames are stepped through or not."""
+    clip = clip_of()
+    empty = [replace(frame, **{key: getattr(frame, key)[:0] for key in _COLUMNS}) for frame in clip.frames[:20]]
+    clip = replace(clip, frames=(*empty, *clip.frames[20:]))
+    quick, whole = track_clip(clip, PARAMETERS), track_clip(clip, PARAMETERS, every_frame=True)
+    assert len(quick) > 100
+    for column in ("frame", "id", "center", "score"):
+        assert np.array_equal(getattr(quick, column), getattr(whole, column))
+
+
+_COLUMNS = ("center", "size", "yaw", "velocity", "score", "label", "source")
+
+
+def tracked(dataset: Dataset, names: list[str], out: Path) -> None:
+    """Write the result files of some sequences."""
+    list(track(dataset, dataset.sequences(names), out, Tracking(offline.read_profile("kitti-paper"))))
+
+
+def test_figures_of_kitti_are_those_of_its_result_files(tmp_path: Path) -> None:
+    """A trial's figures are AB3DMOT's and the centre HOTA of the files that track writes, to their six decimals."""
+    root, names = kitti_root(), ["0004", "0011"]
+    dataset = open_dataset("kitti", root, "pointrcnn", clouds=False)
+    tracked(dataset, names, tmp_path)
+    parameters = optipmb.load_profile("kitti-paper")
+    sequences = dataset.sequences(names)
+    clips = [load(sequence, parameters, rules_of("kitti")) for sequence in sequences]
+    for name in ("Car", "Pedestrian", "Cyclist"):
+        scorer = scorer_of("kitti", name, sequences)
+        single = [of_class(clip, name, scorer.rules) for clip in clips]
+        found = scorer.figures([scorer.measure(clip, track_clip(clip, only(parameters, name))) for clip in single])
+        cases = [
+            prepare(clip.truth, read_kitti_results(tmp_path / f"{clip.name}.txt"), name, ab3dmot_rules(), clip.name)
+            for clip in clips
+        ]
+        official = evaluate_ab3dmot(cases)
+        assert (found["FP"], found["FN"], found["IDS"], found["FRAG"], found["GT"]) == (
+            official.best.false,
+            official.best.missed,
+            official.best.switches,
+            official.best.fragments,
+            official.best.truth,
+        )
+        assert found["sAMOTA"] == pytest.approx(official.samota, abs=1e-6)
+        assert found["AMOTA"] == pytest.approx(official.amota, abs=1e-6)
+        assert found["MOTP"] == pytest.approx(official.best.motp, abs=1e-4) or official.best.true > 0
+        (figures,) = evaluate_figures("kitti", load_recordings("kitti", sequences, tmp_path), [name])
+        if figures.best is not None:
+            assert found["HOTA"] == pytest.approx(figures.best.hota.hota, abs=1e-6)
+
+
+def test_figures_of_nuscenes_are_the_official_ones_of_its_result_file(tmp_path: Path) -> None:
+    """A trial's figures are those of the benchmark's evaluation in memory, and of the file up to its rounding."""
+    dataset = open_dataset("nuscenes", nuscenes_root(), "centerpoint", clouds=False)
+    sequences = dataset.sequences(["all"])
+    list(track(dataset, sequences, tmp_path, Tracking(offline.read_profile("nuscenes-paper"))))
+    official = evaluate_nuscenes(nuscenes_root(), tmp_path)
+    parameters = optipmb.load_profile("nuscenes-paper")
+    clips = [load(sequence, parameters, rules_of("nuscenes")) for sequence in sequences]
+    for name in ("car", "pedestrian"):
+        scorer = scorer_of("nuscenes", name, sequences)
+        single = [of_class(clip, name, scorer.rules) for clip in clips]
+        tables = [track_clip(clip, only(parameters, name)) for clip in single]
+        found = scorer.figures([scorer.measure(clip, table) for clip, table in zip(single, tables, strict=True)])
+        scenes = [prepare_scene(sequence, NuScenesConfig()) for sequence in sequences]
+        for scores, rounding in (
+            (evaluate_scenes(list(zip(scenes, tables, strict=True))), 0.0),
+            (official, 1e-4),  # a threshold between two scores moves with their last digits
+        ):
+            wanted = scores.classes[name]
+            assert found["AMOTA"] == pytest.approx(wanted.amota, abs=rounding)
+            assert found["MOTA"] == pytest.approx(wanted.best.mota, abs=rounding)
+            assert (found["FP"], found["FN"], found["IDS"]) == (wanted.best.fp, wanted.best.fn, wanted.best.ids)
+
+
+def test_degraded_detections_are_a_matter_of_the_seed() -> None:
+    """The same seed gives the same bytes, another seed or copy others."""
+    clip, how = clip_of(Habits(velocity=0.3)), Degradation()
+    first, again = degrade(clip, how, 1), degrade(clip, how, 1)
+    for one, other in zip(first.frames, again.frames, strict=True):
+        assert all(np.array_equal(getattr(one, key), getattr(other, key), equal_nan=True) for key in _COLUMNS)
+    for other in (degrade(clip, how, 2), degrade(clip, how, 1, copy=1)):
+        assert not np.array_equal(first.frames[0].center, other.frames[0].center)
+
+
+def test_degraded_detections_are_as_much_worse_as_asked() -> None:
+    """A tenth is lost, places scatter by what was given, scores stay in (0, 1] and truth stays."""
+    clip = load(recorded(Habits(), frames=200), PARAMETERS, rules_of("scene"))
+    worse = degrade(clip, Degradation(drop=0.1, position=0.3), 0)
+    before, after = (sum(len(frame.score) for frame in one.frames) for one in (clip, worse))
+    assert after / before == pytest.approx(0.9, abs=0.01)
+    shifts = []
+    for one, other in zip(clip.frames, worse.frames, strict=True):
+        place = np.searchsorted(one.source, other.source)
+        shifts.append(other.center[:, :2] - one.center[place, :2])
+        assert ((other.score > 0.0) & (other.score <= 1.0)).all()
+    assert np.concatenate(shifts).std() == pytest.approx(0.3, rel=0.03)
+    assert worse.truth is clip.truth
+
+
+def test_groups_are_even_and_leave_out_what_has_no_truth() -> None:
+    """Every sequence with truth is in one group; groups weigh about the same; too few sequences make no groups."""
+    weights = [100, 0, 50, 49, 30, 21, 3]
+    groups = folds_of(weights, 3)
+    assert sorted(i for group in groups for i in group) == [0, 2, 3, 4, 5, 6]
+    totals = [sum(weights[i] for i in group) for group in groups]
+    assert max(totals) - min(totals) <= 30
+    assert folds_of([5, 0, 0], 3) == []
+    assert len(folds_of([5, 4], 3)) == 2

@@ -1,0 +1,188 @@
+"""The end of every process has a bound: where a step of it hangs, the process ends, and says where."""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import os
+import signal
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from optipmb_schemas import Keys, SessionState
+from optipmb_service.app.lifecycle import LAST_S, EndBound, Steps, StopRequest, _calls, longest_end_s
+from optipmb_service.app.workers import WORKERS_S
+from processes import descendants, wait_until_ended
+from router import Node, Sensor
+from routers import free_endpoint, open_router
+from service_process import ServiceProcess
+from structlog.testing import capture_logs
+
+if TYPE_CHECKING:
+    from types import FrameType
+
+    import pytest
+
+HANGING = Path(__file__).parents[2] / "support" / "hanging"
+SENSOR = Sensor()
+GRACE_S = 0.5
+BOUND_S = longest_end_s(GRACE_S)
+FROZEN_S = 4.0
+"""So long that it is noticed, and shorter than the bound."""
+BUSY_S = 30.0
+"""How much later a busy machine may notice that a process has ended."""
+
+
+def environment(hang: str = "", **settings: object) -> dict[str, str]:
+    """Return variables for a process that is to hang at a place, or nowhere."""
+    path = os.pathsep.join(filter(None, (str(HANGING), os.environ.get("PYTHONPATH"))))
+    hangs = {"PYTHONPATH": path, "HANG": hang} if hang else {}
+    return hangs | {f"OPTIPMB_{name}": str(value) for name, value in ({"GRACE_S": GRACE_S} | settings).items()}
+
+
+def processes(folder: Path, router: str, hang: str = "") -> dict[str, ServiceProcess]:
+    """Start one of every kind; those that need a router use this one."""
+    topics = folder / "ros2.toml"
+    topics.write_text('[ros2.streams."site/node/lidar"]\ndetections = "/boxes"\n')
+    nowhere = free_endpoint().removeprefix("tcp/")
+    commands = {
+        "alone": (),
+        "workers": ("--workers", "2"),
+        "router": ("router",),
+        "grpc": ("grpc", "--connect", router, "--grpc", free_endpoint().removeprefix("tcp/")),
+        "log": ("log", "--connect", router, "--cluster", f"nats://{nowhere}"),
+        "ros2": ("ros2", "--connect", router, "--settings", str(topics)),
+    }
+    return {
+        name: ServiceProcess(
+            *options, listen=name in {"alone", "workers", "router"}, environment=environment(hang), fresh=bool(hang)
+        )
+        for name, options in commands.items()
+    }
+
+
+def ends(folder: Path, hang: str = "") -> tuple[dict[str, tuple[int, float]], dict[str, str]]:
+    """Return exit status and seconds of the end of each process after SIGTERM, and the logs."""
+    with contextlib.ExitStack() as stack:
+        router = free_endpoint()
+        stack.enter_context(open_router(router))
+        started = processes(folder, router, hang)
+        for one in started.values():
+            stack.enter_context(one)
+        for one in started.values():
+            one.wait_ready()
+        below = {pid for one in started.values() for pid in descendants(one.process.pid)}
+        with ThreadPoolExecutor(len(started)) as threads:
+            ended = dict(zip(started, threads.map(ServiceProcess.end, started.values()), strict=True))
+        assert wait_until_ended(below, 0.0) == set()
+        return ended, {name: one.errors for name, one in started.items()}
+
+
+def test_a_session_that_hangs_in_its_close_keeps_no_process(tmp_path: Path) -> None:
+    """Where Zenoh's session does not close, every process ends within its bound, with status 1 and the place logged."""
+    ended, logs = ends(tmp_path, "close")
+    assert {name: status for name, (status, _) in ended.items()} == dict.fromkeys(ended, 1)
+    for name, (_, seconds) in ended.items():
+        bound_s = BOUND_S + (WORKERS_S if name == "workers" else 0.0)
+        assert bound_s - LAST_S <= seconds < bound_s + BUSY_S, name
+        # The parent says it, and each of its workers.
+        assert logs[name].count("end_hangs") == (3 if name == "workers" else 1)
+        assert "sitecustomize.hang" in logs[name]
+    assert "worker_killed" not in logs["workers"]
+
+
+def test_what_hangs_nowhere_ends_with_status_0(tmp_path: Path) -> None:
+    """Every process follows SIGTERM with status 0, before its bound."""
+    ended, logs = ends(tmp_path)
+    assert {name: status for name, (status, _) in ended.items()} == dict.fromkeys(ended, 0)
+    assert not [name for name, text in logs.items() if "hangs" in text or "Traceback" in text]
+
+
+def test_the_lock_of_the_interpreter_keeps_no_process() -> None:
+    """A close that hangs with the interpreter's lock held, so that no Python runs, is ended too, with tracebacks."""
+    with ServiceProcess("router", environment=environment("lock"), fresh=True) as router:
+        router.wait_ready()
+        status, seconds = router.end()
+    assert status == 1
+    assert seconds < BOUND_S + BUSY_S
+    assert "in hang_with_the_lock" in router.errors
+
+
+def test_a_step_that_hangs_before_the_last_checkpoint_does_not_prevent_it(tmp_path: Path) -> None:
+    """A member whose end hangs in its first step keeps the newest state all the same: the next one continues it."""
+    settings = {"STORE": tmp_path, "CHECKPOINT_S": 3600}
+    with ServiceProcess(environment=environment("leave", **settings), fresh=True) as service:
+        service.wait_ready()
+        with Node(service.endpoint) as node:
+            node.send(*(SENSOR.detections(seq) for seq in range(5)))
+            session = node.tracks(SENSOR.stream, 5)[-1].session
+        status, _ = service.end()
+        assert status == 1
+        service.wait_log("step_hangs")
+    with ServiceProcess(environment=environment(**settings, RECOVERY_WAIT_S=0)) as service:
+        service.wait_ready()
+        with Node(service.endpoint) as node:
+            node.send(SENSOR.detections(5))
+            assert node.tracks(SENSOR.stream, 1)[0].session == session
+            assert node.ask(Keys().query(SENSOR.stream, "state"), SessionState).frames == 6
+        assert service.end(signal.SIGTERM)[0] == 0
+
+
+def test_a_control_loop_that_hangs_is_ended_by_the_first_signal() -> None:
+    """Where the loop turns no more, SIGTERM begins the bound all the same."""
+    with ServiceProcess(environment=environment("loop"), fresh=True) as service:
+        service.wait_log("the loop hangs")
+        status, seconds = service.end()
+    assert status == 1
+    assert seconds < BOUND_S + BUSY_S
+    assert "sitecustomize.hang" in service.errors
+
+
+def test_the_time_of_a_frozen_process_does_not_count() -> None:
+    """A process that is stopped during its end has, when it continues, what was left of its time before."""
+    with ServiceProcess("router", environment=environment("close"), fresh=True) as router:
+        router.wait_ready()
+        began = time.monotonic()
+        router.process.send_signal(signal.SIGTERM)
+        router.wait_log("stop_asked")
+        router.process.send_signal(signal.SIGSTOP)
+        time.sleep(FROZEN_S)
+        status, seconds = router.end(signal.SIGCONT)
+    assert status == 1
+    assert time.monotonic() - began > BOUND_S - LAST_S + FROZEN_S / 2
+    assert seconds < BOUND_S + BUSY_S
+    assert "end_hangs" in router.errors
+
+
+async def test_where_no_thread_can_be_started_the_end_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At a limit of processes the first signal counts, though the end has no bound; a step is not done, and said so."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(faulthandler, "dump_traceback_later", lambda *_, **__: None)
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    asked, steps = StopRequest(EndBound(60.0)), Steps()
+    with capture_logs() as logs:
+        asked.ask("SIGTERM")
+        steps.do("leaving", list)
+        assert steps.unfinished(1.0)
+    assert asked.is_set()
+    assert [one["event"] for one in logs] == ["end_unbounded", "stop_asked", "step_hangs"]
+
+
+def test_a_thread_is_listed_whose_innermost_call_is_the_only_one_of_the_package() -> None:
+    """As one that waits for a lock of C; a thread without a call of the package is not."""
+
+    def frame(module: str) -> FrameType:
+        names: dict[str, Any] = {"__name__": module}
+        exec("import sys\ndef call(): return sys._getframe()", names)  # noqa: S102 - a function of another module
+        with ThreadPoolExecutor(1) as thread:
+            found: FrameType = thread.submit(names["call"]).result()
+        return found
+
+    assert _calls(frame("optipmb_service.some")) == "optipmb_service.some.call:2"
+    assert _calls(frame("zenoh")) == ""

@@ -1,0 +1,72 @@
+"""What a process measures: as Prometheus' own client would count it, and the same for the parent of workers."""
+
+from __future__ import annotations
+
+import re
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from optipmb_service.telemetry.metrics import METRICS, SECONDS, Collected, Metrics, families
+from prometheus_client import CollectorRegistry, Histogram, generate_latest
+
+DURATIONS = (0.0, 1e-9, 0.0005, 0.00051, 0.001, 0.0999, 0.1, 1.0, 5.0, 5.1, 1e9)
+NAMES = ("latency", "queue", "decode", "step")
+
+
+def filled() -> Metrics:
+    """Metrics in which something was counted."""
+    metrics = Metrics()
+    for number, seconds in enumerate(DURATIONS):
+        metrics.received("detections", 100 + number)
+        metrics.published(latency_s=seconds, queue_s=seconds / 2, decode_s=0.0, step_s=2 * seconds)
+        metrics.tracks(started=2, ended=1)
+    metrics.received("points", 10_000)
+    metrics.restored()
+    stream = SimpleNamespace(stream='a/b/"c\\\n', frames=3, queue=float("inf"))
+    table = {name: METRICS[name] for name in ("stream_frames_total", "queue_frames")}
+    metrics.add(table, lambda: SimpleNamespace(sessions=[stream], listed=[stream]))
+    return metrics
+
+
+def own(text: bytes) -> list[str]:
+    """Return the lines that are not about the process itself, whose figures change while they are read."""
+    return [line for line in text.decode().splitlines() if not re.match(r"(# \w+ )?process_", line)]
+
+
+def test_durations_are_counted_as_prometheus_counts_them() -> None:
+    """Buckets, their ends, counts and sums are those of the client's own histogram."""
+    registry = CollectorRegistry()
+    histogram = Histogram("optipmb_latency_seconds", "x", buckets=SECONDS, registry=registry)
+    for seconds in DURATIONS:
+        histogram.observe(seconds)
+    expected = [one for one in generate_latest(registry).decode().splitlines() if one.startswith("optipmb_latency_se")]
+    seen = [one for one in own(filled().text()) if one.startswith("optipmb_latency_seconds_")]
+    assert seen == [line for line in expected if "_created" not in line]
+
+
+def test_counts_are_there_from_the_start() -> None:
+    """A counter that has not counted is 0, not absent."""
+    lines = own(Metrics().text())
+    for name in ('received_total{topic="points"}', "tracks_started_total", "step_seconds_count"):
+        assert f"optipmb_{name} 0.0" in lines
+
+
+def test_what_a_worker_hands_over_is_what_it_shows() -> None:
+    """Metrics that went as data to another process give the same text there."""
+    metrics = filled()
+    registry = CollectorRegistry()
+    registry.register(Collected(lambda: families(metrics.samples())))
+    assert own(generate_latest(registry)) == own(metrics.text())
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"\xff", b"{", b"1", b"[1]", b'[["a"]]', b'[["a","b","no kind",[]]]', b'[["a","b","gauge",[["a",1,2]]]]',
+     b'[["a","b","gauge",[["a",{},"x"]]]]', b'[["a","b","gauge",[["a",{},null]]]]', b'[["a","b","gauge",1]]',
+     b'[["a","b",[],[]]]', b"[" * 100_000],
+)  # fmt: skip
+def test_other_data_are_refused(data: Any) -> None:
+    """Whatever an answer is, it gives metrics or one kind of error."""
+    with pytest.raises(ValueError, match="expected the metrics of a worker"):
+        families(data)
