@@ -23,7 +23,7 @@ from plots import STAGES, draw
 from settled import PARAMETERS, recorded, settled
 
 import optipmb
-from optipmb.points import points_in_boxes
+from optipmb.detection_probability import points_in_boxes
 
 if TYPE_CHECKING:
     from collections.abc import Callable

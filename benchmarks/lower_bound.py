@@ -16,11 +16,10 @@ import numba
 import numpy as np
 
 from optipmb.association import associate
-from optipmb.class_posterior import UNGROUPED
-from optipmb.density import components_in, objects_in
+from optipmb.class_posterior import UNGROUPED, Groups
+from optipmb.density import Moment, components_in, objects_in
 from optipmb.hypotheses import local_hypotheses
-from optipmb.motion import predict_state
-from optipmb.predict import predict
+from optipmb.predict import predict, predict_state
 from optipmb.preprocess import preprocess
 from optipmb.table import ClassTable
 from optipmb.update import ukf_update, workspace
@@ -101,22 +100,14 @@ def bare(
 def arguments(parameters: optipmb.Parameters, density: optipmb.Density, frame: optipmb.Frame) -> tuple[Any, ...]:
     """Return the arguments of `bare` for one frame: all that the tracker would have to find out, found out."""
     table = ClassTable.of(parameters)
-    predicted, _ = predict(density, frame.stamp_ns, table)
-    measurements, _, _ = preprocess(frame, table)
+    dt = (frame.stamp_ns - density.stamp_ns) * 1e-9
+    predicted, _ = predict(density, Moment(frame.stamp_ns, density.stamp_ns, dt, table.period), table)
+    measurements, *_ = preprocess(frame, table)
     old, undetected = predicted.bernoulli, predicted.poisson
-    p_d, p_d_poisson = table["detection"][old.label], table["detection"][undetected.label]
+    p_d = table["detection"][np.concatenate((old.label, undetected.label))]
     objects, components = objects_in(old.words), components_in(undetected.words)
-    found = local_hypotheses(
-        objects,
-        UNGROUPED,
-        p_d,
-        components,
-        p_d_poisson,
-        measurements,
-        table.period,
-        table.confusion,
-        table.classes,
-    )
+    groups = Groups(UNGROUPED, table.confusion)
+    found = local_hypotheses(objects, components, p_d, measurements, groups, table.period, table.classes)
     assigned = associate(found.row, found.measurement, found.detection_cost, found.first_cost, len(old))
     before, waiting = density.bernoulli, density.poisson
     count = len(before) + len(waiting)
@@ -132,12 +123,12 @@ def arguments(parameters: optipmb.Parameters, density: optipmb.Density, frame: o
         np.concatenate([before.mean, waiting.mean]),
         np.concatenate([before.covariance, waiting.covariance]),
         np.concatenate([before.label, waiting.label]),
-        (frame.stamp_ns - density.stamp_ns) * 1e-9,
+        dt,
         table.classes,
         np.concatenate([found.row, found.component + len(before)]),
         np.concatenate([found.measurement, found.announced]),
         np.concatenate([old.existence, undetected.weight]),
-        np.concatenate([p_d, p_d_poisson]),
+        p_d,
         measurements.position,
         np.column_stack([winners, assigned[winners]]),
         z,

@@ -10,11 +10,10 @@ from settled import PARAMETERS, settled
 
 import optipmb
 from optipmb.association import associate
-from optipmb.class_posterior import UNGROUPED
-from optipmb.density import components_in, objects_in
-from optipmb.effort import UNLIMITED
-from optipmb.hypotheses import local_hypotheses
-from optipmb.points import points_in_boxes
+from optipmb.class_posterior import UNGROUPED, Groups
+from optipmb.density import Density, Moment, components_in, objects_in
+from optipmb.detection_probability import points_in_boxes
+from optipmb.hypotheses import UNLIMITED, local_hypotheses
 from optipmb.predict import predict
 from optipmb.preprocess import non_maximum_suppression, preprocess
 from optipmb.table import CLASS, ClassTable
@@ -26,11 +25,17 @@ TABLE = ClassTable.of(PARAMETERS)
 OBJECTS = pytest.mark.parametrize("objects", [10, 100, 800])
 
 
+def moment(density: Density, frame: optipmb.Frame) -> Moment:
+    """The time of a frame."""
+    dt = (frame.stamp_ns - density.stamp_ns) * 1e-9
+    return Moment(frame.stamp_ns, density.stamp_ns, dt, TABLE.period)
+
+
 @OBJECTS
 def test_predict(benchmark: BenchmarkFixture, objects: int) -> None:
     """Unscented transforms of all objects and components."""
     _, density, frame = settled(objects)
-    predicted, repaired = benchmark(predict, density, frame.stamp_ns, TABLE)
+    predicted, repaired = benchmark(predict, density, moment(density, frame), TABLE)
     assert (len(predicted.bernoulli), repaired) == (len(density.bernoulli), 0)
 
 
@@ -57,13 +62,12 @@ def test_suppression(benchmark: BenchmarkFixture, apart: float) -> None:
 def before_association(objects: int) -> tuple[Any, ...]:
     """The arguments of `local_hypotheses`."""
     _, density, frame = settled(objects)
-    density, _ = predict(density, frame.stamp_ns, TABLE)
-    measurements, _, _ = preprocess(frame, TABLE)
+    density, _ = predict(density, moment(density, frame), TABLE)
+    measurements, *_ = preprocess(frame, TABLE)
     old, new = density.bernoulli, density.poisson
-    p_d = TABLE["detection"][old.label], TABLE["detection"][new.label]
+    p_d = TABLE["detection"][np.concatenate((old.label, new.label))]
     known, undetected = objects_in(old.words), components_in(new.words)
-    given = known, UNGROUPED, p_d[0], undetected, p_d[1], measurements, TABLE.period
-    return *given, TABLE.confusion, TABLE.classes
+    return known, undetected, p_d, measurements, Groups(UNGROUPED, TABLE.confusion), TABLE.period, TABLE.classes
 
 
 @OBJECTS

@@ -20,10 +20,10 @@ Pure computation: no files but the profiles, no network, no state outside the de
 """
 
 from optipmb.class_names import class_indices, common_name
-from optipmb.columns import bytes_of, columns_in, columns_of, density_of
-from optipmb.density import Bernoullis, Density, Poissons
+from optipmb.density import Bernoullis, Density, Poissons, bytes_of, columns_in, columns_of, density_of
+from optipmb.detection_probability import points_in_boxes
 from optipmb.errors import DensityError, EffortError, FrameError, OptipmbError, ParameterError
-from optipmb.extract import Tracks
+from optipmb.extract import Tracks, sound
 from optipmb.field_of_view import FieldOfView
 from optipmb.frame import Frame, PointCloud, Pose, make_frame
 from optipmb.generic import generic_parameters
@@ -41,8 +41,6 @@ from optipmb.parameters import (
     profiles,
 )
 from optipmb.paths import PredictedPaths, predict_tracks
-from optipmb.points import points_in_boxes
-from optipmb.soundness import sound
 from optipmb.tracker import Diagnostics, Modules, StepResult, Tracker
 from optipmb.warm import warm_up
 

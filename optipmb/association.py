@@ -1,33 +1,43 @@
-"""The best global hypothesis (Section IV.E).
+"""The best global hypothesis, and which objects it leaves (Section IV.E).
 
 Each measurement goes to one object, or is a first-time detection of its own. A pair lowers the total cost only when it
-is cheaper than the first-time detection of its measurement; no other pair is in the best hypothesis. Of those that are,
-the assignment of least cost is found by shortest augmenting paths, after Jonker and Volgenant (1987): objects come in
-one after the other, and each comes by the cheapest chain of moves, which ends at a free measurement or at an object
-that is then missed. Prices on objects and measurements keep all lengths non-negative, so that Dijkstra's algorithm
-finds the chain. A search goes along pairs, so it never leaves the cluster that shares gates with its object; most end
-after one step. The total cost is that of the Hungarian algorithm on the whole matrix of the paper's Fig. 3.
+is cheaper than the first-time detection of its measurement. Of those pairs, the assignment of least cost is found by
+shortest augmenting paths, after Jonker and Volgenant (1987): objects come in one after the other, and each comes by the
+cheapest chain of moves, which ends at a free measurement or at an object that is then missed. Prices on objects and
+measurements keep all lengths non-negative, so that Dijkstra's algorithm finds the chain. A search goes along pairs and
+never leaves the cluster that shares gates with its object. The total cost is that of the Hungarian algorithm on the
+whole matrix of the paper's Fig. 3. Where several hypotheses have the least cost, the order of objects (by id) and
+measurements (by score) decides: the older track gets the better detection.
 
-Where several hypotheses have the least cost, the order of objects and measurements decides, and nothing else: an object
-that comes later takes nothing from an earlier one unless the total becomes lower, and of measurements that cost the
-same it takes the first. Objects are ordered by id and measurements by score, so the older track gets the better
-detection.
+Two objects are not in the same place (not in the paper). A box next to its object, or a track that has drifted, leaves
+an object missed and a detection without an object, for which the paper starts a second track. But a detection whose box
+overlaps the predicted box of a missed object by more than `birth_overlap` is of that object. Such a first-time
+detection is the clutter hypothesis, r = 0, and announces a Poisson component (eq. HABM). Many short tracks are false:
+they forbid births for a nominal period after their last detection. A track of at least `LASTING` nominal periods
+forbids them while it is extracted without a detection, for fewer periods than eta_cnt. All costs remain the paper's.
 """
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from optipmb.compiled import kernel
+from optipmb.density import PHI, X, Y, whole_periods
+from optipmb.geometry import iou_exceeds
+from optipmb.hypotheses import CLUTTER
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from collections.abc import Sequence
 
-    Array = NDArray[np.float64]
-    Index = NDArray[np.int64]
+    from optipmb.density import Bernoullis, Moment
+    from optipmb.hypotheses import Hypotheses
+    from optipmb.preprocess import Measurements
+    from optipmb.rows import Array, Index
+    from optipmb.table import ClassRow
+
 
 UNASSIGNED: Final = -1
 """No measurement of an object, no object of a measurement."""
@@ -41,9 +51,8 @@ def associate(row: Index, measurement: Index, cost: Array, first_cost: Array, n_
     zero. Prices u of objects and v of measurements keep ``gain - u - v >= 0`` on every pair that lowers the total, with
     equality on those assigned, ``u <= 0``, and ``v = 0`` on free measurements.
 
-    Args:
+    Arguments of its own:
         row: (K,) object of each pair, ascending.
-        measurement: (K,) measurement of each pair.
         cost: (K,) w of each pair.
         first_cost: (M,) w of the first-time detection of each measurement.
         n_objects: number N of predicted objects.
@@ -110,3 +119,122 @@ def associate(row: Index, measurement: Index, cost: Array, first_cost: Array, n_
             owner[end] = n
             end, assigned[n] = assigned[n], end
     return assigned
+
+
+LASTING: Final = 10
+"""Nominal periods since its birth from which a track is not a short one: a second of a LiDAR at 10 Hz."""
+
+EVERYTHING: Final = 1.0
+"""No two boxes overlap by more: no birth is forbidden."""
+
+
+@kernel
+def forbid_births(
+    objects: Bernoullis,
+    assigned: Index,
+    hypotheses: Hypotheses,
+    measurements: Measurements,
+    missed_from_ns: Index,
+    moment: Moment,
+    classes: Sequence[ClassRow],
+) -> None:
+    """Turn first-time detections on objects that are missed into clutter, in `hypotheses`.
+
+    Arguments of its own:
+        objects: predicted objects; those that were never extracted forbid nothing.
+        assigned: (N,) measurement of each, or `UNASSIGNED`.
+        hypotheses: of this frame; `first_kind` and `first_existence` are written.
+    """
+    used = np.zeros(len(measurements.yaw), np.bool_)
+    for m in assigned:
+        if m != UNASSIGNED:
+            used[m] = True
+    predicted, detected = np.empty(5), np.empty(5)
+    for k in range(hypotheses.row.shape[0]):
+        n, m = hypotheses.row[k], hypotheses.measurement[k]
+        own = classes[objects.label[n]]
+        overlap = own.birth_overlap
+        if overlap >= EVERYTHING or assigned[n] != UNASSIGNED or used[m] or hypotheses.first_kind[m] == CLUTTER:
+            continue
+        lasting = whole_periods(objects.born_ns[n], moment.stamp_ns, moment.period) >= LASTING
+        longest = max(own.extract_misses - 1, 1) if lasting else 1
+        if not objects.extracted[n] or whole_periods(missed_from_ns[n], moment.stamp_ns, moment.period) > longest:
+            continue
+        predicted[0], predicted[1], predicted[4] = objects.mean[n, X], objects.mean[n, Y], objects.mean[n, PHI]
+        detected[0], detected[1] = measurements.position[m, 0], measurements.position[m, 1]
+        detected[4] = measurements.yaw[m]
+        for s in range(2):
+            predicted[2 + s], detected[2 + s] = objects.auxiliary[n, s], measurements.auxiliary[m, s]
+        if iou_exceeds(predicted, detected, overlap):
+            hypotheses.first_kind[m], hypotheses.first_existence[m] = CLUTTER, 0.0
+
+
+NEW: Final = -1
+"""`Survivors.row` of a first-time detection."""
+
+
+class Survivors(NamedTuple):
+    """The local hypotheses of the best global hypothesis that outlive pruning: one per object of the posterior.
+
+    Known objects come first, in their order; then the new ones, in the order of their measurements.
+
+    Attributes:
+        row: (K,) predicted object, or `NEW`.
+        measurement: (K,) its measurement, or `UNASSIGNED`.
+        existence: (K,) posterior existence probability r.
+        known: how many are known objects.
+        detected: how many of those have a measurement.
+    """
+
+    row: Index
+    measurement: Index
+    existence: Array
+    known: int
+    detected: int
+
+
+@kernel
+def surviving_objects(
+    objects: Bernoullis,
+    p_d: Array,
+    assigned: Index,
+    hypotheses: Hypotheses,
+    measured_label: Index,
+    missed_from_ns: Index,
+    moment: Moment,
+    classes: Sequence[ClassRow],
+) -> Survivors:
+    """Select the objects of the posterior: likely enough (`min_existence`), not missed too long (`max_misses`).
+
+    The second limit is ours: with p_s = 1, as the paper sets it for KITTI, r stays 1 through any number of misses.
+    A detected object has r = 1; a missed one ``r (1 - p_d) / [1 - r + r (1 - p_d)]`` (eq. Misdetect Hypothesis
+    Update); of the measurements that no object took, those that are not clutter make one.
+
+    Arguments of its own:
+        assigned: (N,) the measurement of each, `UNASSIGNED` for the missed ones.
+    """
+    capacity = assigned.shape[0] + measured_label.shape[0]
+    row, measurement, existence = np.empty(capacity, np.int64), np.empty(capacity, np.int64), np.empty(capacity)
+    free = np.ones(measured_label.shape[0], np.bool_)
+    count, detected = 0, 0
+    for n in range(assigned.shape[0]):
+        m, r = assigned[n], objects.existence[n]
+        if m != UNASSIGNED:
+            free[m] = False
+            r = 1.0
+            detected += 1
+        else:
+            own = classes[objects.label[n]]
+            r = r * (1.0 - p_d[n]) / (1.0 - r + r * (1.0 - p_d[n]))
+            misses = whole_periods(missed_from_ns[n], moment.stamp_ns, moment.period)
+            if not r >= own.min_existence or misses > own.max_misses:
+                continue
+        row[count], measurement[count], existence[count] = n, m, r
+        count += 1
+    known = count
+    for m in range(measured_label.shape[0]):
+        r = hypotheses.first_existence[m]
+        if free[m] and hypotheses.first_kind[m] != CLUTTER and r >= classes[measured_label[m]].min_existence:
+            row[count], measurement[count], existence[count] = NEW, m, r
+            count += 1
+    return Survivors(row[:count], measurement[:count], existence[:count], known, detected)

@@ -1,20 +1,27 @@
-"""What a track says of itself, in numbers that come true: its existence probability and its covariance.
+"""What a track publishes of itself: its box, its existence probability and its covariance (not in the paper).
 
-The recursion of the paper is right where its model is. Two of its assumptions fail with real detectors. A detection is
-given to one object for certain, which makes r one, although boxes that the detector imagines follow each other too; and
-errors of detections are taken as independent, although those of neighbouring frames are nearly the same, which makes P
-too small. Both are mended where tracks leave the tracker, so that the recursion itself stays the paper's:
+The recursion is right where its model is. Two assumptions fail with real detectors. A detection is given to one object
+for certain, which makes r one, although imagined boxes follow each other too; and errors of detections are taken as
+independent, although those of neighbouring frames are nearly the same, which makes P too small. Both are mended where
+tracks leave the tracker, so that the recursion stays the paper's:
 
     evidence    e_k = lambda e_{k-1} + (1 - lambda) l_k,     l_k = ln[z_s / (1 - z_s)], or -l_miss where missed
     existence   f(e_k)
     covariance  P + U diag(along(e_k), across(e_k))^2 U'     on x and y, U turned by the heading
     score       (1 - w) x_s + w (1 + e_k / e_max) / 2        e_max the bound of l_k
 
-The evidence is the mean of the log odds of the track's latest detections, with weights that fade. f, along and across
-are piecewise linear and were measured on training data: how often tracks with such evidence are of an object, and how
-far the lasting error of the detector carries them off. lambda holds for one nominal period.
-
+f, along and across are piecewise linear and were measured on training data. lambda holds for one nominal period.
 Without a calibration in the profile, existence is r, the covariance is P, and the evidence stays zero.
+
+The state rests on measurement noise R that is larger than a detector's usual error, so that a half-hidden car whose box
+jumps stays one track. The published box is the estimate with a smaller noise R' of position and heading from the same
+prediction. As the posterior (m, P) has used the detection already, that is one more update with the noise that is left:
+
+    R_x^-1 = R'^-1 - R^-1,    G = P_bb (P_bb + R_x)^-1,    b = (x, y, phi)
+    m_b + G nu,    (I - G) P_bb,    (I - G) P_bo;          nu_phi modulo pi, as in `optipmb.update`
+
+Speed, turn rate and acceleration, o, stay (the gain of a Schmidt-Kalman filter). A missed object publishes its state,
+and so does a class without `reported_noise`.
 """
 
 from __future__ import annotations
@@ -23,17 +30,16 @@ import math
 from typing import TYPE_CHECKING, Final
 
 from optipmb.compiled import kernel
+from optipmb.density import PHI, STATE, X, Y
+from optipmb.predict import wrap
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    import numpy as np
-    from numpy.typing import NDArray
-
+    from optipmb.rows import Array, Index
     from optipmb.table import ClassRow
 
-    Array = NDArray[np.float64]
-    Index = NDArray[np.int64]
+    Box = tuple[float, float, float]
 
 SURE: Final = 14.0
 """Log odds of the surest detection, and minus those of the least sure one: a score of one in a million from certain."""
@@ -58,11 +64,8 @@ def calibrate_rows(
 ) -> None:
     """Overwrite existence, score and covariance of the rows whose class has a calibration.
 
-    Args:
-        label: (K,) classes.
+    Arguments of its own:
         evidence: (K,) e_k.
-        yaw: (K,) headings.
-        classes: (C,) parameters: the knots of f, along and across, and w.
         existence: (K,) in: r, out: f(e_k).
         score: (K,) in: x_s, out: the published score.
         covariance: (K, 6, 6) in: P, out: with the lasting error.
@@ -91,3 +94,38 @@ def calibrate_rows(
         covariance[row, 1, 0] += mixed
         w = own.score_of_evidence
         score[row] = (1.0 - w) * score[row] + w * (0.5 + 0.5 * e / SURE)
+
+
+BOX: Final = (X, Y, PHI)
+"""The entries of the state that a box shows, b."""
+
+
+@kernel
+def follow_box(box: Box, noise: Box, mean: Array, covariance: Array) -> None:
+    """Update the box of a state, m (6,) and P (6, 6) in place, with its detection z once more.
+
+    The entries of z are taken one after the other, as R_x is diagonal; where its variance is zero the state stays.
+    """
+    x, y, yaw = box
+    yaw = mean[PHI] + 0.5 * wrap(2.0 * (yaw - mean[PHI]))
+    for s in BOX:
+        if s == PHI:
+            variance = noise[2]
+            innovation = yaw - mean[PHI]
+        else:
+            variance = noise[0] if s == X else noise[1]
+            innovation = (x if s == X else y) - mean[s]
+        if variance == 0.0:
+            continue
+        total = covariance[s, s] + variance
+        shift = (covariance[X, s] / total, covariance[Y, s] / total, covariance[PHI, s] / total)
+        for i in range(len(BOX)):
+            mean[BOX[i]] += shift[i] * innovation
+        for t in range(STATE):
+            of_row = covariance[s, t]
+            for i in range(len(BOX)):
+                covariance[BOX[i], t] -= shift[i] * of_row
+        for b in BOX:
+            for t in range(STATE):
+                covariance[t, b] = covariance[b, t]
+    mean[PHI] = wrap(mean[PHI])

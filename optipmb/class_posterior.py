@@ -21,7 +21,7 @@ The class that a track reports, and whose parameters it has, is its last one unt
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -31,18 +31,28 @@ from optipmb.errors import DensityError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
+    from optipmb.association import Survivors
     from optipmb.density import Density
     from optipmb.preprocess import Measurements
-    from optipmb.prune import Survivors
+    from optipmb.rows import Array, Index
     from optipmb.table import ClassRow, ClassTable
 
-    Array = NDArray[np.float64]
-    Index = NDArray[np.int64]
 
 CHANGE_ODDS: Final = 3.0
 """How many times as probable as the reported class another must be to be reported."""
+
+
+class Groups(NamedTuple):
+    """What is known of classes that have a group in common.
+
+    Attributes:
+        probability: (N, C) pi_+ of the predicted objects; (N, 0) where the profile has no groups.
+        confusion: (C, C) Lambda, or `UNGROUPED`.
+    """
+
+    probability: Array
+    confusion: Array
+
 
 UNGROUPED: Final = np.zeros((0, 0))
 """Posteriors, and Lambda, where the profile has no groups."""
@@ -54,11 +64,8 @@ def predict_classes(density: Density, kept: Index | None, dt: float, table: Clas
     Objects whose density has none, of a profile without groups or of an earlier version, begin as if first detected as
     their class with a score of 1.
 
-    Args:
-        density: posterior of the last frame.
+    Arguments of its own:
         kept: (K,) objects that stay; None: all.
-        dt: s since then.
-        table: parameters as a table.
 
     Raises:
         DensityError: the probabilities are not those of the classes of a group.
@@ -91,27 +98,20 @@ def weigh_by_class(
     row: Index,
     measurement: Index,
     log_likelihood: Array,
-    class_probability: Array,
     measurements: Measurements,
-    confusion: Array,
+    groups: Groups,
     classes: Sequence[ClassRow],
 ) -> None:
     """Add ln p(d) to the log-likelihoods of pairs; classes without a group stay as they are.
 
-    Args:
-        row: (K,) object of each pair.
-        measurement: (K,) measurement of each pair.
+    Arguments of its own:
         log_likelihood: (K,) is written.
-        class_probability: (N, C) pi_+.
-        measurements: Z_k.
-        confusion: (C, C) Lambda.
-        classes: (C,) parameters: G.
     """
     for k in range(row.shape[0]):
         m = measurement[k]
         d = measurements.label[m]
         if classes[d].group_size > 1:
-            p = label_probability(class_probability[row[k]], d, measurements.score[m], confusion, classes)
+            p = label_probability(groups.probability[row[k]], d, measurements.score[m], groups.confusion, classes)
             log_likelihood[k] += np.log(p)
 
 
@@ -119,26 +119,23 @@ def weigh_by_class(
 def update_classes(
     survivors: Survivors,
     label: Index,
-    class_probability: Array,
+    label_out: Index,
     measurements: Measurements,
-    confusion: Array,
+    groups: Groups,
     classes: Sequence[ClassRow],
-) -> tuple[Index, Array]:
-    """Compute the class that each object of the posterior reports, and its posterior over the classes.
+) -> Array:
+    """Compute the class that each object of the posterior reports, and return its posterior over the classes.
 
-    Args:
+    Arguments of its own:
         survivors: which objects the posterior has; a row below zero is a first-time detection.
-        label: (N,) classes of the predicted objects.
-        class_probability: (N, C) pi_+; `UNGROUPED` where the profile has no groups.
-        measurements: Z_k.
-        confusion: (C, C) Lambda, or `UNGROUPED`.
-        classes: (C,) parameters: G.
+        label_out: (K,) receives the classes.
 
     Returns:
-        (K,) classes and (K, C) pi, (K, 0) where the profile has no groups.
+        (K, C) pi, (K, 0) where the profile has no groups.
     """
+    class_probability, confusion = groups.probability, groups.confusion
     count, grouped = survivors.row.shape[0], confusion.shape[0]
-    label_out, pi = np.empty(count, np.int64), np.zeros((count, grouped))
+    pi = np.zeros((count, grouped))
     for k in range(count):
         n, m = survivors.row[k], survivors.measurement[k]
         label_out[k] = measurements.label[m] if n < 0 else label[n]
@@ -158,4 +155,4 @@ def update_classes(
         likeliest = np.argmax(pi[k])
         if pi[k, likeliest] >= CHANGE_ODDS * pi[k, own] and n >= 0:
             label_out[k] = likeliest
-    return label_out, pi
+    return pi

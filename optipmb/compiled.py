@@ -3,6 +3,19 @@
 ``fastmath`` stays off, so that the same input gives the same bytes on every run; ``parallel`` stays off, so that a
 service may run many streams side by side without threads inside a frame. Division by zero follows IEEE
 (``error_model="numpy"``): kernels guard their divisors themselves.
+
+What the stages of a step take is described once, here; docstrings list what a stage takes beyond that.
+
+    objects, components    predicted objects (N) and Poisson components (J): `mean` (N, 6), `covariance` (N, 6, 6), …
+    measurements           Z_k (M), as `optipmb.preprocess.Measurements`
+    hypotheses             the local hypotheses of the frame, as `optipmb.hypotheses.Hypotheses`
+    row, measurement       (K,) object and measurement of each pair or result
+    label                  classes, indices into the parameters
+    p_d                    (N,) detection probabilities
+    moment                 stamps and times of the frame, as `optipmb.density.Moment`
+    missed_from_ns         (N,) stamps from which misses count
+    classes, table         parameters of the classes, as `optipmb.table.ClassTable`
+    mean_out, …            receive results
 """
 
 from __future__ import annotations
@@ -19,6 +32,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 import numba
 from numba.core import config, event
+from numba.core.caching import IndexDataCacheFile
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -114,8 +128,20 @@ def _compiled(function: F, *, nogil: bool) -> F:
             compiled = jit(cache=True)(function)
         finally:
             options.CACHE_DIR = usual
-    compiled._cache._cache_file._source_stamp = _SOURCES  # noqa: SLF001 - numba has no public name for it
+    cache = compiled._cache._cache_file  # noqa: SLF001 - numba has no public name for it
+    cache._source_stamp = _SOURCES  # noqa: SLF001 - as above
+    cache.__class__ = _Index
     return cast("F", compiled)
+
+
+class _Index(IndexDataCacheFile):
+    """An index of machine code that names what an earlier version of the package had is as good as none."""
+
+    def _load_index(self) -> Any:
+        try:
+            return super()._load_index()  # type: ignore[no-untyped-call]  # numba ships no types
+        except (AttributeError, ImportError):
+            return {}
 
 
 @cache

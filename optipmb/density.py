@@ -1,29 +1,34 @@
 """The PMB density (eq. PMB) as arrays: a Poisson intensity of undetected objects, a multi-Bernoulli of detected ones.
 
 One row per component, structure of arrays, so that kernels run over contiguous memory and a density can be kept,
-compared, hashed and stored as it is. The columns of a record lie in one array (`optipmb.rows`), which is never written
-after the density is made.
+compared, hashed and stored as it is. It is never written after it is made.
 
 Motion state x_M = [x, y, v, phi, omega, a]: position on the ground plane (m), speed along the heading (m/s, negative
 when reversing), heading (rad, in (-pi, pi]), turn rate (rad/s), acceleration (m/s^2).
 Auxiliary state x_A = [length, width, height, z]: box size and height of the box's centre, m.
+
+It is stored as named arrays (`bernoulli.mean`, `poisson.weight`) or as bytes; what is read back is checked.
 """
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final
+from math import prod
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.records import record
-from optipmb.rows import Column, Rows, arrays_of
+from optipmb.errors import DensityError
+from optipmb.rows import Column, Rows, arrays_of, record, shown
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
+    from optipmb.rows import Array
+
 
 X: Final = 0
 Y: Final = 1
@@ -36,6 +41,23 @@ STATE: Final = 6
 
 NO_FRAME: Final = -1
 """`Density.stamp_ns` before the first frame."""
+
+
+class Moment(NamedTuple):
+    """The time of a frame.
+
+    Attributes:
+        stamp_ns: its stamp.
+        before_ns: stamp of the frame before, `NO_FRAME` before the first.
+        dt: s since then; the nominal period at the first.
+        period: nominal period, s.
+    """
+
+    stamp_ns: int
+    before_ns: int
+    dt: float
+    period: float
+
 
 FROM_LAST_DETECTION: Final = np.zeros(0, np.int64)
 """In place of stamps from which misses count, where every frame looks at all objects."""
@@ -55,7 +77,7 @@ class Bernoullis(Rows):
         seen_ns: (N,) int64 stamp of the last detection; x_cnt and x_len are its and born_ns's distance to now.
         score: (N,) confidence score x_s.
         evidence: (N,) mean log odds of the latest detections (`optipmb.calibration`).
-        heading_odds: (N,) log odds that the object faces along phi and not the other way (`optipmb.heading`).
+        heading_odds: (N,) log odds that the object faces along phi and not the other way (`optipmb.lightweight`).
         extracted: (N,) bool, whether the track was ever extracted (t in T).
         confirmed: (N,) bool, whether the track was confirmed when it was last extracted (`optipmb.extract`).
     """
@@ -181,6 +203,12 @@ SLOT: Final = BINS + 2
 NO_BIN: Final = -1
 
 
+ENOUGH: Final = 3.0
+"""Evidence for a motion of the sensor from which it is used, and"""
+LEAST_MOVED_S: Final = 0.25
+"""the time over which it has to be found before, s."""
+
+
 @record
 class SelfCalibration:
     """Counts of the detections of a stream by score.
@@ -222,8 +250,9 @@ class Density:
         class_probability: (N, C) posterior of each detected object over the classes (`optipmb.class_posterior`); None
             where the profile has no groups.
         self_calibration: counts of scores; None where the profile does not calibrate them itself.
-        sensor_motion: (3,) velocity, m/s, and turn rate, rad/s, with which what stands passes a sensor whose motion is
-            estimated (`optipmb.sensor_motion`); None where it is not: frames have poses, or the sensor stands.
+        sensor: (5,) velocity, m/s, and turn rate, rad/s, with which what stands passes a sensor without poses, the
+            evidence that it moves so, and the time over which that was found, s (`optipmb.sensor_motion`); None where
+            it stands or frames have poses.
     """
 
     stamp_ns: int
@@ -234,7 +263,15 @@ class Density:
     misses: Misses | None = None
     class_probability: NDArray[np.float64] | None = None
     self_calibration: SelfCalibration | None = None
-    sensor_motion: NDArray[np.float64] | None = None
+    sensor: NDArray[np.float64] | None = None
+
+    @property
+    def sensor_motion(self) -> NDArray[np.float64] | None:
+        """Velocity, m/s, and turn rate, rad/s, (3,) of `sensor`; None where the evidence is not enough to use them."""
+        sensor = self.sensor
+        if sensor is None or sensor[3] < ENOUGH or sensor[4] < LEAST_MOVED_S:
+            return None
+        return sensor[:3]
 
     @property
     def missed_from_ns(self) -> NDArray[np.int64]:
@@ -267,3 +304,249 @@ def copy_state(
         mean_out[k, s] = mean[n, s]
         for t in range(STATE):
             covariance_out[k, s, t] = covariance[n, s, t]
+
+
+CLASSES: Final = "classes.probability"
+"""Name of `Density.class_probability` among the columns."""
+
+COUNTED: Final = "calibration"
+"""Part of the names of `Density.self_calibration` among the columns."""
+
+SENSOR: Final = "sensor"
+"""Name of `Density.sensor` among the columns."""
+
+MOST_COUNTED: Final = 1e9
+"""Bound of counts of scores, and of numbers of the sensor's motion; those of the tracker are far below."""
+
+ROUNDING: Final = 1e-6
+"""By how much the sum of probabilities may differ from 1."""
+
+_Rows = TypeVar("_Rows", bound=Rows)
+
+
+def fitting(density: Density, classes: int) -> bool:
+    """Tell whether the parts of a density fit together and its classes exist, so that kernels stay within its arrays.
+
+    What `density_of` and the tracker make does; what others put together, or wrote into a column, may not.
+    """
+    misses, objects, pi = density.misses, density.bernoulli, density.class_probability
+    if pi is not None and not (isinstance(pi, np.ndarray) and pi.shape == (len(objects), classes)):
+        return False
+    if misses is not None and len(misses) != len(objects):
+        return False
+    own = density.self_calibration
+    if own is not None:
+        for name, (shape, kind) in _shapes(classes, len(objects), len(density.poisson)).items():
+            column = getattr(own, name)
+            if not isinstance(column, np.ndarray) or column.shape != shape or column.dtype != kind:
+                return False
+    return bool(labels_within(objects.words, density.poisson.words, classes))
+
+
+@kernel
+def labels_within(object_words: Array, component_words: Array, classes: int) -> bool:
+    """Tell whether the labels of the arrays of `Bernoullis` and `Poissons` are below a number of classes."""
+    good = True
+    for c in objects_in(object_words).label:
+        good &= 0 <= c < classes
+    for c in components_in(component_words).label:
+        good &= 0 <= c < classes
+    return bool(good)
+
+
+def check_fitting(density: Density, labels: tuple[str, ...]) -> None:
+    """Refuse a density whose parts do not fit together.
+
+    Raises:
+        DensityError: names the column, with what was expected and received.
+    """
+    if fitting(density, len(labels)):
+        return
+    columns = columns_of(density)
+    density_of(density.stamp_ns, density.next_id, columns, labels)  # names the column
+    lengths = ", ".join(f"{name} {len(column)}" for name, column in columns.items())
+    raise DensityError("density", "columns of equal length", lengths)
+
+
+def columns_of(density: Density) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a density by name, always in the same order."""
+    parts: tuple[tuple[str, Bernoullis | Misses | Poissons], ...]
+    parts = (("bernoulli", density.bernoulli), ("poisson", density.poisson))
+    if density.misses is not None:
+        parts = (*parts, ("misses", density.misses))
+    columns: dict[str, NDArray[Any]] = {
+        f"{part}.{name}": column for part, rows in parts for name, column in rows.columns()
+    }
+    if density.self_calibration is not None:
+        columns |= {f"{COUNTED}.{name}": getattr(density.self_calibration, name) for name in _shapes(0, 0, 0)}
+    if density.sensor is not None:
+        columns |= {SENSOR: density.sensor}
+    return columns if density.class_probability is None else columns | {CLASSES: density.class_probability}
+
+
+def _shapes(classes: int, objects: int, components: int) -> dict[str, tuple[tuple[int, ...], Any]]:
+    """Return shape and type of the arrays of `SelfCalibration`."""
+    return {
+        "classes": ((classes, COUNTS, BINS), np.float64),
+        "objects": ((objects, SLOTS, SLOT), np.uint16),
+        "components": ((components,), np.int64),
+    }
+
+
+def bytes_of(density: Density) -> dict[str, bytes]:
+    """Return the arrays of a density as bytes, one string for each part; `columns_in` reads them.
+
+    A number takes 8 bytes, one of the slots of `SelfCalibration` 2, the least significant first. The columns of a part
+    lie one behind the other in the order of `columns_of`, and a flag is the integer 0 or 1. Equal densities give equal
+    bytes.
+    """
+    parts = {"bernoulli": density.bernoulli.words, "poisson": density.poisson.words}
+    if density.misses is not None:
+        parts["misses"] = density.misses.words
+    if density.class_probability is not None:
+        parts["classes"] = density.class_probability
+    if density.self_calibration is not None:
+        parts |= {
+            f"{COUNTED}.{name}": getattr(density.self_calibration, name).view(np.float64) for name in _shapes(0, 0, 0)
+        }
+    if density.sensor is not None:
+        parts[SENSOR] = density.sensor
+    return {part: words.astype("<f8", copy=False).tobytes() for part, words in parts.items()}
+
+
+def columns_in(parts: Mapping[str, bytes], classes: int) -> dict[str, NDArray[Any]]:
+    """Return the named arrays that bytes hold: what `columns_of` gives for the density of which `bytes_of` made them.
+
+    Args:
+        parts: `bernoulli` and `poisson`; `misses`, `classes` and those of `COUNTED` where the density has them.
+        classes: of the parameters that the density belongs to.
+
+    Raises:
+        DensityError: a part is missing, is not whole rows, or has a flag that is neither 0 nor 1.
+    """
+    columns: dict[str, NDArray[Any]] = {}
+    for kind in (Bernoullis, Poissons, Misses):
+        if kind is not Misses or kind.part in parts:
+            rows = kind.of(_words(parts, kind.part, kind.width))
+            columns |= {f"{kind.part}.{name}": column for name, column in rows.columns()}
+            for name, one in kind.described.items():
+                flags = rows.words.view(np.int64)[one.begin * len(rows) : one.end * len(rows)]
+                if one.number == np.bool_ and not ((flags == 0) | (flags == 1)).all():
+                    raise DensityError(f"{kind.part}.{name}", "flags, 0 or 1", "another number")
+    if "classes" in parts:
+        columns[CLASSES] = _words(parts, "classes", classes).reshape(-1, classes)
+    if SENSOR in parts:
+        columns[SENSOR] = _words(parts, SENSOR, 5)
+    if f"{COUNTED}.classes" in parts:
+        for name, (shape, kind) in _shapes(0, 0, 0).items():
+            width = prod(shape[1:]) * np.dtype(kind).itemsize // 8
+            words = _words(parts, f"{COUNTED}.{name}", width)
+            columns[f"{COUNTED}.{name}"] = words.view(kind).reshape(-1, *shape[1:])
+    return columns
+
+
+def _words(parts: Mapping[str, bytes], part: str, width: int) -> Array:
+    """Return the numbers of a part, of which each row has `width`."""
+    data = parts.get(part)
+    if not isinstance(data, bytes) or len(data) % (8 * width):
+        received = f"{len(data)} bytes" if isinstance(data, bytes) else type(data).__name__
+        raise DensityError(part, f"bytes, {8 * width} for each row", received)
+    return np.frombuffer(data, "<f8").astype(np.float64, copy=False)
+
+
+def density_of(stamp_ns: int, next_id: int, columns: Mapping[str, Any], labels: tuple[str, ...]) -> Density:
+    """Return the density of named arrays.
+
+    Args:
+        stamp_ns: stamp of its last frame.
+        next_id: id of the next new track.
+        columns: what `columns_of` or `columns_in` gave.
+        labels: names of the classes of the parameters that it belongs to.
+
+    Raises:
+        DensityError: a column is missing, has another shape or type, or holds values that no density has.
+    """
+    if not NO_FRAME <= stamp_ns < 2**63:
+        raise DensityError("stamp_ns", "a stamp", str(stamp_ns))
+    bernoulli = _rows(Bernoullis, columns)
+    poisson = _rows(Poissons, columns)
+    for part, rows in (("bernoulli", bernoulli), ("poisson", poisson)):
+        label = rows.label
+        if label.size and not (label.min() >= 0 and label.max() < len(labels)):
+            raise DensityError(f"{part}.label", f"indices below {len(labels)}", f"{label.min()} to {label.max()}")
+        if label.size and not 0 <= rows.born_ns.min() <= rows.born_ns.max() <= stamp_ns:
+            stamps = f"{rows.born_ns.min()} to {rows.born_ns.max()}"
+            raise DensityError(f"{part}.born_ns", f"stamps from 0 to {stamp_ns}", stamps)
+    wrong = (bernoulli.seen_ns < bernoulli.born_ns) | (bernoulli.seen_ns > stamp_ns)
+    if wrong.any():
+        row = int(wrong.argmax())
+        stamps = f"from born_ns, {bernoulli.born_ns[row]}, to {stamp_ns}"
+        raise DensityError(f"bernoulli.seen_ns[{row}]", f"a stamp {stamps}", str(bernoulli.seen_ns[row]))
+    for path, column, high in (
+        ("bernoulli.existence", bernoulli.existence, 1.0),
+        ("bernoulli.score", bernoulli.score, 1.0),
+        ("poisson.weight", poisson.weight, np.inf),
+    ):
+        if column.size and not 0.0 <= column.min() <= column.max() <= high:
+            raise DensityError(path, f"numbers from 0 to {high:g}", f"{column.min():g} to {column.max():g}")
+    ids = bernoulli.id
+    if ids.size and not (np.diff(ids) > 0).all():
+        row = int((np.diff(ids) <= 0).argmax()) + 1
+        raise DensityError(f"bernoulli.id[{row}]", f"an id above the one before it, {ids[row - 1]}", str(ids[row]))
+    if not 0 <= int(ids.max(initial=0)) < next_id < 2**63:
+        raise DensityError("next_id", f"an id above {ids.max(initial=0)}", str(next_id))
+    misses = _rows(Misses, columns) if "misses.looked_ns" in columns else None
+    if misses is not None:
+        for name, since in (("missed_from_ns", misses.missed_from_ns), ("looked_ns", misses.looked_ns)):
+            if since.shape != bernoulli.seen_ns.shape:
+                raise DensityError(f"misses.{name}", f"{len(bernoulli)} rows", shown(since))
+            wrong = (since < bernoulli.seen_ns) | (since > stamp_ns)
+            if wrong.any():
+                row = int(wrong.argmax())
+                text = f"a stamp from seen_ns, {bernoulli.seen_ns[row]}, to {stamp_ns}"
+                raise DensityError(f"misses.{name}[{row}]", text, str(since[row]))
+    pi = _class_probability(columns[CLASSES], len(bernoulli), len(labels)) if CLASSES in columns else None
+    own = None
+    if f"{COUNTED}.classes" in columns:
+        own = _self_calibration(columns, _shapes(len(labels), len(bernoulli), len(poisson)))
+    motion = columns.get(SENSOR)
+    if motion is not None:
+        if not (isinstance(motion, np.ndarray) and motion.shape == (5,) and (np.abs(motion) <= MOST_COUNTED).all()):
+            raise DensityError(SENSOR, f"(5,) finite numbers up to {MOST_COUNTED:g}", shown(motion))
+        motion = np.array(motion, np.float64)
+    return Density(stamp_ns, next_id, bernoulli, poisson, tuple(labels), misses, pi, own, motion)
+
+
+def _self_calibration(columns: Mapping[str, Any], shapes: Mapping[str, tuple[tuple[int, ...], Any]]) -> SelfCalibration:
+    """Return the counts of scores, none of which is negative or above `MOST_COUNTED`."""
+    found = {}
+    for name, (shape, kind) in shapes.items():
+        column, path = columns.get(f"{COUNTED}.{name}"), f"{COUNTED}.{name}"
+        if not isinstance(column, np.ndarray) or column.dtype != kind or column.shape != shape:
+            raise DensityError(path, f"{shape} {kind.__name__}", shown(column))
+        low, high = (NO_BIN, BINS - 1) if kind is np.int64 else (0, MOST_COUNTED)
+        if column.size and not low <= column.min() <= column.max() <= high:
+            raise DensityError(path, f"numbers from {low} to {high:g}", f"{column.min():g} to {column.max():g}")
+        found[name] = np.array(column, order="C")
+    return SelfCalibration(**found)
+
+
+def _class_probability(column: Any, count: int, classes: int) -> NDArray[np.float64]:
+    """Return the posteriors over the classes, each of which sums to 1."""
+    if not isinstance(column, np.ndarray) or column.dtype != np.float64 or column.shape != (count, classes):
+        raise DensityError(CLASSES, f"({count}, {classes}) float64", shown(column))
+    wrong = ~((column >= 0.0).all(axis=1) & (np.abs(column.sum(axis=1) - 1.0) <= ROUNDING))
+    if wrong.any():
+        row = int(wrong.argmax())
+        raise DensityError(f"{CLASSES}[{row}]", "probabilities that sum to 1", str(column[row].tolist())[:200])
+    return np.array(column, order="C")
+
+
+def _rows(kind: type[_Rows], columns: Mapping[str, Any]) -> _Rows:
+    found: dict[str, Any] = {name: columns.get(f"{kind.part}.{name}") for name in kind.described}
+    rows = kind(**found)
+    for name, column in rows.columns():
+        if column.dtype.kind == "f" and not np.isfinite(column).all():
+            row = np.argwhere(~np.isfinite(column))[0]
+            raise DensityError(f"{kind.part}.{name}[{row[0]}]", "finite numbers", str(column[tuple(row)]))
+    return rows

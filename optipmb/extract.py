@@ -1,4 +1,4 @@
-"""Track extraction with two thresholds (OTE, Section IV.H), and the tracks that come out."""
+"""Track extraction with two thresholds (OTE, Section IV.H), the tracks, and whether their numbers are sound."""
 
 from __future__ import annotations
 
@@ -7,14 +7,26 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from optipmb.calibration import calibrate_rows
+from optipmb.calibration import calibrate_rows, follow_box
 from optipmb.compiled import kernel
-from optipmb.density import OMEGA, PHI, STATE, A, V, X, Y, copy_state, misses_counted_from, objects_in, whole_periods
+from optipmb.density import (
+    OMEGA,
+    PHI,
+    STATE,
+    A,
+    Moment,
+    V,
+    X,
+    Y,
+    copy_state,
+    misses_counted_from,
+    objects_in,
+    whole_periods,
+)
 from optipmb.errors import FrameError
-from optipmb.heading import doubt, sign_probability
-from optipmb.position_noise import PLAIN
+from optipmb.frame import PLAIN
+from optipmb.lightweight import doubt, sign_probability
 from optipmb.preprocess import Measurements
-from optipmb.reported import follow_box
 from optipmb.rows import Column, Rows, arrays_of
 
 if TYPE_CHECKING:
@@ -22,12 +34,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from optipmb.density import Bernoullis
-    from optipmb.records import Columns
+    from optipmb.density import Bernoullis, Density
+    from optipmb.rows import Array, Columns, Index
     from optipmb.table import ClassRow, ClassTable
 
-    Array = NDArray[np.float64]
-    Index = NDArray[np.int64]
     Flags = NDArray[np.bool_]
 
 
@@ -41,7 +51,7 @@ class Tracks(Rows):
         size: (N, 3) length, width, height, m.
         yaw: (N,) heading, rad, in (-pi, pi].
         heading_confidence: (N,) probability that the object faces along `yaw` and not the other way; one where the
-            profile does not follow it (`optipmb.heading`).
+            profile does not follow it (`optipmb.lightweight`).
         velocity: (N, 2) over ground, m/s.
         yaw_rate: (N,) rad/s.
         acceleration: (N,) along the heading, m/s^2.
@@ -109,38 +119,24 @@ def tracks_in(words: Array) -> Tracks:
 
 
 def extract(
-    bernoulli: Bernoullis,
-    missed_from_ns: Index,
+    posterior: Density,
     measurement: Index,
     measurements: Measurements,
-    stamp_ns: int,
+    moment: Moment,
     table: ClassTable,
     *,
     two_thresholds: bool,
 ) -> Tracks:
-    """Extract the tracks, and mark in `bernoulli` the objects that were extracted, and those that are confirmed.
+    """Extract the tracks, and mark the objects that were extracted, and those that are confirmed.
 
-    Args:
-        bernoulli: the posterior, not yet given away.
-        missed_from_ns: `Density.missed_from_ns` of the posterior.
+    Arguments of its own:
+        posterior: not yet given away.
         measurement: (N,) measurement of each object, negative where missed.
-        measurements: Z_k.
-        stamp_ns: stamp of the frame.
-        table: parameters as a table.
         two_thresholds: whether OTE is on.
     """
-    return Tracks.of(
-        extract_tracks(
-            bernoulli.words,
-            missed_from_ns,
-            measurement,
-            tuple(measurements),
-            stamp_ns,
-            two_thresholds,
-            table.period,
-            table.classes,
-        )
-    )
+    given = tuple(measurements), tuple(moment)
+    objects, missed_from_ns = posterior.bernoulli.words, posterior.missed_from_ns
+    return Tracks.of(extract_tracks(objects, missed_from_ns, measurement, *given, two_thresholds, table.classes))
 
 
 @kernel
@@ -149,19 +145,16 @@ def extract_tracks(
     missed_from_ns: Index,
     measurement: Index,
     measurements: Columns,
-    stamp_ns: int,
+    moment: Columns,
     two_thresholds: bool,
-    period: float,
     classes: Sequence[ClassRow],
 ) -> Array:
     """Return the array of `Tracks`, calibrated where there is a calibration; `extracted` and `confirmed` are written.
 
     Arguments as in `extract`; `object_words` is the array of the posterior.
     """
-    objects, z = objects_in(object_words), Measurements(*measurements)
-    rows = select_tracks(
-        objects, misses_counted_from(objects, missed_from_ns), stamp_ns, two_thresholds, period, classes
-    )
+    objects, z, now = objects_in(object_words), Measurements(*measurements), Moment(*moment)
+    rows = select_tracks(objects, misses_counted_from(objects, missed_from_ns), now, two_thresholds, classes)
     count = rows.shape[0]
     words, state = np.empty(count * TRACK), np.empty((count, STATE))
     tracks = tracks_in(words)
@@ -177,16 +170,8 @@ def extract_tracks(
             r_x = r_y = own.reported_position
             if position.shape[0] > PLAIN:
                 r_x, r_y = r_x * position[2], r_y * position[4]
-            follow_box(
-                position[0],
-                position[1],
-                z.yaw[m],
-                r_x,
-                r_y,
-                own.reported_heading,
-                state[k],
-                covariance[k],
-            )
+            box, noise = (position[0], position[1], z.yaw[m]), (r_x, r_y, own.reported_heading)
+            follow_box(box, noise, state[k], covariance[k])
         v, phi = state[k, V], state[k, PHI]
         center[k, 0], center[k, 1], center[k, 2] = state[k, X], state[k, Y], objects.auxiliary[n, 3]
         for s in range(3):
@@ -196,8 +181,8 @@ def extract_tracks(
             tracks.heading_confidence[k] = sign_probability(objects.heading_odds[n])
             covariance[k, PHI, PHI] += doubt(tracks.heading_confidence[k])
         velocity[k, 0], velocity[k, 1] = v * math.cos(phi), v * math.sin(phi)
-        tracks.age[k] = (stamp_ns - objects.born_ns[n]) * 1e-9
-        tracks.time_since_detection[k] = (stamp_ns - objects.seen_ns[n]) * 1e-9
+        tracks.age[k] = (now.stamp_ns - objects.born_ns[n]) * 1e-9
+        tracks.time_since_detection[k] = (now.stamp_ns - objects.seen_ns[n]) * 1e-9
         tracks.id[k], tracks.label[k], tracks.yaw[k] = objects.id[n], objects.label[n], phi
         tracks.yaw_rate[k], tracks.acceleration[k] = state[k, OMEGA], state[k, A]
         tracks.existence[k], tracks.score[k] = objects.existence[n], objects.score[n]
@@ -209,12 +194,7 @@ def extract_tracks(
 
 @kernel
 def select_tracks(
-    objects: Bernoullis,
-    missed_from_ns: Index,
-    stamp_ns: int,
-    two_thresholds: bool,
-    period: float,
-    classes: Sequence[ClassRow],
+    objects: Bernoullis, missed_from_ns: Index, moment: Moment, two_thresholds: bool, classes: Sequence[ClassRow]
 ) -> Index:
     """Return the rows that are extracted, and mark them in `extracted`.
 
@@ -225,7 +205,7 @@ def select_tracks(
     for n in range(missed_from_ns.shape[0]):
         own, r = classes[objects.label[n]], objects.existence[n]
         if objects.extracted[n] and two_thresholds:
-            misses = whole_periods(missed_from_ns[n], stamp_ns, period)
+            misses = whole_periods(missed_from_ns[n], moment.stamp_ns, moment.period)
             now = r >= own.extract_known and misses < own.extract_misses
         else:
             now = r >= own.extract_new
@@ -242,11 +222,9 @@ def confirm(
 ) -> None:
     """Confirm tracks with hysteresis: from one existence on, and until it falls below another.
 
-    Args:
+    Arguments of its own:
         rows: (K,) objects.
-        label: (K,) their classes.
         existence: (K,) of the tracks, as published.
-        classes: (C,) parameters: `confirm_from` and `confirm_until`.
         confirmed: (N,) whether they were, the integers 0 and 1; is written.
         now: (K,) receives whether they are.
     """
@@ -254,3 +232,79 @@ def confirm(
         own = classes[label[k]]
         now[k] = existence[k] >= (own.confirm_until if confirmed[rows[k]] else own.confirm_from)
         confirmed[rows[k]] = now[k]
+
+
+MAX_PLACE: Final = 1e9
+"""Largest coordinate of a track, m: ten times what a detection may have."""
+
+MAX_VALUE: Final = 1e5
+"""Largest size, heading, speed, turn rate and acceleration, in the units of `Tracks`."""
+
+MAX_COVARIANCE: Final = 1e30
+"""Largest entry of a covariance, in the units of `Tracks`."""
+
+MAX_AGE: Final = 1e12
+"""Longest age, s."""
+
+_BOUNDS: Final[tuple[tuple[str, float, float], ...]] = (
+    ("center", -MAX_PLACE, MAX_PLACE),
+    ("size", 5e-324, MAX_VALUE),
+    ("yaw", -MAX_VALUE, MAX_VALUE),
+    ("heading_confidence", 0.0, 1.0),
+    ("velocity", -MAX_VALUE, MAX_VALUE),
+    ("yaw_rate", -MAX_VALUE, MAX_VALUE),
+    ("acceleration", -MAX_VALUE, MAX_VALUE),
+    ("existence", 0.0, 1.0),
+    ("score", 0.0, 1.0),
+    ("covariance", -MAX_COVARIANCE, MAX_COVARIANCE),
+    ("age", 0.0, MAX_AGE),
+    ("time_since_detection", 0.0, MAX_AGE),
+)
+
+
+def sound(tracks: Tracks) -> bool:
+    """Tell whether all numbers of the tracks are finite and within bounds, and the ids ascend.
+
+    Existence, score and heading confidence lie in [0, 1], sizes are positive, ages are not negative, coordinates are at
+    most `MAX_PLACE`, covariances `MAX_COVARIANCE`, ages `MAX_AGE`, all others `MAX_VALUE`.
+    """
+    return bool(all_within(tracks.words))
+
+
+def unsound(tracks: Tracks) -> tuple[str, str, str]:
+    """Return what is wrong with tracks that are not `sound`: path of the first value, expected, received."""
+    for name, low, high in _BOUNDS:
+        values = getattr(tracks, name)
+        for place in np.argwhere(~((low <= values) & (values <= high)))[:1]:
+            least = f"from {low:g}" if low <= 0.0 else "above 0"
+            return f"tracks.{name}[{place[0]}]", f"a number {least} to {high:g}", f"{values[tuple(place)]:g}"
+    row = int((np.diff(tracks.id, prepend=-1) <= 0).argmax())
+    return f"tracks.id[{row}]", "ids that ascend, from 0", str(tracks.id[row])
+
+
+@kernel
+def all_within(words: Array) -> bool:
+    """Tell whether the columns of the array of `Tracks` are within the bounds of `sound`; NaN is in none."""
+    tracks = tracks_in(words)
+    center, size, velocity, covariance = tracks.center, tracks.size, tracks.velocity, tracks.covariance
+    good = True
+    before = -1
+    for n in range(tracks.id.shape[0]):
+        good &= tracks.id[n] > before
+        before = tracks.id[n]
+        for s in range(3):
+            good &= abs(center[n, s]) <= MAX_PLACE
+            good &= 0.0 < size[n, s] <= MAX_VALUE
+        good &= abs(tracks.yaw[n]) <= MAX_VALUE
+        good &= 0.0 <= tracks.heading_confidence[n] <= 1.0
+        good &= abs(velocity[n, 0]) <= MAX_VALUE and abs(velocity[n, 1]) <= MAX_VALUE
+        good &= abs(tracks.yaw_rate[n]) <= MAX_VALUE
+        good &= abs(tracks.acceleration[n]) <= MAX_VALUE
+        good &= 0.0 <= tracks.existence[n] <= 1.0
+        good &= 0.0 <= tracks.score[n] <= 1.0
+        good &= 0.0 <= tracks.age[n] <= MAX_AGE
+        good &= 0.0 <= tracks.time_since_detection[n] <= MAX_AGE
+        for s in range(covariance.shape[1]):
+            for t in range(covariance.shape[2]):
+                good &= abs(covariance[n, s, t]) <= MAX_COVARIANCE
+    return good

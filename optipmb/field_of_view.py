@@ -12,7 +12,7 @@ plane upwards, range is the distance from the sensor.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Final, Protocol, Self
 
@@ -20,22 +20,18 @@ import numpy as np
 
 from optipmb.calibration import log_odds
 from optipmb.compiled import kernel
-from optipmb.density import PHI, Misses, Poissons, X, Y
-from optipmb.detection_probability import over_time
+from optipmb.density import PHI, Misses, Moment, X, Y
 from optipmb.errors import FrameError
-from optipmb.records import INDEX, read_only, record
+from optipmb.rows import read_only, record
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from optipmb.density import Bernoullis, Density
     from optipmb.frame import Pose
     from optipmb.preprocess import Measurements
-    from optipmb.prune import Survivors
+    from optipmb.rows import Array, Columns, Index
     from optipmb.table import ClassTable
+    from optipmb.tracker import Update
 
-    Array = NDArray[np.float64]
-    Index = NDArray[np.int64]
 
 NARROWEST: Final = 1e-3
 """Least width of an interval of angles, rad."""
@@ -197,9 +193,7 @@ class Looks:
     misses: Misses
 
 
-def look(
-    view: FieldOfView | None, density: Density, poisson: Poissons, before_ns: int, table: ClassTable
-) -> tuple[Looks | None, Poissons]:
+def look(view: FieldOfView | None, prior: Density, moment: Moment, table: ClassTable) -> tuple[Looks | None, Density]:
     """Find out what of the predicted density is in view, and let the counters of the rest stand still.
 
     A look covers the time since the last frame that looked at the object, but where other frames came in between at
@@ -210,20 +204,17 @@ def look(
     missed, and of a component whose gate no longer holds one standard deviation of its position. With p_s = 1 nothing
     else would end them.
 
-    Args:
+    Arguments of its own:
         view: of the frame, with its pose; None: it looks at everything.
-        density: the prediction.
-        poisson: its Poisson components, and those of the measurements without HABM.
-        before_ns: stamp of the frame before.
-        table: parameters as columns.
 
     Returns:
-        What the frame looks at, None while no frame has had a field of view; and the Poisson components with the
-        stamps that their age counts from.
+        What the frame looks at, None while no frame has had a field of view; and the prediction, whose Poisson
+        components have the stamps that their age counts from.
     """
-    bernoulli, now_ns, misses = density.bernoulli, density.stamp_ns, density.misses
+    bernoulli, poisson, misses = prior.bernoulli, prior.poisson, prior.misses
+    before_ns, now_ns = moment.before_ns, moment.stamp_ns
     if view is None and misses is None:
-        return None, poisson
+        return None, prior
     view = view or FieldOfView()
     if misses is None:
         misses = Misses(missed_from_ns=bernoulli.seen_ns, looked_ns=np.full(len(bernoulli), before_ns, np.int64))
@@ -232,9 +223,7 @@ def look(
     in_view, poisson_in_view = np.empty(len(bernoulli)), np.empty(len(poisson))
     shares_in_view(bernoulli.mean, bernoulli.covariance, bernoulli.auxiliary, *where, in_view)
     shares_in_view(poisson.mean, poisson.covariance, poisson.auxiliary, *where, poisson_in_view)
-    time, missed_from_ns = np.empty(len(bernoulli)), np.empty(len(bernoulli), INDEX)
-    stamps = before_ns, now_ns, table.period
-    count_looks(in_view, misses.looked_ns, misses.missed_from_ns, *stamps, time, missed_from_ns)
+    time, missed_from_ns = count_looks(in_view, misses.looked_ns, misses.missed_from_ns, tuple(moment))
     lost = now_ns - bernoulli.seen_ns > LONGEST_UNSEEN_S * 1e9
     missed_from_ns[lost] = misses.missed_from_ns[lost]
     if len(poisson):
@@ -242,33 +231,18 @@ def look(
         largest = 0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)
         hidden = np.where(largest > table["gate"][poisson.label] ** 2, 0.0, 1.0 - poisson_in_view)
         hidden_ns = np.rint(hidden * max(0, now_ns - before_ns)).astype(np.int64)
-        poisson = poisson.replaced(born_ns=np.minimum(poisson.born_ns + hidden_ns, now_ns))
+        prior = replace(prior, poisson=poisson.replaced(born_ns=np.minimum(poisson.born_ns + hidden_ns, now_ns)))
     looked_ns = np.where(in_view > 0.0, now_ns, misses.looked_ns)
-    return Looks(in_view, poisson_in_view, time, Misses(missed_from_ns=missed_from_ns, looked_ns=looked_ns)), poisson
-
-
-def detection_probability_in_view(p_d: Array, looks: Looks, share: float, table: ClassTable) -> Array:
-    """Return p_d of objects and, behind them, of Poisson components for what is in view, over the time of each look.
-
-    Args:
-        p_d: (N + J,) as if all were in view.
-        looks: what is.
-        share: of the time that p_d holds for, for the components.
-        table: parameters as columns.
-    """
-    count = len(looks.misses)
-    shares = np.full(len(p_d), share)
-    shares[:count] = looks.time / table.detection_time if table.detection_time > 0.0 else 1.0
-    return over_time(p_d * np.concatenate((looks.in_view, looks.poisson_in_view)), shares)
+    return Looks(in_view, poisson_in_view, time, Misses(missed_from_ns=missed_from_ns, looked_ns=looked_ns)), prior
 
 
 def follow_looks(
     looks: Looks,
-    survivors: Survivors,
+    update: Update,
     before: Bernoullis,
     objects: Bernoullis,
     measurements: Measurements,
-    stamp_ns: int,
+    moment: Moment,
     table: ClassTable,
 ) -> Misses:
     """Correct score and evidence of the posterior by what the frame looked at, and return its misses.
@@ -276,17 +250,14 @@ def follow_looks(
     What is out of view keeps its score and its evidence; what is partly in view is missed for that part of the time
     since it was last looked at.
 
-    Args:
+    Arguments of its own:
         looks: of the frame.
-        survivors: which objects the posterior has.
+        update: what the posterior was made of.
         before: the predicted objects.
         objects: the posterior, not yet given away; its scores and evidence are written.
-        measurements: Z_k.
-        stamp_ns: stamp of the frame.
-        table: parameters as columns.
     """
-    count, known = len(objects), survivors.known
-    row, hit = survivors.row[:known], survivors.measurement[:known] >= 0
+    count, known, stamp_ns = len(objects), update.known, moment.stamp_ns
+    row, hit = update.row[:known], update.measurement[:known] >= 0
     missed_from_ns, looked_ns = np.full(count, stamp_ns, np.int64), np.full(count, stamp_ns, np.int64)
     missed_from_ns[:known] = np.where(hit, stamp_ns, looks.misses.missed_from_ns[row])
     looked_ns[:known] = np.where(hit, stamp_ns, looks.misses.looked_ns[row])
@@ -295,7 +266,7 @@ def follow_looks(
     objects.score[:known][hidden] = before.score[row][hidden]
     label = objects.label[:known]
     latest = -table["missed_evidence"][label]
-    latest[hit] = [log_odds(score) for score in measurements.score[survivors.measurement[:known][hit]].tolist()]
+    latest[hit] = [log_odds(score) for score in measurements.score[update.measurement[:known][hit]].tolist()]
     kept = table["memory"][label] ** (np.where(hit, 1.0, share) * looks.time[row] / table.period)
     kept[objects.born_ns[:known] == stamp_ns] = 1.0
     objects.evidence[:known] = kept * before.evidence[row] + (1.0 - kept) * latest
@@ -304,13 +275,7 @@ def follow_looks(
 
 @kernel
 def shares_in_view(
-    mean: Array,
-    covariance: Array,
-    auxiliary: Array,
-    rotation: Array,
-    translation: Array,
-    limits: Array,
-    share: Array,
+    mean: Array, covariance: Array, auxiliary: Array, rotation: Array, translation: Array, limits: Array, share: Array
 ) -> None:
     """Compute how much of each object is in view, in the mean over its position.
 
@@ -320,10 +285,7 @@ def shares_in_view(
     known these are the centre, the corners and the middles of the edges. Along the height: bottom, centre and top, with
     the same weights (Simpson's rule).
 
-    Args:
-        mean: (N, 6) predicted means.
-        covariance: (N, 6, 6) predicted covariances.
-        auxiliary: (N, 4) boxes.
+    Arguments of its own:
         rotation: (3, 3) world from sensor.
         translation: (3,) of the sensor in the world.
         limits: (7,) of `FieldOfView.limits`.
@@ -369,32 +331,25 @@ def in_view(dx: float, dy: float, dz: float, rotation: Array, limits: Array) -> 
 
 
 @kernel
-def count_looks(
-    in_view: Array,
-    looked_ns: Index,
-    missed_from_ns: Index,
-    before_ns: int,
-    now_ns: int,
-    period: float,
-    time: Array,
-    missed_from_out: Index,
-) -> None:
+def count_looks(in_view: Array, looked_ns: Index, missed_from_ns: Index, moment: Columns) -> tuple[Array, Index]:
     """Compute the time that the look at each object covers, and from when its misses count if it is missed.
 
-    Args:
+    Arguments of its own:
         in_view: (N,) shares.
         looked_ns: (N,) stamp of the last look.
         missed_from_ns: (N,) stamp from which misses count.
-        before_ns: stamp of the frame before.
-        now_ns: stamp of the frame.
-        period: nominal period, s.
-        time: (N,) receives seconds since the last look, at most a period where frames in between did not look.
-        missed_from_out: (N,) receives the stamp from which misses count then: later by what was not looked at.
+
+    Returns:
+        (N,) seconds since the last look, at most a period where frames in between did not look; (N,) the stamp from
+        which misses count then: later by what was not looked at.
     """
-    step_ns = now_ns - before_ns
-    most_ns = max(step_ns, math.floor(period * 1e9))
+    now = Moment(*moment)
+    time, missed_from_out = np.empty(in_view.shape[0]), np.empty(in_view.shape[0], np.int64)
+    step_ns = now.stamp_ns - now.before_ns
+    most_ns = max(step_ns, math.floor(now.period * 1e9))
     for n in range(in_view.shape[0]):
-        covered_ns = min(now_ns - looked_ns[n], most_ns)
+        covered_ns = min(now.stamp_ns - looked_ns[n], most_ns)
         time[n] = covered_ns * 1e-9
         counted_ns = math.floor(in_view[n] * covered_ns + 0.5)
         missed_from_out[n] = missed_from_ns[n] + step_ns - counted_ns
+    return time, missed_from_out

@@ -3,6 +3,20 @@
 Conventions: the world frame is fixed, right-handed, z up; metres, seconds, radians; yaw counter-clockwise from x. A
 box is its geometric centre, its size (length along the heading, width, height) and its yaw. A sensor's pose maps its
 coordinates to the world.
+
+A score of 0.4 is a sure object for one detector and a doubtful one for another. A class of the profile may carry a
+curve c, through which every score z_s goes before anything reads it, the score filter included:
+
+    z_s <- c(z_s),   c(0) = 0,   c(d_i) = s_i,   c(1) = 1,   straight in between
+
+where d (`detector`) and s (`calibrated`) ascend strictly within (0, 1): the order of detections stays, and no ties are
+made.
+
+R of a class has sigma^2 for x and for y (eq. Single Object Measurement Model). A detection may bring a covariance of
+its own, R_xy (not in the paper), kept as rho = R_xy / sigma^2 in the columns behind a measured position. S = P_xy +
+sigma^2 rho, R has sigma^2 rho, and P^0 and R_x of `optipmb.calibration` have their variances of x and y times rho. The
+gate widens by the larger variance that rho adds (`optipmb.hypotheses.gate_widening`). Without a curve and with rho = I
+everything is as without, to the last bit.
 """
 
 from __future__ import annotations
@@ -18,16 +32,15 @@ from optipmb.class_names import class_indices
 from optipmb.compiled import kernel
 from optipmb.errors import FrameError
 from optipmb.field_of_view import FieldOfView, check_view
-from optipmb.position_noise import horizontal_covariance, semidefinite
-from optipmb.records import read_only
-from optipmb.score_calibration import calibrate_scores
+from optipmb.rows import read_only
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import ArrayLike, NDArray
 
-    from optipmb.parameters import Parameters
+    from optipmb.parameters import Parameters, ScoreCalibration
+    from optipmb.rows import Array
 
 UNIT_TOLERANCE = 1e-3
 """How far the norm of a quaternion may be from one; it is normalised afterwards."""
@@ -128,7 +141,7 @@ class Frame:
         size: (M, 3) length, width, height, m.
         yaw: (M,) rad.
         velocity: (M, 2) over ground, m/s; a row of NaN where the detector gives none.
-        score: (M,) in (0, 1]; what the thresholds of the class mean by it (`optipmb.score_calibration`).
+        score: (M,) in (0, 1]; what the thresholds of the class mean by it (`optipmb.frame`).
         label: (M,) int64, index into the classes of the parameters.
         source: (M,) int64, index of the object in the arrays that the caller gave.
         labels: names of the classes that `label` points into, those of the parameters.
@@ -398,3 +411,80 @@ def _all(path: str, good: NDArray[np.bool_], expected: str, values: NDArray[np.g
         where = tuple(int(i) for i in np.argwhere(~good)[0])
         element = "".join(f"[{i}]" for i in where)
         raise FrameError(path + element, expected, str(values[where]))
+
+
+def calibrated(curve: ScoreCalibration, score: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return c(z_s) of scores (M,) in [0, 1]."""
+    given, meant = (0.0, *curve.detector, 1.0), (0.0, *curve.calibrated, 1.0)
+    return np.minimum(np.interp(score, given, meant), 1.0)  # rounding may not pass one
+
+
+def calibrate_scores(
+    parameters: Parameters, label: NDArray[np.int64], score: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return scores, those of the classes that have a curve gone through it.
+
+    Args:
+        parameters: the profile.
+        label: (M,) index into its classes; -1 for a class that it lacks.
+        score: (M,) in [0, 1]; the same array comes back where no class has a curve.
+    """
+    for index, table in enumerate(parameters.classes.values()):
+        if table.score_calibration is not None:
+            score = np.where(label == index, calibrated(table.score_calibration, score), score)
+    return score
+
+
+PLAIN: Final = 2
+"""Columns of measured positions, x and y; five with rho_xx, rho_xy and rho_yy."""
+
+LEAST_VARIANCE: Final = 1e-8
+"""Least variance of a position along any axis, m^2."""
+
+LARGEST_VARIANCE: Final = 1e8
+"""Largest variance, m^2."""
+
+SYMMETRY: Final = 1e-6
+"""Share of the largest variance by which opposite entries may differ: those of float32 do."""
+
+
+def horizontal_covariance(covariance: Array, rotation: Array | None) -> Array:
+    """Check covariances of positions and return those of x and y in the world.
+
+    Args:
+        covariance: (M, 3, 3) of x, y and z along the axes of the arrays, m^2; of NaN where unknown.
+        rotation: (3, 3) from these axes to the world; None: they are those of the world.
+
+    Returns:
+        (M, 3) variance of x, covariance of x and y, variance of y; NaN where unknown.
+
+    Raises:
+        FrameError: one is not symmetric, or a variance along some axis is out of bounds; names the object.
+    """
+    unknown: NDArray[np.bool_] = np.all(np.isnan(covariance), axis=(1, 2))
+    known = np.where(unknown[:, None, None], np.eye(3), covariance)
+    expected = (
+        f"a symmetric covariance with variances from {LEAST_VARIANCE:g} to {LARGEST_VARIANCE:g} m^2 along every axis"
+    )
+    good: NDArray[np.bool_] = np.all(np.abs(known) <= LARGEST_VARIANCE, axis=(1, 2))  # NaN is not
+    known[~good] = 0.0
+    difference = np.abs(known - known.transpose(0, 2, 1)).max(axis=(1, 2))
+    known = 0.5 * (known + known.transpose(0, 2, 1))
+    good &= difference <= SYMMETRY * known.max(axis=(1, 2))
+    variance = np.linalg.eigvalsh(known)
+    good &= (variance[:, 0] >= LEAST_VARIANCE) & (variance[:, 2] <= LARGEST_VARIANCE)
+    if not good.all():
+        row = int(np.argmin(good))
+        raise FrameError(f"position_covariance[{row}]", expected, str(covariance[row].tolist())[:200])
+    if rotation is not None:
+        known = rotation @ known @ rotation.T
+    horizontal = np.column_stack((known[:, 0, 0], known[:, 0, 1], known[:, 1, 1]))
+    horizontal[unknown] = np.nan
+    return horizontal
+
+
+def semidefinite(horizontal: Array) -> NDArray[np.bool_]:
+    """Tell which rows (M, 3) of R_xx, R_xy and R_yy can be those of a covariance, up to rounding, or are of NaN."""
+    xx, xy, yy = horizontal.T
+    good = (xx > 0.0) & (yy > 0.0) & (xy * xy <= (1.0 + SYMMETRY) * xx * yy) & (np.maximum(xx, yy) < np.inf)
+    return np.asarray(good | np.isnan(horizontal).all(axis=1), np.bool_)

@@ -61,6 +61,7 @@ def generic_parameters(labels: Iterable[str], period: float, *, name: str = "aut
             "nominal_period": period,
             "detection_time": DETECTION_S,
             "self_calibration": True,
+            "sensor_motion": True,
             "provenance": provenance[:10_000],
             "classes": classes,
         }

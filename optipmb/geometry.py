@@ -1,13 +1,17 @@
-"""Overlap of boxes on the ground plane.
+"""Overlap of boxes on the ground plane, and a grid in which neighbours are found.
 
 A bird's-eye box is a row [x, y, length, width, yaw]. What circles or parallel rectangles show to be far apart is never
 clipped.
+
+The plane is cut into square cells and wrapped around a torus of `side` by `side` of them: cells far apart may share a
+slot, and their contents are told apart by distance. Each slot heads a chain through `following`. A search reaches at
+most one cell size, so it visits at most four cells along each axis, and the torus has at least so many.
 """
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -15,9 +19,8 @@ from optipmb.compiled import kernel
 from optipmb.errors import FrameError
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from optipmb.rows import Array, Index
 
-    Array = NDArray[np.float64]
 
 MAX_CORNERS = 16
 """Two rectangles intersect in at most eight corners; clipping keeps a few more for a moment."""
@@ -147,3 +150,45 @@ def overlaps(first: Array, second: Array) -> Array:
         for m in range(second.shape[0]):
             result[n, m] = box_iou(first[n], second[m])
     return result
+
+
+NOBODY: Final = -1
+"""End of a chain."""
+
+SMALLEST_SIDE: Final = 4
+SMALLEST_CELL: Final = 1e-3
+"""Cells are not smaller than this, m: their numbers stay far from overflow."""
+
+SLACK: Final = 1e-12
+"""Searches reach so much farther, relative to the coordinate, that rounding loses nobody; less than half a cell."""
+
+
+@kernel
+def empty_torus(count: int) -> tuple[Index, Index, int]:
+    """Return the heads of the chains of an empty torus for so many points, their links, and its side."""
+    side = SMALLEST_SIDE
+    while side * side < count:
+        side *= 2
+    return np.full(side * side, NOBODY), np.empty(count, np.int64), side
+
+
+@kernel
+def cell(coordinate: float, size: float) -> int:
+    """Return the number of the cell along one axis; `size` is the side of the cells, m."""
+    return math.floor(coordinate / max(size, SMALLEST_CELL))
+
+
+@kernel
+def insert(head: Index, following: Index, side: int, number: int, x: float, y: float, size: float) -> None:
+    """Put the point with this number, at (x, y), in front of the chain of its cell."""
+    slot = (cell(x, size) & (side - 1)) * side + (cell(y, size) & (side - 1))
+    following[number] = head[slot]
+    head[slot] = number
+
+
+@kernel
+def block(x: float, y: float, reach: float, size: float) -> tuple[int, int, int, int]:
+    """Return the first and the last cell along x, then along y, of what is within `reach` <= `size` of (x, y)."""
+    widest = max(size, SMALLEST_CELL)  # however far out, a search visits a few cells
+    x_reach, y_reach = reach + min(SLACK * (1.0 + abs(x)), widest), reach + min(SLACK * (1.0 + abs(y)), widest)
+    return cell(x - x_reach, size), cell(x + x_reach, size), cell(y - y_reach, size), cell(y + y_reach, size)

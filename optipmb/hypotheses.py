@@ -1,8 +1,9 @@
-"""Local data association hypotheses and their costs (Section IV.D and the birth model of IV.G).
+"""Gates, and local data association hypotheses with their costs (Section IV.D and the birth model of IV.G).
 
 Three kinds: an object is missed, an object is detected by a measurement, a measurement detects something for the
 first time. The costs need the position alone (eq. Simplified measurement model), so the full update is left to the
-hypotheses that win (`optipmb.update`). Likelihoods are kept as logarithms: weights of 1e-300 are ordinary here.
+hypotheses that win (`optipmb.update`). Likelihoods are kept as logarithms: weights of 1e-300 are ordinary here. The
+pairs of a step are counted before it looks at them: they are what a frame costs.
 """
 
 from __future__ import annotations
@@ -14,19 +15,19 @@ import numpy as np
 
 from optipmb.class_posterior import weigh_by_class
 from optipmb.compiled import kernel
-from optipmb.gating import gate, gate_radii
+from optipmb.density import V
+from optipmb.errors import EffortError
+from optipmb.frame import PLAIN
+from optipmb.geometry import NOBODY, block, empty_torus, insert
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
-    from optipmb.density import Bernoullis, Poissons
+    from optipmb.class_posterior import Groups
+    from optipmb.density import Bernoullis, Density, Poissons
     from optipmb.preprocess import Measurements
-    from optipmb.table import ClassRow
-
-    Array = NDArray[np.float64]
-    Index = NDArray[np.int64]
+    from optipmb.rows import Array, Index
+    from optipmb.table import ClassRow, ClassTable
 
 FROM_POISSON: Final = 0
 """First-time detection of what a Poisson component announced."""
@@ -67,13 +68,11 @@ class Hypotheses(NamedTuple):
 @kernel
 def local_hypotheses(
     objects: Bernoullis,
-    class_probability: Array,
-    p_d: Array,
     components: Poissons,
-    p_d_poisson: Array,
+    p_d: Array,
     measurements: Measurements,
+    groups: Groups,
     dt: float,
-    confusion: Array,
     classes: Sequence[ClassRow],
 ) -> Hypotheses:
     """Enumerate the hypotheses that pass the class gate and the distance gate, with their costs.
@@ -81,37 +80,26 @@ def local_hypotheses(
     Resolutions: a likelihood outside the gate counts as zero in p_a, as its cost is infinite; mu_+ in e^j already
     contains the survival probability that Algorithm 1 writes beside it. Where classes have groups, the gate of an
     object is open to its group, and the likelihood has the factor p(d) of `optipmb.class_posterior`.
-
-    Args:
-        objects: predicted detected objects.
-        class_probability: (N, C) their pi_+.
-        p_d: (N,) their detection probabilities.
-        components: predicted Poisson components.
-        p_d_poisson: (J,) theirs.
-        measurements: Z_k.
-        dt: s since the last frame.
-        confusion: (C, C) Lambda; (0, 0) where no classes have a group in common.
-        classes: (C,) parameters.
     """
-    grouped = confusion.shape[0] > 0
+    grouped, count = groups.confusion.shape[0] > 0, objects.label.shape[0]
     position, label = measurements.position, measurements.label
     radius = gate_radii(objects.covariance, objects.label, dt, classes)
     radius_poisson = gate_radii(components.covariance, components.label, dt, classes)
-    close_gates(p_d, radius)
-    close_gates(p_d_poisson, radius_poisson)
+    close_gates(p_d[:count], radius)
+    close_gates(p_d[count:], radius_poisson)
     row, measurement, log_likelihood = gate(
         objects.mean, objects.covariance, objects.label, radius, position, label, classes, grouped
     )
     if grouped:
-        weigh_by_class(row, measurement, log_likelihood, class_probability, measurements, confusion, classes)
+        weigh_by_class(row, measurement, log_likelihood, measurements, groups, classes)
     association = np.empty(label.shape[0])
-    detection_cost = detection_costs(row, measurement, log_likelihood, objects.existence, p_d, association)
+    detection_cost = detection_costs(row, measurement, log_likelihood, objects.existence, p_d[:count], association)
     component, announced, log_e = gate(
         components.mean, components.covariance, components.label, radius_poisson, position, label, classes, False
     )
     for k in range(component.shape[0]):
         j = component[k]
-        log_e[k] = math.log(components.weight[j] * p_d_poisson[j]) + log_e[k]
+        log_e[k] = math.log(components.weight[j] * p_d[count + j]) + log_e[k]
     kind, cost, existence = first_detections(announced, log_e, measurements.score, association, label, classes)
     return Hypotheses(row, measurement, detection_cost, component, announced, log_e, kind, cost, existence, association)
 
@@ -120,8 +108,7 @@ def local_hypotheses(
 def close_gates(p_d: Array, radius: Array) -> None:
     """Write a negative radius, in which nothing lies, for what cannot be detected: no cost is that of p_d = 0.
 
-    Args:
-        p_d: (N,) detection probabilities.
+    Arguments of its own:
         radius: (N,) gating distances, m; some are replaced.
     """
     for n in range(p_d.shape[0]):
@@ -138,12 +125,8 @@ def detection_costs(
     ``w = -ln [r p_d N(z; z_hat, S) / (1 - r + r (1 - p_d))]`` (eq. Detection Hypothesis Update) and
     ``p_a = min[1, sum_n N(z; z_hat^n, S^n)]`` (eq. Association Probability).
 
-    Args:
+    Arguments of its own:
         row: (K,) object of each pair, ascending.
-        measurement: (K,) measurement of each pair.
-        log_likelihood: (K,) ln N of each pair.
-        existence: (N,) r.
-        p_d: (N,) detection probabilities.
         association: (M,) receives p_a.
 
     Returns:
@@ -166,12 +149,7 @@ def detection_costs(
 
 @kernel
 def first_detections(
-    measurement: Index,
-    log_e: Array,
-    score: Array,
-    association: Array,
-    label: Index,
-    classes: Sequence[ClassRow],
+    measurement: Index, log_e: Array, score: Array, association: Array, label: Index, classes: Sequence[ClassRow]
 ) -> tuple[Index, Array, Array]:
     """Compute kind, cost and existence of the first-time detection hypothesis of each measurement.
 
@@ -186,14 +164,9 @@ def first_detections(
 
     A score below `announce_score` is clutter, with components or without.
 
-    Args:
-        measurement: (L,) measurement of each announced pair.
+    Arguments of its own:
         log_e: (L,) ln e^j.
-        score: (M,) z_s.
-        association: (M,) p_a.
         label: (M,) z_c.
-        classes: (C,) parameters: lambda_c, mu_b0 / A, eta_score, `announce_score` and
-            `birth_over_clutter`.
 
     Returns:
         (M,) `FROM_POISSON`, `CLUTTER` or `NEWBORN`, (M,) w and (M,) r.
@@ -225,3 +198,290 @@ def first_detections(
             cost[m] = -math.log(own.birth_intensity * (1.0 - association[m]) + clutter)
             existence[m] = 1.0
     return kind, cost, existence
+
+
+DEVIATIONS_2: Final = 9.21
+"""Squared standard deviations of a position in the plane that 99 % of detections are within: chi^2 of 2 dimensions."""
+
+MAX_RADIUS: Final = 1e6
+"""No gate is wider, m, however uncertain a speed and however long a silence."""
+
+FEW: Final = 256
+"""Up to so many measurements it is faster to look at all of them than to find the neighbours among them."""
+
+
+@kernel
+def gate_radii(covariance: Array, label: Index, dt: float, classes: Sequence[ClassRow]) -> Array:
+    """Compute the gating distance of each object.
+
+    It is eta_dist, and at least the way that its speed may deviate: so many standard deviations of v over dt. The paper
+    has eta_dist alone, at the one frame rate of a data set.
+
+    Returns:
+        (N,) m.
+    """
+    radius = np.empty(label.shape[0])
+    for n in range(label.shape[0]):
+        own = classes[label[n]]
+        radius[n] = own.gate
+        reach = own.gate_deviations * math.sqrt(max(covariance[n, V, V], 0.0)) * dt
+        if reach > radius[n]:  # noqa: PLR1730 - max() would keep NaN
+            radius[n] = reach
+        radius[n] = min(radius[n], MAX_RADIUS)
+    return radius
+
+
+@kernel
+def gate_widening(position: Array, label: Index, classes: Sequence[ClassRow]) -> Array:
+    """Compute by how much each detection widens the gates that it may lie in.
+
+    eta_dist is chosen for detections with R of their class. What R_m of a detection has beyond it widens the gate, as
+    variances add up: ``eta^2 + chi^2 max(0, lambda_1(R_m) - sigma^2)``, lambda_1 the larger eigenvalue, chi^2 the
+    quantile `DEVIATIONS_2`. A detection that is more accurate than its class has the gate of the class.
+
+    Arguments of its own:
+        label: (M,) z_c.
+
+    Returns:
+        (M,) m^2, to be added to the squares of gating distances.
+    """
+    widening = np.zeros(label.shape[0])
+    if position.shape[1] > PLAIN:
+        for m in range(label.shape[0]):
+            rho_xx, rho_xy, rho_yy = position[m, 2], position[m, 3], position[m, 4]
+            largest = 0.5 * (rho_xx + rho_yy) + math.hypot(0.5 * (rho_xx - rho_yy), rho_xy)
+            variance = classes[label[m]].noise_position ** 2
+            widening[m] = min(DEVIATIONS_2 * variance * max(0.0, largest - 1.0), MAX_RADIUS**2)
+    return widening
+
+
+@kernel
+def gate(
+    mean: Array,
+    covariance: Array,
+    label: Index,
+    radius: Array,
+    position: Array,
+    measured_label: Index,
+    classes: Sequence[ClassRow],
+    by_group: bool,
+) -> tuple[Index, Index, Array]:
+    """Find the measurements of an object's class or group within its gate and their position likelihoods.
+
+    Arguments of its own:
+        radius: (N,) gating distances, m, for detections with R of their class; nothing lies in a negative one.
+        by_group: whether the gate is open to all classes of the object's group.
+
+    Returns:
+        Objects, measurements and log-likelihoods ln N(z_xy; z_hat, S) of the pairs (eq. Predicted Measurement),
+        ordered by object, then measurement.
+    """
+    widening = gate_widening(position, measured_label, classes)
+    kind, measured_kind = label, measured_label
+    if by_group:
+        kind, measured_kind = groups(label, classes), groups(measured_label, classes)
+    if position.shape[0] <= FEW:
+        row, measurement = pairs_of_few(mean, kind, radius, position, measured_kind, widening, len(classes))
+    else:
+        row, measurement = pairs_of_many(mean, kind, radius, position, measured_kind, widening, len(classes))
+    log_likelihood = np.empty(row.shape[0])
+    own_noise = position.shape[1] > PLAIN
+    rho_xx, rho_xy, rho_yy = 1.0, 0.0, 1.0
+    before = -1
+    s_xx = s_xy = s_yy = determinant = constant = 0.0
+    for k in range(row.shape[0]):
+        n, m = row[k], measurement[k]
+        if n != before or own_noise or by_group:  # what the pairs of an object share
+            before = n
+            variance = classes[measured_label[m]].noise_position ** 2
+            if own_noise:
+                rho_xx, rho_xy, rho_yy = position[m, 2], position[m, 3], position[m, 4]
+            s_xx, s_yy = covariance[n, 0, 0] + variance * rho_xx, covariance[n, 1, 1] + variance * rho_yy
+            s_xy = covariance[n, 0, 1] + variance * rho_xy
+            determinant = s_xx * s_yy - s_xy * s_xy
+            constant = -math.log(2.0 * math.pi) - 0.5 * math.log(determinant)
+        dx, dy = position[m, 0] - mean[n, 0], position[m, 1] - mean[n, 1]
+        squared = (s_yy * dx * dx - 2.0 * s_xy * dx * dy + s_xx * dy * dy) / determinant
+        log_likelihood[k] = constant - 0.5 * squared
+    return row, measurement, log_likelihood
+
+
+@kernel
+def groups(label: Index, classes: Sequence[ClassRow]) -> Index:
+    """Return the group (N,) of each class of `label` (N,)."""
+    group = np.empty(label.shape[0], np.int64)
+    for n in range(label.shape[0]):
+        group[n] = classes[label[n]].group
+    return group
+
+
+@kernel
+def pairs_of_few(
+    mean: Array, label: Index, radius: Array, position: Array, measured_label: Index, widening: Array, classes: int
+) -> tuple[Index, Index]:
+    """Find the pairs within the gates by looking at every measurement of a class; arguments and order as in `gate`."""
+    n_measurements = position.shape[0]
+    capacity = 2 * (mean.shape[0] + n_measurements) + 16 if mean.shape[0] else 0
+    row, measurement = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
+    # The measurements, class after class.
+    start = np.zeros(classes + 2, np.int64)
+    for c in measured_label:
+        start[c + 2] += 1
+    for c in range(classes):
+        start[c + 2] += start[c + 1]
+    x, y, which = np.empty(n_measurements), np.empty(n_measurements), np.empty(n_measurements, np.int64)
+    wider = np.empty(n_measurements)
+    for m in range(n_measurements):
+        k = start[measured_label[m] + 1]
+        x[k], y[k], wider[k], which[k] = position[m, 0], position[m, 1], widening[m], m
+        start[measured_label[m] + 1] += 1  # in the end where the next class starts
+
+    count = 0
+    for n in range(mean.shape[0]):
+        if count + n_measurements > capacity:
+            capacity = 2 * (count + n_measurements)
+            row, measurement = _grown(row, capacity), _grown(measurement, capacity)
+        if radius[n] < 0.0:
+            continue
+        eta_2, x_n, y_n = radius[n] * radius[n], mean[n, 0], mean[n, 1]
+        for k in range(start[label[n]], start[label[n] + 1]):
+            dx, dy = x[k] - x_n, y[k] - y_n
+            limit = eta_2 + wider[k]
+            if dx * dx <= limit and dx * dx + dy * dy <= limit:  # most are too far along x already
+                row[count], measurement[count] = n, which[k]
+                count += 1
+    return row[:count], measurement[:count]
+
+
+@kernel
+def pairs_of_many(
+    mean: Array, label: Index, radius: Array, position: Array, measured_label: Index, widening: Array, classes: int
+) -> tuple[Index, Index]:
+    """Find the pairs within the gates by looking at neighbours; arguments and order as in `gate`.
+
+    The measurements stand in a torus of cells twice as wide as the widest gate of their class, so that a gate touches
+    at most three cells along each axis.
+    """
+    capacity = 2 * (mean.shape[0] + position.shape[0]) + 16 if mean.shape[0] else 0
+    row, measurement = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
+    widest, most = np.zeros(classes), np.zeros(classes)
+    for m in range(position.shape[0]):
+        most[measured_label[m]] = max(most[measured_label[m]], widening[m])
+    for n in range(mean.shape[0]):
+        widest[label[n]] = max(widest[label[n]], math.sqrt(radius[n] * radius[n] + most[label[n]]))
+    head, following, side = empty_torus(position.shape[0])
+    for m in range(position.shape[0]):
+        insert(head, following, side, m, position[m, 0], position[m, 1], 2.0 * widest[measured_label[m]])
+    count = 0
+    for n in range(mean.shape[0]):
+        eta = radius[n]
+        if eta < 0.0:
+            continue
+        begin, eta_2 = count, eta * eta
+        reach = math.sqrt(eta_2 + most[label[n]])
+        first_x, last_x, first_y, last_y = block(mean[n, 0], mean[n, 1], reach, 2.0 * widest[label[n]])
+        for i in range(first_x, last_x + 1):
+            for j in range(first_y, last_y + 1):
+                m = head[(i & (side - 1)) * side + (j & (side - 1))]
+                while m != NOBODY:
+                    dx, dy = position[m, 0] - mean[n, 0], position[m, 1] - mean[n, 1]
+                    if dx * dx + dy * dy <= eta_2 + widening[m] and measured_label[m] == label[n]:
+                        if count == capacity:
+                            capacity *= 2
+                            row, measurement = _grown(row, capacity), _grown(measurement, capacity)
+                        slot = count  # keep the measurements of this object in ascending order
+                        while slot > begin and measurement[slot - 1] > m:
+                            measurement[slot] = measurement[slot - 1]
+                            slot -= 1
+                        measurement[slot] = m
+                        row[count] = n
+                        count += 1
+                    m = following[m]
+    return row[:count], measurement[:count]
+
+
+@kernel
+def _grown(array: Index, capacity: int) -> Index:
+    larger = np.empty(capacity, array.dtype)
+    larger[: array.shape[0]] = array
+    return larger
+
+
+UNLIMITED: Final = 2**62
+
+
+def check_effort(prior: Density, measurements: Measurements, dt: float, table: ClassTable, most: int) -> None:
+    """Refuse a frame with too many pairs in the gates.
+
+    Counted are the measurements in the gate of each predicted object and Poisson component, and in that of each
+    measurement, which may be an object of the next step.
+
+    Arguments of its own:
+        most: pairs that are allowed.
+
+    Raises:
+        EffortError: there are more.
+    """
+    bernoulli, poisson, count = prior.bernoulli, prior.poisson, measurements.score.shape[0]
+    if (len(bernoulli) + len(poisson) + count) * count <= most:
+        return
+    positions = np.concatenate((bernoulli.mean[:, :2], poisson.mean[:, :2], measurements.position[:, :2]))
+    labels = np.concatenate((bernoulli.label, poisson.label, measurements.label))
+    radius = np.concatenate(
+        (
+            gate_radii(bernoulli.covariance, bernoulli.label, dt, table.classes),
+            gate_radii(poisson.covariance, poisson.label, dt, table.classes),
+            table["gate"][measurements.label],
+        )
+    )
+    widening = gate_widening(measurements.position, measurements.label, table.classes)
+    group = table["group"]
+    measured = measurements.position, group[measurements.label], widening
+    if count_pairs(positions, group[labels], radius, *measured, len(table.classes), most) > most:
+        raise EffortError("center", f"at most {most} pairs of an object and a detection in its gate", "more")
+
+
+@kernel
+def count_pairs(
+    center: Array,
+    label: Index,
+    radius: Array,
+    position: Array,
+    measured_label: Index,
+    widening: Array,
+    classes: int,
+    most: int,
+) -> int:
+    """Count the measurements of an object's class within its gate, over all objects; no further than `most` + 1.
+
+    Arguments of its own:
+        center: (N, 2) positions of the objects, m.
+        radius: (N,) gating distances, m.
+        widening: (M,) of the gates, m^2.
+        classes: C.
+        most: where counting ends.
+    """
+    widest, wider = np.zeros(classes), np.zeros(classes)
+    for m in range(position.shape[0]):
+        wider[measured_label[m]] = max(wider[measured_label[m]], widening[m])
+    for n in range(center.shape[0]):
+        widest[label[n]] = max(widest[label[n]], math.sqrt(radius[n] ** 2 + wider[label[n]]))
+    head, following, side = empty_torus(position.shape[0])
+    for m in range(position.shape[0]):
+        insert(head, following, side, m, position[m, 0], position[m, 1], 2.0 * widest[measured_label[m]])
+    count = 0
+    for n in range(center.shape[0]):
+        eta_2 = radius[n] ** 2
+        reach = math.sqrt(eta_2 + wider[label[n]])
+        first_x, last_x, first_y, last_y = block(center[n, 0], center[n, 1], reach, 2.0 * widest[label[n]])
+        for i in range(first_x, last_x + 1):
+            for j in range(first_y, last_y + 1):
+                m = head[(i & (side - 1)) * side + (j & (side - 1))]
+                while m != NOBODY:
+                    dx, dy = position[m, 0] - center[n, 0], position[m, 1] - center[n, 1]
+                    if dx * dx + dy * dy <= eta_2 + widening[m] and measured_label[m] == label[n]:
+                        count += 1
+                        if count > most:
+                            return count
+                    m = following[m]
+    return count

@@ -1,42 +1,49 @@
-"""The light-weight filter of the non-motion states (Section IV.F): box size, height, counters and confidence."""
+"""The light-weight filter of the non-motion states (Section IV.F): box size, height, counters and confidence.
+
+It has the sign of the heading too (not in the paper). Detectors turn boxes by pi now and then, so the update takes the
+innovation of the heading modulo pi. The sign has a state of its own, h, the log odds that the object faces along phi.
+With lambda the memory over one nominal period,
+
+    h_k = kappa h_{k-1} + (1 - kappa) / (1 - lambda) l_k,     kappa = lambda^(dt / period)
+    l_k = b_d z_s cos(z_phi - phi) + b_v sign(v)              the second term where |v| >= v_0 + 2 sd(v)
+
+where the object is detected. Where h falls below zero the state is turned: phi + pi, -v, -a and -h, and P -> T P T with
+T = diag(1, 1, -1, 1, 1, -1). Both states describe the same motion. A track publishes the probability 1 / (1 + e^-h)
+that its heading is right, and in the variance of the heading what the doubt adds to it. Without `heading_sign` in the
+profile the sign stays that of the birth.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from optipmb.association import NEW
 from optipmb.calibration import log_odds
 from optipmb.compiled import kernel
-from optipmb.heading import follow_sign
-from optipmb.prune import NEW
+from optipmb.density import PHI, STATE, A, V
+from optipmb.predict import wrap
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
-    from optipmb.density import Bernoullis
+    from optipmb.association import Survivors
+    from optipmb.density import Bernoullis, Moment
     from optipmb.preprocess import Measurements
-    from optipmb.prune import Survivors
+    from optipmb.rows import Array
     from optipmb.table import ClassRow
-
-    Array = NDArray[np.float64]
-    Index = NDArray[np.int64]
 
 
 @kernel
 def light_weight_filter(
     survivors: Survivors,
-    label: Index,
     posterior: Bernoullis,
     objects: Bernoullis,
     next_id: int,
     measurements: Measurements,
-    stamp_ns: int,
-    before_ns: int,
-    period: float,
+    moment: Moment,
     classes: Sequence[ClassRow],
 ) -> None:
     """Update the non-motion states of all objects, new and old.
@@ -45,33 +52,26 @@ def light_weight_filter(
     Score). Missed: x_A stays, ``x_s = 0``. New: x_A = z_A before, ids from `next_id` on. The counters are kept as
     stamps, so that they mean the same at every frame rate: x_cnt is the number of nominal periods since `seen_ns`,
     x_len is one more than the (real) number since `born_ns`. The evidence follows `optipmb.calibration`, the sign of
-    the heading `optipmb.heading`, which turns the motion states where it changes. `extracted` and `confirmed` stay as
-    they were.
+    the heading turns the motion states where it changes. `extracted` and `confirmed` stay as they were.
 
-    Args:
+    Arguments of its own:
         survivors: which objects the posterior has.
-        label: (K,) their classes.
-        posterior: the objects, whose motion states are known; receives all other columns.
+        posterior: the objects, whose motion states and classes are known; receives all other columns.
         objects: the predicted objects.
         next_id: id of the first new object.
-        measurements: Z_k.
-        stamp_ns: stamp of the frame.
-        before_ns: stamp of the frame before. The evidence of a frame weighs by the time since then, that of a first
-            detection by one nominal period.
-        period: nominal period, s.
-        classes: (C,) parameters.
     """
+    stamp_ns, label = moment.stamp_ns, posterior.label
     mean, covariance, auxiliary, identity = posterior.mean, posterior.covariance, posterior.auxiliary, posterior.id
     born_ns, seen_ns, score, evidence = posterior.born_ns, posterior.seen_ns, posterior.score, posterior.evidence
     heading_odds, extracted, confirmed = posterior.heading_odds, posterior.extracted, posterior.confirmed
     # What the evidence keeps over the time since the frame before; in a first detection over one nominal period.
-    periods = (stamp_ns - before_ns) * 1e-9 / period
+    periods = moment.dt / moment.period
     memory_of_frame, sign_memory_of_frame = np.empty(len(classes)), np.empty(len(classes))
     for c in range(len(classes)):
         memory_of_frame[c], sign_memory_of_frame[c] = classes[c].memory ** periods, classes[c].sign_memory ** periods
     for k in range(survivors.row.shape[0]):
         n, m = survivors.row[k], survivors.measurement[k]
-        posterior.existence[k], posterior.label[k] = survivors.existence[k], label[k]
+        posterior.existence[k] = survivors.existence[k]
         if n == NEW:
             identity[k] = next_id
             born_ns[k], extracted[k], confirmed[k] = stamp_ns, False, False
@@ -96,7 +96,7 @@ def light_weight_filter(
             z_s = measurements.score[m]
             for s in range(4):
                 auxiliary[k, s] = (1.0 - z_s) * auxiliary[k, s] + z_s * measurements.auxiliary[m, s]
-            x_len = 1.0 + (stamp_ns - born_ns[k]) * 1e-9 / period
+            x_len = 1.0 + (stamp_ns - born_ns[k]) * 1e-9 / moment.period
             score[k] = (1.0 - math.exp(-x_len)) * z_s
             seen_ns[k] = stamp_ns
             latest = log_odds(z_s)
@@ -109,3 +109,60 @@ def light_weight_filter(
                 )
         kept = own.memory if first else memory_of_frame[label[k]]
         evidence[k] = kept * evidence[k] + (1.0 - kept) * latest
+
+
+TAIL: Final = 0.025
+"""Probability beyond an interval of 95 %, on either side."""
+
+CERTAIN: Final = 2.0
+"""Standard deviations by which a speed has to be above v_0 to say which way is forward."""
+
+
+@kernel
+def follow_sign(
+    odds: float, kept: float, own: ClassRow, score: float, yaw: float, mean: Array, covariance: Array
+) -> float:
+    """Return h_k of a detected object, and turn its state in place where the sign has changed.
+
+    Arguments of its own:
+        odds: h_{k-1}; zero before the first detection.
+        kept: kappa.
+        own: parameters of its class: lambda, b_d, b_v and v_0.
+        yaw: z_phi.
+    """
+    latest = own.sign_detection * score * math.cos(yaw - mean[PHI])
+    if abs(mean[V]) >= own.sign_speed + CERTAIN * math.sqrt(covariance[V, V]):
+        latest += math.copysign(own.sign_motion, mean[V])
+    odds = kept * odds + (1.0 - kept) / (1.0 - own.sign_memory) * latest
+    if odds < 0.0:
+        turn_around(mean, covariance)
+        odds = -odds
+    return odds
+
+
+@kernel
+def turn_around(mean: Array, covariance: Array) -> None:
+    """Describe the same motion with the opposite heading: x -> T x and phi + pi, P -> T P T."""
+    mean[PHI] = wrap(mean[PHI] + math.pi)
+    mean[V], mean[A] = -mean[V], -mean[A]
+    for s in range(STATE):
+        if s not in (V, A):
+            for t in (V, A):
+                covariance[s, t] = -covariance[s, t]
+                covariance[t, s] = -covariance[t, s]
+
+
+@kernel
+def sign_probability(odds: float) -> float:
+    """Return 1 / (1 + e^-h), the probability that the object faces along phi; h is not negative."""
+    return 1.0 / (1.0 + math.exp(-odds))
+
+
+@kernel
+def doubt(probability: float) -> float:
+    """Return the variance that the doubt about the sign adds to a heading, rad^2.
+
+    The two headings have the variance p (1 - p) pi^2 about their mean. A doubt of less than `TAIL` lies outside an
+    interval of 95 %, so that much is left out, and headings that are nearly certain have an interval that holds.
+    """
+    return max(probability * (1.0 - probability) - TAIL * (1.0 - TAIL), 0.0) * math.pi**2

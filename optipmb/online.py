@@ -34,10 +34,9 @@ if TYPE_CHECKING:
     from optipmb.field_of_view import FieldOfView
     from optipmb.frame import PointCloud, Pose
     from optipmb.paths import PredictedPaths
+    from optipmb.rows import Array, Index
     from optipmb.tracker import Modules
 
-    Array = NDArray[np.float64]
-    Integers = NDArray[np.int64]
 
 FLAT: Final = (("center", ("x", "y", "z")), ("size", ("l", "w", "h")), ("velocity", ("vx", "vy")))
 """Arrays of a frame, and the columns that may stand for them."""
@@ -77,8 +76,8 @@ class OnlineTracks:
     tracks: Tracks
     name: NDArray[np.str_]
     left_out: int
-    id: Integers
-    label: Integers
+    id: Index
+    label: Index
     center: Array
     size: Array
     yaw: Array
@@ -91,7 +90,7 @@ class OnlineTracks:
     covariance: Array
     age: Array
     time_since_detection: Array
-    detection: Integers
+    detection: Index
     confirmed: NDArray[np.bool_]
     paths: PredictedPaths | None = None
     class_probability: Array | None = None

@@ -93,7 +93,7 @@ class MeasurementNoise(_Table):
 
 
 class ReportedNoise(_Table):
-    """Noise of the detector for the boxes that tracks report (`optipmb.reported`).
+    """Noise of the detector for the boxes that tracks report (`optipmb.calibration`).
 
     An entry that is not below that of `measurement_noise` reports the state as it is.
     """
@@ -114,7 +114,7 @@ class BirthSpread(_Table):
 
 
 class HeadingSign(_Table):
-    """How it is found out which way an object faces, as log odds (`optipmb.heading`)."""
+    """How it is found out which way an object faces, as log odds (`optipmb.lightweight`)."""
 
     memory: OpenProbability = Field(
         default=0.9, description="lambda: weight that the log odds keep over one nominal period"
@@ -165,7 +165,7 @@ Knots = Annotated[tuple[OpenProbability, ...], Field(min_length=2, max_length=MA
 
 
 class ScoreCalibration(_Table):
-    """What the scores of a detector mean to the thresholds of the class (`optipmb.score_calibration`).
+    """What the scores of a detector mean to the thresholds of the class (`optipmb.frame`).
 
     The fields are columns of one table, a row for each knot; the curve is straight from knot to knot, from (0, 0) to
     the first and from the last to (1, 1).

@@ -1,6 +1,6 @@
 """Where tracks are going: their states at times ahead, by the motion model of their class (eq. Motion Predict).
 
-Between two horizons the state is predicted in equal steps of at most one nominal period, each as in `optipmb.motion`.
+Between two horizons the state is predicted in equal steps of at most one nominal period, each as in `optipmb.predict`.
 One long step would be another motion: its noise of speed and heading would reach no position. The covariance is that of
 the filter. The mean is the motion of the state itself and not the mean of the sigma points: where the heading may turn
 far in the time ahead, the latter hardly moves at all, and no object goes that way. A turn rate and an acceleration of
@@ -14,28 +14,24 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from optipmb.columns import check_fitting
 from optipmb.compiled import kernel
-from optipmb.density import OMEGA, PHI, STATE, A, Density, V, X, Y, copy_state
+from optipmb.density import OMEGA, PHI, STATE, A, Density, V, X, Y, check_fitting, copy_state
 from optipmb.errors import DensityError, FrameError
-from optipmb.heading import doubt
-from optipmb.motion import decay_and_turn, displacement, predict_state, wrap
+from optipmb.extract import sound, unsound
+from optipmb.lightweight import doubt
 from optipmb.parameters import HORIZONS, MAX_HORIZON_S, MAX_HORIZONS
-from optipmb.records import record
-from optipmb.soundness import sound, unsound
+from optipmb.predict import decay_and_turn, displacement, predict_state, wrap
+from optipmb.rows import record
 from optipmb.table import ClassTable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
     from optipmb.extract import Tracks
     from optipmb.parameters import Parameters
+    from optipmb.rows import Array, Index
     from optipmb.table import ClassRow
 
-    Array = NDArray[np.float64]
-    Index = NDArray[np.int64]
 
 MAX_STEPS: Final = 1000
 """Most steps of a path, whatever the nominal period."""
@@ -82,7 +78,7 @@ def predict_tracks(
 ) -> PredictedPaths:
     """Predict where objects will be, by the motion model of their class.
 
-    The doubt which way an object faces (`optipmb.heading`) takes no part: both headings describe the same motion.
+    The doubt which way an object faces (`optipmb.lightweight`) takes no part: both headings describe the same motion.
 
     Args:
         tracks: tracks of a step, or a density, of which all detected objects are predicted.
@@ -145,16 +141,7 @@ def _predict(
     paths = PredictedPaths(
         identity.copy(), label.copy(), times, np.empty((*shape, STATE)), np.empty((*shape, STATE, STATE))
     )
-    predict_paths(
-        mean,
-        covariance,
-        paths.label,
-        times,
-        table.period,
-        table.classes,
-        paths.mean,
-        paths.covariance,
-    )
+    predict_paths(mean, covariance, paths.label, times, table.period, table.classes, paths.mean, paths.covariance)
     return paths
 
 
@@ -179,13 +166,10 @@ def predict_paths(
 ) -> None:
     """Predict states to each of the horizons, in equal steps of at most a nominal period between them.
 
-    Args:
+    Arguments of its own:
         mean: (N, 6) states now.
         covariance: (N, 6, 6) their covariances.
-        label: (N,) classes.
         horizons: (H,) ascending times ahead, s.
-        period: nominal period, s.
-        classes: (C,) parameters.
         mean_out: (N, H, 6) receives the states at the horizons.
         covariance_out: (N, H, 6, 6) receives their covariances.
     """

@@ -12,11 +12,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.effort import UNLIMITED
 from optipmb.errors import EffortError
-from optipmb.geometry import iou_exceeds
-from optipmb.neighbours import NOBODY, block, empty_torus, insert
-from optipmb.position_noise import PLAIN
+from optipmb.frame import PLAIN
+from optipmb.geometry import NOBODY, block, empty_torus, insert, iou_exceeds
+from optipmb.hypotheses import UNLIMITED
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -24,18 +23,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from optipmb.frame import Frame
-    from optipmb.records import Columns
+    from optipmb.rows import Array, Columns, Index
     from optipmb.table import ClassRow, ClassTable
-
-    Array = NDArray[np.float64]
-    Index = NDArray[np.int64]
 
 
 class Measurements(NamedTuple):
     """The measurement set Z_k, best score first.
 
     Attributes:
-        position: (M, 2) z_xy, m; (M, 5) with rho_xx, rho_xy and rho_yy of `optipmb.position_noise` behind, where some
+        position: (M, 2) z_xy, m; (M, 5) with rho_xx, rho_xy and rho_yy of `optipmb.frame` behind, where some
             detection of the frame has another R than its class.
         yaw: (M,) z_phi, rad.
         velocity: (M, 2) z_v, m/s, NaN where unknown.
@@ -70,18 +66,10 @@ def preprocess(
         EffortError: more than `most` pairs of detections may overlap.
     """
     own_noise = frame.position_covariance
-    above, chosen, columns = select(
-        frame.center,
-        frame.size,
-        frame.yaw,
-        frame.velocity,
-        frame.score if score is None else score,
-        frame.label,
-        frame.source,
-        PLAIN if own_noise is None else PLAIN + 3,
-        table.classes,
-        most,
-    )
+    if score is None:
+        score = frame.score
+    given = frame.center, frame.size, frame.yaw, frame.velocity, score, frame.label, frame.source
+    above, chosen, columns = select(given, PLAIN if own_noise is None else PLAIN + 3, table.classes, most)
     if above < 0:
         raise EffortError("center", f"at most {most} pairs of detections that may overlap", "more")
     measurements = Measurements(*columns)
@@ -92,25 +80,15 @@ def preprocess(
 
 
 @kernel
-def select(
-    center: Array,
-    size: Array,
-    yaw: Array,
-    velocity: Array,
-    score: Array,
-    label: Index,
-    source: Index,
-    width: int,
-    classes: Sequence[ClassRow],
-    most: int,
-) -> tuple[int, Index, Columns]:
-    """Choose the detections that are measurements.
+def select(detections: Columns, width: int, classes: Sequence[ClassRow], most: int) -> tuple[int, Index, Columns]:
+    """Choose the detections that are measurements, of center, size, yaw, velocity, score, label and source of all.
 
     Returns:
         How many detections pass the score filter, or -1 when more than `most` pairs of boxes had to be looked at; the
         rows of those that pass the suppression too, in their order; their columns of `Measurements`, `width` of them
         for the position.
     """
+    center, size, yaw, _, score, label, source = detections
     chosen = np.empty(score.shape[0], np.int64)
     above = 0
     for m in range(score.shape[0]):
@@ -135,7 +113,7 @@ def select(
             chosen[kept] = chosen[k]
             kept += 1
     chosen = chosen[:kept]
-    return above, chosen, gather(chosen, center, size, yaw, velocity, score, label, source, width)
+    return above, chosen, gather(chosen, detections, width)
 
 
 @kernel
@@ -181,10 +159,8 @@ def sort_canonically(order: Index, score: Array, center: Array, size: Array, yaw
 def non_maximum_suppression(boxes: Array, label: Index, classes: Sequence[ClassRow], most: int) -> NDArray[np.bool_]:
     """Keep each box unless a kept box of its group before it overlaps it by more than the threshold of its class.
 
-    Args:
+    Arguments of its own:
         boxes: (M, 5) bird's-eye boxes, best first.
-        label: (M,) class of each.
-        classes: (C,) parameters: eta_iou and the group.
         most: pairs of boxes whose overlap is computed before it gives up.
 
     Returns:
@@ -222,18 +198,9 @@ def non_maximum_suppression(boxes: Array, label: Index, classes: Sequence[ClassR
 
 
 @kernel
-def gather(
-    chosen: Index,
-    center: Array,
-    size: Array,
-    yaw: Array,
-    velocity: Array,
-    score: Array,
-    label: Index,
-    source: Index,
-    width: int,
-) -> Columns:
+def gather(chosen: Index, detections: Columns, width: int) -> Columns:
     """Copy the chosen detections to the columns of `Measurements`; columns of the position behind y stay unwritten."""
+    center, size, yaw, velocity, score, label, source = detections
     count = chosen.shape[0]
     position, velocity_out, auxiliary = np.empty((count, width)), np.empty((count, 2)), np.empty((count, 4))
     yaw_out, score_out = np.empty(count), np.empty(count)

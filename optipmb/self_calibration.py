@@ -26,26 +26,28 @@ that otherwise a detector of low scores would remain silent for ever.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from optipmb.calibration import log_odds
 from optipmb.compiled import kernel
-from optipmb.density import BINS, COUNTS, NO_FRAME, SLOT, SLOTS, SelfCalibration
+from optipmb.density import BINS, COUNTS, NO_BIN, SLOT, SLOTS, SelfCalibration
 from optipmb.predict import rows_within
-from optipmb.undetected import AGED
+from optipmb.rows import read_only
+from optipmb.undetected import AGED, MARKED
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from optipmb.density import Density
+    from optipmb.density import Density, Moment
+    from optipmb.frame import Frame
+    from optipmb.rows import Array, Index
     from optipmb.table import ClassRow, ClassTable
+    from optipmb.tracker import Update
 
-    Array = NDArray[np.float64]
-    Index = NDArray[np.int64]
     Slots = NDArray[np.uint16]
 
 BIN: Final = 0.4
@@ -123,10 +125,9 @@ def on_curve(odds: float, curve: Array) -> float:
 def calibrate(classes: Array, score: Array, label: Index, table: Sequence[ClassRow]) -> Array:
     """Return the calibrated scores (M,), and bound the thresholds by the lower edge of the median of the scores.
 
-    Args:
+    Arguments of its own:
         classes: (C, `COUNTS`, `BINS`) counts of the classes.
         score: (M,) of the detector.
-        label: (M,) classes.
         table: (C,) parameters; thresholds on scores are written.
     """
     curve, out = curves(classes), np.empty(score.shape[0])
@@ -190,62 +191,49 @@ def next_slot(slots: Slots, counts: Array, needed: float) -> None:
 
 @kernel
 def learn(
-    classes: Array,
-    before: Slots,
-    before_id: Index,
-    before_label: Index,
-    objects_id: Index,
-    objects_label: Index,
-    hit: Index,
-    looked: NDArray[np.bool_],
-    bins: Index,
+    counts: tuple[Array, Slots, Index],
+    before: tuple[Index, Index],
+    after: tuple[Index, Index, Index, NDArray[np.bool_]],
     components_label: Index,
     fate: Index,
-    score: Array,
-    label: Index,
-    rows: Index,
+    detections: tuple[Array, Index, Index],
     dt: float,
 ) -> tuple[Array, Slots, Index]:
     """Return the counts after a frame.
 
-    Args:
-        classes: (C, `COUNTS`, `BINS`) of the classes; is written.
-        before: (N, `SLOTS`, `SLOT`) of the objects of the frame before.
-        before_id: (N,) their ids, ascending.
-        before_label: (N,) their classes.
-        objects_id: (K,) ids of the objects of the posterior, ascending.
-        objects_label: (K,) their classes.
-        hit: (K,) measurement of each, negative where missed.
-        looked: (K,) whether it was in view.
-        bins: (J,) of the predicted components.
-        components_label: (J,) their classes.
-        fate: (J + M,) row of each component, and of that of each measurement, in the posterior; below zero where it
-            has none.
-        score: (D,) scores of the detector, of all detections.
-        label: (D,) their classes.
-        rows: (M,) detection of each measurement.
-        dt: s since the frame before.
+    Arguments of its own:
+        counts: of classes, objects and components, as `SelfCalibration` has them; those of the classes are written.
+        before: ids, ascending, and classes of the objects of the frame before, (N,).
+        after: ids, ascending, and classes of the objects of the posterior, the measurement of each, negative where
+            missed, and whether it was in view, (K,).
+        components_label: (J,) classes of the predicted components.
+        fate: (J + M,) of `update_undetected`.
+        detections: scores and classes of the detections, (D,), and the detection of each measurement, (M,).
     """
+    classes, slots, bins = counts
+    before_id, before_label = before
+    objects_id, objects_label, hit, looked = after
+    score, label, rows = detections
     for d in range(score.shape[0]):
         classes[label[d], GIVEN, bin_of(score[d])] += 1.0
     used, share = np.zeros(rows.shape[0], np.bool_), min(FULL_SLOT * dt, 1.0)
     lasting = needed_shares(classes)
 
     # Objects: those that are gone are evaluated at once
-    after = np.zeros((objects_id.shape[0], SLOTS, SLOT), np.uint16)
+    kept_slots = np.zeros((objects_id.shape[0], SLOTS, SLOT), np.uint16)
     n = 0
     for k in range(objects_id.shape[0] + 1):
         last = k == objects_id.shape[0]
         while n < before_id.shape[0] and (last or before_id[n] < objects_id[k]):
-            own = before[n].copy()
+            own = slots[n].copy()
             for _ in range(SLOTS - 1):
                 next_slot(own, classes[before_label[n]], lasting[before_label[n]])
             n += 1
         if last:
             break
-        own = after[k]
+        own = kept_slots[k]
         if n < before_id.shape[0] and before_id[n] == objects_id[k]:
-            own[:] = before[n]
+            own[:] = slots[n]
             own[SLOTS - 1, TICKS] = min(own[SLOTS - 1, TICKS] + 1e4 * dt + 0.5, MOST_TICKS)
             n += 1
         if own[SLOTS - 1, TICKS] >= SLOT_TICKS and own[SLOTS - 1, OF_LOOKS] > 1:
@@ -260,8 +248,8 @@ def learn(
     kept = 0
     for j in range(fate.shape[0]):
         kept = max(kept, fate[j] + 1)
-    bins_after, components = np.empty(kept, np.int64), bins.shape[0]
-    for j in range(components):
+    bins_after, components = np.full(kept, NO_BIN), fate.shape[0] - rows.shape[0]
+    for j in range(bins.shape[0]):
         b = min(bins[j], BINS - 1)
         if fate[j] >= 0:
             bins_after[fate[j]] = b
@@ -279,42 +267,56 @@ def learn(
             mass = classes[c, first].sum()
             if mass > MASS:
                 classes[c, first:end] *= MASS / mass
-    return classes, after, bins_after
+    return classes, kept_slots, bins_after
+
+
+class Scores(NamedTuple):
+    """The scores of a frame.
+
+    Attributes:
+        before: the density that they are calibrated by.
+        given: (D,) of the detector.
+        meant: (D,) calibrated.
+        label: (D,) classes of the detections.
+    """
+
+    before: Density
+    given: Array
+    meant: Array
+    label: Index
+
+
+def calibrated(density: Density, frame: Frame, table: ClassTable) -> tuple[Scores, ClassTable]:
+    """Return the calibrated scores of a frame, and parameters whose thresholds they may be compared with."""
+    own, table = SelfCalibration.of(density), table.copy()
+    meant = read_only(calibrate(own.classes, frame.score, frame.label, table.classes))
+    return Scores(density, frame.score, meant, frame.label), table
 
 
 def followed(
-    own: SelfCalibration,
-    density: Density,
-    predicted: Density,
-    posterior: Density,
-    hit: Index,
-    fate: Index,
-    score: Array,
-    label: Index,
-    rows: Index,
-    table: ClassTable,
+    scores: Scores, prior: Density, posterior: Density, update: Update, rows: Index, moment: Moment, table: ClassTable
 ) -> SelfCalibration:
-    """Return the counts of the posterior, which go on from those of the density and of its prediction.
+    """Return the counts after a frame, and give the objects of the posterior the scores of the detector.
 
-    Args:
-        own: those of the density.
-        density: posterior of the frame before.
-        predicted: the prediction.
-        posterior: of this frame.
-        hit: (K,) measurement of each object of the posterior, negative where missed.
-        fate: of components and measurements, as `learn` takes it, as the next three.
-        score: (D,) of the detector.
-        label: (D,) classes.
+    Arguments of its own:
+        scores: of the frame.
+        posterior: not yet given away.
+        update: what it was made of.
         rows: (M,) detection of each measurement.
-        table: parameters as a table.
     """
-    first, now = density.stamp_ns == NO_FRAME, posterior.stamp_ns
-    dt = table.period if first else (now - density.stamp_ns) * 1e-9
-    old, new, poisson, bins = density.bernoulli, posterior.bernoulli, density.poisson, own.components
-    if len(predicted.poisson) < len(bins):
-        stamps = density.stamp_ns, True, now, table.period
-        bins = bins[rows_within(poisson.label, poisson.born_ns, *stamps, table.classes)]
-    looked = np.ones(len(new), np.bool_) if posterior.misses is None else posterior.misses.looked_ns == now
-    objects = own.objects, old.id, old.label, new.id, new.label, hit, looked
-    others = bins, predicted.poisson.label, fate, score, label, rows, dt
-    return SelfCalibration(*learn(own.classes.copy(), *objects, *others))
+    density, objects, hit = scores.before, posterior.bernoulli, update.measurement
+    own, old, poisson, fate = SelfCalibration.of(density), density.bernoulli, density.poisson, update.fate
+    objects.score[hit >= 0] *= (scores.given / scores.meant)[rows[hit[hit >= 0]]]
+    bins = own.components
+    if len(prior.poisson) < len(bins):
+        bins = bins[rows_within(poisson.label, poisson.born_ns, density.stamp_ns, True, moment, table.classes)]
+    if not len(posterior.poisson):  # perhaps without RPP
+        fate = np.where(fate >= 0, MARKED, fate)
+    looked = (
+        np.ones(len(objects), np.bool_) if posterior.misses is None else posterior.misses.looked_ns == moment.stamp_ns
+    )
+    after = objects.id, objects.label, hit, looked
+    counts = own.classes.copy(), own.objects, bins
+    detections = scores.given, scores.label, rows
+    found = learn(counts, (old.id, old.label), after, prior.poisson.label, fate, detections, moment.dt)
+    return SelfCalibration(*found)

@@ -8,32 +8,41 @@ the axes of the sensor, as the boxes are. Frames with a pose, and a sensor that 
 The motion is found by votes of pairs of one class for t, for each of some angles theta around a guess, and refined by
 least squares over the pairs that it brings together. The guess is the motion of the frame before.
 
-Traffic in one direction looks like a sensor that drives the other way. Objects that move along their own headings are
-therefore taken for traffic, and a sensor is taken to drive forwards, along its x or y axis, as vehicles can. Once the
-sensor is known to move, objects that drive are predicted before they are compared.
+Cars that approach a standing sensor together look like a sensor that drives towards parked cars: relative motion alone
+does not tell them apart, nor does the sign of headings, which detectors turn around. But a vehicle moves along its
+axis. Boxes that slip sideways stand, and the sensor moves. A motion is therefore weighed against none: each object
+drives along its axis, whichever way and up to the speed of its class, in the axes of the sensor or in those that the
+motion takes away. With c_0 and c_1 how far the nearest detection is from there, in squared standard deviations, a frame
+gives the evidence
+
+    sum_n (c_0 - c_1) / 2 - max_n (c_0 - c_1) / 2 - `FITTED`
+
+without the strongest object, so that one wrong box shows nothing, and less what three fitted numbers gain by chance.
+The motion is used when the sum over frames is enough, after a time that is long enough (`Density.sensor_motion`). Of
+traffic, and of rows of parked cars along the way, there is no evidence. Once the sensor is known to move, objects that
+drive are predicted before they are compared.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.density import NO_FRAME, PHI, V
-from optipmb.records import read_only
+from optipmb.density import ENOUGH, LEAST_MOVED_S, NO_FRAME, PHI, V
+from optipmb.rows import read_only
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from optipmb.density import Density
     from optipmb.frame import Frame
+    from optipmb.rows import Array, Index
+    from optipmb.table import ClassTable
 
-    Array = NDArray[np.float64]
-    Index = NDArray[np.int64]
-    Pairs = tuple[Array, Index, Array, Index]
 
 MOST: Final = 64
 """Objects nearest to the sensor, and detections of the highest scores, that are compared: the work is bounded."""
@@ -64,10 +73,16 @@ SHORTEST_S: Final = 0.005
 """Time between frames below which a sensor does not move."""
 LONGEST_S: Final = 2.0
 """Time between frames from which a motion is no guess of the next."""
-AHEAD: Final = 0.94
-"""Cosine of the angle to its heading up to which an object moves along it."""
-TRAFFIC: Final = 0.7
-"""Share of the objects that move along their headings from which the motion is theirs."""
+UNKNOWN: Final = 3.0
+"""Standard deviations of an unknown speed of its class that an object moves within."""
+APART: Final = 0.35
+"""Standard deviation of the distance between an object and its next detection, m."""
+TURNED: Final = 0.1
+"""That of the axis of a box, rad."""
+MOST_SIDEWAYS: Final = 2.0
+"""Evidence that an object gives at most."""
+FITTED: Final = 1.5
+"""Evidence that a motion gains by chance: half of its three numbers."""
 FORWARDS: Final = 0.96
 """Cosine of the angle to an axis of the sensor up to which it drives along it."""
 CORNERING: Final = 5.0
@@ -80,72 +95,99 @@ STANDING: Final = (0.3, 0.01)
 """Speed, m/s, and turn rate, rad/s, below which a sensor may be taken to stand again."""
 
 
-def follow_sensor(density: Density, frame: Frame) -> Density:
+class Pairs(NamedTuple):
+    """Objects and detections that may belong together.
+
+    Attributes:
+        start: (N, 2) places of the objects.
+        label: (N,) their classes.
+        target: (M, 2) places of the detections.
+        target_label: (M,) their classes.
+    """
+
+    start: Array
+    label: Index
+    target: Array
+    target_label: Index
+
+
+def follow_sensor(density: Density, frame: Frame, table: ClassTable) -> Density:
     """Carry a density into the axes of a frame without a pose, with the motion of the sensor found on the way.
 
-    Args:
-        density: posterior of the last frame, in the axes of that.
+    Arguments of its own:
         frame: with boxes in the axes of the sensor; a frame with a pose ends what was known of the motion.
 
     Returns:
         The density, the same where the sensor stands.
     """
-    before, dt = density.sensor_motion, (frame.stamp_ns - density.stamp_ns) * 1e-9
+    dt = (frame.stamp_ns - density.stamp_ns) * 1e-9
     if density.stamp_ns == NO_FRAME or dt < SHORTEST_S:
         return density
-    standing = density if before is None else replace(density, sensor_motion=None)
+    unknown = density if density.sensor is None else replace(density, sensor=None)
     if dt > LONGEST_S or (frame.pose is not None and not frame.pose.is_identity):
-        return standing
+        return unknown
     objects = density.bernoulli
     recent = np.flatnonzero((objects.seen_ns == density.stamp_ns) & (objects.existence >= SHARE))
     rows = recent[np.argsort(np.hypot(*objects.mean[recent, :2].T), kind="stable")[:MOST]]
     best = np.argsort(-frame.score, kind="stable")[:MOST]
-    pairs = (
-        np.ascontiguousarray(objects.mean[rows, :2]),
-        objects.label[rows],
-        np.ascontiguousarray(frame.center[best, :2]),
-        frame.label[best],
-    )
+    start, target = np.ascontiguousarray(objects.mean[rows, :2]), np.ascontiguousarray(frame.center[best, :2])
+    pairs = Pairs(start, objects.label[rows], target, frame.label[best])
     ahead = np.column_stack((np.cos(objects.mean[rows, PHI]), np.sin(objects.mean[rows, PHI])))
+    before = None if density.sensor_motion is None else density.sensor_motion * dt
     if before is not None:
-        found = _continued(pairs, objects.mean[rows, V, None] * dt * ahead, before * dt, dt)
+        found = _continued(pairs, objects.mean[rows, V, None] * dt * ahead, before, dt)
         if found is not None:
             still = math.hypot(found[0], found[1]) < STANDING[0] * dt and abs(found[2]) < STANDING[1] * dt
-            return standing if still else _carried(density, found, dt)
-    found = _begun(pairs, ahead, dt)
-    if found is None and before is not None and together(*pairs, np.zeros(3)).sum() < SHARE * len(rows):
-        found = before * dt  # neither gone on nor stopped: the next frame may tell
-    if found is None:
-        return standing
-    return _carried(density if before is not None else _over_ground(density, found, dt, frame), found, dt)
+            return unknown if still else _carried(density, found, dt)
+    found = _begun(pairs, dt)
+    after = unknown if found is None else _weighed(density, pairs, ahead, found, dt, table)
+    if found is not None and after.sensor_motion is not None:
+        return _carried(after if before is not None else _over_ground(after, found, dt, frame), found, dt)
+    if before is not None and together(pairs, np.zeros(3)).sum() < SHARE * len(rows):
+        return _carried(density, before, dt)  # neither gone on nor stopped: the next frame may tell
+    return after
 
 
 def _continued(pairs: Pairs, driven: Array, guess: Array, dt: float) -> Array | None:
     """Return the motion near that of the frame before, which stays where there are few objects; None if it is gone."""
-    start, label, target, target_label = pairs
-    start = start + np.where(np.hypot(*driven.T)[:, None] > MOVING * dt, driven, 0.0)
+    start = pairs.start + np.where(np.hypot(*driven.T)[:, None] > MOVING * dt, driven, 0.0)
     reach, turn, trust = 1.0 + CHANGE[0] * dt * dt, 0.02 + CHANGE[1] * dt * dt, (0.15 / (0.05 + dt * dt)) ** 2
-    found, count, _ = common_motion(start, label, target, target_label, guess, reach, turn, trust)
+    found, count, _ = common_motion(pairs._replace(start=start), guess, reach, turn, trust)
     if count >= max(CREW // 2, 0.5 * SHARE * len(start)):
         return found
     return guess if len(start) < CREW else None
 
 
-def _begun(pairs: Pairs, ahead: Array, dt: float) -> Array | None:
-    """Return the motion of a sensor that was not known to move; None where it stands, for all that can be told."""
-    start, few = pairs[0], len(pairs[0]) < CREW
-    apart = 1.0 - together(*pairs, np.zeros(3))
+def _begun(pairs: Pairs, dt: float) -> Array | None:
+    """Return a motion that a sensor may have begun; None where it stands, for all that can be told."""
+    start, few = pairs.start, len(pairs.start) < CREW
+    apart = 1.0 - together(pairs, np.zeros(3))
     if few or apart.sum() < STILL * len(start) or np.hypot(*start.T).mean() > FARTHEST:
         return None
-    found, count, cost = common_motion(*pairs, np.zeros(3), FASTEST[0] * dt, FASTEST[1] * dt, 0.0)
-    joined = together(*pairs, found) > 0.0
+    found, count, cost = common_motion(pairs, np.zeros(3), FASTEST[0] * dt, FASTEST[1] * dt, 0.0)
     if count < max(CREW, SHARE * len(start)) or cost > 0.5 * apart.sum():
         return None
-    moved = (taken(start, found) - start)[joined]
-    size = np.hypot(*moved.T)
-    traffic = ((moved * ahead[joined]).sum(axis=1) > AHEAD * size).mean() > TRAFFIC
+    size = np.hypot(*(taken(start, found) - start)[together(pairs, found) > 0.0].T)
     clear = size.mean() >= max(LEAST_MOTION[0], LEAST_MOTION[1] * dt)
-    return found if clear and not traffic and _drives(found, dt) else None
+    return found if clear and _drives(found, dt) else None
+
+
+def _weighed(density: Density, pairs: Pairs, ahead: Array, motion: Array, dt: float, table: ClassTable) -> Density:
+    """Return a density with a motion and the evidence for it, which goes on from one that is alike."""
+    cos, sin = math.cos(motion[2]), math.sin(motion[2])
+    turned = ahead @ np.array([[cos, sin], [-sin, cos]])
+    reach = (UNKNOWN * dt * table["birth_unknown"][:, V])[pairs.label]
+    walks = table["constant_velocity"][pairs.label]
+    standing = sideways(pairs, ahead, reach, walks)
+    moving = sideways(pairs._replace(start=taken(pairs.start, motion)), turned, reach, walks)
+    gained = standing - moving
+    evidence, seconds, rate = gained.sum() - max(gained.max(), 0.0) - FITTED, dt, motion / dt
+    before = density.sensor if density.sensor_motion is None else None
+    if before is not None:
+        off = rate - before[:3]
+        if math.hypot(off[0], off[1]) < 1.0 + CHANGE[0] * dt and abs(off[2]) < 0.1 + CHANGE[1] * dt:
+            evidence, seconds = evidence + before[3], seconds + before[4]
+    return replace(density, sensor=read_only(np.array([*rate, max(evidence, 0.0), seconds])))
 
 
 def _drives(motion: Array, dt: float) -> bool:
@@ -170,7 +212,7 @@ def _over_ground(density: Density, motion: Array, dt: float, frame: Frame) -> De
 
 def _carried(density: Density, motion: Array, dt: float) -> Density:
     """Return a density in the axes of a sensor that made a motion."""
-    parts = {}
+    parts: dict[str, Any] = {"sensor": read_only(np.array([*motion / dt, ENOUGH, LEAST_MOVED_S]))}
     cos, sin = math.cos(motion[2]), math.sin(motion[2])
     turn = np.eye(6)
     turn[:2, :2] = (cos, -sin), (sin, cos)
@@ -181,7 +223,7 @@ def _carried(density: Density, motion: Array, dt: float) -> Density:
         heading = mean[:, PHI] + motion[2]
         mean[:, PHI] = heading - 2.0 * math.pi * np.ceil((heading - math.pi) / (2.0 * math.pi))
         parts[name] = rows.replaced(mean=mean, covariance=turn @ rows.covariance @ turn.T)
-    return replace(density, **parts, sensor_motion=read_only(motion / dt))
+    return replace(density, **parts)
 
 
 def taken(points: Array, motion: Array) -> Array:
@@ -204,35 +246,51 @@ def nearest(x: float, y: float, label: int, target: Array, target_label: Index, 
 
 
 @kernel
-def together(start: Array, label: Index, target: Array, target_label: Index, motion: Array) -> Array:
-    """Return how near each point (N,) comes to a target of its class: 1 in its place, 0 from `NEAR` on."""
-    held = np.zeros(start.shape[0])
+def together(pairs: Pairs, motion: Array) -> Array:
+    """Return how near each start (N,) comes to a target of its class: 1 in its place, 0 from `NEAR` on."""
+    start, held = pairs.start, np.zeros(pairs.start.shape[0])
     cos, sin = math.cos(motion[2]), math.sin(motion[2])
     for n in range(start.shape[0]):
         x = cos * start[n, 0] - sin * start[n, 1] + motion[0]
         y = sin * start[n, 0] + cos * start[n, 1] + motion[1]
-        held[n] = 1.0 - nearest(x, y, label[n], target, target_label, NEAR * NEAR)[1] / (NEAR * NEAR)
+        held[n] = 1.0 - nearest(x, y, pairs.label[n], pairs.target, pairs.target_label, NEAR * NEAR)[1] / (NEAR * NEAR)
     return held
 
 
 @kernel
-def common_motion(
-    start: Array,
-    label: Index,
-    target: Array,
-    target_label: Index,
-    guess: Array,
-    reach: float,
-    turn: float,
-    trust: float,
-) -> tuple[Array, int, float]:
+def sideways(pairs: Pairs, ahead: Array, reach: Array, walks: NDArray[np.bool_]) -> Array:
+    """Return how far the nearest target is from where each object can have moved to, (N,) up to `MOST_SIDEWAYS`.
+
+    Half the square in standard deviations: across its axis, along which it drives as far as its reach; a walker reaches
+    a circle.
+
+    Args:
+        pairs: objects and detections.
+        ahead: (N, 2) axes of the objects.
+        reach: (N,) how far they can move, m.
+        walks: (N,) whether they can move any way.
+    """
+    out = np.full(pairs.start.shape[0], MOST_SIDEWAYS)
+    for n in range(out.shape[0]):
+        for m in range(pairs.target.shape[0]):
+            if pairs.target_label[m] != pairs.label[n]:
+                continue
+            dx, dy = pairs.target[m, 0] - pairs.start[n, 0], pairs.target[m, 1] - pairs.start[n, 1]
+            along, across = abs(dx * ahead[n, 0] + dy * ahead[n, 1]), dy * ahead[n, 0] - dx * ahead[n, 1]
+            if walks[n]:
+                along, across = math.hypot(dx, dy), 0.0
+            beyond, turned = max(along - reach[n], 0.0), 0.0 if walks[n] else TURNED * min(along, reach[n])
+            squared = (across * across + beyond * beyond) / (APART * APART + turned * turned)
+            out[n] = min(out[n], 0.5 * squared)
+    return out
+
+
+@kernel
+def common_motion(pairs: Pairs, guess: Array, reach: float, turn: float, trust: float) -> tuple[Array, int, float]:
     """Find the motion that most points have in common.
 
     Args:
-        start: (N, 2) points.
-        label: (N,) their classes.
-        target: (M, 2) where they may have come to.
-        target_label: (M,) classes.
+        pairs: points, and where they may have come to.
         guess: (3,) t and theta around which it is looked for.
         reach: how far t may be from the guess along each axis, m.
         turn: how far theta may be, rad.
@@ -241,6 +299,7 @@ def common_motion(
     Returns:
         The motion (3,), how many points it brings to targets, and the sum of their distances, each from 0 to 1.
     """
+    start, label, target, target_label = pairs.start, pairs.label, pairs.target, pairs.target_label
     motion, votes_best, far_best = guess.copy(), 0, math.inf
     side = min(MOST_CELLS, 2 * math.ceil(reach / CELL) + 2)
     low = -0.5 * CELL * side
@@ -270,8 +329,8 @@ def common_motion(
         for k in range(count):
             votes[voters[k, 0] + 1, voters[k, 1] + 1] = 0
     for limit in (2.0 * CELL, 1.5 * CELL, NEAR, NEAR, NEAR):
-        _refine(start, label, target, target_label, limit, guess, trust, motion)
-    held = together(start, label, target, target_label, motion)
+        _refine(pairs, limit, guess, trust, motion)
+    held = together(pairs, motion)
     count = 0
     for n in range(held.shape[0]):
         count += held[n] > 0.0
@@ -279,49 +338,41 @@ def common_motion(
 
 
 @kernel
-def _refine(
-    start: Array,
-    label: Index,
-    target: Array,
-    target_label: Index,
-    limit: float,
-    guess: Array,
-    trust: float,
-    motion: Array,
-) -> None:
+def _refine(pairs: Pairs, limit: float, guess: Array, trust: float, motion: Array) -> None:
     """Fit `motion` to the pairs that it brings within a limit, and to the guess at four places, by least squares."""
     cos, sin = math.cos(motion[2]), math.sin(motion[2])
+    start, target = pairs.start, pairs.target
     total = p_x = p_y = q_x = q_y = 0.0
-    pairs, weights = np.empty((start.shape[0] + 4, 4)), np.empty(start.shape[0] + 4)
+    joined, weights = np.empty((start.shape[0] + 4, 4)), np.empty(start.shape[0] + 4)
     count = 0
     for n in range(start.shape[0]):
         x = cos * start[n, 0] - sin * start[n, 1] + motion[0]
         y = sin * start[n, 0] + cos * start[n, 1] + motion[1]
-        m = nearest(x, y, label[n], target, target_label, limit * limit)[0]
+        m = nearest(x, y, pairs.label[n], target, pairs.target_label, limit * limit)[0]
         if m >= 0:
-            pairs[count, 0], pairs[count, 1] = start[n, 0], start[n, 1]
-            pairs[count, 2], pairs[count, 3] = target[m, 0], target[m, 1]
+            joined[count, 0], joined[count, 1] = start[n, 0], start[n, 1]
+            joined[count, 2], joined[count, 3] = target[m, 0], target[m, 1]
             weights[count] = 1.0
             count += 1
     cos, sin = math.cos(guess[2]), math.sin(guess[2])
     for x, y in ((15.0, 0.0), (-15.0, 0.0), (0.0, 15.0), (0.0, -15.0)):
-        pairs[count, 0], pairs[count, 1] = x, y
-        pairs[count, 2], pairs[count, 3] = cos * x - sin * y + guess[0], sin * x + cos * y + guess[1]
+        joined[count, 0], joined[count, 1] = x, y
+        joined[count, 2], joined[count, 3] = cos * x - sin * y + guess[0], sin * x + cos * y + guess[1]
         weights[count] = 0.25 * trust
         count += 1
     for k in range(count):
         w = weights[k]
         total += w
-        p_x += w * pairs[k, 0]
-        p_y += w * pairs[k, 1]
-        q_x += w * pairs[k, 2]
-        q_y += w * pairs[k, 3]
+        p_x += w * joined[k, 0]
+        p_y += w * joined[k, 1]
+        q_x += w * joined[k, 2]
+        q_y += w * joined[k, 3]
     if total < TWO:
         return
     p_x, p_y, q_x, q_y = p_x / total, p_y / total, q_x / total, q_y / total
     dot = cross = 0.0
     for k in range(count):
-        x, y, u, v = pairs[k, 0] - p_x, pairs[k, 1] - p_y, pairs[k, 2] - q_x, pairs[k, 3] - q_y
+        x, y, u, v = joined[k, 0] - p_x, joined[k, 1] - p_y, joined[k, 2] - q_x, joined[k, 3] - q_y
         dot += weights[k] * (x * u + y * v)
         cross += weights[k] * (x * v - y * u)
     theta = math.atan2(cross, dot) if dot != 0.0 or cross != 0.0 else motion[2]

@@ -37,7 +37,7 @@ class ClassRow(Protocol):
         noise_position: standard deviation of z_x and z_y.
         noise_velocity: of z_vx and z_vy.
         noise_heading: of z_phi.
-        reported_position: variance that R_x of `optipmb.reported` leaves for z_x and z_y; zero without it.
+        reported_position: variance that R_x of `optipmb.calibration` leaves for z_x and z_y; zero without it.
         reported_heading: for z_phi.
         birth_known: (6,) standard deviations of P^0 when the detection brings a velocity.
         birth_unknown: (6,) when it does not.
@@ -215,7 +215,7 @@ def _values(p: ClassParameters) -> dict[str, Any]:
 
 
 def _left_over(parameters: ClassParameters, name: str) -> float:
-    """R_x of `optipmb.reported`: 1 / (1 / R' - 1 / R), zero where boxes are reported as they are."""
+    """R_x of `optipmb.calibration`: 1 / (1 / R' - 1 / R), zero where boxes are reported as they are."""
     if parameters.reported_noise is None:
         return 0.0
     reported, measured = getattr(parameters.reported_noise, name), getattr(parameters.measurement_noise, name)

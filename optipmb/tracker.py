@@ -3,120 +3,123 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from optipmb.association import associate
-from optipmb.birth import first_detected_states
-from optipmb.births_beside import forbid_births
-from optipmb.class_posterior import UNGROUPED, update_classes
+from optipmb.association import associate, forbid_births, surviving_objects
+from optipmb.class_posterior import UNGROUPED, Groups, update_classes
 from optipmb.compiled import kernel
 from optipmb.density import (
     NO_FRAME,
     OBJECT,
     Bernoullis,
     Density,
+    Moment,
     Poissons,
-    SelfCalibration,
     components_in,
     misses_counted_from,
     objects_in,
 )
-from optipmb.detection_probability import detection_probability, over_time
-from optipmb.effort import UNLIMITED, check_effort
+from optipmb.detection_probability import detection_probability
 from optipmb.errors import FrameError
 from optipmb.extract import extract
-from optipmb.field_of_view import detection_probability_in_view, follow_looks, look
-from optipmb.hypotheses import local_hypotheses
+from optipmb.field_of_view import follow_looks, look
+from optipmb.hypotheses import UNLIMITED, check_effort, local_hypotheses
 from optipmb.lightweight import light_weight_filter
 from optipmb.paths import paths_of
 from optipmb.predict import predict
 from optipmb.preprocess import Measurements, preprocess
-from optipmb.prune import Survivors, surviving_objects
-from optipmb.records import read_only, record
-from optipmb.self_calibration import calibrate, followed
+from optipmb.rows import record
+from optipmb.self_calibration import calibrated, followed
 from optipmb.sensor_motion import follow_sensor
 from optipmb.table import ClassTable
 from optipmb.undetected import update_undetected, with_measurement_births
-from optipmb.update import ukf_updates
+from optipmb.update import first_detected_states, ukf_updates
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
     from optipmb.extract import Tracks
-    from optipmb.field_of_view import Looks
-    from optipmb.frame import Frame, PointCloud
+    from optipmb.frame import Frame
     from optipmb.parameters import Parameters
     from optipmb.paths import PredictedPaths
-    from optipmb.records import Columns
+    from optipmb.rows import Array, Columns, Index
     from optipmb.table import ClassRow
 
-    Array = NDArray[np.float64]
-    Index = NDArray[np.int64]
+
+class Prior(NamedTuple):
+    """The prediction as kernels take it.
+
+    Attributes:
+        objects: array of the predicted objects.
+        missed_from_ns: `Density.missed_from_ns` of them.
+        class_probability: (N, C) their class posteriors, (N, 0) where no classes have a group in common.
+        components: array of the predicted Poisson components; behind them, without HABM, are those of the measurements.
+        n_predicted: how many of them were predicted.
+        next_id: id of the first new object.
+    """
+
+    objects: Array
+    missed_from_ns: Index
+    class_probability: Array
+    components: Array
+    n_predicted: int
+    next_id: int
+
+
+class Update(NamedTuple):
+    """The PMB update of Algorithm 1.
+
+    Attributes:
+        objects: array of the objects of the posterior.
+        class_probability: (K, C) their class posteriors, or (K, 0).
+        components: array of the Poisson components.
+        fate: of the predicted ones (`optipmb.undetected.update_undetected`).
+        row: (K,) predicted object of each object of the posterior, or `optipmb.association.NEW`.
+        measurement: (K,) its measurement, negative where missed.
+        known: how many objects are known ones.
+        detected: how many of those have a measurement.
+        repaired: how many covariances had to be repaired.
+    """
+
+    objects: Array
+    class_probability: Array
+    components: Array
+    fate: Index
+    row: Index
+    measurement: Index
+    known: int
+    detected: int
+    repaired: int
 
 
 @kernel
 def update(
-    object_words: Array,
-    class_probability: Array,
-    detection: Array,
-    by_class: bool,
-    missed_from_ns: Index,
-    component_words: Array,
-    n_predicted: int,
-    measurements: Columns,
-    dt: float,
-    stamp_ns: int,
-    before_ns: int,
-    next_id: int,
-    adaptive: bool,
-    period: float,
-    confusion: Array,
-    classes: Sequence[ClassRow],
-) -> tuple[Array, Array, Array, Index, Index, Index, int, int, int]:
-    """Update the prediction with the measurements: the PMB update of Algorithm 1.
+    prior: Columns, p_d: Array, measurements: Columns, moment: Columns, confusion: Array, classes: Sequence[ClassRow]
+) -> Columns:
+    """Update the prediction with the measurements, and return the fields of `Update`.
 
-    Args:
-        object_words: array of the predicted objects.
-        class_probability: (N, C) their class posteriors, (0, 0) where no classes have a group in common.
-        detection: (N + J,) detection probabilities of the objects and, behind them, of the components.
-        by_class: whether it has those of the classes instead, (C,).
-        missed_from_ns: `Density.missed_from_ns` of the prediction.
-        component_words: array of the predicted Poisson components; behind them, without HABM, are those of the
-            measurements.
-        n_predicted: how many of them were predicted.
-        measurements: Z_k.
-        dt: s since the frame before.
-        stamp_ns: stamp of the frame.
-        before_ns: stamp of the frame before.
-        next_id: id of the first new object.
-        adaptive: whether HABM is on.
-        period: nominal period, s.
-        confusion: (C, C) Lambda of `optipmb.class_posterior`, (0, 0) likewise.
-        classes: (C,) parameters.
-
-    Returns:
-        The array of the objects, their class posteriors, the array of the Poisson components and their fates; the other
-        fields of `Survivors`; how many covariances had to be repaired.
+    Arguments of its own:
+        prior: the fields of `Prior`.
+        p_d: (N + J,) detection probabilities of the objects and, behind them, of the components.
+        measurements: those of `Measurements`.
+        moment: those of `Moment`.
+        confusion: (C, C) Lambda of `optipmb.class_posterior`, (0, 0) where no classes have a group in common.
     """
-    z = Measurements(*measurements)
-    objects, components = objects_in(object_words), components_in(component_words)
-    since_ns, count = misses_counted_from(objects, missed_from_ns), objects.label.shape[0]
-    p_d, p_d_poisson = detection[:count], detection[count:]
-    if by_class:
-        p_d, p_d_poisson = detection[objects.label], detection[components.label]
+    given, z, now = Prior(*prior), Measurements(*measurements), Moment(*moment)
+    objects, components = objects_in(given.objects), components_in(given.components)
+    since_ns, count = misses_counted_from(objects, given.missed_from_ns), objects.label.shape[0]
+    groups = Groups(given.class_probability, confusion)
 
     # Local hypotheses: missed, detected, first-time detected; HABM
-    hypotheses = local_hypotheses(objects, class_probability, p_d, components, p_d_poisson, z, dt, confusion, classes)
+    hypotheses = local_hypotheses(objects, components, p_d, z, groups, now.dt, classes)
 
     # Data association: the best global hypothesis, and what of it outlives the pruning of the MB
     row, measurement, cost = hypotheses.row, hypotheses.measurement, hypotheses.detection_cost
-    assigned = associate(row, measurement, cost, hypotheses.first_cost, p_d.shape[0])
-    forbid_births(objects, assigned, hypotheses, z, since_ns, stamp_ns, period, classes)
-    kept = surviving_objects(objects, p_d, assigned, hypotheses, z.label, since_ns, stamp_ns, period, classes)
+    assigned = associate(row, measurement, cost, hypotheses.first_cost, count)
+    forbid_births(objects, assigned, hypotheses, z, since_ns, now, classes)
+    kept = surviving_objects(objects, p_d[:count], assigned, hypotheses, z.label, since_ns, now, classes)
 
     # Motion states: detected and missed objects by the UKF, then the births of first-time detections
     known, words = kept.known, np.empty(kept.row.shape[0] * OBJECT)
@@ -128,13 +131,11 @@ def update(
     )
 
     # Other states: class, light-weight filter
-    label, class_probability = update_classes(kept, objects.label, class_probability, z, confusion, classes)
-    light_weight_filter(kept, label, posterior, objects, next_id, z, stamp_ns, before_ns, period, classes)
+    class_probability = update_classes(kept, objects.label, posterior.label, z, groups, classes)
+    light_weight_filter(kept, posterior, objects, given.next_id, z, now, classes)
 
     # Undetected objects: PPP update, RPP, and the births of HABM
-    undetected, fate = update_undetected(
-        components, p_d_poisson, n_predicted, hypotheses, z, stamp_ns, period, classes, adaptive
-    )
+    undetected, fate = update_undetected(components, p_d[count:], given.n_predicted, hypotheses, z, now, classes)
     return words, class_probability, undetected, fate, kept.row, kept.measurement, known, kept.detected, repaired
 
 
@@ -225,19 +226,12 @@ class Tracker:
     gates of objects. What a step costs is nearly proportional to them, about a microsecond each.
     """
 
-    def __init__(
-        self,
-        parameters: Parameters,
-        modules: Modules | None = None,
-        *,
-        max_pairs: int = UNLIMITED,
-    ) -> None:
+    def __init__(self, parameters: Parameters, modules: Modules | None = None, *, max_pairs: int = UNLIMITED) -> None:
         self._max_pairs = max_pairs
         self.parameters = parameters
         self.modules = modules if modules is not None else Modules()
         self._labels = parameters.labels
         self._table = ClassTable.of(parameters)
-        self._detection = self._table["detection"].copy()
         self._horizons = np.array(parameters.horizons, np.float64)
 
     def initial(self, next_id: int = 1) -> Density:
@@ -260,109 +254,67 @@ class Tracker:
             DensityError: the parts of the density do not fit together, or a label is of no class.
             EffortError: the frame needs more than `max_pairs` pairs looked at; nothing costly was done yet.
         """
-        self._check(density, frame)
-        now, table, modules = frame.stamp_ns, self._table, self.modules
-        dt = table.period if density.stamp_ns == NO_FRAME else (now - density.stamp_ns) * 1e-9
+        moment, table, modules = self._moment(density, frame), self._table, self.modules
+        cloud = frame.cloud if modules.adp else None
         if self.parameters.sensor_motion:
-            density = follow_sensor(density, frame)
+            density = follow_sensor(density, frame, table)
 
         # PMB prediction
-        predicted, repaired = predict(density, now, table)
-        bernoulli, poisson = predicted.bernoulli, predicted.poisson
+        predicted, repaired = predict(density, moment, table)
 
-        # Measurements, and the detection probabilities p_d(x_+) of what is in view
-        own, score = None, frame.score
+        # Measurements
+        scores, score = None, frame.score
         if self.parameters.self_calibration:
-            own, table = SelfCalibration.of(density), table.copy()
-            score = read_only(calibrate(own.classes, score, frame.label, table.classes))
-        measurements, chosen, below_score, suppressed = preprocess(frame, table, self._max_pairs, score)
-        check_effort(bernoulli, poisson, measurements, dt, table, self._max_pairs)
-        if not modules.habm:
-            poisson = with_measurement_births(poisson, measurements, now, table)
-        looks, poisson = look(frame.field_of_view, predicted, poisson, density.stamp_ns, table)
-        cloud = frame.cloud if modules.adp else None
-        by_class = cloud is None and looks is None
-        p_d = self._detection_probabilities(bernoulli, poisson, cloud, looks, dt)
+            scores, table = calibrated(density, frame, table)
+            score = scores.meant
+        z, chosen, below_score, suppressed = preprocess(frame, table, self._max_pairs, score)
+        check_effort(predicted, z, moment.dt, table, self._max_pairs)
+
+        # Detection probabilities p_d(x_+) of what is in view
+        prior = predicted if modules.habm else with_measurement_births(predicted, z, table)
+        looks, prior = look(frame.field_of_view, prior, moment, table)
+        p_d = detection_probability(prior, cloud, looks, moment, table)
 
         # PMB update: hypotheses, association, states, births
-        missed_from_ns = predicted.missed_from_ns if looks is None else looks.misses.missed_from_ns
-        pi = predicted.class_probability
-        words, class_probability, undetected, fate, row, hits, known, detected, repaired_now = update(
-            bernoulli.words,
-            UNGROUPED if pi is None else pi,
-            p_d,
-            by_class,
+        missed_from_ns = prior.missed_from_ns if looks is None else looks.misses.missed_from_ns
+        likely = UNGROUPED if prior.class_probability is None else prior.class_probability
+        given = (
+            prior.bernoulli.words,
             missed_from_ns,
-            poisson.words,
+            likely,
+            prior.poisson.words,
             len(predicted.poisson),
-            tuple(measurements),
-            dt,
-            now,
-            density.stamp_ns,
-            predicted.next_id,
-            modules.habm,
-            table.period,
-            table.confusion,
-            table.classes,
+            prior.next_id,
         )
-        objects, misses = Bernoullis.of(words), None
-        if looks is not None:
-            survivors = Survivors(row, hits, objects.existence, known, detected)
-            misses = follow_looks(looks, survivors, bernoulli, objects, measurements, now, table)
-        born = len(objects) - known
-        poisson = Poissons.of(undetected) if modules.rpp else Poissons.empty()
-        pi = None if pi is None else class_probability
-        posterior = Density(now, predicted.next_id + born, objects, poisson, density.labels, misses, pi)
-        if own is not None:
-            objects.score[hits >= 0] *= (frame.score / score)[chosen[hits[hits >= 0]]]
-            given = frame.score, frame.label, chosen
-            own = followed(own, density, predicted, posterior, hits, fate, *given, table)
+        after = Update(*update(given, p_d, tuple(z), tuple(moment), table.confusion, table.classes))
+        objects = Bernoullis.of(after.objects)
+        poisson = Poissons.of(after.components) if modules.rpp else Poissons.empty()
+        misses = None if looks is None else follow_looks(looks, after, prior.bernoulli, objects, z, moment, table)
+        pi = None if prior.class_probability is None else after.class_probability
+        born = len(objects) - after.known
+        posterior = Density(moment.stamp_ns, prior.next_id + born, objects, poisson, density.labels, misses, pi)
+        if scores is not None:
+            own = followed(scores, predicted, posterior, after, chosen, moment, table)
             posterior = replace(posterior, self_calibration=own)
-        if density.sensor_motion is not None:
-            posterior = replace(posterior, sensor_motion=density.sensor_motion)
+        if density.sensor is not None:
+            posterior = replace(posterior, sensor=density.sensor)
 
         # Track extraction
-        tracks = extract(objects, posterior.missed_from_ns, hits, measurements, now, table, two_thresholds=modules.ote)
+        tracks = extract(posterior, after.measurement, z, moment, table, two_thresholds=modules.ote)
         paths = paths_of(tracks, self._horizons, table) if self._horizons.size else None
-
-        diagnostics = Diagnostics(
-            cloud is not None,
-            frame.score.shape[0],
-            below_score,
-            suppressed,
-            detected,
-            born,
-            repaired + repaired_now,
-        )
         pi = None if pi is None else pi[np.searchsorted(objects.id, tracks.id)]
+        removed, repaired = (frame.score.shape[0], below_score, suppressed), repaired + after.repaired
+        diagnostics = Diagnostics(cloud is not None, *removed, after.detected, born, repaired)
         return StepResult(posterior, tracks, diagnostics, paths, pi)
 
-    def _check(self, density: Density, frame: Frame) -> None:
-        """Refuse other classes, which kernels would read out of bounds for, and frames of the past."""
+    def _moment(self, density: Density, frame: Frame) -> Moment:
+        """Return the time of a frame; refuse the past, and other classes, for which kernels read out of bounds."""
         labels = self._labels
         for path, given in (("labels", frame.labels), ("density.labels", density.labels)):
             if given != labels:
                 raise FrameError(path, f"the classes of profile {self.parameters.name}, {labels}", str(given)[:200])
         if density.stamp_ns != NO_FRAME and frame.stamp_ns < density.stamp_ns:
             raise FrameError("stamp_ns", f"a stamp from {density.stamp_ns} on", str(frame.stamp_ns))
-
-    def _detection_probabilities(
-        self, bernoulli: Bernoullis, poisson: Poissons, cloud: PointCloud | None, looks: Looks | None, dt: float
-    ) -> Array:
-        """Compute p_d(x_+) of objects and, behind them, of Poisson components, in one pass over the cloud.
-
-        Without a cloud and a field of view it is that of the class: then of each class.
-        """
-        share = dt / self._table.detection_time if self._table.detection_time > 0.0 else 1.0
-        if cloud is None and looks is None:
-            return over_time(self._detection, share)
-        p_d = detection_probability(
-            np.concatenate((bernoulli.mean, poisson.mean)),
-            np.concatenate((bernoulli.auxiliary, poisson.auxiliary)),
-            np.concatenate((bernoulli.label, poisson.label)),
-            cloud,
-            self._table,
-        )
-        if looks is None:
-            return over_time(p_d, share)
-        return detection_probability_in_view(p_d, looks, share, self._table)
+        period = self._table.period
+        dt = period if density.stamp_ns == NO_FRAME else (frame.stamp_ns - density.stamp_ns) * 1e-9
+        return Moment(frame.stamp_ns, density.stamp_ns, dt, period)

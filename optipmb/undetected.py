@@ -6,26 +6,25 @@ frames may find (hybrid adaptive birth model, HABM, Section IV.G).
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from optipmb.birth import birth_states
 from optipmb.compiled import kernel
 from optipmb.density import COMPONENT, Poissons, components_in, copy_state, whole_periods
 from optipmb.hypotheses import CLUTTER
+from optipmb.update import birth_states
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
+    from optipmb.density import Density, Moment
     from optipmb.hypotheses import Hypotheses
     from optipmb.preprocess import Measurements
+    from optipmb.rows import Array, Index
     from optipmb.table import ClassRow, ClassTable
 
-    Array = NDArray[np.float64]
-    Index = NDArray[np.int64]
 
 AGED: Final = -1
 MARKED: Final = -2
@@ -39,10 +38,8 @@ def update_undetected(
     n_predicted: int,
     hypotheses: Hypotheses,
     measurements: Measurements,
-    stamp_ns: int,
-    period: float,
+    moment: Moment,
     classes: Sequence[ClassRow],
-    adaptive: bool,
 ) -> tuple[Array, Index]:
     """Return the array of the Poisson components that stay under RPP, and of lambda_b; and the fate of each, (J + M,).
 
@@ -59,18 +56,12 @@ def update_undetected(
     lambda_b has a component for each low-scored measurement of M_low, of weight ``mu_b = mu_ab (1 - p_a)`` (eq. HABM);
     a zero weight makes none.
 
-    Args:
+    Arguments of its own:
         components: the components.
-        p_d: (J,) their detection probabilities.
-        n_predicted: how many of them were predicted; those behind were made by the measurements of this frame
-            (without HABM), and are not used up by the very measurement that has just made them.
-        hypotheses: of this frame.
-        measurements: Z_k.
-        stamp_ns: stamp of the frame.
-        period: nominal period, s.
-        classes: (C,) parameters.
-        adaptive: whether HABM is on; off: nothing is born here.
+        n_predicted: how many of them were predicted; those behind were made by the measurements of this frame, which
+            do not use them up. Then nothing is born here: HABM is off.
     """
+    adaptive = n_predicted == p_d.shape[0]
     capacity = p_d.shape[0] + measurements.score.shape[0]
     fate = np.full(capacity, AGED, np.int64)
     for k in range(hypotheses.component.shape[0]):
@@ -80,7 +71,7 @@ def update_undetected(
     chosen, weight = np.empty(capacity, np.int64), np.empty(capacity)
     old = 0
     for j in range(p_d.shape[0]):
-        steps = whole_periods(components.born_ns[j], stamp_ns, period)
+        steps = whole_periods(components.born_ns[j], moment.stamp_ns, moment.period)
         if fate[j] != MARKED and steps <= classes[components.label[j]].poisson_steps:
             chosen[old], weight[old], fate[j] = j, components.weight[j] * (1.0 - p_d[j]), old
             old += 1
@@ -93,7 +84,7 @@ def update_undetected(
             chosen[count], weight[count], fate[p_d.shape[0] + m] = m, born, count
             count += 1
     kept, born_of = chosen[:old], chosen[old:count]
-    return with_births(components, kept, born_of, weight[:count], measurements, stamp_ns, classes), fate
+    return with_births(components, kept, born_of, weight[:count], measurements, moment.stamp_ns, classes), fate
 
 
 @kernel
@@ -108,14 +99,11 @@ def with_births(
 ) -> Array:
     """Return the array of the components that stay and, behind them, of those that are born.
 
-    Args:
+    Arguments of its own:
         components: the components.
         kept: (K,) which of them stay.
         born: (L,) measurements that make a component each.
         weight: (K + L,) weights of all.
-        measurements: Z_k.
-        stamp_ns: stamp of the frame.
-        classes: (C,) parameters.
     """
     old, count = kept.shape[0], weight.shape[0]
     words = np.empty(count * COMPONENT)
@@ -137,11 +125,10 @@ def with_births(
     return words
 
 
-def with_measurement_births(
-    poisson: Poissons, measurements: Measurements, stamp_ns: int, table: ClassTable
-) -> Poissons:
+def with_measurement_births(prior: Density, measurements: Measurements, table: ClassTable) -> Density:
     """Add a component of weight `baseline_birth_rate` for every measurement: GNN-PMB's birth model, the baseline."""
+    poisson, stamp_ns = prior.poisson, prior.stamp_ns
     weight = np.concatenate((poisson.weight, table["baseline_birth_rate"][measurements.label]))
     kept, born = np.arange(len(poisson)), np.arange(measurements.score.shape[0])
-    components = components_in(poisson.words)
-    return Poissons.of(with_births(components, kept, born, weight, measurements, stamp_ns, table.classes))
+    words = with_births(components_in(poisson.words), kept, born, weight, measurements, stamp_ns, table.classes)
+    return replace(prior, poisson=Poissons.of(words))

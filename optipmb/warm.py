@@ -11,13 +11,13 @@ import numpy as np
 from numba.core.dispatcher import Dispatcher
 
 from optipmb.errors import EffortError
+from optipmb.extract import sound
 from optipmb.field_of_view import FieldOfView
 from optipmb.frame import PointCloud, Pose, make_frame
 from optipmb.geometry import bev_iou
 from optipmb.parameters import load_profile, parse_parameters
 from optipmb.paths import predict_tracks
-from optipmb.sensor_motion import common_motion
-from optipmb.soundness import sound
+from optipmb.sensor_motion import Pairs, common_motion, sideways
 from optipmb.tracker import Modules, Tracker
 
 
@@ -55,7 +55,9 @@ def warm_up() -> int:
         _run()
         bev_iou(np.zeros((1, 5)), np.zeros((1, 5)))
         place, label = np.zeros((1, 2)), np.zeros(1, np.int64)
-        common_motion(place, label, place, label, np.zeros(3), 0.0, 0.0, 0.0)
+        pairs = Pairs(place, label, place, label)
+        common_motion(pairs, np.zeros(3), 0.0, 0.0, 0.0)
+        sideways(pairs, place, np.zeros(1), np.zeros(1, np.bool_))
     finally:
         gc.set_threshold(*thresholds)
     return compilations() - before

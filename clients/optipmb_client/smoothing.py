@@ -3,7 +3,7 @@
 The unscented Rauch-Tung-Striebel smoother (Särkkä, "Unscented Rauch-Tung-Striebel smoother", IEEE Transactions on
 Automatic Control 53(3), 2008), with the motion models of the tracker. From the last state of a track to its first,
 
-    X = m_k +- sqrt(n) S_k,  P_k = S_k S_k'        sigma points, as in `optipmb.motion`
+    X = m_k +- sqrt(n) S_k,  P_k = S_k S_k'        sigma points, as in `optipmb.predict`
     m-, P-                                         mean and covariance of f(X); P- with Q
     D   = sum w (X - m_k) (f(X) - m-)'
     G   = D (P-)^-1
@@ -11,10 +11,10 @@ Automatic Control 53(3), 2008), with the motion models of the tracker. From the 
     P^s_k = P_k + G (P^s_{k+1} - P-) G'
 
 m_k and P_k are the state and covariance of every frame in which the filter holds the object; in frames in which it is a
-track, those of its published box (`optipmb.reported`). So frames without detection need no rule of their own.
+track, those of its published box (`optipmb.calibration`). So frames without detection need no rule of their own.
 
 An object does not turn by pi from frame to frame, so one sign of the heading holds for the whole track: the one in
-favour of which the mean of the log odds (`optipmb.heading`) is; and this mean is the confidence in it.
+favour of which the mean of the log odds (`optipmb.lightweight`) is; and this mean is the confidence in it.
 
 Size, height, existence and score stay as the tracker tells them.
 """
@@ -27,13 +27,13 @@ import numpy as np
 from optipmb import Density, Parameters, Tracks
 from optipmb.calibration import calibrate_rows
 from optipmb.density import OMEGA, PHI, STATE, A, V
-from optipmb.heading import doubt, sign_probability
-from optipmb.motion import ORDER, SPREAD, WEIGHT, predict_state
+from optipmb.lightweight import doubt, sign_probability
+from optipmb.predict import ORDER, SPREAD, WEIGHT, predict_state
 from optipmb.table import ClassTable
 from optipmb_client.geometry import Bools, Floats, Ints, wrap_angle
 
 _TURN: Final = np.array([-1.0 if s in {V, A} else 1.0 for s in range(STATE)])
-"""Diagonal of T: x -> T x and phi + pi describes the same motion (`optipmb.heading`)."""
+"""Diagonal of T: x -> T x and phi + pi describes the same motion (`optipmb.lightweight`)."""
 
 
 class Smoother:

@@ -17,7 +17,7 @@ from optipmb_client.smoothing import smooth
 from optipmb_schemas import Tracks
 
 from optipmb import load_profile
-from optipmb.heading import turn_around
+from optipmb.lightweight import turn_around
 from optipmb.table import ClassTable
 
 Array = NDArray[np.float64]

@@ -16,7 +16,7 @@ from optipmb_client.tuning.values import only
 from tuning_cases import Habits, Recorded, recorded
 
 import optipmb
-from optipmb.score_calibration import calibrated
+from optipmb.frame import calibrated
 
 RULES = rules_of("scene")
 CARS = only(optipmb.load_profile("kitti"), "Car")

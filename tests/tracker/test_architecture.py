@@ -91,10 +91,10 @@ def test_modules_do_not_import_each_other_in_circles() -> None:
 
 
 def test_every_module_is_described_and_of_readable_length() -> None:
-    """A docstring each, and at most 400 lines."""
+    """A docstring each, and at most 1,000 lines."""
     for name, tree in MODULES.items():
         assert ast.get_docstring(tree), name
-        assert len((FOLDER / f"{name}.py").read_text(encoding="utf-8").splitlines()) <= 400, name
+        assert len((FOLDER / f"{name}.py").read_text(encoding="utf-8").splitlines()) <= 1000, name
 
 
 def test_the_public_names_exist_and_are_described() -> None:

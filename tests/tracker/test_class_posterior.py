@@ -11,11 +11,11 @@ from class_rows import class_rows
 from scenes import random_parameters
 
 import optipmb
-from optipmb.class_posterior import CHANGE_ODDS, UNGROUPED, label_probability, update_classes, weigh_by_class
-from optipmb.gating import gate, groups
+from optipmb.association import NEW, Survivors
+from optipmb.class_posterior import CHANGE_ODDS, UNGROUPED, Groups, label_probability, update_classes, weigh_by_class
+from optipmb.hypotheses import gate, groups
 from optipmb.parameters import parse_parameters
 from optipmb.preprocess import Measurements
-from optipmb.prune import NEW, Survivors
 from optipmb.table import ClassTable
 
 if TYPE_CHECKING:
@@ -85,7 +85,8 @@ def test_the_posterior_is_bayes_rule(seed: int) -> None:
     measurement[10:] = 10, 11
     z = Measurements(UNGROUPED, UNGROUPED, UNGROUPED, UNGROUPED, score, measured, measured)
     classes = class_rows(4, group=GROUP, group_size=SIZE)
-    found, pi = update_classes(Survivors(row, measurement, score, 10, 0), label, before, z, confusion, classes)
+    survivors, found = Survivors(row, measurement, score, 10, 0), np.empty(12, np.int64)
+    pi = update_classes(survivors, label, found, z, Groups(before, confusion), classes)
     changed = 0
     for k in range(12):
         m, own = measurement[k], measured[k] if row[k] == NEW else label[k]
@@ -97,8 +98,8 @@ def test_the_posterior_is_bayes_rule(seed: int) -> None:
         assert found[k] == (best if changes else own)
         changed += int(found[k] != own)
     assert changed
-    named, nothing = update_classes(Survivors(row, measurement, score, 10, 0), label, UNGROUPED, z, UNGROUPED, classes)
-    np.testing.assert_array_equal(named, np.where(row == NEW, measured, label))
+    nothing = update_classes(survivors, label, found, z, Groups(UNGROUPED, UNGROUPED), classes)
+    np.testing.assert_array_equal(found, np.where(row == NEW, measured, label))
     assert nothing.shape == (12, 0)
 
 
@@ -120,7 +121,7 @@ def test_pairs_weigh_by_what_the_detector_calls_them(seed: int) -> None:
     wanted = np.argwhere(near & (GROUP[label][:, None] == GROUP[measured]))
     np.testing.assert_array_equal(np.column_stack((row, measurement)), wanted)
     z = Measurements(position, UNGROUPED, UNGROUPED, UNGROUPED, score, measured, measured)
-    weigh_by_class(row, measurement, found, pi, z, confusion, classes)
+    weigh_by_class(row, measurement, found, z, Groups(pi, confusion), classes)
     for n, m, value in zip(row, measurement, found, strict=True):
         p = pi[n] @ likelihoods(confusion, measured[m], score[m])
         variance, away = 1 + noise[measured[m]] ** 2, mean[n, :2] - position[m]

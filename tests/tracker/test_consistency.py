@@ -10,7 +10,7 @@ import oracle_formulas as textbook
 import pytest
 
 import optipmb
-from optipmb.motion import predict_state
+from optipmb.predict import predict_state
 from optipmb.table import ClassTable
 from optipmb.update import ukf_update, workspace
 

@@ -9,7 +9,7 @@ import pytest
 from class_rows import class_rows
 
 import optipmb
-from optipmb.effort import count_pairs
+from optipmb.hypotheses import count_pairs
 from optipmb.preprocess import non_maximum_suppression
 
 PARAMETERS = optipmb.load_profile("nuscenes")

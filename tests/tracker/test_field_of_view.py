@@ -116,8 +116,7 @@ def test_looks_are_counted_as_plain_arithmetic_says(seed: int) -> None:
     before, now, period = 5_000_000_000, 5_000_000_000 + int(rng.integers(0, 200_000_000)), 0.1
     share, looked = rng.choice([0.0, 0.25, 1.0], 30), before - rng.choice([0, 50_000_000, 3_000_000_000], 30)
     since = looked - rng.integers(0, 10**9, 30)
-    time, missed = np.empty(30), np.empty(30, np.int64)
-    count_looks(share, looked, since, before, now, period, time, missed)
+    time, missed = count_looks(share, looked, since, (now, before, (now - before) * 1e-9, period))
     covered = np.minimum(now - looked, max(now - before, 100_000_000))
     np.testing.assert_array_equal(time, covered * 1e-9)
     counted = (now - missed) - (before - since)

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import optipmb
-from optipmb.effort import UNLIMITED
+from optipmb.detection_probability import CELLS, NOWHERE, SIDE, boxes_in_sensor, boxes_of_cells, cells_of_points
 from optipmb.geometry import intersection_area
-from optipmb.points import CELLS, NOWHERE, SIDE, boxes_in_sensor, boxes_of_cells, cells_of_points
+from optipmb.hypotheses import UNLIMITED
 from optipmb.preprocess import non_maximum_suppression
 
 Array = NDArray[np.float64]

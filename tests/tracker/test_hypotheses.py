@@ -17,8 +17,21 @@ from scipy.optimize import linear_sum_assignment
 
 from optipmb.association import UNASSIGNED
 from optipmb.association import associate as associate_pairs
-from optipmb.gating import DEVIATIONS_2, FEW, gate, gate_radii, gate_widening, pairs_of_few, pairs_of_many
-from optipmb.hypotheses import CLUTTER, FROM_POISSON, NEWBORN, Hypotheses, detection_costs, first_detections
+from optipmb.hypotheses import (
+    CLUTTER,
+    DEVIATIONS_2,
+    FEW,
+    FROM_POISSON,
+    NEWBORN,
+    Hypotheses,
+    detection_costs,
+    first_detections,
+    gate,
+    gate_radii,
+    gate_widening,
+    pairs_of_few,
+    pairs_of_many,
+)
 
 Array = NDArray[np.float64]
 NOTHING = np.zeros(0)

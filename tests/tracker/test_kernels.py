@@ -14,14 +14,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from read_only import read_only
 
-from optipmb.association import UNASSIGNED
-from optipmb.birth import birth_states, first_detected_states, moment_match
-from optipmb.births_beside import forbid_births
+from optipmb.association import NEW, UNASSIGNED, Survivors, forbid_births, surviving_objects
 from optipmb.calibration import SURE, calibrate_rows
 from optipmb.density import (
     OBJECT,
     BernoulliArrays,
     Bernoullis,
+    Moment,
     PoissonArrays,
     Poissons,
     components_in,
@@ -29,21 +28,19 @@ from optipmb.density import (
     whole_periods,
 )
 from optipmb.extract import Tracks, extract_tracks, select_tracks
-from optipmb.geometry import bev_iou, box_iou, iou_exceeds
+from optipmb.geometry import NOBODY, bev_iou, block, box_iou, empty_torus, insert, iou_exceeds
 from optipmb.hypotheses import CLUTTER, FROM_POISSON, NEWBORN, Hypotheses
 from optipmb.lightweight import light_weight_filter
-from optipmb.motion import predict_state
-from optipmb.neighbours import NOBODY, block, empty_torus, insert
-from optipmb.predict import predict_density
+from optipmb.predict import predict_density, predict_state
 from optipmb.preprocess import Measurements, gather, select, sort_canonically
-from optipmb.prune import NEW, Survivors, surviving_objects
 from optipmb.undetected import AGED, MARKED, update_undetected, with_births
-from optipmb.update import ukf_updates
+from optipmb.update import birth_states, first_detected_states, moment_match, ukf_updates
 
 Array = NDArray[np.float64]
 COMPILING = settings(deadline=None)  # the first call compiles
 NOW = 10_000_000_000
 PERIOD = 0.1
+MOMENT = Moment(NOW, NOW - 150_000_000, 0.15, PERIOD)
 SEEDS = pytest.mark.parametrize("seed", range(5))
 
 
@@ -117,11 +114,11 @@ def test_only_scores_from_the_filter_on_are_chosen(seed: int) -> None:
     thresholds = np.array([0.3, 0.5])
     classes = class_rows(2, score_filter=thresholds, nms_iou=0.1, suppressed_with=[0, 1])
     given = read_only(center, np.ones((40, 3)), np.zeros(40), np.zeros((40, 2)), score, label, np.arange(40))
-    above, chosen, columns = select(*given, 2, classes, 10**6)
+    above, chosen, columns = select(tuple(given), 2, classes, 10**6)
     wanted = np.flatnonzero(score >= thresholds[label])
     assert above == wanted.size
     np.testing.assert_array_equal(chosen, wanted[np.argsort(-score[wanted], kind="stable")])
-    for found, gathered in zip(columns, gather(chosen, *given, 2), strict=True):
+    for found, gathered in zip(columns, gather(chosen, tuple(given), 2), strict=True):
         np.testing.assert_array_equal(found, gathered)
 
 
@@ -199,7 +196,7 @@ def test_components_within_their_limit_are_predicted(seed: int) -> None:
         confirmed=rng.random(30) < 0.5,
     )
     components = Poissons(**both, weight=weight, born_ns=since)
-    given = objects.words, since, components.words, 0.2, before, NOW, PERIOD
+    given = objects.words, since, components.words, (NOW, before, 0.2, PERIOD)
     kept, *found, repaired = predict_density(*given, classes)
     assert repaired == 0
     known, undetected = Bernoullis.of(found[0]), Poissons.of(found[1])
@@ -238,7 +235,7 @@ def test_objects_survive_by_existence_and_misses(seed: int) -> None:
     hypotheses = hypotheses_of(first_kind=kind, first_existence=first)
     classes = class_rows(2, max_misses=max_misses, min_existence=floor)
     row, measurement, existence, known, hits = surviving_objects(
-        objects, p_d, assigned, hypotheses, measured, seen, NOW, PERIOD, classes
+        objects, p_d, assigned, hypotheses, measured, seen, MOMENT, classes
     )
     detected = assigned != UNASSIGNED
     posterior = np.where(detected, 1.0, r * (1 - p_d) / (1 - r + r * (1 - p_d)))
@@ -278,7 +275,7 @@ def test_births_are_forbidden_as_set_logic_says(seed: int) -> None:
     assert 0 < forbidden.sum() < m
     hypotheses = hypotheses_of(row=row, measurement=measurement, first_kind=kind.copy(), first_existence=first.copy())
     classes = class_rows(2, birth_overlap=limit, extract_misses=misses)
-    forbid_births(objects, assigned, hypotheses, z, seen, NOW, PERIOD, classes)
+    forbid_births(objects, assigned, hypotheses, z, seen, MOMENT, classes)
     np.testing.assert_array_equal(hypotheses.first_kind, np.where(forbidden, CLUTTER, kind))
     forgotten = forbidden & (kind != CLUTTER)
     np.testing.assert_array_equal(hypotheses.first_existence, np.where(forgotten, 0.0, first))
@@ -319,8 +316,8 @@ def test_the_light_weight_filter_is_its_formulas(seed: int) -> None:
         classes[f"sign_{name}"] = column
     survivors = Survivors(row, measurement, rng.uniform(0, 1, 6), 4, 2)
     new = row == NEW
-    named = np.where(new, measured[measurement], label[row])
-    light_weight_filter(survivors, named, after, objects, 77, measurements, NOW, NOW - 150_000_000, PERIOD, classes)
+    after.label[:] = np.where(new, measured[measurement], label[row])
+    light_weight_filter(survivors, after, objects, 77, measurements, MOMENT, classes)
     existence, *out, weighed, facing, flags, shown = after[2:]
     np.testing.assert_array_equal(existence, survivors.existence)
     old = row >= 0
@@ -362,7 +359,7 @@ def test_tracks_are_selected_by_two_thresholds(seed: int, *, both: bool) -> None
     first, second, misses = np.array([0.2, 0.4]), np.array([0.5, 0.8]), np.array([3, 8])
     flags = known.copy()
     classes = class_rows(2, extract_new=first, extract_known=second, extract_misses=misses)
-    rows = select_tracks(objects_of(existence=r, label=label, extracted=flags), seen, NOW, both, PERIOD, classes)
+    rows = select_tracks(objects_of(existence=r, label=label, extracted=flags), seen, MOMENT, both, classes)
     again = (r >= second[label]) & (periods(seen) < misses[label])
     wanted = np.where(known & both, again, r >= first[label])
     np.testing.assert_array_equal(rows, np.flatnonzero(wanted))
@@ -397,7 +394,7 @@ def test_tracks_are_read_off_the_states(*, calibrated: bool) -> None:
     before, extracted = np.arange(9) % 2 == 0, np.isin(np.arange(9), rows)
     columns = mean, covariance, r, label, auxiliary, identity, born, seen, score, evidence, odds, extracted, before
     objects = Bernoullis(**dict(zip(Bernoullis.described, columns, strict=True)))
-    words = extract_tracks(objects.words, seen, measurement, tuple(measured), NOW, True, PERIOD, classes)
+    words = extract_tracks(objects.words, seen, measurement, tuple(measured), tuple(MOMENT), True, classes)
     (ids, labels, center, size, heading_, facing_, velocity, rate, acceleration, *told, age, since, detection, now) = (
         column for _, column in Tracks.of(words).columns()
     )
@@ -488,15 +485,15 @@ def test_what_is_undetected_stays_or_is_born(seed: int, *, adaptive: bool) -> No
     )
     marked, kind = rng.integers(0, 25, 8), rng.choice([FROM_POISSON, CLUTTER, NEWBORN], 20)
     association, measured = rng.choice([0.0, 0.3, 1.0], 20), random_measurements(rng, 20)
-    announced, least = rng.integers(0, 20, 8), np.array([0.0, 0.4])
+    announced, least, predicted = rng.integers(0, 20, 8), np.array([0.0, 0.4]), 25 if adaptive else 15
     hypotheses = hypotheses_of(component=marked, announced=announced, first_kind=kind, association=association)
     steps, rate = np.array([2, 9]), np.array([0.5, 2.0])
     births = rng.uniform(0, 2, 2), rng.uniform(0.1, 1, (2, 6)), rng.uniform(0.1, 1, (2, 6))
     classes = class_rows(2, poisson_steps=steps, adaptive_birth_rate=rate, announce_score=least)
     classes["birth_heading_speed"], classes["birth_known"], classes["birth_unknown"] = births
-    found, fate = update_undetected(components, p_d, 15, hypotheses, measured, NOW, PERIOD, classes, adaptive)
+    found, fate = update_undetected(components, p_d, predicted, hypotheses, measured, MOMENT, classes)
     high = measured.score >= least[measured.label]
-    used = np.isin(np.arange(25), marked[(marked < 15) & high[announced]])
+    used = np.isin(np.arange(25), marked[(marked < predicted) & high[announced]])
     stays = np.flatnonzero((periods(born) <= steps[label]) & ~used)
     new = np.flatnonzero((kind == CLUTTER) & (association < 1) & high & adaptive)
     carried = [*(weight * (1 - p_d))[stays], *rate[measured.label[new]] * (1 - association[new])]

@@ -10,10 +10,9 @@ import pytest
 from class_rows import class_rows
 
 import optipmb
-from optipmb.birth import birth_states
-from optipmb.gating import gate
+from optipmb.hypotheses import gate
 from optipmb.preprocess import Measurements
-from optipmb.update import ukf_updates
+from optipmb.update import birth_states, ukf_updates
 
 CARS, FRAMES, DT_NS = 6, 12, 100_000_000
 HALF = np.pi / 6

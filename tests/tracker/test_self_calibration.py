@@ -182,9 +182,9 @@ def test_frames_are_counted_as_plain_python_counts(seed: int) -> None:
         plain.forget()
 
         identity = np.array([*known], np.int64), np.array([*known.values()], np.int64)
-        after = np.array([*now], np.int64), np.array([*now.values()], np.int64)
-        given = announced, announced_label, fate, score, label, rows, dt
-        state, before, kept = learn(state, before, *identity, *after, hit, looked, *given)
+        after = np.array([*now], np.int64), np.array([*now.values()], np.int64), hit, looked
+        given = state, before, announced
+        state, before, kept = learn(given, identity, after, announced_label, fate, (score, label, rows), dt)
         announced = np.r_[announced[of_old >= 0], own_bin[rows[of_new >= 0]]]
         announced_label = np.r_[announced_label[of_old >= 0], label[rows[of_new >= 0]]]
         known = now
@@ -299,3 +299,24 @@ def test_the_order_of_detections_changes_nothing() -> None:
 
     found, wanted = run(PARAMETERS, shuffled())[-1].density, run(PARAMETERS, street(30))[-1].density
     assert optipmb.bytes_of(found) == optipmb.bytes_of(wanted)
+
+
+@pytest.mark.parametrize("modules", [optipmb.Modules(habm=False), optipmb.Modules(rpp=False)])
+def test_scores_are_calibrated_with_any_modules(modules: optipmb.Modules) -> None:
+    """The components that measurements made, and those that all went, leave counts that fit the density."""
+    tracker = optipmb.Tracker(optipmb.load_profile("generic"), modules)
+    density, place = tracker.initial(), np.array([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0], [0.0, 30.0, 0.0]])
+    for k in range(12):
+        frame, _ = optipmb.make_frame(
+            tracker.parameters,
+            stamp_ns=k * 100_000_000,
+            labels=("car",),
+            label=[0, 0, 0],
+            center=place,
+            size=[[4.0, 2.0, 1.5]] * 3,
+            yaw=[0.0] * 3,
+            score=[0.9, 0.3, 0.6],
+        )
+        density = tracker.step(density, frame).density
+    assert density.self_calibration is not None
+    assert len(density.self_calibration.components) == len(density.poisson)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import TYPE_CHECKING
 
@@ -10,18 +11,30 @@ import pytest
 
 import optipmb
 from optipmb.density import NO_FRAME
-from optipmb.sensor_motion import NEAR, common_motion, nearest, taken, together
+from optipmb.sensor_motion import (
+    APART,
+    MOST_SIDEWAYS,
+    NEAR,
+    TURNED,
+    Pairs,
+    common_motion,
+    nearest,
+    sideways,
+    taken,
+    together,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Array = NDArray[np.float64]
 
-FIXED = optipmb.load_profile("generic")
-GENERIC = FIXED.model_copy(update={"sensor_motion": True})
+GENERIC = optipmb.load_profile("generic")
+FIXED = GENERIC.model_copy(update={"sensor_motion": False})
 PLACES = np.random.default_rng(5).uniform((0.0, -25.0), (300.0, 25.0), (60, 2))
 """Parked cars along a way of 300 m."""
-HEADINGS = np.random.default_rng(6).choice([0.0, math.pi], 60)
+HEADINGS = np.random.default_rng(6).choice([0.0, math.pi, 0.5 * math.pi], 60)
+"""Along the way, either way, and across it."""
 
 
 def street(speed: float, rate: float, *, turn: float = 0.0, moving: float = 0.0) -> list[tuple[float, Array, Array]]:
@@ -47,7 +60,7 @@ def street(speed: float, rate: float, *, turn: float = 0.0, moving: float = 0.0)
 def tracked(
     parameters: optipmb.Parameters, frames: list[tuple[float, Array, Array]]
 ) -> tuple[list[optipmb.OnlineTracks], dict[int, set[int]]]:
-    """The tracks of each frame, and the ids of each car."""
+    """The tracks of each frame, and the ids of each car after the first half second."""
     tracker, found, ids = optipmb.OnlineTracker(parameters), [], dict[int, set[int]]()
     for t, boxes, cars in frames:
         count = len(boxes)
@@ -60,7 +73,7 @@ def tracked(
             label=["car"] * count,
         )
         for identity, row in zip(tracks.id.tolist(), tracks.detection.tolist(), strict=True):
-            if row >= 0:
+            if row >= 0 and t > 0.5:
                 ids.setdefault(int(cars[row]), set()).add(identity)
         found.append(tracks)
     return found, ids
@@ -68,11 +81,14 @@ def tracked(
 
 @pytest.mark.parametrize(("speed", "turn", "rate"), [(15.0, 0.0, 10.0), (15.0, 0.0, 2.0), (10.0, 0.3, 5.0)])
 def test_parked_cars_keep_their_ids_and_stand(speed: float, turn: float, rate: float) -> None:
-    """Past a sensor that drives straight or round a bend: one id each, and no speed; without it more ids."""
+    """Past a sensor that drives straight or round a bend: one id each, and no speed; without it more ids.
+
+    Some are parked across the way: rows along it alone would tell nothing.
+    """
     frames = street(speed, rate, turn=turn)
     found, ids = tracked(GENERIC, frames)
     assert all(len(one) == 1 for one in ids.values())
-    for tracks in found[3:]:
+    for tracks in found[max(3, int(0.5 * rate)) :]:
         assert tracks.sensor_motion is not None
         np.testing.assert_allclose(tracks.sensor_motion, [-speed, 0.0, -turn], atol=1.5)
     old = found[-1].age > 1.0
@@ -88,6 +104,55 @@ def test_a_sensor_that_stands_changes_no_byte(moving: float) -> None:
     found, fixed = tracked(GENERIC, frames)[0], tracked(FIXED, frames)[0]
     assert all(one.sensor_motion is None for one in found)
     assert [one.tracks.words.tobytes() for one in found] == [one.tracks.words.tobytes() for one in fixed]
+
+
+def crossing(rate: float, parked: int, crossing: int, flipped: str, lanes: Array) -> list[tuple[float, Array, Array]]:
+    """Boxes and numbers of the cars at a crossing where a sensor stands: six approach at 12 m/s, others cross or park.
+
+    All approach with the same speed from 40 m on, and pass. Parked cars stand along the way. Headings of none, of a
+    random half or of all boxes are turned around.
+    """
+    rng, count = np.random.default_rng(parked + crossing), 6 + parked + crossing
+    place = np.vstack(
+        (
+            np.column_stack((40.0 + 8.0 * np.arange(6), np.resize(lanes, 6))),
+            np.column_stack((rng.uniform(6.0, 35.0, parked), rng.choice([-7.0, 7.0], parked))),
+            np.column_stack((15.0 + 4.0 * (np.arange(crossing) % 2), -40.0 - 9.0 * np.arange(crossing))),
+        )
+    )
+    speed = np.repeat([[-12.0, 0.0], [0.0, 0.0], [0.0, 9.0]], [6, parked, crossing], axis=0)
+    yaw = np.r_[np.full(6, math.pi), rng.choice([0.0, math.pi], parked), np.full(crossing, 0.5 * math.pi)]
+    yaw += math.pi * (rng.random(count) < {"none": 0.0, "random": 0.5, "all": 1.0}[flipped])
+    return [
+        (
+            k / rate,
+            np.column_stack((place + speed * k / rate + rng.normal(0.0, 0.1, (count, 2)), yaw))
+            + rng.normal(0.0, [0.0, 0.0, 0.05], (count, 3)),
+            np.arange(count),
+        )
+        for k in range(int(12.0 * rate))
+    ]
+
+
+@pytest.mark.parametrize("lanes", [[-3.5], [-3.5, 3.5]], ids=["one_lane", "both_sides"])
+@pytest.mark.parametrize("rate", [2.0, 10.0, 20.0])
+def test_traffic_that_approaches_a_standing_sensor_is_not_its_motion(rate: float, lanes: list[float]) -> None:
+    """Six cars that all move alike, whichever way detectors turn their boxes, beside parked and crossing cars."""
+    for parked, across, flipped in itertools.product((0, 2, 5), (0, 4), ("none", "random", "all")):
+        found, _ = tracked(GENERIC, crossing(rate, parked, across, flipped, np.array(lanes)))
+        assert all(tracks.sensor_motion is None for tracks in found), (parked, across, flipped)
+
+
+def test_pedestrians_that_walk_together_are_not_its_motion() -> None:
+    """Neither with headings of no use: people walk any way. What people cannot do is motion of the sensor."""
+    rng = np.random.default_rng(0)
+    place, yaw = rng.uniform([2.0, -10.0], [22.0, 10.0], (12, 2)), rng.uniform(-math.pi, math.pi, 12)
+    for speed, moves in ((1.6, False), (12.0, True)):
+        tracker, density = optipmb.Tracker(GENERIC), optipmb.Tracker(GENERIC).initial()
+        for k in range(15):
+            boxes = np.column_stack((place - [0.1 * speed * k, 0.0] + rng.normal(0.0, 0.08, (12, 2)), yaw))
+            density = tracker.step(density, frame_of(0.1 * k, boxes, label="pedestrian")).density
+        assert (density.sensor_motion is not None) == moves
 
 
 def test_a_sensor_that_stops_stands() -> None:
@@ -125,19 +190,17 @@ def test_the_estimate_is_stored_with_the_density() -> None:
     first, second = (tracker.step(one, following).density for one in (density, again))
     assert first.stamp_ns != NO_FRAME
     assert optipmb.bytes_of(first) == optipmb.bytes_of(second)
-    with pytest.raises(optipmb.DensityError, match=r"sensor\.motion"):
-        optipmb.density_of(
-            density.stamp_ns, density.next_id, {**columns, "sensor.motion": np.full(3, np.nan)}, density.labels
-        )
+    with pytest.raises(optipmb.DensityError, match="sensor"):
+        optipmb.density_of(density.stamp_ns, density.next_id, {**columns, "sensor": np.full(5, np.nan)}, density.labels)
 
 
-def frame_of(t: float, boxes: Array, pose: optipmb.Pose | None = None) -> optipmb.Frame:
-    """A frame of cars."""
+def frame_of(t: float, boxes: Array, pose: optipmb.Pose | None = None, label: str = "car") -> optipmb.Frame:
+    """A frame of objects of one class."""
     count = len(boxes)
     return optipmb.make_frame(
         GENERIC,
         stamp_ns=round(t * 1e9),
-        labels=("car",),
+        labels=(label,),
         label=np.zeros(count, np.int64),
         center=np.column_stack((boxes[:, :2], np.zeros(count))),
         size=np.tile([4.5, 1.9, 1.6], (count, 1)),
@@ -155,7 +218,8 @@ def test_the_motion_is_the_rigid_fit_of_the_pairs_it_joins(seed: int) -> None:
     true = np.array([-6.0, 0.8, 0.06]) + rng.normal(0.0, [0.5, 0.2, 0.01])
     target = np.vstack((taken(start, true)[:14] + rng.normal(0.0, 0.05, (14, 2)), rng.uniform(-40.0, 40.0, (8, 2))))
     target_label = np.r_[label[:14], rng.integers(0, 2, 8)]
-    motion, count, cost = common_motion(start, label, target, target_label, np.zeros(3), 10.0, 0.15, 0.0)
+    pairs = Pairs(start, label, target, target_label)
+    motion, count, cost = common_motion(pairs, np.zeros(3), 10.0, 0.15, 0.0)
     np.testing.assert_allclose(motion, true, atol=0.1)
     assert count >= 14
 
@@ -164,7 +228,7 @@ def test_the_motion_is_the_rigid_fit_of_the_pairs_it_joins(seed: int) -> None:
     distance[label[:, None] != target_label[None]] = np.inf
     rows = np.flatnonzero(distance.min(axis=1) < NEAR)
     held = np.maximum(0.0, 1.0 - distance.min(axis=1) ** 2 / NEAR**2)
-    np.testing.assert_allclose(together(start, label, target, target_label, motion), held, atol=1e-12)
+    np.testing.assert_allclose(together(pairs, motion), held, atol=1e-12)
     np.testing.assert_allclose(cost, 20.0 - held.sum())
     assert count == len(rows)
     assert [nearest(*moved[n], label[n], target, target_label, NEAR**2)[0] for n in rows] == distance[rows].argmin(
@@ -182,9 +246,27 @@ def test_few_points_follow_the_guess() -> None:
     """A guess that is trusted weighs in the fit as so many points; without points it is the motion."""
     guess, label = np.array([-1.0, 0.1, 0.02]), np.zeros(1, np.int64)
     start = np.array([[20.0, 5.0]])
-    alone = common_motion(start, label, start + 500.0, label, guess, 1.0, 0.05, 4.0)
+    alone = common_motion(Pairs(start, label, start + 500.0, label), guess, 1.0, 0.05, 4.0)
     np.testing.assert_allclose(alone[0], guess, atol=1e-12)
     assert (alone[1], alone[2]) == (0, 1.0)
     off = taken(start, guess) + np.array([0.5, 0.0])
-    drawn = common_motion(start, label, off, label, guess, 1.0, 0.0, 4.0)[0]
+    drawn = common_motion(Pairs(start, label, off, label), guess, 1.0, 0.0, 4.0)[0]
     assert 0.0 < math.hypot(*(taken(start, drawn) - taken(start, guess))[0]) < 0.5
+
+
+def test_sideways_is_the_least_distance_to_where_an_object_can_drive() -> None:
+    """In numpy over all pairs: across the axis and beyond the reach of a vehicle, beyond the circle of a walker."""
+    rng = np.random.default_rng(3)
+    start, target = rng.uniform(-5.0, 5.0, (20, 2)), rng.uniform(-5.0, 5.0, (15, 2))
+    label, target_label = rng.integers(0, 3, 20), rng.integers(0, 2, 15)
+    heading, reach, walks = rng.uniform(-math.pi, math.pi, 20), rng.uniform(0.1, 2.0, 20), rng.random(20) < 0.5
+    axis = np.exp(1j * heading)
+    apart = ((target[None] - start[:, None]) @ [1, 1j]) * axis.conj()[:, None]
+    along = np.where(walks[:, None], np.abs(apart), np.abs(apart.real))
+    across = np.where(walks[:, None], 0.0, apart.imag)
+    squared = across**2 + np.maximum(along - reach[:, None], 0.0) ** 2
+    turned = np.where(walks[:, None], 0.0, TURNED * np.minimum(along, reach[:, None]))
+    cost = np.where(label[:, None] == target_label[None], 0.5 * squared / (APART**2 + turned**2), np.inf)
+    ahead = np.column_stack((axis.real, axis.imag))
+    found = sideways(Pairs(start, label, target, target_label), ahead, reach, walks)
+    np.testing.assert_allclose(found, np.minimum(cost.min(axis=1), MOST_SIDEWAYS), atol=1e-12)

@@ -14,20 +14,23 @@ from hypothesis.extra.numpy import arrays
 from read_only import read_only
 
 from optipmb.calibration import SURE, calibrate_rows, log_odds
-from optipmb.class_posterior import UNGROUPED
+from optipmb.class_posterior import UNGROUPED, Groups
 from optipmb.density import (
+    COMPONENT,
     FROM_LAST_DETECTION,
+    OBJECT,
     BernoulliArrays,
     Bernoullis,
     PoissonArrays,
     Poissons,
+    components_in,
     misses_counted_from,
     objects_in,
 )
+from optipmb.detection_probability import of_rows
 from optipmb.errors import FrameError
 from optipmb.frame import MAX_COORDINATE, MAX_SPEED, _refuse, allowed
-from optipmb.gating import gate, gate_radii
-from optipmb.hypotheses import detection_costs, first_detections, local_hypotheses
+from optipmb.hypotheses import detection_costs, first_detections, gate, gate_radii, local_hypotheses
 from optipmb.preprocess import Measurements, gather
 from optipmb.warm import kernels
 
@@ -36,21 +39,22 @@ HERE = Path(__file__).parent
 
 TWINS = {
     "association.associate": "test_hypotheses.test_the_total_is_that_of_the_hungarian_algorithm",
-    "birth.birth_states": "test_update.test_a_birth_is_the_textbook_birth",
-    "birth.first_detected_states": "test_kernels.test_announced_objects_are_matched_mixtures",
-    "births_beside.forbid_births": "test_kernels.test_births_are_forbidden_as_set_logic_says",
+    "update.birth_states": "test_update.test_a_birth_is_the_textbook_birth",
+    "update.first_detected_states": "test_kernels.test_announced_objects_are_matched_mixtures",
+    "association.forbid_births": "test_kernels.test_births_are_forbidden_as_set_logic_says",
     "calibration.calibrate_rows": "test_twins.test_rows_are_calibrated_as_numpy_interpolates",
     "calibration.log_odds": "test_twins.test_log_odds_are_bounded",
     "class_posterior.label_probability": "test_class_posterior.test_pairs_weigh_by_what_the_detector_calls_them",
     "class_posterior.update_classes": "test_class_posterior.test_the_posterior_is_bayes_rule",
     "class_posterior.weigh_by_class": "test_class_posterior.test_pairs_weigh_by_what_the_detector_calls_them",
-    "columns.labels_within": "test_safety.test_labels_are_within_the_classes",
+    "density.labels_within": "test_safety.test_labels_are_within_the_classes",
     "density.components_in": "test_rows.test_kernels_read_the_columns_that_numpy_does",
     "density.objects_in": "test_rows.test_kernels_read_the_columns_that_numpy_does",
     "density.misses_counted_from": "test_twins.test_misses_count_from_the_last_detection_without_fields_of_view",
     "density.copy_state": "test_update.test_states_without_a_measurement_stay_as_predicted",
     "density.whole_periods": "test_kernels.test_periods_are_counted_to_the_nearest",
     "extract.confirm": "test_confirmed.test_confirmation_has_hysteresis",
+    "detection_probability.of_rows": "test_twins.test_rows_have_the_value_of_their_class",
     "extract.extract_tracks": "test_kernels.test_tracks_are_read_off_the_states",
     "extract.tracks_in": "test_rows.test_kernels_read_the_columns_that_numpy_does",
     "extract.select_tracks": "test_kernels.test_tracks_are_selected_by_two_thresholds",
@@ -60,49 +64,49 @@ TWINS = {
     "geometry.corners": "test_geometry.test_iou_is_that_of_clipped_polygons",
     "geometry.intersection_area": "test_geometry.test_iou_is_that_of_clipped_polygons",
     "geometry.iou_exceeds": "test_kernels.test_cheap_rejections_change_no_decision",
-    "effort.count_pairs": "test_effort.test_pairs_are_counted_up_to_a_limit",
-    "heading.doubt": "test_kernels.test_tracks_are_read_off_the_states",
-    "heading.follow_sign": "test_kernels.test_the_light_weight_filter_is_its_formulas",
-    "heading.sign_probability": "test_kernels.test_tracks_are_read_off_the_states",
-    "heading.turn_around": "test_kernels.test_the_light_weight_filter_is_its_formulas",
+    "hypotheses.count_pairs": "test_effort.test_pairs_are_counted_up_to_a_limit",
+    "lightweight.doubt": "test_kernels.test_tracks_are_read_off_the_states",
+    "lightweight.follow_sign": "test_kernels.test_the_light_weight_filter_is_its_formulas",
+    "lightweight.sign_probability": "test_kernels.test_tracks_are_read_off_the_states",
+    "lightweight.turn_around": "test_kernels.test_the_light_weight_filter_is_its_formulas",
     "field_of_view.count_looks": "test_field_of_view.test_looks_are_counted_as_plain_arithmetic_says",
     "field_of_view.in_view": "test_field_of_view.test_a_point_is_in_view_by_its_angles",
     "field_of_view.shares_in_view": "test_field_of_view.test_shares_are_the_quadrature_over_the_box_and_its_position",
-    "gating._grown": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
+    "hypotheses._grown": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
     "hypotheses.close_gates": "test_field_of_view.test_gates_are_closed_for_what_cannot_be_detected",
     "hypotheses.detection_costs": "test_hypotheses.test_costs_and_association_probabilities_are_the_formulas",
     "hypotheses.first_detections": "test_hypotheses.test_each_kind_of_first_detection_has_its_formula",
-    "gating.gate": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
-    "gating.gate_widening": "test_hypotheses.test_a_gate_widens_by_what_r_is_above_that_of_the_class",
-    "gating.gate_radii": "test_hypotheses.test_gates_widen_with_unknown_speed",
-    "gating.groups": "test_class_posterior.test_pairs_weigh_by_what_the_detector_calls_them",
-    "gating.pairs_of_few": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
-    "gating.pairs_of_many": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
+    "hypotheses.gate": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
+    "hypotheses.gate_widening": "test_hypotheses.test_a_gate_widens_by_what_r_is_above_that_of_the_class",
+    "hypotheses.gate_radii": "test_hypotheses.test_gates_widen_with_unknown_speed",
+    "hypotheses.groups": "test_class_posterior.test_pairs_weigh_by_what_the_detector_calls_them",
+    "hypotheses.pairs_of_few": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
+    "hypotheses.pairs_of_many": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
     "hypotheses.local_hypotheses": "test_twins.test_hypotheses_are_those_of_their_parts",
     "lightweight.light_weight_filter": "test_kernels.test_the_light_weight_filter_is_its_formulas",
-    "motion.decay_and_turn": "test_motion.test_the_prediction_is_the_textbook_unscented_transform",
-    "motion.displacement": "test_motion.test_the_prediction_is_the_textbook_unscented_transform",
-    "motion.centred": "test_motion.test_the_prediction_is_the_textbook_unscented_transform",
-    "motion.ctra_displacement": "test_motion.test_the_displacement_is_the_integral_of_the_velocity",
-    "motion.predict_state": "test_motion.test_the_prediction_is_the_textbook_unscented_transform",
-    "motion.small_turn": "test_motion.test_the_displacement_is_the_integral_of_the_velocity",
-    "motion.square_root": "test_motion.test_the_square_root_squared_is_the_covariance",
-    "motion.travel": "test_motion.test_the_way_under_a_decaying_acceleration_is_its_integral",
-    "motion.turn_integrals": "test_motion.test_the_way_under_a_decaying_acceleration_is_its_integral",
-    "motion.wrap": "test_motion.test_a_wrapped_angle_is_the_same_direction_in_the_half_open_interval",
-    "neighbours.block": "test_kernels.test_a_search_finds_every_neighbour_once",
-    "neighbours.cell": "test_kernels.test_a_search_finds_every_neighbour_once",
-    "neighbours.empty_torus": "test_kernels.test_a_search_finds_every_neighbour_once",
-    "neighbours.insert": "test_kernels.test_a_search_finds_every_neighbour_once",
-    "reported.follow_box": "test_kernels.test_tracks_are_read_off_the_states",
+    "predict.decay_and_turn": "test_motion.test_the_prediction_is_the_textbook_unscented_transform",
+    "predict.displacement": "test_motion.test_the_prediction_is_the_textbook_unscented_transform",
+    "predict.centred": "test_motion.test_the_prediction_is_the_textbook_unscented_transform",
+    "predict.ctra_displacement": "test_motion.test_the_displacement_is_the_integral_of_the_velocity",
+    "predict.predict_state": "test_motion.test_the_prediction_is_the_textbook_unscented_transform",
+    "predict.small_turn": "test_motion.test_the_displacement_is_the_integral_of_the_velocity",
+    "predict.square_root": "test_motion.test_the_square_root_squared_is_the_covariance",
+    "predict.travel": "test_motion.test_the_way_under_a_decaying_acceleration_is_its_integral",
+    "predict.turn_integrals": "test_motion.test_the_way_under_a_decaying_acceleration_is_its_integral",
+    "predict.wrap": "test_motion.test_a_wrapped_angle_is_the_same_direction_in_the_half_open_interval",
+    "geometry.block": "test_kernels.test_a_search_finds_every_neighbour_once",
+    "geometry.cell": "test_kernels.test_a_search_finds_every_neighbour_once",
+    "geometry.empty_torus": "test_kernels.test_a_search_finds_every_neighbour_once",
+    "geometry.insert": "test_kernels.test_a_search_finds_every_neighbour_once",
+    "calibration.follow_box": "test_kernels.test_tracks_are_read_off_the_states",
     "paths._doubts": "test_paths.test_a_doubtful_heading_changes_no_motion",
     "paths.move": "test_paths.test_states_are_predicted_as_numpy_does_step_by_step",
     "paths.predict_paths": "test_paths.test_states_are_predicted_as_numpy_does_step_by_step",
-    "points.boxes_in_sensor": "test_geometry.test_points_in_boxes_counts_every_point",
-    "points.boxes_of_cells": "test_geometry.test_points_in_boxes_counts_every_point",
-    "points.cells_of_points": "test_geometry.test_points_at_the_faces_of_boxes_fall_into_their_cells",
-    "points.column": "test_geometry.test_points_at_the_faces_of_boxes_fall_into_their_cells",
-    "points.count_points": "test_geometry.test_points_in_boxes_counts_every_point",
+    "detection_probability.boxes_in_sensor": "test_geometry.test_points_in_boxes_counts_every_point",
+    "detection_probability.boxes_of_cells": "test_geometry.test_points_in_boxes_counts_every_point",
+    "detection_probability.cells_of_points": "test_geometry.test_points_at_the_faces_of_boxes_fall_into_their_cells",
+    "detection_probability.column": "test_geometry.test_points_at_the_faces_of_boxes_fall_into_their_cells",
+    "detection_probability.count_points": "test_geometry.test_points_in_boxes_counts_every_point",
     "predict.predict_rows": "test_kernels.test_components_within_their_limit_are_predicted",
     "predict.rows_within": "test_kernels.test_components_within_their_limit_are_predicted",
     "predict.predict_density": "test_kernels.test_components_within_their_limit_are_predicted",
@@ -111,7 +115,7 @@ TWINS = {
     "preprocess.precedes": "test_kernels.test_the_canonical_order_is_a_lexicographic_one",
     "preprocess.select": "test_kernels.test_only_scores_from_the_filter_on_are_chosen",
     "preprocess.sort_canonically": "test_kernels.test_the_canonical_order_is_a_lexicographic_one",
-    "prune.surviving_objects": "test_kernels.test_objects_survive_by_existence_and_misses",
+    "association.surviving_objects": "test_kernels.test_objects_survive_by_existence_and_misses",
     "self_calibration.bin_of": "test_self_calibration.test_a_bin_is_that_of_the_log_odds",
     "self_calibration.calibrate": "test_self_calibration.test_scores_go_through_the_isotonic_curve",
     "self_calibration.curves": "test_self_calibration.test_scores_go_through_the_isotonic_curve",
@@ -119,15 +123,16 @@ TWINS = {
     "self_calibration.learn": "test_self_calibration.test_frames_are_counted_as_plain_python_counts",
     "self_calibration.needed_shares": "test_self_calibration.test_the_share_of_looks_follows_the_recall_of_the_best",
     "self_calibration.next_slot": "test_self_calibration.test_frames_are_counted_as_plain_python_counts",
-    "soundness.all_within": "test_soundness.test_bounds_are_kept_in_every_column",
+    "extract.all_within": "test_soundness.test_bounds_are_kept_in_every_column",
     "sensor_motion._refine": "test_sensor_motion.test_the_motion_is_the_rigid_fit_of_the_pairs_it_joins",
     "sensor_motion.common_motion": "test_sensor_motion.test_the_motion_is_the_rigid_fit_of_the_pairs_it_joins",
     "sensor_motion.nearest": "test_sensor_motion.test_the_motion_is_the_rigid_fit_of_the_pairs_it_joins",
+    "sensor_motion.sideways": "test_sensor_motion.test_sideways_is_the_least_distance_to_where_an_object_can_drive",
     "sensor_motion.together": "test_sensor_motion.test_the_motion_is_the_rigid_fit_of_the_pairs_it_joins",
     "tracker.update": "test_oracle.test_every_combination_of_modules_equals_algorithm_1",
     "undetected.with_births": "test_kernels.test_components_that_stay_and_those_that_are_born_stand_in_order",
     "undetected.update_undetected": "test_kernels.test_what_is_undetected_stays_or_is_born",
-    "birth.moment_match": "test_update.test_a_mixture_keeps_its_mean_and_covariance",
+    "update.moment_match": "test_update.test_a_mixture_keeps_its_mean_and_covariance",
     "update.ukf_update": "test_update.test_the_update_is_the_textbook_ukf",
     "update.ukf_updates": "test_update.test_the_update_is_the_textbook_ukf",
     "update.workspace": "test_update.test_the_update_is_the_textbook_ukf",
@@ -143,6 +148,14 @@ def test_every_kernel_has_a_twin() -> None:
         body = ast.parse(path.read_text(encoding="utf-8")).body
         tests |= {f"{path.stem}.{node.name}" for node in body if isinstance(node, ast.FunctionDef)}
     assert set(TWINS.values()) <= tests
+
+
+def test_rows_have_the_value_of_their_class() -> None:
+    """Objects first, then components."""
+    value, first, second = np.array([0.3, 0.7, 0.9]), np.array([2, 0, 1, 1]), np.array([1, 2])
+    words = np.zeros(4 * OBJECT), np.zeros(2 * COMPONENT)
+    objects_in(words[0]).label[:], components_in(words[1]).label[:] = first, second
+    np.testing.assert_array_equal(of_rows(value, *words), value[np.r_[first, second]])
 
 
 def test_misses_count_from_the_last_detection_without_fields_of_view() -> None:
@@ -246,7 +259,7 @@ def test_measurements_are_the_chosen_rows(seed: int) -> None:
         rng.permutation(40)[:20],
     )
     chosen = rng.permutation(20)[:12]
-    out = gather(chosen, *read_only(center, size, yaw, velocity, score, label, source), 2)
+    out = gather(chosen, tuple(read_only(center, size, yaw, velocity, score, label, source)), 2)
     wanted = center[:, :2], yaw, velocity, np.column_stack([size, center[:, 2]]), score, label, source
     for found, column in zip(out, wanted, strict=True):
         np.testing.assert_array_equal(found, column[chosen])
@@ -271,7 +284,7 @@ def test_hypotheses_are_those_of_their_parts(seed: int) -> None:
     components = PoissonArrays(**dict(Poissons.empty().columns()) | parts[1] | {"weight": weight[new]})
     empty = np.empty(15)
     measurements = Measurements(position, empty, np.empty((15, 2)), np.empty((15, 4)), score, measured, measured)
-    found = local_hypotheses(objects, UNGROUPED, p_d[old], components, p_d[new], measurements, 0.15, UNGROUPED, classes)
+    found = local_hypotheses(objects, components, p_d, measurements, Groups(UNGROUPED, UNGROUPED), 0.15, classes)
     radius = gate_radii(covariance, label, 0.15, classes)
     row, measurement, likelihood = gate(*parts[0].values(), radius[old], position, measured, classes, False)
     association = np.empty(15)

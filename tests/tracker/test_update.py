@@ -13,10 +13,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from optipmb.birth import birth_states, moment_match
+from optipmb.association import NEW
 from optipmb.preprocess import Measurements
-from optipmb.prune import NEW
-from optipmb.update import ukf_update, ukf_updates, workspace
+from optipmb.update import birth_states, moment_match, ukf_update, ukf_updates, workspace
 
 Array = NDArray[np.float64]
 

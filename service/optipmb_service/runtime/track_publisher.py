@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
-from optipmb.records import record
+from optipmb.rows import record
 from optipmb_service.runtime.ports import TransportError
 from optipmb_service.session.values import SECOND
 

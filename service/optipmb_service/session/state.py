@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
 import optipmb_schemas as schemas
 from pydantic import Field
 
-from optipmb.records import record
+from optipmb.rows import record
 from optipmb_service.session.timeline import Cursor, FrameId, Order, Placement, Verdict
 from optipmb_service.session.values import MAX_LABELS, Count, Epoch, Whole
 

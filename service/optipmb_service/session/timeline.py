@@ -27,7 +27,7 @@ from dataclasses import field, replace
 from enum import StrEnum, unique
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from optipmb.records import record
+from optipmb.rows import record
 from optipmb_service.session.values import (
     MAX_SENSORS,
     Count,

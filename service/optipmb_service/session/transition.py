@@ -26,7 +26,7 @@ import numpy as np
 import optipmb_schemas as schemas
 
 import optipmb
-from optipmb.records import record
+from optipmb.rows import record
 from optipmb_service.session import convert
 from optipmb_service.session.state import FilterState, FrameCounts, PoseHistory, SensorState
 from optipmb_service.session.timeline import JUMP_FRAMES, FrameId, Verdict
