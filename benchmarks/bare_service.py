@@ -20,14 +20,13 @@ from optipmb_service.runtime.scheduler import Scheduler
 from optipmb_service.session import convert
 from optipmb_service.session.timeline import FrameId
 from optipmb_service.settings import Settings
-from optipmb_service.zenoh.connection import opened
-from optipmb_service.zenoh.handles import cached_publisher, directly
+from optipmb_service.zenoh.client import Client
 
 import optipmb
 
 if TYPE_CHECKING:
-    import zenoh
-    from optipmb_service.zenoh.handles import Putting
+    from optipmb_client.zenoh.handles import Sender
+    from optipmb_client.zenoh.session import Sample, Session
 
 PROFILE: Final = "generic"
 CACHE: Final = 50
@@ -41,18 +40,18 @@ class Frames:
         keys: of what is published.
     """
 
-    def __init__(self, session: zenoh.Session, keys: schemas.Keys) -> None:
+    def __init__(self, session: Session, keys: schemas.Keys) -> None:
         self._session, self._keys = session, keys
         self._parameters = optipmb.load_profile(PROFILE)
         self._tracker = optipmb.Tracker(self._parameters)
         self._densities: dict[str, optipmb.Density] = {}
-        self._publishers: dict[str, Putting] = {}
+        self._publishers: dict[str, Sender] = {}
         times = {"queue_ms": 0.0, "decode_ms": 0.0, "step_ms": 0.0}
         self._delivery = {"instance": "bare", "received_ns": 0, "published_ns": 0, **times, "run": 0}
         self._waiting: deque[bytes] = deque()
         self._scheduler = Scheduler()
 
-    def take(self, sample: zenoh.Sample) -> None:
+    def take(self, sample: Sample) -> None:
         """Take detections."""
         self._waiting.append(sample.payload.to_bytes())
         self._scheduler.submit(self.work)
@@ -63,8 +62,8 @@ class Frames:
         stream = message.stream
         if stream not in self._densities:
             self._densities[stream] = self._tracker.initial()
-            self._publishers[stream] = cached_publisher(
-                self._session, self._keys.tracks(stream), schemas.Tracks, CACHE, detected=False
+            self._publishers[stream] = self._session.cached_sender(
+                self._keys.tracks(stream), schemas.encoding_of(schemas.Tracks), cache=CACHE, detected=False
             )
         frame, ignored = convert.frame_of(self._parameters, message)
         result = self._tracker.step(self._densities[stream], frame)
@@ -90,13 +89,12 @@ def main() -> None:
     endpoint, prefix = sys.argv[1:]
     warm_up()
     keys = schemas.Keys(prefix)
-    session = opened(Settings(connect=(endpoint,), prefix=prefix))
+    session = Client(Settings(connect=(endpoint,), prefix=prefix))
     frames = Frames(session, keys)
-    subscriber = session.declare_subscriber(keys.all("detections"), directly(frames.take))
+    session.listen(keys.all("detections"), frames.take)
     settle()
     print("ready", flush=True)
     sys.stdin.read()
-    del subscriber
     session.close()
 
 

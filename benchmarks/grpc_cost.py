@@ -39,13 +39,15 @@ import grpc
 import numpy as np
 from grpc_ways import BARE, RATE_HZ, TRACK, Library, Raw, Way, answer_of, answering, boxes, frame_of, request_of
 from optipmb_client import Publisher
+from optipmb_client.zenoh.session import Session
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 
 from gateway import GatewayProcess, resident
-from optipmb_schemas import Keys, encode
+from optipmb_schemas import encode
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
+from optipmb_service.settings import Settings
 from optipmb_service.zenoh.client import Client
 from routers import open_client
 from service_process import ServiceProcess
@@ -98,7 +100,7 @@ def main() -> None:
     with contextlib.ExitStack() as opened:
         router = opened.enter_context(ServiceProcess("router"))
         router.wait_ready()
-        session = opened.enter_context(open_client(router.endpoint))
+        session = Session(opened.enter_context(open_client(router.endpoint)))
         ways = opened_ways(opened, router.endpoint, options)
         kept = [answering(session, way.stream) for way in ways if way.stream]
         rates = [float(rate) for rate in options.rates.split(",")]
@@ -121,7 +123,7 @@ async def serve(router: str, stream: str) -> None:
     loop, coming = asyncio.get_running_loop(), asyncio.Queue[bytes]()
     outgoing: Outgoing | None = None
     if router:
-        client = Client(open_client(router), Keys().prefix)
+        client = Client(Settings(connect=(router,)))
         outgoing = client.publish(stream, 200, 0, lambda: None)
         kept = client.subscribe(
             client.keys.tracks(stream), lambda one: loop.call_soon_threadsafe(coming.put_nowait, one.payload)

@@ -9,17 +9,15 @@ from typing import TYPE_CHECKING, Any
 import grpc
 import numpy as np
 from optipmb_client import Publisher, Subscriber
-from optipmb_schemas import Detections, Keys, Tracks, decode, encode
+from optipmb_schemas import Detections, Keys, Tracks, decode, encode, encoding_of
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
-from optipmb_service.zenoh.client import Client
-from optipmb_service.zenoh.handles import cached_publisher
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    import zenoh
-    from optipmb_service.zenoh.client import Message
+    from optipmb_client.incoming import Arrival
+    from optipmb_client.zenoh.session import Session
 
 RATE_HZ = 10.0
 EPOCH = bytes(range(16))
@@ -133,15 +131,15 @@ def answer_of(frame: Detections) -> bytes:
     return bytes(convert.to_proto(tracks_of(frame)).ByteSize())
 
 
-def answering(session: zenoh.Session, stream: str) -> Any:
+def answering(session: Session, stream: str) -> Any:
     """Answer every frame of a stream with a track for each of its objects; nothing is lost on the way."""
-    client = Client(session, Keys().prefix)
-    publisher = cached_publisher(session, client.keys.tracks(stream), Tracks, 200)
+    keys = Keys()
+    publisher = session.cached_sender(keys.tracks(stream), encoding_of(Tracks), cache=200)
 
-    def answer(message: Message) -> None:
+    def answer(message: Arrival) -> None:
         publisher.put(encode(tracks_of(decode(message.payload, Detections))))
 
-    return publisher, client.subscribe(client.keys.detections(stream), answer)
+    return publisher, session.subscribe(keys.detections(stream), answer)
 
 
 def tracks_of(frame: Detections) -> Tracks:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from optipmb_client.errors import ClientError, ConnectionFailed, ServiceRefused, ServiceUnavailable, UsageError
-    from optipmb_client.history import kept_tracks
     from optipmb_client.publisher import Publisher
+    from optipmb_client.sessions import kept_tracks
     from optipmb_client.subscriber import Missed, Received, Statistics, Subscriber
     from optipmb_client.zenoh import DEFAULT_ENDPOINT, Connection
 
@@ -34,8 +34,8 @@ __all__ = [
 # Imported on first use: offline commands need no Zenoh.
 _MODULES = {
     "errors": ("ClientError", "ConnectionFailed", "ServiceRefused", "ServiceUnavailable", "UsageError"),
-    "history": ("kept_tracks",),
     "publisher": ("Publisher",),
+    "sessions": ("kept_tracks",),
     "subscriber": ("Missed", "Received", "Statistics", "Subscriber"),
     "zenoh": ("DEFAULT_ENDPOINT", "Connection"),
 }

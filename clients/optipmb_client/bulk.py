@@ -46,17 +46,11 @@ class WorkerDiedError(Exception):
 
 @dataclass(frozen=True)
 class Failed:
-    """Error of a task.
+    """Error of a task."""
 
-    Attributes:
-        reason: One line.
-        wrong_input: Whether the data or an option were wrong, not the program or its surroundings.
-        trace: Traceback of an unexpected error; empty for others.
-    """
-
-    reason: str
-    wrong_input: bool = False
-    trace: str = ""
+    reason: str  # one line
+    wrong_input: bool = False  # whether the data or an option were wrong, not the program or its surroundings
+    trace: str = ""  # traceback of an unexpected error; empty for others
 
     def error(self) -> UsageError | ClientError:
         """Return the error to raise for it, with the trace as a note."""

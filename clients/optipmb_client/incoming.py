@@ -39,12 +39,16 @@ class Arrival:
 
 @dataclass(frozen=True)
 class Answer:
-    """A reply to a query; `ok` is False for an error reply, whose payload then says why."""
+    """A reply to a query; `ok` is False for an error reply, whose payload then says why.
+
+    `about` is a key that the answer is about, where it says one.
+    """
 
     key: str
     payload: bytes
     encoding: str
     ok: bool
+    about: str = ""
 
 
 class Inbox:

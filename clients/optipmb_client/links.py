@@ -2,60 +2,22 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, TypeAlias
 
-from optipmb_schemas import Message
 from optipmb_schemas.installation import install_command
 
 from optipmb_client.errors import ClientError, ConnectionFailed
-from optipmb_client.incoming import Answer, Inbox
 from optipmb_client.zenoh import Connection
 
-__all__ = ["GRPC", "Link", "SendsMessages", "Subscribed", "linked"]
+if TYPE_CHECKING:
+    from optipmb_client.grpc import GrpcConnection
+
+__all__ = ["GRPC", "Link", "linked"]
 
 GRPC = "grpc://"
 
-
-class SendsMessages(Protocol):
-    """Sends the messages of one topic of a stream."""
-
-    @property
-    def wanted(self) -> bool:
-        """Whether anybody takes them, or may come for them later."""
-
-    def pack(self, message: Message) -> bytes:
-        """Return a message as it is sent."""
-
-    def put(self, payload: bytes) -> None:
-        """Send a packed message; waits for nobody."""
-
-    def close(self) -> None:
-        """Withdraw; what was sent before goes out."""
-
-
-class Subscribed(Protocol):
-    """A subscription that fills an inbox."""
-
-    def close(self) -> None:
-        """End it; what is in the inbox stays readable."""
-
-
-class Link(Protocol):
-    """What publishers, subscribers and replays use of a connection."""
-
-    def senders(
-        self, stream: str, *, prefix: str, cache: int, cache_clouds: int
-    ) -> tuple[SendsMessages, SendsMessages]:
-        """Return what sends the detections and the clouds of a stream."""
-
-    def subscribe_tracks(self, pattern: str, inbox: Inbox, *, prefix: str, problems: bool) -> Subscribed:
-        """Move the tracks of a pattern into an inbox, its problems too where that is asked for."""
-
-    def query(self, key: str, payload: bytes = b"", encoding: str = "", *, timeout: float = 2.0) -> tuple[Answer, ...]:
-        """Ask everybody who answers at a key; nothing when nobody does in time."""
-
-    def close(self) -> None:
-        """Close everything that was opened here."""
+Link: TypeAlias = "Connection | GrpcConnection"
+"""What publishers, subscribers and replays are given: both open senders, subscribe to tracks, and ask."""
 
 
 def linked(

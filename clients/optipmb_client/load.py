@@ -33,7 +33,7 @@ from optipmb_client.incoming import Arrival, Inbox
 from optipmb_client.pictures import matplotlib_needed
 from optipmb_client.sessions import close_session, set_parameters
 from optipmb_client.zenoh import Connection
-from optipmb_client.zenoh.sender import Sender
+from optipmb_client.zenoh.handles import Sender
 
 FIRST = 2**32  # number of the first frame: from here on msgpack writes nine bytes
 STREAM_BYTES = 24  # length of the names of streams

@@ -16,12 +16,16 @@ import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from optipmb_schemas import PREFIX, Detections, FieldOfView, Keys, MessageError, Points, Pose
 from optipmb_schemas.arrays import ArrayLike, numeric
 
 from optipmb_client.links import Link, linked
+
+if TYPE_CHECKING:
+    from optipmb_client.grpc.streams import GrpcSender
+    from optipmb_client.zenoh.handles import Sender
 
 __all__ = ["Publisher"]
 
@@ -64,7 +68,7 @@ class Publisher:
         frame: Literal["sensor", "world"] = "sensor",
         config: str | Path | None = None,
         timeout: float = 5.0,
-        connection: Link | None = None,
+        connection: "Link | None" = None,
         cache: int = CACHE,
         cache_clouds: int = 0,
         prefix: str = PREFIX,
@@ -80,6 +84,8 @@ class Publisher:
         self._own = linked(connect, config=config, timeout=timeout) if connection is None else None
         link = connection or self._own
         assert link is not None  # noqa: S101  one of the two is there: said for the type checker
+        self._detections: Sender | GrpcSender
+        self._points: Sender | GrpcSender
         self._detections, self._points = link.senders(stream, prefix=prefix, cache=cache, cache_clouds=cache_clouds)
 
     def __enter__(self) -> Self:

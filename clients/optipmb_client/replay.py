@@ -41,40 +41,24 @@ KEPT_PROBLEMS = 20
 
 @dataclass(frozen=True)
 class Pace:
-    """How fast frames are sent.
+    """How fast frames are sent."""
 
-    Attributes:
-        speed: Multiple of the recorded rate; None: as fast as tracks come back.
-        window: Frames in flight at most when `speed` is None.
-        patience_s: The replay ends when nothing has come back for so long.
-        service_s: How long to wait for a service to answer at the start.
-    """
-
-    speed: float | None = None
-    window: int = 8
-    patience_s: float = 30.0
-    service_s: float = 10.0
+    speed: float | None = None  # multiple of the recorded rate; None: as fast as tracks come back
+    window: int = 8  # frames in flight at most when `speed` is None
+    patience_s: float = 30.0  # the replay ends when nothing has come back for so long
+    service_s: float = 10.0  # how long to wait for a service to answer at the start
 
 
 @dataclass(frozen=True)
 class Replaying:
-    """How sequences are replayed.
+    """How sequences are replayed."""
 
-    Attributes:
-        profile: Profile that the service knows.
-        pace: How fast.
-        classes: Only detections of these; empty: all.
-        streams: Sequences at once.
-        prefix: First part of all keys.
-        full: Whether all columns of the tracks are written too, beside each result file.
-    """
-
-    profile: str
+    profile: str  # name that the service knows
     pace: Pace
-    classes: Sequence[str] = ()
-    streams: int = 1
-    prefix: str = PREFIX
-    full: bool = False
+    classes: Sequence[str] = ()  # only detections of these; empty: all
+    streams: int = 1  # sequences at once
+    prefix: str = PREFIX  # first part of all keys
+    full: bool = False  # whether all columns of the tracks are written too, beside each result file
 
 
 @dataclass(frozen=True)

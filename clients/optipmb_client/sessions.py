@@ -1,12 +1,14 @@
-"""Asking the service: parameters, reset and state of a stream's session, and the status of the services themselves."""
+"""Asking the service: parameters, reset, state and kept tracks of a stream's session, and the services themselves."""
 
 import time
+from collections.abc import Iterator
 from typing import TypeVar
 
 from optipmb_schemas import (
     PREFIX,
     DrainRequest,
     Keys,
+    Message,
     MessageError,
     MoveRequest,
     Problem,
@@ -14,6 +16,8 @@ from optipmb_schemas import (
     ServiceStatus,
     SessionParameters,
     SessionState,
+    Tracks,
+    TracksRequest,
     decode,
     encode,
     encoding_of,
@@ -28,6 +32,7 @@ __all__ = [
     "close_session",
     "drain_service",
     "find_services",
+    "kept_tracks",
     "move_stream",
     "only_service",
     "session_state",
@@ -36,9 +41,11 @@ __all__ = [
 
 QUERY_S = 2.0
 MOVE_S = 25.0
+TRACKS_S = 15.0
+"""Longest wait for kept tracks: a service reads its log for up to 3 s, and several queries in turn."""
 RETRY_S = 0.1
 
-Message = TypeVar("Message", SessionParameters, SessionState, ServiceStatus, MoveRequest, DrainRequest)
+_Answer = TypeVar("_Answer", bound=Message)
 
 
 def set_parameters(
@@ -55,36 +62,67 @@ def set_parameters(
         ServiceUnavailable: No service answered within `patience_s` seconds.
         ServiceRefused: A service answered that it will not; the text says why.
     """
-    key = Keys(prefix).query(stream, "parameters")
     deadline = time.monotonic() + patience_s
-    while True:
-        asked = connection.query(key, encode(parameters), encoding_of(SessionParameters), timeout=QUERY_S)
-        if asked:
-            return _read(asked, SessionParameters)
+    while (
+        in_force := _ask(connection, Keys(prefix).query(stream, "parameters"), SessionParameters, parameters)
+    ) is None:
         if time.monotonic() >= deadline:
             raise ServiceUnavailable(
                 f"no tracking service answered for {patience_s:g} s; is optipmb-service running, with the same prefix?"
             )
         time.sleep(RETRY_S)
+    return in_force
 
 
 def close_session(connection: Link, stream: str, *, prefix: str = PREFIX) -> SessionState | None:
     """End the session of a stream and free what it holds; None when no service answers, or it says no."""
-    key = Keys(prefix).query(stream, "reset")
-    asked = connection.query(key, encode(ResetRequest(close=True)), encoding_of(ResetRequest), timeout=QUERY_S)
     try:
-        return _read(asked, SessionState) if asked else None
+        return _ask(connection, Keys(prefix).query(stream, "reset"), SessionState, ResetRequest(close=True))
     except ServiceRefused:
         return None
 
 
 def session_state(connection: Link, stream: str, *, prefix: str = PREFIX) -> SessionState | None:
     """Return the state of a stream's session; None when no service answers, or it has none."""
-    asked = connection.query(Keys(prefix).query(stream, "state"), timeout=QUERY_S)
     try:
-        return _read(asked, SessionState) if asked else None
+        return _ask(connection, Keys(prefix).query(stream, "state"), SessionState)
     except ServiceRefused:
         return None
+
+
+def kept_tracks(
+    connection: Connection, stream: str, from_ns: int = 0, to_ns: int | None = None, *, prefix: str = PREFIX
+) -> Iterator[Tracks]:
+    """Yield the tracks of a stream in a range of stamps, by stamp, each frame once, as far as they are kept.
+
+    The service keeps the last 100 messages of a stream; with `--cluster` and `optipmb-service log` those of an hour, or
+    of what the setting `log_tracks_s` says. The range is asked for part by part, as the iterator goes on.
+
+    Args:
+        connection: Where to ask.
+        stream: Name of the stream, `site/node/sensor`.
+        from_ns: First stamp, of the sensor's clock.
+        to_ns: Last stamp; None: up to the newest frame.
+        prefix: First part of all keys, as configured in the service.
+
+    Raises:
+        MessageError: The name or a stamp is not valid.
+        ServiceUnavailable: No service answers completely in time.
+        ServiceRefused: The service answers that it cannot; the text says why.
+    """
+    key = Keys(prefix).query(stream, "tracks")
+    next_ns: int | None = from_ns
+    while next_ns is not None:
+        request = TracksRequest(from_ns=next_ns, to_ns=to_ns)
+        answers = connection.query(key, encode(request), encoding_of(request), timeout=TRACKS_S)
+        if not answers:
+            raise ServiceUnavailable(f"no tracking service answered for {stream} in {TRACKS_S:g} s (prefix {prefix})")
+        tracks = [one for one in answers if one.ok and one.encoding != encoding_of(request)]
+        refusals = [one for one in answers if not one.ok]
+        if not refusals and len(tracks) == len(answers):
+            raise ServiceUnavailable(f"the tracks of {stream} did not come completely in {TRACKS_S:g} s; ask again")
+        yield from (decode(one.payload, Tracks, encoding=one.encoding) for one in tracks)
+        next_ns = _rest(next_ns, refusals[0]) if refusals else None
 
 
 def move_stream(connection: Connection, instance: str, stream: str, worker: int, *, prefix: str = PREFIX) -> None:
@@ -96,10 +134,8 @@ def move_stream(connection: Connection, instance: str, stream: str, worker: int,
         ServiceRefused: It has no such worker, or the move was not done in time.
     """
     request = MoveRequest(stream=stream, worker=worker)
-    asked = connection.query(Keys(prefix).move(instance), encode(request), encoding_of(MoveRequest), timeout=MOVE_S)
-    if not asked:
+    if _ask(connection, Keys(prefix).move(instance), MoveRequest, request, timeout=MOVE_S) is None:
         raise ServiceUnavailable(f"no service {instance} answers")
-    _read(asked, MoveRequest)
 
 
 def drain_service(connection: Connection, member: str, *, drains: bool = True, prefix: str = PREFIX) -> None:
@@ -110,10 +146,8 @@ def drain_service(connection: Connection, member: str, *, drains: bool = True, p
         ServiceRefused: There is no other one, or it did not take all streams in time.
     """
     request = DrainRequest(drain=drains)
-    asked = connection.query(Keys(prefix).drain(member), encode(request), encoding_of(DrainRequest), timeout=MOVE_S)
-    if not asked:
+    if _ask(connection, Keys(prefix).drain(member), DrainRequest, request, timeout=MOVE_S) is None:
         raise ServiceUnavailable(f"no service {member} answers")
-    _read(asked, DrainRequest)
 
 
 def find_services(connection: Connection, *, prefix: str = PREFIX, patience_s: float = 1.0) -> list[ServiceStatus]:
@@ -125,8 +159,8 @@ def find_services(connection: Connection, *, prefix: str = PREFIX, patience_s: f
             return []
         time.sleep(RETRY_S)
     instances = [key.rsplit("/", 2)[1] for key in alive]
-    answers = [connection.query(keys.status(instance), timeout=QUERY_S) for instance in instances]
-    return [_read(answer, ServiceStatus) for answer in answers if answer]
+    found = [_ask(connection, keys.status(instance), ServiceStatus) for instance in instances]
+    return [status for status in found if status is not None]
 
 
 def only_service(connection: Connection, option: str, *, prefix: str = PREFIX) -> str:
@@ -144,18 +178,38 @@ def only_service(connection: Connection, option: str, *, prefix: str = PREFIX) -
     return names[0]
 
 
-def _read(answers: tuple[Answer, ...], expected: type[Message]) -> Message:
-    """Return the first good answer.
+def _ask(
+    connection: Link, key: str, expected: type[_Answer], request: Message | None = None, *, timeout: float = QUERY_S
+) -> _Answer | None:
+    """Ask at a key and return the first good answer; None when nobody answers.
 
     Raises:
-        ServiceRefused: There is none; says what the first error was.
+        ServiceRefused: All answers are errors; says what the first one was.
     """
+    payload, encoding = (b"", "") if request is None else (encode(request), encoding_of(request))
+    answers = connection.query(key, payload, encoding, timeout=timeout)
     for answer in answers:
         if answer.ok:
             return decode(answer.payload, expected, encoding=answer.encoding)
-    first = answers[0]
+    if not answers:
+        return None
+    raise ServiceRefused(f"the service refused: {_reason(answers[0])}")
+
+
+def _reason(refusal: Answer) -> str:
     try:
-        reason = decode(first.payload, Problem, encoding=first.encoding).message
+        return decode(refusal.payload, Problem, encoding=refusal.encoding).message
     except MessageError:
-        reason = first.payload[:200].decode(errors="replace")
-    raise ServiceRefused(f"the service refused: {reason}")
+        return refusal.payload[:200].decode(errors="replace")
+
+
+def _rest(asked_ns: int, refusal: Answer) -> int:
+    """Return the stamp at which the rest of kept tracks begins.
+
+    Raises:
+        ServiceRefused: There is no rest, but another problem.
+    """
+    problem = decode(refusal.payload, Problem)
+    if problem.code != "cut" or problem.stamp_ns is None or problem.stamp_ns <= asked_ns:
+        raise ServiceRefused(f"the service refused: {problem.message}")
+    return problem.stamp_ns

@@ -119,7 +119,7 @@ class Subscriber:
         corrections: bool = True,
         queue: int = 1024,
         config: str | Path | None = None,
-        connection: Link | None = None,
+        connection: "Link | None" = None,
         connect_timeout: float = 5.0,
         prefix: str = PREFIX,
     ) -> None:

@@ -20,12 +20,11 @@ import re
 import struct
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from itertools import accumulate, chain, pairwise
 from math import prod
 from operator import attrgetter
-from typing import Annotated, Any, Final, Literal, TypeVar, get_type_hints
+from typing import Annotated, Any, Final, Literal, NamedTuple, TypeVar, get_type_hints
 
 import msgpack
 import msgspec
@@ -718,9 +717,9 @@ class _Builder:
             data = self._data_in(fields)
             plan = _plan_of(kind, self._shapes_in(fields))
             _need([*map(len, data)] == plan.sizes)
-            _need(plan.is_usual if limits.at_least_default else plan.is_within(limits))
-            for column in plan.columns:
-                column.read(data, values)
+            _need(plan.is_usual if limits.at_least_default else _are_within(plan.lengths, limits))
+            for read in plan.readers:
+                read(data, values)
             given |= plan.names
         for name, check in self._checks:
             if values[name] is not None:
@@ -730,125 +729,92 @@ class _Builder:
         return message
 
 
-@dataclass(frozen=True, slots=True)
-class _Columns:
-    """Columns of one number type, one behind the other, those with unknown rows last.
+_Read = Callable[[tuple[memoryview, ...], dict[str, Any]], None]
+"""Adds columns, of the data of all arrays, to the values. Raises ValueError: a number is out of its range."""
 
-    Attributes:
-        dtype: their number type.
-        order: numbers of the arrays.
-        places: name, place and shape of each (None: one dimension), and whether its rows may be unknown.
-        known: count of the numbers that must be within their bounds; rows of the others may be unknown.
-        low, high: bounds of each number.
-    """
 
-    dtype: str
-    order: tuple[int, ...]
-    places: tuple[tuple[str, slice, tuple[int, ...] | None, bool], ...]
-    known: int
-    low: Numeric
-    high: Numeric
+def _columns(dtype: str, arrays: list[tuple[int, str, Array, tuple[int, ...]]]) -> _Read:
+    """Return the reader of columns of one number type: one behind the other, those with unknown rows last."""
+    arrays = sorted(arrays, key=lambda one: one[2].unknown)
+    sizes = [prod(shape) for *_, shape in arrays]
+    places = [slice(begin, end) for begin, end in pairwise(accumulate(sizes, initial=0))]
+    low = np.concatenate([np.full(size, _least(one[2]), dtype) for one, size in zip(arrays, sizes, strict=True)])
+    high = np.concatenate([np.full(size, one[2].high, dtype) for one, size in zip(arrays, sizes, strict=True)])
+    order = [at for at, *_ in arrays]
+    columns = [
+        (name, place, shape if len(shape) > 1 else None)
+        for (_, name, _, shape), place in zip(arrays, places, strict=True)
+    ]
+    unknown = [(name, place) for (_, name, one, _), place in zip(arrays, places, strict=True) if one.unknown]
+    known = unknown[0][1].start if unknown else len(low)
 
-    @classmethod
-    def of(cls, dtype: str, arrays: list[tuple[int, str, Array, tuple[int, ...]]]) -> "_Columns":
-        arrays = sorted(arrays, key=lambda one: one[2].unknown)
-        places, end, known = [], 0, 0
-        low, high = [], []
-        for _, name, described, shape in arrays:
-            begin, size = end, prod(shape)
-            end += size
-            known = known if described.unknown else end
-            places.append((name, slice(begin, end), shape if len(shape) > 1 else None, described.unknown))
-            low.append(np.full(size, _least(described), dtype))
-            high.append(np.full(size, described.high, dtype))
-        order = tuple(at for at, *_ in arrays)
-        return cls(dtype, order, tuple(places), known, np.concatenate(low), np.concatenate(high))
-
-    def read(self, data: tuple[memoryview, ...], values: dict[str, Any]) -> None:
-        """Add the columns to the values. Raises ValueError: a number is out of its range."""
-        numbers = np.frombuffer(b"".join([data[at] for at in self.order]), self.dtype)
-        good = (numbers >= self.low) & (numbers <= self.high)
-        for name, place, shape, _ in self.places:
+    def read(data: tuple[memoryview, ...], values: dict[str, Any]) -> None:
+        numbers = np.frombuffer(b"".join([data[at] for at in order]), dtype)
+        good = (numbers >= low) & (numbers <= high)
+        for name, place, shape in columns:
             values[name] = numbers[place] if shape is None else numbers[place].reshape(shape)
         if not good[good.argmin()]:
-            _need(bool(good[: self.known].all()))
-            for name, place, _, unknown in self.places:
-                if unknown:
-                    unknown_rows = np.isnan(array := values[name]).all(axis=-1, keepdims=True)
-                    _need(bool((good[place].reshape(array.shape) | unknown_rows).all()))
+            _need(bool(good[:known].all()))
+            for name, place in unknown:
+                unknown_rows = np.isnan(array := values[name]).all(axis=-1, keepdims=True)
+                _need(bool((good[place].reshape(array.shape) | unknown_rows).all()))
+
+    return read
 
 
-@dataclass(frozen=True, slots=True)
-class _Column:
-    """A single column."""
+def _column(at: int, name: str, described: Array, shape: tuple[int, ...]) -> _Read:
+    """Return the reader of a single column, which is a view of the payload where it is large and aligned."""
+    low, high, dtype = _least(described), described.high, described.dtype
 
-    at: int
-    name: str
-    described: Array
-    shape: tuple[int, ...]
-    low: Any
-
-    def read(self, data: tuple[memoryview, ...], values: dict[str, Any]) -> None:
-        """Add the column to the values, a view of the payload where that is large and aligned."""
-        block, described = data[self.at], self.described
-        numbers = np.frombuffer(block if len(block) >= LARGE else bytes(block), described.dtype)
+    def read(data: tuple[memoryview, ...], values: dict[str, Any]) -> None:
+        block = data[at]
+        numbers = np.frombuffer(block if len(block) >= LARGE else bytes(block), dtype)
         if not numbers.flags.aligned:
-            numbers = np.frombuffer(bytes(block), described.dtype)
-        values[self.name] = array = numbers.reshape(self.shape)
+            numbers = np.frombuffer(bytes(block), dtype)
+        values[name] = array = numbers.reshape(shape)
         # Both are NaN where there is one, and comparisons with NaN are false.
-        if not (numbers[numbers.argmin()] >= self.low and numbers[numbers.argmax()] <= described.high):
+        if not (numbers[numbers.argmin()] >= low and numbers[numbers.argmax()] <= high):
             _need(described.unknown and numeric.first_outside(array, described) is None)
 
+    return read
 
-@dataclass(slots=True)
-class _Plan:
-    """Reading plan for the arrays of a message, by their shapes.
 
-    Attributes:
-        names: arrays that are present.
-        sizes: bytes of each array, 0 of an absent one.
-        lengths: symbolic dimensions.
-        columns: columns of one number type together, or single ones.
-        is_usual: whether they are within the default limits.
-    """
+class _Plan(NamedTuple):
+    """Reading plan for the arrays of a message, by their shapes."""
 
     names: frozenset[str]
+    """Arrays that are present."""
     sizes: list[int]
-    lengths: tuple[tuple[str, int], ...]
-    columns: tuple[_Columns | _Column, ...]
-    is_usual: bool = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.is_usual = self.is_within(DEFAULT)
-
-    def is_within(self, limits: Limits) -> bool:
-        """Return whether no dimension is above a limit."""
-        return all(length <= limits.rows(letter) for letter, length in self.lengths)
+    """Bytes of each array, 0 of an absent one."""
+    lengths: dict[str, int]
+    """Symbolic dimensions."""
+    readers: list[_Read]
+    is_usual: bool
+    """Whether they are within the default limits."""
 
 
 @lru_cache(128)
 def _plan_of(kind: type[Message], shapes: tuple[tuple[int, ...] | None, ...]) -> _Plan:
     """Return the plan for arrays of these shapes, None for an absent one. Raises ValueError: no message has them."""
     lengths: dict[str, int] = {}
-    arrays = []
+    arrays, sizes = [], [0] * len(shapes)
     for at, ((name, described), shape) in enumerate(zip(kind.arrays.items(), shapes, strict=True)):
         if shape is None:
             continue
         for want, length in zip(described.shape, shape, strict=True):
             _need(0 < length == (want if isinstance(want, int) else lengths.setdefault(want, length)))
         arrays.append((at, name, described, shape))
-    sizes = [0] * len(shapes)
-    for at, _, described, shape in arrays:
         sizes[at] = DTYPES[described.dtype] * prod(shape)
-    columns: list[_Columns | _Column] = []
+    readers: list[_Read] = []
     many = sum(prod(shape) for *_, shape in arrays) > MOST_NUMBERS
     for dtype in dict.fromkeys(described.dtype for _, _, described, _ in arrays):
         alike = [one for one in arrays if one[2].dtype == dtype]
-        if many or len(alike) == 1:
-            columns += [_Column(*one, _least(one[2])) for one in alike]
-        else:
-            columns.append(_Columns.of(dtype, alike))
-    return _Plan(frozenset(name for _, name, *_ in arrays), sizes, tuple(lengths.items()), tuple(columns))
+        readers += [_column(*one) for one in alike] if many or len(alike) == 1 else [_columns(dtype, alike)]
+    return _Plan(frozenset(name for _, name, *_ in arrays), sizes, lengths, readers, _are_within(lengths, DEFAULT))
+
+
+def _are_within(lengths: dict[str, int], limits: Limits) -> bool:
+    return all(length <= limits.rows(letter) for letter, length in lengths.items())
 
 
 def _least(described: Array) -> Any:

@@ -8,14 +8,16 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
+import zenoh.ext
 from optipmb_client.errors import ConnectionFailed
 from optipmb_client.incoming import Arrival, Inbox
 from optipmb_client.links import linked
-from optipmb_client.zenoh import DEFAULT_ENDPOINT, Connection, configuration
-from optipmb_client.zenoh.subscription import Subscription
+from optipmb_client.zenoh import DEFAULT_ENDPOINT, Connection
+from optipmb_client.zenoh import connection as connecting
 from routers import free_endpoint, open_client, open_router
 
 
@@ -60,7 +62,7 @@ def test_a_timeout_that_is_none_is_one_error(timeout: float, scheme: str) -> Non
 def test_a_connection_may_wait_for_ever(endpoint: str) -> None:
     """With an infinite timeout a connection opens; it has a router when it is open."""
     with Connection(endpoint, timeout=math.inf) as connection:
-        assert list(connection._session.info.routers_zid())
+        assert connection._session.linked()
 
 
 def test_a_router_that_comes_later_within_the_timeout_is_waited_for() -> None:
@@ -72,7 +74,7 @@ def test_a_router_that_comes_later_within_the_timeout_is_waited_for() -> None:
     try:
         with Connection(address, timeout=60.0) as connection:
             assert not connection.closed
-            assert list(connection._session.info.routers_zid())
+            assert connection._session.linked()
     finally:
         timer.join()
         opened[0].close()
@@ -81,8 +83,9 @@ def test_a_router_that_comes_later_within_the_timeout_is_waited_for() -> None:
 def test_what_is_sent_just_before_closing_arrives(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Closing a connection flushes: the last small and the last large message are both received."""
     # A large message that finds no room within half a second is dropped, whether or not the connection closes.
-    monkeypatch.setattr(configuration, "WAIT_BEFORE_DROP_US", 30_000_000)
-    monkeypatch.setattr(configuration, "WAIT_BEFORE_DROP_FRAGMENTS_US", 30_000_000)
+    drop = "transport/link/tx/queue/congestion_control/drop"
+    longer = {f"{drop}/wait_before_drop": 30_000_000, f"{drop}/max_wait_before_drop_fragments": 30_000_000}
+    monkeypatch.setattr(connecting, "BUSY", {**connecting.BUSY, **longer})
     inbox = Inbox(10)
     with Connection(endpoint) as receiver:
         receiver.subscribe("a/*", inbox)
@@ -116,25 +119,29 @@ def test_a_late_subscriber_gets_the_history_of_the_cache(endpoint: str) -> None:
     assert {arrival.encoding for arrival in arrivals if arrival} == {"application/msgpack;optipmb.Detections.v1"}
 
 
-def test_what_a_publisher_sent_before_its_first_sample_came_is_not_lost(endpoint: str) -> None:
+def test_what_a_publisher_sent_before_its_first_sample_came_is_not_lost(
+    endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A subscription that gets nothing but what is sent from now on brings the publisher's earlier messages first."""
+    monkeypatch.setattr(zenoh.ext, "declare_advanced_subscriber", plain_subscriber)
     inbox = Inbox(10_000)
     with Connection(endpoint) as sender, Connection(endpoint) as receiver:
         small = sender.cached_sender("a/small", "zenoh/bytes", cache=1000)
         for number in range(5):
             small.put(b"%d" % number)
-        session = receiver._session
-        subscription = Subscription(  # a plain one, which asks no cache itself
-            lambda handler: session.declare_subscriber("a/*", handler), inbox, session
-        )
+        receiver.subscribe("a/*", inbox)
         sent, deadline = 5, time.monotonic() + 60.0
         while not inbox.pending and time.monotonic() < deadline:
             small.put(b"%d" % sent)
             sent += 1
             time.sleep(0.01)  # the subscription is on its way to the publisher; there is no event for it
         received = [inbox.get(60.0) for _ in range(sent)]
-        subscription.close()
     assert [arrival.payload for arrival in received if arrival] == [b"%d" % number for number in range(sent)]
+
+
+def plain_subscriber(session: zenoh.Session, key: str, handler: Any, **_: object) -> Any:
+    """Subscribe without asking any cache."""
+    return session.declare_subscriber(key, handler)
 
 
 def test_an_unread_inbox_neither_blocks_the_publisher_nor_the_closing(endpoint: str) -> None:
@@ -159,13 +166,14 @@ def test_nothing_arrives_after_closing(endpoint: str) -> None:
         inbox = Inbox(100_000)
         with Connection(endpoint) as sender:
             receiver = Connection(endpoint)
-            subscription = receiver.subscribe("a/*", inbox)
+            receiver.subscribe("a/*", inbox)
             small = sender.cached_sender("a/small", "zenoh/bytes", cache=1)
             for number in range(3000):
                 small.put(b"%d" % number)
             receiver.close()
-            assert not subscription.alive
             assert receiver.closed
+            received = inbox.pending
+        assert inbox.pending == received
 
 
 def test_a_closed_connection_is_one_clear_error(endpoint: str) -> None:

@@ -9,14 +9,13 @@ from optipmb_client import Publisher, Subscriber
 from optipmb_client.errors import ConnectionFailed
 from optipmb_client.incoming import Inbox
 from optipmb_client.zenoh import Connection
-from optipmb_client.zenoh.connection import MOST_KEYS
+from optipmb_client.zenoh.session import MOST_KEYS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from optipmb_client.zenoh.sender import Sender
-    from optipmb_client.zenoh.subscription import Subscription
+    from optipmb_client.zenoh.handles import Reading, Sender
 
 ALONE: Final = '{mode: "peer", scouting: {multicast: {enabled: false}}, listen: {endpoints: []}}'
 
@@ -33,7 +32,7 @@ def _plain_cached(connection: Connection, key: str) -> Sender:
     return connection.plain_sender(key, "", cache=1)
 
 
-def _subscribed(connection: Connection, key: str) -> Subscription:
+def _subscribed(connection: Connection, key: str) -> Reading:
     return connection.subscribe(key, Inbox(1))
 
 
@@ -48,7 +47,7 @@ def connection(tmp_path: Path) -> Iterator[Connection]:
 
 @pytest.mark.parametrize("opened", [_cached, _plain, _plain_cached, _subscribed])
 def test_what_was_opened_early_is_heard_to_the_last(
-    connection: Connection, opened: Callable[[Connection, str], Sender | Subscription]
+    connection: Connection, opened: Callable[[Connection, str], Sender | Reading]
 ) -> None:
     """When a connection has declared all keys that it can, the next publisher is refused, and early ones go on.
 

@@ -6,7 +6,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import optipmb_client
+import optipmb_schemas
+import optipmb_service
 
+import optipmb
+
+OTHERS = (optipmb, optipmb_schemas, optipmb_service)
 SOURCES = sorted(Path(optipmb_client.__file__).parent.rglob("*.py"))
 
 
@@ -39,9 +44,12 @@ def test_the_tracker_is_imported_for_offline_tracking_alone() -> None:
 
 
 def test_zenoh_is_imported_in_one_folder() -> None:
-    """Only modules of the folder zenoh/ import zenoh."""
-    modules = {f"zenoh/{name}.py" for name in ("configuration", "connection", "sender", "subscription")}
+    """Of all packages only the client imports zenoh, and of that only the folder zenoh/."""
+    modules = {f"zenoh/{name}.py" for name in ("configuration", "connection", "handles", "session")}
     assert importers("zenoh") == modules
+    others = [source for package in OTHERS for source in Path(package.__path__[0]).rglob("*.py")]
+    assert len(others) > 100
+    assert [source for source in others if "zenoh" in set(imported(source))] == []
 
 
 def test_the_node_distribution_has_what_it_imports() -> None:

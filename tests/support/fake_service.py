@@ -9,6 +9,8 @@ from typing import Self
 import numpy as np
 import zenoh
 from numpy.typing import NDArray
+from optipmb_client.incoming import Arrival
+from optipmb_client.zenoh.session import Session
 from optipmb_schemas import (
     Detections,
     Keys,
@@ -25,7 +27,6 @@ from optipmb_schemas import (
     encode,
     encoding_of,
 )
-from optipmb_service.zenoh.subscription import Subscription
 from routers import open_client
 
 SESSION = "0123456789abcdef0123456789abcdef"
@@ -65,7 +66,7 @@ class FakeService:
         self._publishers: dict[str, zenoh.ext.AdvancedPublisher] = {}
         self._lock = threading.Lock()
         self._opened: list[object] = []
-        self._opened.append(Subscription(session, KEYS.all("detections"), self._on_detections))
+        self._opened.append(Session(session).subscribe(KEYS.all("detections"), self._on_detections))
         self._work(session.declare_subscriber(KEYS.all("points"), zenoh.handlers.FifoChannel(1000)), self._on_points)
         for what, answer in (("parameters", self._on_parameters), ("reset", self._on_reset)):
             self._work(session.declare_queryable(KEYS.all_queries(what), zenoh.handlers.FifoChannel(100)), answer)
@@ -89,11 +90,11 @@ class FakeService:
 
         threading.Thread(target=loop, daemon=True).start()
 
-    def _on_detections(self, sample: zenoh.Sample) -> None:
+    def _on_detections(self, arrival: Arrival) -> None:
         try:
-            message = decode(sample.payload.to_bytes(), Detections, encoding=str(sample.encoding))
+            message = arrival.read(Detections)
         except MessageError as error:
-            stream = KEYS.stream_of(str(sample.key_expr))
+            stream = KEYS.stream_of(arrival.key)
             problem = Problem.of(error, stream=stream, instance=self.instance)
             self._session.put(KEYS.problems(stream), encode(problem), encoding=encoding_of(Problem))
             return

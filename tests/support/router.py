@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 import numpy as np
 import zenoh
 import zenoh.ext
+from optipmb_client.zenoh.session import Session
 from optipmb_schemas import (
     Detections,
     Keys,
@@ -27,11 +28,12 @@ from optipmb_schemas import (
     encode,
     encoding_of,
 )
-from optipmb_service.zenoh.subscription import Subscription
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
     from types import TracebackType
+
+    from optipmb_client.incoming import Arrival
 
 SECOND = 1_000_000_000
 DEADLINE_S = 60.0
@@ -268,10 +270,10 @@ class Node:
     def _collect(self, pattern: str) -> Collected:
         collected = Collected()
 
-        def take(sample: zenoh.Sample) -> None:
-            collected.add(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding))
+        def take(arrival: Arrival) -> None:
+            collected.add(arrival.key, arrival.payload, arrival.encoding)
 
-        self._closing.append(Subscription(self.session, pattern, take).close)
+        self._closing.append(Session(self.session).subscribe(pattern, take).close)
         return collected
 
     def _drain(self, subscriber: Any, take: Callable[[Any], None]) -> None:

@@ -19,9 +19,9 @@ ALLOWED = {
     "tomllib", "types", "typing",
 }  # fmt: skip
 EXCEPTIONS = {
-    "compiled": {"logging", "os", "stat", "tempfile", "time"},  # to log how far a compilation is; a folder for kernels
+    "compiled": {"logging", "os", "stat", "tempfile", "time"},  # to show why a first frame takes a minute; a folder
     "warm": {"gc"},  # to collect less often while a compiler fills the memory
-    "online": {"datetime", "pandas", "pyarrow"},  # stamps and tables as users have them
+    "online": {"datetime", "pandas", "pyarrow"},  # to take dates, and give tracks in the tables that users ask for
 }
 TOUCHES_FILES = {"compiled", "parameters", "prepared"}
 DOES_IO = {"open", "print", "input", "exec", "eval", "__import__"}

@@ -14,10 +14,10 @@ from rich.live import Live
 from optipmb_client.commands.options import AsJson, print_json, print_table, report
 from optipmb_client.commands.service_options import ServiceOptions
 from optipmb_client.errors import ConnectionFailed, ServiceRefused, ServiceUnavailable, UsageError
-from optipmb_client.history import kept_tracks
 from optipmb_client.sessions import (
     drain_service,
     find_services,
+    kept_tracks,
     move_stream,
     only_service,
     session_state,

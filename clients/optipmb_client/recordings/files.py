@@ -43,23 +43,14 @@ _LARGEST = 2**30
 
 @dataclass(frozen=True)
 class Recorded:
-    """A message of a recording.
-
-    Attributes:
-        stream: Name of its stream.
-        topic: Last part of its key: `detections`, `points`, `tracks`, `problems`, `parameters`.
-        payload: Its bytes.
-        encoding: Its Zenoh encoding.
-        received_ns: When it was received, ns since 1970 UTC.
-        stamp_ns: The stamp in it; where it has none, the same as `received_ns`.
-    """
+    """A message of a recording."""
 
     stream: str
-    topic: str
+    topic: str  # last part of its key: `detections`, `points`, `tracks`, `problems`, `parameters`
     payload: bytes
-    encoding: str
-    received_ns: int
-    stamp_ns: int
+    encoding: str  # of Zenoh
+    received_ns: int  # ns since 1970 UTC
+    stamp_ns: int  # stamp of the message, or `received_ns` without one
 
 
 class RecordingFile:

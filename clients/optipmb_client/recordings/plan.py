@@ -24,23 +24,14 @@ _ANYWHERE = {"stream": "any/any/any", "session": "0" * 32, "delivery": None, "re
 
 @dataclass
 class StreamPlan:
-    """Content of a recording for one stream.
-
-    Attributes:
-        stream: Its name.
-        frames: Stamps of the frames in order of arrival, each frame once.
-        clouds: How often there is a cloud of a stamp.
-        with_cloud: Frames that are played with their cloud.
-        tracks: Newest recorded tracks of each frame.
-        parameters: Parameters in force when the session began; None when they were not recorded.
-    """
+    """Content of a recording for one stream."""
 
     stream: str
-    frames: dict[FrameId, int] = field(default_factory=dict)
-    clouds: collections.Counter[int] = field(default_factory=collections.Counter)
-    with_cloud: set[FrameId] = field(default_factory=set)
-    tracks: dict[FrameId, Tracks] = field(default_factory=dict)
-    parameters: SessionParameters | None = None
+    frames: dict[FrameId, int] = field(default_factory=dict)  # stamps in order of arrival, each frame once
+    clouds: collections.Counter[int] = field(default_factory=collections.Counter)  # by stamp
+    with_cloud: set[FrameId] = field(default_factory=set)  # frames that are played with their cloud
+    tracks: dict[FrameId, Tracks] = field(default_factory=dict)  # newest
+    parameters: SessionParameters | None = None  # when the session began; None when they were not recorded
 
     @property
     def clouds_lost(self) -> int:

@@ -19,7 +19,7 @@ from optipmb_client.replay import CLOUD_WAIT_S, Exchange, Pace, await_wanted
 from optipmb_client.results.output import Latency, latency
 from optipmb_client.sessions import close_session, session_state, set_parameters
 from optipmb_client.zenoh import Connection
-from optipmb_client.zenoh.sender import Sender
+from optipmb_client.zenoh.handles import Sender
 
 
 @dataclass(frozen=True)
@@ -48,21 +48,13 @@ class PlayedStream:
 
 @dataclass(frozen=True)
 class Playing:
-    """How a recording is played.
-
-    Attributes:
-        pace: How fast.
-        site: Streams are played as `<site>-<their site>/...`, so that they meet no session; None: as recorded.
-        profile: Profile; default: the recorded one.
-        prefix: First part of all keys.
-        on_frame: Called when the tracks of a frame have come back.
-    """
+    """How a recording is played."""
 
     pace: Pace
-    site: str | None
-    profile: str | None = None
-    prefix: str = PREFIX
-    on_frame: Callable[[], None] = lambda: None
+    site: str | None  # streams are played as `<site>-<their site>/...` and meet no session; None: as recorded
+    profile: str | None = None  # default: the recorded one
+    prefix: str = PREFIX  # first part of all keys
+    on_frame: Callable[[], None] = lambda: None  # called when the tracks of a frame have come back
 
 
 def choose(recording: Iterable[Recorded], streams: Iterable[str] = ()) -> dict[str, StreamPlan]:

@@ -1,63 +1,67 @@
-"""The configuration of a Zenoh session: endpoints, a file, and values that suit large messages on busy machines."""
+"""The configuration of a Zenoh session: a file, and values over it."""
 
 import json
-import math
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import zenoh
 
 from optipmb_client.errors import ConnectionFailed
+from optipmb_client.zenoh.handles import reason
 
-__all__ = ["DEFAULT_ENDPOINT", "configuration"]
+__all__ = ["BUSY", "certificates", "configured", "loaded"]
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-WAIT_BEFORE_DROP_US = 50_000  # with the defaults (1 ms) large messages are lost whenever the machine is busy
-WAIT_BEFORE_DROP_FRAGMENTS_US = 500_000
-LEASE_MS = 3000  # after so long a router takes a silent client for gone, and lets it in again; by default 10 s
-CLOUD_BATCHES = 16  # of 64 kB on the way to the network: with the default of 2 sending a cloud takes four times as long
+BUSY: Mapping[str, object] = MappingProxyType(
+    {
+        "scouting/multicast/enabled": False,
+        # It loses messages without a word when a receiver stalls, and leaves files behind.
+        "transport/shared_memory/enabled": False,
+        # With the defaults (1 ms) large messages are lost whenever the machine is busy.
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 50_000,
+        "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": 500_000,
+    }
+)
+"""Values for large messages on busy machines."""
 
 
-def configuration(endpoints: tuple[str, ...], config: str | Path | None, timeout: float) -> zenoh.Config:
-    """Return what opens a session; arguments as for `Connection`.
+def loaded(file: str | Path | None) -> zenoh.Config:
+    """Return a configuration file, or Zenoh's defaults.
 
     Raises:
-        ConnectionFailed: An endpoint, the file or the timeout is unusable.
+        ConnectionFailed: The file cannot be used.
     """
-    if not timeout >= 0:  # NaN is not
-        raise ConnectionFailed(f"timeout: expected seconds, 0 or more, received {timeout!r}", endpoints=endpoints)
     try:
-        settings = zenoh.Config() if config is None else zenoh.Config.from_file(config)
-        own = json.loads(settings.get_json("id"))
-        if config is None:
-            values: dict[str, object] = {
-                "mode": "client",
-                "transport/link/tx/queue/size/data_low": CLOUD_BATCHES,
-                "scouting/multicast/enabled": False,
-                "transport/link/tx/lease": LEASE_MS,
-                "transport/shared_memory/enabled": False,
-                "transport/link/tx/queue/congestion_control/drop/wait_before_drop": WAIT_BEFORE_DROP_US,
-                "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": (
-                    WAIT_BEFORE_DROP_FRAGMENTS_US
-                ),
-            }
-            for key, value in values.items():
-                settings.insert_json5(key, json.dumps(value))
-        if endpoints:
-            settings.insert_json5("connect/endpoints", json.dumps(endpoints))
-        settings.insert_json5("connect/timeout_ms", json.dumps(-1 if timeout == math.inf else int(timeout * 1e3)))
-        retry = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
-        settings.insert_json5("connect/retry", json.dumps(retry))
+        return zenoh.Config() if file is None else zenoh.Config.from_file(file)
     except (zenoh.ZError, OSError) as error:
-        if config is not None and not Path(config).is_file():
-            raise ConnectionFailed(f"there is no Zenoh configuration file at {config}") from error
-        where = " ".join([*endpoints, *([str(config)] if config else [])])
+        why = reason(error) if isinstance(error, zenoh.ZError) else str(error)
+        raise ConnectionFailed(f"Zenoh configuration {file}: {why}") from error
+
+
+def configured(values: Mapping[str, object], file: str | Path | None = None, *, router: bool = False) -> zenoh.Config:
+    """Return a configuration file, or Zenoh's defaults, with values over it.
+
+    Raises:
+        ConnectionFailed: The file or a value cannot be used, or the file gives an id to what is no router. Zenoh
+            numbers what a session sends, and drops what comes again from a session of the same id.
+    """
+    config = loaded(file)
+    own = json.loads(config.get_json("id"))
+    if own is not None and not router:
         raise ConnectionFailed(
-            f"not a usable Zenoh endpoint or configuration: {where} (an endpoint looks like {DEFAULT_ENDPOINT})",
-            endpoints=endpoints,
-        ) from error
-    if own is not None:  # Zenoh numbers what a session sends, and drops what comes again from a session of the same id
-        raise ConnectionFailed(
-            f'{config}: id: expected none, received "{own}": nobody would hear the second run of this program, nor'
-            " another one of that id; remove it"
+            f'Zenoh configuration {file}: id: expected none, received "{own}": nobody would hear the second run of this'
+            " program, nor another one of that id; remove it"
         )
-    return settings
+    for key, value in values.items():
+        try:
+            config.insert_json5(key, json.dumps(value))
+        except zenoh.ZError as error:
+            raise ConnectionFailed(f"setting {key}: {reason(error)}") from error
+    return config
+
+
+def certificates(config: zenoh.Config) -> dict[str, Path]:
+    """Return the files of the certificates that a configuration names, by Zenoh's names."""
+    names = ("connect_certificate", "listen_certificate", "root_ca_certificate")
+    found = {name: json.loads(config.get_json(f"transport/link/tls/{name}")) for name in names}
+    return {name: Path(file) for name, file in found.items() if file}

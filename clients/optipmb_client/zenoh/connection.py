@@ -1,41 +1,31 @@
-"""A Zenoh session: what is opened on it, what is asked over it, and how all of it is closed."""
+"""A Zenoh session of a node or a command, as a client of routers."""
 
 import contextlib
 import json
-import threading
+import math
 import time
 import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Self
 
 import zenoh
-from optipmb_schemas import Detections, Keys, Points, Topic, encoding_of
+from optipmb_schemas import Keys, Topic
 from optipmb_schemas.certificates import end_of, ended
 
 from optipmb_client.errors import ConnectionFailed
 from optipmb_client.incoming import Answer, Inbox
-from optipmb_client.zenoh.configuration import DEFAULT_ENDPOINT, configuration
-from optipmb_client.zenoh.sender import Sender, cached_sender, plain_sender
-from optipmb_client.zenoh.subscription import Subscription, Subscriptions, subscribe
+from optipmb_client.zenoh.configuration import BUSY, certificates, configured
+from optipmb_client.zenoh.handles import Reading, Sender
+from optipmb_client.zenoh.session import CACHED, Session, opened
 
-__all__ = ["Connection"]
+__all__ = ["DEFAULT_ENDPOINT", "Connection"]
 
-NO_BOUND = 2**31 - 1  # of the replies to a query, in effect: they are all kept anyhow, and its timeout ends them
-
-MOST_KEYS = 0xFFFF
-"""Keys that a Zenoh session can declare in its life: it numbers them by 16 bits and gives no number back. Beyond, it
-would use numbers again that are in use, and what is sent with these would be lost without an error."""
-
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+LEASE_MS = 3000  # after so long a router takes a silent client for gone, and lets it in again; by default 10 s
+CLOUD_BATCHES = 16  # of 64 kB on the way to the network: with the default of 2 sending a cloud takes four times as long
 POLL_S = 0.02
-
-PLAIN = 1
-"""Keys that a publisher declares."""
-CACHED = 2
-"""Keys that a publisher with a cache declares, and a subscriber that asks caches for what was lost."""
-
-_Opened = TypeVar("_Opened", Sender, Subscription)
 
 
 class Connection:
@@ -67,24 +57,21 @@ class Connection:
         if not endpoints and config is None:
             endpoints = (DEFAULT_ENDPOINT,)
         self.where = ", ".join(endpoints) or str(config)  # for people
-        settings = configuration(endpoints, config, timeout)
+        settings = _configuration(endpoints, config, timeout)
         try:
-            self._session = zenoh.open(settings)
-        except zenoh.ZError as error:
+            self._session = Session(opened(settings))
+        except ConnectionFailed as error:
             raise self._unanswered(endpoints, timeout, settings) from error
         # A router that starts at this moment may be known and not linked yet: what is sent then is lost.
         ends = time.monotonic() + timeout
-        while json.loads(settings.get_json("mode")) == "client" and not self._session.info.routers_zid():
+        while json.loads(settings.get_json("mode")) == "client" and not self._session.linked():
             if time.monotonic() > ends:
-                self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stubs leave it untyped
+                self._session.close()
                 raise self._unanswered(endpoints, timeout, settings)
             time.sleep(POLL_S)
-        self._opened: weakref.WeakSet[Sender | Subscription] = weakref.WeakSet()
-        self._lock = threading.Lock()
-        self._keys = 0
         # For programs that forget to close: messages that still stand in a batch would be lost at their end, and a
-        # draining thread that wakes after the interpreter has ended would abort the process.
-        self._finalizer = weakref.finalize(self, _close_all, self._opened, self._session)
+        # thread of the network that calls back after the interpreter has ended would abort the process.
+        self._finalizer = weakref.finalize(self, self._session.close)
 
     def __enter__(self) -> Self:
         return self
@@ -101,14 +88,50 @@ class Connection:
     @property
     def closed(self) -> bool:
         """Whether `close` has been called."""
-        return self._session.is_closed()
+        return self._session.closed
+
+    def cached_sender(self, key: str, encoding: str, *, cache: int) -> Sender:
+        """Open a publisher for small messages that must not get lost: it keeps the newest `cache` for recovery."""
+        return self._session.cached_sender(key, encoding, cache=cache)
+
+    def plain_sender(self, key: str, encoding: str, *, cache: int = 0) -> Sender:
+        """Open a publisher for large messages: lower priority than the small ones; with `cache` it keeps the newest."""
+        return self._session.plain_sender(key, encoding, cache=cache)
+
+    def senders(self, stream: str, *, prefix: str, cache: int, cache_clouds: int) -> tuple[Sender, Sender]:
+        """Open what sends the detections and the clouds of a stream, each keeping the newest for recovery."""
+        return self._session.senders(Keys(prefix), stream, cache=cache, cache_clouds=cache_clouds)
+
+    def subscribe(self, pattern: str, inbox: Inbox) -> Reading:
+        """Move all that is published under `pattern` into `inbox`; losses are recovered from the publishers' caches.
+
+        What those caches hold from before the subscription comes first. (Recovery would bring it anyhow, at the first
+        heartbeat of a publisher: for it a late subscriber is one that has lost everything so far.)
+        """
+        return self._session.subscribe(pattern, inbox.put, history=True)
+
+    def subscribe_tracks(self, pattern: str, inbox: Inbox, *, prefix: str, problems: bool) -> contextlib.ExitStack:
+        """Move the tracks of a pattern into an inbox, its problems too where that is asked for."""
+        topics: tuple[Topic, ...] = ("tracks", "problems") if problems else ("tracks",)
+        self._session.require(CACHED * len(topics))
+        subscriptions = contextlib.ExitStack()
+        for topic in topics:
+            subscriptions.callback(self.subscribe(Keys(prefix).matching(pattern, topic), inbox).close)
+        return subscriptions
+
+    def query(self, key: str, payload: bytes = b"", encoding: str = "", *, timeout: float = 2.0) -> tuple[Answer, ...]:
+        """Ask everybody who answers at `key`; an empty result means that nobody did within `timeout` seconds."""
+        return self._session.query(key, payload, encoding, timeout=timeout)
+
+    def alive(self, pattern: str, *, timeout: float = 2.0) -> tuple[str, ...]:
+        """Keys of the liveliness tokens under `pattern`, sorted."""
+        return self._session.alive(pattern, timeout=timeout)
 
     def _unanswered(self, endpoints: tuple[str, ...], timeout: float, settings: zenoh.Config) -> ConnectionFailed:
-        names = ("connect_certificate", "root_ca_certificate")
-        found = [json.loads(settings.get_json(f"transport/link/tls/{name}")) for name in names]
-        ends = [ended(Path(file), end_of(Path(file))) for file in found if file]
-        advice = "; ".join(filter(None, ends)) or "is optipmb-service running there?"
-        if any(found) and not any(ends):
+        found = [file for name, file in certificates(settings).items() if name != "listen_certificate"]
+        ends = [end for file in found if (end := ended(file, end_of(file)))]
+        advice = "; ".join(ends) or "is optipmb-service running there?"
+        if found and not ends:
             advice = "is optipmb-service running there, and does its TLS certificate hold?"
         return ConnectionFailed(
             f"nothing answers at {self.where} (waited {timeout:g} s); {advice}",
@@ -116,105 +139,32 @@ class Connection:
             timeout=timeout,
         )
 
-    def cached_sender(self, key: str, encoding: str, *, cache: int) -> Sender:
-        """Open a publisher for small messages that must not get lost: it keeps the newest `cache` for recovery."""
-        self._count(CACHED)
-        with _usable():
-            return self._keep(cached_sender(self._session, key, encoding, cache))
 
-    def plain_sender(self, key: str, encoding: str, *, cache: int = 0) -> Sender:
-        """Open a publisher for large messages: lower priority than the small ones; with `cache` it keeps the newest."""
-        self._count(CACHED if cache else PLAIN)
-        with _usable():
-            return self._keep(plain_sender(self._session, key, encoding, cache))
-
-    def subscribe(self, pattern: str, inbox: Inbox) -> Subscription:
-        """Move all that is published under `pattern` into `inbox`; losses are recovered from the publishers' caches.
-
-        What those caches hold from before the subscription comes first. (Recovery would bring it anyhow, at the first
-        heartbeat of a publisher: for it a late subscriber is one that has lost everything so far.)
-        """
-        (subscription,) = self._subscribe([pattern], inbox)
-        return subscription
-
-    def senders(self, stream: str, *, prefix: str, cache: int, cache_clouds: int) -> tuple[Sender, Sender]:
-        """Open what sends the detections and the clouds of a stream, each keeping the newest for recovery."""
-        session, keys = self._session, Keys(prefix)
-        self._count(CACHED + (CACHED if cache_clouds else PLAIN))
-        with _usable():
-            return (
-                self._keep(cached_sender(session, keys.detections(stream), encoding_of(Detections), cache)),
-                self._keep(plain_sender(session, keys.points(stream), encoding_of(Points), cache_clouds)),
-            )
-
-    def subscribe_tracks(self, pattern: str, inbox: Inbox, *, prefix: str, problems: bool) -> Subscriptions:
-        """Move the tracks of a pattern into an inbox, its problems too where that is asked for."""
-        topics: tuple[Topic, ...] = ("tracks", "problems") if problems else ("tracks",)
-        return Subscriptions(self._subscribe([Keys(prefix).matching(pattern, topic) for topic in topics], inbox))
-
-    def query(self, key: str, payload: bytes = b"", encoding: str = "", *, timeout: float = 2.0) -> tuple[Answer, ...]:
-        """Ask everybody who answers at `key`; an empty result means that nobody did within `timeout` seconds."""
-        answers = []
-        with _usable():
-            replies = self._session.get(
-                key,
-                zenoh.handlers.FifoChannel(NO_BOUND),
-                target=zenoh.QueryTarget.ALL,
-                consolidation=zenoh.ConsolidationMode.NONE,  # the default keeps one reply per key: of two services one
-                timeout=timeout,
-                payload=payload or None,
-                encoding=encoding or None,
-            )
-            for reply in replies:
-                if (sample := reply.ok) is not None:
-                    text = str(sample.encoding)
-                    answers.append(Answer(str(sample.key_expr), sample.payload.to_bytes(), text, ok=True))
-                elif (error := reply.err) is not None and (said := error.payload.to_bytes()) != b"Timeout":
-                    answers.append(Answer(key, said, str(error.encoding), ok=False))
-        return tuple(answers)
-
-    def alive(self, pattern: str, *, timeout: float = 2.0) -> tuple[str, ...]:
-        """Keys of the liveliness tokens under `pattern`, sorted."""
-        with _usable():
-            replies = self._session.liveliness().get(pattern, zenoh.handlers.FifoChannel(NO_BOUND), timeout=timeout)
-            return tuple(sorted({str(sample.key_expr) for reply in replies if (sample := reply.ok) is not None}))
-
-    def _subscribe(self, patterns: Sequence[str], inbox: Inbox) -> list[Subscription]:
-        """Open a subscription to each pattern, or none of them."""
-        self._count(CACHED * len(patterns))
-        with _usable():
-            return [self._keep(subscribe(self._session, pattern, inbox)) for pattern in patterns]
-
-    def _count(self, keys: int) -> None:
-        """Count keys that are going to be declared.
-
-        Raises:
-            ConnectionFailed: they are more than are left.
-        """
-        with self._lock:
-            if self._keys + keys > MOST_KEYS:
-                raise ConnectionFailed(
-                    f"this connection has declared {self._keys} keys and cannot declare more: open another one"
-                )
-            self._keys += keys
-
-    def _keep(self, opened: _Opened) -> _Opened:
-        self._opened.add(opened)
-        return opened
-
-
-@contextlib.contextmanager
-def _usable() -> Iterator[None]:
-    """Turn Zenoh's error for whatever cannot be done on a session into ours."""
+def _configuration(endpoints: tuple[str, ...], file: str | Path | None, timeout: float) -> zenoh.Config:
+    if not timeout >= 0:  # NaN is not
+        raise ConnectionFailed(f"timeout: expected seconds, 0 or more, received {timeout!r}", endpoints=endpoints)
+    if file is not None and not Path(file).is_file():
+        raise ConnectionFailed(f"there is no Zenoh configuration file at {file}")
+    values: dict[str, object] = {
+        "connect/timeout_ms": -1 if timeout == math.inf else int(timeout * 1e3),
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
+    }
+    if endpoints:
+        values["connect/endpoints"] = endpoints
+    if file is None:
+        values |= {
+            **BUSY,
+            "mode": "client",
+            "transport/link/tx/queue/size/data_low": CLOUD_BATCHES,
+            "transport/link/tx/lease": LEASE_MS,
+        }
     try:
-        yield
-    except zenoh.ZError as error:
-        reason = str(error).partition(" at /")[0]  # what follows is a place in Zenoh's own source
-        raise ConnectionFailed(f"the connection cannot be used: {reason}") from error
-
-
-def _close_all(opened: weakref.WeakSet[Sender | Subscription], session: Any) -> None:
-    for one in tuple(opened):
-        one.close()
-    with contextlib.suppress(zenoh.ZError):
-        session.close()
+        return configured(values, file)
+    except ConnectionFailed as error:
+        if isinstance(error.__cause__, zenoh.ZError | OSError):
+            where = " ".join([*endpoints, *([str(file)] if file else [])])
+            raise ConnectionFailed(
+                f"not a usable Zenoh endpoint or configuration: {where} (an endpoint looks like {DEFAULT_ENDPOINT})",
+                endpoints=endpoints,
+            ) from error
+        raise

@@ -15,13 +15,12 @@ from optipmb_service.app import lifecycle
 from optipmb_service.app.lifecycle import say_ready, settle
 from optipmb_service.telemetry.health import Reporter
 from optipmb_service.telemetry.metrics import GATEWAY_METRICS
-from optipmb_service.zenoh import Router
+from optipmb_service.zenoh.client import Client
 
 if TYPE_CHECKING:
     from optipmb_service.app.lifecycle import StopRequest
     from optipmb_service.settings import Settings
     from optipmb_service.telemetry.health import ProcessHealth
-    from optipmb_service.zenoh.client import Client
 
 log = structlog.get_logger("optipmb_service")
 
@@ -47,7 +46,7 @@ async def run_router(settings: Settings) -> int:
     """Route until SIGINT or SIGTERM; returns the exit status, as `lifecycle.run` does."""
 
     async def serve(asked: StopRequest, health: ProcessHealth) -> bool:
-        router = Router(settings)
+        router = Client(settings)
         health.report(Reporter())
         say_ready("router", settings.instance, settings.endpoints)
         log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)

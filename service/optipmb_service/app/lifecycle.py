@@ -46,8 +46,9 @@ if TYPE_CHECKING:
     from pathlib import Path
     from types import FrameType
 
+    from optipmb_client.zenoh.session import KeyNumbers
+
     from optipmb_service.settings import Settings
-    from optipmb_service.zenoh.key_numbers import KeyCount
 
 HANDOVER_S: Final = 4.0  # at the end, how long other members may take to have the streams; it takes a second
 CLOSE_S: Final = 3.0  # at the end, how long a process may take to close, beyond handover and grace
@@ -62,8 +63,8 @@ SWITCH_S: Final = 0.0005  # by default it is ten times as long, and a frame that
 KEYS_S: Final = 1.0  # period of the check of declared keys
 GAINED: Final = 0.1  # share of the declared keys that a restart gives back at least
 STDERR: Final = 2
-CALLS: Final = 6  # calls that are logged of a thread: the innermost one, and those of this package
-PACKAGE: Final = __name__.partition(".")[0]
+CALLS: Final = 6  # calls that are logged of a thread: the innermost one, and those of these packages
+PACKAGES: Final = ("optipmb_service", "optipmb_client")
 
 log = structlog.get_logger("optipmb_service")
 
@@ -201,9 +202,9 @@ def _log_threads(seconds: float) -> None:
 
 
 def _calls(frame: FrameType) -> str:
-    """Return the calls of a thread; nothing where none is of this package."""
+    """Return the calls of a thread; nothing where none is of these packages."""
     stack = [(one.f_globals.get("__name__", ""), one, line) for one, line in traceback.walk_stack(frame)]
-    ours = [one for one in stack if one[0].partition(".")[0] == PACKAGE]
+    ours = [one for one in stack if one[0].partition(".")[0] in PACKAGES]
     calls = [*stack[:1], *(one for one in ours if one is not stack[0])][:CALLS] if ours else []
     return " < ".join(f"{module}.{one.f_code.co_name}:{line}" for module, one, line in calls)
 
@@ -274,7 +275,7 @@ async def unless(asked: StopRequest, work: Callable[[], _T]) -> _T | None:
     return result.result() if result.done() else None
 
 
-async def watch_keys(asked: StopRequest, used: Callable[[], KeyCount], most: int) -> None:
+async def watch_keys(asked: StopRequest, used: Callable[[], KeyNumbers], most: int) -> None:
     """Have the process begin again before its network session has no number for keys any more.
 
     It does not where that would give it few: what is open when it ends needs as many again.
@@ -407,7 +408,7 @@ async def run_client(settings: Settings, serve: Callable[[StopRequest, ProcessHe
 
     async def connected(asked: StopRequest, health: ProcessHealth) -> bool | None:
         log.info("connecting", endpoints=settings.connect)
-        client = await unless(asked, lambda: Client.opened(settings))
+        client = await unless(asked, lambda: Client(settings))
         if client is None:
             return None
         health.metrics.add(NETWORK_METRICS, lambda: client)

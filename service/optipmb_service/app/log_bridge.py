@@ -25,11 +25,13 @@ from optipmb_service.telemetry.metrics import LOG_METRICS, PROBLEM_METRICS
 from optipmb_service.telemetry.problem_reporter import ProblemReporter, log_problem
 
 if TYPE_CHECKING:
+    from optipmb_client.incoming import Arrival
+
     from optipmb_service.app.lifecycle import StopRequest
     from optipmb_service.cluster.message_log import Topic
     from optipmb_service.settings import Settings
     from optipmb_service.telemetry.health import ProcessHealth
-    from optipmb_service.zenoh.client import Client, Message
+    from optipmb_service.zenoh.client import Client
 
 log = structlog.get_logger("optipmb_service")
 
@@ -77,7 +79,7 @@ class LogBridge(Reporter):
         self.writer.close()
         self._log.connection.close(CLOSE_S)
 
-    def _take(self, message: Message) -> None:
+    def _take(self, message: Arrival) -> None:
         """Put a valid message into the log; one that is not, who tracks reports."""
         try:
             stream = self._client.keys.stream_of(message.key)

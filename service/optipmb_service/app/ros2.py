@@ -25,18 +25,20 @@ from optipmb_service.ros2 import graph
 from optipmb_service.ros2.bridge import Bridge
 from optipmb_service.ros2.diagnostics import DIAGNOSTICS, diagnostics
 from optipmb_service.ros2.matching import Matching, Wanted
+from optipmb_service.ros2.node import Ros2Node
 from optipmb_service.runtime.ports import TransportError
 from optipmb_service.telemetry.health import BEAT_S, STUCK_S, Reporter
-from optipmb_service.zenoh.ros2 import Ros2Node
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from optipmb_client.incoming import Arrival
+    from optipmb_client.zenoh.handles import Reading
+
     from optipmb_service.app.lifecycle import StopRequest
     from optipmb_service.settings import Settings
     from optipmb_service.telemetry.health import ProcessHealth
-    from optipmb_service.zenoh.client import Message, Outgoing
-    from optipmb_service.zenoh.subscription import Subscription
+    from optipmb_service.zenoh.client import Outgoing
 
 QUEUE: Final = 2048
 QUEUE_BYTES: Final = 2**28  # messages that wait for the working thread, and their bytes
@@ -65,7 +67,7 @@ class _Work(Reporter):
         self._types = own_types()
         self._bridge = Bridge(settings.ros2, settings.instance, self._types, self, time.monotonic)
         self._outgoing: dict[str, Outgoing] = {}
-        self._subscriptions: list[Subscription] = []
+        self._subscriptions: list[Reading] = []
         self._queue: collections.deque[tuple[Callable[[], None], int]] = collections.deque()
         self._waiting_bytes = 0
         self._asking = ThreadPoolExecutor(1, "ask")
@@ -168,8 +170,8 @@ class _Work(Reporter):
         client = self._node.client
         key, encoding = client.keys.query(stream, "parameters"), schemas.encoding_of(parameters)
         try:
-            answers = client.ask(key, schemas.encode(parameters), encoding, timeout=QUERY_S)
-            if not any(answer.good for answer in answers):
+            answers = client.query(key, schemas.encode(parameters), encoding, timeout=QUERY_S)
+            if not any(answer.ok for answer in answers):
                 said = schemas.decode(answers[0].payload, schemas.Problem).message if answers else "nobody answered"
                 log.warning("problem", stream=stream, message=f"parameters of its session: {said}")
         except (TransportError, schemas.MessageError) as error:
@@ -226,7 +228,7 @@ class _Work(Reporter):
                     return
             log.warning("problem", topic=wanted.topic, message=str(error))
 
-    def _come_back(self, one: Message) -> None:
+    def _come_back(self, one: Arrival) -> None:
         try:
             if one.key.endswith("/tracks"):
                 self._bridge.take_tracks(schemas.decode(one.payload, schemas.Tracks, encoding=one.encoding))

@@ -39,16 +39,17 @@ from optipmb_service.telemetry.metrics import (
     StreamFigures,
 )
 from optipmb_service.telemetry.problem_reporter import ProblemReporter, log_problem
-from optipmb_service.zenoh import Transport
+from optipmb_service.zenoh.transport import Transport
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from optipmb_client.zenoh.session import KeyNumbers
+
     from optipmb_service.runtime.profiles import Profiles
     from optipmb_service.settings import Settings
     from optipmb_service.zenoh.client import Client
-    from optipmb_service.zenoh.key_numbers import KeyCount
 
 log = structlog.get_logger("optipmb_service")
 
@@ -198,7 +199,7 @@ class Service(Reporter):
         return ended and kept and not unfinished
 
     @property
-    def key_numbers(self) -> KeyCount:
+    def key_numbers(self) -> KeyNumbers:
         """What is used of the numbers that its network session has for keys."""
         return self.client().key_numbers
 

@@ -34,10 +34,10 @@ from optipmb_service.app import lifecycle
 from optipmb_service.app.lifecycle import LATE_S, RESTART, SLICE_S, grpc_edge, say_ready, unless, watch_keys
 from optipmb_service.cluster.leases import ALIVE, instance_of
 from optipmb_service.runtime.profiles import Fusion
-from optipmb_service.runtime.queries import TEXT, UNDRAINED, drain_asked, guarded, move_asked, problem_with
+from optipmb_service.runtime.queries import TEXT, UNDRAINED, drain_asked, guarded, move_asked
 from optipmb_service.telemetry.health import BEAT_S, Reporter
 from optipmb_service.telemetry.metrics import NETWORK_METRICS
-from optipmb_service.zenoh import Transport
+from optipmb_service.zenoh.transport import Transport
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -337,17 +337,14 @@ class AggregateView(Reporter):
 
     def answer(self, request: Request) -> None:
         """Answer a query about the instance, and finish it whatever happens."""
-        guarded(request, lambda: self._answer(request))
+        guarded(request, lambda: self._answer(request), instance=self._instance)
 
     def _answer(self, request: Request) -> None:
         keys = self._keys
         status, metrics = keys.status(self._instance), keys.metrics(self._instance)
         orders = {keys.move(self._instance): self._move, keys.drain(self._instance): self._drain}
         if request.key in orders:
-            try:
-                orders[request.key](request)
-            except schemas.MessageError as error:
-                request.refuse(problem_with(error, instance=self._instance))
+            orders[request.key](request)
             return
         if request.matches(status):
             request.answer(status, self.status())

@@ -274,7 +274,7 @@ class NatsConnection:
         self._lost()
 
 
-def access(tls: Path | None, credentials: Path | None) -> dict[str, Any]:
+def access(tls: Path | None = None, credentials: Path | None = None) -> dict[str, Any]:
     """Return the options of NATS' client that open a connection to servers that do not let everybody in.
 
     Args:

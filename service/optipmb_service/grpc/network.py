@@ -22,11 +22,12 @@ from optipmb_service.grpc.selection import EVERYTHING
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Hashable, Iterable
 
+    from optipmb_client.incoming import Answer, Arrival
+    from optipmb_client.zenoh.handles import Reading
     from optipmb_schemas.protobuf.convert import EncodedTracks
 
     from optipmb_service.grpc.selection import Selection
-    from optipmb_service.zenoh.client import Client, Message, Outgoing
-    from optipmb_service.zenoh.subscription import Subscription
+    from optipmb_service.zenoh.client import Client, Outgoing
 
 IDLE_S: Final = 60.0
 """Time after which a subscription or publisher that no call has taken is closed."""
@@ -170,7 +171,7 @@ class _Feed:
 
     def __init__(self) -> None:
         self.listeners: tuple[Listener, ...] = ()
-        self.subscription: Subscription | None = None
+        self.subscription: Reading | None = None
 
     def close(self) -> None:
         """Withdraw the subscription."""
@@ -250,12 +251,12 @@ class Network:
         """
 
         def read() -> list[EncodedTracks]:
-            messages = self._client.recent(key, HISTORY_S)
+            messages = self._client.cached(key, timeout=HISTORY_S)
             return [tracks for one in messages if (tracks := self._tracks(one)) is not None]
 
         return await asyncio.to_thread(read)
 
-    def _receive(self, feed: _Feed, message: Message) -> None:
+    def _receive(self, feed: _Feed, message: Arrival) -> None:
         """Take a message on the thread of its subscription."""
         if not (listeners := feed.listeners):
             return
@@ -285,14 +286,14 @@ class Network:
             listener, item = self._arrived.popleft()
             listener.take(item)
 
-    def _tracks(self, message: Message) -> EncodedTracks | None:
+    def _tracks(self, message: Answer | Arrival) -> EncodedTracks | None:
         try:
             return convert.transcode(message.payload, encoding=message.encoding)
         except schemas.MessageError as error:
             self._invalid(str(error))
             return None
 
-    def _problem(self, message: Message) -> schemas.Problem | None:
+    def _problem(self, message: Arrival) -> schemas.Problem | None:
         try:
             return schemas.decode(message.payload, schemas.Problem, encoding=message.encoding)
         except schemas.MessageError as error:

@@ -125,13 +125,13 @@ async def list_streams(call: Call) -> None:
     client.keys.matching(pattern, "tracks")
     call.caller.may_read(pattern)
     answers, alive = await asyncio.gather(
-        asyncio.to_thread(client.ask, client.keys.all_status(), timeout=QUERY_S),
-        asyncio.to_thread(client.alive, client.keys.all_alive(), QUERY_S),
+        asyncio.to_thread(client.query, client.keys.all_status(), timeout=QUERY_S),
+        asyncio.to_thread(client.alive, client.keys.all_alive(), timeout=QUERY_S),
     )
     services = {client.keys.instance_of(key) for key in alive}
     listed = []
     for answer in answers:
-        if answer.good:
+        if answer.ok:
             status = schemas.decode(answer.payload, schemas.ServiceStatus, encoding=answer.encoding)
             if status.instance in services:
                 listed += [(status.instance, one) for one in status.sessions if _matches(one.stream, pattern)]
@@ -148,9 +148,9 @@ async def _asked(call: Call, key: str, message: schemas.Message | None, kind: ty
     """
     payload = b"" if message is None else schemas.encode(message)
     encoding = "" if message is None else schemas.encoding_of(message)
-    answers = await asyncio.to_thread(call.gateway.client.ask, key, payload, encoding, timeout=QUERY_S)
+    answers = await asyncio.to_thread(call.gateway.client.query, key, payload, encoding, timeout=QUERY_S)
     for answer in answers:
-        if answer.good:
+        if answer.ok:
             return convert.to_proto(schemas.decode(answer.payload, kind, encoding=answer.encoding))
     if not answers:
         raise EndCall(grpc.StatusCode.UNAVAILABLE, NOBODY)
@@ -172,10 +172,10 @@ async def _kept(call: Call, stream: str, wanted: schemas.TracksRequest) -> Async
     next_ns: int | None = wanted.from_ns
     while next_ns is not None:
         part = wanted.model_copy(update={"from_ns": next_ns})
-        answers = await asyncio.to_thread(client.ask, key, schemas.encode(part), encoding, timeout=KEPT_S)
-        found = [one for one in answers if one.good and one.encoding != encoding]
+        answers = await asyncio.to_thread(client.query, key, schemas.encode(part), encoding, timeout=KEPT_S)
+        found = [one for one in answers if one.ok and one.encoding != encoding]
         problems = [
-            schemas.decode(one.payload, schemas.Problem, encoding=one.encoding) for one in answers if not one.good
+            schemas.decode(one.payload, schemas.Problem, encoding=one.encoding) for one in answers if not one.ok
         ]
         if not problems and len(found) == len(answers):
             raise EndCall(grpc.StatusCode.UNAVAILABLE, "the tracks did not come completely" if found else NOBODY)

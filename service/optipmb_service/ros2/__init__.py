@@ -1,6 +1,5 @@
 """ROS 2 at the edge: topics of an rmw_zenoh system become streams, and their tracks become topics.
 
 It is a client of the same Zenoh network as the service, in a process of its own, and needs no ROS. `graph` knows how
-rmw_zenoh names things, `bridge` what becomes of each message, `running` the process. Zenoh itself is in
-`optipmb_service.zenoh.ros2`.
+rmw_zenoh names things, `bridge` what becomes of each message, `node` what is declared on the network.
 """

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Protocol
 
+from optipmb_client.errors import ConnectionFailed
+
 if TYPE_CHECKING:
     import optipmb_schemas as schemas
 
@@ -86,8 +88,8 @@ class Request(Protocol):
         """End the replies."""
 
 
-class TransportError(Exception):
-    """The network cannot be used; the text is one clear line."""
+TransportError = ConnectionFailed
+"""The network cannot be used; the text is one clear line."""
 
 
 class EdgeError(Exception):

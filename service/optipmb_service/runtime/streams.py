@@ -167,7 +167,7 @@ class Streams:
             stream, session = self.parsed(packet.key)
         except schemas.MessageError as error:
             # Whoever receives it receives the detections of all: it is one of all members.
-            self._refuse(packet, "invalid_value", "", error.expected, error.received)
+            self._refuse("invalid_value", packet, "", error.expected, error.received)
             return
         topic: Literal["detections", "points"] = "detections" if packet.frame else "points"
         if not self.member.holds(session):
@@ -176,7 +176,7 @@ class Streams:
             return
         self.metrics.received(topic, packet.size)
         if exceeded := self.admission.exceeded(stream, packet.size, packet.now_ns):
-            self._refuse(packet, "quota", stream, exceeded, "more")
+            self._refuse("quota", packet, stream, exceeded, "more")
         else:
             self._push(session, packet, own=True)
 
@@ -545,7 +545,7 @@ class Streams:
         expected = "room for what waits for its session, for two minutes at most"
         self._report("shed", session, expected, f"{len(lost)} more; the oldest were dropped", len(lost))
 
-    def _refuse(self, packet: Packet, code: str, stream: str, expected: str, received: str) -> None:
+    def _refuse(self, code: str, packet: Packet, stream: str, expected: str, received: str) -> None:
         with self._lock:
             frame = packet.frame
             self._past += MessageCounters(received=frame, refused=frame, clouds_refused=not frame)

@@ -18,30 +18,18 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import structlog
-import zenoh
-import zenoh.ext
-from optipmb_schemas.late_join import ANSWER_S, CacheQueries, LateJoin
+from optipmb_client.zenoh.late_join import CacheQueries, LateJoin
+from optipmb_client.zenoh.session import NEWEST
 
 from optipmb_service.runtime.intake import ALL
-from optipmb_service.runtime.ports import TransportError
-from optipmb_service.zenoh import key_numbers
-from optipmb_service.zenoh.connection import line
-from optipmb_service.zenoh.handles import directly, undeclare
-from optipmb_service.zenoh.subscription import ask_cache
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from optipmb_service.zenoh.handles import Undeclared
+    from optipmb_client.zenoh.handles import Declared
+    from optipmb_client.zenoh.session import Sample, Session
 
 log = structlog.get_logger("optipmb_service")
-
-NEWEST: Final = zenoh.ext.HistoryConfig(detect_late_publishers=False, max_samples=1)
-"""Without the newest message, the first heartbeat of each publisher would bring all that its cache holds.
-
-Late publishers are not detected: after a link was lost, the newest message would come so before those that it follows,
-and Zenoh would take these for lost. Heartbeats tell of what was missed.
-"""
 
 MOST_RETURNED: Final = 16_384
 """Publishers that are to be asked at once."""
@@ -53,15 +41,12 @@ LAST_PAUSE_NS: Final = 16_000_000_000
 MOST: Final = 256
 """Messages of a topic that may wait while another thread hands over those before them."""
 
-RECOVERY: Final = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
-
 
 class Topic:
     """The subscriptions of one topic.
 
     Args:
         name: of the topic, for the log.
-        session: to subscribe on.
         receive: called for each sample, one after the other; the thread of the network is not to be kept waiting.
         answered: called with the key of a publisher when all has been handed over that its cache held.
     """
@@ -69,8 +54,8 @@ class Topic:
     def __init__(
         self,
         name: str,
-        session: zenoh.Session,
-        receive: Callable[[zenoh.Sample], None],
+        session: Session,
+        receive: Callable[[Sample], None],
         answered: Callable[[str], None] = lambda _: None,
     ) -> None:
         self._name = name
@@ -80,12 +65,12 @@ class Topic:
         self._turn = threading.Lock()
         self._closed = False
         self._drained = threading.Event()
-        self._subscribers: dict[str, tuple[str, Undeclared, Undeclared]] = {}
-        self._queries: CacheQueries[zenoh.Sample] = CacheQueries(lambda *query: ask_cache(session, *query))
-        self._late_join: LateJoin[zenoh.Sample] = LateJoin(self._hand_over, self._queries.ask, answered)
+        self._subscribers: dict[str, tuple[str, Declared]] = {}
+        self._queries: CacheQueries[Sample] = CacheQueries(session.ask)
+        self._late_join: LateJoin[Sample] = LateJoin(self._hand_over, self._queries.ask, answered)
 
     def subscribe(
-        self, name: str, key: str, passing: Callable[[zenoh.Sample], None] | None = None, *, cached: bool = True
+        self, name: str, key: str, passing: Callable[[Sample], None] | None = None, *, cached: bool = True
     ) -> None:
         """Receive what is published under a key expression from now on, and what caches hold of it.
 
@@ -93,25 +78,15 @@ class Topic:
             name: of the subscription; `ALL` for that of all streams.
             key: the key expression.
             passing: called for each sample instead of the topic's function; nothing is recovered then.
-            cached: whether what was lost is recovered from caches. To declare that takes Zenoh several times as long,
-                and longer the more is declared already.
+            cached: whether what was lost is recovered from caches.
 
         Raises:
             TransportError: the session is closed, or has declared all keys that it can.
         """
         recovers = passing is None and cached
-        taken = key_numbers.take(self._session, key_numbers.CACHED if recovers else key_numbers.PLAIN)
-        handler = directly(partial(self._take, self._late_join.take if passing is None else passing))
-        try:
-            if recovers:
-                subscriber: Undeclared = zenoh.ext.declare_advanced_subscriber(
-                    self._session, key, handler, history=NEWEST, recovery=RECOVERY
-                )
-            else:
-                subscriber = self._session.declare_subscriber(key, handler)
-        except zenoh.ZError as error:
-            raise TransportError(line(error)) from error
-        self._subscribers[name] = key, subscriber, taken
+        take = partial(self._in_turn, self._late_join.take if passing is None else passing)
+        subscriber = self._session.listen(key, take, recovers=recovers, history=NEWEST if recovers else None)
+        self._subscribers[name] = key, subscriber
 
     def leave(self, names: Iterable[str]) -> None:
         """Withdraw subscriptions; what came before is handed over. Caches are asked again when their keys come again.
@@ -119,11 +94,10 @@ class Topic:
         While all streams are received, none has gone.
         """
         left = [self._subscribers.pop(name) for name in names]
-        for _, subscriber, taken in left:
-            undeclare(subscriber)
-            undeclare(taken)
+        for _, subscriber in left:
+            subscriber.close()
         if left and ALL not in self._subscribers:
-            kept = frozenset(key for key, *_ in self._subscribers.values())
+            kept = frozenset(key for key, _ in self._subscribers.values())
             # After what has come, which would be known again.
             self._in_turn(self._late_join.keep, kept)
 
@@ -140,22 +114,19 @@ class Topic:
         # One that does not return is left behind with its thread; whoever closes again goes on with the others.
         with contextlib.suppress(KeyError):
             while True:
-                _, (_, subscriber, taken) = self._subscribers.popitem()
-                undeclare(subscriber)
-                undeclare(taken)
+                _, (_, subscriber) = self._subscribers.popitem()
+                subscriber.close()
         self._in_turn(self._end)
         self._drained.wait(timeout)
         self._end()
         self._queries.close()
         self._late_join.close()
 
-    def _take(self, handle: Callable[[zenoh.Sample], None], sample: zenoh.Sample) -> None:
-        """Take a sample on the thread of the network that brings it; of several links there are several threads."""
-        if sample.kind == zenoh.SampleKind.PUT:
-            self._in_turn(handle, sample)
-
     def _in_turn(self, work: Callable[..., object], *arguments: object) -> None:
-        """Have work done after all that came before it: here, or on the thread that is doing so already."""
+        """Have work done after all that came before it: here, or on the thread that is doing so already.
+
+        Of several links there are several threads of the network.
+        """
         self._waiting.append((work, arguments))
         # The thread that holds the lock looks at the queue again after it has released it, so nothing stays behind.
         # This thread waits for it only where too much is in the queue.
@@ -176,7 +147,7 @@ class Topic:
         self._closed = True
         self._drained.set()
 
-    def _hand_over(self, sample: zenoh.Sample) -> None:
+    def _hand_over(self, sample: Sample) -> None:
         try:
             self._receive(sample)
         except Exception:
@@ -190,12 +161,11 @@ class ReturnedPublishers:
     begin anew, and Zenoh drops its messages, up to the highest number before, without a word.
 
     Args:
-        session: to ask on.
         due: returns the number that is expected next of a publisher, by Zenoh id and number of the entity; 0: it is not
             known.
     """
 
-    def __init__(self, session: zenoh.Session, due: Callable[[str, int], int]) -> None:
+    def __init__(self, session: Session, due: Callable[[str, int], int]) -> None:
         self._session = session
         self._due = due
         self._waiting: dict[str, tuple[int, int]] = {}
@@ -226,22 +196,14 @@ class ReturnedPublishers:
     def _ask(self, token: str, report: Callable[[str, int, int], None]) -> None:
         due = self._expected(token)
 
-        def take(reply: zenoh.Reply) -> None:
-            if (sample := reply.ok) is None or (info := sample.source_info) is None:
+        def take(sample: Sample) -> None:
+            if (info := sample.source_info) is None:
                 return
             newest = info.source_sn
             if self._waiting.pop(token, None) is not None and newest + 1 < due:
                 report(token, due, newest)
 
-        with contextlib.suppress(zenoh.ZError):  # the session is closed
-            self._session.get(
-                f"{token.rpartition('/')[0]}/**?_max=1",
-                zenoh.handlers.Callback(take, indirect=False),
-                accept_replies=zenoh.ReplyKeyExpr.ANY,
-                consolidation=zenoh.ConsolidationMode.NONE,
-                congestion_control=zenoh.CongestionControl.DROP,
-                timeout=ANSWER_S,
-            )
+        self._session.ask(f"{token.rpartition('/')[0]}/**?_max=1", take, background=True)
 
     def _expected(self, token: str) -> int:
         zid, _, rest = token.rpartition("/@adv/pub/")[2].partition("/")

@@ -1,29 +1,23 @@
 """Subscriptions of viewers: shared by those of one stream, kept for a while for who comes back, and bounded in rate.
 
-Each subscription takes a number for its key that Zenoh never gives back (`key_numbers`). A browser that connects again
-and again takes none while its subscriptions are kept, and whoever asks for ever new streams soon has to wait.
+Each subscription takes a number for its key that Zenoh never gives back. A browser that connects again and again takes
+none while its subscriptions are kept, and whoever asks for ever new streams soon has to wait.
 """
 
 from __future__ import annotations
 
-import contextlib
 import threading
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Final, Literal
-
-import zenoh
+from typing import TYPE_CHECKING, Final
 
 from optipmb_service.runtime.ports import TransportError
-from optipmb_service.zenoh import key_numbers
-from optipmb_service.zenoh.connection import line
-from optipmb_service.zenoh.handles import undeclare
+from optipmb_service.zenoh.client import Turns
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from optipmb_service.zenoh.handles import Undeclared
+    from optipmb_client.zenoh.handles import Reading
+    from optipmb_client.zenoh.session import Sample, Session
 
 Receive = Callable[[str, bytes, str], None]
 """Takes topic, payload and encoding."""
@@ -42,27 +36,20 @@ PERIOD_S: Final = 15.0
 
 
 class Taps:
-    """The subscriptions of the viewers of a process; may be used by any threads.
+    """The subscriptions of the viewers of a process; may be used by any threads."""
 
-    Args:
-        session: to subscribe on.
-        prefix: first chunks of all keys.
-    """
-
-    def __init__(self, session: zenoh.Session, prefix: str) -> None:
+    def __init__(self, session: Session, prefix: str) -> None:
         self._session = session
         self._prefix = prefix
         self._lock = threading.Lock()
         self._taps: dict[tuple[str, str], _Tap] = {}
         self._timed = False
-        self._turns = key_numbers.Turns(BURST, PERIOD_S)
+        self._turns = Turns(BURST, PERIOD_S)
 
     def join(self, names: tuple[str, str], receive: Receive) -> Callable[[], None]:
         """Hand over the newest tracks and detections of streams, until the result is called, which may be twice.
 
-        Args:
-            names: key expressions of the streams of the tracks and of the detections.
-            receive: called on threads of their own.
+        The names are key expressions of the streams of the tracks and of the detections.
 
         Raises:
             TransportError: the session is closed, or too many streams were subscribed to.
@@ -110,36 +97,26 @@ class Taps:
 
 
 class _Tap:
-    """The subscriptions to one stream, each with a thread of its own.
+    """The subscriptions to one stream, each with a thread of its own."""
 
-    Raises:
-        TransportError: the session is closed.
-    """
-
-    def __init__(self, session: zenoh.Session, prefix: str, tracks: str, detections: str) -> None:
+    def __init__(self, session: Session, prefix: str, tracks: str, detections: str) -> None:
         self.listeners: dict[object, Receive] = {}
         self.left_s = 0.0
-        self._declared: list[Undeclared] = [key_numbers.take(session, 2 * key_numbers.PLAIN)]
+        self._readings: list[Reading] = []
         try:
-            self._follow(session, "tracks", f"{prefix}/{tracks}/tracks")
-            self._follow(session, "detections", f"{prefix}/{detections}/detections")
-        except zenoh.ZError as error:
+            for topic, names in (("tracks", tracks), ("detections", detections)):
+                hand_over = partial(self._hand_over, topic)
+                self._readings.append(session.read_newest(f"{prefix}/{names}/{topic}", hand_over))
+        except TransportError:
             self.close()
-            raise TransportError(line(error)) from error
+            raise
 
     def close(self) -> None:
-        for one in self._declared:
-            undeclare(one)
+        for one in self._readings:
+            one.close(0.0)
 
-    def _follow(self, session: zenoh.Session, topic: Literal["tracks", "detections"], key: str) -> None:
-        def hand_over(samples: Iterable[zenoh.Sample]) -> None:
-            with contextlib.suppress(zenoh.ZError):  # how a channel says that it is closed and empty
-                for sample in samples:
-                    if receivers := tuple(self.listeners.values()):
-                        payload, encoding = sample.payload.to_bytes(), str(sample.encoding)
-                        for receive in receivers:
-                            receive(topic, payload, encoding)
-
-        subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(1))
-        self._declared.append(subscriber)
-        threading.Thread(target=hand_over, args=(subscriber.handler,), name=f"viewer-{topic}", daemon=True).start()
+    def _hand_over(self, topic: str, sample: Sample) -> None:
+        if receivers := tuple(self.listeners.values()):
+            payload, encoding = sample.payload.to_bytes(), str(sample.encoding)
+            for receive in receivers:
+                receive(topic, payload, encoding)

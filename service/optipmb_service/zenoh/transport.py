@@ -2,46 +2,33 @@
 
 from __future__ import annotations
 
-import contextlib
 import secrets
-import threading
 import time
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import optipmb_schemas as schemas
-import zenoh
-import zenoh.ext
+import structlog
 
 from optipmb_service.runtime.ports import Packet, TransportError
-from optipmb_service.zenoh import key_numbers
-from optipmb_service.zenoh.announcements import Announcements
+from optipmb_service.runtime.queries import problem_with
 from optipmb_service.zenoh.client import Client
-from optipmb_service.zenoh.connection import close, line, log_link, opened
-from optipmb_service.zenoh.handles import (
-    Channel,
-    Publisher,
-    Readers,
-    Replies,
-    cached_publisher,
-    publish_problem,
-    undeclare,
-)
 from optipmb_service.zenoh.inputs import ReturnedPublishers, Topic
-from optipmb_service.zenoh.queries import OpenQueries
-from optipmb_service.zenoh.subscription import ask_cache
 from optipmb_service.zenoh.taps import Taps
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Set as AbstractSet
+
+    from optipmb_client.zenoh.handles import Declared, Reading, Sender
+    from optipmb_client.zenoh.session import Sample, Session
 
     from optipmb_service.runtime.intake import Kind
     from optipmb_service.runtime.ports import Request
     from optipmb_service.settings import Settings
-    from optipmb_service.zenoh.handles import Undeclared
 
-CHANNEL: Final = 4096
-"""Messages between Zenoh and a draining thread; more than any publisher's history."""
+MOST_OPEN: Final = 256
+"""Queries of one key expression that may be open; those beyond are refused."""
 
 RECENT_S: Final = 2.0
 """How long other instances may take to answer what they have received of streams that have come here."""
@@ -52,15 +39,66 @@ TRACKS_CACHE: Final = 100
 It is longer than a dead link of the client library takes to be noticed and replaced, 4 s.
 """
 
+ANNOUNCED: Final = 32
+"""Streams of one token. A stream that comes or goes costs those who watch as many names as its token has."""
+
 CACHES_S: Final = 1.0
 """How long the caches may take to answer."""
+
+
+log = structlog.get_logger("optipmb_service")
+
+
+class StreamPublisher:
+    """The publisher of a stream's tracks, and what else is declared while it is there."""
+
+    def __init__(self, sender: Sender, others: Sequence[Declared]) -> None:
+        self._sender = sender
+        self._others = others
+        self.publish = sender.put
+
+    def release(self) -> None:
+        """Withdraw all of it."""
+        for one in (*self._others, self._sender):
+            one.close()
+
+
+class Announcements:
+    """The streams that a discoverer announces, by tokens of many streams each: all are full, but for one.
+
+    What a router takes to declare a token grows with how many tokens there are, for each that watches them: with a
+    token for each stream it was most of what a new stream cost, and with 10,000 streams beyond what one router can do.
+    """
+
+    def __init__(self, session: Session, keys: schemas.Keys, instance: str, run: str) -> None:
+        self._session, self._keys, self._instance, self._run = session, keys, instance, run
+        self._groups: dict[str, tuple[str, ...]] = {}
+        """The group of each stream that is announced."""
+        self._tokens: dict[tuple[str, ...], Declared] = {}
+
+    def announce(self, streams: AbstractSet[str]) -> None:
+        """Announce these streams, and no others; those that stay are announced all the time."""
+        new = sorted(streams - self._groups.keys())
+        gone = self._groups.keys() - streams
+        if not new and not gone:
+            return
+        left = {self._groups[stream] for stream in gone} | {group for group in self._tokens if len(group) < ANNOUNCED}
+        pool = [stream for group in sorted(left) for stream in group if stream not in gone] + new
+        groups = [tuple(pool[first : first + ANNOUNCED]) for first in range(0, len(pool), ANNOUNCED)]
+        for group in groups:
+            if group not in self._tokens:
+                self._tokens[group] = self._session.token(self._keys.discovered(group, self._instance, self._run))
+            self._groups.update(dict.fromkeys(group, group))
+        for group in left.difference(groups):
+            self._tokens.pop(group).close()
+        for stream in gone:
+            del self._groups[stream]
 
 
 class Transport:
     """A Zenoh session with what the service declares on it.
 
-    Args:
-        settings: endpoints, prefix, instance.
+    Its methods raise `TransportError` when the session is closed, or has declared all keys that it can.
 
     Raises:
         TransportError: an endpoint is in use or unusable. As a client it does not raise but wait for a router.
@@ -71,20 +109,17 @@ class Transport:
         self._prefix = settings.prefix
         self._instance = settings.instance
         self._max_bytes = settings.limits.max_bytes
-        self._is_router = settings.is_router
-        self._session = opened(settings)
-        self._readers = Readers()
+        self._client = Client(settings)
         self._topics: dict[str, Topic] = {}
-        self._discover: Callable[[zenoh.Sample], None] = lambda _: None
+        self._discover: Callable[[Sample], None] = lambda _: None
         self._all = False
         self._run = secrets.token_hex(8)
         """Tells this process from all others, also from those of its name."""
-        self._announcements = Announcements(self._session, self._keys, self._instance, self._run)
-        self._returned = ReturnedPublishers(self._session, lambda *_: 0)
-        self._publishers: set[Publisher] = set()
-        self._lock = threading.Lock()
-        self._alive: Undeclared | None = None
-        self._taps = Taps(self._session, self._prefix)
+        self._announcements = Announcements(self._client, self._keys, self._instance, self._run)
+        self._returned = ReturnedPublishers(self._client, lambda *_: 0)
+        self._alive: Declared | None = None
+        self._owners: Reading | None = None
+        self._taps = Taps(self._client, self._prefix)
 
     # Receiving
 
@@ -107,14 +142,14 @@ class Transport:
             answered: called with a key when all detections have been handed over that a publisher's cache held.
         """
 
-        def discover(sample: zenoh.Sample) -> None:
+        def discover(sample: Sample) -> None:
             key = str(sample.key_expr)
             if noticed(key, sample.source_info is not None):
                 self._receive(sample, key, on_frame)
             else:
                 passed_by(key, len(sample.payload))
 
-        def detected(sample: zenoh.Sample) -> None:
+        def detected(sample: Sample) -> None:
             key = str(sample.key_expr)
             if self._all:
                 noticed(key, sample.source_info is not None)
@@ -122,10 +157,10 @@ class Transport:
 
         self._discover = discover
         self._topics = {
-            "detections": Topic("detections", self._session, detected, answered),
-            "points": Topic("points", self._session, lambda one: self._receive(one, str(one.key_expr), on_cloud)),
+            "detections": Topic("detections", self._client, detected, answered),
+            "points": Topic("points", self._client, lambda one: self._receive(one, str(one.key_expr), on_cloud)),
         }
-        self._returned = ReturnedPublishers(self._session, self._topics["detections"].due)
+        self._returned = ReturnedPublishers(self._client, self._topics["detections"].due)
         # A name with a part too few or too many matches no other subscription: it is received to be refused.
         for names in ("*/*", "*/*/*/*"):
             self._topics["detections"].subscribe(names, f"{self._prefix}/{names}/detections", detected, cached=False)
@@ -133,13 +168,7 @@ class Transport:
     def subscribe(self, kind: Kind, stream: str, *, cached: bool) -> None:
         """Receive the detections or clouds of a stream, or of all of them where it is empty; `discovery` is of all.
 
-        Args:
-            kind: what of it.
-            stream: its name.
-            cached: whether what was lost is recovered from the publisher's cache.
-
-        Raises:
-            TransportError: the session is closed.
+        With `cached`, what was lost is recovered from the publisher's cache.
         """
         if kind == "discovery":
             self._topics["detections"].subscribe(kind, self._keys.all("detections"), self._discover)
@@ -181,8 +210,8 @@ class Transport:
             if present:
                 self._returned.came(key)
 
-        self._watch("publishers", self._keys.all_publishers(), returned)
-        self._watch("discovered", self._keys.all_discovered(), announced)
+        self._client.watch(self._keys.all_publishers(), returned)
+        self._client.watch(self._keys.all_discovered(), announced)
 
     def discover(self, streams: set[str]) -> None:
         """Announce these streams, and no others."""
@@ -193,64 +222,30 @@ class Transport:
 
         The question has the lowest priority: it overtakes no message on the way to who is asked.
         """
-        found, replies = [], Replies(RECENT_S)
-        try:
-            self._session.get(
-                self._keys.recent(),
-                replies.handler,
-                payload="\n".join(sessions),
-                target=zenoh.QueryTarget.ALL,
-                consolidation=zenoh.ConsolidationMode.NONE,
-                allowed_destination=zenoh.Locality.REMOTE,
-                priority=zenoh.Priority.BACKGROUND,
-                timeout=RECENT_S,
-            )
-        except zenoh.ZError as error:
-            raise TransportError(line(error)) from error
-        for reply in replies:
-            if (sample := reply.ok) is not None and (about := sample.attachment) is not None:
-                key, payload = about.to_string(), sample.payload.to_bytes()
+        found = []
+        payload = "\n".join(sessions).encode()
+        for answer in self._client.query(self._keys.recent(), payload, timeout=RECENT_S, background=True):
+            if answer.ok and answer.about:
                 now = time.time_ns(), time.monotonic_ns()
-                packet = Packet(key, payload, len(payload), str(sample.encoding), *now)
-                found.append((packet, key.endswith("/detections")))
+                packet = Packet(answer.about, answer.payload, len(answer.payload), answer.encoding, *now)
+                found.append((packet, answer.about.endswith("/detections")))
         return found
 
     def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]], bool], None]) -> None:
-        """Call `then`, on a thread of the network, with what the caches of a stream hold of its detections, all frames.
+        """Call `then`, on a thread of its own, with what the caches of a stream hold of its detections, all frames.
 
         It is called, too, with whether all caches have answered in time.
-
-        Raises:
-            TransportError: the session is closed.
         """
         found: list[tuple[Packet, bool]] = []
 
-        def reply(sample: zenoh.Sample) -> None:
+        def reply(sample: Sample) -> None:
             self._receive(sample, str(sample.key_expr), lambda packet: found.append((packet, True)))
 
-        try:
-            ask_cache(self._session, f"{self._keys.detections(stream)}/@adv/pub/**", reply, partial(then, found))
-        except zenoh.ZError as error:
-            raise TransportError(line(error)) from error
+        self._client.ask(f"{self._keys.detections(stream)}/@adv/pub/**", reply, partial(then, found))
 
     def find_duplicate_name(self, found: Callable[[], None]) -> None:
-        """Call `found`, on a thread of the network, for each other process with the name of this one."""
-
-        def take(reply: zenoh.Reply) -> None:
-            if reply.ok is not None:
-                found()
-
-        with contextlib.suppress(zenoh.ZError):  # the session is closed
-            self._session.get(
-                self._keys.metrics(self._instance),
-                zenoh.handlers.Callback(take, indirect=False),
-                target=zenoh.QueryTarget.ALL,
-                consolidation=zenoh.ConsolidationMode.NONE,
-                congestion_control=zenoh.CongestionControl.DROP,
-                allowed_destination=zenoh.Locality.REMOTE,
-                priority=zenoh.Priority.BACKGROUND,
-                timeout=RECENT_S,
-            )
+        """Call `found`, on a thread of its own, for each other process with the name of this one."""
+        self._client.ask(self._keys.metrics(self._instance), lambda _: found(), timeout=RECENT_S, background=True)
 
     def look_for_returned(self, report: Callable[[str, int, int], None]) -> None:
         """Call `report` for each publisher that came back with numbers below those that it has sent.
@@ -274,19 +269,16 @@ class Transport:
 
     def ask(self, key: str, timeout: float, payload: bytes = b"", encoding: str = "") -> bytes | None:
         """Ask at a key and return the first answer; None when none comes in time (s)."""
-        replies = Replies(timeout)
         try:
-            self._session.get(key, replies.handler, timeout=timeout, payload=payload, encoding=encoding or None)
-        except zenoh.ZError:  # the session is closed
+            answers = self._client.query(key, payload, encoding, timeout=timeout)
+        except TransportError:  # the session is closed
             return None
-        samples = (sample for reply in replies if (sample := reply.ok) is not None)
-        return next((bytes(sample.payload.to_bytes()) for sample in samples), None)
+        return next((answer.payload for answer in answers if answer.ok), None)
 
     def _serve(self, key: str, answer: Callable[[Request], None]) -> None:
-        queries = OpenQueries(self._instance)
-        key_numbers.take(self._session, key_numbers.PLAIN)
-        queryable = self._session.declare_queryable(key, queries.handler)
-        self._readers.add("queries", queryable, queries, answer)
+        full = schemas.MessageError("too_large", "key", f"at most {MOST_OPEN} queries open at once", "another one")
+        refusal = problem_with(full, instance=self._instance, code="refused")
+        self._client.serve(key, answer, most=MOST_OPEN, refusal=refusal)
 
     def tap(self, stream: str, receive: Callable[[str, bytes, str], None], detections: str = "") -> Callable[[], None]:
         """Hand over topic, payload and encoding of the newest detections and tracks of a stream to a viewer.
@@ -300,24 +292,18 @@ class Transport:
         return self._taps.join((stream, detections or stream), receive)
 
     def recent_tracks(self, stream: str) -> list[tuple[bytes, str]]:
-        """Return what those who track a stream keep of its tracks for subscribers, each message with its encoding.
-
-        Raises:
-            TransportError: the session is closed.
-        """
-        return [(one.payload, one.encoding) for one in self.client().recent(self._keys.tracks(stream), CACHES_S)]
+        """Return what those who track a stream keep of its tracks for subscribers, each message with its encoding."""
+        return [(one.payload, one.encoding) for one in self._client.cached(self._keys.tracks(stream), timeout=CACHES_S)]
 
     def client(self) -> Client:
         """Return what an edge in this process uses of the session."""
-        return Client(self._session, self._prefix, router=self._is_router)
+        return self._client
 
     def watch(self) -> None:
         """Log the nodes and routers that this session is linked to, as they come and go."""
-        channel: Channel[zenoh.TransportEvent] = Channel(CHANNEL // 16)
-        listener = self._session.info.declare_transport_events_listener(channel.handler, history=True)
-        self._readers.add("links", listener, channel, log_link)
+        self._client.watch_links(_log_link)
 
-    def _receive(self, sample: zenoh.Sample, key: str, receive: Callable[[Packet], None]) -> None:
+    def _receive(self, sample: Sample, key: str, receive: Callable[[Packet], None]) -> None:
         wall_ns, now_ns = time.time_ns(), time.monotonic_ns()
         payload = sample.payload
         size = len(payload)
@@ -328,66 +314,39 @@ class Transport:
 
     def announce(self) -> None:
         """Say that this instance is alive; to be called when it is ready."""
-        self._alive = self._session.liveliness().declare_token(self._keys.alive(self._instance))
+        self._alive = self._client.token(self._keys.alive(self._instance))
 
-    def open_publisher(self, stream: str) -> Publisher:
-        """Open the publisher of a stream's tracks, say that this instance tracks it, and declare its inputs' keys.
-
-        Raises:
-            TransportError: the session is closed, or has declared all keys that it can.
-        """
+    def open_publisher(self, stream: str) -> StreamPublisher:
+        """Open the publisher of a stream's tracks, say that this instance tracks it, and declare its inputs' keys."""
         # Who subscribes asks the caches, and hears by heartbeats of what it missed: nobody needs a token for that, and
         # each costs the router more the more there are.
-        taken = key_numbers.take(self._session, key_numbers.CACHED)
-        publisher = cached_publisher(
-            self._session, self._keys.tracks(stream), schemas.Tracks, TRACKS_CACHE, detected=False
-        )
-        try:
-            token = self._session.liveliness().declare_token(self._keys.owner(stream, self._instance))
-            keys = (self._keys.detections(stream), self._keys.points(stream)) if self._all else ()
-            inputs = [key_numbers.DeclaredKey(self._session, key) for key in keys]
-        except zenoh.ZError as error:
-            raise TransportError(line(error)) from error
-        whole = Publisher(publisher, (token, taken, *inputs), self._forget)
-        with self._lock:
-            self._publishers.add(whole)
-        return whole
+        key, encoding = self._keys.tracks(stream), schemas.encoding_of(schemas.Tracks)
+        sender = self._client.cached_sender(key, encoding, cache=TRACKS_CACHE, detected=False)
+        token = self._client.token(self._keys.owner(stream, self._instance))
+        inputs = (self._keys.detections(stream), self._keys.points(stream)) if self._all else ()
+        return StreamPublisher(sender, (token, *map(self._client.declare_key, inputs)))
 
     def publish_problem(self, problem: schemas.Problem) -> None:
         """Send a problem on its stream's key; one without a stream has no key and is not sent."""
-        publish_problem(self._session, self._keys, problem)
+        self._client.publish_problem(problem)
 
     def watch_owners(self, on_owner: Callable[[str, str, bool], None] | None) -> None:
-        """Tell which instance tracks which stream, or does so no longer (False), from now on; None: nobody any more.
-
-        Raises:
-            TransportError: the session is closed.
-        """
-        self._readers.end("owners")
+        """Tell which instance tracks which stream, or does so no longer (False), from now on; None: nobody any more."""
+        if self._owners is not None:
+            self._owners.close(0.0)
+            self._owners = None
         if on_owner is not None:
-            self._watch(
-                "owners",
+            self._owners = self._client.watch(
                 self._keys.all_owners(),
                 lambda key, present: on_owner(self._keys.stream_of(key), self._keys.instance_of(key), present),
             )
-
-    def _watch(self, name: str, pattern: str, on_token: Callable[[str, bool], None]) -> None:
-        """Tell of the tokens of a pattern, those that are there and those that come and go."""
-        channel: Channel[zenoh.Sample] = Channel(CHANNEL)
-        try:
-            tokens = self._session.liveliness().declare_subscriber(pattern, channel.handler, history=True)
-        except zenoh.ZError as error:
-            raise TransportError(line(error)) from error
-        self._readers.add(
-            name, tokens, channel, lambda one: on_token(str(one.key_expr), one.kind == zenoh.SampleKind.PUT)
-        )
 
     # The end
 
     def leave(self) -> None:
         """Say that this instance is alive no longer."""
         if self._alive is not None:
-            undeclare(self._alive)
+            self._alive.close()
             self._alive = None
 
     def stop(self, timeout: float) -> None:
@@ -395,22 +354,19 @@ class Transport:
         self.leave()
         for topic in self._topics.values():
             topic.close(timeout)
-        self._readers.stop(timeout)
+        self._client.stop(timeout)
 
     def close(self) -> None:
         """Withdraw everything and close the session."""
         self.stop(timeout=0.2)
-        with self._lock:
-            publishers = tuple(self._publishers)
-        for publisher in publishers:
-            publisher.release()
-        close(self._session)
-
-    def _forget(self, publisher: Publisher) -> None:
-        with self._lock:
-            self._publishers.discard(publisher)
+        self._client.close(0.0)
 
 
 def _name(stream: str, *, cached: bool) -> str:
     """Return the name of a subscription; for a moment there may be one with recovery and one without."""
     return stream if cached else f"{stream} plain"
+
+
+def _log_link(peer: str, kind: str, came: bool) -> None:  # noqa: FBT001 - as a link is told
+    """Log that a node or a router has linked to the session, or has gone."""
+    log.info("peer_connected" if came else "peer_lost", peer=peer, kind=kind)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 
 import pytest
+from optipmb_client.zenoh.session import KeyNumbers
 from optipmb_service.app.lifecycle import StopRequest, watch_keys
-from optipmb_service.zenoh.key_numbers import KeyCount
 from unbounded import NO_BOUND
 
 MOST = 1000
@@ -17,13 +17,13 @@ TURNS = 20
 @pytest.mark.parametrize(
     ("keys", "restarts"),
     [
-        (KeyCount(999, 0), False),
-        (KeyCount(1000, 0), True),
-        (KeyCount(1000, 900), True),
-        (KeyCount(1000, 901), False),
+        (KeyNumbers(999, 0), False),
+        (KeyNumbers(1000, 0), True),
+        (KeyNumbers(1000, 900), True),
+        (KeyNumbers(1000, 901), False),
     ],
 )
-async def test_a_process_restarts_where_that_gives_it_numbers(keys: KeyCount, *, restarts: bool) -> None:
+async def test_a_process_restarts_where_that_gives_it_numbers(keys: KeyNumbers, *, restarts: bool) -> None:
     """When enough are used up, and not where what is open would need more than nine of ten of them again."""
     asked = StopRequest(NO_BOUND)
     watching = asyncio.create_task(watch_keys(asked, lambda: keys, MOST))

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from optipmb_schemas import Keys
 from optipmb_service.runtime.directory import StreamDirectory
-from optipmb_service.zenoh.announcements import MOST, Announcements
+from optipmb_service.zenoh.transport import ANNOUNCED, Announcements
 
 KEYS = Keys()
 
@@ -18,11 +18,7 @@ class Tokens:
         self.now: set[str] = set()
         self.heard = StreamDirectory("other", 1, lambda _: True)
 
-    def liveliness(self) -> "Tokens":
-        """Return what declares tokens."""
-        return self
-
-    def declare_token(self, key: str) -> "Token":
+    def token(self, key: str) -> "Token":
         """Declare one, and have it heard of."""
         assert key not in self.now
         self.now.add(key)
@@ -50,7 +46,7 @@ class Token:
     def __init__(self, session: Tokens, key: str) -> None:
         self._session, self._key = session, key
 
-    def undeclare(self) -> None:
+    def close(self) -> None:
         """Withdraw it."""
         self._session.withdraw(self._key)
 
@@ -79,7 +75,7 @@ def test_each_stream_is_in_one_token_and_all_tokens_but_one_are_full(monkeypatch
         announcements.announce(streams | new)
         streams |= new
         assert tokens.announced == sorted(streams)
-        assert sum(len(KEYS.discovered_streams(key)) < MOST for key in tokens.now) <= 1
+        assert sum(len(KEYS.discovered_streams(key)) < ANNOUNCED for key in tokens.now) <= 1
         assert {one for one, known in tokens.heard._streams.items() if known.left_ns is None} == streams
         assert not away
         most = max(most, len(tokens.now))

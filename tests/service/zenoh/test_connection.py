@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from typing import TYPE_CHECKING
 
 import pytest
-from optipmb_schemas import Keys, Tracks
+from optipmb_client.zenoh.session import Session
+from optipmb_schemas import Keys, Tracks, encoding_of
 from optipmb_service.settings import load
-from optipmb_service.zenoh.connection import opened
-from optipmb_service.zenoh.handles import Publisher, cached_publisher
-from optipmb_service.zenoh.subscription import Subscription
+from optipmb_service.zenoh.client import Client
 from router import until
 from routers import free_endpoint, open_client, open_router
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     import zenoh
+    from optipmb_client.zenoh.handles import Sender
 
 KEYS = Keys()
 ECHO = "echo"
@@ -34,24 +35,27 @@ def endpoint() -> Iterator[str]:
         yield endpoint
 
 
-def connected(endpoint: str, file: Path | None = None) -> zenoh.Session:
+@contextlib.contextmanager
+def connected(endpoint: str, file: Path | None = None) -> Iterator[Client]:
     """The session of a member."""
     given = {"connect": [endpoint], "instance": "member", "store": "none"}
-    return opened(load(None, given | ({} if file is None else {"zenoh_config": str(file)})).settings)
+    client = Client(load(None, given | ({} if file is None else {"zenoh_config": str(file)})).settings)
+    yield client
+    client.close()
 
 
-def opened_publisher(member: zenoh.Session, stream: str) -> Publisher:
+def opened_publisher(member: Client, stream: str) -> Sender:
     """The publisher of a stream's tracks."""
-    return Publisher(cached_publisher(member, KEYS.tracks(stream), Tracks, 8, detected=False))
+    return member.cached_sender(KEYS.tracks(stream), encoding_of(Tracks), cache=8, detected=False)
 
 
-def interests(member: zenoh.Session, asker: zenoh.Session) -> set[str]:
+def interests(member: Client, asker: zenoh.Session) -> set[str]:
     """The keys in whose subscribers publishers are interested, as the router tells; of heartbeats it tells nothing.
 
     It has dealt with all that the member declared when it answers that one. A router of Zenoh 1.10 that is asked while
     it deals with a declaration can block for ever.
     """
-    assert [reply.ok is not None for reply in member.get(ECHO)] == [True]
+    assert [answer.ok for answer in member.query(ECHO)] == [True]
     found = [reply.ok for reply in asker.get("@/*/router/publisher/**")]
     return {str(one.key_expr).partition("/publisher/")[2] for one in found if one is not None}
 
@@ -65,14 +69,14 @@ def test_a_router_knows_one_interest_however_many_streams_there_are(endpoint: st
     file.write_text(json.dumps({"aggregation": {"publishers": ["others/**"]}}))
     with connected(endpoint, file) as member, open_client(endpoint) as asker:
         publishers = [opened_publisher(member, f"site/node/lidar{number}") for number in range(5)]
-        others = [member.declare_publisher(f"others/{number}") for number in range(2)]
+        others = [member.sender(f"others/{number}") for number in range(2)]
         assert interests(member, asker) == {KEYS.all("tracks"), "others/**"}
         for one in others:
-            one.undeclare()
+            one.close()
         for publisher in publishers[1:]:
-            publisher.release()
+            publisher.close()
         assert interests(member, asker) == {KEYS.all("tracks")}
-        publishers[0].release()
+        publishers[0].close()
         assert interests(member, asker) == set()
 
 
@@ -87,18 +91,18 @@ def test_tracks_come_whichever_publisher_was_declared_first(endpoint: str) -> No
         def heard(number: int, payload: bytes) -> None:
             """A new subscriber of a stream gets a message, sent before it came, and one that is sent after."""
             got: list[bytes] = []
-            publishers[number].publish(payload)
+            publishers[number].put(payload)
             key = KEYS.tracks(f"site/node/lidar{number}")
-            subscription = Subscription(viewer, key, lambda sample: got.append(sample.payload.to_bytes()))
+            subscription = Session(viewer).subscribe(key, lambda arrival: got.append(arrival.payload))
             until(lambda: payload in got, "a message of the cache")
-            publishers[number].publish(payload + b" and on")
+            publishers[number].put(payload + b" and on")
             until(lambda: payload + b" and on" in got, "a message")
             subscription.close()
 
         heard(0, b"of the first")
-        publishers[0].release()
+        publishers[0].close()
         heard(1, b"of the second")
-        publishers[1].release()
-        publishers[2].release()
+        publishers[1].close()
+        publishers[2].close()
         publishers[1] = opened_publisher(member, "site/node/lidar1")
         heard(1, b"of the first again")

@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Any, Final, cast
 import optipmb_service.zenoh.inputs
 import pytest
 import zenoh
-from optipmb_schemas import Detections, Keys
+from optipmb_client.zenoh.session import Session
+from optipmb_schemas import Keys
 from optipmb_service.runtime.intake import ALL
-from optipmb_service.zenoh.handles import cached_publisher
 from optipmb_service.zenoh.inputs import Topic
-from optipmb_service.zenoh.subscription import ask_cache
 from router import Collected
 from routers import free_endpoint, open_router
 
@@ -33,12 +32,14 @@ class Network:
 
     def __init__(self, session: zenoh.Session) -> None:
         self.session = session
-        self.publisher = cached_publisher(session, KEY, Detections, 100)
+        self.link = Session(session)
+        self.publisher = self.link.cached_sender(KEY, "", cache=100)
         self.received = Collected()
         self.answered: list[str] = []
-        self.topic = Topic("detections", session, self._receive, self.answered.append)
+        self.topic = Topic("detections", self.link, self.receive, self.answered.append)
 
-    def _receive(self, sample: zenoh.Sample) -> None:
+    def receive(self, sample: zenoh.Sample) -> None:
+        """Take a message."""
         self.received.add(str(sample.key_expr), sample.payload.to_bytes(), "")
 
     def publish(self, *payloads: bytes) -> None:
@@ -125,12 +126,15 @@ def test_an_error_while_a_cache_is_asked_ends_nothing(network: Network, monkeypa
     def fail(*_: object, **_named: object) -> None:
         raise zenoh.ZError("closed")
 
-    closed: Any = SimpleNamespace(get=fail)
-    monkeypatch.setattr(optipmb_service.zenoh.inputs, "ask_cache", lambda _session, *query: ask_cache(closed, *query))
-    network.topic.subscribe(ALL, KEYS.all("detections"))
+    closed: Any = SimpleNamespace(_session=SimpleNamespace(get=fail))
+    ask = Session.ask
+    monkeypatch.setattr(network.link, "ask", lambda *query: ask(closed, *query))
+    topic = Topic("detections", network.link, network.receive)
+    topic.subscribe(ALL, KEYS.all("detections"))
     network.publish(b"2")
     network.session.put(KEYS.detections("site/node/camera"), b"other")
     network.counts(b"2", b"other")
+    topic.close(CLOSE_S)
 
 
 def test_messages_of_several_threads_are_handed_over_one_at_a_time(network: Network) -> None:
@@ -143,7 +147,7 @@ def test_messages_of_several_threads_are_handed_over_one_at_a_time(network: Netw
         at_work.release()
         received.add(str(sample.key_expr), sample.payload.to_bytes(), "")
 
-    topic = Topic("points", network.session, receive)
+    topic = Topic("points", network.link, receive)
     topic.subscribe(ALL, KEYS.all("points"), cached=False)
     sent = [[bytes((sender, number)) for number in range(20)] for sender in range(4)]
     senders = [
@@ -180,7 +184,7 @@ def test_a_thread_waits_while_too_many_messages_wait(network: Network, monkeypat
         return sender
 
     sent = [bytes((number,)) for number in range(20)]
-    topic = Topic("points", network.session, receive)
+    topic = Topic("points", network.link, receive)
     topic.subscribe(ALL, KEYS.all("points"), cached=False)
     senders = [send(sent[0])]
     try:
@@ -201,16 +205,15 @@ def test_a_thread_waits_while_too_many_messages_wait(network: Network, monkeypat
 def test_a_topic_is_closed_again_while_a_subscription_does_not_return() -> None:
     """The end closes a topic again whose first close is stuck: each subscription is withdrawn once."""
     withdrawn: list[str] = []
-    topic = Topic("detections", cast("zenoh.Session", None), lambda _: None)
+    topic = Topic("detections", cast("Session", SimpleNamespace(ask=None)), lambda _: None)
 
     def subscriber(name: str) -> Any:
-        def undeclare() -> None:
+        def close() -> None:
             withdrawn.append(name)
             topic.close(CLOSE_S)  # as from another thread meanwhile
 
-        return SimpleNamespace(undeclare=undeclare)
+        return SimpleNamespace(close=close)
 
-    taken: Any = SimpleNamespace(undeclare=lambda: None)
-    topic._subscribers = {name: ("key", subscriber(name), taken) for name in ("a", "b", "c")}
+    topic._subscribers = {name: ("key", subscriber(name)) for name in ("a", "b", "c")}
     topic.close(CLOSE_S)
     assert sorted(withdrawn) == ["a", "b", "c"]

@@ -6,89 +6,76 @@ from typing import TYPE_CHECKING
 
 import pytest
 import zenoh
-from optipmb_schemas import Detections
+from optipmb_client.zenoh.session import CACHED, MOST_KEYS, PLAIN, Session
 from optipmb_service.runtime.ports import TransportError
-from optipmb_service.zenoh import key_numbers
-from optipmb_service.zenoh.connection import close
-from optipmb_service.zenoh.handles import Publisher, cached_publisher, directly
 from optipmb_service.zenoh.inputs import Topic
-from optipmb_service.zenoh.key_numbers import CACHED, MOST, PLAIN, DeclaredKey
-from optipmb_service.zenoh.subscription import Subscription
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 
 @pytest.fixture
-def session() -> Iterator[zenoh.Session]:
+def session() -> Iterator[Session]:
     """A session alone."""
     config = zenoh.Config()
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("listen/endpoints", "[]")
-    session = zenoh.open(config)
+    session = Session(zenoh.open(config))
     yield session
-    close(session)
-    assert key_numbers.used(session).declared == 0
+    session.close()
+    assert session.key_numbers.open == 0
 
 
-def _published(session: zenoh.Session, key: str) -> Callable[[], object]:
-    taken = key_numbers.take(session, CACHED)
-    return Publisher(cached_publisher(session, key, Detections, 1, detected=False), (taken,)).release
+def _published(session: Session, key: str) -> Callable[[], object]:
+    return session.cached_sender(key, "", cache=1, detected=False).close
 
 
-def _received(session: zenoh.Session, key: str) -> Callable[[], object]:
+def _received(session: Session, key: str) -> Callable[[], object]:
     topic = Topic("detections", session, lambda _: None)
     topic.subscribe(key, key)
     return lambda: topic.leave([key])
 
 
-def _received_plainly(session: zenoh.Session, key: str) -> Callable[[], object]:
+def _received_plainly(session: Session, key: str) -> Callable[[], object]:
     topic = Topic("points", session, lambda _: None)
     topic.subscribe(key, key, cached=False)
     return lambda: topic.leave([key])
 
 
-def _known(session: zenoh.Session, key: str) -> Callable[[], object]:
-    return DeclaredKey(session, key).undeclare
+def _known(session: Session, key: str) -> Callable[[], object]:
+    return session.declare_key(key).close
 
 
 @pytest.mark.parametrize("declare", [_published, _received, _received_plainly, _known])
-def test_no_number_is_given_twice(
-    session: zenoh.Session, declare: Callable[[zenoh.Session, str], Callable[[], object]]
-) -> None:
+def test_no_number_is_given_twice(session: Session, declare: Callable[[Session, str], Callable[[], object]]) -> None:
     """Whatever comes and goes: when a session has used up its numbers, nothing is declared, and what is open delivers.
 
     Zenoh alone goes on with numbers that are in use, and what these publishers send is lost without an error.
     """
     received: list[bytes] = []
-    key_numbers.take(session, PLAIN)
-    subscriber = session.declare_subscriber(
-        "early", directly(lambda sample: received.append(sample.payload.to_bytes()))
-    )
-    key_numbers.take(session, CACHED)
-    early = cached_publisher(session, "early", Detections, 1, detected=False)
+    session.listen("early", lambda sample: received.append(sample.payload.to_bytes()))
+    early = session.cached_sender("early", "", cache=1, detected=False)
 
     def come_and_go() -> None:
-        for number in range(MOST):
+        for number in range(MOST_KEYS):
             declare(session, f"passing/{number}/lidar")()
 
-    with pytest.raises(TransportError, match="65535 keys"):
+    with pytest.raises(TransportError, match=r"6553[45] keys"):
         come_and_go()
-    used = key_numbers.used(session)
-    assert MOST - CACHED < used.declared <= MOST
+    used = session.key_numbers
+    assert MOST_KEYS - CACHED < used.declared <= MOST_KEYS
     assert used.open == PLAIN + CACHED
     early.put(b"late")
     assert received == [b"late"]
-    del subscriber
 
 
-def test_numbers_are_in_use_until_what_has_them_is_withdrawn(session: zenoh.Session) -> None:
+def test_numbers_are_in_use_until_what_has_them_is_withdrawn(session: Session) -> None:
     """Withdrawn again, nothing is given back twice; those that are used up stay so."""
-    subscription = Subscription(session, "some/**", lambda _: None)
-    key = key_numbers.take(session, PLAIN)
-    assert (key_numbers.used(session).declared, key_numbers.used(session).open) == (CACHED + PLAIN, CACHED + PLAIN)
-    key.undeclare()
-    key.undeclare()
-    assert key_numbers.used(session).open == CACHED
+    subscription = session.subscribe("some/**", lambda _: None)
+    key = session.declare_key("some/key")
+    assert (session.key_numbers.declared, session.key_numbers.open) == (CACHED + PLAIN, CACHED + PLAIN)
+    key.close()
+    key.close()
+    assert session.key_numbers.open == CACHED
     subscription.close()
-    assert (key_numbers.used(session).declared, key_numbers.used(session).open) == (CACHED + PLAIN, 0)
+    assert (session.key_numbers.declared, session.key_numbers.open) == (CACHED + PLAIN, 0)

@@ -15,7 +15,7 @@ import pytest
 import zenoh
 import zenoh.ext
 from optipmb_client import Connection
-from optipmb_client.zenoh.sender import HEARTBEAT_S
+from optipmb_client.zenoh.session import HEARTBEAT_S
 from optipmb_schemas import (
     Density,
     Detections,

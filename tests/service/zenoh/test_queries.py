@@ -6,7 +6,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final
 
-import optipmb_service.zenoh.queries
+import optipmb_service.zenoh.transport
 import pytest
 from optipmb_schemas import Keys, Problem, SessionState, decode
 from optipmb_service.runtime import queries
@@ -43,7 +43,7 @@ def test_a_query_about_many_streams_whose_state_fails_gives_its_room_back(
 @pytest.mark.parametrize(
     ("module", "name", "key"),
     [
-        (optipmb_service.zenoh.queries, "MOST_OPEN", KEYS.query(SENSOR.stream, "state")),
+        (optipmb_service.zenoh.transport, "MOST_OPEN", KEYS.query(SENSOR.stream, "state")),
         (queries, "MOST_WILDCARDS", f"{KEYS.prefix}/*/*/*/q/state"),
     ],
     ids=["of one stream", "of many"],

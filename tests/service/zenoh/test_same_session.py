@@ -9,12 +9,12 @@ import threading
 import time
 from typing import TYPE_CHECKING, Final
 
-import optipmb_service.zenoh.transport
+import optipmb_client.zenoh.session
 import pytest
-from optipmb_schemas import Detections, Keys, Tracks
+from optipmb_client.zenoh.handles import Channel
+from optipmb_client.zenoh.session import Session
+from optipmb_schemas import Keys
 from optipmb_service.settings import load
-from optipmb_service.zenoh.client import Client
-from optipmb_service.zenoh.handles import Channel, cached_publisher
 from optipmb_service.zenoh.inputs import Topic
 from optipmb_service.zenoh.transport import Transport
 from router import until
@@ -23,17 +23,16 @@ from routers import free_endpoint, open_client, open_router
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    import zenoh
 
 KEYS: Final = Keys()
 HANGS_S: Final = 60.0
 
 
 @pytest.fixture
-def session() -> Iterator[zenoh.Session]:
+def session() -> Iterator[Session]:
     """A session that is a router itself."""
     with open_router(free_endpoint()) as session:
-        yield session
+        yield Session(session)
 
 
 def ends(work: Callable[[], object]) -> None:
@@ -44,22 +43,21 @@ def ends(work: Callable[[], object]) -> None:
     assert not thread.is_alive()
 
 
-def test_a_question_has_as_many_answers_as_there_are(session: zenoh.Session) -> None:
+def test_a_question_has_as_many_answers_as_there_are(session: Session) -> None:
     """The caches of one's own hold more than any channel of Zenoh; what they cache is sent meanwhile."""
-    publishers = [cached_publisher(session, KEYS.tracks(f"site/node/{one}"), Tracks, 50) for one in range(8)]
+    publishers = [session.cached_sender(KEYS.tracks(f"site/node/{one}"), "", cache=50) for one in range(8)]
     for publisher in publishers:
         for _ in range(50):
             publisher.put(b"x")
     found: list[object] = []
-    client = Client(session, KEYS.prefix, router=True)
-    ends(lambda: found.extend(client.recent(KEYS.all("tracks"), 10.0)))
+    ends(lambda: found.extend(session.cached(KEYS.all("tracks"), timeout=10.0)))
     assert len(found) == 400
     ends(lambda: publishers[0].put(b"y"))
 
 
 def test_as_many_tokens_may_be_there_as_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is watched may be more than waits for a thread: owners, and the links of a router."""
-    monkeypatch.setattr(optipmb_service.zenoh.transport, "CHANNEL", 16)  # of links one
+    monkeypatch.setattr(optipmb_client.zenoh.session, "CHANNEL", 1)
     endpoint = free_endpoint()
     transport = Transport(load(None, {"listen": [endpoint], "instance": "one", "store": "none"}).settings)
     owners: set[str] = set()
@@ -88,14 +86,14 @@ def test_a_channel_waits_for_room_only_where_it_is_read() -> None:
     assert not third.is_alive()
 
 
-def test_subscribing_to_what_is_sent_in_the_same_session_waits_for_no_cache(session: zenoh.Session) -> None:
+def test_subscribing_to_what_is_sent_in_the_same_session_waits_for_no_cache(session: Session) -> None:
     """A cache answers a new subscription with its lock held; asking it once more from there must not wait for it."""
     received = []
     topic = Topic("detections", session, received.append)
 
     def subscribe(number: int) -> None:
         key, over = KEYS.detections(f"site/node/{number}"), threading.Event()
-        publisher = cached_publisher(session, key, Detections, 200)
+        publisher = session.cached_sender(key, "", cache=200)
         for _ in range(100):
             publisher.put(bytes(2000))
 

@@ -7,7 +7,7 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from optipmb_service.zenoh.handles import directly
+from optipmb_client.zenoh.session import Session
 from routers import free_endpoint, open_client, open_router
 from service_process import ServiceProcess
 
@@ -33,11 +33,10 @@ def test_a_thread_of_the_network_keeps_its_state() -> None:
 
     endpoint = free_endpoint()
     with open_router(endpoint), open_client(endpoint) as receiver, open_client(endpoint) as sender:
-        subscriber = receiver.declare_subscriber("some/*/messages", directly(take))
+        Session(receiver).listen("some/*/messages", take)
         publisher = sender.declare_publisher("some/other/messages")
         while not enough.wait(0.01):  # one after the other: those that came together would share a state anyway
             publisher.put(b"message")
-        del subscriber
     assert len(states) == len({thread for thread, _ in states})
 
 

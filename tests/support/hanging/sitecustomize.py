@@ -10,8 +10,9 @@ import os
 import sys
 import time
 
+from optipmb_client.zenoh import session
 from optipmb_service.app import service
-from optipmb_service.zenoh import connection, transport
+from optipmb_service.zenoh import transport
 
 LONG_S = 3600
 
@@ -37,7 +38,4 @@ if os.environ["HANG"] == "leave":
 elif os.environ["HANG"] == "loop":
     service.Service.housekeeping = hang_in_the_loop  # type: ignore[method-assign]  # the loop is to hang
 else:
-    real = connection.close
-    for module in [one for name, one in sys.modules.items() if name.startswith("optipmb_service.zenoh")]:
-        if getattr(module, "close", None) is real:
-            module.close = hang if os.environ["HANG"] == "close" else hang_with_the_lock  # type: ignore[attr-defined]  # it is to hang
+    session.close_session = hang if os.environ["HANG"] == "close" else hang_with_the_lock

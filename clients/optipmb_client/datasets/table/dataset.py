@@ -17,7 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 from optipmb_schemas import Tracks
 
-from optipmb_client.datasets.interface import IDENTITY, DataSequence, Dataset, DetectionFrame, Truth, chosen
+from optipmb_client.datasets.interface import (
+    DETECTION_COLUMNS,
+    IDENTITY,
+    DataSequence,
+    Dataset,
+    DetectionFrame,
+    Truth,
+    chosen,
+)
 from optipmb_client.datasets.table.names import ALIASES
 from optipmb_client.datasets.table.rows import NO_ID, Boxes, read_tables
 from optipmb_client.datasets.table.values import Finding, Reading
@@ -259,19 +267,11 @@ class TableSequence(DataSequence):
         boxes = self._boxes
         for index in range(len(self)):
             rows = self._of(index)
-            yield DetectionFrame(
-                index=index,
-                stamp_ns=int(self._stamps[index]) - self._origin,
-                pose=self.poses[index],
-                labels=self.labels,
-                label=self._label[self._start[index] : self._start[index + 1]],
-                center=boxes.center[rows],
-                size=boxes.size[rows],
-                yaw=boxes.yaw[rows],
-                score=boxes.score[rows],
-                velocity=None if boxes.velocity is None else boxes.velocity[rows],
-                position_covariance=None if boxes.position_covariance is None else boxes.position_covariance[rows],
-            )
+            stamp_ns = int(self._stamps[index]) - self._origin
+            label = self._label[self._start[index] : self._start[index + 1]]
+            known = (name for name in DETECTION_COLUMNS if name != "label" and getattr(boxes, name) is not None)
+            columns = {name: getattr(boxes, name)[rows] for name in known}
+            yield DetectionFrame(index, stamp_ns, self.poses[index], self.labels, label, **columns)
 
     def truth(self) -> Truth | None:
         """Return the objects of the table of truth, at the stamps of these frames.

@@ -6,9 +6,9 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-import optipmb_schemas.late_join
+import optipmb_client.zenoh.late_join
 import pytest
-from optipmb_schemas.late_join import CacheQueries, LateJoin
+from optipmb_client.zenoh.late_join import CacheQueries, LateJoin
 
 
 @dataclass(frozen=True)
@@ -147,8 +147,8 @@ def test_closing_hands_over_what_waits_and_nothing_afterwards() -> None:
 
 def test_what_waits_and_who_is_known_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """Too many samples do not wait any longer for the cache; the publisher known longest is asked again."""
-    monkeypatch.setattr(optipmb_schemas.late_join, "MAX_WAITING", 3)
-    monkeypatch.setattr(optipmb_schemas.late_join, "MAX_SOURCES", 2)
+    monkeypatch.setattr(optipmb_client.zenoh.late_join, "MAX_WAITING", 3)
+    monkeypatch.setattr(optipmb_client.zenoh.late_join, "MAX_SOURCES", 2)
     one = Joined()
     one.take(3, 4, 5, 6)
     assert one.received == [3, 4, 5, 6]
@@ -163,8 +163,8 @@ def test_what_waits_and_who_is_known_are_bounded(monkeypatch: pytest.MonkeyPatch
 
 def test_an_answer_brings_no_forgotten_publisher_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """A publisher that did not wait any longer and is forgotten stays so: its cache is asked when it is heard again."""
-    monkeypatch.setattr(optipmb_schemas.late_join, "MAX_WAITING", 2)
-    monkeypatch.setattr(optipmb_schemas.late_join, "MAX_SOURCES", 1)
+    monkeypatch.setattr(optipmb_client.zenoh.late_join, "MAX_WAITING", 2)
+    monkeypatch.setattr(optipmb_client.zenoh.late_join, "MAX_SOURCES", 1)
     one = Joined()
     one.take(3, 4)
     one.join.keep(())
@@ -177,7 +177,7 @@ def test_an_answer_brings_no_forgotten_publisher_back(monkeypatch: pytest.Monkey
 
 def test_bytes_that_wait_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """With more bytes than may wait the publisher concerned waits no longer; what then waits is counted from there."""
-    monkeypatch.setattr(optipmb_schemas.late_join, "MAX_WAITING_BYTES", 30)
+    monkeypatch.setattr(optipmb_client.zenoh.late_join, "MAX_WAITING_BYTES", 30)
     one, other = Joined(), Entity("def")
     one.take(3, 4)
     one.take(8, source=other)
@@ -192,7 +192,7 @@ def test_bytes_that_wait_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_an_answer_lets_go_what_waits_behind_its_own_gap(monkeypatch: pytest.MonkeyPatch) -> None:
     """When too much waited for one answer, what waits for a later one goes on waiting for it."""
-    monkeypatch.setattr(optipmb_schemas.late_join, "MAX_WAITING", 3)
+    monkeypatch.setattr(optipmb_client.zenoh.late_join, "MAX_WAITING", 3)
     one = Joined()
     one.take(0, 2, 3, 4, 7)
     one.answer(1)
@@ -218,7 +218,7 @@ class LostQueries:
 
     def end_first(self) -> None:
         """End the first one unanswered when it has been sent as often as it is."""
-        while len(self.sent) <= len(optipmb_schemas.late_join.REPEATS_S):
+        while len(self.sent) <= len(optipmb_client.zenoh.late_join.REPEATS_S):
             time.sleep(0.001)
         self.sent[0][1](False)
 
@@ -232,7 +232,7 @@ class LostQueries:
 
 @pytest.fixture
 def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(optipmb_schemas.late_join, "REPEATS_S", (0.001, 0.001, 0.001))
+    monkeypatch.setattr(optipmb_client.zenoh.late_join, "REPEATS_S", (0.001, 0.001, 0.001))
 
 
 @pytest.mark.usefixtures("_soon")

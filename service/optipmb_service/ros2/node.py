@@ -9,29 +9,21 @@ from __future__ import annotations
 import secrets
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
-
-import zenoh
-import zenoh.ext
+from typing import TYPE_CHECKING, Final
 
 from optipmb_service.ros2 import graph
-from optipmb_service.runtime.ports import TransportError
 from optipmb_service.zenoh.client import Client
-from optipmb_service.zenoh.connection import line, opened
-from optipmb_service.zenoh.handles import Readers, undeclare
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from optipmb_client.zenoh.handles import Sender
+
     from optipmb_service.settings import Settings
-    from optipmb_service.zenoh.handles import Undeclared
 
-CHANNEL: Final = 1024
+MESSAGES: Final = 1024
 CLOUDS: Final = 8
-"""Clouds between Zenoh and the reader; the oldest goes beyond it."""
-
-HISTORY: Final = 100
-"""Static transforms that are asked of each publisher."""
+"""Messages of a topic, or clouds, between Zenoh and the reader; the oldest goes beyond it."""
 
 JOIN_S: Final = 1.0
 
@@ -40,8 +32,8 @@ JOIN_S: Final = 1.0
 class _Publication:
     """What a topic is published with: for nodes that hash types, and for those of Humble, which do not."""
 
-    hashed: Any
-    unhashed: Any
+    hashed: Sender
+    unhashed: Sender
     gid: bytes
     number: int = 0
 
@@ -57,30 +49,23 @@ class Ros2Node:
     """
 
     def __init__(self, settings: Settings) -> None:
-        self._session = opened(settings)
-        self.client = Client(self._session, settings.prefix)
+        self.client = Client(settings)
         """The client of the service."""
         self._domain = settings.ros2.domain
-        self._node = graph.Node(self._domain, str(self._session.info.zid()), settings.ros2.node)
+        self._node = graph.Node(self._domain, self.client.id, settings.ros2.node)
         self._entities = 0
-        self._held: list[Undeclared] = []
-        self._readers = Readers()
         self._publications: dict[str, _Publication] = {}
-        self._token(self._node.token())
+        self.client.token(self._node.token())
 
     def advertise(self, topic: str, type_name: str, type_hash: str) -> None:
         """Declare a publisher and its token."""
         endpoint = self._endpoint(graph.PUBLISHER, topic, type_name, type_hash, graph.Qos())
         hashed, unhashed = (
-            self._session.declare_publisher(
-                graph.TopicKey(self._domain, topic, type_name, one).key,
-                congestion_control=zenoh.CongestionControl.DROP,
-            )
+            self.client.sender(graph.TopicKey(self._domain, topic, type_name, one).key)
             for one in (type_hash, graph.NO_HASH)
         )
-        self._held += [hashed, unhashed]
         self._publications[topic] = _Publication(hashed, unhashed, secrets.token_bytes(graph.GID))
-        self._token(endpoint.token())
+        self.client.token(endpoint.token())
 
     def publish(self, topic: str, payload: bytes) -> None:
         """Send the CDR bytes of a message.
@@ -91,17 +76,14 @@ class Ros2Node:
         publication = self._publications[topic]
         publication.number += 1
         attachment = graph.attachment(publication.number, time.time_ns(), publication.gid)
-        try:
-            publication.hashed.put(payload, attachment=attachment)
-            if publication.unhashed.matching_status.matching:
-                publication.unhashed.put(payload, attachment=attachment)
-        except zenoh.ZError as error:
-            raise TransportError(line(error)) from error
+        publication.hashed.put(payload, attachment)
+        if publication.unhashed.wanted:
+            publication.unhashed.put(payload, attachment)
 
     def listened(self, topic: str) -> bool:
         """Whether somebody subscribes to a topic that is published here."""
         publication = self._publications[topic]
-        return any(one.matching_status.matching for one in (publication.hashed, publication.unhashed))
+        return publication.hashed.wanted or publication.unhashed.wanted
 
     def subscribe(
         self,
@@ -116,49 +98,32 @@ class Ros2Node:
         """Hand over the messages of a topic, of whatever type, on a thread of its own."""
         endpoint = self._endpoint(graph.SUBSCRIPTION, topic, type_name, type_hash, qos)
         pattern = graph.topic_pattern(self._domain, topic)
-        subscriber: Any
+
+        def take(at: str, payload: bytes) -> None:
+            if (key := graph.parse_topic(at)) is not None:
+                receive(key, payload)
+
         if qos.transient_local:
-            subscriber = zenoh.ext.declare_advanced_subscriber(
-                self._session,
-                pattern,
-                zenoh.handlers.FifoChannel(CHANNEL),
-                history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=HISTORY),
-            )
+            self.client.subscribe(pattern, lambda arrival: take(arrival.key, arrival.payload), history=True)
         else:
-            channel: Any = zenoh.handlers.RingChannel(CLOUDS) if clouds else zenoh.handlers.FifoChannel(CHANNEL)
-            subscriber = self._session.declare_subscriber(pattern, channel)
-
-        def take(sample: zenoh.Sample) -> None:
-            key = graph.parse_topic(str(sample.key_expr))
-            if key is not None and sample.kind == zenoh.SampleKind.PUT:
-                receive(key, sample.payload.to_bytes())
-
-        self._readers.add(topic, subscriber, subscriber.handler, take)
-        self._token(endpoint.token())
+            most = CLOUDS if clouds else MESSAGES
+            self.client.read_newest(pattern, lambda one: take(str(one.key_expr), one.payload.to_bytes()), most=most)
+        self.client.token(endpoint.token())
 
     def watch(self, changed: Callable[[graph.Endpoint, bool], None]) -> None:
         """Tell which publishers and subscriptions come, and go (False); those of this node are left out."""
-        tokens = self._session.liveliness().declare_subscriber(
-            graph.graph_pattern(self._domain), zenoh.handlers.FifoChannel(CHANNEL), history=True
-        )
 
-        def take(sample: zenoh.Sample) -> None:
-            endpoint = graph.parse_endpoint(str(sample.key_expr))
+        def take(key: str, present: bool) -> None:  # noqa: FBT001 - as a token is told
+            endpoint = graph.parse_endpoint(key)
             if endpoint is not None and endpoint.node.session != self._node.session:
-                changed(endpoint, sample.kind == zenoh.SampleKind.PUT)
+                changed(endpoint, present)
 
-        self._readers.add("graph", tokens, tokens.handler, take)
+        self.client.watch(graph.graph_pattern(self._domain), take)
 
     def close(self) -> None:
         """Withdraw everything and close the session."""
-        self._readers.stop(JOIN_S)
-        for declared in reversed(self._held):
-            undeclare(declared)
-        self.client.close()
+        self.client.close(JOIN_S)
 
     def _endpoint(self, kind: str, topic: str, type_name: str, type_hash: str, qos: graph.Qos) -> graph.Endpoint:
         self._entities += 1
         return graph.Endpoint(self._node, self._entities, kind, topic, type_name, type_hash, qos)
-
-    def _token(self, key: str) -> None:
-        self._held.append(self._session.liveliness().declare_token(key))

@@ -1,4 +1,4 @@
-"""What a subscription gets of a publisher with a cache: all that the cache still holds, each message in its turn.
+"""Samples of publishers with a cache in their order, with all that the cache still holds of those before.
 
 A publisher sends to the subscriptions that it knows of. While the declaration of a new one is on its way, messages go
 to the cache alone, and Zenoh's own query of the caches may have been answered before. Once a later message has come,
