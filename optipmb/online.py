@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -40,12 +41,12 @@ if TYPE_CHECKING:
 
 FLAT: Final = (("center", ("x", "y", "z")), ("size", ("l", "w", "h")), ("velocity", ("vx", "vy")))
 """Arrays of a frame, and the columns that may stand for them."""
-ALIASES: Final = {
+ALIASES: Final = MappingProxyType({
     "length": "l", "width": "w", "height": "h", "heading": "yaw", "confidence": "score",
     "class": "label", "name": "label", "category": "label", "type": "label",
-}  # fmt: skip
+})  # fmt: skip
 """Other names of columns."""
-WITHOUT: Final = {"z": 0.0, "h": 1.5, "score": 1.0}
+WITHOUT: Final = MappingProxyType({"z": 0.0, "h": 1.5, "score": 1.0})
 """Values of the columns that may be missing, as in the tables of `optipmb track`."""
 BOXES: Final = ("center", "size", "yaw", "score", "label")
 KNOWN: Final = (*BOXES, "velocity", "position_covariance", *(part for _, parts in FLAT for part in parts), *ALIASES)

@@ -89,7 +89,7 @@ def _run() -> None:
             yaw=[0.0, 1.0, 2.0],
             score=[score] * 3,
             velocity=[[1.0, 0.0], [0.0, 0.0], [np.nan, np.nan]],
-            cloud=cloud,
+            cloud=cloud if k else None,
             field_of_view=FieldOfView() if k else None,
         )
         result = tracker.step(posterior, given)
