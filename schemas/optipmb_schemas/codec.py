@@ -717,7 +717,7 @@ class _Builder:
             data = self._data_in(fields)
             plan = _plan_of(kind, self._shapes_in(fields))
             _need([*map(len, data)] == plan.sizes)
-            _need(plan.is_usual if limits.at_least_default else _are_within(plan.lengths, limits))
+            _need(plan.is_usual if limits.allows_default_rows else _are_within(plan.lengths, limits))
             for read in plan.readers:
                 read(data, values)
             given |= plan.names
@@ -859,7 +859,7 @@ def read_columns(payload: bytes, kind: type[T], limits: Limits) -> T | None:
     of floats. Where it would copy a large payload, `_is_encoding` compares the payload without them.
     """
     builder: Any = _BUILDERS.get(kind)
-    if np is None or builder is None or not (_LITTLE and limits.has_usual_structure):
+    if np is None or builder is None or not (_LITTLE and limits.allows_columns):
         return None
     try:
         fields = DECODERS[kind](payload)

@@ -4,7 +4,7 @@ The defaults carry the largest LiDAR clouds in use with room to spare, and keep 
 take in the tens of megabytes. A message above a limit is answered by a `too_large` problem that names it.
 """
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Final
 
@@ -23,7 +23,8 @@ _DIMENSIONS: Final = {
 }
 
 
-_STRUCTURE: Final = ("max_text", "max_values", "max_depth", "max_labels")
+_COLUMNS: Final = {"max_text": 2000, "max_values": 1000, "max_depth": 4, "max_labels": 256}
+"""Bytes of a text, values, levels and labels that no valid message with columns of binary numbers exceeds."""
 
 
 @dataclass(frozen=True)
@@ -47,14 +48,14 @@ class Limits:
         return most
 
     @cached_property
-    def at_least_default(self) -> bool:
-        """Whether no limit is below the default."""
-        return all(getattr(self, f.name) >= f.default for f in fields(self))
+    def allows_columns(self) -> bool:
+        """Whether a valid message with columns of binary numbers can be above no limit but those of its arrays."""
+        return all(getattr(self, name) >= most for name, most in _COLUMNS.items())
 
     @cached_property
-    def has_usual_structure(self) -> bool:
-        """Whether none of texts, values, nesting and labels is below the default."""
-        return replace(DEFAULT, **{name: getattr(self, name) for name in _STRUCTURE}).at_least_default
+    def allows_default_rows(self) -> bool:
+        """Whether no limit of an array dimension is below the default."""
+        return all(getattr(self, name) >= getattr(DEFAULT, name) for name in _DIMENSIONS.values())
 
     def described(self) -> list[tuple[str, int, str]]:
         """Return name, value and meaning of every limit, for people."""

@@ -158,6 +158,12 @@ def test_limits_are_those_of_the_models(examples: dict[str, Message], limits: Li
         decode(payload, Detections, limits=limits)
 
 
+def test_limits_of_a_service_need_no_models(examples: dict[str, Message]) -> None:
+    """Fewer values than by default, as a service allows, are still more than a message with columns has."""
+    limits = Limits(max_values=2**17, max_json_bytes=2**21)
+    assert all(check(encode(examples[name]), type(examples[name]), limits) for name in NAMES)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_every_value_replaced_by_every_other(examples: dict[str, Message], name: str) -> None:
     """Any value of the message replaced, left out, or written twice: what is read is what the models make of it."""
