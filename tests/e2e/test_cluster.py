@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -587,7 +588,11 @@ def test_the_topology_of_kubernetes_runs_as_processes(tmp_path: Path, capsys: py
         subprocess.Popen(["/bin/sh", script], env=environment, stdout=log, stderr=log, process_group=0) as process,
     ):
         try:
-            until(lambda: (tmp_path / "log").read_text().count("\nready ") == 6, "all are ready", READY_S)
+            until(
+                lambda: len(re.findall("^ready ", (tmp_path / "log").read_text(), re.MULTILINE)) == 6,
+                "all ready",
+                READY_S,
+            )
             for endpoint in routers:
                 arguments = ("replay", "--dataset", "scene", "--option", "frames=20", "--connect", endpoint)
                 assert run_here(capsys, *arguments).returncode == 0
