@@ -43,7 +43,7 @@ def test_predict(benchmark: BenchmarkFixture, objects: int) -> None:
 def test_preprocess(benchmark: BenchmarkFixture, objects: int) -> None:
     """Canonical order, score filter and suppression."""
     _, _, frame = settled(objects)
-    measurements, below, suppressed = benchmark(preprocess, frame, TABLE)
+    measurements, _, below, suppressed = benchmark(preprocess, frame, TABLE)
     assert len(measurements.score) + below + suppressed == len(frame.score)
 
 
