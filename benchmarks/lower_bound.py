@@ -117,7 +117,10 @@ def arguments(parameters: optipmb.Parameters, density: optipmb.Density, frame: o
     winners = np.flatnonzero(assigned >= 0)
     z = np.column_stack([measurements.position, measurements.velocity, measurements.yaw])
     sigma = np.column_stack(
-        [table[f"noise_{name}"] for name in ("position", "position", "velocity", "velocity", "heading")]
+        [
+            *(table[f"noise_{name}"] for name in ("position", "position", "velocity", "velocity", "heading")),
+            np.zeros(len(table["noise_position"])),  # no covariance of x and y
+        ]
     )
     return (
         np.concatenate([before.mean, waiting.mean]),
