@@ -270,6 +270,8 @@ class OnlineTracker:
 
 def _stamp(t: Any) -> int:
     """Return the nanoseconds of a time in seconds, or of a date."""
+    if isinstance(t, datetime | np.datetime64) and str(t) == "NaT":
+        raise FrameError("t", "seconds or a date", "NaT")
     if isinstance(t, datetime):  # pandas' own has nanoseconds, and those of datetime are exact
         since = t - datetime(1970, 1, 1, tzinfo=None if t.tzinfo is None else UTC)
         return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000 + getattr(t, "nanosecond", 0)
@@ -291,7 +293,12 @@ def _columns(boxes: Any, arrays: Mapping[str, ArrayLike]) -> dict[str, Any]:
         return {"center": [], "size": [], "yaw": [], "score": [], "label": []}
     if unknown := [name for name in given if name not in KNOWN]:
         raise FrameError(unknown[0], f"columns among {', '.join(KNOWN)}", f"the columns {', '.join(given)}")
-    given = {ALIASES.get(name, name): values for name, values in given.items()}
+    whole = {part: name for name, parts in FLAT for part in parts}
+    renamed = [ALIASES.get(name, name) for name in given]
+    meanings = [whole[name] if whole.get(name) in given else name for name in renamed]
+    if twice := [name for name, meaning in zip(given, meanings, strict=True) if meanings.count(meaning) > 1]:
+        raise FrameError(twice[-1], "one column for each meaning", f"the columns {', '.join(twice)}")
+    given = dict(zip(renamed, given.values(), strict=True))
     columns: dict[str, Any] = {}
     for name, parts in FLAT:
         if name in given:

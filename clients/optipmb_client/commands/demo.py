@@ -30,13 +30,12 @@ def demo(
     The service is a process of its own on a free port and ends with the demo.
     """
     needed("optipmb demo", "demo", "uvicorn", "starlette", "structlog", "prometheus_client", "scipy")
-    # They load packages that only this command needs.
-    from optipmb_client.datasets import Preloaded, open_dataset  # noqa: PLC0415
-    from optipmb_client.evaluation import combine, default_rules, evaluate_files  # noqa: PLC0415
-    from optipmb_client.pictures import draw_results  # noqa: PLC0415
-    from optipmb_client.replay import Pace, Replaying, replay  # noqa: PLC0415
-    from optipmb_client.service_process import ServiceProcess  # noqa: PLC0415
-    from optipmb_client.zenoh import Connection  # noqa: PLC0415
+    from optipmb_client.datasets import Preloaded, open_dataset  # noqa: PLC0415  packages of this command alone
+    from optipmb_client.evaluation import combine, default_rules, evaluate_files  # noqa: PLC0415  as above
+    from optipmb_client.pictures import draw_results  # noqa: PLC0415  as above
+    from optipmb_client.replay import Pace, Replaying, replay  # noqa: PLC0415  as above
+    from optipmb_client.service_process import ServiceProcess  # noqa: PLC0415  as above
+    from optipmb_client.zenoh import Connection  # noqa: PLC0415  as above
 
     pace = speed_of(speed)
     with FrameProgress("replaying", frames) as progress:
