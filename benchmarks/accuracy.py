@@ -18,20 +18,20 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"
 
 from greedy import greedy_tracks
 from kalman import HABITS, kalman_tracks
-from optipmb_client.datasets import open_dataset
-from optipmb_client.evaluation.errors import evaluate_errors
-from optipmb_client.tuning.clips import Clip, Degradation, degrade, load, of_class, track_clip, track_fully
-from optipmb_client.tuning.scoring import plain_figures, rules_of, scorer_of
-from optipmb_client.tuning.values import only
+from optipmb_tools.datasets import open_dataset
+from optipmb_tools.evaluation.errors import evaluate_errors
+from optipmb_tools.tuning.clips import Clip, Degradation, degrade, load, of_class, track_clip, track_fully
+from optipmb_tools.tuning.scoring import plain_figures, rules_of, scorer_of
+from optipmb_tools.tuning.values import only
 
 import optipmb
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from optipmb_client.datasets import DataSequence
-    from optipmb_client.evaluation.cases import Rules
-    from optipmb_client.results import ResultTable
+    from optipmb_tools.datasets import DataSequence
+    from optipmb_tools.evaluation.cases import Rules
+    from optipmb_tools.results import ResultTable
 
     Way = tuple[str, Callable[[Clip], ResultTable]]
 

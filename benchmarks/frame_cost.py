@@ -23,12 +23,12 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import optipmb_schemas as schemas
-from optipmb_client.load import generated
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.profiles import Profiles
 from optipmb_service.runtime.track_publisher import TrackPublisher
 from optipmb_service.session import convert
 from optipmb_service.session.session import Session
+from optipmb_tools.load import generated
 
 import optipmb
 
@@ -123,7 +123,7 @@ class Network:
 def packets(objects: int, points: int) -> Iterator[list[Packet]]:
     """Yield the messages of each frame, its cloud first."""
     frames, keys = generated(objects, points, RATE_HZ), schemas.Keys()
-    load = first_of("load.material", "load", package="optipmb_client")
+    load = first_of("load.material", "load", package="optipmb_tools")
     for k in range(WARM + FRAMES):
         begins = load.head(STREAM, bytes(16), load.FIRST + k, 10**18 + round(k * 1e9 / RATE_HZ))
         made = []

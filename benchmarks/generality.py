@@ -23,26 +23,26 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from optipmb_client import offline
-from optipmb_client.datasets import open_dataset
-from optipmb_client.evaluation import default_rules
-from optipmb_client.evaluation.calibration import calibration
-from optipmb_client.evaluation.cases import CENTRE_DISTANCE
-from optipmb_client.geometry import Pose, to_sensor, to_world
-from optipmb_client.results import ResultTable
-from optipmb_client.results.full import COLUMNS, FullTable
-from optipmb_client.results.kitti import LEAST_SHOWN
-from optipmb_client.results.rows import stacked
-from optipmb_client.tuning.clips import Clip, load, of_class
-from optipmb_client.tuning.scoring import plain_figures, rules_of, scorer_of
+from optipmb_tools import offline
+from optipmb_tools.datasets import open_dataset
+from optipmb_tools.evaluation import default_rules
+from optipmb_tools.evaluation.calibration import calibration
+from optipmb_tools.evaluation.cases import CENTRE_DISTANCE
+from optipmb_tools.geometry import Pose, to_sensor, to_world
+from optipmb_tools.results import ResultTable
+from optipmb_tools.results.full import COLUMNS, FullTable
+from optipmb_tools.results.kitti import LEAST_SHOWN
+from optipmb_tools.results.rows import stacked
+from optipmb_tools.tuning.clips import Clip, load, of_class
+from optipmb_tools.tuning.scoring import plain_figures, rules_of, scorer_of
 
 import optipmb
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from optipmb_client.datasets import DataSequence, DetectionFrame, Truth
-    from optipmb_client.geometry import Bools, Floats, Ints
+    from optipmb_tools.datasets import DataSequence, DetectionFrame, Truth
+    from optipmb_tools.geometry import Bools, Floats, Ints
 
     from optipmb import Parameters, Tracks
 

@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from optipmb_client.datasets import open_dataset
-from optipmb_client.results.nuscenes import NUSCENES_CLASSES
-from optipmb_client.tuning.clips import load, track_clip
-from optipmb_client.tuning.scoring import Measured, Scorer, rules_of, scorer_of
+from optipmb_tools.datasets import open_dataset
+from optipmb_tools.results.nuscenes import NUSCENES_CLASSES
+from optipmb_tools.tuning.clips import load, track_clip
+from optipmb_tools.tuning.scoring import Measured, Scorer, rules_of, scorer_of
 
 import optipmb
 from optipmb.geometry import bev_iou
@@ -27,7 +27,7 @@ from optipmb.geometry import bev_iou
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from optipmb_client.results import ResultTable
+    from optipmb_tools.results import ResultTable
 
 DETECTORS = ("centerpoint", "megvii")
 PROFILES = ("nuscenes-paper", "nuscenes", "nuscenes-megvii")

@@ -52,7 +52,7 @@ Arguments = dict[str, Any]
 
 def recorded(dataset: str) -> tuple[optipmb.Parameters, list[list[Arguments]]]:
     """The arguments of `make_frame` of all frames of all sequences, KITTI's with cars only; skips without the data."""
-    from optipmb_client.datasets import open_dataset, selected_frames  # noqa: PLC0415 - the dense scene needs none
+    from optipmb_tools.datasets import open_dataset, selected_frames  # noqa: PLC0415 - the dense scene needs none
     from real_data import kitti_root, nuscenes_root  # noqa: PLC0415 - the same
 
     if dataset == "kitti":

@@ -30,8 +30,9 @@ import optipmb
 import optipmb_client
 import optipmb_schemas
 import optipmb_service
+import optipmb_tools
 
-for package in (optipmb, optipmb_client, optipmb_schemas, optipmb_service):
+for package in (optipmb, optipmb_client, optipmb_schemas, optipmb_service, optipmb_tools):
     folder = Path(package.__file__).parent
     assert "site-packages" in folder.parts, folder
     assert (folder / "py.typed").is_file(), f"{folder.name} lacks py.typed: its users' type checkers see nothing"

@@ -1,4 +1,4 @@
-"""The client: publish detections and receive tracks from programs of your own, replay and evaluate datasets.
+"""The node API: publish detections and receive tracks from your own programs.
 
     from optipmb_client import Publisher, Subscriber
 

@@ -5,8 +5,8 @@ import json
 from pathlib import Path
 
 import pytest
-from optipmb_client.cli import run
-from optipmb_client.tuning import ROWS
+from optipmb_tools.cli import run
+from optipmb_tools.tuning import ROWS
 
 DOCS = Path(__file__).parents[2] / "docs"
 SCENE = ["--dataset", "scene", "--option", "frames=16", "--option", "clouds=0", "--sequences", "0000", "0001"]

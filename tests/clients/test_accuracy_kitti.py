@@ -9,13 +9,13 @@ import pytest
 from accuracy import figures, material
 from greedy import greedy_tracks
 from kalman import kalman_tracks
-from optipmb_client.cli import run
-from optipmb_client.datasets import Regions, Truth, open_dataset
-from optipmb_client.evaluation.calibration import CalibrationResult
-from optipmb_client.evaluation.errors import evaluate_errors
-from optipmb_client.tuning.calibrate import cross_calibration
-from optipmb_client.tuning.clips import Clip, track_clip, track_fully
-from optipmb_client.tuning.values import only
+from optipmb_tools.cli import run
+from optipmb_tools.datasets import Regions, Truth, open_dataset
+from optipmb_tools.evaluation.calibration import CalibrationResult
+from optipmb_tools.evaluation.errors import evaluate_errors
+from optipmb_tools.tuning.calibrate import cross_calibration
+from optipmb_tools.tuning.clips import Clip, track_clip, track_fully
+from optipmb_tools.tuning.values import only
 from real_data import kitti_root
 
 import optipmb

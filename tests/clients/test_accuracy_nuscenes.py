@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 from accuracy import figures, material
 from greedy import greedy_tracks
-from optipmb_client.cli import run
-from optipmb_client.datasets import open_dataset
-from optipmb_client.tuning.clips import load, of_class, track_clip
-from optipmb_client.tuning.scoring import rules_of, scorer_of
-from optipmb_client.tuning.values import only
+from optipmb_tools.cli import run
+from optipmb_tools.datasets import open_dataset
+from optipmb_tools.tuning.clips import load, of_class, track_clip
+from optipmb_tools.tuning.scoring import rules_of, scorer_of
+from optipmb_tools.tuning.values import only
 from real_data import all_nuscenes, nuscenes_root
 
 import optipmb

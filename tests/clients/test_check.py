@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import result_of, run_here
-from optipmb_client.datasets import open_dataset
-from optipmb_client.table_files import read_table, write_table
+from optipmb_tools.datasets import open_dataset
+from optipmb_tools.table_files import read_table, write_table
 
 FRAMES, PERIOD = 50, 0.1
 Table = dict[str, np.ndarray]

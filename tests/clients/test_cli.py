@@ -12,7 +12,7 @@ from commands import optipmb, run_here, start
 from fake_service import Behaviour, FakeService
 from hypothesis import given
 from hypothesis import strategies as st
-from optipmb_client.cli import run, spread
+from optipmb_tools.cli import run, spread
 from routers import free_endpoint
 
 SMALL = ["--dataset", "scene", "--option", "frames=8", "--option", "vehicles=4", "--option", "clouds=0"]
@@ -172,7 +172,7 @@ def test_a_warm_installation_has_nothing_to_compile(capsys: pytest.CaptureFixtur
 def test_help_does_not_load_the_tracker() -> None:
     """`optipmb --help` imports neither the tracker's compiler nor the plotting library."""
     code = (
-        "import sys; from optipmb_client.cli import run; run(['--help']); "
+        "import sys; from optipmb_tools.cli import run; run(['--help']); "
         "sys.exit(','.join({'numba', 'matplotlib', 'optipmb', 'scipy'} & set(sys.modules)) or 0)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
@@ -186,10 +186,10 @@ def test_tracking_a_table_loads_nothing_else(tmp_path: Path) -> None:
         "t,x,y,z,length,width,height,yaw,score,class\n0.0,1,2,0,4,2,1,0,0.9,car\n0.1,1,2,0,4,2,1,0,0.9,car\n"
     )
     code = (
-        "import sys; from optipmb_client.cli import run; "
+        "import sys; from optipmb_tools.cli import run; "
         f"run(['track', {str(table)!r}, '--out', {str(tmp_path / 'out')!r}]); "
-        "others = ('optuna', 'optipmb_client.tuning', 'optipmb_client.load', 'optipmb_client.datasets.scene', "
-        "'optipmb_client.datasets.kitti', 'optipmb_client.datasets.nuscenes', 'optipmb_client.commands.replay'); "
+        "others = ('optuna', 'optipmb_tools.tuning', 'optipmb_tools.load', 'optipmb_tools.datasets.scene', "
+        "'optipmb_tools.datasets.kitti', 'optipmb_tools.datasets.nuscenes', 'optipmb_tools.commands.replay'); "
         "sys.exit(','.join(sorted(set(others) & set(sys.modules))) or 0)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=False)

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import run_here
-from optipmb_client.camera import SENSOR_FROM_CAMERA, alpha_of, sensor_from_kitti
-from optipmb_client.datasets import DatasetError, open_dataset
-from optipmb_client.datasets.kitti import (
+from optipmb_tools.camera import SENSOR_FROM_CAMERA, alpha_of, sensor_from_kitti
+from optipmb_tools.datasets import DatasetError, open_dataset
+from optipmb_tools.datasets.kitti import (
     EARTH_RADIUS_M,
     SPLITS,
     KittiDataset,
@@ -19,7 +19,7 @@ from optipmb_client.datasets.kitti import (
     read_poses,
     read_scan,
 )
-from optipmb_client.geometry import points_in_box, rotation_of, stack_poses, to_sensor, to_world, wrap_angle
+from optipmb_tools.geometry import points_in_box, rotation_of, stack_poses, to_sensor, to_world, wrap_angle
 from real_data import kitti_root
 
 ROW = "0,2,10,20,30,40,{score},1.5,1.6,4.0,1.0,1.7,20.0,-1.5,-1.6"

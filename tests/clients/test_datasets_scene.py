@@ -8,14 +8,14 @@ from typing import TypeAlias
 
 import numpy as np
 import pytest
-from optipmb_client.datasets import DatasetError, Truth, open_dataset
-from optipmb_client.datasets.scene.dataset import MIN_POINTS, RADIUS, SceneSequence, visits
-from optipmb_client.datasets.scene.detector import CLASSES, FALSE, MIN_SCORE, Found, detection_probability
-from optipmb_client.datasets.scene.lidar import BEAMS, GROUND, NOTHING, cast, scan
-from optipmb_client.datasets.scene.traffic import HALF_WIDTH, fixed_boxes, parking_places
-from optipmb_client.evaluation import Rules, evaluate_clear, iou_bev
-from optipmb_client.geometry import points_in_box, rotation_of, wrap_angle
-from optipmb_client.results import ResultTable
+from optipmb_tools.datasets import DatasetError, Truth, open_dataset
+from optipmb_tools.datasets.scene.dataset import MIN_POINTS, RADIUS, SceneSequence, visits
+from optipmb_tools.datasets.scene.detector import CLASSES, FALSE, MIN_SCORE, Found, detection_probability
+from optipmb_tools.datasets.scene.lidar import BEAMS, GROUND, NOTHING, cast, scan
+from optipmb_tools.datasets.scene.traffic import HALF_WIDTH, fixed_boxes, parking_places
+from optipmb_tools.evaluation import Rules, evaluate_clear, iou_bev
+from optipmb_tools.geometry import points_in_box, rotation_of, wrap_angle
+from optipmb_tools.results import ResultTable
 
 import optipmb
 

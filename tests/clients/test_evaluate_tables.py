@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import result_of, run_here
-from optipmb_client.table_files import read_table, write_table
+from optipmb_tools.table_files import read_table, write_table
 
 FRAMES, CARS = 50, 2
 

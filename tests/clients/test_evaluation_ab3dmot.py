@@ -9,16 +9,16 @@ import pytest
 from evaluation_cases import TrackRow, TruthRow, followed, parked, shuffled, tracks_of, truth_of, write_kitti
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_client.datasets import open_dataset
-from optipmb_client.evaluation.ab3dmot import (
+from optipmb_tools.datasets import open_dataset
+from optipmb_tools.evaluation.ab3dmot import (
     POINTS,
     Ab3dmotResult,
     Counts,
     evaluate_ab3dmot,
     recall_points,
 )
-from optipmb_client.evaluation.cases import Case, ab3dmot_rules, prepare
-from optipmb_client.evaluation.evaluate import evaluate_figures, load_recordings
+from optipmb_tools.evaluation.cases import Case, ab3dmot_rules, prepare
+from optipmb_tools.evaluation.evaluate import evaluate_figures, load_recordings
 from scipy.optimize import linear_sum_assignment
 
 PATIENT = settings(deadline=None, max_examples=60)  # other work on the machine may make any example slow

@@ -4,7 +4,7 @@ import numpy as np
 from evaluation_cases import tracks_of, truth_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_client.evaluation.cases import (
+from optipmb_tools.evaluation.cases import (
     Case,
     Rules,
     assign_frames,
@@ -14,7 +14,7 @@ from optipmb_client.evaluation.cases import (
     prepare,
     uncontested,
 )
-from optipmb_client.evaluation.clear import match_frames
+from optipmb_tools.evaluation.clear import match_frames
 from scipy.optimize import linear_sum_assignment
 
 PATIENT = settings(deadline=None, max_examples=100)  # other work on the machine may make any example slow

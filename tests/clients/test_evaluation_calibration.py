@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from evaluation_cases import parked, tracks_of, truth_of
-from optipmb_client.datasets import DatasetError, open_dataset
-from optipmb_client.evaluation.calibration import CalibrationResult, calibration, evaluate_calibration
-from optipmb_client.evaluation.cases import Rules
-from optipmb_client.evaluation.evaluate import evaluate_figures, load_recordings
-from optipmb_client.geometry import Floats
-from optipmb_client.results.full import FullTable, full_path, read_full, write_full
-from optipmb_client.tracking import Tracking, track
+from optipmb_tools.datasets import DatasetError, open_dataset
+from optipmb_tools.evaluation.calibration import CalibrationResult, calibration, evaluate_calibration
+from optipmb_tools.evaluation.cases import Rules
+from optipmb_tools.evaluation.evaluate import evaluate_figures, load_recordings
+from optipmb_tools.geometry import Floats
+from optipmb_tools.results.full import FullTable, full_path, read_full, write_full
+from optipmb_tools.tracking import Tracking, track
 
 import optipmb
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from optipmb_client.datasets import DatasetError, Regions, Truth, open_dataset
-from optipmb_client.evaluation import (
+from optipmb_tools.datasets import DatasetError, Regions, Truth, open_dataset
+from optipmb_tools.evaluation import (
     ClearResult,
     Rules,
     Switch,
@@ -18,7 +18,7 @@ from optipmb_client.evaluation import (
     prepare,
     sweep,
 )
-from optipmb_client.results import ResultTable
+from optipmb_tools.results import ResultTable
 from real_data import kitti_root
 
 Row = tuple[int, int, float]

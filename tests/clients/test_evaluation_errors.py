@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from optipmb_client.datasets import DataSequence, DetectionFrame, open_dataset
-from optipmb_client.evaluation.cases import Rules
-from optipmb_client.evaluation.errors import DIRECTIONS, ErrorResult, evaluate_errors
-from optipmb_client.evaluation.evaluate import evaluate_figures, load_recordings
-from optipmb_client.tracking import Tracking, track
+from optipmb_tools.datasets import DataSequence, DetectionFrame, open_dataset
+from optipmb_tools.evaluation.cases import Rules
+from optipmb_tools.evaluation.errors import DIRECTIONS, ErrorResult, evaluate_errors
+from optipmb_tools.evaluation.evaluate import evaluate_figures, load_recordings
+from optipmb_tools.tracking import Tracking, track
 
 import optipmb
 

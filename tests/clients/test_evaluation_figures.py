@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from commands import result_of, run_here
 from evaluation_cases import write_kitti
-from optipmb_client.cli import run
-from optipmb_client.datasets import DatasetError, open_dataset
-from optipmb_client.datasets.kitti import KittiSequence
-from optipmb_client.evaluation.evaluate import Settings, evaluate_figures, load_recordings
-from optipmb_client.results.kitti import LEAST_SHOWN, read_kitti_results
-from optipmb_client.table_files import write_table
+from optipmb_tools.cli import run
+from optipmb_tools.datasets import DatasetError, open_dataset
+from optipmb_tools.datasets.kitti import KittiSequence
+from optipmb_tools.evaluation.evaluate import Settings, evaluate_figures, load_recordings
+from optipmb_tools.results.kitti import LEAST_SHOWN, read_kitti_results
+from optipmb_tools.table_files import write_table
 from real_data import kitti_root, nuscenes_root
 
 CLASSES = ("Car", "Pedestrian", "Cyclist")

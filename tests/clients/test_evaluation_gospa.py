@@ -7,8 +7,8 @@ import pytest
 from evaluation_cases import TrackRow, TruthRow, followed, parked, tracks_of, truth_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_client.evaluation.cases import Rules, prepare
-from optipmb_client.evaluation.gospa import GospaResult, evaluate_gospa
+from optipmb_tools.evaluation.cases import Rules, prepare
+from optipmb_tools.evaluation.gospa import GospaResult, evaluate_gospa
 
 PATIENT = settings(deadline=None, max_examples=60)  # other work on the machine may make any example slow
 

@@ -11,10 +11,10 @@ import pytest
 from evaluation_cases import TrackRow, TruthRow, followed, parked, shuffled, tracks_of, truth_of, write_kitti
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_client.datasets import open_dataset
-from optipmb_client.evaluation.cases import Case, Rules, counted, hota_2d_rules, prepare, similarity
-from optipmb_client.evaluation.evaluate import evaluate_figures, load_recordings
-from optipmb_client.evaluation.hota import NOTHING, HotaResult, evaluate_hota
+from optipmb_tools.datasets import open_dataset
+from optipmb_tools.evaluation.cases import Case, Rules, counted, hota_2d_rules, prepare, similarity
+from optipmb_tools.evaluation.evaluate import evaluate_figures, load_recordings
+from optipmb_tools.evaluation.hota import NOTHING, HotaResult, evaluate_hota
 
 PATIENT = settings(deadline=None, max_examples=60)  # other work on the machine may make any example slow
 NEAR = Rules("distance", 2.0)

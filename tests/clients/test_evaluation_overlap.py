@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from optipmb_client.evaluation import iou_3d, iou_bev
-from optipmb_client.evaluation.overlap import intersection_area
-from optipmb_client.geometry import Floats, points_in_box
+from optipmb_tools.evaluation import iou_3d, iou_bev
+from optipmb_tools.evaluation.overlap import intersection_area
+from optipmb_tools.geometry import Floats, points_in_box
 
 Boxes = tuple[Floats, Floats, Floats]
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from optipmb_client.files import DatasetError, numbers, read_rows, write_whole
+from optipmb_tools.files import DatasetError, numbers, read_rows, write_whole
 
 
 def test_a_number_that_is_none_is_named_with_its_line(tmp_path: Path) -> None:

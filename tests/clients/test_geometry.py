@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from optipmb_client.camera import Camera, kitti_from_sensor, sensor_from_kitti, synthetic_camera
-from optipmb_client.geometry import (
+from optipmb_tools.camera import Camera, kitti_from_sensor, sensor_from_kitti, synthetic_camera
+from optipmb_tools.geometry import (
     box_corners,
     planar_pose,
     points_in_box,

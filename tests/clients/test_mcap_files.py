@@ -18,10 +18,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
-from optipmb_client.datasets import DatasetError, dataset_at, open_dataset
-from optipmb_client.foxglove_view import FoxgloveMessages, FoxgloveServer
-from optipmb_client.recordings.files import Recorded, RecordingFile, RecordingWriter
-from optipmb_client.recordings.plan import plan, renamed, steps
 from optipmb_client.zenoh import Connection
 from optipmb_schemas import (
     Detections,
@@ -37,6 +33,10 @@ from optipmb_schemas import (
     encode_json,
     encoding_of,
 )
+from optipmb_tools.datasets import DatasetError, dataset_at, open_dataset
+from optipmb_tools.foxglove_view import FoxgloveMessages, FoxgloveServer
+from optipmb_tools.recordings.files import Recorded, RecordingFile, RecordingWriter
+from optipmb_tools.recordings.plan import plan, renamed, steps
 
 KEYS = Keys()
 STREAM = "garage/robot-1/lidar"
@@ -110,7 +110,7 @@ def put(writer: RecordingWriter, message: Message, received_ns: int, *, json: bo
 
 LIMITED = """
 import resource, sys
-from optipmb_client.cli import run
+from optipmb_tools.cli import run
 
 resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
 sys.exit(run(sys.argv[1:]))

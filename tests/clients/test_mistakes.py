@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from optipmb_client.cli import run
-from optipmb_client.table_files import write_table
 from optipmb_schemas.installation import install_command
+from optipmb_tools.cli import run
+from optipmb_tools.table_files import write_table
 from own_tables import FRAMES, boxes
 
 ROWS = 3 * FRAMES

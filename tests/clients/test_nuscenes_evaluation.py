@@ -13,10 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from nuscenes_cases import COLUMNS, Rows, disturbed_tracks, greedy_tracks, truth_tracks, write
 from nuscenes_tables import Scene, Thing, crowd, write_detections, write_root
-from optipmb_client.cli import run
-from optipmb_client.datasets import DatasetError
-from optipmb_client.datasets.nuscenes import NuScenesDataset, NuScenesSequence
-from optipmb_client.evaluation.nuscenes import (
+from optipmb_tools.cli import run
+from optipmb_tools.datasets import DatasetError
+from optipmb_tools.datasets.nuscenes import NuScenesDataset, NuScenesSequence
+from optipmb_tools.evaluation.nuscenes import (
     Event,
     Matching,
     NuScenesClass,
@@ -36,8 +36,8 @@ from optipmb_client.evaluation.nuscenes import (
     prepare_scene,
     score_thresholds,
 )
-from optipmb_client.results import ResultTable
-from optipmb_client.results.nuscenes import NUSCENES_CLASSES
+from optipmb_tools.results import ResultTable
+from optipmb_tools.results.nuscenes import NUSCENES_CLASSES
 from real_data import nuscenes_root
 
 CAR, PEDESTRIAN = NUSCENES_CLASSES.index("car"), NUSCENES_CLASSES.index("pedestrian")

@@ -12,13 +12,13 @@ from fake_service import FakeService
 from nuscenes_cases import Rows, disturbed_tracks, truth_tracks, write
 from nuscenes_tables import box, crowd, write_detections, write_root
 from optipmb_client import Connection
-from optipmb_client.datasets import DatasetError
-from optipmb_client.datasets.nuscenes import NuScenesDataset, NuScenesSequence
-from optipmb_client.offline import read_profile
-from optipmb_client.replay import Pace, Replaying, replay
-from optipmb_client.results.nuscenes import NUSCENES_MAX_BOXES, read_nuscenes_results, result_table
-from optipmb_client.results.output import Results
-from optipmb_client.tracking import Tracking, track
+from optipmb_tools.datasets import DatasetError
+from optipmb_tools.datasets.nuscenes import NuScenesDataset, NuScenesSequence
+from optipmb_tools.offline import read_profile
+from optipmb_tools.replay import Pace, Replaying, replay
+from optipmb_tools.results.nuscenes import NUSCENES_MAX_BOXES, read_nuscenes_results, result_table
+from optipmb_tools.results.output import Results
+from optipmb_tools.tracking import Tracking, track
 
 SCENES = [crowd("scene-0103", 1, 6), crowd("scene-0916", 2, 5, 1_538_984_233_000_000)]
 FILE = "tracking_results.json"

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from optipmb_client.datasets import Dataset, Preloaded, open_dataset, selected_frames
 from optipmb_client.errors import UsageError
-from optipmb_client.offline import read_profile, track_whole
-from optipmb_client.results.output import latency
-from optipmb_client.tracking import Tracking, track
 from optipmb_schemas import PATHS
+from optipmb_tools.datasets import Dataset, Preloaded, open_dataset, selected_frames
+from optipmb_tools.offline import read_profile, track_whole
+from optipmb_tools.results.output import latency
+from optipmb_tools.tracking import Tracking, track
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 
 import pytest
-from optipmb_client.cli import run
+from optipmb_tools.cli import run
 
 PAGE = (Path(__file__).parents[2] / "docs" / "paper.md").read_text(encoding="utf-8")
 
@@ -18,7 +18,7 @@ def section(title: str) -> str:
 
 
 def test_the_code_of_each_equation_exists() -> None:
-    """Equations 1 to 41 have a row each; `module.name` is in the tracker, or in the client where it says so."""
+    """Equations 1 to 41 have a row each; `module.name` is in the tracker, or in the tools where it says so."""
     numbers: list[int] = []
     named = 0
     for line in section("Equations").splitlines():
@@ -27,7 +27,7 @@ def test_the_code_of_each_equation_exists() -> None:
             first, _, last = part.partition("-")
             numbers += range(int(first), int(last or first) + 1)
         for name in re.findall(r"`((?:\w+\.)+\w+)`", line):
-            assert resolve_name(name if name.startswith("optipmb_client") else f"optipmb.{name}")
+            assert resolve_name(name if name.startswith("optipmb_tools") else f"optipmb.{name}")
             named += 1
     assert sorted(numbers) == list(range(1, 42))
     assert named > 20

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import run_here
-from optipmb_client.datasets import DataSequence, Truth, open_dataset
 from optipmb_client.errors import ClientError
-from optipmb_client.evaluation import ClearResult, Rules, evaluate_clear
-from optipmb_client.pictures import WIDTH_PX, Panel, animate_tracks, draw_tracks
-from optipmb_client.results import ResultTable, empty_table
+from optipmb_tools.datasets import DataSequence, Truth, open_dataset
+from optipmb_tools.evaluation import ClearResult, Rules, evaluate_clear
+from optipmb_tools.pictures import WIDTH_PX, Panel, animate_tracks, draw_tracks
+from optipmb_tools.results import ResultTable, empty_table
 from PIL import Image
 
 PNG = b"\x89PNG\r\n\x1a\n"

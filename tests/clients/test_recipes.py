@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from commands import run_here
 from nuscenes_tables import Scene, box, write_detections, write_root
-from optipmb_client.table_files import read_table, write_table
+from optipmb_tools.table_files import read_table, write_table
 from own_tables import FRAMES, boxes
 from real_data import REPOSITORY
 

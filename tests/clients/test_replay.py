@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from fake_service import Behaviour, FakeService
 from optipmb_client import Connection, ServiceRefused, ServiceUnavailable, UsageError
-from optipmb_client.datasets import Dataset, open_dataset
-from optipmb_client.replay import Pace, ReplayedSequence, Replaying, replay
 from optipmb_schemas import Detections, Tracks
+from optipmb_tools.datasets import Dataset, open_dataset
+from optipmb_tools.replay import Pace, ReplayedSequence, Replaying, replay
 from router import until
 
 FRAMES = 24

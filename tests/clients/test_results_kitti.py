@@ -8,12 +8,12 @@ import pytest
 from commands import run_here
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from optipmb_client.camera import synthetic_camera
-from optipmb_client.datasets import DatasetError, open_dataset
-from optipmb_client.geometry import Floats, Ints, Pose, planar_pose, wrap_angle
-from optipmb_client.offline import read_profile, track_whole
-from optipmb_client.results import empty_table
-from optipmb_client.results.kitti import SUBMISSION_SCORES, read_kitti_results, write_kitti_results
+from optipmb_tools.camera import synthetic_camera
+from optipmb_tools.datasets import DatasetError, open_dataset
+from optipmb_tools.geometry import Floats, Ints, Pose, planar_pose, wrap_angle
+from optipmb_tools.offline import read_profile, track_whole
+from optipmb_tools.results import empty_table
+from optipmb_tools.results.kitti import SUBMISSION_SCORES, read_kitti_results, write_kitti_results
 from real_data import kitti_root
 
 LABELS = ("Car", "Pedestrian", "Cyclist")

@@ -12,12 +12,12 @@ import pytest
 from commands import result_of, run_here
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from optipmb_client.cli import run
-from optipmb_client.datasets import DataSequence, dataset_at, open_dataset
-from optipmb_client.files import DatasetError
-from optipmb_client.offline import read_profile
-from optipmb_client.results.full import FullTable, full_path, read_full
-from optipmb_client.tracking import Tracking, track
+from optipmb_tools.cli import run
+from optipmb_tools.datasets import DataSequence, dataset_at, open_dataset
+from optipmb_tools.files import DatasetError
+from optipmb_tools.offline import read_profile
+from optipmb_tools.results.full import FullTable, full_path, read_full
+from optipmb_tools.tracking import Tracking, track
 from real_data import kitti_root
 
 DETECTIONS = "/detector/boxes/tracks/detections"

@@ -10,11 +10,11 @@ import oracle_formulas as plain
 import pytest
 from commands import run_here
 from numpy.typing import NDArray
-from optipmb_client.datasets import DataSequence, Preloaded, open_dataset
-from optipmb_client.geometry import wrap_angle
-from optipmb_client.offline import read_profile, track_whole
-from optipmb_client.smoothing import smooth
 from optipmb_schemas import Tracks
+from optipmb_tools.datasets import DataSequence, Preloaded, open_dataset
+from optipmb_tools.geometry import wrap_angle
+from optipmb_tools.offline import read_profile, track_whole
+from optipmb_tools.smoothing import smooth
 
 from optipmb import load_profile
 from optipmb.lightweight import turn_around

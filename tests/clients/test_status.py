@@ -6,10 +6,10 @@ import time
 import pytest
 from fake_service import FakeService
 from optipmb_client import Connection
-from optipmb_client.cli import run
 from optipmb_client.sessions import find_services
-from optipmb_client.terminal import members_of, status_tables
 from optipmb_schemas import MemberSummary, Problem, ServiceStatus
+from optipmb_tools.cli import run
+from optipmb_tools.terminal import members_of, status_tables
 from rich.console import Console
 
 

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import result_of, run_here
-from optipmb_client.datasets import DataSequence, DatasetError, open_dataset
-from optipmb_client.datasets.table import TableDataset, TableSequence, match_stamps
-from optipmb_client.datasets.table.names import find_columns
-from optipmb_client.offline import track_whole
-from optipmb_client.table_files import read_table, write_table
+from optipmb_tools.datasets import DataSequence, DatasetError, open_dataset
+from optipmb_tools.datasets.table import TableDataset, TableSequence, match_stamps
+from optipmb_tools.datasets.table.names import find_columns
+from optipmb_tools.offline import track_whole
+from optipmb_tools.table_files import read_table, write_table
 from own_tables import FRAMES, boxes
 
 from optipmb import load_profile

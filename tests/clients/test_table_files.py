@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import run_here
-from optipmb_client.camera import kitti_from_sensor
-from optipmb_client.datasets import DatasetError, open_dataset
-from optipmb_client.table_files import Columns, line_of, read_table, write_table
+from optipmb_tools.camera import kitti_from_sensor
+from optipmb_tools.datasets import DatasetError, open_dataset
+from optipmb_tools.table_files import Columns, line_of, read_table, write_table
 from own_tables import FRAMES, boxes
 
 PLAIN = "t,x,class\n0.0,1.5,car\n0.1,-2.25,Fuß\n"

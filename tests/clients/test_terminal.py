@@ -4,8 +4,8 @@ import io
 from typing import Any
 
 import pytest
-from optipmb_client.terminal import StatusView
 from optipmb_schemas import Problem, ServiceStatus, SessionSummary
+from optipmb_tools.terminal import StatusView
 from rich.console import Console
 
 HEIGHT = 40

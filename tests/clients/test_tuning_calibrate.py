@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_client.datasets import open_dataset
-from optipmb_client.tuning.calibrate import calibrate, measured_calibration, rank
-from optipmb_client.tuning.clips import Clip, load, of_class, track_clip, track_fully
-from optipmb_client.tuning.scoring import rules_of, scorer_of
-from optipmb_client.tuning.values import only, profile_text, with_calibration, with_values
+from optipmb_tools.datasets import open_dataset
+from optipmb_tools.tuning.calibrate import calibrate, measured_calibration, rank
+from optipmb_tools.tuning.clips import Clip, load, of_class, track_clip, track_fully
+from optipmb_tools.tuning.scoring import rules_of, scorer_of
+from optipmb_tools.tuning.values import only, profile_text, with_calibration, with_values
 from tuning_cases import Habits, recorded
 
 import optipmb

@@ -6,19 +6,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from optipmb_client import offline
-from optipmb_client.datasets import Dataset, open_dataset
-from optipmb_client.datasets.scene.lidar import Scan, scan
-from optipmb_client.evaluation.ab3dmot import evaluate_ab3dmot
-from optipmb_client.evaluation.cases import ab3dmot_rules, prepare
-from optipmb_client.evaluation.evaluate import evaluate_figures, load_recordings
-from optipmb_client.evaluation.nuscenes import NuScenesConfig, evaluate_nuscenes, evaluate_scenes, prepare_scene
-from optipmb_client.results.kitti import read_kitti_results
-from optipmb_client.tracking import Tracking, track
-from optipmb_client.tuning.clips import Clip, Degradation, degrade, load, of_class, track_clip
-from optipmb_client.tuning.objective import folds_of
-from optipmb_client.tuning.scoring import rules_of, scorer_of
-from optipmb_client.tuning.values import only
+from optipmb_tools import offline
+from optipmb_tools.datasets import Dataset, open_dataset
+from optipmb_tools.datasets.scene.lidar import Scan, scan
+from optipmb_tools.evaluation.ab3dmot import evaluate_ab3dmot
+from optipmb_tools.evaluation.cases import ab3dmot_rules, prepare
+from optipmb_tools.evaluation.evaluate import evaluate_figures, load_recordings
+from optipmb_tools.evaluation.nuscenes import NuScenesConfig, evaluate_nuscenes, evaluate_scenes, prepare_scene
+from optipmb_tools.results.kitti import read_kitti_results
+from optipmb_tools.tracking import Tracking, track
+from optipmb_tools.tuning.clips import Clip, Degradation, degrade, load, of_class, track_clip
+from optipmb_tools.tuning.objective import folds_of
+from optipmb_tools.tuning.scoring import rules_of, scorer_of
+from optipmb_tools.tuning.values import only
 from real_data import kitti_root, nuscenes_root
 from tuning_cases import Habits, recorded
 
@@ -55,7 +55,7 @@ def test_a_generated_scene_is_scanned_once(monkeypatch: pytest.MonkeyPatch) -> N
         taken.append(1)
         return scan(*arguments)
 
-    monkeypatch.setattr("optipmb_client.datasets.scene.dataset.scan", counted)
+    monkeypatch.setattr("optipmb_tools.datasets.scene.dataset.scan", counted)
     (sequence,) = open_dataset("scene", frames=3, clouds=False).sequences(["0000"])
     load(sequence, PARAMETERS, rules_of("scene"))
     assert len(taken) == 3

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from optipmb_client.cli import run
+from optipmb_tools.cli import run
 
 import optipmb
 

@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 import pytest
-from optipmb_client.datasets import open_dataset
-from optipmb_client.tuning.clips import load, of_class
-from optipmb_client.tuning.estimate import Estimate, estimate, spread, usual
-from optipmb_client.tuning.scoring import rules_of
-from optipmb_client.tuning.values import only
+from optipmb_tools.datasets import open_dataset
+from optipmb_tools.tuning.clips import load, of_class
+from optipmb_tools.tuning.estimate import Estimate, estimate, spread, usual
+from optipmb_tools.tuning.scoring import rules_of
+from optipmb_tools.tuning.values import only
 from tuning_cases import Habits, Recorded, recorded
 
 import optipmb

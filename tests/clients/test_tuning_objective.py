@@ -3,11 +3,11 @@
 from functools import partial
 
 import pytest
-from optipmb_client.tuning.clips import load, of_class
-from optipmb_client.tuning.objective import MARGIN, Objective
-from optipmb_client.tuning.refine import prune, weigh
-from optipmb_client.tuning.scoring import rules_of, scorer_of
-from optipmb_client.tuning.values import Value, only, value_of, with_values
+from optipmb_tools.tuning.clips import load, of_class
+from optipmb_tools.tuning.objective import MARGIN, Objective
+from optipmb_tools.tuning.refine import prune, weigh
+from optipmb_tools.tuning.scoring import rules_of, scorer_of
+from optipmb_tools.tuning.values import Value, only, value_of, with_values
 from tuning_cases import Habits, recorded
 
 import optipmb

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from nuscenes_tables import Scene, Thing, box, write_detections, write_root
-from optipmb_client.cli import run
-from optipmb_client.tuning.clips import Clip, load, of_class
-from optipmb_client.tuning.estimate import pair_all
-from optipmb_client.tuning.score_curves import score_curve
-from optipmb_client.tuning.scoring import rules_of
-from optipmb_client.tuning.values import only
+from optipmb_tools.cli import run
+from optipmb_tools.tuning.clips import Clip, load, of_class
+from optipmb_tools.tuning.estimate import pair_all
+from optipmb_tools.tuning.score_curves import score_curve
+from optipmb_tools.tuning.scoring import rules_of
+from optipmb_tools.tuning.values import only
 from tuning_cases import Habits, Recorded, recorded
 
 import optipmb

@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 from optipmb_client.errors import UsageError
-from optipmb_client.tuning.search import Dimension, dimensions, penalty, repaired
-from optipmb_client.tuning.values import Value, profile_text, value_of, with_classes, with_values, write_profile
+from optipmb_tools.tuning.search import Dimension, dimensions, penalty, repaired
+from optipmb_tools.tuning.values import Value, profile_text, value_of, with_classes, with_values, write_profile
 
 import optipmb
 
 pytest.importorskip("optuna")
-from optipmb_client.tuning.search import Search
+from optipmb_tools.tuning.search import Search
 
 SPACE = (*(Dimension(f"d{i}", "log", 0.1, 10.0, 1.0) for i in range(5)), Dimension("n", "whole", 1, 100, 30))
 START = {one.path: one.value(one.start) for one in SPACE}

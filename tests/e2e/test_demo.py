@@ -16,7 +16,7 @@ def test_demo_runs_without_a_display(tmp_path: Path) -> None:
     environment = {name: value for name, value in os.environ.items() if name not in {"DISPLAY", "WAYLAND_DISPLAY"}}
     out = tmp_path / "not" / "there" / "yet"
     done = subprocess.run(
-        [sys.executable, "-m", "optipmb_client", "demo", "--out", str(out), "--json"],
+        [sys.executable, "-m", "optipmb_tools", "demo", "--out", str(out), "--json"],
         capture_output=True,
         text=True,
         timeout=280,

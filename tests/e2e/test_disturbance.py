@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from commands import kill, result_of, run_here, start
 from optipmb_client import Connection, Publisher, Subscriber
-from optipmb_client.cli import run
-from optipmb_client.service_process import ServiceProcess
 from optipmb_client.sessions import find_services
 from optipmb_schemas import Detections, Keys, Points, Problem, SessionParameters, Tracks, encoding_of
+from optipmb_tools.cli import run
+from optipmb_tools.service_process import ServiceProcess
 from routers import open_client
 
 SCENE = ("--dataset", "scene", "--option", "frames=40", "--option", "clouds=0")

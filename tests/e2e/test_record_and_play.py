@@ -13,18 +13,18 @@ import pytest
 from commands import kill, result_of, run_here, start
 from mcap.reader import make_reader
 from optipmb_client import Connection, Subscriber
-from optipmb_client.cli import run
-from optipmb_client.datasets import DatasetError, open_dataset
-from optipmb_client.recordings.files import RecordingFile
-from optipmb_client.replay import Pace, Replaying, replay
-from optipmb_client.service_process import ServiceProcess
 from optipmb_schemas import Tracks, decode, encode
+from optipmb_tools.cli import run
+from optipmb_tools.datasets import DatasetError, open_dataset
+from optipmb_tools.recordings.files import RecordingFile
+from optipmb_tools.replay import Pace, Replaying, replay
+from optipmb_tools.service_process import ServiceProcess
 from real_data import kitti_root
 
 if TYPE_CHECKING:
     import subprocess
 
-    from optipmb_client.datasets import Dataset
+    from optipmb_tools.datasets import Dataset
 
 FRAMES = 15
 VALUES = {"frames": FRAMES, "vehicles": 8, "pedestrians": 2}

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 import zenoh
 import zenoh.ext
-from optipmb_client.datasets import DataSequence, open_dataset
-from optipmb_client.offline import read_profile, track_whole
 from optipmb_schemas import Keys, SessionParameters, decode
 from optipmb_schemas.ros2.arrays import CLOUD
 from optipmb_schemas.ros2.tracks import HORIZONS, TOPICS, TRACKED
 from optipmb_schemas.ros2.types import own_types
 from optipmb_service.app import cli
 from optipmb_service.ros2 import graph
+from optipmb_tools.datasets import DataSequence, open_dataset
+from optipmb_tools.offline import read_profile, track_whole
 from ros2_client import Ros2Client, hash_by_sdk
 from router import until
 from routers import open_client

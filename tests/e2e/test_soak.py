@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 from fleet import Fleet
 from optipmb_client import Connection
-from optipmb_client.load import Load, Run, generated, run_load
 from optipmb_client.sessions import find_services
 from optipmb_schemas import Detections, Keys, ServiceStatus, encode, encoding_of
+from optipmb_tools.load import Load, Run, generated, run_load
 from router import Sensor
 
 import optipmb

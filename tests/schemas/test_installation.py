@@ -10,8 +10,8 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from optipmb_client.extras import _EXTRAS
 from optipmb_schemas.installation import install_command
+from optipmb_tools.extras import _EXTRAS
 
 ROOT = Path(__file__).parents[2]
 WHEEL = "optipmb-0.1.0-py3-none-any.whl"

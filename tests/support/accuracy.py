@@ -2,10 +2,10 @@
 
 from functools import cache
 
-from optipmb_client.datasets import open_dataset
-from optipmb_client.tuning.clips import Clip, load, of_class, track_clip
-from optipmb_client.tuning.scoring import Figures, Scorer, rules_of, scorer_of
-from optipmb_client.tuning.values import only
+from optipmb_tools.datasets import open_dataset
+from optipmb_tools.tuning.clips import Clip, load, of_class, track_clip
+from optipmb_tools.tuning.scoring import Figures, Scorer, rules_of, scorer_of
+from optipmb_tools.tuning.values import only
 from real_data import kitti_root, nuscenes_root
 
 import optipmb

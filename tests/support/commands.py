@@ -8,12 +8,12 @@ from typing import Any
 
 import forked
 import pytest
-from optipmb_client.cli import run
+from optipmb_tools.cli import run
 
 
 def optipmb(*arguments: object, timeout: float = 240.0) -> "subprocess.CompletedProcess[str]":
     """Run the client's command in a process of its own."""
-    command = [sys.executable, "-m", "optipmb_client", *map(str, arguments)]
+    command = [sys.executable, "-m", "optipmb_tools", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
 
 
@@ -28,7 +28,7 @@ def run_here(capsys: pytest.CaptureFixture[str], *arguments: object) -> "subproc
 
 def start(*arguments: object, fresh: bool = False) -> "subprocess.Popen[str]":
     """Start the client's command and return the running process; a new interpreter where a start is the claim."""
-    command = ("optipmb_client", *map(str, arguments))
+    command = ("optipmb_tools", *map(str, arguments))
     return forked.start(*command, fresh=fresh, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from optipmb_client.camera import Camera, alpha_of, kitti_from_sensor
-from optipmb_client.datasets import Regions, Truth
-from optipmb_client.results import ResultTable
+from optipmb_tools.camera import Camera, alpha_of, kitti_from_sensor
+from optipmb_tools.datasets import Regions, Truth
+from optipmb_tools.results import ResultTable
 
 LABELS = ("Car", "Van", "Pedestrian", "Person", "Cyclist")
 SIZE = (4.0, 2.0, 1.5)

@@ -32,7 +32,7 @@ def load() -> None:
     with suppress(ModuleNotFoundError):  # an extra that not all tests need
         import_module("optipmb_service.cluster.jetstream")
     import_module("optipmb_service.app.worker").warm_up()
-    import_module("optipmb_client.cli")
+    import_module("optipmb_tools.cli")
     gc.collect()
     gc.freeze()
 

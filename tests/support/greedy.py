@@ -16,8 +16,8 @@ from boxes import Row, table_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-    from optipmb_client.results import ResultTable
-    from optipmb_client.tuning.clips import Clip
+    from optipmb_tools.results import ResultTable
+    from optipmb_tools.tuning.clips import Clip
 
 REACH = {
     "car": 4.0,

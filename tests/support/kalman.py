@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from boxes import Row, table_of
-from optipmb_client.evaluation.overlap import intersection_area
-from optipmb_client.geometry import box_corners, wrap_angle
+from optipmb_tools.evaluation.overlap import intersection_area
+from optipmb_tools.geometry import box_corners, wrap_angle
 from scipy.optimize import linear_sum_assignment
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-    from optipmb_client.results import ResultTable
-    from optipmb_client.tuning.clips import Clip
+    from optipmb_tools.results import ResultTable
+    from optipmb_tools.tuning.clips import Clip
 
     Array = NDArray[np.float64]
 

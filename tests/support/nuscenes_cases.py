@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from optipmb_client.datasets import DetectionFrame
-from optipmb_client.datasets.nuscenes import NuScenesDataset, NuScenesSequence
-from optipmb_client.results.nuscenes import NUSCENES_CLASSES, scene_file
+from optipmb_tools.datasets import DetectionFrame
+from optipmb_tools.datasets.nuscenes import NuScenesDataset, NuScenesSequence
+from optipmb_tools.results.nuscenes import NUSCENES_CLASSES, scene_file
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from optipmb_client.datasets import open_dataset
 from optipmb_schemas import Detections, Keys, Points, Pose, SessionState, Tracks, decode, encode, encoding_of
 from optipmb_service.session.checkpoint import digest_of
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Policy, Tracked
+from optipmb_tools.datasets import open_dataset
 from router import plain
 
 import optipmb

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from optipmb_client.datasets import DetectionFrame, Pose, Regions, Truth
-from optipmb_client.geometry import Floats, wrap_angle
+from optipmb_tools.datasets import DetectionFrame, Pose, Regions, Truth
+from optipmb_tools.geometry import Floats, wrap_angle
 
 LABELS = ("Car", "Pedestrian", "Cyclist")
 HERE = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))

@@ -24,8 +24,8 @@ from pathlib import Path
 from typing import Any
 
 from evaluation_cases import write_kitti
-from optipmb_client.datasets import open_dataset
-from optipmb_client.evaluation.evaluate import evaluate_figures, load_recordings
+from optipmb_tools.datasets import open_dataset
+from optipmb_tools.evaluation.evaluate import evaluate_figures, load_recordings
 
 TOLERANCE = 1e-9
 SEEDS = 4

@@ -31,8 +31,8 @@ from typing import Any
 import numpy as np
 from nuscenes_cases import COLUMNS, Rows, disturbed_tracks, greedy_tracks, truth_tracks, write
 from nuscenes_tables import crowd, write_detections, write_root
-from optipmb_client.datasets.nuscenes import NuScenesDataset
-from optipmb_client.evaluation.nuscenes import NuScenesScores, evaluate_nuscenes
+from optipmb_tools.datasets.nuscenes import NuScenesDataset
+from optipmb_tools.evaluation.nuscenes import NuScenesScores, evaluate_nuscenes
 
 TOLERANCE = 1e-6
 SPLIT = "mini_val"

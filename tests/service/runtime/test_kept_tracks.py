@@ -15,13 +15,13 @@ from commands import run_here
 from fake_service import tracks_of
 from nats_process import NatsProcess
 from optipmb_client import Connection, ServiceRefused, ServiceUnavailable, kept_tracks
-from optipmb_client.table_files import read_table
 from optipmb_schemas import Keys, Limits, Tracks, TracksRequest, decode, encode, encoding_of
 from optipmb_service.cluster.message_log import LogReader, MessageLog
 from optipmb_service.runtime import kept_tracks as service_tracks
 from optipmb_service.runtime.kept_tracks import LATE_NS, TracksRange
 from optipmb_service.runtime.profiles import Fusion
 from optipmb_service.runtime.recovery import Log
+from optipmb_tools.table_files import read_table
 from router import Node, Sensor, plain, until
 from routers import free_endpoint, open_client, open_router
 

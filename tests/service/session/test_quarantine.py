@@ -10,13 +10,13 @@ import optipmb_schemas as schemas
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from optipmb_client import dumps as client
-from optipmb_client.cli import run
 from optipmb_client.errors import UsageError
 from optipmb_service.runtime.persistence import DUMPS, MAX_DUMPS, save_dump
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Policy
+from optipmb_tools import dumps as client
+from optipmb_tools.cli import run
 from router import Sensor
 from sessions import Failing, Merged, begun, dumps, feed, problems, tracks
 

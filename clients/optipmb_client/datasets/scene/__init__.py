@@ -1,5 +1,0 @@
-"""Generated traffic scenes."""
-
-from optipmb_client.datasets.scene.dataset import SceneDataset, SceneOptions, SceneSequence, scene_options
-
-__all__ = ["SceneDataset", "SceneOptions", "SceneSequence", "scene_options"]

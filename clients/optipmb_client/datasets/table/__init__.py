@@ -1,5 +1,0 @@
-"""Tables of detections: CSV, Parquet, JSON Lines and Feather files of anybody's making."""
-
-from optipmb_client.datasets.table.dataset import OPTIONS, TableDataset, TableSequence, match_stamps
-
-__all__ = ["OPTIONS", "TableDataset", "TableSequence", "match_stamps"]

@@ -1,0 +1,192 @@
+"""The command `optipmb`. An error is one line on standard error and a status: 2 for wrong input, 1 for the rest."""
+
+import inspect
+import re
+import signal
+import sys
+from collections.abc import Iterable, Sequence
+from importlib import import_module
+from importlib.metadata import version
+from types import FrameType
+from typing import Annotated, Any, NoReturn
+
+import typer
+from optipmb_client.errors import ClientError, UsageError
+from optipmb_schemas import MessageError
+from typer.core import TyperCommand, TyperGroup
+
+from optipmb_tools.commands.options import MANY, RAY_ADDRESS, grouped
+from optipmb_tools.extras import to_install
+from optipmb_tools.files import DatasetError
+
+FAILED = 1
+WRONG = 2
+INTERRUPTED = 128 + signal.SIGINT
+TERMINATED = 128 + signal.SIGTERM
+
+# Module of each command, and its function where that has another name; in the order of the help
+COMMANDS = {
+    "demo": "demo",
+    "check": "check",
+    "track": "track",
+    "replay": "replay",
+    "record": "recordings",
+    "play": "recordings",
+    "watch": "view",
+    "evaluate": "evaluate",
+    "tune": "tune",
+    "ablate": "ablate",
+    "sweep": "ablate",
+    "plot": "view",
+    "status": "service",
+    "tracks": "service",
+    "profiles": "profiles",
+    "load": "load",
+    "set": "service",
+    "move": "service",
+    "drain": "service",
+    "warm-up": "profiles",
+}
+FUNCTIONS = {"set": "set_profile", "warm-up": "warm_up"}
+
+# The option parser's error for a wrong option: the base of its public subclass, as it has no public name itself.
+_OptionError: Any = typer.BadParameter.__base__
+
+
+class _Command(TyperCommand):
+    def get_params(self, ctx: Any) -> list[Any]:  # the context and the parameters have no public types
+        return _without_types_of_flags(super().get_params(ctx))
+
+
+class _Commands(TyperGroup):
+    """The commands; the module of one is imported when it is called, or listed in the help."""
+
+    def get_params(self, ctx: Any) -> list[Any]:  # as above
+        return _without_types_of_flags(super().get_params(ctx))
+
+    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002  as click calls it
+        return list(COMMANDS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002  as click calls it
+        if cmd_name not in COMMANDS:
+            return None
+        module = import_module(f"optipmb_tools.commands.{COMMANDS[cmd_name]}")
+        command = getattr(module, FUNCTIONS.get(cmd_name, cmd_name))
+        paragraphs = inspect.cleandoc(command.__doc__ or "").split("\n\n")
+        text = "\n\n".join(" ".join(part.split()) for part in paragraphs)
+        alone = typer.Typer(add_completion=False)
+        alone.command(cmd_name, cls=_Command, help=text)(grouped(command))
+        return typer.main.get_command(alone)
+
+
+def _without_types_of_flags(parameters: list[Any]) -> list[Any]:
+    """Let the help show no type beside a flag, because a flag takes no value."""
+    for one in parameters:
+        if getattr(one, "is_flag", False):
+            one.metavar = ""
+    return parameters
+
+
+app = typer.Typer(
+    name="optipmb",
+    cls=_Commands,
+    help="Track objects in 3D: offline, or through a tracking service.",
+    add_completion=False,
+)
+
+
+def _version(value: bool) -> None:  # noqa: FBT001  the parser calls it so
+    if value:
+        typer.echo(f"optipmb {version('optipmb')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    *,
+    _show: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Options before the command."""
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run one command line, without the program's name; return the exit status."""
+    try:
+        words = filled(spread(arguments, MANY), "--ray", RAY_ADDRESS, "local")
+        words = filled(words, "--submission", re.compile(r"\d*\.?\d+"), "default")
+        result = app(words or ["--help"], prog_name="optipmb", standalone_mode=False)
+        return int(result or 0)
+    except _OptionError as error:
+        return _fail(WRONG, error.format_message())
+    except ModuleNotFoundError as error:
+        text = to_install(error.name or "", f"optipmb {arguments[0]}")
+        if text is None:
+            raise
+        return _fail(FAILED, text)
+    except (UsageError, DatasetError, MessageError, ClientError) as error:
+        return _fail(FAILED if isinstance(error, ClientError) else WRONG, str(error))
+    except OSError as error:
+        return _fail(WRONG, f"{error.filename}: {error.strerror}" if error.filename else str(error))
+    except (KeyboardInterrupt, typer.Abort):
+        return _fail(INTERRUPTED, "interrupted")
+
+
+def main() -> NoReturn:
+    """Run the command line of this process and exit."""
+    signal.signal(signal.SIGTERM, _terminate)
+    sys.exit(run(sys.argv[1:]))
+
+
+def _terminate(_number: int, _frame: FrameType | None) -> NoReturn:
+    sys.exit(TERMINATED)  # as an exception, so that every session is closed and every child ended
+
+
+def _fail(status: int, text: str) -> int:
+    print("optipmb: " + " ".join(text.split()), file=sys.stderr)  # noqa: T201  this is the error line
+    return status
+
+
+def filled(arguments: Sequence[str], option: str, values: re.Pattern[str], default: str) -> list[str]:
+    """Rewrite `--x` as `--x=DEFAULT` where none of the values that the option takes follows."""
+    end = arguments.index("--") if "--" in arguments else len(arguments)
+    return [
+        f"{one}={default}"
+        if one == option and place < end and not values.fullmatch("".join(arguments[place + 1 : place + 2]))
+        else one
+        for place, one in enumerate(arguments)
+    ]
+
+
+def spread(arguments: Sequence[str], options: Iterable[str]) -> list[str]:
+    """Rewrite `--x a b,c` as `--x a --x b --x c` for each of the `options`.
+
+    The values of an option are the arguments after it up to the next one that begins with a dash. A flag without a
+    value stays alone, for the parser to complain about.
+    """
+    many = set(options)
+    result: list[str] = []
+    flag = ""
+    for position, argument in enumerate(arguments):
+        if argument == "--":
+            return [*result, *arguments[position:]]
+        name, equals, value = argument.partition("=")
+        if name in many:
+            flag = name
+            following = arguments[position + 1 : position + 2]
+            if equals:
+                result += _pairs(flag, value)
+            elif not following or following[0].startswith("-"):
+                result.append(flag)
+        elif argument.startswith("-"):
+            flag = ""
+            result.append(argument)
+        else:
+            result += _pairs(flag, argument) if flag else [argument]
+    return result
+
+
+def _pairs(flag: str, values: str) -> list[str]:
+    names = [name for name in values.split(",") if name]
+    return [part for name in names or [""] for part in (flag, name)]

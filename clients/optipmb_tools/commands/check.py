@@ -1,0 +1,99 @@
+"""`optipmb check`: findings of the readers about data, before tracking."""
+
+import itertools
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import typer
+
+from optipmb_tools.class_names import class_like
+from optipmb_tools.commands.options import AsJson, DataOptions, plain_table, print_json, print_table
+from optipmb_tools.datasets.motion import headings_along
+
+# Kinds of objects that a profile for unknown detectors tells apart
+KINDS = ("car", "truck", "bus", "trailer", "pedestrian", "bicycle", "motorcycle")
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence as Many
+
+    from optipmb_tools.datasets import DataSequence
+    from optipmb_tools.geometry import Floats
+
+
+def check(data: DataOptions, *, as_json: AsJson = False) -> None:
+    """Show how your data are read, without tracking: optipmb check detections.csv.
+
+    Units, rate, classes, headings against the motion of the boxes, suspicious rows, and the options that read them
+    otherwise. Status 1: track would refuse the data; the findings marked as wrong say why.
+    """
+    name, root = data.named()
+    if name == "table" and root is not None:
+        from optipmb_tools.datasets.table import TableDataset  # noqa: PLC0415  packages of an extra
+
+        options = {option: str(value) for option, value in data.options(name).items()}
+        table = TableDataset(root, options, lenient=True)
+        chosen = list(table.sequences(data.sequences or ["all"]))
+        findings: list[dict[str, Any]] = [asdict(one) for one in table.findings]
+    else:
+        chosen = data.open().sequences
+        share, moves = headings_along(chosen)
+        text = f"{share:.0%} of {moves} moves are along the heading" if moves else "no box moves far enough to compare"
+        findings = [{"topic": "yaw", "text": text, "option": "", "wrong": False}]
+    recordings = [_recording(one) for one in chosen]
+    classes = _classes(chosen)
+    wrong = any(one["wrong"] for one in findings)
+    if as_json:
+        print_json({"command": "check", "findings": findings, "recordings": recordings, "classes": classes})
+    else:
+        _print(findings, recordings, classes)
+    if wrong:
+        raise typer.Exit(1)
+
+
+def _recording(sequence: "DataSequence") -> dict[str, Any]:
+    stamps = np.array([frame.stamp_ns for frame in sequence.frames()], dtype=np.int64)
+    steps = np.diff(stamps) / 1e9
+    return {
+        "recording": sequence.name,
+        "frames": len(stamps),
+        "Hz": round(1.0 / float(np.median(steps)), 3) if len(steps) and np.median(steps) else None,
+        "seconds": round(float(steps.sum()), 3),
+        "longest_gap_s": round(float(steps.max(initial=0.0)), 3),
+        "boxes": sum(len(frame) for frame in sequence.frames()),
+    }
+
+
+def _classes(sequences: "Many[DataSequence]") -> list[dict[str, Any]]:
+    rows: dict[str, list[Floats]] = {}
+    for frame in itertools.chain.from_iterable(one.frames() for one in sequences):
+        for label in np.unique(frame.label).tolist():
+            mine = frame.label == label
+            rows.setdefault(frame.labels[label], []).append(np.column_stack([frame.size, frame.score])[mine])
+    found = []
+    for name, parts in rows.items():
+        values = np.concatenate(parts)
+        size = " x ".join(f"{side:.3g}" for side in np.median(values[:, :3], axis=0))
+        scores = f"{values[:, 3].min():.3g} to {values[:, 3].max():.3g}"
+        tracked = class_like(name, KINDS) or "other"
+        found.append({"class": name, "kind": tracked, "boxes": len(values), "size": size, "scores": scores})
+    return found
+
+
+def _print(findings: "Many[dict[str, Any]]", *tables: "Many[dict[str, Any]]") -> None:
+    table = plain_table(("", "finding", "change with"))
+    for column in table.columns[1:]:
+        column.no_wrap = False
+    for one in findings:
+        mark = "WRONG " if one["wrong"] else ""
+        table.add_row(one["topic"], mark + one["text"], one["option"])
+    print_table(table)
+    for rows in tables:
+        print_table("")
+        names = [name.replace("_", " ") for name in rows[0]] if rows else []
+        table = plain_table(names[:1], names[1:])
+        for column in table.columns[:1]:
+            column.no_wrap = False
+        for row in rows:
+            table.add_row(*("-" if value is None else str(value) for value in row.values()))
+        print_table(table)

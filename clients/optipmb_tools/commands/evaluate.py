@@ -1,0 +1,183 @@
+"""`optipmb evaluate`: result files against the truth."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from optipmb_client.errors import UsageError
+
+from optipmb_tools import bulk
+from optipmb_tools.commands.options import (
+    AsJson,
+    Data,
+    JobOptions,
+    LabelledOptions,
+    print_json,
+    print_table,
+    warn,
+)
+from optipmb_tools.extras import needed
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from optipmb_tools.evaluation import ClassResult, Rules
+    from optipmb_tools.evaluation.evaluate import ClassFigures
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchingOptions:
+    """Options of how boxes are compared."""
+
+    iou: Annotated[
+        float | None, typer.Option(min=0.0, max=1.0, help="Boxes match from this 3D intersection over union on.")
+    ] = None
+    distance: Annotated[
+        float | None, typer.Option(min=0.0, help="Boxes match up to this distance of their centres, in metres.")
+    ] = None
+    cutoff: Annotated[float, typer.Option(min=0.01, help="Cut-off distance of GOSPA and OSPA, in metres.")] = 2.0
+    order: Annotated[float, typer.Option(min=1.0, help="Order of GOSPA and OSPA.")] = 2.0
+
+    def rules(self, dataset: str) -> "Rules":
+        """Return the rules of CLEAR MOT."""
+        from optipmb_tools.evaluation import default_rules  # noqa: PLC0415  loads the solvers of scipy
+
+        if self.iou is not None and self.distance is not None:
+            raise UsageError("--iou and --distance: one of them at most")
+        if self.iou is not None:
+            return default_rules(dataset, "iou_3d", self.iou)
+        if self.distance is not None:
+            return default_rules(dataset, "distance", self.distance)
+        return default_rules(dataset)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationJobs(JobOptions):
+    """Options of evaluation in several processes."""
+
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Classes at once; default: one for each processor.", show_default=False)
+    ] = None
+
+
+def evaluate(
+    data: LabelledOptions,
+    *,
+    tracks: Annotated[
+        list[Path],
+        typer.Option(
+            "--tracks",
+            help="Folder with the result files of track or replay, or a table of tracks; several times: compared.",
+        ),
+    ],
+    classes: Annotated[
+        list[str] | None,
+        typer.Option("--class", "--classes", metavar="NAME...", help="Classes to evaluate.", show_default=False),
+    ] = None,
+    how: MatchingOptions,
+    jobs: EvaluationJobs,
+    as_json: AsJson = False,
+) -> None:
+    """Compare result files with the truth, per class.
+
+    CLEAR MOT figures, HOTA of centres in the plane, GOSPA and OSPA; of KITTI, AB3DMOT's protocol and the HOTA of image
+    boxes. Tracks that were written with --full are tested for calibration too.
+
+    No detections are needed; where they are named, or there is just one detector, only its classes are evaluated.
+
+    The best threshold is the one on the mean score of a track that gives the highest MOTA.
+    """
+    needed("optipmb evaluate", "evaluation", "scipy")
+    from optipmb_tools.commands.tables import comparison_tables  # noqa: PLC0415  loads the solvers of scipy
+
+    more = {"tracks": " ".join(map(str, tracks))} if data.named()[0] == "table" else {}
+    opened = data.open(**more)
+    spelt = {label.lower(): label for label in opened.labels}
+    names = tuple(one if one in opened.labels else spelt.get(one.lower(), one) for one in classes or opened.labels)
+    note = cache(warn)  # prints each assumption once
+    with jobs.executor(opened.frames, max(1, len(names))) as executor:
+        reports = {str(one): _evaluated(opened, one, names, how, executor, note) for one in tracks}
+    for tables in (one.tables for one in opened.sequences if hasattr(one, "tables")):
+        tables.check()
+    report = {"command": "evaluate", "dataset": opened.name, "sequences": opened.names}
+    (first, *others) = reports.values()
+    if as_json and others:
+        print_json({**report, "trackers": {place: one.parts for place, one in reports.items()}})
+    elif as_json:
+        print_json({**report, "tracks": tracks[0], **first.parts})
+    else:
+        shown = comparison_tables({place: one.figures for place, one in reports.items()}) if others else first.tables
+        for table in shown:
+            print_table(table)
+
+
+@dataclass(frozen=True)
+class _Evaluated:
+    """Result for the tracks of one tracker: for programs, for comparison, and as tables."""
+
+    parts: dict[str, Any]
+    figures: "Sequence[ClassFigures]"
+    tables: "Sequence[RenderableType]"
+
+
+def _evaluated(
+    opened: Data,
+    tracks: Path,
+    names: tuple[str, ...],
+    how: MatchingOptions,
+    executor: bulk.Executor,
+    note: Callable[[str], None],
+) -> _Evaluated:
+    from optipmb_tools.commands.tables import clear_table, figure_tables, nuscenes_table  # noqa: PLC0415  as above
+    from optipmb_tools.evaluation import evaluate_files  # noqa: PLC0415  as above
+    from optipmb_tools.evaluation.evaluate import (  # noqa: PLC0415  as above
+        Evaluation,
+        FiguresTask,
+        Settings,
+        class_average,
+        figures_of,
+    )
+    from optipmb_tools.evaluation.nuscenes import evaluate_nuscenes  # noqa: PLC0415  as above
+
+    asked = opened.dataset.arguments
+    head: list[RenderableType] = []
+    overall: dict[str, Any] = {}
+    settings = Settings((how.iou,), how.cutoff, how.order) if how.iou else Settings(cutoff=how.cutoff, order=how.order)
+    if opened.name == "nuscenes" and asked.root is not None:
+        if how.iou is not None or how.distance is not None:
+            raise UsageError("--iou and --distance: the benchmark of nuScenes has its own rules")
+        scores = evaluate_nuscenes(asked.root, tracks, opened.names)
+        head = [nuscenes_table(scores, names)]
+        overall = {"overall": scores.to_json()["overall"]}
+        parts = {name: {"nuscenes": one.to_json()} for name, one in scores.classes.items() if name in names}
+        best = {name: scores.classes[name].best.threshold for name in parts}
+    else:
+        results = evaluate_files(opened.sequences, tracks, names, how.rules(opened.name), note)
+        parts = {one.name: _figures(one) for one in results}
+        best = {} if opened.name == "kitti" else {one.name: one.sweep.thresholds[one.sweep.best] for one in results}
+        if opened.name != "kitti" or how.distance is not None:  # AB3DMOT's protocol gives them at its own threshold
+            head = [clear_table(results, metres=how.iou is None)]
+    here = opened.sequences if executor.here else None
+    executor.start(figures_of, Evaluation(asked, tuple(opened.names), settings, names, here))
+    tasks = [FiguresTask(tracks, name, best.get(name)) for name in names]
+    figures = [one for found in bulk.values(executor, tasks, str, warn) for one in found]
+    if not figures:
+        raise UsageError(f"{tracks}: neither the truth nor the tracks have objects of these classes")
+    by_class = {one.name: {**parts.get(one.name, {}), **one.summary()} for one in figures}
+    average = class_average(figures) if overall else None
+    if average is not None:
+        overall["overall"]["hota_centre"] = average
+    tables = (*head, *figure_tables(figures, how.cutoff, average))
+    return _Evaluated({**overall, "classes": by_class}, figures, tables)
+
+
+def _figures(result: "ClassResult") -> dict[str, Any]:
+    best = result.sweep.best
+    return {
+        "all": result.total.summary(),
+        "best": {"score": result.sweep.thresholds[best], **result.sweep.results[best].summary()},
+        "sequences": {name: single.summary() for name, single in result.sequences.items()},
+    }

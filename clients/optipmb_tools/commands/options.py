@@ -1,0 +1,320 @@
+"""Options that several commands share, and printing."""
+
+import contextlib
+import dataclasses
+import inspect
+import json
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from optipmb_client.errors import ClientError, UsageError
+from optipmb_schemas.installation import install_command
+from rich.console import Console, Group, RenderableType
+from rich.table import Table
+
+from optipmb_tools.bulk import Executor, executor_for
+from optipmb_tools.datasets import DATASETS, DataSequence, Dataset, dataset_at, open_dataset
+from optipmb_tools.table_files import SUFFIXES
+
+WORTH_PROCESSES = 3000  # frames from which further processes are faster than this one alone
+WIDE = 200
+MANY = ("--sequences", "--classes", "--class", "--streams")  # options that take several values after one flag
+RAY_ADDRESS = re.compile(r"auto|local|(ray://)?[^\s/]+:\d+")  # values of --ray
+
+Classes = Annotated[
+    list[str] | None,
+    typer.Option("--classes", metavar="NAME...", help="Only objects of these classes.", show_default=False),
+]
+
+
+def _out(out: Path) -> Path:
+    """Refuse a file in a format that is not written."""
+    suffix = out.suffix.lower()
+    if not out.is_dir() and suffix not in (*SUFFIXES, ".mcap") and re.fullmatch(r"\.[a-z]{2,}[a-z0-9]*", suffix):
+        raise UsageError(f"--out {out}: expected a folder, or a table ({', '.join(SUFFIXES)})")
+    return out
+
+
+Out = Annotated[
+    Path,
+    typer.Option(
+        "--out", callback=_out, help="Folder for the results, or one table: .csv, .parquet, .jsonl, .feather."
+    ),
+]
+Full = Annotated[
+    bool, typer.Option("--full", help="Also write all that is known of the tracks, with covariances, as .npz files.")
+]
+Profile = Annotated[
+    str | None,
+    typer.Option(
+        "--profile", help="Parameter profile, or auto for a detector that nobody tuned; default: the dataset's own."
+    ),
+]
+Ray = Annotated[
+    str | None,
+    typer.Option(
+        "--ray",
+        metavar="[ADDRESS]",
+        help="Work on a Ray cluster: HOST:PORT of its head, auto for the one of this machine; default: one that is "
+        "started here and ends with the command.",
+        show_default=False,
+    ),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+
+
+@dataclass(frozen=True)
+class Data:
+    """A data set that was opened, and the sequences that were chosen."""
+
+    dataset: Dataset
+    sequences: list[DataSequence]
+
+    @property
+    def name(self) -> str:
+        """Name of the data set, as `--dataset` gives it."""
+        return self.dataset.name
+
+    @property
+    def frames(self) -> int:
+        """Frames of all sequences."""
+        return sum(map(len, self.sequences))
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the sequences."""
+        return [sequence.name for sequence in self.sequences]
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Classes of the sequences, in their order."""
+        return tuple(dict.fromkeys(label for sequence in self.sequences for label in sequence.labels))
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetOptions:
+    """Options that name a data set and its sequences."""
+
+    data: Path | None = field(default=None, init=False)
+    dataset: Annotated[
+        str | None, typer.Option("--dataset", help=f"Layout of the data: {', '.join(DATASETS)}.", show_default=False)
+    ] = None
+    root: Annotated[Path | None, typer.Option("--root", help="File or folder of the dataset; scenes need none.")] = None
+    detections: Annotated[
+        str | None, typer.Option("--detections", help="Detector: name of a folder in detections/, or a path.")
+    ] = None
+    sequences: Annotated[
+        list[str] | None,
+        typer.Option("--sequences", metavar="NAME...", help="Sequences, splits, or all.", show_default=False),
+    ] = None
+    option: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--option",
+            metavar="NAME=VALUE",
+            help="Option of the dataset: frames=50 of a scene, yaw=degrees of a table.",
+        ),
+    ] = None
+    truth: Path | None = field(default=None, init=False)
+
+    def named(self) -> tuple[str, Path | None]:
+        """Return the name of the data set and its root.
+
+        Raises:
+            DatasetError: The argument looks like no data that are known.
+            UsageError: No data are named, or two.
+        """
+        dataset, root = self.dataset, self.root
+        if self.data is not None:
+            if root is not None:
+                raise UsageError(f"{self.data} and --root {root}: one of them names the data")
+            dataset, root = dataset or dataset_at(self.data), self.data
+        if dataset is None:
+            raise UsageError("no data: name a table, a recording or a folder, or give --dataset and --root")
+        return dataset, root
+
+    def options(self, dataset: str) -> dict[str, float | str]:
+        """Return the options of the data set.
+
+        Raises:
+            UsageError: An option is not `NAME=VALUE`, or not for this data set.
+        """
+        found = dict(_option(text) for text in self.option or ())
+        if self.truth is not None:
+            if dataset != "table":
+                raise UsageError(f"--truth: for tables; {dataset} has annotations of its own")
+            found["truth"] = str(self.truth)
+        return found
+
+    def open(self, **more: float | str) -> Data:
+        """Open the data set and the chosen sequences, all by default; print the assumptions.
+
+        Args:
+            more: Further options of the data set.
+
+        Raises:
+            DatasetError, UsageError: Any of it is not there, or not allowed.
+        """
+        name, root = self.named()
+        opened = open_dataset(name, root, self.detections, **self.options(name) | more)
+        chosen = list(opened.sequences(self.sequences or ["all"]))
+        for note in (*opened.notes, *(note for one in chosen for note in one.notes)):
+            warn(note)
+        return Data(opened, chosen)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataOptions(DatasetOptions):
+    """Options of a data set, which an argument may name too."""
+
+    data: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[DATA]",
+            help="Your data: a table (CSV, Parquet, JSON Lines, Feather) or a folder of them, a bag of ROS 2, a "
+            "recording (.mcap), or a folder of KITTI or nuScenes. In the place of --dataset and --root.",
+            show_default=False,
+        ),
+    ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelledOptions(DataOptions):
+    """Options of data whose truth is needed."""
+
+    truth: Annotated[
+        Path | None,
+        typer.Option(
+            "--truth", help="Table of the true objects, or a folder of one per recording.", show_default=False
+        ),
+    ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class JobOptions:
+    """Options of work in several processes."""
+
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Recordings at once; default: one for each processor.", show_default=False)
+    ] = None
+    ray: Ray = None
+
+    def executor(self, frames: int, tasks: int) -> Executor:
+        """Return an executor of `tasks` tasks; by default a process for each processor, for few frames this one.
+
+        Raises:
+            ClientError: Ray is not installed, or no cluster answers.
+        """
+        if self.ray is not None:
+            return executor_for(self.jobs or 0, self.ray)
+        jobs = self.jobs
+        if jobs is None:
+            jobs = len(os.sched_getaffinity(0)) if frames > WORTH_PROCESSES else 1
+        return executor_for(min(jobs, tasks))
+
+
+def grouped(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command with the options of its groups as parameters of its own, which is how typer reads them."""
+    given = inspect.signature(command, eval_str=True).parameters
+    groups = {name: one.annotation for name, one in given.items() if hasattr(one.annotation, "__dataclass_fields__")}
+    members = {
+        name: list(inspect.signature(group, eval_str=True).parameters.values()) for name, group in groups.items()
+    }
+
+    def call(**values: Any) -> None:
+        for name, group in groups.items():
+            values[name] = group(**{one.name: values.pop(one.name) for one in members[name]})
+        command(**values)
+
+    spread = [one for name, whole in given.items() for one in members.get(name, [whole])]
+    own = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in spread]
+    call.__dict__["__signature__"] = inspect.Signature(own)
+    call.__name__, call.__doc__ = command.__name__, command.__doc__
+    return call
+
+
+def _option(text: str) -> tuple[str, float | str]:
+    name, equals, value = text.partition("=")
+    if not (name and equals and value):
+        raise UsageError(f"--option: expected NAME=VALUE, received {text!r}")
+    return name, number_or_text(value)
+
+
+def number_or_text(value: str) -> float | str:
+    """Return the value of an option of a data set as a number, if it is one."""
+    try:
+        number = float(value)
+    except ValueError:
+        return value
+    return int(number) if number.is_integer() else number
+
+
+@contextlib.contextmanager
+def mcap_needed() -> Iterator[None]:
+    """Raise the command that installs the packages for recordings where they are missing."""
+    try:
+        yield
+    except ImportError as error:
+        raise ClientError(f"recordings need mcap, which is not installed: {install_command('record')}") from error
+
+
+def plain_table(left: Sequence[str], right: Sequence[str] = (), *, title: str | None = None) -> Table:
+    """Return a table without lines; the columns `right`, of numbers, are aligned to the right."""
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    for name in (*left, *right):
+        table.add_column(name, justify="right" if name in right else "left", no_wrap=True)
+    return table
+
+
+def print_table(table: RenderableType) -> None:
+    """Print something of rich on standard output.
+
+    A table that is wider than the terminal is printed in parts, one below the other, each with the first columns.
+    """
+    from optipmb_tools.terminal import parts  # noqa: PLC0415  most commands print no table
+
+    console = Console()
+    width = console.width if console.is_terminal or "COLUMNS" in os.environ else WIDE
+    console = Console(width=width)
+    for part in table.renderables if isinstance(table, Group) else (table,):
+        for number, fitting in enumerate(parts(part, width) if isinstance(part, Table) else (part,)):
+            if number:
+                console.print()
+            console.print(fitting)
+
+
+def report(result: dict[str, Any], *lines: str, as_json: bool) -> None:
+    """Print a result as JSON, or the lines for people."""
+    if as_json:
+        print_json(result)
+    else:
+        for line in lines:
+            say(line)
+
+
+def print_json(result: Any) -> None:
+    """Print a result on standard output as JSON: dataclasses as maps, paths as text."""
+    typer.echo(json.dumps(result, default=_plain))
+
+
+def say(text: str) -> None:
+    """Print a line for people on standard output, at once."""
+    typer.echo(text)
+    sys.stdout.flush()
+
+
+def warn(text: str) -> None:
+    """Print a line on standard error."""
+    typer.echo(f"optipmb: {text}", err=True)
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    return str(value)

@@ -1,0 +1,179 @@
+"""`optipmb track`: a data set, or a dump that a service saved, through the tracker in this process."""
+
+import sys
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from optipmb_client.errors import TrackingFailed, UsageError
+
+from optipmb_tools.commands.options import (
+    AsJson,
+    Classes,
+    Data,
+    DataOptions,
+    Full,
+    JobOptions,
+    Out,
+    Profile,
+    number_or_text,
+    print_json,
+    report,
+    say,
+    warn,
+)
+from optipmb_tools.progress import FrameProgress
+from optipmb_tools.table_files import is_table
+
+if TYPE_CHECKING:
+    from optipmb_tools.tracking import TrackedSequence
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackOptions:
+    """Options of offline tracking."""
+
+    out: Out = Path("out/track")
+    profile: Profile = None
+    classes: Classes = None
+    full: Full = False
+    smooth: Annotated[
+        bool,
+        typer.Option("--smooth", help="Estimate every state from all frames of its track, later ones too: for labels."),
+    ] = False
+    fuse: Annotated[
+        bool,
+        typer.Option("--fuse", help="The sensors of a recording feed one density, by turns: by the column sensor."),
+    ] = False
+    keep_input: Annotated[
+        bool, typer.Option("--keep-input", help="Of a bag, with --out FILE.mcap: also copy what is in it.")
+    ] = False
+    submission: Annotated[
+        str | None,
+        typer.Option(metavar="[SCORE]", help="Write a submission; of KITTI confirmed tracks from this mean score on."),
+    ] = None
+
+    def check_out(self, data: Data) -> None:
+        """Refuse a file where the results are several; a bag of tracks holds one topic of a bag."""
+        out = self.out
+        if self.submission is not None and (self.full or is_table(out)):
+            raise UsageError("--submission: expected a folder as --out, and no --full: the files are for the benchmark")
+        if out.suffix != ".mcap":
+            return
+        if data.name != "rosbag":
+            raise UsageError(f"--out {out}: expected a folder, or a table: only tracks of a bag are written as a bag")
+        if len(data.sequences) > 1:
+            names = " ".join(data.names)
+            raise UsageError(f"--out {out}: expected one of the bag's topics by --sequences, received {names}")
+
+
+def track(
+    data: DataOptions,
+    *,
+    how: TrackOptions,
+    jobs: JobOptions,
+    dump: Annotated[
+        Path | None, typer.Option("--dump", help="What a service saved of a stream when tracking it failed.")
+    ] = None,
+    trace: Annotated[bool, typer.Option("--trace", help="With --dump: also print where the error was raised.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Track your data on this machine, without a service: optipmb track detections.csv --out tracks.csv.
+
+    From a bag of ROS 2, --out FILE.mcap makes a bag with the tracks as TrackedObjects, Detection3DArray and markers.
+
+    A profile may also be a TOML file here. Replaying the same data through a service gives the same files.
+    With --smooth, positions, headings and velocities also use later frames, which no service can.
+
+    With --dump, the frames that a service saved are gone through once more instead. Status 1 and one line say which
+    of them raises which error; status 0 that none does any more.
+    """
+    if dump is not None:
+        _replay_dump(dump, trace=trace, as_json=as_json)
+        return
+    from optipmb_tools import offline, tracking  # noqa: PLC0415  loads the tracker and its compiler
+
+    more: dict[str, float | str] = {name: 1 for name in ("keep_input", "fuse") if getattr(how, name)}
+    if how.submission is not None:
+        more["submission"] = number_or_text(how.submission)
+    opened = data.open(**more)
+    how.check_out(opened)
+    chosen = opened.sequences
+    name = how.profile or opened.dataset.profile
+    parameters = offline.profile_for(name, chosen)
+    for doubt in offline.doubts(parameters, chosen):
+        warn(doubt)
+    if name == offline.AUTO:
+        warn(f"profile auto: {parameters.provenance}")
+    results = []
+    failed = None
+    try:
+        with (
+            FrameProgress("tracking", opened.frames) as progress,
+            jobs.executor(opened.frames, len(chosen)) as executor,
+        ):
+            for result in tracking.track(
+                opened.dataset,
+                chosen,
+                how.out,
+                tracking.Tracking(parameters, how.classes or (), full=how.full, smooth=how.smooth),
+                executor=executor,
+                on_frame=progress.advance,
+                note=lambda text: progress.note(f"optipmb: {text}"),
+            ):
+                results.append(result)
+                if not as_json:
+                    _say_result(result)
+    except tracking.RecordingsFailed as error:
+        failed = error
+    reasons = {} if failed is None else {name: one.reason for name, one in failed.failures.items()}
+    shown = {"command": "track", "dataset": opened.name, "profile": name, "out": how.out, "sequences": results}
+    report({**shown, "failed": reasons}, f"results in {how.out}", as_json=as_json)
+    if failed is not None:
+        raise failed
+    _complain(results, parameters.name)
+
+
+def _say_result(result: "TrackedSequence") -> None:
+    rate = result.frames / max(result.seconds, 1e-9)
+    step = f", step p50 {result.step.p50_ms:.2f} ms p99 {result.step.p99_ms:.2f} ms" if result.step else ""
+    others = result.tracks - result.confirmed
+    counts = f"{result.confirmed} tracks" + (f" and {others} never confirmed" if others else "")
+    say(f"{result.name}: {result.frames} frames, {counts}, {rate:.0f} frames/s{step}")
+
+
+def _complain(results: "list[TrackedSequence]", profile: str) -> None:
+    """Print the detections that were left out; end with status 1 if there were detections and no tracks."""
+    detections = sum(one.detections for one in results)
+    left_out: Counter[str] = sum((Counter(one.left_out) for one in results), Counter())
+    if left_out:
+        named = ", ".join(f"{count} {name}" for name, count in sorted(left_out.items()))
+        warn(f"{left_out.total()} of {detections} detections are left out with profile {profile}: {named}")
+    if estimated := sum(one.estimated for one in results):
+        frames = sum(one.frames for one in results)
+        warn(f"the motion of the sensor is estimated in {estimated} of {frames} frames: boxes have no poses")
+    cut, samples = map(sum, zip(*(one.cut for one in results), strict=True))
+    if cut:
+        from optipmb_tools.results.nuscenes import NUSCENES_MAX_BOXES  # noqa: PLC0415  of one format
+
+        warn(f"{cut} boxes in {samples} samples are not written: a sample of nuScenes has {NUSCENES_MAX_BOXES} at most")
+    if detections and not any(one.tracks for one in results):
+        warn(f"no tracks came of {detections} detections: do their scores and rate fit profile {profile}?")
+        raise typer.Exit(1)
+
+
+def _replay_dump(file: Path, *, trace: bool, as_json: bool) -> None:
+    from optipmb_tools import dumps  # noqa: PLC0415  loads the tracker and its compiler
+
+    result = dumps.replay(dumps.read(file))
+    if as_json:
+        print_json({"command": "track", "dump": file, "result": result})
+    if result.error is None:
+        say(f"{result.stream}: {result.frames} frames without an error; saved was {result.saved}")
+        return
+    if trace:
+        print(result.trace, file=sys.stderr)  # noqa: T201  it was asked for
+    again = "the saved error again" if result.same else f"another error than the saved one ({result.saved})"
+    raise TrackingFailed(f"{result.stream}: frame {result.seq}, stamp {result.stamp_ns} ns: {result.error}: {again}")

@@ -1,0 +1,230 @@
+"""`optipmb tune`: from detections and labels to a parameter profile."""
+
+from dataclasses import dataclass
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from optipmb_client.errors import UsageError
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from optipmb_tools.commands.ablate import cells_of
+from optipmb_tools.commands.options import (
+    AsJson,
+    Classes,
+    JobOptions,
+    LabelledOptions,
+    Out,
+    Profile,
+    plain_table,
+    print_json,
+    print_table,
+    say,
+)
+from optipmb_tools.extras import needed
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from optipmb_tools.tuning import Curves, Estimate, Refined
+
+SHOWN = ("sAMOTA", "AMOTA", "MOTA", "MOTP", "HOTA", "IDS", "FP", "FN", "GT")
+LEAST_SHOWN = 100  # boxes of tracks from which a tenth of the probabilities is shown
+METRICS = ("combination", "samota", "amota", "mota", "hota", "both")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProfileOptions:
+    """Options of the profile that is tuned."""
+
+    profile: Profile = None
+    classes: Classes = None
+    out: Out = Path("out/tune")
+    name: Annotated[str | None, typer.Option(help="Name of the new profile.", show_default=False)] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class EstimateOptions:
+    """Options of the estimate."""
+
+    estimate_only: Annotated[bool, typer.Option("--estimate-only", help="Estimate, and search nothing.")] = False
+    reference: Annotated[
+        str | None,
+        typer.Option(
+            help="With --estimate-only: the detector that the thresholds of the profile were chosen with; its scores on"
+            " the same data are what those of --detections are brought to.",
+            show_default=False,
+        ),
+    ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchOptions:
+    """Options of the search."""
+
+    metric: Annotated[str, typer.Option(help=f"What is maximised: {', '.join(METRICS)}.")] = "combination"
+    trials: Annotated[int, typer.Option(min=1, help="Trials of the search on all sequences.")] = 120
+    folds: Annotated[int, typer.Option(min=0, help="Groups of sequences that are left out in turn; 0: none.")] = 3
+    fold_trials: Annotated[
+        int | None, typer.Option(min=1, help="Trials of the search without a group; default: half of --trials.")
+    ] = None
+    degrade: Annotated[int, typer.Option(min=0, help="Degraded copies of the detections beside the plain ones.")] = 1
+    everything: Annotated[bool, typer.Option("--all", help="Search the parameters of the paper's table too.")] = False
+    seed: Annotated[int, typer.Option(min=0, help="Seed of every random choice.")] = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class TuneJobs(JobOptions):
+    """Options of tuning in several processes."""
+
+    jobs: Annotated[int, typer.Option(min=1, help="Sequences tracked at once.")] = 1
+
+
+def tune(
+    data: LabelledOptions,
+    *,
+    into: ProfileOptions,
+    estimation: EstimateOptions,
+    search: SearchOptions,
+    jobs: TuneJobs,
+    as_json: AsJson = False,
+) -> None:
+    """Estimate the parameters of each class from labelled data, then refine them by tracking.
+
+    A second call with the same --out continues where the first one ended.
+    """
+    from optipmb_tools import tuning  # noqa: PLC0415  loads the tracker and its compiler
+    from optipmb_tools.offline import profile_compared  # noqa: PLC0415  as above
+
+    reference, out = estimation.reference, into.out
+    if not estimation.estimate_only:
+        needed("optipmb tune", "tune", "optuna")
+    if search.metric not in METRICS:
+        raise UsageError(f"--metric: one of {', '.join(METRICS)}, received {search.metric!r}")
+    if reference is not None and not estimation.estimate_only:
+        raise UsageError("--reference: with --estimate-only, which writes a profile that --profile then tunes")
+    opened = data.open()
+    asked, chosen = opened.dataset.arguments, opened.sequences
+    parameters = profile_compared(into.profile or opened.dataset.profile, chosen)
+    curves: tuning.Curves = {}
+    if reference is not None:
+        parameters, curves = tuning.calibrate_scores(asked, reference, chosen, parameters, into.classes, out, into.name)
+    source = tuning.Source.of(asked.name, asked.detections, chosen, parameters, into.classes)
+    estimates = tuning.estimate_all(source, parameters, out)
+    if not as_json:
+        for one in estimates.values():
+            print_table(_estimate(one, {path: tuning.value_of(parameters, one.name, path) for path in one.values}))
+    if estimation.estimate_only:
+        _say_estimates(estimates, curves, reference, out, as_json=as_json)
+        return
+    plan = tuning.Plan(
+        metric=search.metric,
+        trials=search.trials,
+        fold_trials=search.fold_trials or max(1, search.trials // 2),
+        folds=search.folds,
+        copies=search.degrade,
+        seed=search.seed,
+        everything=search.everything,
+    )
+    with jobs.executor(opened.frames, jobs.jobs) as executor, tuning.TrialDisplay() as display:
+        tuned = tuning.tune_all(source, parameters, plan, out, display, into.name, executor)
+    if as_json:
+        results: Mapping[str, Any] = {name: one.to_json() for name, one in tuned.classes.items()}
+        print_json({"command": "tune", "profile": tuned.profile, "classes": results})
+        return
+    for refined in tuned.classes.values():
+        print_table(_report(refined))
+    say(f"profile in {tuned.profile}")
+
+
+def _say_estimates(
+    estimates: "Mapping[str, Estimate]", curves: "Curves", reference: str | None, out: Path, *, as_json: bool
+) -> None:
+    if as_json:
+        found = {"estimates": {name: one.to_json() for name, one in estimates.items()}}
+        shown = {"score_calibration": {name: one and one.model_dump() for name, one in curves.items()}}
+        print_json({"command": "tune", "out": out, **found, **(shown if reference else {})})
+        return
+    for name, curve in curves.items():
+        knots = zip(curve.detector, curve.calibrated, strict=True) if curve else ()
+        shown_knots = "  ".join(f"{score:g} -> {meant:g}" for score, meant in knots)
+        say(f"{name}: score -> score of {reference}: {shown_knots or 'too few detections on labels'}")
+    if reference:
+        say(f"the profile with the scores of {reference} in {out}/calibrated.toml")
+    say(f"estimates in {out}/estimate.json, as a profile in {out}/estimated.toml")
+
+
+def _estimate(found: "Estimate", before: "Mapping[str, object]") -> Group:
+    table = _table(found.name, "profile", "estimate")
+    for path, value in found.values.items():
+        table.add_row(path, str(before[path]), str(value))
+    facts = (
+        f"{found.labels} boxes of {found.objects} objects, {found.detections} detections, {found.pairs} on labels; "
+        f"found {_share(found.detection)}, {found.clutter:.2f} false a frame; "
+        f"turned round {_share(found.flip_rate)}; errors of neighbouring frames correlate {found.lasting:.2f}"
+    )
+    scores = "score -> true: " + "  ".join(f"{one.score:.2f} -> {one.precision:.2f}" for one in found.bins)
+    return Group(table, Text(facts), Text(scores), Text())
+
+
+def _table(first: str, *others: str) -> Table:
+    table = plain_table((first,), others)
+    for column in table.columns:
+        column.no_wrap = False
+    return table
+
+
+def _share(value: float) -> str:
+    return f"{100.0 * value:.1f} %"
+
+
+def _report(refined: "Refined") -> Group:
+    figures = _table(refined.name, *SHOWN)
+    copies = ("", *(f", degraded {i + 1}" for i in range(refined.plan.copies)))
+    for title, rows in (
+        ("before", refined.before),
+        ("cross-validated", refined.crossed),
+        ("after (on the tuning data)", refined.after),
+    ):
+        for copy, row in zip(copies, rows, strict=False):
+            figures.add_row(title + copy, *cells_of(row, SHOWN))
+    for fold in refined.folds:
+        figures.add_row(f"without {' '.join(fold.sequences)}: before", *cells_of(fold.before[0], SHOWN))
+        figures.add_row(f"without {' '.join(fold.sequences)}: after", *cells_of(fold.after[0], SHOWN))
+    changes = _table("changed", "from", "to", "gain", "+-", "gains")
+    for one in refined.changes:
+        gains = f"{one.positive} of {one.groups}"
+        changes.add_row(one.path, str(one.start), str(one.value), f"{one.gain:.5f}", f"{one.error:.5f}", gains)
+    ranking = _table("tracks ranked by", refined.plan.metric, "gain", "+-", "sAMOTA", "AMOTA", "MOTA")
+    for score in refined.ranking:
+        shown = (score.value, score.gain, score.error, *(score.figures[name] for name in ("sAMOTA", "AMOTA", "MOTA")))
+        ranking.add_row(score.score, *(f"{value:.4f}" if isfinite(value) else "-" for value in shown))
+    return Group(
+        figures, Text(), changes, Text(_objective(refined)), Text(), ranking, Text(_calibration(refined)), Text()
+    )
+
+
+def _calibration(refined: "Refined") -> str:
+    """Say how well existence and covariance are calibrated."""
+    found = refined.calibration
+    low, high = found.interval
+    shown = "  ".join(
+        f"{one.predicted:.2f} -> {one.observed:.2f} ({one.count})" for one in found.deciles if one.count >= LEAST_SHOWN
+    )
+    whose = "each with the calibration of the others" if len(refined.sequences) > 1 else "that gave the calibration"
+    return (
+        f"sequences, {whose}: NEES {found.mean:.2f} ({low:.2f} to {high:.2f}, objects being independent), "
+        f"{100.0 * found.coverage:.1f} % of errors in the 95 % ellipse; existence predicted -> observed: {shown}"
+    )
+
+
+def _objective(refined: "Refined") -> str:
+    text = f"{refined.plan.metric}: before {refined.value_before:.4f}, after {refined.value_after:.4f}"
+    if refined.value_crossed is None:
+        return f"{text}; no sequences were left out, so how much of it holds elsewhere is not known"
+    gains = [fold.value_after - fold.value_before for fold in refined.folds]
+    shown = ", ".join(f"{gain:+.4f}" for gain in gains)
+    return f"{text}, cross-validated {refined.value_crossed:.4f}; gains on what was left out: {shown}"

@@ -1,0 +1,389 @@
+"""nuScenes: the official tables, detections in the official submission layout, LiDAR scans where they are present.
+
+Conventions: the world is the global frame of the dataset. Detections are given in it, so the pose of their frames is
+the identity; `poses` of a sequence, and the pose of every cloud, are those of the LiDAR (LIDAR_TOP). Sequences are
+scenes, frames are keyframes (samples, 2 Hz), stamps are those of the samples. Only the seven classes of the tracking
+benchmark are kept.
+
+Layout, below the root: the tables in `v1.0-trainval`, `v1.0-mini` or `v1.0-test` (the root may also be that folder
+itself), scans in `samples/LIDAR_TOP`, detections in `detections/NAME.json`, splits of one's own in `splits.json` beside
+the tables: a map from the name of a split to a list of scene names, as the official tools read it.
+
+The height of a detection is that of the box's centre, as the layout says. Some public detection files have that of its
+bottom instead: they say so by `"z_origin": "bottom"` in their `meta`, or the caller does by the option `z_bottom`.
+"""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from optipmb_schemas import Tracks
+
+from optipmb_tools.datasets.interface import IDENTITY, Cloud, DataSequence, Dataset, DetectionFrame, Points, Truth
+from optipmb_tools.datasets.nuscenes_tables import Annotations, Keyframe, NuScenesTables, SceneSamples
+from optipmb_tools.files import DatasetError, read_points, read_text
+from optipmb_tools.geometry import Bools, Floats, Ints, Pose
+from optipmb_tools.results.nuscenes import (
+    NUSCENES_CLASSES,
+    Submission,
+    join_scenes,
+    quaternion_yaw,
+    read_submission,
+    write_scene,
+)
+
+VERSIONS = ("v1.0-trainval", "v1.0-mini", "v1.0-test")
+
+# Objects at least so far from the car, in metres, do not count in the benchmark
+CLASS_RANGE = {
+    "bicycle": 40.0,
+    "bus": 50.0,
+    "car": 50.0,
+    "motorcycle": 40.0,
+    "pedestrian": 40.0,
+    "trailer": 50.0,
+    "truck": 50.0,
+}
+
+# The class of a category in the tracking benchmark; it has no others
+TRACKING_CLASS = {
+    "vehicle.bicycle": "bicycle",
+    "vehicle.bus.bendy": "bus",
+    "vehicle.bus.rigid": "bus",
+    "vehicle.car": "car",
+    "vehicle.motorcycle": "motorcycle",
+    "human.pedestrian.adult": "pedestrian",
+    "human.pedestrian.child": "pedestrian",
+    "human.pedestrian.construction_worker": "pedestrian",
+    "human.pedestrian.police_officer": "pedestrian",
+    "vehicle.trailer": "trailer",
+    "vehicle.truck": "truck",
+}
+
+# Official splits: ranges of the numbers of their scenes, ends included
+_RANGES = {
+    "train": (
+        "1-2 4-11 19-34 41-76 120-135 138-139 149-152 154-155 157-168 170-185 187-188 190-196 199-200 202-204 "
+        "206-214 218-220 222 224-264 283-306 315-318 321 323-324 328 347-386 388-403 405-408 410-459 461-465 467-469 "
+        "471-472 474-480 499-502 504-515 517-518 525-539 541-546 566 568 570-578 580 582-600 639-679 681 683-689 "
+        "695-698 700-701 703-719 726-728 730-731 733-741 744 746-747 749-752 757-765 767-769 786-787 789-792 803-806 "
+        "808-813 815-817 819-822 847-856 858 860-866 868-873 875-878 880 882-903 945 947 949 952-953 955-961 975-984 "
+        "988-992 994-1025 1044-1058 1074-1102 1104-1110"
+    ),
+    "val": (
+        "3 12-18 35-36 38-39 92-110 221 268-278 329-332 344-346 519-524 552-565 625-627 629-630 632-638 770-771 775 "
+        "777-778 780-784 794-800 802 904-917 919-931 962-963 966-969 971-972 1059-1073"
+    ),
+    "test": (
+        "77-91 111-119 140 142-148 265-266 279-282 307-314 333-343 481-498 547-551 601-604 606-624 827-831 833-842 "
+        "844-846 932-933 935-943 1026-1043"
+    ),
+    "mini_train": "61 553 655 757 796 1077 1094 1100",
+    "mini_val": "103 916",
+}
+SPLITS = tuple(_RANGES)
+
+_OCCLUSION = np.array([3, 2, 1, 1, 0])  # KITTI's level for each level of visibility
+_LEAST_SCORE = 1e-12
+
+
+class _Source:
+    """Files of a data set, shared by its sequences; each is read on first use, and once."""
+
+    def __init__(self, folder: Path, detections: Path | None, *, clouds: bool, z_bottom: bool | None) -> None:
+        self.root = folder.parent
+        self.tables = NuScenesTables(folder)
+        self.clouds = clouds
+        self._detections = detections
+        self._z_bottom = z_bottom
+
+    @cached_property
+    def submission(self) -> Submission | None:
+        """The detections; None where no detector is named and there is not just one."""
+        return None if self._detections is None else read_submission(self._detections, "detection")
+
+    def need_submission(self) -> Submission:
+        """Return the detections, which only tracking needs."""
+        if self.submission is None:
+            names = ", ".join(path.stem for path in _detectors(self.root))
+            received = f"several: {names}" if names else "none"
+            raise DatasetError(self.root, "the name of a detector, or just one in detections/", received)
+        return self.submission
+
+    @cached_property
+    def z_bottom(self) -> bool:
+        """Whether the height of a detection is that of the bottom of its box."""
+        if self._z_bottom is not None:
+            return self._z_bottom
+        submission = self.need_submission()
+        origin = submission.meta.get("z_origin", "center")
+        if origin not in ("center", "bottom"):
+            raise DatasetError(submission.path, 'meta.z_origin "center" or "bottom"', repr(origin))
+        return bool(origin == "bottom")
+
+
+class NuScenesSequence(DataSequence):
+    """One scene."""
+
+    labels = NUSCENES_CLASSES
+
+    def __init__(self, samples: SceneSamples, source: _Source) -> None:
+        self.name = samples.name
+        self.samples = samples.tokens  # one per frame
+        self.stamp_us = samples.stamp_us  # (F,)
+        self._source = source
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    @cached_property
+    def _keyframes(self) -> tuple[Keyframe, ...]:
+        keyframes = self._source.tables.keyframes
+        for token in self.samples:
+            if token not in keyframes:
+                path = self._source.tables.folder / "sample_data.json"
+                raise DatasetError(path, f"a LIDAR_TOP keyframe of sample {token}", "none")
+        return tuple(keyframes[token] for token in self.samples)
+
+    @cached_property
+    def poses(self) -> tuple[Pose, ...]:
+        """World from LiDAR, one per frame."""
+        return tuple(keyframe.lidar for keyframe in self._keyframes)
+
+    @property
+    def ego_poses(self) -> tuple[Pose, ...]:
+        """World from car, one per frame."""
+        return tuple(keyframe.ego for keyframe in self._keyframes)
+
+    @cached_property
+    def _scans(self) -> tuple[Path | None, ...]:
+        if not self._source.clouds:
+            return (None,) * len(self)
+        paths = (self._source.root / keyframe.filename for keyframe in self._keyframes)
+        return tuple(path if path.is_file() else None for path in paths)
+
+    @cached_property
+    def has_clouds(self) -> bool:
+        """Whether any keyframe's scan is present."""
+        return any(self._scans)
+
+    def frames(self) -> Iterator[DetectionFrame]:
+        """Yield every keyframe in order, also those without detections.
+
+        Raises:
+            DatasetError: The file of detections lacks a sample, or a score is not in [0, 1].
+        """
+        submission = self._source.need_submission()
+        for index, token in enumerate(self.samples):
+            boxes = submission.boxes(token)
+            if len(boxes) and not (boxes.score.min() >= 0.0 and boxes.score.max() <= 1.0):
+                raise DatasetError(submission.path, f"scores from 0 to 1 in results.{token}", "others")
+            center = boxes.center.copy()
+            if self._source.z_bottom:
+                center[:, 2] += 0.5 * boxes.size[:, 2]
+            yield DetectionFrame(
+                index=index,
+                stamp_ns=int(self.stamp_us[index]) * 1000,
+                pose=IDENTITY,
+                labels=NUSCENES_CLASSES,
+                label=boxes.label,
+                center=center,
+                size=boxes.size,
+                yaw=boxes.yaw,
+                score=np.maximum(boxes.score, _LEAST_SCORE),
+                velocity=boxes.velocity if np.isfinite(boxes.velocity).any() else None,
+                cloud=self._cloud(index),
+            )
+
+    def _cloud(self, index: int) -> Cloud | None:
+        path = self._scans[index]
+        return None if path is None else Cloud(partial(read_sweep, path), *self._keyframes[index].lidar)
+
+    def annotations(self) -> Annotations:
+        """Return all annotations of the scene, whatever their category."""
+        return self._source.tables.annotations(self.name)
+
+    def ego_distance(self, frame: Ints, center: Floats) -> Floats:
+        """Return the distances (R,) in the plane of boxes (R, 3) from the car in their frames (R,)."""
+        ego = np.array([pose.translation[:2] for pose in self.ego_poses]).reshape(-1, 2)
+        return np.asarray(np.linalg.norm(center[:, :2] - ego[frame], axis=1), dtype=np.float64)
+
+    def truth(self) -> Truth | None:
+        """Return the annotations of the seven classes; None where the scene has none at all.
+
+        Those out of the benchmark's range, or without LiDAR or radar points, are ignored. `id` is the place of the
+        object in the table of instances.
+        """
+        everything = self.annotations()
+        if not len(everything):
+            return None
+        kept, label = tracking_labels(everything)
+        frame, center = everything.frame[kept], everything.center[kept]
+        reach = np.array([CLASS_RANGE[name] for name in NUSCENES_CLASSES])[label]
+        unseen = (everything.lidar_points + everything.radar_points)[kept] == 0
+        return Truth.of(
+            NUSCENES_CLASSES,
+            frame,
+            id=everything.instance[kept],
+            label=label,
+            center=center,
+            size=everything.size[kept],
+            yaw=quaternion_yaw(everything.rotation[kept]),
+            velocity=everything.velocity[kept],
+            occlusion=_OCCLUSION[everything.visibility[kept]],
+            points=everything.lidar_points[kept],
+            ignored=unseen | (self.ego_distance(frame, center) >= reach),
+        )
+
+
+def tracking_labels(annotations: Annotations) -> tuple[Bools, Ints]:
+    """Return which annotations (R,) are of a class of the tracking benchmark, and the classes of those (K,)."""
+    code = {name: i for i, name in enumerate(NUSCENES_CLASSES)}
+    label = np.array([code.get(TRACKING_CLASS.get(name, ""), -1) for name in annotations.category], dtype=np.int64)
+    return label >= 0, label[label >= 0]
+
+
+def read_sweep(path: Path) -> Points:
+    """Return the points (P, 3) of a `.pcd.bin` file, in the frame of the LiDAR.
+
+    Raises:
+        DatasetError: The file cannot be read, or is no list of five 32-bit numbers per point (x y z intensity ring).
+    """
+    return read_points(path, "a LiDAR scan", 5)
+
+
+class NuScenesDataset(Dataset):
+    """A nuScenes root together with one detector's results."""
+
+    name = "nuscenes"
+    profile = "nuscenes-megvii"
+
+    def __init__(
+        self,
+        root: Path,
+        detections: str | Path | None = None,
+        *,
+        clouds: bool = True,
+        z_bottom: bool | None = None,
+        submission: bool = False,
+    ) -> None:
+        folder = _find_tables(root)
+        detections = _find_detector(folder.parent, detections)
+        self._source = _Source(folder, detections, clouds=clouds, z_bottom=z_bottom)
+        self._submission = submission
+
+    @cached_property
+    def notes(self) -> tuple[str, ...]:
+        """Assumptions about the detections, and the content of a submission."""
+        found = () if self._source.submission is None else self._source.submission.notes
+        all_written = "submission: all tracks are written, whatever their score, as AMOTA is over all scores"
+        return (*found, *((all_written,) if self._submission else ()))
+
+    @property
+    def tables(self) -> NuScenesTables:
+        """The tables."""
+        return self._source.tables
+
+    def sequences(self, names: Sequence[str]) -> list[NuScenesSequence]:
+        """Return the scenes of these names, of official splits, and of those in `splits.json` beside the tables.
+
+        `all` are those that the tables have, and the detections if any are given. Of a split, those that the tables
+        have are taken.
+
+        Raises:
+            DatasetError: a named scene is not there, or none is.
+        """
+        scenes = self.tables.scenes
+        splits = own_splits(self.tables.folder) if set(names) - {"all", *scenes, *SPLITS} else {}
+        wanted: list[str] = []
+        for name in names:
+            if name == "all":
+                wanted += self._detected()
+            elif name in SPLITS or name in splits:
+                members = scenes_of_split(name) if name in SPLITS else splits[name]
+                wanted += [scene for scene in members if scene in scenes]
+            elif name in scenes:
+                wanted.append(name)
+            else:
+                known = ", ".join([*("all", *SPLITS, *splits), *list(scenes)[:3]])
+                more = f" and {len(scenes) - 3} more scenes" if len(scenes) > 3 else ""  # noqa: PLR2004  as many named
+                raise DatasetError(self.tables.folder, f"a scene or a split ({known}{more})", repr(name))
+        if not wanted:
+            raise DatasetError(self.tables.folder, f"scenes of {' '.join(names) or 'some name'}", "none")
+        return [NuScenesSequence(scenes[name], self._source) for name in dict.fromkeys(wanted)]
+
+    def write(self, out: Path, sequence: DataSequence, tracks: Mapping[int, Tracks]) -> Path:
+        """Write `out/scenes/NAME.json`."""
+        return write_scene(out, sequence.name, self.tables.scenes[sequence.name].tokens, self._meta, tracks)
+
+    def join(self, out: Path, sequences: Sequence[DataSequence]) -> None:
+        """Write `out/tracking_results.json` from the files of these scenes."""
+        join_scenes(out, [sequence.name for sequence in sequences], self._meta)
+
+    @property
+    def _meta(self) -> Mapping[str, Any]:
+        return {} if self._source.submission is None else self._source.submission.meta
+
+    def _detected(self) -> list[str]:
+        submission = self._source.submission
+        return [
+            scene.name
+            for scene in self.tables.scenes.values()
+            if submission is None or any(token in submission.rows for token in scene.tokens)
+        ]
+
+
+def _find_tables(root: Path) -> Path:
+    """Return the folder of the tables, given it or the one around it."""
+    if (root / "scene.json").is_file():
+        return root
+    found = [root / version for version in VERSIONS if (root / version / "scene.json").is_file()]
+    if len(found) == 1:
+        return found[0]
+    received = "a folder without them" if root.is_dir() else "no such folder"
+    if found:
+        received = f"{' and '.join(path.name for path in found)}: name one of them, such as {found[0]}"
+    raise DatasetError(root, f"a nuScenes root with the tables of one release ({', '.join(VERSIONS)})", received)
+
+
+def _detectors(base: Path) -> list[Path]:
+    return sorted((base / "detections").glob("*.json"))
+
+
+def _find_detector(base: Path, detections: str | Path | None) -> Path | None:
+    """Return the file of a detector, given its name, its path, or nothing when there is just one."""
+    if detections is None:
+        found = _detectors(base)
+        return found[0] if len(found) == 1 else None
+    for place in (base / "detections" / f"{detections}.json", Path(detections)):
+        if place.is_file():
+            return place
+    raise DatasetError(base, f"detections/{detections}.json, or the path of a detection file", "no such file")
+
+
+def scenes_of_split(split: str) -> tuple[str, ...]:
+    """Return the names of the scenes of an official split, in order."""
+    bounds = (part.partition("-") for part in _RANGES[split].split())
+    return tuple(f"scene-{number:04d}" for low, _, high in bounds for number in range(int(low), int(high or low) + 1))
+
+
+def own_splits(folder: Path) -> dict[str, tuple[str, ...]]:
+    """Return the splits of `splits.json` in a folder of tables; none when there is no such file.
+
+    Raises:
+        DatasetError: the file is not a map from names to lists of names.
+    """
+    path = folder / "splits.json"
+    if not path.exists():
+        return {}
+    what = "a map from the name of a split to a list of scene names"
+    try:
+        content = json.loads(read_text(path, what))
+    except json.JSONDecodeError as error:
+        raise DatasetError(path, what, error.msg, line=error.lineno) from error
+    if not isinstance(content, dict) or not all(isinstance(scenes, list) for scenes in content.values()):
+        raise DatasetError(path, what, "something else")
+    return {name: tuple(map(str, scenes)) for name, scenes in content.items()}

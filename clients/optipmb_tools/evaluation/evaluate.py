@@ -1,0 +1,314 @@
+"""Figures of the results of a dataset against its truth.
+
+Conventions: metres, z up. CLEAR MOT and the protocols of KITTI are taken where KITTI has its boxes, in the sensor frame
+of each frame and in its image, so that a tilt of the sensor changes nothing; figures that need centres in the plane are
+taken in the world frame.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from optipmb_tools.datasets import DataSequence, DatasetArguments, DatasetError, Truth
+from optipmb_tools.datasets.nuscenes import CLASS_RANGE, NuScenesSequence
+from optipmb_tools.evaluation.ab3dmot import IOU_LIMITS, Ab3dmotResult, evaluate_ab3dmot
+from optipmb_tools.evaluation.calibration import CalibrationResult, evaluate_calibration
+from optipmb_tools.evaluation.cases import Case, Rules, ab3dmot_rules, default_rules, hota_2d_rules, prepare
+from optipmb_tools.evaluation.clear import ClearResult, Sweep, clear, combine, sweep
+from optipmb_tools.evaluation.errors import ErrorResult, evaluate_errors
+from optipmb_tools.evaluation.figures import defined
+from optipmb_tools.evaluation.gospa import CUTOFF, ORDER, GospaResult, evaluate_gospa
+from optipmb_tools.evaluation.hota import HotaResult, evaluate_hota
+from optipmb_tools.evaluation.tracks import read_compared, read_full_tracks
+from optipmb_tools.results import ResultTable
+from optipmb_tools.results.full import FullTable, full_path, read_full
+from optipmb_tools.results.nuscenes import read_nuscenes_results, result_table
+
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class ClassResult:
+    """The CLEAR MOT figures of one class."""
+
+    name: str
+    total: ClearResult
+    """All tracks, all sequences."""
+    sequences: dict[str, ClearResult]
+    """All tracks, by sequence."""
+    sweep: Sweep
+    """All sequences, over thresholds on the mean score of a track."""
+
+
+def evaluate_files(
+    sequences: Sequence[DataSequence],
+    results: Path,
+    names: Sequence[str],
+    rules: Rules,
+    warn: Callable[[str], None] | None = None,
+) -> list[ClassResult]:
+    """Return the CLEAR MOT figures of each class from the tracks of each sequence.
+
+    Args:
+        sequences: each must have a truth.
+        results: the folder of the result files, or a table of tracks.
+        names: classes; those that occur neither in the truth nor in the results are left out.
+        rules: how to compare.
+        warn: is called with each assumption.
+
+    Raises:
+        DatasetError: a sequence has no truth, or its result file is missing or wrong.
+
+    """
+    cases: dict[str, list[Case]] = {name: [] for name in names}
+    pairs = read_compared(sequences, results, names, warn)
+    for sequence, (truth, table) in zip(sequences, pairs, strict=True):
+        local = truth.to_sensor(sequence.poses)
+        for name in names:
+            cases[name].append(prepare(local, table, name, rules, sequence.name))
+    found = []
+    for name, parts in cases.items():
+        if any(len(part.truth_id) or len(part.track_id) for part in parts):
+            single = {case.sequence: clear(case, rules) for case in parts}
+            found.append(ClassResult(name, combine(single.values()), single, sweep(parts, rules)))
+    return found
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One sequence with its truth and its tracks, both in the world frame."""
+
+    sequence: DataSequence
+    truth: Truth
+    tracks: ResultTable
+    full: FullTable | None
+    """All columns of the same tracks, where they were kept."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Options of the figures."""
+
+    limits: tuple[float, ...] = IOU_LIMITS
+    """Least 3D intersections over union for AB3DMOT's protocol."""
+    cutoff: float = CUTOFF
+    """c of GOSPA and OSPA, metres."""
+    order: float = ORDER
+    """p of GOSPA and OSPA."""
+
+
+@dataclass(frozen=True)
+class TrackFigures:
+    """Figures of the tracks of one class that reach a score."""
+
+    threshold: float
+    """Lowest mean score of these tracks; minus infinity for all."""
+    hota_2d: HotaResult | None
+    """KITTI only."""
+    hota: HotaResult
+    """Of centres in the plane."""
+    gospa: GospaResult
+
+
+@dataclass(frozen=True)
+class ClassFigures:
+    """The figures of one class over all sequences."""
+
+    name: str
+    ab3dmot: tuple[Ab3dmotResult, ...]
+    """One for each limit; KITTI only."""
+    everything: TrackFigures
+    """Of all tracks."""
+    best: TrackFigures | None
+    """Of the tracks from the best threshold on."""
+    calibration: CalibrationResult | None
+    """Where the tracks were kept with all columns."""
+    errors: ErrorResult | None
+    """Likewise."""
+
+    def summary(self) -> dict[str, object]:
+        """Return the figures by name; None for those that are not there."""
+        parts = {"all": self.everything, "best": self.best}
+        return {
+            "ab3dmot": {f"{result.limit:g}": result.summary() for result in self.ab3dmot},
+            "hota_2d": {key: one.hota_2d.summary() if one and one.hota_2d else None for key, one in parts.items()},
+            "hota_centre": {key: one.hota.summary() if one else None for key, one in parts.items()},
+            "gospa": {key: one.gospa.summary() if one else None for key, one in parts.items()},
+            "calibration": self.calibration.summary() if self.calibration else None,
+            "errors": self.errors.summary() if self.errors else None,
+        }
+
+
+def load_recordings(
+    dataset: str, sequences: Sequence[DataSequence], results: Path, names: Sequence[str] = ()
+) -> list[Recording]:
+    """Return the sequences with their truth and their tracks.
+
+    Args:
+        dataset: its name, on which the layout of the result files depends.
+        sequences: each must have a truth.
+        results: the folder of the result files.
+        names: as for `read_compared`.
+
+    Raises:
+        DatasetError: a sequence has no truth, or its results are missing or wrong.
+
+    """
+    if dataset == "nuscenes":
+        return _nuscenes_recordings(sequences, results)
+    pairs = zip(sequences, read_compared(sequences, results, names), strict=True)
+    return [
+        Recording(one, truth, tracks.to_world(one.poses), read_full_tracks(results, one))
+        for one, (truth, tracks) in pairs
+    ]
+
+
+def _nuscenes_recordings(sequences: Sequence[DataSequence], results: Path) -> list[Recording]:
+    submission = read_nuscenes_results(results)
+    recordings = []
+    for sequence in sequences:
+        if not isinstance(sequence, NuScenesSequence):
+            raise TypeError(f"a sequence of nuScenes is wanted, received {type(sequence).__name__}")
+        truth = sequence.truth()
+        if truth is None:
+            raise DatasetError(f"sequence {sequence.name}", "annotations to compare with", "none")
+        table = result_table(submission, sequence.name, sequence.samples)
+        # The benchmark compares only what is near, by class; truth farther away is ignored already.
+        reach = np.array([CLASS_RANGE.get(name, 0.0) for name in table.labels] or [0.0])
+        near = sequence.ego_distance(table.frame, table.center) < reach[table.label]
+        beside = full_path(submission.path.parent / "scenes" / f"{sequence.name}.json")
+        full = read_full(beside) if beside.is_file() else None
+        recordings.append(Recording(sequence, truth, table.take(near), full))
+    return recordings
+
+
+def class_average(figures: Sequence[ClassFigures]) -> dict[str, dict[str, float | None]]:
+    """Return HOTA of centres as means over the classes that the truth has, of all tracks and of the best.
+
+    It is what TrackEval calls class averaged (`cls_comb_cls_av`). A class without a best threshold has no tracks: 0.
+    """
+    known = [one for one in figures if (one.everything.hota.true + one.everything.hota.missed).any()]
+    found = {}
+    for key, parts in (("all", [one.everything for one in known]), ("best", [one.best for one in known])):
+        values = [(one.hota.hota, one.hota.deta, one.hota.assa) if one else (0.0, 0.0, 0.0) for one in parts]
+        means = np.mean(values or [(np.nan, np.nan, np.nan)], axis=0).tolist()
+        found[key] = dict(zip(("HOTA", "DetA", "AssA"), map(defined, means), strict=True))
+    return found
+
+
+def evaluate_figures(
+    dataset: str,
+    recordings: Sequence[Recording],
+    names: Sequence[str],
+    settings: Settings | None = None,
+    thresholds: Mapping[str, float] | None = None,
+) -> list[ClassFigures]:
+    """Return the figures of each class; classes that neither the truth nor the tracks have are left out.
+
+    Args:
+        dataset: its name, on which it depends which boxes are ignored.
+        recordings: sequences with truth and tracks.
+        names: classes.
+        settings: options of the figures.
+        thresholds: lowest mean score of the tracks that are also evaluated without the others, by class; for KITTI by
+            default the threshold with the highest MOTA of AB3DMOT's protocol at its first limit.
+
+    """
+    settings, thresholds = settings or Settings(), thresholds or {}
+    present = {name for one in recordings for table in (one.truth, one.tracks) for name in table.names.tolist()}
+    local = [
+        (one.truth.to_sensor(one.sequence.poses), one.tracks.to_sensor(one.sequence.poses), one.sequence.name)
+        for one in (recordings if dataset == "kitti" else ())
+    ]
+    near, far = (default_rules(dataset, "distance", limit) for limit in (None, settings.cutoff))
+    compared = [(len(one.sequence), one.truth.labelled) for one in recordings]
+    frames = [count if mask is None else int(mask.sum()) for count, mask in compared]
+    whole = [(one.sequence, one.truth, one.tracks, one.full) for one in recordings if one.full is not None]
+
+    def of_class(name: str) -> ClassFigures:
+        def cases(rules: Rules) -> list[Case]:
+            return [prepare(one.truth, one.tracks, name, rules, one.sequence.name) for one in recordings]
+
+        def local_cases(rules: Rules) -> list[Case]:
+            return [prepare(truth, tracks, name, rules, sequence) for truth, tracks, sequence in local]
+
+        image, centres, sets = local_cases(hota_2d_rules()), cases(near), cases(far)
+
+        def from_score(threshold: float) -> TrackFigures:
+            # The benchmark of nuScenes sums up scores in another order: a track at its own threshold is kept anyway.
+            parts = ([case.from_score(threshold - _ROUNDING) for case in one] for one in (image, centres, sets))
+            flat, plane, kept = parts
+            return TrackFigures(
+                threshold=threshold,
+                hota_2d=evaluate_hota(flat, hota_2d_rules()) if flat else None,
+                hota=evaluate_hota(plane, near),
+                gospa=evaluate_gospa(zip(kept, frames, strict=True), far, settings.order),
+            )
+
+        boxes = local_cases(ab3dmot_rules(min(settings.limits)))
+        protocol = tuple(evaluate_ab3dmot(boxes, limit) for limit in settings.limits if local)
+        threshold = thresholds.get(name, protocol[0].threshold if protocol else -np.inf)
+        return ClassFigures(
+            name=name,
+            ab3dmot=protocol,
+            everything=from_score(-np.inf),
+            best=from_score(threshold) if np.isfinite(threshold) else None,
+            calibration=evaluate_calibration([part[1:] for part in whole], name, near) if whole else None,
+            errors=evaluate_errors(whole, name, near) if whole else None,
+        )
+
+    return [of_class(name) for name in names if name in present]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Data that all tasks share; can be sent to another process without `here`."""
+
+    data: DatasetArguments
+    names: tuple[str, ...]
+    """Of the sequences."""
+    settings: Settings
+    classes: tuple[str, ...] = ()
+    """By whose names those of truth and tracks are called."""
+    here: Sequence[DataSequence] | None = None
+    """The sequences, where this process has opened them."""
+    _loaded: dict[Path, Sequence[Recording]] = field(default_factory=dict)
+
+    @cached_property
+    def sequences(self) -> Sequence[DataSequence]:
+        """The sequences; a process opens them once."""
+        return self.here or self.data.open().sequences(self.names)
+
+    def recordings(self, tracks: Path) -> Sequence[Recording]:
+        """Return truth and tracks; those of the last tracker are kept."""
+        if tracks not in self._loaded:
+            self._loaded.clear()
+            self._loaded[tracks] = load_recordings(self.data.name, self.sequences, tracks, self.classes)
+        return self._loaded[tracks]
+
+
+@dataclass(frozen=True)
+class FiguresTask:
+    """The figures of one class of one tracker."""
+
+    tracks: Path
+    name: str
+    threshold: float | None
+    """Of the tracks that are also evaluated without the others; None: as `evaluate_figures` chooses it."""
+
+    def __str__(self) -> str:
+        return f"{self.name} of {self.tracks}"
+
+
+def figures_of(shared: Evaluation, task: FiguresTask) -> list[ClassFigures]:
+    """Return the figures of one class of one tracker; none for a class that neither truth nor tracks have.
+
+    Raises:
+        DatasetError: as `load_recordings`.
+    """
+    thresholds: Mapping[str, float] = {} if task.threshold is None else {task.name: task.threshold}
+    recordings = shared.recordings(task.tracks)
+    return evaluate_figures(shared.data.name, recordings, (task.name,), shared.settings, thresholds)

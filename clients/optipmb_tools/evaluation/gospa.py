@@ -1,0 +1,102 @@
+"""GOSPA and OSPA: the distance between the set of tracks and the set of true objects, frame by frame.
+
+Conventions: metres, centres in the plane. With d the distance of a pair, c the cut-off and p the order, the generalised
+optimal sub-pattern assignment metric (Rahmathullah et al., 2017; alpha = 2) of one frame is
+
+    GOSPA = ( sum over pairs of d^p + c^p / 2 (missed + false) )^(1/p)
+
+for the best choice of pairs with d < c: what is not paired is missed or false. Its three parts, each raised to 1/p, are
+given too; the p-th power of GOSPA is the sum of the p-th powers of the parts. The optimal sub-pattern assignment metric
+(Schuhmacher et al., 2008) is bounded by c; with m <= n the sizes of the two sets, all m are paired and
+
+    OSPA = ( 1/n ( sum over pairs of min(d, c)^p + c^p (n - m) ) )^(1/p)
+
+Both are 0 where there is neither an object nor a track. The figures are means over all frames. They know nothing of
+identities: they say how good the picture of each moment is.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from optipmb_tools.evaluation.cases import Case, Rules, assign_frames, best_pairs, counted
+from optipmb_tools.geometry import Floats
+
+CUTOFF = 2.0
+ORDER = 2.0
+
+
+@dataclass(frozen=True)
+class GospaResult:
+    """Sums over frames, metres; results of several sequences add up."""
+
+    frames: int = 0
+    gospa: float = 0.0
+    localisation: float = 0.0
+    """Part of GOSPA: inaccurate places."""
+    missed: float = 0.0
+    """Part of GOSPA: missed objects."""
+    false: float = 0.0
+    """Part of GOSPA: false tracks."""
+    ospa: float = 0.0
+
+    def __add__(self, other: "GospaResult") -> "GospaResult":
+        return GospaResult(**{name: value + getattr(other, name) for name, value in vars(self).items()})
+
+    def summary(self) -> dict[str, float | None]:
+        """Return the means over frames by name; None where there are no frames."""
+        names = {
+            "GOSPA": self.gospa,
+            "localisation": self.localisation,
+            "missed": self.missed,
+            "false": self.false,
+            "OSPA": self.ospa,
+        }
+        return {name: value / self.frames if self.frames else None for name, value in names.items()}
+
+
+def evaluate_gospa(parts: Iterable[tuple[Case, int]], rules: Rules, order: float = ORDER) -> GospaResult:
+    """Return the figures of one class over all sequences.
+
+    Args:
+        parts: the class in each sequence and the number of frames of the sequence that are compared.
+        rules: those by which the cases were prepared; centres, and their limit is the cut-off c.
+        order: p, at least 1.
+
+    """
+    return sum((gospa(counted(case, rules), frames, rules.limit, order) for case, frames in parts), GospaResult())
+
+
+def gospa(case: Case, frames: int, cutoff: float = CUTOFF, order: float = ORDER) -> GospaResult:
+    """Return the figures of one sequence in which everything counts.
+
+    Args:
+        case: truth, tracks, and the pairs up to the cut-off with their distance as cost.
+        frames: how many are compared.
+        cutoff: c, metres.
+        order: p, at least 1.
+
+    """
+    near = case.pairs(case.cost < cutoff)
+    power = near.cost**order
+    limit = cutoff**order
+    # A pair is worth what it saves: either of the two metrics charges c^p for two that are left alone or far apart.
+    taken = assign_frames(near.pair_frame, near.truth_row, near.track_row, limit - power, best_pairs)
+    when = near.pair_frame[taken]
+    stop = 1 + max(case.truth_frame.max(initial=-1), case.track_frame.max(initial=-1))
+    paired = np.bincount(when, minlength=stop)
+    objects = np.bincount(case.truth_frame, minlength=stop)
+    tracks = np.bincount(case.track_frame, minlength=stop)
+    parts = [
+        np.bincount(when, power[taken], stop),
+        0.5 * limit * (objects - paired),
+        0.5 * limit * (tracks - paired),
+    ]
+    most = np.maximum(objects, tracks)
+    ospa = (parts[0] + limit * (most - paired)) / np.maximum(most, 1)
+    return GospaResult(frames, *(_sum_of_roots(part, order) for part in (sum(parts), *parts, ospa)))
+
+
+def _sum_of_roots(values: Floats, order: float) -> float:
+    return float((values ** (1.0 / order)).sum())

@@ -1,0 +1,179 @@
+"""The tracks of a run, read for evaluation: a table of anybody's, or the result files of a dataset in a folder."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from optipmb_tools.class_names import class_like
+from optipmb_tools.datasets import DataSequence, DatasetError, Truth
+from optipmb_tools.datasets.kitti import KittiSequence
+from optipmb_tools.datasets.nuscenes import NuScenesSequence
+from optipmb_tools.datasets.table import TableSequence
+from optipmb_tools.datasets.table.dataset import ObjectTable, TableOptions, read_objects
+from optipmb_tools.results import ResultTable
+from optipmb_tools.results.full import FullTable, full_path, read_full
+from optipmb_tools.results.kitti import LEAST_SHOWN, read_kitti_results
+from optipmb_tools.results.nuscenes import NUSCENES_FILE, read_nuscenes_results, result_table
+from optipmb_tools.results.rows import empty_table
+from optipmb_tools.table_files import SUFFIXES, is_table
+
+__all__ = ["read_compared", "read_full_tracks", "read_tracks"]
+
+_OTHERS = ("Van", "Truck", "Person_sitting", "Person", "Tram")
+"""Classes of KITTI that are no other names of those that are evaluated."""
+
+
+def read_compared(
+    sequences: Sequence[DataSequence], results: Path, names: Sequence[str], warn: Callable[[str], None] | None = None
+) -> list[tuple[Truth, ResultTable]]:
+    """Return truth and tracks (as `read_tracks`) of each sequence, with one name for classes that mean the same.
+
+    Args:
+        sequences: what to compare with.
+        results: as for `read_tracks`.
+        names: classes to be evaluated, by whose names others are called.
+        warn: is called with each assumption.
+
+    Raises:
+        DatasetError: a sequence has no truth, or as for `read_tracks`.
+    """
+    pairs = []
+    for sequence in sequences:
+        truth = sequence.truth()
+        if truth is None:
+            raise DatasetError(f"sequence {sequence.name}", "annotations to compare with", "none")
+        pairs.append((truth, read_tracks(results, sequence)))
+    detected = _alike((label for one in sequences for label in one.labels), names)
+    known = (*names, *detected.values())
+    true = tuple(label for truth, _ in pairs for label in truth.labels)
+    if not any(isinstance(one, TableSequence) for one in sequences):
+        known += (*true, *_OTHERS)
+    renamed = _alike(true, known), _alike((label for _, tracks in pairs for label in tracks.labels), known)
+    notes = [note for pair in pairs for one in pair for note in one.notes]
+    for owner, found in zip(("truth", "tracks"), renamed, strict=True):
+        if other := [f"{label} as {name}" for label, name in found.items() if label != name]:
+            notes.append(f"classes of the {owner}: {', '.join(other)}")
+        if known and (other := [label for label, name in found.items() if name not in known]):
+            notes.append(f"classes of the {owner} not compared: {', '.join(other)} (--option class.NAME=NAME)")
+    if all(renamed) and set(renamed[0].values()).isdisjoint(renamed[1].values()):
+        notes.append(f"no class is in both: truth has {', '.join(renamed[0])}, tracks have {', '.join(renamed[1])}")
+    if warn is not None:
+        for note in notes:
+            warn(note)
+    true_names, track_names = renamed
+    return [
+        (
+            replace(truth, labels=tuple(true_names[label] for label in truth.labels)),
+            replace(tracks, labels=tuple(track_names[label] for label in tracks.labels)),
+        )
+        for truth, tracks in pairs
+    ]
+
+
+def _alike(labels: Iterable[str], known: Sequence[str]) -> dict[str, str]:
+    """Return each label with the name by which it is known, or its own.
+
+    Where a label has that name but for its case, others that mean the same keep theirs: `car` is, `van` is not.
+    """
+    known = tuple(dict.fromkeys(known))
+    found = {label: class_like(label, known) or label for label in labels}
+    same = {name for label, name in found.items() if label.lower() == name.lower()}
+    return {label: label if name in same and label.lower() != name.lower() else name for label, name in found.items()}
+
+
+def read_tracks(results: Path, sequence: DataSequence) -> ResultTable:
+    """Return the tracks of a sequence in the sensor frame of each frame, where KITTI's result files have them.
+
+    Args:
+        results: a table of tracks of one or more sequences, or a folder with `NAME.txt` (KITTI) or a table `NAME.*`;
+            for nuScenes also a result file of its benchmark, or its folder.
+        sequence: what was tracked.
+
+    Raises:
+        DatasetError: there is no such file, or it is wrong, or has frames that the sequence lacks.
+    """
+    if isinstance(sequence, NuScenesSequence) and (results.suffix == ".json" or (results / NUSCENES_FILE).is_file()):
+        scene = result_table(read_nuscenes_results(results), sequence.name, sequence.samples)
+        return scene.to_sensor(sequence.poses)
+    path = _file(results, sequence.name)
+    if is_table(path):
+        return _with_image(path, _from_table(path, sequence).to_sensor(sequence.poses), sequence)
+    table = read_kitti_results(path)
+    if len(table) and table.frame[-1] >= len(sequence):
+        raise DatasetError(path, f"frames from 0 to {len(sequence) - 1}", f"frame {table.frame[-1]}")
+    return _with_image(path, table, sequence)
+
+
+def read_full_tracks(results: Path, sequence: DataSequence) -> FullTable | None:
+    """Return all that is known of the tracks; None where it was not written."""
+    beside = full_path(_file(results, sequence.name))
+    return read_full(beside) if beside.is_file() else None
+
+
+def _file(results: Path, name: str) -> Path:
+    if is_table(results) and not results.is_dir():
+        return results
+    tables = (results / f"{name}{suffix}" for suffix in SUFFIXES)
+    return next((path for path in tables if path.is_file()), results / f"{name}.txt")
+
+
+def _from_table(path: Path, sequence: DataSequence) -> ResultTable:
+    """Return the tracks of a table in the world frame."""
+    tables: TableOptions = getattr(sequence, "tables", TableOptions())
+    (table,) = read_objects(path, [path], tables)
+    key = _key(table, sequence, tables) if len(table.boxes.frame_stamp) else None
+    if key is None:
+        return replace(empty_table(), notes=(f"{path}: no tracks of {sequence.name}",))
+    stamps = getattr(sequence, "stamps", None)
+    if stamps is None:
+        stamps = np.array([frame.stamp_ns for frame in sequence.frames()], dtype=np.int64)
+    rows, frame, _, notes = table.at(key, stamps, getattr(sequence, "numbers", None))
+    boxes = table.boxes
+    if (frame < 0).any():
+        line = table.line(int(rows[np.flatnonzero(frame < 0)[0]]))
+        raise DatasetError(path, f"stamps of the frames of {sequence.name}", "another stamp", line=line)
+    labels = tuple(dict.fromkeys(boxes.name[rows].tolist()))
+    center, yaw, _ = table.in_world(rows)
+    return ResultTable(
+        labels=labels,
+        frame=frame,
+        id=boxes.id[rows] if boxes.id is not None else rows,
+        label=np.array([labels.index(name) for name in boxes.name[rows].tolist()], dtype=np.int64),
+        center=center,
+        size=boxes.size[rows],
+        yaw=yaw,
+        score=boxes.score[rows],
+        box2d=np.full((len(rows), 4), np.nan),
+        notes=(*table.notes, *notes),
+    )
+
+
+def _key(table: ObjectTable, sequence: DataSequence, tables: TableOptions) -> str | None:
+    """Return the key of a sequence in a table of tracks; None where it has other recordings of the dataset only."""
+    keys = table.boxes.keys
+    columns: dict[str, str] = getattr(sequence, "key_columns", {})
+    for one in (".".join(columns.values()), sequence.name):
+        if one in keys:
+            return one
+    if tables.recordings & keys.keys():
+        return None
+    if len(keys) == 1:
+        return next(iter(keys))
+    raise DatasetError(table.path, f"rows of {sequence.name}", f"those of {', '.join(keys)}")
+
+
+def _with_image(path: Path, table: ResultTable, sequence: DataSequence) -> ResultTable:
+    """Return tracks of KITTI with image boxes: projected ones for lines without (-1), and for files without any.
+
+    Lines of OptiPMB that the image does not show (0 0 0 0) stay so, for they were projected in the same way.
+    """
+    box = table.box2d
+    lacking = np.isnan(box).any(axis=1) | (box == -1.0).all(axis=1) | ~(box[:, 3] > box[:, 1]).any()
+    if not isinstance(sequence, KittiSequence) or not lacking.any():
+        return table
+    image, shown = sequence.camera.boxes(table.center, table.size, table.yaw, least_shown=LEAST_SHOWN)
+    note = f"{path}: {int(lacking.sum())} boxes without an image box: their 3D boxes are projected into the image"
+    notes = (*table.notes, note) if shown[lacking].any() else table.notes
+    return replace(table, box2d=np.where(lacking[:, None], image, box), notes=notes)

@@ -1,0 +1,39 @@
+"""Which extra of the installation brings a package, and the command that installs it."""
+
+import importlib.util
+from collections.abc import Mapping
+from typing import Final
+
+from optipmb_client.errors import ClientError
+from optipmb_schemas.installation import install_command
+
+_EXTRAS: Final[Mapping[str, str]] = {
+    "client": "zenoh typer rich",
+    "service": "prometheus_client pydantic_settings starlette structlog uvicorn",
+    "evaluation": "scipy",
+    "tune": "optuna",
+    "plot": "matplotlib",
+    "table": "pyarrow",
+    "ray": "ray",
+    "record": "mcap foxglove",
+    "ros2": "rosbags",
+    "watch": "rerun",
+}
+_EXTRA_OF: Final = {package: extra for extra, packages in _EXTRAS.items() for package in packages.split()}
+
+
+def to_install(package: str, what: str = "this") -> str | None:
+    """Return the line that says how to install a package that is missing; None for one that no extra brings."""
+    extra = _EXTRA_OF.get(package.partition(".")[0])
+    return None if extra is None else f"{what} needs {package}, which is not installed: {install_command(extra)}"
+
+
+def needed(what: str, extra: str, *packages: str) -> None:
+    """Raise where one of the packages of an extra is missing, before anything else is done.
+
+    Raises:
+        ClientError: with the command that installs the extra.
+    """
+    for package in packages:
+        if importlib.util.find_spec(package) is None:
+            raise ClientError(f"{what} needs {package}, which is not installed: {install_command(extra)}")

@@ -1,0 +1,168 @@
+"""Output of a run, the same for offline tracking and replay: result files in a folder, or one table.
+
+A table has one row per track and frame, in the world frame, in order of frames and, in a frame, of ids. Columns: those
+that name the recording and the time in the table of detections (for other data sets `sequence` and `stamp_ns`), then
+frame (its number in the table of detections, or else counted from 0), id, class, x, y, z, l, w, h, yaw, vx, vy,
+yaw_rate, acceleration, score, existence, confirmed (1 or 0), age, time_since_detection and detection_row: the row of
+the table (from 0; for other data sets the place in the frame) of the detection that the track was given, no value while
+it is missed. A velocity has no value until it is known: from the second detection on, where the detector gives none. On
+request the upper triangle of the covariance of (x, y, v, phi, omega, a) follows, `cov_x_x` to `cov_a_a`. Metres,
+seconds, radians. The same tracks always give the same bytes.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from optipmb_schemas import Tracks
+
+from optipmb_tools.results.full import full_path, write_full
+from optipmb_tools.results.rows import stacked
+from optipmb_tools.table_files import Columns, is_table, write_table
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from optipmb_tools.datasets.interface import DataSequence, Dataset
+
+_STATE: Final = ("x", "y", "v", "phi", "omega", "a")
+COVARIANCE: Final = {f"cov_{_STATE[i]}_{_STATE[j]}": (i, j) for i in range(6) for j in range(i, 6)}
+"""Column -> place in the covariance (6, 6)."""
+
+
+def track_columns(
+    name: str, tracks: Mapping[int, Tracks], sequence: "DataSequence | None" = None, *, full: bool = False
+) -> Columns:
+    """Return tracks (world frame) by frame index as columns, with `full` also the covariance.
+
+    Args:
+        name: Value of the column `sequence`.
+        tracks: The tracks of each frame.
+        sequence: The tracked sequence; knows the columns and rows of its table of detections, if it came from one.
+        full: Whether to add the covariance.
+    """
+    order = sorted(tracks)
+    parts = [tracks[index] for index in order]
+    frame = np.repeat(np.array(order, dtype=np.int64), [len(one.id) for one in parts])
+    names = [name for one in parts for name in np.asarray(one.labels, np.str_)[one.label]]
+    numbers = None if sequence is None else sequence.numbers
+    columns: Columns = {} if sequence is None else {one: each[frame] for one, each in sequence.frame_columns.items()}
+    if sequence is not None and sequence.time_column and sequence.times is not None:
+        keys = {column: np.full(len(frame), value) for column, value in sequence.key_columns.items()}
+        columns = keys | columns | {sequence.time_column: sequence.times[frame]}
+    else:
+        stamps = np.repeat(np.array([one.stamp_ns for one in parts], dtype=np.int64), [len(one.id) for one in parts])
+        columns = {"sequence": np.full(len(frame), name)} | columns | {"stamp_ns": stamps}
+    columns |= {"frame": frame if numbers is None else numbers[frame]}
+    columns |= {"id": stacked(parts, "id"), "class": np.array(names, dtype=np.str_)}
+    age, unseen, velocity = (stacked(parts, name) for name in ("age", "time_since_detection", "velocity"))
+    unknown = (age == unseen) & (velocity == 0.0).all(axis=1)  # detected once, by a detector that gives none
+    columns |= dict(zip("xyz", stacked(parts, "center").T, strict=True))
+    columns |= dict(zip("lwh", stacked(parts, "size").T, strict=True))
+    columns["yaw"] = stacked(parts, "yaw")
+    columns |= dict(zip(("vx", "vy"), np.where(unknown[:, None], np.nan, velocity).T, strict=True))
+    columns |= {name: stacked(parts, name) for name in ("yaw_rate", "acceleration", "score", "existence")}
+    columns["confirmed"] = np.concatenate([np.empty(0, np.int64), *map(_confirmed, parts)])
+    columns |= {"age": age, "time_since_detection": unseen}
+    detection: list[float] = []
+    for index, part in zip(order, parts, strict=True):
+        rows = None if sequence is None else sequence.rows(index)
+        place = part.detection.tolist()
+        detection += [np.nan if one < 0 else one if rows is None else rows[one] for one in place]
+    columns["detection_row"] = np.array(detection, dtype=np.float64)
+    if full:
+        covariance = stacked(parts, "covariance")
+        columns |= {name: covariance[:, i, j] for name, (i, j) in COVARIANCE.items()}
+    return columns
+
+
+def _confirmed(tracks: Tracks) -> "NDArray[np.int64]":
+    """Return which tracks are confirmed, 1 or 0: all, where the service does not tell."""
+    return np.ones(len(tracks.id), np.int64) if tracks.confirmed is None else np.asarray(tracks.confirmed, np.int64)
+
+
+def join(parts: Sequence[Columns]) -> Columns:
+    """Return tables with the same columns as one, one below the other."""
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else {}
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Quantiles of durations, in milliseconds."""
+
+    p50_ms: float
+    p99_ms: float
+    max_ms: float
+
+
+def latency(durations_ns: Sequence[int]) -> Latency | None:
+    """Return the quantiles of durations in nanoseconds; None when there are none."""
+    if not durations_ns:
+        return None
+    p50, p99, most = np.quantile(np.asarray(durations_ns, dtype=np.float64) / 1e6, [0.5, 0.99, 1.0])
+    return Latency(float(p50), float(p99), float(most))
+
+
+def horizons_for(out: Path) -> tuple[float, ...] | None:
+    """Return the horizons of the predicted paths that a result needs: a bag of ROS 2; None: the profile's."""
+    if out.suffix != ".mcap":
+        return None
+    from optipmb_schemas.ros2.tracks import HORIZONS  # noqa: PLC0415  packages of an extra
+
+    return HORIZONS
+
+
+class Results:
+    """Result files of a run: one for each sequence in a folder, or one table of all of them.
+
+    `write` may be called in another process than `take` and `close`, on an object with the same arguments.
+
+    Args:
+        dataset: The tracked data set; it knows the format of its result files.
+        out: The folder, or a file with the suffix of a table.
+        full: Whether all columns of the tracks are written: into a file beside each result file, or into further
+            columns of the table. Otherwise a file that an earlier run left beside a result file is removed.
+    """
+
+    def __init__(self, dataset: "Dataset", out: Path, *, full: bool = False) -> None:
+        self._dataset = dataset
+        self._out = out
+        self._full = full
+        self._table = is_table(out) and not out.is_dir()
+        self._taken: dict[str, Path | Columns] = {}
+
+    def write(self, sequence: "DataSequence", tracks: Mapping[int, Tracks]) -> Path | Columns:
+        """Write the tracks of a sequence by frame index; return the file, or its rows of the table of all."""
+        if self._table:
+            return track_columns(sequence.name, tracks, sequence, full=self._full)
+        path = self._dataset.write(self._out, sequence, tracks)
+        if self._full:
+            write_full(full_path(path), tracks)
+        else:
+            full_path(path).unlink(missing_ok=True)
+        return path
+
+    def take(self, sequence: "DataSequence", written: Path | Columns) -> bool:
+        """Keep what `write` returned; return whether it is here: another machine may have written it elsewhere."""
+        here = not isinstance(written, Path) or written.is_file()
+        if here:
+            self._taken[sequence.name] = written
+        return here
+
+    @property
+    def files(self) -> list[Path]:
+        """Result files so far."""
+        return [written for written in self._taken.values() if isinstance(written, Path)]
+
+    def close(self, sequences: "Sequence[DataSequence]") -> None:
+        """Write the table in the order of the names, or the file of a benchmark that holds all sequences.
+
+        Sequences that were not taken are missing in the table; a file of a benchmark is written of all or not at all.
+        """
+        parts = {name: written for name, written in self._taken.items() if not isinstance(written, Path)}
+        if parts:
+            write_table(self._out, join([parts[name] for name in sorted(parts)]))
+        elif all(one.name in self._taken for one in sequences):
+            self._dataset.join(self._out, sequences)

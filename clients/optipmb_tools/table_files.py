@@ -1,0 +1,477 @@
+"""Tables on disk: CSV, Parquet, JSON Lines and Feather, read into columns and written from them.
+
+The formats are pyarrow's, which is an extra of the installation and imported here alone. Lists and structures inside a
+row become columns of their own: `center` with three numbers is `center.0`, `center.1`, `center.2`. JSON, and folders
+with a file for each frame, are read as records, one for each box; such a folder is of MMDetection3D (`preds/*.json`),
+or has `.txt` files in the format of KITTI's object benchmark.
+"""
+
+import codecs
+import io
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from optipmb_client.errors import ClientError
+from optipmb_schemas.installation import install_command
+
+from optipmb_tools.camera import sensor_from_kitti
+from optipmb_tools.files import DatasetError, numbers, read_rows, read_text, write_whole
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Columns: TypeAlias = dict[str, NDArray[Any]]
+"""By name, all of one length: float64 (NaN where no value is), int64 (none missing), datetime64[ns] or str."""
+
+SUFFIXES: Final = (".csv", ".tsv", ".parquet", ".jsonl", ".ndjson", ".feather", ".arrow")
+"""Formats that are read and written."""
+_READ_ONLY: Final = (".json", ".txt")
+_TEXT: Final = (".csv", ".tsv", ".txt")
+_PICKLES: Final = (".pkl", ".pickle")
+_COMPRESSED: Final = (".gz", ".bz2", ".zst")
+_SEPARATORS: Final = ",;\t"
+_MOST_PARTS: Final = 16
+_DATE: Final = re.compile(
+    r"(\d{4}([-/])\d\d?\2\d\d?|\d\d?([-/.])\d\d?\3\d{4})[T ]+\d\d?:\d\d[:.,\d]*( ?UTC|(Z|[-+]\d\d(:?\d\d)?))?"
+)
+_DAY_OR_MONTH: Final = re.compile(r"^(\d{1,2})([-/.])(\d{1,2})\2(\d{4})")
+_ONE_DIGIT: Final = re.compile(r"(?<=[-T ])(\d)(?=[-T :])")
+_MONTHS: Final = 12
+_Record: TypeAlias = dict[str, Any]
+BOX_LISTS: Final = ("bboxes_3d", "boxes_3d", "boxes_lidar", "pred_boxes", "gt_boxes", "boxes", "bbox_3d", "box3d")
+"""Names of lists of x, y, z, length, width, height, yaw and, in some, a velocity."""
+LISTS: Final = (
+    *BOX_LISTS,
+    "detections",
+    "objects",
+    "predictions",
+    "annotations",
+)  # names of lists of all boxes of a frame
+_FIRST: Final = 8  # field of a line of KITTI's object benchmark where the 3D box begins
+_STAMPS: Final = 1_000_000_000  # from here on, the number in the name of a file is a stamp, not a frame
+_COMMA: Final = r"^\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*$"
+
+
+def is_table(path: Path) -> bool:
+    """Tell by its name whether a file is a table; CSV and JSON Lines may be compressed."""
+    return _kind(path) in SUFFIXES
+
+
+def tables_in(path: Path) -> list[Path]:
+    """Return the tables that a file or folder is; a folder with a file for each frame is one table by itself."""
+    if not path.is_dir():
+        return [path] if _kind(path) in (*SUFFIXES, *_READ_ONLY, *_PICKLES) else []
+    files = sorted(file for file in path.iterdir() if not file.name.startswith("."))
+    tables = [file for file in files if is_table(file)]
+    if tables or any(file.suffix == ".mcap" for file in files):
+        return tables
+    if frame_files(path):
+        return [path]
+    return files if all(file.suffix.lower() in _READ_ONLY for file in files) else []
+
+
+def _kind(path: Path) -> str:
+    name = path.name.lower()
+    for ending in _COMPRESSED:
+        if name.removesuffix(ending).endswith((".csv", ".tsv", ".jsonl", ".ndjson")):
+            name = name.removesuffix(ending)
+    return Path(name).suffix
+
+
+def _pyarrow() -> Any:
+    try:
+        import pyarrow as pa  # noqa: PLC0415  packages of an extra
+    except ImportError as error:
+        raise ClientError(f"tables need pyarrow, which is not installed: {install_command('table')}") from error
+    return pa
+
+
+def read_table(path: Path, options: Mapping[str, str] | None = None) -> Columns:
+    """Read a table into memory; a header alone gives columns without rows.
+
+    Args:
+        path: a file, or a folder with a file for each frame.
+        options: of the user: `decimal` and `encoding` of text tables, `date`.
+
+    Raises:
+        DatasetError: There is no such file, or it is not of the format that its name says.
+        ClientError: pyarrow is not installed.
+    """
+    pa = _pyarrow()
+    kind, options = _kind(path), options or {}
+    if not path.is_dir() and kind not in (*SUFFIXES, *_READ_ONLY):
+        found = f"a file named *{kind}" if kind else "no suffix"
+        if kind in _PICKLES:
+            found = "a pickle, which may run any program: docs/own-data.md, Recipes, converts it in five lines"
+        raise DatasetError(path, f"a table ({', '.join((*SUFFIXES, *_READ_ONLY))})", found)
+    try:
+        if not path.stat().st_size:
+            raise DatasetError(path, "a table", "an empty file")
+        table = _read(pa, path, kind, options)
+    except OSError as error:  # pyarrow's errors of content are of this kind too
+        raise DatasetError(path, f"a table ({kind})", error.strerror or str(error)) from error
+    except pa.ArrowException as error:
+        raise DatasetError(path, f"a table ({kind})", str(error)) from error
+    columns: Columns = {}
+    for name, column in zip(table.column_names, table.columns, strict=True):
+        for part, values in _parts(pa, str(name), column.combine_chunks()):
+            if part in columns:
+                raise DatasetError(path, "every column once", f"{part!r} twice")
+            columns[part] = _dates(pa, path, part, values, options) if values.dtype.kind == "U" else values
+    return columns
+
+
+def _read(pa: Any, path: Path, kind: str, options: Mapping[str, str]) -> Any:
+    if path.is_dir():
+        return _rows(pa, read_frames(path))
+    if kind in _TEXT:
+        return _read_text(pa, path, kind, options)
+    if kind == ".json":
+        return _rows(pa, split_boxes(read_json(path)))
+    if kind in {".jsonl", ".ndjson"}:
+        from pyarrow import json as arrow_json  # noqa: PLC0415  packages of an extra
+
+        with pa.input_stream(path) as stream:
+            table = arrow_json.read_json(stream)
+    elif kind == ".parquet":
+        from pyarrow import parquet  # noqa: PLC0415  as above
+
+        table = parquet.read_table(path)
+    else:
+        from pyarrow import feather  # noqa: PLC0415  as above
+
+        table = feather.read_table(path)
+    lists = [table.schema.field(name).type for name in table.column_names if name in LISTS]
+    if any(_is_list(pa, one) and pa.types.is_nested(one.value_type) for one in lists):
+        return _rows(pa, split_boxes(table.to_pylist()))
+    return table
+
+
+def _text(path: Path, options: Mapping[str, str]) -> str:
+    """Return the text of a file in the encoding that the user or its first bytes say; UTF-8 otherwise."""
+    with _pyarrow().input_stream(path) as stream:
+        data = bytes(stream.read())
+    marked = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    encoding = options.get("encoding", "utf-16" if marked else "utf-8-sig")
+    text, wrong = "", data.find(0) if encoding == "utf-8-sig" else -1
+    try:
+        text = data.decode(encoding)
+    except LookupError as error:
+        raise DatasetError("--option encoding", "latin-1, cp1252, utf-8, utf-16-le …", repr(encoding)) from error
+    except UnicodeDecodeError as error:
+        wrong = error.start
+    if wrong >= 0:
+        expected = "text in UTF-8 (--option encoding=latin-1, cp1252 or utf-16-le reads others)"
+        raise DatasetError(path, expected, f"byte 0x{data[wrong]:02x}", line=data[:wrong].count(b"\n") + 1)
+    return re.sub(r"\Asep=.(?=\n)", "", text.replace("\r\n", "\n"))
+
+
+def line_of(path: Path, row: int, options: Mapping[str, str] | None = None) -> int:
+    """Return the line, from 1, of a row of a text table, or the row, from 1, of another table."""
+    if path.is_dir() or _kind(path) not in _TEXT:
+        return row + 1
+    lines = _text(path, options or {}).split("\n")
+    filled = [number for number, line in enumerate(lines, start=1) if line.strip() and not line.startswith("#")]
+    return filled[row + _has_names(re.split(r"[,;\s]+", lines[filled[0] - 1].strip()))]
+
+
+def _has_names(fields: list[str]) -> bool:
+    return 2 * sum(map(_is_number, fields)) < len(fields)
+
+
+def _normal_text(path: Path, original: str, kind: str) -> tuple[bytes, str]:
+    """Return a text table without comments and with as many names as columns, and its separator."""
+    text = re.sub(r"(?m)^#.*\n?", "", original) if "#" in original else original
+    head, _, rest = text.lstrip("\n").partition("\n")
+    comments = [line.lstrip("# ") for line in original.split("\n", _MOST_PARTS) if line.startswith("#")]
+    separator = "\t" if kind == ".tsv" else max(_SEPARATORS, key=head.count)
+    if separator not in head and len(head.split()) > 1:
+        separator = " "
+        head, rest = (re.sub(r"(?m)^ +| +$", "", re.sub(r"[ \t]+", " ", part)) for part in (head, rest))
+        comments = [" ".join(line.split()) for line in comments]
+    if is_kitti_object(head):
+        raise DatasetError(path, "a table", "boxes of a frame as in KITTI's object benchmark: name their folder")
+    if not _has_names(head.split(separator)):  # numpy writes the names of the columns into a comment
+        names = [line for line in comments if line.count(separator) == head.count(separator)]
+        if not names:
+            raise DatasetError(path, "a first line with the names of the columns", repr(head.strip()[:60]))
+        head, rest = names[-1], f"{head}\n{rest}"
+    first = rest.split("\n", 1)[0].rstrip()
+    more = first.count(separator) - head.count(separator)
+    if more == 1 and first.endswith(separator):
+        head += separator
+    elif more == -1 and head.endswith(separator):
+        head = head.removesuffix(separator)
+    return f"{head}\n{rest}".encode(), separator
+
+
+def _read_text(pa: Any, path: Path, kind: str, options: Mapping[str, str]) -> Any:
+    from pyarrow import csv  # noqa: PLC0415  packages of an extra
+
+    data, separator = _normal_text(path, _text(path, options), kind)
+
+    def parsed(decimal: str, *, threads: bool = True) -> Any:
+        null = ["", "nan", "NaN", "NA", "null", "None"]
+        convert = csv.ConvertOptions(null_values=null, strings_can_be_null=True, decimal_point=decimal)
+        parse, read = csv.ParseOptions(delimiter=separator), csv.ReadOptions(use_threads=threads)
+        return csv.read_csv(io.BytesIO(data), parse_options=parse, convert_options=convert, read_options=read)
+
+    decimal = options.get("decimal")
+    if decimal not in {None, ",", "."}:
+        raise DatasetError("--option decimal", "a comma or a point", repr(decimal))
+    try:
+        table = parsed(decimal or ".")
+    except pa.ArrowInvalid:
+        table = parsed(decimal or ".", threads=False)  # raises with the number of the row
+    if decimal is None and _has_commas(pa, path, table):
+        table = parsed(",")
+    names = enumerate(table.column_names)  # a separator at the end of the lines gives one without name and values
+    return table.select([place for place, name in names if name or table.column(place).null_count < len(table)])
+
+
+def _has_commas(pa: Any, path: Path, table: Any) -> bool:
+    """Tell whether the numbers of a table have a decimal comma; refuse one where only some have."""
+    import pyarrow.compute as pc  # noqa: PLC0415  packages of an extra
+
+    texts = [field.name for field in table.schema if pa.types.is_string(field.type)]
+    commas = [name for name in texts if pc.all(pc.match_substring_regex(table[name], _COMMA)).as_py()]
+    points = [field.name for field in table.schema if pa.types.is_floating(field.type)]
+    if commas and points:
+        expected = "decimal points or commas (--option decimal=. or decimal=, says which)"
+        raise DatasetError(path, expected, f"commas in column {commas[0]}, points in column {points[0]}")
+    return bool(commas)
+
+
+def _dates(pa: Any, path: Path, name: str, texts: NDArray[Any], options: Mapping[str, str]) -> NDArray[Any]:
+    """Return a column of dates with a time of day as such, and other texts as they are."""
+    first = next((text for text in texts.tolist() if text), "").strip()
+    date = _DATE.fullmatch(first)
+    if date is None:
+        return texts
+    unique, place = np.unique(texts, return_inverse=True)
+    found = [text.strip() for text in unique.tolist()]
+    order = _order_of_days(path, name, found, options)
+    days = [_DAY_OR_MONTH.sub(order, text.removesuffix("UTC").strip()).replace("/", "-") for text in found]
+    dates = [_ONE_DIGIT.sub(r"0\1", text.replace(",", ".")) or None for text in days]
+    try:
+        stamps = pa.array(dates).cast(pa.timestamp("ns", "UTC" if date[5] else None)).to_numpy(zero_copy_only=False)
+    except pa.ArrowInvalid as error:
+        wrong = next(number for number, text in enumerate(dates) if f"'{text}'" in str(error))
+        expected = f"a date as YYYY-MM-DD HH:MM:SS.ffffff in column {name}, with a zone in all rows or in none"
+        line = line_of(path, int(np.flatnonzero(place == wrong)[0]), options)
+        raise DatasetError(path, expected, repr(found[wrong]), line=line) from error
+    return np.asarray(stamps.astype("datetime64[ns]")[place])
+
+
+def _order_of_days(path: Path, name: str, texts: list[str], options: Mapping[str, str]) -> str:
+    """Return how a date as 03/01/2025 is written as 2025-01-03, as a replacement of `_DAY_OR_MONTH`."""
+    orders = {"dmy": r"\4-\3-\1", "mdy": r"\4-\1-\3"}
+    found = [match for match in map(_DAY_OR_MONTH.match, texts) if match is not None]
+    first, second = (any(int(match[place]) > _MONTHS for match in found) for place in (1, 3))
+    order = options.get("date", "dmy" if not found or first or found[0][2] == "." else "mdy" if second else "")
+    if order not in orders:
+        expected = "dates as YYYY-MM-DD, or --option date=dmy (day first) or date=mdy"
+        raise DatasetError(path, expected, repr(options.get("date", texts[-1])) + f" for column {name}")
+    return orders[order]
+
+
+def _rows(pa: Any, records: list[dict[str, Any]]) -> Any:
+    """Return records as a table; values of several types as text, so that the first wrong one can be named."""
+    columns = {}
+    for name in dict.fromkeys(name for one in records for name in one):
+        values = [one.get(name) for one in records]
+        try:
+            columns[name] = pa.array(values)
+        except (pa.ArrowInvalid, pa.ArrowTypeError):
+            columns[name] = pa.array([None if value is None else str(value) for value in values])
+    return pa.table(columns)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text.strip().strip('"'))
+    except ValueError:
+        return False
+    return True
+
+
+def _is_list(pa: Any, kind: Any) -> bool:
+    return bool(pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind))
+
+
+def _parts(pa: Any, name: str, column: Any) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Give a column as arrays of numpy, one for each number of a list and each field of a structure."""
+    kind = column.type
+    types = pa.types
+    if types.is_dictionary(kind):
+        column, kind = column.dictionary_decode(), kind.value_type
+    if types.is_struct(kind):
+        for field, child in zip(kind, column.flatten(), strict=True):
+            yield from _parts(pa, f"{name}.{field.name}", child)
+    elif (
+        _is_list(pa, kind)
+        and len(lengths := {len(row) for row in column if row.is_valid}) == 1
+        and max(lengths) <= _MOST_PARTS
+    ):
+        rows = column.to_pylist()
+        for place in range(max(lengths)):
+            child = pa.array([None if row is None else row[place] for row in rows])
+            yield from _parts(pa, f"{name}.{place}", child)
+    elif types.is_timestamp(kind):
+        yield name, column.cast(pa.timestamp("ns")).to_numpy(zero_copy_only=False).astype("datetime64[ns]")
+    elif types.is_integer(kind) and not column.null_count:
+        yield name, column.to_numpy(zero_copy_only=False).astype(np.int64)
+    elif types.is_integer(kind) or types.is_floating(kind) or types.is_decimal(kind) or types.is_null(kind):
+        yield name, column.cast(pa.float64()).to_numpy(zero_copy_only=False)
+    else:
+        yield name, np.array(["" if value is None else str(value) for value in column.to_pylist()], dtype=np.str_)
+
+
+def to_arrow(columns: Mapping[str, NDArray[Any]]) -> "pa.Table":
+    """Return columns as a table of pyarrow; NaN becomes no value.
+
+    Raises:
+        ClientError: pyarrow is not installed.
+    """
+    pa = _pyarrow()
+    return pa.table({name: pa.array(values, from_pandas=values.dtype.kind == "f") for name, values in columns.items()})
+
+
+def write_table(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
+    """Write a table in the format that its name says; it appears complete, or not at all. NaN is written as no value.
+
+    Raises:
+        DatasetError: The name says no format that can be written.
+        ClientError: pyarrow is not installed.
+    """
+    kind = path.suffix.lower()
+    if kind in {".jsonl", ".ndjson"}:  # dates as text
+        columns = {name: one.astype(np.str_) if one.dtype.kind == "M" else one for name, one in columns.items()}
+    table = to_arrow(columns)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    content: Any = io.BytesIO()
+    if kind in {".csv", ".tsv"}:
+        from pyarrow import csv  # noqa: PLC0415  packages of an extra
+
+        separator = "\t" if kind == ".tsv" else ","
+        texts = [name for name, values in columns.items() if values.dtype.kind == "U"]
+        special = any(
+            mark in text for name in texts for text in np.unique(columns[name]) for mark in (separator, '"', "\n")
+        )
+        style = "needed" if special else "none"  # "needed" quotes every text
+        csv.write_csv(table, content, csv.WriteOptions(delimiter=separator, quoting_style=style, quoting_header=style))
+    elif kind in {".jsonl", ".ndjson"}:
+        content.write("".join(json.dumps(row) + "\n" for row in table.to_pylist()).encode())
+    elif kind == ".parquet":
+        from pyarrow import parquet  # noqa: PLC0415  as above
+
+        parquet.write_table(table, content)
+    elif kind in {".feather", ".arrow"}:
+        from pyarrow import feather  # noqa: PLC0415  as above
+
+        feather.write_feather(table, content)
+    else:
+        raise DatasetError(path, f"a table ({', '.join(SUFFIXES)})", f"a file named *{kind}")
+    write_whole(path, content.getvalue())
+
+
+def frame_files(folder: Path) -> list[Path]:
+    """Return the files of a folder with the boxes of a frame each; none where it is no such folder."""
+    for suffix in (".json", ".txt"):
+        files = sorted(folder.glob(f"*{suffix}"))
+        text = next((file.read_bytes().decode(errors="replace") for file in files if file.stat().st_size), "")
+        if is_kitti_object(text) if suffix == ".txt" else text[:1] == "{" and '"bboxes_3d"' in text:
+            return files
+    return []
+
+
+def is_kitti_object(text: str) -> bool:
+    """Tell whether a text begins with a box in the format of KITTI's object benchmark."""
+    return re.match(r"[A-Za-z]\w*( +-?\d[-+.e\d]*){14,15} *(\n|$)", text) is not None
+
+
+def read_frames(folder: Path) -> list[_Record]:
+    """Return a record for each box of a folder with a file for each frame, whose name has its number or stamp.
+
+    Raises:
+        DatasetError: A file is wrong; says where.
+    """
+    files = frame_files(folder)
+    found = [re.findall(r"\d+", file.stem) for file in files]
+    number = [int(digits[-1]) for digits in found if digits]
+    if len(set(number)) < len(files):
+        number = list(range(len(files)))
+    name = "timestamp" if min(number) >= _STAMPS else "frame"
+    read = _kitti_frame if files[0].suffix == ".txt" else read_json
+    return split_boxes([{name: n} | one for n, file in sorted(zip(number, files, strict=True)) for one in read(file)])
+
+
+def _kitti_frame(path: Path) -> list[_Record]:
+    rows = [(line, fields) for line, fields in read_rows(path, "boxes") if fields[0] != "DontCare"]
+    boxes = [(line, fields[_FIRST:] + ["1"] * (len(fields) == _FIRST + 7)) for line, fields in rows]  # labels: no score
+    values = numbers(path, boxes, 8, f"h w l x y z rotation_y score from field {_FIRST + 1} on")
+    center, size, yaw = sensor_from_kitti(values[:, 3:6], values[:, :3], values[:, 6])
+    lists = np.column_stack((center, size, yaw)).tolist()
+    return [{"labels_3d": [fields[0] for _, fields in rows], "scores_3d": values[:, 7].tolist(), "bboxes_3d": lists}]
+
+
+def read_json(path: Path) -> list[_Record]:
+    """Return the records of a JSON file: an array of them, or an object with the boxes of a frame.
+
+    Raises:
+        DatasetError: It is something else.
+    """
+    try:
+        content = json.loads(read_text(path, "JSON"))
+    except json.JSONDecodeError as error:
+        raise DatasetError(path, "JSON", error.msg, line=error.lineno) from error
+    if isinstance(content, dict) and isinstance(content.get("results"), dict):
+        how = f"--dataset nuscenes --root ROOT --detections {path}"
+        raise DatasetError(path, "a table", f"results of nuScenes, which are read by {how}")
+    if isinstance(content, dict) and any(name in content for name in LISTS):
+        content = [content]
+    if not isinstance(content, list) or not all(isinstance(one, dict) for one in content):
+        expected = f"an array of objects, or an object with a list {', '.join(LISTS)}"
+        raise DatasetError(path, expected, repr(str(content)[:60]))
+    for one in content:
+        if "box_type_3d" in one:
+            _centre(path, one)
+    return content
+
+
+def _centre(path: Path, frame: _Record) -> None:
+    """Move the boxes of a frame of MMDetection3D, given by their bottoms, up to their centres."""
+    kind = frame.pop("box_type_3d")
+    if kind != "LiDAR" or any(len(box) not in {7, 9} for box in frame["bboxes_3d"]):
+        raise DatasetError(path, "boxes of 7 or 9 numbers, of box_type_3d LiDAR", f"others, of {kind}")
+    for box in frame["bboxes_3d"]:
+        box[2] += 0.5 * box[5]
+    frame["labels_3d"] = [str(label) for label in frame["labels_3d"]]
+
+
+def split_boxes(records: Sequence[_Record]) -> list[_Record]:
+    """Return a record for each box: of a list of boxes in a record, and of the other lists that are as long."""
+    names = dict.fromkeys(name for one in records for name in one)
+
+    def lists(name: str) -> list[Any]:
+        return [[] if one.get(name) is None else one[name] for one in records]
+
+    def has_boxes(value: object) -> bool:
+        return isinstance(value, list) and all(isinstance(box, (list, dict)) for box in value)
+
+    key = next((name for name in LISTS if name in names and all(map(has_boxes, lists(name)))), None)
+    if key is None:
+        return list(records)
+    counts = [len(boxes) for boxes in lists(key)]
+    split = [name for name in names if [len(one) if isinstance(one, list) else -1 for one in lists(name)] == counts]
+    rows: list[_Record] = []
+    for one, count in zip(records, counts, strict=True):
+        frame = {name: value for name, value in one.items() if name not in split}
+        boxes = [frame | {name: one[name][place] for name in split} for place in range(count)]
+        rows += [box | box.pop(key) if isinstance(box[key], dict) else box for box in boxes] or [frame]
+    return rows

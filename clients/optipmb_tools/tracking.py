@@ -1,0 +1,175 @@
+"""Offline tracking of the recordings of a data set, one task each: here, in several processes, or on a Ray cluster."""
+
+import functools
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from optipmb_client.errors import ClientError
+
+from optipmb import Modules, Parameters
+from optipmb_tools.bulk import Executor, Failed, Here, in_order, run
+from optipmb_tools.datasets import DataSequence, Dataset, DatasetArguments
+from optipmb_tools.files import remove_unfinished
+from optipmb_tools.offline import track_whole
+from optipmb_tools.results.output import Latency, Results, horizons_for, latency
+from optipmb_tools.table_files import Columns
+
+SHOWN = 20  # recordings that failed, named in the error
+
+
+@dataclass(frozen=True)
+class TrackedSequence:
+    """Result of tracking one sequence."""
+
+    name: str
+    file: Path
+    frames: int
+    clouds: int
+    detections: int
+    left_out: dict[str, int]  # detections of each class that the profile lacks, or that are below its score filter
+    estimated: int  # frames in which the motion of the sensor was estimated
+    cut: tuple[int, int]  # boxes beyond those that a benchmark accepts in a sample, and such samples
+    tracks: int
+    confirmed: int  # tracks that were confirmed in some frame
+    seconds: float
+    step: Latency | None  # durations of the tracker's steps
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """How sequences are tracked."""
+
+    parameters: Parameters
+    classes: Sequence[str] = ()  # only detections of these; empty: all
+    modules: Modules | None = None
+    full: bool = False  # also write all columns of the tracks
+    smooth: bool = False  # estimate states from all frames of their track (`optipmb_tools.smoothing`)
+
+
+@dataclass(frozen=True)
+class _Opened:
+    dataset: Dataset
+    sequences: Mapping[str, DataSequence] | None = None  # None: read for each task, as so many cannot all be kept
+    on_frame: Callable[[], None] = lambda: None
+
+
+@dataclass(frozen=True)
+class _Shared:
+    """Arguments of all tasks of a run; can be sent to another process without `here`."""
+
+    data: DatasetArguments
+    out: Path
+    how: Tracking
+    here: _Opened | None
+
+    @functools.cached_property
+    def opened(self) -> _Opened:
+        return self.here or _Opened(self.data.open())  # a process opens it once
+
+
+class RecordingsFailed(ClientError):  # noqa: N818  as its siblings
+    """Some of several recordings failed; the others are tracked, and their results are written.
+
+    Attributes:
+        failures: Reason by name of the recording.
+    """
+
+    def __init__(self, failures: Mapping[str, Failed], count: int) -> None:
+        self.failures = dict(failures)
+        names = " ".join([*itertools.islice(failures, SHOWN), *(["…"] if len(failures) > SHOWN else [])])
+        super().__init__(f"{len(failures)} of {count} recordings failed, the others are tracked: {names}")
+
+
+def _track_one(shared: _Shared, name: str) -> tuple[TrackedSequence, Path | Columns]:
+    """Track one sequence and write its results; idempotent. Return the rows where all sequences share one table."""
+    opened, how = shared.opened, shared.how
+    (sequence,) = [opened.sequences[name]] if opened.sequences else opened.dataset.sequences([name])
+    found = track_whole(how.parameters, sequence, how.classes, how.modules, smooth=how.smooth, on_frame=opened.on_frame)
+    written = Results(opened.dataset, shared.out, full=how.full).write(sequence, found.tracks)
+    beyond = []
+    if opened.dataset.name == "nuscenes" and isinstance(written, Path):
+        from optipmb_tools.results.nuscenes import NUSCENES_MAX_BOXES  # noqa: PLC0415  of one format
+
+        counts = [len(one.id) for one in found.tracks.values()]
+        beyond = [count - NUSCENES_MAX_BOXES for count in counts if count > NUSCENES_MAX_BOXES]
+    return TrackedSequence(
+        name,
+        written if isinstance(written, Path) else shared.out,
+        len(found.tracks),
+        found.clouds,
+        found.detections,
+        found.left_out,
+        found.estimated,
+        (sum(beyond), len(beyond)),
+        len({number for one in found.tracks.values() for number in one.id.tolist()}),
+        len({number for one in found.tracks.values() for number in one.id[one.confirmed == 1].tolist()}),
+        found.seconds,
+        latency(found.steps_ns),
+    ), written
+
+
+def _taken(
+    ended: Iterable[tuple[int, Any]],
+    sequences: Sequence[DataSequence],
+    results: Results,
+    note: Callable[[str], None],
+    on_frame: Callable[[], None],
+) -> Iterator[tuple[int, TrackedSequence | Failed]]:
+    """Yield the place and result of each sequence that ended, and count its frames."""
+    for place, value in ended:
+        sequence, result = sequences[place], value
+        if not isinstance(value, Failed):
+            result, written = value
+            if not results.take(sequence, written):
+                result = Failed(f"{written} is on another machine: --out needs a folder that all machines share")
+        if isinstance(result, Failed) and len(sequences) > 1:
+            note(f"recording {sequence.name} failed: {result.reason}")
+        yield place, result
+        for _ in range(len(sequence)):
+            on_frame()
+
+
+def track(
+    dataset: Dataset,
+    sequences: Sequence[DataSequence],
+    out: Path,
+    how: Tracking,
+    *,
+    executor: Executor | None = None,
+    on_frame: Callable[[], None] = lambda: None,
+    note: Callable[[str], None] = lambda _: None,
+) -> Iterator[TrackedSequence]:
+    """Track sequences, one task each, and write their results into `out`, a folder or a table.
+
+    Yields each sequence when it and those before it are done and written. The results are the same bytes with any
+    executor; other processes open the data set themselves. A sequence that fails does not stop the others.
+
+    Raises:
+        RecordingsFailed: Some of several sequences failed; raised when all others are done and written.
+        UsageError, ClientError: All of them failed.
+    """
+    executor = executor or Here()
+    if (horizons := horizons_for(out)) is not None:
+        how = replace(how, parameters=how.parameters.model_copy(update={"horizons": horizons}))
+    names = tuple(one.name for one in sequences)
+    opened = _Opened(dataset, {one.name: one for one in sequences}, on_frame) if executor.here else None
+    executor.start(_track_one, _Shared(dataset.arguments, out, replace(how, classes=tuple(how.classes)), opened))
+    results = Results(dataset, out, full=how.full)
+    failures: dict[str, Failed] = {}
+    ended = run(executor, names, lambda name: f"recording {name}", note)
+    taken = _taken(ended, sequences, results, note, on_frame if opened is None else lambda: None)
+    for name, one in zip(names, in_order(taken), strict=True):
+        if isinstance(one, Failed):
+            failures[name] = one
+        else:
+            yield one
+    if len(failures) == len(names) > 0:
+        raise failures[names[0]].error()
+    results.close(sequences)
+    if opened is None:
+        remove_unfinished(results.files)
+    if failures:
+        raise RecordingsFailed(failures, len(names))

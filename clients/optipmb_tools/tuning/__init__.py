@@ -1,0 +1,31 @@
+"""Tuning: from a detector's results and labels to a parameter profile; ablation and parameter sweeps."""
+
+from optipmb_tools.tuning.display import TrialDisplay
+from optipmb_tools.tuning.estimate import Estimate
+from optipmb_tools.tuning.refine import Plan, Refined
+from optipmb_tools.tuning.run import Curves, Source, calibrate_scores, estimate_all, tune_all
+from optipmb_tools.tuning.scoring import Figures, plain_figures
+from optipmb_tools.tuning.values import value_of
+from optipmb_tools.tuning.variants import ROWS, Row, Variant, ablation, measure_variants, sweep, write_sweep
+
+__all__ = [
+    "ROWS",
+    "Curves",
+    "Estimate",
+    "Figures",
+    "Plan",
+    "Refined",
+    "Row",
+    "Source",
+    "TrialDisplay",
+    "Variant",
+    "ablation",
+    "calibrate_scores",
+    "estimate_all",
+    "measure_variants",
+    "plain_figures",
+    "sweep",
+    "tune_all",
+    "value_of",
+    "write_sweep",
+]

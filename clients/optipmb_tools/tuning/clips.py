@@ -1,0 +1,201 @@
+"""Sequences in memory, ready to be tracked any number of times: detections of some classes, and their truth.
+
+Conventions: frames are in the world frame, made once by `optipmb.make_frame`; so are the tracks. The truth is in
+the sensor frame of each row's frame, where KITTI compares, and in the world frame.
+"""
+
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optipmb import Frame, Modules, Parameters, Tracker, Tracks
+from optipmb_tools.camera import Camera
+from optipmb_tools.datasets import DataSequence, DatasetError, Truth
+from optipmb_tools.evaluation import Rules
+from optipmb_tools.geometry import Floats, Ints, stack_poses, to_sensor, wrap_angle
+from optipmb_tools.offline import tracker_frame
+from optipmb_tools.results import ResultTable
+from optipmb_tools.results.full import COLUMNS, FullTable
+from optipmb_tools.results.kitti import LEAST_SHOWN
+from optipmb_tools.results.rows import stacked
+
+_DETECTION_COLUMNS = ("center", "size", "yaw", "velocity", "score", "source", "position_covariance")
+_LEAST_SCORE = 1e-12
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One sequence with its detections of some classes."""
+
+    name: str
+    labels: tuple[str, ...]
+    """The classes, as the parameters that will be used have them."""
+    frames: tuple[Frame, ...]
+    """(F,) world frame."""
+    rotation: Floats
+    """(F, 3, 3) world from sensor."""
+    translation: Floats
+    """(F, 3)"""
+    camera: Camera | None
+    """In whose image the benchmark counts; None where it does not."""
+    truth: Truth
+    """Of these classes and those alike, in the sensor frame of each row's frame."""
+    world: Truth
+    """The same in the world frame."""
+
+    @property
+    def stamps(self) -> Ints:
+        """(F,) nanoseconds."""
+        return np.array([frame.stamp_ns for frame in self.frames], dtype=np.int64)
+
+
+def load(sequence: DataSequence, parameters: Parameters, rules: Rules) -> Clip:
+    """Read one sequence into memory: detections of the classes of the parameters, clouds, and the truth.
+
+    Raises:
+        DatasetError: it has no truth, or one of some frames only, by which clutter cannot be counted.
+        UsageError: it has values that the tracker refuses.
+
+    """
+    frames = list(sequence.frames())  # first: a generated scene takes its truth from the scans that its frames needed
+    truth = sequence.truth()
+    if truth is None:
+        raise DatasetError(f"sequence {sequence.name}", "annotations to compare with", "none")
+    if truth.labelled is not None:
+        received = (
+            f"labels in {int(truth.labelled.sum())} of {len(frames)}: interpolate them, or take detections of these"
+        )
+        raise DatasetError(f"sequence {sequence.name}", "a truth of every frame to tune by", received)
+    alike = {name for label in parameters.labels for name in (label, *rules.neighbours.get(label, ()))}
+    kept = truth.take(np.isin(truth.names, sorted(alike)))
+    rotation, translation = stack_poses(sequence.poses)
+    return Clip(
+        name=sequence.name,
+        labels=parameters.labels,
+        frames=tuple(tracker_frame(parameters, sequence.name, frame) for frame in frames),
+        rotation=rotation,
+        translation=translation,
+        camera=getattr(sequence, "camera", None),
+        truth=kept.to_sensor(sequence.poses),
+        world=kept,
+    )
+
+
+def of_class(clip: Clip, name: str, rules: Rules) -> Clip:
+    """Return a clip with the detections and the truth of one class only, for parameters with this class only."""
+    index = clip.labels.index(name)
+    frames = []
+    for frame in clip.frames:
+        chosen = np.flatnonzero(frame.label == index)
+        columns = {key: column[chosen] for key in _DETECTION_COLUMNS if (column := getattr(frame, key)) is not None}
+        frames.append(replace(frame, label=np.zeros(len(chosen), dtype=np.int64), labels=(name,), **columns))
+    rows = np.isin(clip.truth.names, (name, *rules.neighbours.get(name, ())))
+    return replace(clip, labels=(name,), frames=tuple(frames), truth=clip.truth.take(rows), world=clip.world.take(rows))
+
+
+@dataclass(frozen=True)
+class Degradation:
+    """How much worse the detections of a degraded copy are."""
+
+    drop: float = 0.1
+    """Share of the detections that are lost."""
+    position: float = 0.1
+    """Standard deviation of the noise added to x and to y, m."""
+    heading: float = 0.05
+    """Of the noise added to the heading, rad."""
+    velocity: float = 0.2
+    """Of the noise added to each component of a known velocity, m/s."""
+    score: float = 0.5
+    """Of the noise added to the logit of the score."""
+
+
+def degrade(clip: Clip, degradation: Degradation, seed: int, copy: int = 0) -> Clip:
+    """Return a clip with worse detections; `copy` counts several copies of the same seed.
+
+    A detector is better on the sequences that it was trained on than anywhere else. The same seed and the same
+    detections give the same copy.
+    """
+    rng = np.random.Generator(np.random.PCG64([seed, copy, zlib.crc32("/".join((clip.name, *clip.labels)).encode())]))
+    return replace(clip, frames=tuple(_worse(frame, degradation, rng) for frame in clip.frames))
+
+
+def _worse(frame: Frame, degradation: Degradation, rng: np.random.Generator) -> Frame:
+    # Every number is drawn for every detection, so that one more of them changes no other.
+    count = len(frame.score)
+    kept = np.flatnonzero(rng.random(count) >= degradation.drop)
+    shift = degradation.position * rng.standard_normal((count, 2))
+    turn = degradation.heading * rng.standard_normal(count)
+    drift = degradation.velocity * rng.standard_normal((count, 2))
+    blur = degradation.score * rng.standard_normal(count)
+    center = frame.center.copy()
+    center[:, :2] += shift
+    with np.errstate(divide="ignore"):  # a score of one has the logit infinity and stays one
+        logit = np.log(frame.score) - np.log1p(-frame.score) + blur
+    score = np.clip(0.5 * (1.0 + np.tanh(0.5 * logit)), _LEAST_SCORE, 1.0)
+    return Frame(
+        stamp_ns=frame.stamp_ns,
+        center=center[kept],
+        size=frame.size[kept],
+        yaw=wrap_angle(frame.yaw + turn)[kept],
+        velocity=(frame.velocity + drift)[kept],
+        score=score[kept],
+        label=frame.label[kept],
+        source=frame.source[kept],
+        labels=frame.labels,
+        cloud=frame.cloud,
+    )
+
+
+def track_clip(
+    clip: Clip, parameters: Parameters, modules: Modules | None = None, *, every_frame: bool = False
+) -> ResultTable:
+    """Return the tracks of a clip in the world frame, with image boxes where there is a camera.
+
+    Args:
+        clip: with detections of the classes of the parameters.
+        parameters: with the classes of the clip.
+        modules: of the tracker.
+        every_frame: also step through frames in which nothing can happen; the tracks are the same.
+
+    """
+    return _table(clip, parameters, list(_steps(clip, parameters, modules, every_frame=every_frame)))
+
+
+def track_fully(clip: Clip, parameters: Parameters) -> tuple[ResultTable, FullTable]:
+    """Return the tracks of a clip as `track_clip` does, and all their columns."""
+    found = list(_steps(clip, parameters, None, every_frame=False))
+    table, parts = _table(clip, parameters, found), [tracks for _, tracks in found]
+    return table, FullTable(table.labels, table.frame, *(stacked(parts, name) for name in COLUMNS))
+
+
+def _steps(
+    clip: Clip, parameters: Parameters, modules: Modules | None, *, every_frame: bool
+) -> Iterator[tuple[int, Tracks]]:
+    """Yield the tracks of each frame that has any."""
+    tracker = Tracker(parameters, modules)
+    least = min(one.score_filter for one in parameters.classes.values())
+    density = tracker.initial()
+    for index, frame in enumerate(clip.frames):
+        # Nothing there and nothing new: the step would give the same density with another stamp, which nothing reads.
+        empty = not len(density.bernoulli) and not len(density.poisson)
+        if empty and not every_frame and not (frame.score >= least).any():
+            continue
+        result = tracker.step(density, frame)
+        density = result.density
+        if len(result.tracks.id):
+            yield index, result.tracks
+
+
+def _table(clip: Clip, parameters: Parameters, found: Sequence[tuple[int, Tracks]]) -> ResultTable:
+    parts = [tracks for _, tracks in found]
+    when: Ints = np.repeat([index for index, _ in found], [len(tracks) for tracks in parts]).astype(np.int64)
+    identity, label, center, size, yaw, score = (
+        stacked(parts, name) for name in ("id", "label", "center", "size", "yaw", "score")
+    )
+    image = np.full((len(when), 4), np.nan)
+    if clip.camera is not None and parts:
+        local, turned = to_sensor(clip.rotation[when], clip.translation[when], center, yaw)
+        image = clip.camera.boxes(local, size, turned, LEAST_SHOWN)[0]  # as the result files have it
+    return ResultTable(parameters.labels, when, identity, label, center, size, yaw, score, image)

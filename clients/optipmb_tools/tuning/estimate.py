@@ -1,0 +1,387 @@
+"""Estimates of a class from training data, without tracking: noise, motion, births, detections and false ones.
+
+Each figure comes from one place: R from detections minus labels, Q from the labels' trajectories, P^0 from the first
+detection of each object, p_d0 and mu_c / A from what is found and what is false. Standard deviations are winsorised
+(`spread`), for detections and labels are wrong in a few places by much. Estimates are where a search begins, not where
+it must end: a detector's errors last over frames, labels have errors of their own, and a motion model has to cover what
+it leaves out.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from optipmb import Parameters
+from optipmb_tools.evaluation import Rules
+from optipmb_tools.geometry import Floats, Ints, wrap_angle
+from optipmb_tools.tuning.clips import Clip
+from optipmb_tools.tuning.pairing import (
+    Pairs,
+    Residuals,
+    Trajectory,
+    detected,
+    pair_detections,
+    residuals,
+    trajectories,
+)
+from optipmb_tools.tuning.score_curves import counted_scores
+from optipmb_tools.tuning.values import Value, rounded, value_of
+
+WINDOW_S = 1.0
+"""Pieces of trajectories in which motion is fitted; at low frame rates four frames."""
+PAIR_LIMIT = 2.0
+"""Largest distance between a detection and its label, m; the gate where that is less."""
+MOVING = 0.5
+"""Speed from which an object moves, m/s."""
+LEAST_PAIRS = 20
+"""With fewer detections on labels there is nothing to estimate from."""
+_BINS = 10
+_GAP_QUANTILE = 0.98
+_SMALL = 1e-2
+_NORMAL = 1.482602218505602
+"""Standard deviation of a Gaussian in units of its median absolute value."""
+_REACH = 3.0
+_LEAST_POINTS = 4
+
+
+@dataclass(frozen=True)
+class ScoreBin:
+    """Detections with scores in a range."""
+
+    low: float
+    high: float
+    detections: int
+    score: float
+    """Mean."""
+    precision: float
+    """Share that belongs to a label."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Estimates of one class; NaN where there is too little data."""
+
+    name: str
+    labels: int
+    objects: int
+    detections: int
+    pairs: int
+    values: dict[str, Value]
+    """By path in the profile."""
+    flip_rate: float
+    """Share of detections whose heading is nearer to the opposite of the label's."""
+    lasting: float
+    """Correlation of the position errors of neighbouring detections of one object."""
+    usual_position: float
+    """Standard deviation of the usual position error, by the median, m."""
+    detection: float
+    """Share of labels found, from the score filter on."""
+    clutter: float
+    """False detections per frame, from the score filter on."""
+    clutter_area: float
+    """Area that false detections come from, m^2."""
+    longest_gap: float
+    """Nominal periods within which 98 of 100 breaks between detections of an object end."""
+    bins: tuple[ScoreBin, ...]
+    score_scale: float
+    score_shift: float
+    """Log odds that a detection is true = scale * logit(score) + shift; 1 and 0 when scores are calibrated."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as plain values; None for NaN."""
+        return {key: _plain(value) for key, value in asdict(self).items()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def estimate(clips: Sequence[Clip], name: str, parameters: Parameters, rules: Rules) -> Estimate:
+    """Return the estimates of one class.
+
+    Args:
+        clips: of this class only.
+        name: the class.
+        parameters: their score filter, gate, clutter rate and nominal period are used.
+        rules: of the benchmark: which labels are ignored and which detections excused.
+
+    """
+    table = parameters.classes[name]
+    paths = [trajectories(clip, name) for clip in clips]
+    everything = pair_all(clips, name, parameters, rules)
+    pairs = [pair_detections(clip, name, table.score_filter, min(PAIR_LIMIT, table.gate), rules) for clip in clips]
+    errors = residuals(pairs, paths)
+    count = len(errors.heading)
+    values: dict[str, float] = {}
+    clutter_area = _area(pairs)
+    clutter = _ratio(sum(int(one.false.sum()) for one in pairs), sum(one.frames for one in pairs))
+    gap = _longest_gap(pairs, paths, parameters.nominal_period)
+    if count >= LEAST_PAIRS:
+        values |= _measurement(errors)
+        values |= _process([path for objects in paths for path in objects.values()], parameters.nominal_period)
+        values |= _birth(errors, pairs, paths)
+        values["area"] = table.clutter_rate * clutter_area / clutter if clutter > 0 else math.nan
+        values["max_misses"] = math.ceil(gap) if math.isfinite(gap) else math.nan
+    flips = float((np.abs(errors.heading) > 0.5 * np.pi).mean()) if count else math.nan
+    kept: dict[str, Value] = {
+        path: _fitting(parameters, name, path, value)
+        for path, value in values.items()
+        if math.isfinite(value) and value > 0
+    }
+    bins, scale, shift = _scores(everything)
+    return Estimate(
+        name=name,
+        labels=sum(one.truth for one in pairs),
+        objects=sum(len(objects) for objects in paths),
+        detections=sum(len(one.score) for one in pairs),
+        pairs=count,
+        values=kept,
+        flip_rate=flips,
+        lasting=_lasting(errors, parameters.nominal_period),
+        usual_position=usual(errors.position),
+        detection=_ratio(sum(one.found for one in pairs), sum(one.truth for one in pairs)),
+        clutter=clutter,
+        clutter_area=clutter_area,
+        longest_gap=gap,
+        bins=bins,
+        score_scale=scale,
+        score_shift=shift,
+    )
+
+
+def pair_all(clips: Sequence[Clip], name: str, parameters: Parameters, rules: Rules) -> list[Pairs]:
+    """Return the detections of all scores of a class, paired with its labels; arguments as in `estimate`."""
+    limit = min(PAIR_LIMIT, parameters.classes[name].gate)
+    return [pair_detections(clip, name, 0.0, limit, rules) for clip in clips]
+
+
+def _fitting(parameters: Parameters, name: str, path: str, value: float) -> Value:
+    """Return a value of the kind that the profile has at a path."""
+    kind = value_of(parameters, name, path)
+    return round(value) if isinstance(kind, int) else rounded(max(value, _SMALL))
+
+
+def _measurement(errors: Residuals) -> dict[str, float]:
+    return {
+        "measurement_noise.position": spread(errors.position),
+        "measurement_noise.heading": spread(wrap_angle(2.0 * errors.heading) / 2.0),
+        "measurement_noise.velocity": spread(errors.velocity[np.isfinite(errors.velocity).all(axis=1)]),
+    }
+
+
+def _process(paths: Sequence[Trajectory], period: float) -> dict[str, float]:
+    """Return Q: how much speed, acceleration, heading and turn rate change between neighbouring pieces.
+
+    The change of each over a time tau has the variance q^2 tau, beside what the model foresees and what the fit's own
+    error adds; position follows the model within the error of labels, and keeps what the profile has.
+    """
+    window = max(WINDOW_S, 4.0 * period)
+    changes: list[Floats] = []
+    errors: list[Floats] = []
+    for path in paths:
+        for part in _unbroken(path, 1.5 * period):
+            motion = fit_motion(part.time, part.position, part.yaw, window)
+            if len(motion.time) < 2:  # noqa: PLR2004  a change is between two
+                continue
+            # Most cars stand, most of the time; noise is for what moves.
+            moves = np.maximum(np.abs(motion.speed[1:]), np.abs(motion.speed[:-1])) > MOVING
+            tau = np.diff(motion.time)
+            foreseen = 0.5 * (motion.acceleration[1:] + motion.acceleration[:-1])
+            turned = 0.5 * (motion.turn_rate[1:] + motion.turn_rate[:-1])
+            changes.append(
+                np.column_stack(
+                    [
+                        np.diff(motion.speed) - foreseen * tau,
+                        np.diff(motion.acceleration),
+                        np.diff(motion.heading) - turned * tau,
+                        np.diff(motion.turn_rate),
+                    ]
+                )
+                / np.sqrt(tau)[:, None]
+            )
+            errors.append((motion.variance[1:] + motion.variance[:-1]) / tau[:, None])
+            changes[-1], errors[-1] = changes[-1][moves], errors[-1][moves]
+    if sum(map(len, changes)) < LEAST_PAIRS:
+        return {}
+    table, noise = np.concatenate(changes), np.median(np.concatenate(errors), axis=0)
+    found = {}
+    for column, key in enumerate(("speed", "acceleration", "heading", "turn_rate")):
+        square = spread(table[:, column]) ** 2
+        # A tenth remains in any case: that the fit explains all of it is chance.
+        found[f"process_noise.{key}"] = math.sqrt(max(square - float(noise[column]), 0.1 * square))
+    return found
+
+
+def _unbroken(path: Trajectory, longest: float) -> list[Trajectory]:
+    """Return the pieces of a trajectory without gaps in time."""
+    cuts = np.flatnonzero(np.diff(path.time) > longest) + 1
+    rows = np.split(np.arange(len(path.time)), cuts)
+    return [
+        Trajectory(*(getattr(path, key)[part] for key in ("frame", "time", "position", "yaw", "velocity", "ignored")))
+        for part in rows
+    ]
+
+
+def _birth(errors: Residuals, pairs: Sequence[Pairs], paths: Sequence[dict[int, Trajectory]]) -> dict[str, float]:
+    """Return P^0 from the first detection of each object, and from what objects do."""
+    first = errors.first
+    velocity = errors.velocity[first]
+    starts = [path.velocity[at[0]] for _, path, _, at in detected(pairs, paths)]
+    speeds = np.linalg.norm(np.array(starts).reshape(-1, 2), axis=1)
+    speeds = speeds[np.isfinite(speeds)]
+    return {
+        "birth.position": spread(errors.position[first]),
+        "birth.heading": spread(wrap_angle(2.0 * errors.heading[first]) / 2.0),
+        "birth.speed": spread(velocity[np.isfinite(velocity).all(axis=1)]),
+        # Most objects of many classes stand; those that do not are the ones that need it.
+        "birth.unknown_speed": float(np.sqrt(np.mean(speeds**2))) if len(speeds) else math.nan,
+    }
+
+
+def _lasting(errors: Residuals, period: float) -> float:
+    """Return the correlation of position errors of neighbouring frames; NaN of too few, or of none but zeros."""
+    pair = np.flatnonzero(errors.gap < 1.5 * period)  # NaN is not less
+    if len(pair) < LEAST_PAIRS:
+        return math.nan
+    limit = 3.0 * usual(errors.position)
+    here = np.clip(errors.position, -limit, limit)
+    squared = float((here[pair] ** 2).sum())
+    return float((here[pair] * here[pair - 1]).sum()) / squared if squared else math.nan
+
+
+def _longest_gap(pairs: Sequence[Pairs], paths: Sequence[dict[int, Trajectory]], period: float) -> float:
+    """Return the nominal periods within which nearly all breaks between detections of an object end."""
+    between = [one for _, path, _, at in detected(pairs, paths) for one in np.diff(path.time[at]).tolist()]
+    gaps = [one / period - 1.0 for one in between if one > 1.5 * period]
+    return float(np.quantile(gaps, _GAP_QUANTILE)) if gaps else math.nan
+
+
+def _area(pairs: Sequence[Pairs], cell: float = 5.0) -> float:
+    """Return the area of the cells around the sensor in which there are detections."""
+    cells = {tuple(row) for one in pairs for row in np.floor(one.place / cell).astype(np.int64).tolist()}
+    return cell * cell * len(cells)
+
+
+def _scores(pairs: Sequence[Pairs]) -> tuple[tuple[ScoreBin, ...], float, float]:
+    """Return how often detections of each score are true, and the fit of the log odds (Platt, 1999)."""
+    score, true = counted_scores(pairs)
+    edges = np.linspace(0.0, 1.0, _BINS + 1)
+    which = np.clip(np.digitize(score, edges) - 1, 0, _BINS - 1)
+    bins = tuple(
+        ScoreBin(
+            low=float(edges[i]),
+            high=float(edges[i + 1]),
+            detections=int((which == i).sum()),
+            score=float(score[which == i].mean()),
+            precision=float(true[which == i].mean()),
+        )
+        for i in range(_BINS)
+        if (which == i).any()
+    )
+    scale, shift = _platt(score, true) if true.any() and not true.all() else (math.nan, math.nan)
+    return bins, scale, shift
+
+
+def _platt(score: Floats, true: np.ndarray) -> tuple[float, float]:
+    """Fit log odds = scale * logit(score) + shift by Newton's method, held by a weak prior at scale 1, shift 0."""
+    clipped = np.clip(score, 1e-4, 1.0 - 1e-4)
+    design = np.column_stack([np.log(clipped / (1.0 - clipped)), np.ones(len(score))])
+    weights, prior = np.array([1.0, 0.0]), np.array([1.0, 0.0])
+    for _ in range(50):
+        odds = 1.0 / (1.0 + np.exp(-np.clip(design @ weights, -30.0, 30.0)))
+        slope = design.T @ (true - odds) - 0.1 * (weights - prior)
+        bend = (design * (odds * (1.0 - odds))[:, None]).T @ design + 0.1 * np.eye(2)
+        step = np.linalg.solve(bend, slope)
+        weights = weights + np.clip(step, -1.0, 1.0)
+        if np.abs(step).max() < 1e-9:  # noqa: PLR2004  far below what is shown
+            break
+    return float(weights[0]), float(weights[1])
+
+
+def _ratio(part: float, whole: float) -> float:
+    return part / whole if whole else math.nan
+
+
+def usual(errors: Floats) -> float:
+    """Return the standard deviation that a Gaussian with the same median absolute value has; NaN without errors."""
+    return float(_NORMAL * np.median(np.abs(errors))) if errors.size else float("nan")
+
+
+def spread(errors: Floats) -> float:
+    """Return the root mean square of errors of which none counts for more than three usual ones; NaN without errors."""
+    if not errors.size:
+        return float("nan")
+    limit = _REACH * usual(errors)
+    return float(np.sqrt(np.mean(np.minimum(np.abs(errors), limit) ** 2)))
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Motion of an object at the middles of windows of time that do not overlap."""
+
+    time: Floats
+    """(W,) s"""
+    speed: Floats
+    """(W,) along the heading, m/s"""
+    acceleration: Floats
+    """(W,) along the heading, m/s^2"""
+    heading: Floats
+    """(W,) rad, unwrapped"""
+    turn_rate: Floats
+    """(W,) rad/s"""
+    variance: Floats
+    """(W, 4) of the errors of speed, acceleration, heading and turn rate that the scatter of the points leaves"""
+
+
+def fit_motion(time: Floats, position: Floats, yaw: Floats, window: float) -> Motion:
+    """Fit polynomials to pieces of a trajectory: quadratic ones to the position, straight lines to the heading.
+
+    Args:
+        time: (R,) s, ascending.
+        position: (R, 2) m.
+        yaw: (R,) rad.
+        window: length of a piece, s; pieces with fewer than four points are left out.
+
+    """
+    turned = np.unwrap(yaw)
+    piece: Ints = np.floor((time - time[0]) / window + 1e-9).astype(np.int64)
+    rows = []
+    for which in np.unique(piece).tolist():
+        use = piece == which
+        if use.sum() < _LEAST_POINTS:
+            continue
+        middle = time[0] + (which + 0.5) * window
+        rows.append((middle, *_fit(time[use] - middle, position[use], turned[use])))
+    table = np.array(rows, dtype=np.float64).reshape(len(rows), 9)
+    return Motion(table[:, 0], table[:, 1], table[:, 2], table[:, 3], table[:, 4], table[:, 5:])
+
+
+def _fit(time: Floats, position: Floats, yaw: Floats) -> tuple[float, ...]:
+    """Return speed, acceleration, heading, turn rate at time 0, and the variances of the four."""
+    count = len(time)
+    square = np.column_stack([np.ones(count), time, 0.5 * time**2])
+    inverse = np.linalg.inv(square.T @ square)
+    path = inverse @ square.T @ position
+    scatter = float(((position - square @ path) ** 2).sum()) / max(1, 2 * (count - 3))
+    straight = square[:, :2]
+    inverse_yaw = np.linalg.inv(straight.T @ straight)
+    turn = inverse_yaw @ straight.T @ yaw
+    scatter_yaw = float(((yaw - straight @ turn) ** 2).sum()) / max(1, count - 2)
+    ahead = np.array([np.cos(turn[0]), np.sin(turn[0])])
+    return (
+        float(path[1] @ ahead),
+        float(path[2] @ ahead),
+        float(turn[0]),
+        float(turn[1]),
+        scatter * float(inverse[1, 1]),
+        scatter * float(inverse[2, 2]),
+        scatter_yaw * float(inverse_yaw[0, 0]),
+        scatter_yaw * float(inverse_yaw[1, 1]),
+    )

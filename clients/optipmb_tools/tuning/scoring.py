@@ -1,0 +1,178 @@
+"""Figures and scores of tracks: each sequence is measured on its own, and any choice of sequences is summed up.
+
+Conventions: scores of tracks are the mean scores of whole tracks. The averages over recalls are those of AB3DMOT's
+protocol, with 3D overlap for KITTI and with the distance of centres up to two metres elsewhere, and those of the
+nuScenes benchmark for nuScenes. All single figures are those at the threshold with the highest MOTA, `threshold`; HOTA
+is that of centres in the plane, `HOTA, all` that of all tracks.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optipmb_tools.datasets import DataSequence
+from optipmb_tools.datasets.nuscenes import NuScenesSequence
+from optipmb_tools.evaluation import Case, ClearResult, Rules, clear, combine, default_rules
+from optipmb_tools.evaluation.ab3dmot import Counts, evaluate_ab3dmot
+from optipmb_tools.evaluation.cases import ab3dmot_rules, prepare
+from optipmb_tools.evaluation.figures import defined
+from optipmb_tools.evaluation.hota import HotaResult, evaluate_hota
+from optipmb_tools.evaluation.nuscenes import (
+    NuScenesConfig,
+    NuScenesScene,
+    Pairing,
+    evaluate_class,
+    pair,
+    prepare_scene,
+)
+from optipmb_tools.geometry import Bools, to_sensor
+from optipmb_tools.results import ResultTable
+from optipmb_tools.results.nuscenes import NUSCENES_CLASSES
+from optipmb_tools.tuning.clips import Clip
+
+Figures = dict[str, float]
+"""Figures of one class by their names in `evaluation.FIGURES`; NaN where they are not defined."""
+
+METRICS: Mapping[str, str] = {
+    "combination": "mean of sAMOTA, AMOTA, MOTA and HOTA, less a tenth of the switches per object",
+    "samota": "sAMOTA",
+    "amota": "AMOTA",
+    "mota": "MOTA at the best threshold",
+    "hota": "HOTA of centres at that threshold",
+    "both": "three parts AMOTA, one part the HOTA of all tracks, less a tenth of the switches per object",
+}
+_SINGLE = {"samota": "sAMOTA", "amota": "AMOTA", "mota": "MOTA", "hota": "HOTA"}
+_SWITCH = 0.1
+
+
+def metric(name: str, figures: Figures, objects: int) -> float:
+    """Return one of `METRICS`; figures that are not defined count zero."""
+    known = {key: 0.0 if math.isnan(value) else value for key, value in figures.items()}
+    if name in _SINGLE:
+        return known[_SINGLE[name]]
+    if name == "both":
+        mean = 0.75 * known["AMOTA"] + 0.25 * known["HOTA, all"]
+    else:
+        mean = sum(known[one] for one in _SINGLE.values()) / len(_SINGLE)
+    return mean - _SWITCH * known["IDS"] / max(1, objects)
+
+
+def plain_figures(figures: Figures) -> dict[str, float | int | None]:
+    """Return figures for JSON: whole numbers as such, None for those that are not defined."""
+    return {
+        name: int(value) if (known := defined(value)) is not None and value == int(value) and abs(value) > 1 else known
+        for name, value in figures.items()
+    }
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One sequence: truth and tracks with the pairs that may match."""
+
+    case: Case
+    """By the rules of the benchmark."""
+    near: Case
+    """By the distance of the centres, for HOTA."""
+    official: Pairing | None = None
+    """By the rules of the nuScenes benchmark."""
+
+
+@dataclass(frozen=True)
+class Scorer:
+    """Compares tracks with the truth, for one class."""
+
+    name: str
+    """The class."""
+    rules: Rules
+    """Which labels are ignored, and which tracks are excused."""
+    near: Rules
+    """By the distance of centres, for HOTA."""
+    scenes: Mapping[str, NuScenesScene] | None = None
+    """By sequence, where figures are those of the nuScenes benchmark."""
+
+    @property
+    def config(self) -> NuScenesConfig:
+        """Settings of the nuScenes benchmark with this class only."""
+        return NuScenesConfig(class_range={self.name: NuScenesConfig().class_range[self.name]})
+
+    def counts(self, clip: Clip, tracks: ResultTable) -> Bools:
+        """Return which of the tracks of a clip (R,), in the world frame, are in the range of the benchmark."""
+        if self.scenes is None:
+            return np.ones(len(tracks), dtype=np.bool_)
+        distance = np.linalg.norm(tracks.center[:, :2] - self.scenes[clip.name].ego[tracks.frame], axis=1)
+        return np.asarray(distance < self.config.class_range[self.name], dtype=np.bool_)
+
+    def measure(self, clip: Clip, tracks: ResultTable) -> Measured:
+        """Compare the tracks of a clip, in the world frame, with its truth."""
+        official = None
+        if self.scenes is not None:
+            scene, label = self.scenes[clip.name], NUSCENES_CLASSES.index(self.name)
+            boxes = scene.tracks(tracks, self.config)
+            official = pair(scene.truth, boxes, label, len(scene.stamp_us), self.config.match_distance)
+            tracks = tracks.take(self.counts(clip, tracks))
+        near = prepare(clip.world, tracks, self.name, self.near, clip.name)
+        if self.rules.measure == "distance":
+            return Measured(near, near, official)
+        when = tracks.frame
+        center, yaw = to_sensor(clip.rotation[when], clip.translation[when], tracks.center, tracks.yaw)
+        local = replace(tracks, center=center, yaw=yaw)
+        return Measured(prepare(clip.truth, local, self.name, self.rules, clip.name), near, official)
+
+    def figures(self, measured: Sequence[Measured]) -> Figures:
+        """Return the figures of some sequences together."""
+        near = [one.near for one in measured]
+        best: ClearResult | Counts
+        if self.rules.measure == "distance":
+            found = evaluate_ab3dmot([replace(one, similarity=1.0 - one.cost / self.near.limit) for one in near], 0.0)
+            amotp = self.near.limit * (1.0 - found.amotp)
+            # Of CLEAR MOT, where changes of identity over breaks count too.
+            best = combine(clear(case.from_score(found.threshold), self.near) for case in near)
+            switches = len(best.switches)
+        else:
+            found = evaluate_ab3dmot([one.case for one in measured], self.rules.limit)
+            amotp, best, switches = found.amotp, found.best, found.best.switches
+        hota = self._hota(near, found.threshold)
+        figures = {
+            "sAMOTA": found.samota,
+            "AMOTA": found.amota,
+            "AMOTP": amotp,
+            "MOTA": best.mota,
+            "MOTP": best.motp,
+            "HOTA": hota.hota,
+            "DetA": hota.deta,
+            "AssA": hota.assa,
+            "IDS": switches,
+            "FRAG": best.fragments,
+            "FP": best.false,
+            "FN": best.missed,
+            "GT": best.truth,
+            "threshold": found.threshold,
+            "HOTA, all": self._hota(near, -math.inf).hota,
+        }
+        if self.scenes is not None:
+            official = [one.official for one in measured if one.official is not None]
+            own = evaluate_class(official, self.config).figures()
+            figures |= {name: own[name.lower()] for name in _OFFICIAL}
+        return figures
+
+    def _hota(self, near: Sequence[Case], threshold: float) -> HotaResult:
+        return evaluate_hota([case.from_score(threshold) for case in near], self.near)
+
+
+_OFFICIAL = ("AMOTA", "AMOTP", "MOTA", "MOTP", "IDS", "FRAG", "FP", "FN", "GT", "threshold")
+
+
+def rules_of(dataset: str) -> Rules:
+    """Return the rules by which boxes of a dataset are compared here."""
+    return ab3dmot_rules() if dataset == "kitti" else default_rules(dataset)
+
+
+def scorer_of(dataset: str, name: str, sequences: Sequence[DataSequence]) -> Scorer:
+    """Return the scorer of a class of a dataset."""
+    scorer = Scorer(name, rules_of(dataset), default_rules(dataset, "distance"))
+    scenes = [sequence for sequence in sequences if isinstance(sequence, NuScenesSequence)]
+    if not scenes or len(scenes) < len(sequences):
+        return scorer
+    return replace(scorer, scenes={scene.name: prepare_scene(scene, scorer.config) for scene in scenes})
