@@ -17,6 +17,14 @@ CODES: Final = {
         "Objects of a class that the profile lacks are left out; reported once per session.",
         "Choose another profile, or send the names of its classes.",
     ),
+    "score_filter": (
+        "Most detections of a class have scores below the profile's `score_filter`; reported once per session.",
+        "Choose the profile `generic`, or lower the filter of the class.",
+    ),
+    "no_pose": (
+        "The sensor moves, and its frames have no pose: the motion is estimated; reported once per session.",
+        "Send poses where they are known: tracks are in the axes of the sensor without them.",
+    ),
     "late": (
         "The frame came later than the window in which tracks are corrected.",
         "Publish in order, or raise `rewind_s`.",

@@ -15,10 +15,12 @@ publisher.
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
+import numpy as np
 import optipmb_schemas as schemas
 
 import optipmb
@@ -58,6 +60,9 @@ if TYPE_CHECKING:
 
 FLUSH_NS: Final = SECOND
 """Longest time for all pending frames at a reset, a change of parameters or the end: others wait for them."""
+
+SCORED: Final = 200
+"""Detections of a class after which its share below the score filter is reported."""
 
 
 class Session:
@@ -100,6 +105,8 @@ class Session:
         self._clock = clock
         self._sensors: dict[str, SensorQueue] = {}
         self._quarantine: dict[str, str] = {}
+        self._estimated = ""
+        """Incarnation in which the motion of a sensor was reported as estimated."""
         self._deliveries = Deliveries()
         self._has_ready = False
         self._cloud_wait_ns: int | None = None
@@ -483,6 +490,9 @@ class Session:
     # Settings
 
     def _transition(self, parameters: optipmb.Parameters) -> Transition:
+        self._filters = np.array([one.score_filter for one in parameters.classes.values()])
+        self._scores = np.zeros((2, len(self._filters)), np.int64)
+        """Detections of each class of the profile, and of these the ones below its score filter."""
         return Transition(self.stream, parameters, self._make(parameters), self._policy)
 
     def _limit_wait(self, cloud_wait_ns: int) -> None:
@@ -583,6 +593,8 @@ class Session:
         if found := queue.stamps.add(frame_id.stamp_ns, since_ns):
             expected = "stamps in nanoseconds that advance with time"
             outputs.append(self._problem("clock", frame_id, "stamp_ns", expected, found))
+        if not self.parameters.self_calibration:  # which never filters the upper half of a class
+            outputs += self._low_scores(frame_id, frame)
         deadline_ns, inputs = queue.cloud_deadline_ns(message, since_ns), (message, frame, ignored)
         pending = PendingFrame(frame_id, detections, inputs, deadline_ns, ticket, judged)
         waits = queue.held or deadline_ns is not None or queue.clouds.newest_ns is not None
@@ -703,6 +715,11 @@ class Session:
         self._follow(gone)
         self._deliveries.inserted += inputs is None
         outputs = [] if self.session == before else self._restarted(outcomes)
+        if self.parameters.sensor_motion and self._estimated != self.session and self.density.sensor_motion is not None:
+            self._estimated = self.session
+            x, y, _ = self.density.sensor_motion.tolist()
+            received = f"none, and what stands moves by {math.hypot(x, y):.1f} m/s: the motion is estimated"
+            outputs.append(self._problem("no_pose", frame_id, "pose", "the pose of a sensor that moves", received))
         step_ns = (self._clock() - began_ns) // max(1, len(outcomes))
         for one in outcomes:
             if (one.unknown or one.tracks is None) and not one.frame.revision:
@@ -758,6 +775,23 @@ class Session:
                 received = f"{begun.reason}, {_seconds(begun.jump_ns)}"
                 return [begun, self._problem("restarted", one.frame.frame_id, "", "a stream that goes on", received)]
         return []
+
+    def _low_scores(self, frame_id: FrameId, frame: optipmb.Frame) -> list[Output]:
+        """Count the detections below the score filter; report each class that loses most of them, once."""
+        labels, size = self.parameters.labels, len(self._filters)
+        self._scores[0] += np.bincount(frame.label, minlength=size)
+        low = frame.score < self._filters[frame.label]
+        if not low.any():
+            return []
+        self._scores[1] += np.bincount(frame.label[low], minlength=size)
+        given, removed = self._scores
+        problems: list[Output] = []
+        for index in np.flatnonzero((given >= SCORED) & (2 * removed > given)).tolist():
+            received = f"{removed[index]} of {given[index]} below {self._filters[index]:g}"
+            expected = f"most scores of {labels[index]} above the filter of the profile {self.parameters.name}"
+            problems.append(self._problem("score_filter", frame_id, f"{labels[index]}.score", expected, received))
+            self._filters[index] = 0.0  # reported
+        return problems
 
     def _left_out(self, outcome: Outcome) -> list[Output]:
         """Report objects of unknown classes, and a frame that was refused when its turn came."""
