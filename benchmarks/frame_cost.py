@@ -116,7 +116,7 @@ class Network:
 def packets(objects: int, points: int) -> Iterator[list[Any]]:
     """Yield the messages of each frame, its cloud first."""
     load, keys = module_of("optipmb_tools.load", "optipmb_client.load"), schemas.Keys()
-    packet = part_of("Packet", "stream.backlog", "stream.ports", "runtime.ports")
+    packet = part_of("Packet", "zenoh.inputs", "runtime.ports")
     frames = load.generated(objects, points, RATE_HZ)
     for k in range(WARM + FRAMES):
         begins = load.head(STREAM, bytes(16), load.FIRST + k, 10**18 + round(k * 1e9 / RATE_HZ))

@@ -29,11 +29,11 @@ from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeVar
 
 import structlog
+from optipmb_client.errors import ClientError
 from optipmb_schemas.installation import install_command
 
 from optipmb_service import __version__
 from optipmb_service.cluster.store import StoreError
-from optipmb_service.stream.ports import EdgeError, TransportError
 from optipmb_service.telemetry import logs
 from optipmb_service.telemetry.certificates import Certificates
 from optipmb_service.telemetry.health import BEAT_S, ProcessHealth
@@ -318,7 +318,7 @@ def _monitoring(settings: Settings, health: ProcessHealth) -> Iterator[None]:
     """Answer over HTTP, where that is asked for.
 
     Raises:
-        HttpError: the address cannot be listened on.
+        ClientError: the address cannot be listened on.
     """
     if not settings.http:
         yield
@@ -338,7 +338,7 @@ def grpc_edge(settings: Settings, client: Client, metrics: Metrics) -> Iterator[
     """Serve gRPC beside a process, where that is asked for, and add its metrics.
 
     Raises:
-        EdgeError: it cannot be served.
+        ClientError: it cannot be served.
     """
     if not settings.grpc:
         yield
@@ -346,7 +346,7 @@ def grpc_edge(settings: Settings, client: Client, metrics: Metrics) -> Iterator[
     try:
         from optipmb_service.grpc.server import serving  # noqa: PLC0415 - an extra that only this needs
     except ModuleNotFoundError as error:
-        raise EdgeError(f"gRPC needs {error.name}, which is not installed: {install_command('grpc')}") from error
+        raise ClientError(f"gRPC needs {error.name}, which is not installed: {install_command('grpc')}") from error
     with serving(settings, client) as calls:
         metrics.add(GATEWAY_METRICS, lambda: calls)
         yield
@@ -389,7 +389,7 @@ async def run(
         tasks.append(asyncio.create_task(certificates.watch()))
         with _monitoring(settings, health):
             ended = await serve(asked, health)
-    except (TransportError, EdgeError, StoreError) as error:
+    except (ClientError, StoreError) as error:
         logs.say(f"optipmb-service: {error}")
         return 1
     finally:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_schemas as schemas
 import structlog
+from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_schemas.ros2.arrays import CLOUD
 from optipmb_schemas.ros2.tracks import TOPICS
 from optipmb_schemas.ros2.types import own_types
@@ -26,7 +27,6 @@ from optipmb_service.ros2.bridge import Bridge
 from optipmb_service.ros2.diagnostics import DIAGNOSTICS, diagnostics
 from optipmb_service.ros2.matching import Matching, Wanted
 from optipmb_service.ros2.node import Ros2Node
-from optipmb_service.stream.ports import TransportError
 from optipmb_service.telemetry.health import BEAT_S, STUCK_S, Reporter
 
 if TYPE_CHECKING:

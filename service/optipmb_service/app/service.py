@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_schemas as schemas
 import structlog
+from optipmb_client.errors import ConnectionFailed as TransportError
 
 import optipmb
 from optipmb_service import __version__
@@ -24,7 +25,6 @@ from optipmb_service.cluster.member import Member
 from optipmb_service.stream.intake import Intake
 from optipmb_service.stream.kept_tracks import TrackQuery
 from optipmb_service.stream.persistence import DAY_S, CheckpointWriter
-from optipmb_service.stream.ports import TransportError
 from optipmb_service.stream.problems import problem_of
 from optipmb_service.stream.queries import ServiceQueries, StreamQueries, members_of
 from optipmb_service.stream.scheduler import Scheduler

@@ -42,9 +42,10 @@ from optipmb_service.zenoh.transport import Transport
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
+    from optipmb_client.zenoh.handles import Query
+
     from optipmb_service.app.lifecycle import StopRequest
     from optipmb_service.settings import Settings
-    from optipmb_service.stream.ports import Request
     from optipmb_service.telemetry.health import ProcessHealth
     from optipmb_service.telemetry.metrics import Metrics
 
@@ -335,11 +336,11 @@ class AggregateView(Reporter):
         """Hand over what comes on a stream to a viewer, whichever worker tracks it, until the result is called."""
         return None if self._ending else self._network.tap(stream, receive, self._fusion.seen_by(stream))
 
-    def answer(self, request: Request) -> None:
+    def answer(self, request: Query) -> None:
         """Answer a query about the instance, and finish it whatever happens."""
         guarded(request, lambda: self._answer(request), instance=self._instance)
 
-    def _answer(self, request: Request) -> None:
+    def _answer(self, request: Query) -> None:
         keys = self._keys
         status, metrics = keys.status(self._instance), keys.metrics(self._instance)
         orders = {keys.move(self._instance): self._move, keys.drain(self._instance): self._drain}
@@ -351,14 +352,14 @@ class AggregateView(Reporter):
         if request.matches(metrics):
             request.answer_text(metrics, self._metrics.text(), TEXT)
 
-    def _move(self, request: Request) -> None:
+    def _move(self, request: Query) -> None:
         asked = move_asked(request, self._limits, len(self._names))
         key = self._keys.move(self._names[asked.worker])
         if self._network.ask(key, MOVE_S, request.payload or b"", request.encoding) is None:
             raise schemas.MessageError("invalid_value", "worker", "a worker to which the stream comes", "none in time")
         request.answer(request.key, asked)
 
-    def _drain(self, request: Request) -> None:
+    def _drain(self, request: Query) -> None:
         asked = drain_asked(request, self._limits)
         answers = [one for one in self._ask(self._keys.status) if one is not None] if asked.drain else []
         members = _newest(schemas.decode(answer, schemas.ServiceStatus) for answer in answers)

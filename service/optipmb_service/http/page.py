@@ -19,10 +19,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import optipmb_schemas as schemas
+from optipmb_client.errors import ConnectionFailed as TransportError
 from starlette.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
-
-from optipmb_service.stream.ports import TransportError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Sequence

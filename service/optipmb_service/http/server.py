@@ -16,6 +16,7 @@ import time
 from typing import TYPE_CHECKING, Any, Final
 
 import uvicorn
+from optipmb_client.errors import ClientError
 from starlette.applications import Starlette
 from starlette.datastructures import Headers
 from starlette.responses import JSONResponse, PlainTextResponse, Response
@@ -23,7 +24,6 @@ from starlette.routing import Route
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from optipmb_service.http.page import page
-from optipmb_service.stream.ports import HttpError
 from optipmb_service.telemetry.metrics import CONTENT_TYPE
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ class Server:
         address: `host:port` or `[v6]:port`; port 0 takes any free one.
 
     Raises:
-        HttpError: the address cannot be listened on.
+        ClientError: the address cannot be listened on.
     """
 
     def __init__(self, application: ASGIApp, address: str) -> None:
@@ -138,7 +138,7 @@ class Server:
             family = socket.getaddrinfo(host, int(port), type=socket.SOCK_STREAM)[0][0]
             self._socket = socket.create_server((host, int(port)), family=family, backlog=CONNECTIONS)
         except OSError as error:
-            raise HttpError(f"cannot listen on {address} for HTTP: {error.strerror or error}") from error
+            raise ClientError(f"cannot listen on {address} for HTTP: {error.strerror or error}") from error
         bound = self._socket.getsockname()
         self.address = f"[{bound[0]}]:{bound[1]}" if family == socket.AF_INET6 else f"{bound[0]}:{bound[1]}"
         self._server = uvicorn.Server(

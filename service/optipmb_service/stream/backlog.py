@@ -25,8 +25,8 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import structlog
 
-from optipmb_service.stream.ports import Packet
 from optipmb_service.stream.values import SECOND
+from optipmb_service.zenoh.inputs import Packet
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence

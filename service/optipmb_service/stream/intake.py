@@ -20,7 +20,7 @@ from __future__ import annotations
 import threading
 import time
 from itertools import islice
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Final
 
 import optipmb_schemas as schemas
 import structlog
@@ -28,21 +28,20 @@ import structlog
 from optipmb_service.cluster.leases import PARTITIONS, Change, partition_of
 from optipmb_service.stream.directory import StreamDirectory, node_of
 from optipmb_service.stream.values import SECOND
+from optipmb_service.zenoh.inputs import Input
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from optipmb_service.cluster.member import Member
-    from optipmb_service.stream.ports import Packet
     from optipmb_service.stream.streams import Streams
+    from optipmb_service.zenoh.inputs import Kind, Packet
+    from optipmb_service.zenoh.transport import Transport
 
 log = structlog.get_logger("optipmb_service")
 
 DISCOVERY: Final = 0
 """The partition whose holder is the discoverer."""
-
-ALL: Final = ""
-"""Instead of a stream: all of them."""
 
 EXPIRY_S: Final = 1.0
 NEW_STREAMS: Final = 128
@@ -61,62 +60,12 @@ DRAIN_S: Final = 0.5
 
 DRAIN_POLL_S: Final = 0.005
 
-Kind = Literal["detections", "points", "discovery"]
-
-
-class Input(NamedTuple):
-    """A subscription to a stream, or to all of them; `cached`: lost messages are recovered from a cache."""
-
-    kind: Kind
-    stream: str = ALL
-    cached: bool = True
-
 
 def _inputs(streams: Iterable[str]) -> set[Input]:
     """Return all possible subscriptions to these streams, and those to all streams."""
     kinds: tuple[Kind, Kind] = ("detections", "points")
     of_all = {Input("discovery"), Input("detections"), Input("points")}
     return of_all | {Input(kind, stream, cached) for stream in streams for kind in kinds for cached in (False, True)}
-
-
-class Inputs(Protocol):
-    """Subscriptions, tokens and questions to other members, on the network."""
-
-    def receive(
-        self,
-        on_frame: Callable[[Packet], None],
-        on_cloud: Callable[[Packet], None],
-        noticed: Callable[[str, bool], bool],
-        passed_by: Callable[[str, int], None],
-        answered: Callable[[str], None],
-    ) -> None:
-        """Register the receivers of messages, of discovered keys, of those that are dropped, and of complete caches."""
-
-    def subscribe(self, kind: Kind, stream: str, *, cached: bool) -> None:
-        """Receive a stream, or all of them; what was lost comes from the cache of the publisher where it has one."""
-
-    def unsubscribe(self, inputs: Iterable[tuple[Kind, str, bool]]) -> None:
-        """Receive streams no longer."""
-
-    def watch_streams(
-        self, published: Callable[[str, str, bool], None], discovered: Callable[[str, bool], None]
-    ) -> None:
-        """Report tokens of publishers, and streams that others announce; True: it is there, False: it has gone."""
-
-    def watch_owners(self, on_owner: Callable[[str, str, bool], None] | None) -> None:
-        """Report from now on which instance tracks which stream (False: no longer); None: stop."""
-
-    def discover(self, streams: set[str]) -> None:
-        """Announce these streams, and no others."""
-
-    def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]], bool], None]) -> None:
-        """Call `then` soon with what the caches of a stream hold, all frames, and with whether all have answered."""
-
-    def ask_recent(self, sessions: Sequence[str]) -> list[tuple[Packet, bool]]:
-        """Return what other instances have received lately of sessions, each packet with whether it is a frame."""
-
-    def pass_through(self, then: Callable[[], None]) -> None:
-        """Call `then` when all that has come until now is handed over."""
 
 
 class Intake:
@@ -132,7 +81,7 @@ class Intake:
     """
 
     def __init__(
-        self, streams: Streams, member: Member, inputs: Inputs, *, standby: bool, linger_s: float, idle_s: float
+        self, streams: Streams, member: Member, inputs: Transport, *, standby: bool, linger_s: float, idle_s: float
     ) -> None:
         self._streams = streams
         self._member = member

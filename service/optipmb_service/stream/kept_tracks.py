@@ -11,14 +11,15 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 import optipmb_schemas as schemas
 import structlog
+from optipmb_client.errors import ConnectionFailed as TransportError
 
-from optipmb_service.stream.ports import TransportError
 from optipmb_service.stream.problems import problem_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from optipmb_service.stream.ports import Request
+    from optipmb_client.zenoh.handles import Query
+
     from optipmb_service.stream.recovery import Log
 
 log = structlog.get_logger("optipmb_service")
@@ -147,7 +148,7 @@ class TrackQuery:
         self._pool = ThreadPoolExecutor(1, "tracks")
         self._room = threading.BoundedSemaphore(AT_ONCE)
 
-    def answer(self, request: Request, stream: str) -> None:
+    def answer(self, request: Query, stream: str) -> None:
         """Take a query; it is finished later."""
         try:
             asked = self._asked(request)
@@ -165,7 +166,7 @@ class TrackQuery:
             from_ns = max(0, wanted.from_ns - LATE_NS)
             self._pool.submit(self._guarded, stream, answer, self._logged.tracks, stream, from_ns, wanted.add, answer)
 
-    def _asked(self, request: Request) -> schemas.TracksRequest:
+    def _asked(self, request: Query) -> schemas.TracksRequest:
         """Return what a query asks for, and take the room for its answer."""
         asked, payload = schemas.TracksRequest(), request.payload
         if payload:
@@ -185,7 +186,7 @@ class TrackQuery:
             failed(f"{type(error).__name__}: {error}")
 
     def _answer(
-        self, request: Request, stream: str, asked: schemas.TracksRequest, wanted: TracksRange, failure: str
+        self, request: Query, stream: str, asked: schemas.TracksRequest, wanted: TracksRange, failure: str
     ) -> None:
         """Answer with what the log has, or caches where it knows nothing of the stream."""
         failures = [failure] if failure else []
@@ -223,7 +224,7 @@ class TrackQuery:
         frame = tracks.epoch, tracks.seq, tracks.sensor or "", tracks.stamp_ns
         return _Recent(*frame, order_of(tracks), payload, encoding)
 
-    def _finish(self, request: Request, problem: schemas.Problem | None) -> None:
+    def _finish(self, request: Query, problem: schemas.Problem | None) -> None:
         try:
             if problem is not None:
                 request.refuse(problem)

@@ -13,12 +13,13 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import structlog
+from optipmb_client.errors import ConnectionFailed as TransportError
 
 from optipmb_service.cluster.log_position import Missed, Position
 from optipmb_service.stream.directory import BACK_NS
-from optipmb_service.stream.ports import Packet, TransportError
 from optipmb_service.stream.timeline import number_of
 from optipmb_service.stream.values import MAX_SENSORS
+from optipmb_service.zenoh.inputs import Packet
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence

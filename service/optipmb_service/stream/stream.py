@@ -20,13 +20,13 @@ import structlog
 
 from optipmb_service.stream.checkpoint import CheckpointError, forgotten
 from optipmb_service.stream.persistence import save_dump
-from optipmb_service.stream.ports import Packet
 from optipmb_service.stream.problems import problem_of
 from optipmb_service.stream.recovery import CacheRecovery, LogCheck
 from optipmb_service.stream.session import Session
 from optipmb_service.stream.track_publisher import Arrival, TrackPublisher
 from optipmb_service.stream.values import MAX_SENSORS, Begun, Incarnation, Quarantined, Tracked
 from optipmb_service.telemetry.stream_meter import Counters, MessageCounters, StreamMeter, total
+from optipmb_service.zenoh.inputs import Packet
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -31,13 +31,14 @@ if TYPE_CHECKING:
     from optipmb_service.settings import Settings
     from optipmb_service.stream.intake import Intake
     from optipmb_service.stream.persistence import CheckpointWriter
-    from optipmb_service.stream.ports import Packet, Publisher
     from optipmb_service.stream.profiles import Profiles
     from optipmb_service.stream.recovery import Log
     from optipmb_service.stream.scheduler import Scheduler
     from optipmb_service.stream.values import Incarnation
     from optipmb_service.telemetry.metrics import Metrics
     from optipmb_service.telemetry.problem_reporter import ProblemReporter
+    from optipmb_service.zenoh.inputs import Packet
+    from optipmb_service.zenoh.transport import StreamPublisher
 
 MAX_UNPROVEN: Final = 256
 """Streams at once that have not sent a valid message yet."""
@@ -103,7 +104,7 @@ class Streams:
         settings: Settings,
         profiles: Profiles,
         *,
-        open_publisher: Callable[[str], Publisher],
+        open_publisher: Callable[[str], StreamPublisher],
         reporter: ProblemReporter,
         scheduler: Scheduler,
         member: Member,

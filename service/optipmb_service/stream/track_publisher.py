@@ -9,19 +9,19 @@ import time
 from typing import TYPE_CHECKING, Final
 
 import structlog
+from optipmb_client.errors import ConnectionFailed as TransportError
 
 from optipmb.rows import record
-from optipmb_service.stream.ports import TransportError
 from optipmb_service.stream.values import SECOND
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from optipmb_service.cluster.member import Member
-    from optipmb_service.stream.ports import Publisher
     from optipmb_service.stream.values import Tracked
     from optipmb_service.telemetry.metrics import Metrics
     from optipmb_service.telemetry.stream_meter import StreamMeter
+    from optipmb_service.zenoh.transport import StreamPublisher
 
 log = structlog.get_logger("optipmb_service")
 
@@ -53,7 +53,7 @@ class TrackPublisher:
         self,
         stream: str,
         instance: str,
-        open_publisher: Callable[[str], Publisher],
+        open_publisher: Callable[[str], StreamPublisher],
         meter: StreamMeter,
         metrics: Metrics,
         member: Member,
@@ -64,7 +64,7 @@ class TrackPublisher:
         self._meter = meter
         self._metrics = metrics
         self._member = member
-        self._publisher: Publisher | None = None
+        self._publisher: StreamPublisher | None = None
         self.waiting: list[tuple[bytes, Arrival, int, int]] = []
         """Encoded tracks that wait for the write lease."""
         self._ids = b""

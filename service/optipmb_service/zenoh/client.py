@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Final
 
 import optipmb_schemas as schemas
 import structlog
+from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_client.zenoh.session import Session
 
-from optipmb_service.stream.ports import TransportError
 from optipmb_service.zenoh.connection import opened
 
 if TYPE_CHECKING:

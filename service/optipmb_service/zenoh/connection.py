@@ -11,10 +11,9 @@ import os
 from typing import TYPE_CHECKING, Final
 
 import optipmb_schemas as schemas
+from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_client.zenoh.configuration import BUSY, certificates, configured, loaded
 from optipmb_client.zenoh.session import opened as open_session
-
-from optipmb_service.stream.ports import TransportError
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -9,23 +9,21 @@ from typing import TYPE_CHECKING, Final
 
 import optipmb_schemas as schemas
 import structlog
+from optipmb_client.errors import ConnectionFailed as TransportError
 
-from optipmb_service.stream.ports import Packet, TransportError
-from optipmb_service.stream.queries import problem_with
 from optipmb_service.zenoh.client import Client
-from optipmb_service.zenoh.inputs import ReturnedPublishers, Topic
+from optipmb_service.zenoh.inputs import Packet, ReturnedPublishers, Topic
 from optipmb_service.zenoh.taps import Taps
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
     from collections.abc import Set as AbstractSet
 
-    from optipmb_client.zenoh.handles import Declared, Reading, Sender
+    from optipmb_client.zenoh.handles import Declared, Query, Reading, Sender
     from optipmb_client.zenoh.session import Sample, Session
 
     from optipmb_service.settings import Settings
-    from optipmb_service.stream.intake import Kind
-    from optipmb_service.stream.ports import Request
+    from optipmb_service.zenoh.inputs import Kind
 
 MOST_OPEN: Final = 256
 """Queries of one key expression that may be open; those beyond are refused."""
@@ -254,12 +252,12 @@ class Transport:
         """
         self._returned.look(report)
 
-    def serve(self, about_streams: Callable[[Request], None], about_service: Callable[[Request], None]) -> None:
+    def serve(self, about_streams: Callable[[Query], None], about_service: Callable[[Query], None]) -> None:
         """Hand over the queries about streams and those about this instance, each on a thread of its own."""
         self._serve(f"{self._prefix}/*/*/*/q/*", about_streams)
         self.serve_service(about_service)
 
-    def serve_service(self, about_service: Callable[[Request], None], names: Sequence[str] = ("*",)) -> None:
+    def serve_service(self, about_service: Callable[[Query], None], names: Sequence[str] = ("*",)) -> None:
         """Hand over the queries about this instance alone, those of each name on a thread of its own.
 
         Who asks all instances waits for each that declares the name, so one that takes no such query must not.
@@ -275,9 +273,17 @@ class Transport:
             return None
         return next((answer.payload for answer in answers if answer.ok), None)
 
-    def _serve(self, key: str, answer: Callable[[Request], None]) -> None:
-        full = schemas.MessageError("too_large", "key", f"at most {MOST_OPEN} queries open at once", "another one")
-        refusal = problem_with(full, instance=self._instance, code="refused")
+    def _serve(self, key: str, answer: Callable[[Query], None]) -> None:
+        expected, received = f"at most {MOST_OPEN} queries open at once", "another one"
+        refusal = schemas.Problem(
+            stream="",
+            instance=self._instance,
+            code="refused",
+            path="key",
+            expected=expected,
+            received=received,
+            message=f"Query: key: expected {expected}, received {received}.",
+        )
         self._client.serve(key, answer, most=MOST_OPEN, refusal=refusal)
 
     def tap(self, stream: str, receive: Callable[[str, bytes, str], None], detections: str = "") -> Callable[[], None]:
