@@ -18,7 +18,7 @@ from optipmb_service.app.lifecycle import settle
 from optipmb_service.app.worker import warm_up
 from optipmb_service.settings import Settings
 from optipmb_service.stream import convert
-from optipmb_service.stream.scheduler import Scheduler
+from optipmb_service.stream.streams import Scheduler
 from optipmb_service.stream.timeline import FrameId
 from optipmb_service.zenoh.client import Client
 
@@ -69,16 +69,16 @@ class Frames:
         result = self._tracker.step(self._densities[stream], frame)
         self._densities[stream] = result.density
         tracks = convert.tracks_of(
-            result.tracks,
-            None,
-            stream=stream,
-            frame_id=FrameId(message.epoch, message.seq, message.stamp_ns),
+            result,
+            stream,
+            FrameId(message.epoch, message.seq, message.stamp_ns),
             session="0" * 32,
             revision=0,
-            parameters=self._parameters,
+            profile=self._parameters.name,
             cloud_used=False,
             gap=0,
             ignored=ignored,
+            labels=self._parameters.labels,
         )
         self._publishers[stream].put(tracks.encoded(self._delivery))
         return False

@@ -161,6 +161,9 @@ def measured(objects: int, points: int) -> dict[str, float]:
     streams_type = part_of("Streams", "stream.streams", "runtime.streams")
     stream_type = part_of("Stream", "stream.stream", "runtime.stream")
     session = part_of("Session", "stream.session", "session.session")
+    publishing = (stream_type, "_send")
+    if not hasattr(*publishing):
+        publishing = (part_of("TrackPublisher", "runtime.track_publisher"), "send")
     parts = Parts()
     network: Any = Network()  # in the place of several parts
     nothing: Any = None
@@ -173,7 +176,7 @@ def measured(objects: int, points: int) -> dict[str, float]:
         ("conversion", part_of("convert", "stream", "session"), "cloud_of"),
         ("conversion", part_of("convert", "stream", "session"), "tracks_of"),
         ("step", optipmb.Tracker, "step"),
-        ("publishing", part_of("TrackPublisher", "stream.track_publisher", "runtime.track_publisher"), "send"),
+        ("publishing", *publishing),
         ("metrics", metrics, "received"),
         ("metrics", metrics, "published"),
         ("metrics", metrics, "tracks"),

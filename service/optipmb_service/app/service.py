@@ -27,8 +27,7 @@ from optipmb_service.stream.kept_tracks import TrackQuery
 from optipmb_service.stream.persistence import DAY_S, CheckpointWriter
 from optipmb_service.stream.problems import problem_of
 from optipmb_service.stream.queries import ServiceQueries, StreamQueries, members_of
-from optipmb_service.stream.scheduler import Scheduler
-from optipmb_service.stream.streams import Streams
+from optipmb_service.stream.streams import Scheduler, Streams
 from optipmb_service.stream.values import SECOND
 from optipmb_service.telemetry.health import Reporter
 from optipmb_service.telemetry.metrics import (

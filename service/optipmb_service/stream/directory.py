@@ -203,25 +203,22 @@ class StreamDirectory:
     def admit(self, now_ns: int) -> None:
         """Announce the next streams in place of those that have got a session, or have waited too long for one."""
         with self._lock:
-            self._admit(now_ns)
-
-    def _admit(self, now_ns: int) -> None:
-        for stream, since_ns in tuple(self._unproven.items()):
-            known = self._streams.get(stream)
-            if known is None or not known.announced or self._has_session(stream):
-                del self._unproven[stream]
-            elif now_ns - since_ns > UNPROVEN_NS:
-                del self._unproven[stream]
-                known.announced = False
-                self._settled(known, now_ns)
-                if len(self._queued) < MAX_STREAMS:
-                    self._queued.setdefault(stream, known.seen_ns)
-        while self._queued and len(self._unproven) < MAX_UNPROVEN_ANNOUNCED:
-            stream = next(iter(self._queued))
-            seen_ns = self._queued.pop(stream)
-            if now_ns - seen_ns <= QUEUED_NS and (known := self._found(stream)) is not None and not known.tokens:
-                self._unproven[stream] = now_ns
-                known.announced, known.left_ns, known.seen_ns = True, None, seen_ns
+            for stream, since_ns in tuple(self._unproven.items()):
+                known = self._streams.get(stream)
+                if known is None or not known.announced or self._has_session(stream):
+                    del self._unproven[stream]
+                elif now_ns - since_ns > UNPROVEN_NS:
+                    del self._unproven[stream]
+                    known.announced = False
+                    self._settled(known, now_ns)
+                    if len(self._queued) < MAX_STREAMS:
+                        self._queued.setdefault(stream, known.seen_ns)
+            while self._queued and len(self._unproven) < MAX_UNPROVEN_ANNOUNCED:
+                stream = next(iter(self._queued))
+                seen_ns = self._queued.pop(stream)
+                if now_ns - seen_ns <= QUEUED_NS and (known := self._found(stream)) is not None and not known.tokens:
+                    self._unproven[stream] = now_ns
+                    known.announced, known.left_ns, known.seen_ns = True, None, seen_ns
 
     def _found(self, stream: str) -> _Known | None:
         known = self._streams.get(stream)

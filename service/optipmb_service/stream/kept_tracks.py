@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import optipmb_schemas as schemas
 import structlog
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from optipmb_client.zenoh.handles import Query
 
+    from optipmb_service.cluster.message_log import LogMessage
     from optipmb_service.stream.recovery import Log
 
 log = structlog.get_logger("optipmb_service")
@@ -37,23 +38,18 @@ LATE_NS: Final = 5_000_000_000
 """Longest distance, by stamps, of a correction from the tracks of a frame. Frames are inserted for a second."""
 
 
-class _Published(Protocol):
-    """Tracks as they were published; the higher `order` of a frame holds."""
+class _Recent(NamedTuple):
+    epoch: bytes
+    seq: int
+    sensor: str
+    stamp_ns: int
+    order: tuple[int, int]
+    payload: bytes
+    encoding: str
 
-    @property
-    def epoch(self) -> bytes: ...
-    @property
-    def seq(self) -> int: ...
-    @property
-    def sensor(self) -> str: ...
-    @property
-    def stamp_ns(self) -> int: ...
-    @property
-    def order(self) -> tuple[int, int]: ...
-    @property
-    def payload(self) -> bytes: ...
-    @property
-    def encoding(self) -> str: ...
+
+_Published: TypeAlias = "LogMessage | _Recent"
+"""Tracks as they were published; the higher `order` of a frame holds."""
 
 
 class TracksRange:
@@ -107,16 +103,6 @@ class TracksRange:
                 self._to_ns = one.stamp_ns - 1
                 self._frames = {frame: kept for frame, kept in self._frames.items() if kept.stamp_ns < one.stamp_ns}
                 return
-
-
-class _Recent(NamedTuple):
-    epoch: bytes
-    seq: int
-    sensor: str
-    stamp_ns: int
-    order: tuple[int, int]
-    payload: bytes
-    encoding: str
 
 
 def order_of(tracks: schemas.Tracks) -> tuple[int, int]:
@@ -236,13 +222,5 @@ class TrackQuery:
     def _problem(
         self, code: str, stream: str, path: str, expected: str, received: str, stamp_ns: int | None = None
     ) -> schemas.Problem:
-        return problem_of(
-            code,
-            stream=stream,
-            instance=self._instance,
-            path=path,
-            expected=expected,
-            received=received,
-            message=f"Query: {path or 'tracks'}: expected {expected}, received {received}.",
-            stamp_ns=stamp_ns,
-        )
+        texts = {"path": path, "expected": expected, "received": received, "subject": f"Query: {path or 'tracks'}"}
+        return problem_of(code, stream=stream, instance=self._instance, stamp_ns=stamp_ns, **texts)

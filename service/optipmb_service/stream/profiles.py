@@ -20,8 +20,6 @@ import optipmb
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from optipmb_service.stream.values import Steps
-
 
 @dataclass(frozen=True)
 class Profiles:
@@ -63,7 +61,9 @@ class Profiles:
         """Return a profile by its name, None when there is none."""
         return self.known.get(name)
 
-    def trackers(self, make: Callable[[optipmb.Parameters], optipmb.Tracker]) -> Callable[[optipmb.Parameters], Steps]:
+    def trackers(
+        self, make: Callable[[optipmb.Parameters], optipmb.Tracker]
+    ) -> Callable[[optipmb.Parameters], optipmb.Tracker]:
         """Return what gives all streams of a profile one tracker, for it keeps nothing of them (0.6 ms each)."""
         made = {parameters.name: make(parameters) for parameters in self.known.values()}
 

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from optipmb_service.stream.state import Inputs
     from optipmb_service.stream.timeline import Decision, Timeline
     from optipmb_service.stream.transition import Outcome
-    from optipmb_service.stream.values import Reason, Steps
+    from optipmb_service.stream.values import Reason
 
     Condition = Literal["new", "running", "recovering", "quarantined", "closed"]
 
@@ -88,7 +88,7 @@ class Session:
         fused: bool = False,
         instance: str = "session",
         incarnation: Incarnation | None = None,
-        tracker: Callable[[optipmb.Parameters], Steps] = optipmb.Tracker,
+        tracker: Callable[[optipmb.Parameters], optipmb.Tracker] = optipmb.Tracker,
         clock: Callable[[], int] = time.perf_counter_ns,
     ) -> None:
         incarnation = incarnation or Incarnation()
@@ -303,7 +303,7 @@ class Session:
         *,
         fence: int = 1,
         instance: str = "session",
-        tracker: Callable[[optipmb.Parameters], Steps] = optipmb.Tracker,
+        tracker: Callable[[optipmb.Parameters], optipmb.Tracker] = optipmb.Tracker,
         clock: Callable[[], int] = time.perf_counter_ns,
     ) -> Self:
         """Return the session that a checkpoint was taken of. It is `recovering` for a while.
@@ -838,18 +838,10 @@ class Session:
         self, code: str, frame_id: FrameId, path: str, expected: str, received: str, count: int = 1
     ) -> schemas.Problem:
         """Return a problem of a frame, on the stream of its sensor."""
-        return problem_of(
-            code,
-            stream=frame_id.sensor or self.stream,
-            instance=self._instance,
-            path=path,
-            expected=expected,
-            received=received,
-            message=f"Frame {frame_id.seq}: {path or 'tracker'}: expected {expected}, received {received}.",
-            seq=frame_id.seq,
-            stamp_ns=frame_id.stamp_ns,
-            count=count,
-        )
+        texts = {"path": path, "expected": expected, "received": received}
+        frame = {"seq": frame_id.seq, "stamp_ns": frame_id.stamp_ns, "count": count}
+        stream, subject = frame_id.sensor or self.stream, f"Frame {frame_id.seq}: {path or 'tracker'}"
+        return problem_of(code, stream=stream, instance=self._instance, subject=subject, **texts, **frame)
 
 
 def _seconds(jump_ns: int) -> str:

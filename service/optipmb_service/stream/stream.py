@@ -17,14 +17,14 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import optipmb_schemas as schemas
 import structlog
+from optipmb_client.errors import ConnectionFailed as TransportError
 
 from optipmb_service.stream.checkpoint import CheckpointError, forgotten
 from optipmb_service.stream.persistence import save_dump
 from optipmb_service.stream.problems import problem_of
 from optipmb_service.stream.recovery import CacheRecovery, LogCheck
 from optipmb_service.stream.session import Session
-from optipmb_service.stream.track_publisher import Arrival, TrackPublisher
-from optipmb_service.stream.values import MAX_SENSORS, Begun, Incarnation, Quarantined, Tracked
+from optipmb_service.stream.values import MAX_SENSORS, SECOND, Begun, Incarnation, Quarantined, Tracked
 from optipmb_service.telemetry.stream_meter import Counters, MessageCounters, StreamMeter, total
 from optipmb_service.zenoh.inputs import Packet
 
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from optipmb_service.stream.checkpoint import Checkpoint
     from optipmb_service.stream.streams import Streams
     from optipmb_service.stream.values import Output
+    from optipmb_service.zenoh.transport import StreamPublisher
 
 log = structlog.get_logger("optipmb_service")
 
@@ -47,8 +48,18 @@ TURN_NS: Final = 5_000_000
 REST: Final = 9
 """Rest of a sensor after a message beyond the limit, in times of what it took: it has a tenth of the time at most."""
 
+MILLISECOND: Final = 1e6
+
 CLOUD_REFUSED: Final = {"invalid_value", "refused"}
 """Problems by which a session refuses a cloud: not valid, or of one sensor too many."""
+
+
+class Arrival(NamedTuple):
+    """Times of a frame's arrival, and of its decoding."""
+
+    wall_ns: int
+    now_ns: int
+    decode_ns: int
 
 
 class Stream:
@@ -72,9 +83,11 @@ class Stream:
         self._member = streams.member
         self._prefix = f"{streams.keys.prefix}/"
         self._step_limit_ns = streams.step_limit_ns
-        self._tracks = TrackPublisher(
-            name, streams.instance, streams.open_publisher, self.meter, streams.metrics, streams.member
-        )
+        self._publisher: StreamPublisher | None = None
+        self._unpublished: list[tuple[bytes, Tracked, int]] = []
+        """Encoded tracks that wait for the write lease, each with the time that its frame waited, ns."""
+        self._ids = b""
+        """Ids of the newest tracks, as the bytes of int64."""
         self._caches = CacheRecovery(name, streams)
         self._resting: dict[str, int] = {}
         """Monotonic time until when messages of a sensor are refused that took too long."""
@@ -110,8 +123,8 @@ class Stream:
         if not paused:
             if backlog.answered and (answered := backlog.take_answered()):
                 self._guard(self.on_caches_answered, *answered)
-            if self._tracks.waiting:
-                self._guard(self._tracks.flush)
+            if self._unpublished:
+                self._guard(self._publish)
             self._guard(self._settle)
         turn = backlog.end_turn(close=not self.occupied, urgent=paused)
         if turn is None:
@@ -268,7 +281,7 @@ class Stream:
         session = self.session
         for output in outputs:
             if isinstance(output, Tracked):
-                self._tracks.send(output)
+                self._send(output)
             elif isinstance(output, Begun):
                 epoch = session.state().epoch if session else None
                 log.info(
@@ -286,6 +299,58 @@ class Stream:
             else:
                 self._streams.reporter.report(output, time.monotonic_ns())
 
+    def _open_publisher(self) -> None:
+        try:
+            self._publisher = self._streams.open_publisher(self.name)
+        except TransportError as error:
+            log.warning("publisher_failed", stream=self.name, error=str(error))
+
+    def _send(self, tracked: Tracked) -> None:
+        """Publish the tracks of a frame, now or when the write lease holds again."""
+        ticket: Arrival = tracked.ticket
+        passed_ns = time.monotonic_ns() - ticket.now_ns
+        waited_ns = max(0, passed_ns - ticket.decode_ns - tracked.step_ns)
+        delivery = {
+            "instance": self._streams.instance,
+            "received_ns": ticket.wall_ns,
+            "published_ns": time.time_ns(),
+            "queue_ms": waited_ns / MILLISECOND,
+            "decode_ms": ticket.decode_ns / MILLISECOND,
+            "step_ms": tracked.step_ns / MILLISECOND,
+            "run": tracked.run,
+        }
+        self._count_tracks(tracked.estimates.id.tobytes())
+        self._unpublished.append((tracked.encoded(delivery), tracked, waited_ns))
+        self._publish()
+
+    def _publish(self) -> None:
+        """Publish what waits, if the write lease holds."""
+        if not self._unpublished or not self._member.may_write(self.name, self._fence):
+            return
+        waiting, self._unpublished = self._unpublished, []
+        for payload, tracked, waited_ns in waiting:
+            try:
+                if self._publisher is not None:
+                    self._publisher.publish(payload)
+            except TransportError as error:
+                log.warning("publish_failed", stream=self.name, error=str(error))
+            else:
+                latency_ns = time.monotonic_ns() - tracked.ticket.now_ns
+                self.meter.published(latency_ns)
+                self._streams.metrics.published(
+                    latency_s=latency_ns / SECOND,
+                    queue_s=waited_ns / SECOND,
+                    decode_s=tracked.ticket.decode_ns / SECOND,
+                    step_s=tracked.step_ns / SECOND,
+                )
+
+    def _count_tracks(self, ids: bytes) -> None:
+        """Count the tracks that are new, and those that ended."""
+        if ids != self._ids:
+            after, before = (set(memoryview(one).cast("q")) for one in (ids, self._ids))
+            self._streams.metrics.tracks(started=len(after - before), ended=len(before - after))
+            self._ids = ids
+
     def report(
         self, code: str, path: str, expected: str, received: str, *, what: str = "", count: int = 1, stream: str = ""
     ) -> None:
@@ -300,17 +365,9 @@ class Stream:
             count: number of messages that it concerns.
             stream: the one it is reported on; that of the session.
         """
-        message = f"{what or 'Stream'}: {path or 'message'}: expected {expected}, received {received}."
-        problem = problem_of(
-            code,
-            stream=stream or self.name,
-            instance=self._streams.instance,
-            path=path,
-            expected=expected,
-            received=received,
-            message=message,
-            count=count,
-        )
+        texts = {"path": path, "expected": expected, "received": received}
+        about = {"stream": stream or self.name, "subject": f"{what or 'Stream'}: {path or 'message'}"}
+        problem = problem_of(code, instance=self._streams.instance, count=count, **about, **texts)
         self._streams.reporter.report(problem, time.monotonic_ns())
 
     def _report_overload(self, stream: str, received: str) -> None:
@@ -426,7 +483,7 @@ class Stream:
         closed = restored is None or not restored.counters.frames
         if holds and not (closed and self._restore_only):
             self._fence = fence
-            self._tracks.open(fence)
+            self._open_publisher()
             session = self._restored(restored) if restored else self._new(incarnation, fence)
             self._counts.open(session)
             self._changed, self.session = False, session
@@ -495,7 +552,6 @@ class Stream:
     def on_renewed(self) -> None:
         """Go on under another fence: the store has lost the lease, and all checkpoints with it."""
         self._fence = self._member.fence(self.name)
-        self._tracks.renew(self._fence)
         self._changed = True
 
     def on_recalled(self) -> None:
@@ -524,7 +580,7 @@ class Stream:
             self._hand_over(session)
         else:
             self.deliver(session.flush())
-        self._tracks.flush()  # what waited for the write lease is in the state that is kept
+        self._publish()  # what waited for the write lease is in the state that is kept
         state = session.snapshot()
         if reason == "query":
             session.reset()
@@ -571,7 +627,11 @@ class Stream:
             return
         self.session, self._armed_ns = None, None
         self._caches.forget()
-        self._tracks.close()
+        self._unpublished.clear()  # another owner publishes it
+        self._count_tracks(b"")
+        if self._publisher is not None:
+            self._publisher.release()
+            self._publisher = None
         self._counts.close()
         self._streams.admission.release(self.name, session.incarnation)
         log.info(

@@ -6,6 +6,7 @@ guards the table of backlogs; nothing slow is done under it.
 
 from __future__ import annotations
 
+import queue
 import threading
 import time
 from functools import lru_cache, partial
@@ -13,6 +14,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import optipmb_schemas as schemas
+import structlog
 
 import optipmb
 from optipmb_service.cluster.leases import Change, partition_of
@@ -33,12 +35,13 @@ if TYPE_CHECKING:
     from optipmb_service.stream.persistence import CheckpointWriter
     from optipmb_service.stream.profiles import Profiles
     from optipmb_service.stream.recovery import Log
-    from optipmb_service.stream.scheduler import Scheduler
     from optipmb_service.stream.values import Incarnation
     from optipmb_service.telemetry.metrics import Metrics
     from optipmb_service.telemetry.problem_reporter import ProblemReporter
     from optipmb_service.zenoh.inputs import Packet
     from optipmb_service.zenoh.transport import StreamPublisher
+
+log = structlog.get_logger("optipmb_service")
 
 MAX_UNPROVEN: Final = 256
 """Streams at once that have not sent a valid message yet."""
@@ -554,16 +557,8 @@ class Streams:
         self._report(code, stream, expected, received)
 
     def _report(self, code: str, stream: str, expected: str, received: str, count: int = 1) -> None:
-        problem = problem_of(
-            code,
-            stream=stream,
-            instance=self.instance,
-            path="key",
-            expected=expected,
-            received=received,
-            message=f"Key: expected {expected}, received {received}.",
-            count=count,
-        )
+        texts = {"path": "key", "expected": expected, "received": received}
+        problem = problem_of(code, stream=stream, instance=self.instance, subject="Key", count=count, **texts)
         self.reporter.report(problem, time.monotonic_ns())
 
     # The table
@@ -594,6 +589,46 @@ class Streams:
             known = self._streams.get
             self._unproven = {one for one in self._unproven if not one.occupied and known(one.name) is one}
         return len(self._unproven) >= most
+
+
+class Scheduler:
+    """A thread that does the work that was submitted, first come first served.
+
+    One is enough: most of a frame is under the interpreter's lock. It is a daemon: a step that does not end must not
+    keep the process.
+    """
+
+    def __init__(self) -> None:
+        self._queue: queue.SimpleQueue[Callable[[], bool] | None] = queue.SimpleQueue()
+        self._began_ns: int | None = None
+        self._thread = threading.Thread(target=self._run, name="tracking", daemon=True)
+        self._thread.start()
+
+    def submit(self, work: Callable[[], bool]) -> None:
+        """Have the thread call `work`, which does a bounded piece and returns whether there is more."""
+        self._queue.put(work)
+
+    @property
+    def busy_s(self) -> float:
+        """Seconds that the present piece of work has taken; 0 while the thread waits."""
+        began_ns = self._began_ns
+        return 0.0 if began_ns is None else (time.monotonic_ns() - began_ns) / 1e9
+
+    def close(self, timeout: float) -> bool:
+        """End the thread after what was submitted; False when it did not end in time (s)."""
+        self._queue.put(None)
+        self._thread.join(timeout)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        while (work := self._queue.get()) is not None:
+            self._began_ns = time.monotonic_ns()
+            try:
+                if work():
+                    self._queue.put(work)
+            except Exception:
+                log.exception("internal_error", thread="tracking")  # one stream must not end the thread of all
+            self._began_ns = None
 
 
 class Rivals:

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from optipmb_service.stream.state import Inputs, Position, ProcessedFrame
-    from optipmb_service.stream.values import Policy, Reason, Steps, Tracked
+    from optipmb_service.stream.values import Policy, Reason, Tracked
 
 GIVE_UP_NS: Final = SECOND
 """Sensor time after which a density that makes every frame too much is given up."""
@@ -78,7 +78,7 @@ class Transition:
         policy: where a sensor can be.
     """
 
-    def __init__(self, stream: str, parameters: optipmb.Parameters, tracker: Steps, policy: Policy) -> None:
+    def __init__(self, stream: str, parameters: optipmb.Parameters, tracker: optipmb.Tracker, policy: Policy) -> None:
         self.stream = stream
         self.parameters = parameters
         self._tracker = tracker
@@ -256,17 +256,16 @@ class Transition:
         highest = sensor.tracked[1] if sensor.tracked is not None and same else frame_id.seq - 1
         gap = max(0, frame_id.seq - highest - 1)
         tracks = convert.tracks_of(
-            result.tracks,
-            result.paths,
-            result.class_probability,
-            stream=self.stream,
-            frame_id=frame_id,
+            result,
+            self.stream,
+            frame_id,
             session=before.session,
             revision=frame.revision,
-            parameters=self.parameters,
+            profile=self.parameters.name,
             cloud_used=used,
             gap=gap,
             ignored=ignored,
+            labels=self.parameters.labels,
         )
         unknown = self._unknown(message, sensor.reported) if ignored else {}
         repaired = int(result.diagnostics.repaired)

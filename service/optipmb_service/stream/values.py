@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, Literal, NamedTuple, Protocol
+from typing import Annotated, Any, Final, Literal, NamedTuple
 
 import numpy as np
 import optipmb_schemas as schemas
@@ -57,13 +57,6 @@ MAX_ERROR: Final = 400
 
 MAX_LABELS: Final = 256
 """Unknown class names remembered as reported."""
-
-
-class Steps(Protocol):
-    """Tracker of a session; `optipmb.Tracker` is one."""
-
-    def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
-        """Return the density after the frame, and its tracks."""
 
 
 @dataclass(frozen=True, slots=True)
