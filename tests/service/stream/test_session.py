@@ -344,11 +344,11 @@ def test_unknown_classes_are_left_out_and_told_once() -> None:
 def test_a_score_filter_that_removes_most_of_a_class_is_reported_once() -> None:
     """The class whose scores lie below the filter of the profile is reported with its share, and no other class."""
     one, scores = session(), np.array([0.001, 0.9, 0.001])
-    outputs = feed(one, range(300), labels=("car", "pedestrian"), label=np.array([0, 1, 0]), score=scores)
+    outputs = feed(one, range(600), labels=("car", "pedestrian"), label=np.array([0, 1, 0]), score=scores)
     (problem,) = [one for one in problems(outputs) if one.code == "score_filter"]
     assert problem.path == "car.score"
-    assert problem.received == "200 of 200 below 0.246"
-    assert not problems(feed(session(), range(300), score=np.full(3, 0.9)))
+    assert problem.received == "100 of 100 below 0.246"
+    assert not problems(feed(session(), range(500), score=np.full(3, 0.9)))
 
 
 def test_an_estimated_motion_of_the_sensor_is_reported_once() -> None:
