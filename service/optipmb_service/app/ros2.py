@@ -26,7 +26,7 @@ from optipmb_service.ros2.bridge import Bridge
 from optipmb_service.ros2.diagnostics import DIAGNOSTICS, diagnostics
 from optipmb_service.ros2.matching import Matching, Wanted
 from optipmb_service.ros2.node import Ros2Node
-from optipmb_service.runtime.ports import TransportError
+from optipmb_service.stream.ports import TransportError
 from optipmb_service.telemetry.health import BEAT_S, STUCK_S, Reporter
 
 if TYPE_CHECKING:
