@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optipmb_schemas.errors import invalid
-from optipmb_schemas.ros2.definitions import CLASS_NAMES, OBJECTS
+from optipmb_schemas.ros2.tracks import CLASS_NAMES, DETECTION_ARRAY
+from optipmb_schemas.ros2.types import AUTOWARE
 
 __all__ = ["CLOUD", "DETECTIONS", "Boxes", "boxes_of", "frame_of", "points_of", "stamp_of"]
 
 CLOUD: Final = "sensor_msgs/msg/PointCloud2"
-_ARRAY: Final = "vision_msgs/msg/Detection3DArray"
-DETECTIONS: Final = (_ARRAY, *OBJECTS)
+DETECTIONS: Final = (DETECTION_ARRAY, *(f"{package}/DetectedObjects" for package in AUTOWARE))
 """Types of messages that hold detections."""
 
 _FLOATS: Final = {7: "f4", 8: "f8"}
