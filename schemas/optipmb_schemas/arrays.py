@@ -8,6 +8,7 @@ number type of the description, row by row and read-only: a numpy array (`numeri
 A letter is a symbolic dimension: equal letters are equal numbers within one message (`Message` compares them).
 """
 
+import sys
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
@@ -21,6 +22,8 @@ from pydantic_core import CoreSchema, core_schema
 
 from optipmb_schemas.errors import MessageError, cut, invalid, shape_text
 
+if sys.byteorder != "little":
+    raise ImportError("the messages need a little-endian machine")
 try:
     from optipmb_schemas import numeric
 except ModuleNotFoundError as error:

@@ -52,11 +52,6 @@ class Limits:
         """Whether a valid message with columns of binary numbers can be above no limit but those of its arrays."""
         return all(getattr(self, name) >= most for name, most in _COLUMNS.items())
 
-    @cached_property
-    def allows_default_rows(self) -> bool:
-        """Whether no limit of an array dimension is below the default."""
-        return all(getattr(self, name) >= getattr(DEFAULT, name) for name in _DIMENSIONS.values())
-
     def described(self) -> list[tuple[str, int, str]]:
         """Return name, value and meaning of every limit, for people."""
         return [(f.name, getattr(self, f.name), f.metadata["meaning"]) for f in fields(self)]

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import AfterValidator, Field
 
 from optipmb_schemas.arrays import Array, Integers, Numeric, Reals, Singles, first_descent, numeric, unit_quaternion
-from optipmb_schemas.errors import MessageError, invalid, shape_text, show
+from optipmb_schemas.errors import MessageError, invalid, shape_text
 from optipmb_schemas.model import (
     Count,
     Epoch,
@@ -354,8 +354,9 @@ class Density(Message):
 
 
 def _check_labels(label: Integers, labels: tuple[str, ...]) -> None:
-    if len(label) and (most := label[at := numeric.largest(label)]) >= len(labels):
-        raise MessageError("invalid_value", f"label[{at}]", f"an index into the {len(labels)} labels", show(int(most)))
+    values = label.tolist()
+    if values and (most := max(values)) >= len(labels):
+        raise invalid(f"label[{values.index(most)}]", f"an index into the {len(labels)} labels", most)
 
 
 def _check_covariances(covariance: Reals) -> None:

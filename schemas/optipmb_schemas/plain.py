@@ -4,7 +4,6 @@ import array
 import math
 import operator
 import struct
-import sys
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, Final
 
@@ -15,9 +14,6 @@ if TYPE_CHECKING:
 
 WHOLE: Final = (int,)
 REAL: Final = (int, float)
-
-if sys.byteorder != "little":
-    raise ImportError("on a big-endian machine the messages need numpy: pip install numpy")
 
 _CODES: Final = dict(zip(("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8"), "fdbhiqBHIQ", strict=True))
 """Number types of the wire, by the letters of `array` and `struct`."""
@@ -135,19 +131,9 @@ def of_bytes(data: bytes | memoryview, dtype: str, shape: list[int]) -> Numbers:
     return Numbers(_flat(data, _CODES[dtype]), tuple(shape))
 
 
-def bytes_of(numbers: Numbers) -> bytes:
-    """Return the bytes of an array, little-endian, row by row."""
-    return numbers.tobytes()
-
-
 def memory_of(numbers: Numbers) -> memoryview:
-    """Return the bytes of numbers."""
-    return memoryview(numbers.tobytes())
-
-
-def joined(parts: list[Any]) -> bytes:
-    """Return bytes and those of arrays, one behind the other."""
-    return b"".join([one if type(one) is bytes else one.tobytes() for one in parts])
+    """Return the numbers of an array in memory, row by row."""
+    return numbers.flat
 
 
 def canonical(numbers: Numbers, description: "Array") -> Numbers:
@@ -183,11 +169,6 @@ def first_outside(numbers: Numbers, description: "Array") -> int | None:
         width = numbers.shape[-1]
         outside = [at for at in outside if not all(map(math.isnan, flat[at - at % width :][:width]))]
     return outside[0] if outside else None
-
-
-def largest(numbers: Numbers) -> int:
-    """Return which number of a non-empty array (N,) is the first of the largest."""
-    return max(range(len(numbers)), key=numbers.flat.__getitem__)
 
 
 def finite(points: Any) -> Any:
