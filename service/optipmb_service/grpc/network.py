@@ -10,7 +10,7 @@ import asyncio
 import collections
 import contextlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Final
 
 import optipmb_schemas as schemas
 from optipmb_schemas.protobuf import convert
@@ -18,9 +18,10 @@ from optipmb_schemas.protobuf import tracking_pb2 as pb
 
 from optipmb_service.grpc.calls import varint
 from optipmb_service.grpc.selection import EVERYTHING
+from optipmb_service.zenoh.client import IdlePool
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Hashable, Iterable
+    from collections.abc import AsyncIterator, Callable, Iterable
 
     from optipmb_client.incoming import Answer, Arrival
     from optipmb_client.zenoh.handles import Reading
@@ -29,12 +30,9 @@ if TYPE_CHECKING:
     from optipmb_service.grpc.selection import Selection
     from optipmb_service.zenoh.client import Client, Outgoing
 
-IDLE_S: Final = 60.0
-"""Time after which a subscription or publisher that no call has taken is closed."""
-
 IDLE_SUBSCRIPTIONS: Final = 256
 IDLE_PUBLISHERS: Final = 64
-"""How many are kept; a publisher is kept with what it caches."""
+"""How many are kept without a call; a publisher is kept with what it caches."""
 
 HISTORY_S: Final = 2.0
 """Longest wait for the caches of the services."""
@@ -47,14 +45,6 @@ _TRACKS: Final = b"\x0a"
 
 PublisherKey = tuple[str, int, int]
 """Stream, cached detections, cached clouds."""
-
-
-class _Closable(Protocol):
-    def close(self) -> None:
-        """Release it."""
-
-
-R = TypeVar("R", bound=_Closable)
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,40 +122,6 @@ def _publication(tracks: EncodedTracks) -> tuple[object, ...]:
     return tracks.stream, tracks.sensor, tracks.epoch, tracks.seq, tracks.run, tracks.revision
 
 
-class _IdlePool(Generic[R]):
-    """Idle resources by key, each closed after `IDLE_S`; beyond `most` the oldest is closed."""
-
-    def __init__(self, most: int) -> None:
-        self._loop = asyncio.get_running_loop()
-        self._most = most
-        self._idle: collections.OrderedDict[Hashable, tuple[asyncio.TimerHandle, R]] = collections.OrderedDict()
-
-    def keep(self, key: Hashable, resource: R) -> bool:
-        """Add a resource; False when there is one of this key."""
-        if key in self._idle:
-            return False
-        self._idle[key] = self._loop.call_later(IDLE_S, self._end, key), resource
-        if len(self._idle) > self._most:
-            self._end(next(iter(self._idle)))
-        return True
-
-    def take(self, key: Hashable) -> R | None:
-        """Remove and return the resource of a key, None when there is none."""
-        timer, resource = self._idle.pop(key, (None, None))
-        if timer is not None:
-            timer.cancel()
-        return resource
-
-    def close(self) -> None:
-        """Close all resources."""
-        for key in list(self._idle):
-            self._end(key)
-
-    def _end(self, key: Hashable) -> None:
-        if (resource := self.take(key)) is not None:
-            self._loop.run_in_executor(None, resource.close)
-
-
 class _Feed:
     """A subscription and its listeners."""
 
@@ -192,13 +148,13 @@ class Network:
         self._loop = asyncio.get_running_loop()
         self._invalid = invalid
         self._feeds: dict[str, _Feed] = {}
-        self._idle_feeds: _IdlePool[_Feed] = _IdlePool(IDLE_SUBSCRIPTIONS)
-        self._idle_publishers: _IdlePool[Outgoing] = _IdlePool(IDLE_PUBLISHERS)
+        self._idle_feeds: IdlePool[_Feed] = IdlePool(IDLE_SUBSCRIPTIONS)
+        self._idle_publishers: IdlePool[Outgoing] = IdlePool(IDLE_PUBLISHERS)
         self._arrived: collections.deque[tuple[Listener, Item]] = collections.deque()
         self._waking = False
 
     def close(self) -> None:
-        """Withdraw what no call has any more."""
+        """Withdraw what no call has any more; may wait."""
         self._idle_feeds.close()
         self._idle_publishers.close()
 

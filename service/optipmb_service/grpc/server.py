@@ -145,7 +145,7 @@ class Server:
         for call in tuple(self._calls):
             call.end()
         await self._server.stop(GRACE_S)
-        self.network.close()
+        await asyncio.to_thread(self.network.close)
 
     def refused(self, problem: schemas.Problem) -> None:
         """Count and report the problem of a message that is not valid."""
