@@ -133,9 +133,7 @@ def move_stream(connection: Connection, instance: str, stream: str, worker: int,
         ServiceUnavailable: No such instance.
         ServiceRefused: It has no such worker, or the move was not done in time.
     """
-    request = MoveRequest(stream=stream, worker=worker)
-    if _ask(connection, Keys(prefix).move(instance), MoveRequest, request, timeout=MOVE_S) is None:
-        raise ServiceUnavailable(f"no service {instance} answers")
+    _order(connection, Keys(prefix).move(instance), MoveRequest(stream=stream, worker=worker), instance)
 
 
 def drain_service(connection: Connection, member: str, *, drains: bool = True, prefix: str = PREFIX) -> None:
@@ -145,9 +143,12 @@ def drain_service(connection: Connection, member: str, *, drains: bool = True, p
         ServiceUnavailable: No such service.
         ServiceRefused: There is no other one, or it did not take all streams in time.
     """
-    request = DrainRequest(drain=drains)
-    if _ask(connection, Keys(prefix).drain(member), DrainRequest, request, timeout=MOVE_S) is None:
-        raise ServiceUnavailable(f"no service {member} answers")
+    _order(connection, Keys(prefix).drain(member), DrainRequest(drain=drains), member)
+
+
+def _order(connection: Connection, key: str, request: Message, instance: str) -> None:
+    if _ask(connection, key, type(request), request, timeout=MOVE_S) is None:
+        raise ServiceUnavailable(f"no service {instance} answers")
 
 
 def find_services(connection: Connection, *, prefix: str = PREFIX, patience_s: float = 1.0) -> list[ServiceStatus]:
