@@ -1,6 +1,6 @@
 """Messages to bytes and back: pure and deterministic, so equal messages give equal bytes.
 
-Decoding is total and bounded: it returns a message or raises `MessageError`, whatever the bytes are, and sizes, counts
+Decoding is total and bounded: for any bytes it returns a message or raises `MessageError`, and sizes, counts
 and nesting are checked before memory is taken for them. A msgpack header of five bytes can declare four thousand
 million items, and a byte per level can nest lists as deep as the payload is long. So the bytes are walked once, without
 building anything, before the models read them.
@@ -108,7 +108,7 @@ def decode(payload: bytes, expected: type[T], *, encoding: str = "", limits: Lim
         payload: msgpack or JSON. Large arrays of the message are views of it.
         expected: the type of message that belongs on the key.
         encoding: the Zenoh encoding of the sample. Where it does not say, the first byte tells msgpack from JSON.
-        limits: what is accepted at most.
+        limits: of messages.
 
     Raises:
         MessageError: whenever the payload is not a valid message of this type within the limits.
@@ -130,7 +130,7 @@ def build(fields: dict[str, Any], expected: type[T], limits: Limits) -> T:
     """Return the message of fields as they were received, arrays as blocks or nested lists.
 
     Raises:
-        MessageError: whenever they are not those of a valid message of this type within the limits.
+        MessageError: they do not make a valid message of this type within the limits.
     """
     labels = fields.get("labels")
     if isinstance(labels, list) and len(labels) > limits.max_labels:
@@ -394,7 +394,7 @@ _PLAIN: Final = frozenset({str, bytes, int, float, bool})  # what msgpack takes 
 
 
 def _scalar(value: Any) -> Any:
-    """Return a number or text of a subclass, such as numpy's float64, as what it is."""
+    """Return a number or text of a subclass, such as numpy's float64, as its base type."""
     kinds: tuple[Any, ...] = (float, str, bytes, int)
     for kind in kinds:
         if isinstance(value, kind):
@@ -409,8 +409,8 @@ def encode(message: Message, **others: Any) -> bytes:
     """Return the message as msgpack, arrays as blocks. Fields that are None are left out.
 
     Args:
-        message: what is encoded.
-        others: values that are known to be valid, in place of those of the message.
+        message: the message.
+        others: values that are known to be valid; they replace fields of the message.
     """
     return b"".join(_parts(type(message), message.__dict__ | others if others else message.__dict__))
 
@@ -459,7 +459,7 @@ def encode_columns(
 
     Args:
         kind: type of the message.
-        header: the fields before the arrays, without those that are None.
+        header: the fields before the arrays, but for None.
         names: of the array fields in their order; they have numbers of 8 bytes, and no length but N may vary.
         columns: of float64, the numbers of all arrays as their bytes.
         others: the fields behind the arrays, likewise; a message in one as its fields.
@@ -656,7 +656,7 @@ def _checker_of(kind: type[Message]) -> Callable[[dict[str, Any]], dict[str, Any
 
 @lru_cache(512)
 def _checked_scalars(kind: type[Message], *values: Any) -> tuple[dict[str, Any], frozenset[str]]:
-    """Return the scalars with the defaults of all fields, and the names of those that are there."""
+    """Return the scalars with the defaults of all fields, and the names of the given ones."""
     given = {name: value for name, value in zip(_scalars_of(kind), values, strict=True) if value is not UNSET}
     _need(None not in given.values())
     return kind.optional | _checker_of(kind)(given), frozenset((*given, *_numbers_of(kind)))

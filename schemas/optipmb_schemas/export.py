@@ -5,7 +5,7 @@ documentation page are brought up to date as well. With `--check` nothing is wri
 gets one line, and the exit status is 1.
 
 A page marks where a table belongs with the comment `<!-- table: NAME -->` and its end with `<!-- end -->`; what lies
-between is replaced. Names are those of the message types, `limits` and `codes`.
+between is replaced. Names are message types, `limits` and `codes`.
 """
 
 import argparse

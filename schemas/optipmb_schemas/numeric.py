@@ -1,6 +1,6 @@
 """Fields of numbers as numpy arrays. `plain` has the same names for programs without numpy; `arrays` chooses.
 
-Whatever a field is given, what it holds is a numpy array of the number type of its description, in native byte order,
+A field always holds a numpy array of the number type of its description, in native byte order,
 C-contiguous, aligned and read-only, so compiled code that is specialised on array types sees one type. An array that is
 all this already is held as a view, without a copy.
 """
@@ -26,7 +26,7 @@ _DTYPES: Final = {name: np.dtype("<" + name) for name in ("f4", "f8", "i1", "i2"
 
 
 def asarray(value: Any) -> Any:
-    """Return what is no list as an array, as far as it is one."""
+    """Return a value that is no list as an array, as far as it is one."""
     return np.asarray(value)
 
 
@@ -98,7 +98,7 @@ def first_outside(array: NDArray[Any], description: "Array") -> int | None:
 
 
 def finite(points: Any) -> Any:
-    """Return x, y, z of the points whose coordinates are finite; what is no cloud as it is."""
+    """Return x, y, z of the points whose coordinates are finite; other values as they are."""
     if not isinstance(points, np.ndarray) or points.ndim != 2 or points.dtype.kind != "f":  # noqa: PLR2004  a table: rows and columns
         return points
     xyz = np.ascontiguousarray(points[:, :3])

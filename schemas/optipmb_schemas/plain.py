@@ -25,7 +25,7 @@ _BUFFERS: Final = frozenset("bBhHiIlLqQ") | _FLOATS
 class Numbers:
     """Numbers in rows, read-only: what a field holds where numpy is not installed.
 
-    `len`, loops, `[i]`, `shape`, `tolist` and `tobytes` do what those of a numpy array do; a row of a table is again of
+    `len`, loops, `[i]`, `shape`, `tolist` and `tobytes` work as on a numpy array; a row of a table is again of
     this type. Further operations need numpy: `pip install numpy`.
 
     Args:
@@ -114,7 +114,7 @@ def _rebuilt(data: bytes, code: str, shape: tuple[int, ...]) -> Numbers:
 
 
 def _flat(data: bytes | memoryview, code: str) -> memoryview:
-    if not data:  # what is empty cannot be cast
+    if not data:  # an empty buffer cannot be cast
         return memoryview(array.array(code))
     as_bytes: Any = memoryview(data).cast("B")
     flat: memoryview = as_bytes.cast(code)
@@ -172,7 +172,7 @@ def first_outside(numbers: Numbers, description: "Array") -> int | None:
 
 
 def finite(points: Any) -> Any:
-    """Return x, y, z of the points whose coordinates are finite; what is no cloud as it is."""
+    """Return x, y, z of the points whose coordinates are finite; other values as they are."""
     if not (isinstance(points, Numbers) and len(points.shape) == 2 and points.flat.format in _FLOATS):  # noqa: PLR2004  a table: rows and columns
         return points
     xyz = _columns(points, 3)

@@ -29,10 +29,10 @@ _Numbered = tuple[int, bytes]
 
 
 class Publishing(ResumedCall):
-    """The detections and clouds of one stream in a `Publish` call, opened anew at the next gateway when it fails.
+    """The detections and clouds of one stream in a `Publish` call, opened again at the next gateway when it fails.
 
-    The newest messages are kept and sent again then: nobody knows which of them the old gateway had passed on, and
-    whoever has them already drops them.
+    The newest messages are kept and sent again then, as the old gateway may not have passed them on. Receivers drop
+    repetitions.
 
     Args:
         channels: to gateways.
@@ -64,7 +64,7 @@ class Publishing(ResumedCall):
         self._open(f"stream {stream}", timeout)
 
     def put(self, topic: str, payload: bytes) -> None:
-        """Send a message; waits for nobody.
+        """Send a message without waiting.
 
         Raises:
             ConnectionFailed: after the end.
@@ -104,7 +104,7 @@ class Publishing(ResumedCall):
             self._changed.notify_all()
 
     def _requests(self) -> Iterator[bytes]:
-        """Iterate over the options, what is kept, and what comes, until the next call; run by a thread of gRPC."""
+        """Yield the options, kept messages and new ones, until the next call; run by a thread of gRPC."""
         with self._changed:
             self._calls += 1
             call = self._calls
@@ -153,7 +153,7 @@ class _Waiting:
             self.popleft()
 
     def prepend(self, messages: Sequence[_Numbered]) -> None:
-        """Add what was given to a call that failed."""
+        """Add the messages of a call that failed."""
         self._messages.extendleft(reversed(messages))
         self._bytes += sum(len(payload) for _, payload in messages)
 
@@ -187,7 +187,7 @@ class GrpcSender:
         self._publishing.put(self._topic, payload)
 
     def close(self) -> None:
-        """Withdraw; what was sent before goes out."""
+        """Withdraw; earlier messages still go out."""
         if not self._closed:
             self._closed = True
             self._publishing.release()
@@ -213,12 +213,12 @@ class _ProtoArrival(Arrival):
 
 
 class GrpcSubscription(ResumedCall):
-    """A `Subscribe` call, made anew when it ends; what the services keep comes first each time.
+    """A `Subscribe` call, made again when it ends; kept tracks come first each time.
 
     Args:
         channels: to gateways.
         pattern: of streams.
-        inbox: for what comes.
+        inbox: for the messages.
         keys: of the network, for the names of arrivals.
         problems: whether problems come too.
         timeout: seconds to wait until it is in force.
@@ -239,7 +239,7 @@ class GrpcSubscription(ResumedCall):
         self._open("subscription", timeout)
 
     def close(self) -> None:
-        """End it; what is in the inbox stays readable."""
+        """End it; the inbox stays readable."""
         self._end()
 
     def _requests(self) -> Iterator[bytes]:

@@ -3,8 +3,8 @@
 `from_proto` builds what `decode` builds of msgpack and checks it in the same way, so that both forms have the same
 limits and the same errors. It is total: it returns a model or raises `MessageError`.
 
-`transcode` takes tracks from msgpack to protobuf without a model between them: a service has checked what it has
-published. What is checked is what can be known without looking at the values: the structure, the types, and that each
+`transcode` takes tracks from msgpack to protobuf without a model between them: a service has checked the
+tracks that it publishes. The checks here do not look at values: the structure, the types, and that each
 column has the rows of the others and the bytes of its shape. A receiver that wants more has `from_proto`.
 """
 
@@ -184,7 +184,7 @@ def transcode(payload: bytes, *, encoding: str = "", limits: Limits = DEFAULT) -
     Args:
         payload: msgpack or JSON.
         encoding: the Zenoh encoding of the sample.
-        limits: what is accepted at most.
+        limits: of messages.
 
     Raises:
         MessageError: they are no tracks within the limits.
@@ -193,7 +193,7 @@ def transcode(payload: bytes, *, encoding: str = "", limits: Limits = DEFAULT) -
         try:
             tracks = _tracks(DECODERS[Tracks](payload), limits)
         except REFUSED:
-            tracks = None  # decoding says what is wrong, if anything is
+            tracks = None  # decoding names the fault, if any
         if tracks is not None:
             return tracks
     return EncodedTracks.of(to_proto(decode(payload, Tracks, encoding=encoding, limits=limits)))

@@ -29,7 +29,7 @@ _NORM: Final = 1e-2
 """How far the norm of a quaternion may be from one: some detectors write 32-bit numbers."""
 _SECOND: Final = 10**9
 _UNKNOWN: Final = (0.0,) * 36
-"""The covariance of a pose that nobody knows, row by row."""
+"""The covariance of an unknown pose, row by row."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ def _of_vision(number: int, detection: Any) -> _Row:
 
 
 def _hypothesis(result: Any) -> Any:
-    """Return what has class and score: versions before 4 of vision_msgs have no hypothesis around them."""
+    """Return the object with class and score; versions before 4 of vision_msgs have no hypothesis around them."""
     return getattr(result, "hypothesis", result)
 
 

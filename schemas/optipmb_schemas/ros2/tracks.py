@@ -11,7 +11,7 @@ All in the world frame, under the name that the caller gives it. What the messag
   are a digest of the stream's name.
 - the class with probability 1; where tracks have probabilities of classes, those above 0, the most probable first.
 - in `Detection3DArray`: the id as text, the score, the class by name.
-- markers: boxes, the way of the next second as arrows, class, id and existence. The first marker clears those of
+- markers: boxes, the way of the next second as arrows, class, id and existence. The first marker clears
   earlier frames.
 """
 

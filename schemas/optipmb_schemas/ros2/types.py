@@ -1,7 +1,7 @@
 """Message types of ROS 2: definitions, CDR bytes to messages and back, hashes of types.
 
 A message is an object with the fields of its type; arrays of numbers are numpy arrays. The library is rosbags: pure
-Python, maintained, Apache-2.0, and it needs no ROS. It has most of ROS 2's types; those that it lacks are defined here.
+Python, maintained, Apache-2.0, and it needs no ROS. It has most of ROS 2's types; missing ones are defined here.
 """
 
 import functools
@@ -135,7 +135,7 @@ _ZEROS: Final = {"string": "", "bool": False}
 
 
 class Types:
-    """Types that can be read and written: those of rosbags, and those defined here.
+    """Types that can be read and written: of rosbags, and defined here.
 
     Args:
         carried: Definitions that came with the data, by type; they take the place of ours, because they are what the
@@ -193,7 +193,7 @@ class Types:
         return bytes(self._store.serialize_cdr(message, message.__msgtype__, little_endian=True))
 
     def definition(self, name: str) -> str:
-        """Return the definition of a type and of those that it is made of, as bags hold it."""
+        """Return the definition of a type and of the types inside, as bags hold it."""
         text: str = self._store.generate_msgdef(name, ros_version=2)[0]
         return text
 

@@ -1,6 +1,6 @@
 """The network as calls use it: subscriptions that they share, and publishers that they use in turn.
 
-What is wanted by many calls is received, decoded and encoded once. What no call has any more is kept for the next one,
+Messages for many calls are received, decoded and encoded once. Unused subscriptions are kept for the next call,
 because Zenoh never gives back the number of a key.
 """
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 IDLE_SUBSCRIPTIONS: Final = 256
 IDLE_PUBLISHERS: Final = 64
-"""How many are kept without a call; a publisher is kept with what it caches."""
+"""How many are kept without a call; a publisher is kept with its cache."""
 
 HISTORY_S: Final = 2.0
 """Longest wait for the caches of the services."""
@@ -63,7 +63,7 @@ class Item:
 
     @classmethod
     def of_tracks(cls, tracks: EncodedTracks, selection: Selection = EVERYTHING) -> Item:
-        """Return what is wanted of tracks as a response."""
+        """Return a selection of tracks as a response."""
         payload = selection.of(tracks.message()).SerializeToString() if selection.key else tracks.payload
         return cls(tracks.stream, b"".join((_TRACKS, varint(len(payload)), payload)), tracks)
 
@@ -76,11 +76,11 @@ class Item:
 
 @dataclass(eq=False, frozen=True)
 class Listener:
-    """A call that takes what comes.
+    """A call that receives items.
 
     Attributes:
         take: takes something; called on the loop.
-        selection: what it wants of tracks.
+        selection: of its tracks.
         passes: whether it wants the tracks of a frame; called on a thread of the subscription.
     """
 
@@ -95,13 +95,13 @@ class Deduplicator:
     At the next heartbeat of a publisher, recovery sends a subscriber that has heard nothing yet all that is cached.
 
     Args:
-        take: called with what is new.
+        take: called with new items.
     """
 
     def __init__(self, take: Callable[[Item], None]) -> None:
         self._take = take
         self._known: set[tuple[object, ...]] = set()
-        self._early: list[Item] | None = []  # what came before it was known what the caches hold
+        self._early: list[Item] | None = []  # items from before the answer of the caches
 
     def put(self, item: Item) -> None:
         """Pass on an item, now or when the caches have been asked, or leave it out."""
@@ -140,7 +140,7 @@ class Network:
 
     Args:
         client: of the network.
-        invalid: called for what comes and is no valid message, on any thread.
+        invalid: called for each message that is not valid, on any thread.
     """
 
     def __init__(self, client: Client, invalid: Callable[[str], None]) -> None:
@@ -160,7 +160,7 @@ class Network:
 
     @contextlib.asynccontextmanager
     async def subscribed(self, key: str, listener: Listener) -> AsyncIterator[None]:
-        """Have a listener take what is published under a key expression.
+        """Have a listener receive the publications under a key expression.
 
         Raises:
             TransportError: the network cannot be used.
@@ -230,7 +230,7 @@ class Network:
                 items = {key: Item.of_tracks(tracks, selection) for key, selection in selections.items()}
                 arrived = [(one, items[one.selection.key]) for one in wanting]
         self._arrived.extend(arrived)
-        if arrived and not self._waking:  # what is added after this was seen is still handed over
+        if arrived and not self._waking:  # items that are added after this are still handed over
             self._waking = True
             with contextlib.suppress(RuntimeError):  # the loop has ended
                 self._loop.call_soon_threadsafe(self._hand_over)

@@ -41,7 +41,7 @@ RESTART_S: Final = 5.0
 CLOUDS_S: Final = 2.0
 """Without a cloud for so long none is waited for."""
 CLOCK_BACK_NS: Final = 5 * 10**9
-"""Stamps of detections that go back by more are those of a clock that was set back, as a simulation's that restarts."""
+"""Stamps of detections that go back by more: the clock was set back, as of a simulation that restarts."""
 
 
 @dataclass
@@ -159,7 +159,7 @@ class Bridge:
         self._refuse(self._streams[stream], error)
 
     def go_on(self) -> None:
-        """Send messages whose poses are known, drop those that waited for too long; to be called regularly."""
+        """Send messages whose poses are known, drop messages that waited for too long; to be called regularly."""
         now = time.monotonic()
         for stream in self._streams.values():
             for queue in stream.waiting.values():
@@ -167,7 +167,7 @@ class Bridge:
                     queue.popleft()
 
     def take_tracks(self, message: schemas.Tracks) -> None:
-        """Publish the tracks of a stream to ROS; those of frames before the newest one are left out."""
+        """Publish the tracks of a stream to ROS, but for frames before the newest one."""
         stream = self._streams[message.stream]
         if time.monotonic() < stream.restart_s or message.session == stream.ended:
             return
@@ -304,7 +304,7 @@ class Bridge:
         return schemas.Pose(translation=translation, quaternion=quaternion)
 
     def _restart(self, stream: _Stream, before: str, stamp_ns: int) -> None:
-        """Have the session begin anew in another world than before, while messages wait."""
+        """Restart the session in another world, while messages wait."""
         text = f"the root of tf is now {stream.world!r}, where tracks begin anew; it was {before!r}"
         self._tell(stream, "world_changed", f"{text}. Set `fixed_frame` to wait for a frame", stamp_ns, refused=0)
         stream.restart_s, stream.ended = time.monotonic() + RESTART_S, stream.session

@@ -57,7 +57,7 @@ def dds_type(name: str) -> str:
 
 
 def ros_type(name: str) -> str:
-    """Return the name of a type as ROS has it; what is none stays as it is."""
+    """Return the name of a type as ROS has it, and other text as it is."""
     return name.replace("::dds_::", "::").removesuffix("_").replace("::", "/")
 
 
@@ -113,7 +113,7 @@ def topic_pattern(domain: int, topic: str) -> str:
 
 
 def parse_topic(key: str) -> TopicKey | None:
-    """Return the parts of a key; None when it is that of no topic."""
+    """Return the parts of a key; None when it is no topic's."""
     parts = key.split("/")
     if len(parts) < 4 or not parts[0].isdecimal():  # noqa: PLR2004 - domain, topic, type, hash
         return None

@@ -1,7 +1,7 @@
 """A node of ROS 2 and a client of the service on one Zenoh session.
 
 Publishers are reliable and volatile. Static transforms are asked of the caches of their publishers, as rmw_zenoh does
-for what is TRANSIENT_LOCAL.
+for TRANSIENT_LOCAL topics.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Ros2Node:
         self._gids: dict[str, bytes] = {}
         self._numbers: dict[str, int] = {}
         self._senders: dict[str, tuple[Sender, Sender]] = {}
-        """Publishers of a topic: for nodes that hash types, and for those of Humble, which do not."""
+        """Publishers of a topic: for nodes that hash types, and for nodes of Humble, which do not."""
         self._outgoing: dict[str, Outgoing] = {}
         self._asking = ThreadPoolExecutor(1, "ask")
         self._asked: set[str] = set()
@@ -103,7 +103,7 @@ class Ros2Node:
     def subscribe(
         self, endpoint: graph.Endpoint, receive: Callable[[graph.TopicKey, bytes], None], *, clouds: bool = False
     ) -> None:
-        """Hand over the messages of a topic, of whatever type, on a thread of its own."""
+        """Hand over the messages of a topic, of any type, on a thread of its own."""
         pattern = graph.topic_pattern(self._domain, endpoint.topic)
 
         def take(at: str, payload: bytes) -> None:
@@ -118,9 +118,9 @@ class Ros2Node:
         self.client.token(endpoint.token())
 
     def watch(self, changed: Callable[[graph.Endpoint, bool], None]) -> None:
-        """Tell which publishers and subscriptions come, and go (False); those of this node are left out."""
+        """Tell which publishers and subscriptions come, and go (False), but for this node's."""
 
-        def take(key: str, present: bool) -> None:  # noqa: FBT001 - as a token is told
+        def take(key: str, present: bool) -> None:  # noqa: FBT001 - the signature of a watcher
             endpoint = graph.parse_endpoint(key)
             if endpoint is not None and endpoint.node.session != self._node.session:
                 changed(endpoint, present)

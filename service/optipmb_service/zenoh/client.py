@@ -1,7 +1,7 @@
 """The network as the service and its edges use it: publishes inputs, reads outputs, asks.
 
-What it declares for others is what `optipmb_client` declares for a program of its own, so that nothing on the network
-can tell the two apart.
+It declares the same as `optipmb_client` does for a program of its own, so that nothing on the network can tell the two
+apart.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ R = TypeVar("R", bound=_Closable)
 class IdlePool(Generic[R]):
     """Subscriptions and publishers that are not used at the moment, by key; may be used by any threads.
 
-    They are kept for the next user because Zenoh never gives back the number of a key. Those that were kept for
-    `IDLE_S` are closed, and the oldest of more than `most`.
+    They are kept for the next user because Zenoh never gives back the number of a key. They are closed after
+    `IDLE_S`, and the oldest of more than `most` at once.
     """
 
     def __init__(self, most: int) -> None:
@@ -143,7 +143,7 @@ class Outgoing:
         self._senders = detections, points
         self.detections = detections.put
         self.points = points.put
-        points.on_wanted(lambda: self.wanted())  # noqa: PLW0108 - it is set anew for another call
+        points.on_wanted(lambda: self.wanted())  # noqa: PLW0108 - it changes with the call
 
     @property
     def points_wanted(self) -> bool:
@@ -194,7 +194,7 @@ class Client(Session):
                 self.put(self.keys.problems(problem.stream), schemas.encode(problem), schemas.encoding_of(problem))
 
     def subscribe(self, key: str, receive: Callable[[Arrival], object], *, history: bool = False) -> Reading:
-        """Hand over what is published under a key expression, as `Session` does.
+        """Hand over publications under a key expression, as `Session` does.
 
         Raises:
             TransportError: also where too many were opened.

@@ -1,7 +1,7 @@
-"""Subscriptions of viewers: shared by those of one stream, kept for a while for who comes back, and bounded in rate.
+"""Subscriptions of viewers: shared by the viewers of a stream, kept for a while, and bounded in rate.
 
 Each subscription takes a number for its key that Zenoh never gives back. A browser that connects again and again takes
-none while its subscriptions are kept, and whoever asks for ever new streams soon has to wait.
+none while its subscriptions are kept, and a viewer of ever new streams soon has to wait.
 """
 
 from __future__ import annotations
