@@ -28,7 +28,7 @@ from optipmb_service.runtime.profiles import Profiles
 from optipmb_service.runtime.track_publisher import TrackPublisher
 from optipmb_service.session import convert
 from optipmb_service.session.session import Session
-from optipmb_tools.load import generated
+from optipmb_tools.run.load import generated
 
 import optipmb
 

@@ -18,8 +18,8 @@ from optipmb_schemas.installation import install_command
 from rich.console import Console, Group, RenderableType
 from rich.table import Table
 
-from optipmb_tools.bulk import Executor, executor_for
 from optipmb_tools.datasets import DATASETS, DataSequence, Dataset, dataset_at, open_dataset
+from optipmb_tools.run.bulk import Executor, executor_for
 from optipmb_tools.table_files import SUFFIXES
 
 WORTH_PROCESSES = 3000  # frames from which further processes are faster than this one alone
@@ -277,7 +277,7 @@ def print_table(table: RenderableType) -> None:
 
     A table that is wider than the terminal is printed in parts, one below the other, each with the first columns.
     """
-    from optipmb_tools.terminal import parts  # noqa: PLC0415  most commands print no table
+    from optipmb_tools.views.terminal import parts  # noqa: PLC0415  most commands print no table
 
     console = Console()
     width = console.width if console.is_terminal or "COLUMNS" in os.environ else WIDE

@@ -14,7 +14,7 @@ from optipmb_client.errors import UsageError
 
 from optipmb_tools.commands.options import AsJson, Full, mcap_needed, print_json, report, say, warn
 from optipmb_tools.commands.service_options import PaceOptions, ServiceOptions
-from optipmb_tools.progress import FrameProgress, StatusLine
+from optipmb_tools.views.progress import FrameProgress, StatusLine
 
 if TYPE_CHECKING:
     from optipmb_tools.recordings.play import PlayedStream

@@ -109,7 +109,7 @@ def _stay(ends: float | None) -> None:
 
 
 def _in_foxglove(messages: Iterable[Message], viewer: ViewerOptions, ends: float | None) -> None:
-    from optipmb_tools.foxglove_view import FoxgloveServer  # noqa: PLC0415  an extra of the installation
+    from optipmb_tools.views.foxglove import FoxgloveServer  # noqa: PLC0415  an extra of the installation
 
     with FoxgloveServer(viewer.host, viewer.foxglove_port) as server:
         say(f"open {server.address} in Foxglove (Open connection, Foxglove WebSocket)")
@@ -121,7 +121,7 @@ def _in_foxglove(messages: Iterable[Message], viewer: ViewerOptions, ends: float
 def _in_rerun(messages: Iterable[Message], followed: str | None, viewer: ViewerOptions, ends: float | None) -> None:
     import rerun as rr  # noqa: PLC0415  an extra of the installation
 
-    from optipmb_tools.viewer import View  # noqa: PLC0415  as above
+    from optipmb_tools.views.viewer import View  # noqa: PLC0415  as above
 
     recording = rr.RecordingStream("optipmb")
     if viewer.web:
@@ -206,7 +206,7 @@ def plot(
 ) -> None:
     """Draw the tracks of one sequence from above, with what was missed and confused where the truth is known."""
     from optipmb_tools.evaluation import default_rules, evaluate_files  # noqa: PLC0415  loads the solvers of scipy
-    from optipmb_tools.pictures import draw_results  # noqa: PLC0415  as above
+    from optipmb_tools.views.pictures import draw_results  # noqa: PLC0415  as above
 
     if out.suffix == ".gif" and len(tracks) > 1:
         raise UsageError(f"--out {out}: a moving picture shows one --tracks, received {len(tracks)}; name a PNG file")

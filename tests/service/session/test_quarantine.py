@@ -15,8 +15,8 @@ from optipmb_service.runtime.persistence import DUMPS, MAX_DUMPS, save_dump
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Policy
-from optipmb_tools import dumps as client
 from optipmb_tools.cli import run
+from optipmb_tools.run import dumps as client
 from router import Sensor
 from sessions import Failing, Merged, begun, dumps, feed, problems, tracks
 

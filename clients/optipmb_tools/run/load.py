@@ -31,9 +31,9 @@ from optipmb_client.zenoh.handles import Sender
 from optipmb_schemas import PREFIX, Detections, Keys, Points, Pose, SessionParameters, encode, encoding_of
 from rich.table import Table
 
-from optipmb_tools.colours import COLOURS
 from optipmb_tools.datasets import Cloud, DataSequence, DetectionFrame
-from optipmb_tools.pictures import matplotlib_needed
+from optipmb_tools.views.colours import COLOURS
+from optipmb_tools.views.pictures import matplotlib_needed
 
 FIRST = 2**32  # number of the first frame: from here on msgpack writes nine bytes
 STREAM_BYTES = 24  # length of the names of streams

@@ -1,23 +1,172 @@
-"""Offline tracking of the recordings of a data set, one task each: here, in several processes, or on a Ray cluster."""
+"""Offline tracking: one sequence in this process, or the recordings of a data set, one task each.
+
+Tracks have the same bytes as those of a replay through the service (`optipmb_tools.run.replay`).
+"""
 
 import functools
 import itertools
+import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from optipmb_client.errors import ClientError
+import numpy as np
+from optipmb_client.errors import ClientError, UsageError
+from optipmb_schemas import Tracks, class_fields, path_fields
 
-from optipmb import Modules, Parameters
-from optipmb_tools.bulk import Executor, Failed, Here, in_order, run
-from optipmb_tools.datasets import DataSequence, Dataset, DatasetArguments
+import optipmb
+from optipmb import (
+    FieldOfView,
+    Frame,
+    Modules,
+    OptipmbError,
+    Parameters,
+    PointCloud,
+    Pose,
+    PredictedPaths,
+    StepResult,
+    Tracker,
+    make_frame,
+    predict_tracks,
+    warm_up,
+)
+from optipmb_tools.datasets import DataSequence, Dataset, DatasetArguments, DetectionFrame, selected_frames
 from optipmb_tools.files import remove_unfinished
-from optipmb_tools.offline import track_whole
+from optipmb_tools.geometry import Floats
 from optipmb_tools.results.output import Latency, Results, horizons_for, latency
+from optipmb_tools.run.bulk import Executor, Failed, Here, in_order, run
 from optipmb_tools.table_files import Columns
 
 SHOWN = 20  # recordings that failed, named in the error
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """Tracks of one sequence by frame index, and counts."""
+
+    tracks: dict[int, Tracks]
+    clouds: int
+    detections: int
+    left_out: dict[str, int]  # detections of each class that the profile lacks, or that are below its score filter
+    estimated: int  # frames in which the motion of the sensor was estimated
+    steps_ns: tuple[int, ...]
+    seconds: float
+
+
+def tracker_frame(parameters: Parameters, sequence: str, given: DetectionFrame) -> Frame:
+    """Return a frame of a sequence for the tracker.
+
+    Raises:
+        UsageError: It holds values that the tracker refuses.
+    """
+    cloud = given.cloud
+    try:
+        frame, _ = make_frame(
+            parameters,
+            stamp_ns=given.stamp_ns,
+            labels=given.labels,
+            pose=Pose(*given.pose),
+            cloud=None if cloud is None else PointCloud(cloud.xyz, Pose(*cloud.pose)),
+            field_of_view=FieldOfView.of(given.field_of_view, None),
+            **given.columns,
+        )
+    except OptipmbError as error:
+        raise UsageError(f"sequence {sequence}, frame {given.index}: {error}") from error
+    return frame
+
+
+_warm = functools.cache(warm_up)  # once in each process
+
+
+def track_whole(
+    parameters: Parameters,
+    sequence: DataSequence,
+    classes: Sequence[str] = (),
+    modules: Modules | None = None,
+    *,
+    smooth: bool = False,
+    on_frame: Callable[[], None] = lambda: None,
+) -> Tracked:
+    """Track one sequence, with `smooth` so that states are given all frames of their track.
+
+    Raises:
+        UsageError: A frame holds values that the tracker refuses.
+        DatasetError: The sequence cannot be read.
+    """
+    _warm()
+    begun = time.monotonic()
+    found: dict[int, Tracks] = {}
+    steps: list[int] = []
+    clouds = detections = estimated = 0
+    left_out: Counter[str] = Counter()
+    least = np.array([one.score_filter for one in parameters.classes.values()])
+    given, low = np.zeros(len(least), np.int64), np.zeros(len(least), np.int64)
+    smoother = None
+    if smooth:
+        from optipmb_tools.run.smoothing import Smoother  # noqa: PLC0415  of --smooth alone
+
+        smoother = Smoother(parameters)
+    # A smoother joins the frames of a track, which an estimated motion has in axes of their own.
+    tracker = Tracker(parameters.model_copy(update={"sensor_motion": False}) if smooth else parameters, modules)
+    density = tracker.initial()
+    for frame in selected_frames(sequence, classes):
+        taken = tracker_frame(parameters, sequence.name, frame)
+        started = time.perf_counter_ns()
+        result = tracker.step(density, taken)
+        steps.append(time.perf_counter_ns() - started)
+        density = result.density
+        found[frame.index] = _message(parameters, sequence, frame, result)
+        if smoother is not None:
+            smoother.add(frame.index, density, result.tracks)
+        clouds += frame.cloud is not None
+        estimated += density.sensor_motion is not None
+        detections += len(frame)
+        if len(taken.source) < len(frame):
+            left_out.update(frame.labels[i] for i in np.delete(frame.label, taken.source).tolist())
+        given += np.bincount(taken.label, minlength=len(least))
+        if not parameters.self_calibration:  # which never filters the upper half of a class
+            low += np.bincount(taken.label[taken.score < least[taken.label]], minlength=len(least))
+        on_frame()
+    for name, count, total in zip(parameters.labels, low.tolist(), given.tolist(), strict=True):
+        if count:
+            most = ", most of the class" if count > total / 2 else ""
+            left_out[f"{name} below its score_filter{most}"] = count
+    if smoother is not None:
+        for index, one in smoother.tracks():
+            paths = predict_tracks(one, parameters.horizons, parameters) if parameters.horizons else None
+            found[index] = found[index].model_copy(update=track_fields(one, paths))
+    return Tracked(found, clouds, detections, dict(left_out), estimated, tuple(steps), time.monotonic() - begun)
+
+
+def track_fields(
+    tracks: optipmb.Tracks, paths: PredictedPaths | None, class_probability: Floats | None = None
+) -> dict[str, Any]:
+    """Return tracks, their paths and classes as fields of the message.
+
+    Raises:
+        MessageError: Paths or classes hold numbers that no message may.
+    """
+    fields = dict(tracks.columns()) | {"confirmed": tracks.confirmed.astype(np.int64)}
+    if paths is not None:
+        fields |= path_fields(paths.horizons, paths.mean, paths.covariance)
+    return fields if class_probability is None else fields | class_fields(class_probability)
+
+
+def _message(parameters: Parameters, sequence: DataSequence, frame: DetectionFrame, result: StepResult) -> Tracks:
+    """Return the tracks of a frame as the service publishes them, in a session that has no name."""
+    header = {
+        "stream": sequence.name,
+        "epoch": bytes(16),
+        "seq": frame.index,
+        "stamp_ns": frame.stamp_ns,
+        "session": "0" * 32,
+        "profile": parameters.name,
+        "cloud_used": frame.cloud is not None,
+        "labels": parameters.labels,
+    }
+    return Tracks.trusted(header | track_fields(result.tracks, result.paths, result.class_probability))
 
 
 @dataclass(frozen=True)
@@ -46,7 +195,7 @@ class Tracking:
     classes: Sequence[str] = ()  # only detections of these; empty: all
     modules: Modules | None = None
     full: bool = False  # also write all columns of the tracks
-    smooth: bool = False  # estimate states from all frames of their track (`optipmb_tools.smoothing`)
+    smooth: bool = False  # estimate states from all frames of their track (`optipmb_tools.run.smoothing`)
 
 
 @dataclass(frozen=True)
