@@ -1,20 +1,18 @@
 """Options that several commands share, and printing."""
 
-import contextlib
 import dataclasses
 import inspect
 import json
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from optipmb_client.errors import ClientError, UsageError
-from optipmb_schemas.installation import install_command
+from optipmb_client.errors import UsageError
 from rich.console import Console, Group, RenderableType
 from rich.table import Table
 
@@ -253,15 +251,6 @@ def number_or_text(value: str) -> float | str:
     except ValueError:
         return value
     return int(number) if number.is_integer() else number
-
-
-@contextlib.contextmanager
-def mcap_needed() -> Iterator[None]:
-    """Raise the command that installs the packages for recordings where they are missing."""
-    try:
-        yield
-    except ImportError as error:
-        raise ClientError(f"recordings need mcap, which is not installed: {install_command('record')}") from error
 
 
 def plain_table(left: Sequence[str], right: Sequence[str] = (), *, title: str | None = None) -> Table:

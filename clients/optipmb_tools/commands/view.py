@@ -13,7 +13,7 @@ import typer
 from optipmb_client.errors import UsageError
 from optipmb_schemas import Density, Detections, Keys, Message, MessageError, Points, Problem, Topic, Tracks, decode
 
-from optipmb_tools.commands.options import AsJson, LabelledOptions, mcap_needed, report, say
+from optipmb_tools.commands.options import AsJson, LabelledOptions, report, say
 from optipmb_tools.commands.service_options import ServiceOptions, speed_of
 from optipmb_tools.extras import needed
 
@@ -169,8 +169,9 @@ def _live(service: ServiceOptions, timeout: float, shown: ShownOptions) -> Itera
 
 def _recorded(file: Path, speed: float | None, shown: ShownOptions) -> Iterator[Message | None]:
     """Yield the messages of a recording, at its pace."""
-    with mcap_needed():
-        from optipmb_tools.recordings.files import RecordingFile  # noqa: PLC0415  packages of an extra
+    needed("recordings", "record", "mcap", need="need")
+    from optipmb_tools.recordings.files import RecordingFile  # noqa: PLC0415  packages of an extra
+
     zero: float | None = None
     for one in RecordingFile(file):
         if (shown.streams and one.stream not in shown.streams) or (one.topic == "points" and not shown.points):

@@ -32,8 +32,8 @@ from optipmb_schemas import PREFIX, Detections, Keys, Points, Pose, SessionParam
 from rich.table import Table
 
 from optipmb_tools.datasets import Cloud, DataSequence, DetectionFrame
+from optipmb_tools.extras import needed
 from optipmb_tools.views.colours import COLOURS
-from optipmb_tools.views.pictures import matplotlib_needed
 
 FIRST = 2**32  # number of the first frame: from here on msgpack writes nine bytes
 STREAM_BYTES = 24  # length of the names of streams
@@ -428,9 +428,10 @@ def draw_runs(path: Path, runs: Sequence[Run], latency_ms: float | None = None) 
     Raises:
         ClientError: matplotlib is not installed.
     """
-    with matplotlib_needed():
-        from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  an extra
-        from matplotlib.figure import Figure  # noqa: PLC0415  an extra
+    needed("pictures", "plot", "matplotlib", need="need")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  an extra
+    from matplotlib.figure import Figure  # noqa: PLC0415  an extra
+
     runs = sorted(runs, key=lambda run: run.throughput)
     rates = [run.throughput for run in runs]
     figure = Figure(figsize=(8.0, 4.8), layout="constrained")
