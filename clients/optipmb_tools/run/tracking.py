@@ -8,7 +8,7 @@ import itertools
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,10 @@ from optipmb_tools.run.bulk import Executor, Failed, Here, in_order, run
 from optipmb_tools.table_files import Columns
 
 SHOWN = 20  # recordings that failed, named in the error
+
+
+def _ignored() -> None:
+    """Do nothing, as the default of a callback."""
 
 
 @dataclass(frozen=True)
@@ -199,24 +203,19 @@ class Tracking:
 
 
 @dataclass(frozen=True)
-class _Opened:
-    dataset: Dataset
-    sequences: Mapping[str, DataSequence] | None = None  # None: read for each task, as so many cannot all be kept
-    on_frame: Callable[[], None] = lambda: None
-
-
-@dataclass(frozen=True)
-class _Shared:
-    """Arguments of all tasks of a run; can be sent to another process without `here`."""
+class _Job:
+    """Arguments of all tasks of a run."""
 
     data: DatasetArguments
     out: Path
     how: Tracking
-    here: _Opened | None
+    here: Dataset | None = None  # opened already, with its sequences; another process opens the data set itself
+    sequences: Mapping[str, DataSequence] = field(default_factory=dict)
+    on_frame: Callable[[], None] = _ignored
 
     @functools.cached_property
-    def opened(self) -> _Opened:
-        return self.here or _Opened(self.data.open())  # a process opens it once
+    def dataset(self) -> Dataset:
+        return self.here or self.data.open()
 
 
 class RecordingsFailed(ClientError):  # noqa: N818  as its siblings
@@ -232,21 +231,21 @@ class RecordingsFailed(ClientError):  # noqa: N818  as its siblings
         super().__init__(f"{len(failures)} of {count} recordings failed, the others are tracked: {names}")
 
 
-def _track_one(shared: _Shared, name: str) -> tuple[TrackedSequence, Path | Columns]:
+def _track_one(job: _Job, name: str) -> tuple[TrackedSequence, Path | Columns]:
     """Track one sequence and write its results; idempotent. Return the rows where all sequences share one table."""
-    opened, how = shared.opened, shared.how
-    (sequence,) = [opened.sequences[name]] if opened.sequences else opened.dataset.sequences([name])
-    found = track_whole(how.parameters, sequence, how.classes, how.modules, smooth=how.smooth, on_frame=opened.on_frame)
-    written = Results(opened.dataset, shared.out, full=how.full).write(sequence, found.tracks)
+    dataset, how = job.dataset, job.how
+    sequence = job.sequences[name] if name in job.sequences else dataset.sequences([name])[0]
+    found = track_whole(how.parameters, sequence, how.classes, how.modules, smooth=how.smooth, on_frame=job.on_frame)
+    written = Results(dataset, job.out, full=how.full).write(sequence, found.tracks)
     beyond = []
-    if opened.dataset.name == "nuscenes" and isinstance(written, Path):
+    if dataset.name == "nuscenes" and isinstance(written, Path):
         from optipmb_tools.results.nuscenes import NUSCENES_MAX_BOXES  # noqa: PLC0415  of one format
 
         counts = [len(one.id) for one in found.tracks.values()]
         beyond = [count - NUSCENES_MAX_BOXES for count in counts if count > NUSCENES_MAX_BOXES]
     return TrackedSequence(
         name,
-        written if isinstance(written, Path) else shared.out,
+        written if isinstance(written, Path) else job.out,
         len(found.tracks),
         found.clouds,
         found.detections,
@@ -304,12 +303,15 @@ def track(
     if (horizons := horizons_for(out)) is not None:
         how = replace(how, parameters=how.parameters.model_copy(update={"horizons": horizons}))
     names = tuple(one.name for one in sequences)
-    opened = _Opened(dataset, {one.name: one for one in sequences}, on_frame) if executor.here else None
-    executor.start(_track_one, _Shared(dataset.arguments, out, replace(how, classes=tuple(how.classes)), opened))
+    job = _Job(dataset.arguments, out, replace(how, classes=tuple(how.classes)))
+    if executor.here:
+        job = replace(job, here=dataset, sequences={one.name: one for one in sequences}, on_frame=on_frame)
+        on_frame = _ignored  # frames are counted while they are tracked
+    executor.start(_track_one, job)
     results = Results(dataset, out, full=how.full)
     failures: dict[str, Failed] = {}
     ended = run(executor, names, lambda name: f"recording {name}", note)
-    taken = _taken(ended, sequences, results, note, on_frame if opened is None else lambda: None)
+    taken = _taken(ended, sequences, results, note, on_frame)
     for name, one in zip(names, in_order(taken), strict=True):
         if isinstance(one, Failed):
             failures[name] = one
@@ -318,7 +320,7 @@ def track(
     if len(failures) == len(names) > 0:
         raise failures[names[0]].error()
     results.close(sequences)
-    if opened is None:
+    if not executor.here:
         remove_unfinished(results.files)
     if failures:
         raise RecordingsFailed(failures, len(names))
