@@ -67,10 +67,6 @@ class Keys:
         """Return the key of the metrics query of an instance."""
         return f"{self.prefix}/service/{_instance(instance)}/q/metrics"
 
-    def samples(self, instance: str) -> str:
-        """Return the key at which the parent of a worker asks it for its metrics as data; of no use to others."""
-        return f"{self.prefix}/service/{_instance(instance)}/q/samples"
-
     def move(self, instance: str) -> str:
         """Return the key of the query that moves a stream between the workers of an instance."""
         return f"{self.prefix}/service/{_instance(instance)}/q/move"

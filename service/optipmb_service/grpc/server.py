@@ -22,7 +22,7 @@ from optipmb_service.grpc import inputs, outputs
 from optipmb_service.grpc.access import Access, credentials
 from optipmb_service.grpc.calls import Call, CallerGoneError, EndCall, ending_with_caller
 from optipmb_service.grpc.network import Network
-from optipmb_service.runtime.ports import EdgeError, TransportError
+from optipmb_service.stream.ports import EdgeError, TransportError
 from optipmb_service.telemetry.problem_reporter import ProblemReporter, log_problem
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ import optipmb_schemas as schemas
 import structlog
 from optipmb_client.zenoh.session import Session
 
-from optipmb_service.runtime.ports import TransportError
+from optipmb_service.stream.ports import TransportError
 from optipmb_service.zenoh.connection import opened
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ import optipmb_schemas as schemas
 from optipmb_client.zenoh.configuration import BUSY, certificates, configured, loaded
 from optipmb_client.zenoh.session import opened as open_session
 
-from optipmb_service.runtime.ports import TransportError
+from optipmb_service.stream.ports import TransportError
 
 if TYPE_CHECKING:
     from pathlib import Path

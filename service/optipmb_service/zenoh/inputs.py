@@ -21,7 +21,7 @@ import structlog
 from optipmb_client.zenoh.late_join import CacheQueries, LateJoin
 from optipmb_client.zenoh.session import NEWEST
 
-from optipmb_service.runtime.intake import ALL
+from optipmb_service.stream.intake import ALL
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Final
 import optipmb_schemas as schemas
 import structlog
 
-from optipmb_service.runtime.ports import Packet, TransportError
-from optipmb_service.runtime.queries import problem_with
+from optipmb_service.stream.ports import Packet, TransportError
+from optipmb_service.stream.queries import problem_with
 from optipmb_service.zenoh.client import Client
 from optipmb_service.zenoh.inputs import ReturnedPublishers, Topic
 from optipmb_service.zenoh.taps import Taps
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from optipmb_client.zenoh.handles import Declared, Reading, Sender
     from optipmb_client.zenoh.session import Sample, Session
 
-    from optipmb_service.runtime.intake import Kind
-    from optipmb_service.runtime.ports import Request
     from optipmb_service.settings import Settings
+    from optipmb_service.stream.intake import Kind
+    from optipmb_service.stream.ports import Request
 
 MOST_OPEN: Final = 256
 """Queries of one key expression that may be open; those beyond are refused."""
