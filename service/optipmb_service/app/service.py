@@ -132,7 +132,6 @@ class Service(Reporter):
             self._streams,
             status=self.status,
             metrics=self._metrics.text,
-            samples=self._metrics.samples,
             hand_over=self._intake.hand_over,
             workers=settings.workers,
         )

@@ -374,7 +374,7 @@ class AggregateView(Reporter):
 
     def _samples(self) -> Iterator[tuple[int, bytes]]:
         """Yield the metrics of the workers that answer, each with its number."""
-        for index, answer in enumerate(self._ask(self._keys.samples)):
+        for index, answer in enumerate(self._ask(self._keys.metrics)):
             if answer is not None:
                 yield index, answer
 

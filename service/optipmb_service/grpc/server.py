@@ -51,7 +51,7 @@ SAID_BY: Final = "optipmb-gateway"
 """Trailing metadata by which a gateway signs its errors: others come of the way to it."""
 
 GRACE_S: Final = 1.0
-"""How long calls may take to finish what is under way at the end."""
+"""How long calls may take to finish at the end."""
 
 LINK_S: Final = 0.5
 """How often the gateway looks whether it has a router."""
@@ -139,14 +139,14 @@ class Server:
         self._watching = asyncio.create_task(self._watch())
 
     async def stop(self) -> None:
-        """Take no calls any more, finish what is under way, and end."""
+        """Refuse new calls, finish the open ones, and end."""
         if self._watching is not None:
             self._watching.cancel()
         await self._health.enter_graceful_shutdown()
         for call in tuple(self._calls):
             call.end()
         await self._server.stop(GRACE_S)
-        self.network.close()
+        await asyncio.to_thread(self.network.close)
 
     def refused(self, problem: schemas.Problem) -> None:
         """Count and report the problem of a message that is not valid."""

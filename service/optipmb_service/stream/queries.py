@@ -43,9 +43,6 @@ log = structlog.get_logger("optipmb_service")
 TEXT = "text/plain;version=0.0.4"
 """Zenoh encoding of the metrics."""
 
-JSON = "application/json"
-"""Zenoh encoding of the metrics as data."""
-
 MOVE_S = 15.0
 """Longest time for moving a stream; it takes a second."""
 
@@ -338,7 +335,6 @@ class ServiceQueries:
         streams: the streams.
         status: returns the status of the service.
         metrics: returns its metrics, in Prometheus' text format.
-        samples: returns its metrics as data for the parent of this process.
         hand_over: gives what was received lately of sessions that are tracked elsewhere now.
         workers: number of processes of the service.
     """
@@ -349,7 +345,6 @@ class ServiceQueries:
         *,
         status: Callable[[], schemas.ServiceStatus],
         metrics: Callable[[], bytes],
-        samples: Callable[[], bytes],
         hand_over: Callable[[Iterable[str], Callable[[Packet], None]], None],
         workers: int,
     ) -> None:
@@ -358,7 +353,6 @@ class ServiceQueries:
         self._member = streams.member
         self._status = status
         self._metrics = metrics
-        self._samples = samples
         self._handed_over = hand_over
         self._workers = workers
         self._moves = ThreadPoolExecutor(1, "move")
@@ -382,9 +376,6 @@ class ServiceQueries:
     def _report(self, request: Query) -> None:
         instance = self._streams.instance
         status, metrics = self._keys.status(instance), self._keys.metrics(instance)
-        if request.key == self._keys.samples(instance):
-            request.answer_text(request.key, self._samples(), JSON)
-            return
         if request.matches(status):
             request.answer(status, self._status())
         if request.matches(metrics):

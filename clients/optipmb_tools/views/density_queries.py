@@ -4,11 +4,10 @@ import threading
 import time
 from typing import Final, Self
 
-from optipmb_schemas import PREFIX, Keys
-
 from optipmb_client.errors import ConnectionFailed
 from optipmb_client.incoming import Arrival, Inbox
 from optipmb_client.zenoh import Connection
+from optipmb_schemas import PREFIX, Keys
 
 PERIOD_S: Final = 0.5
 TIMEOUT_S: Final = 1.0

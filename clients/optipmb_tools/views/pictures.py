@@ -14,10 +14,10 @@ import numpy as np
 from optipmb_client.errors import ClientError
 from optipmb_schemas.installation import install_command
 
-from optipmb_tools.colours import colour_of
 from optipmb_tools.datasets import DataSequence, DetectionFrame, Truth
 from optipmb_tools.geometry import Floats, Ints, box_corners, rotation_of, stack_poses, to_world
 from optipmb_tools.results import ResultTable
+from optipmb_tools.views.colours import colour_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -170,7 +170,7 @@ def _draw_failures(axes: "Axes", truth: Truth, results: "Sequence[ClearResult]")
         )
     label = "change of id"
     for result in results:
-        for switch in result.switches:
+        for switch in result.changes:
             x, y, _ = truth.center[place[switch.frame, switch.truth]].tolist()
             axes.plot(x, y, "o", color=_INK, markerfacecolor="none", markersize=11, label=label, zorder=8)
             axes.annotate(
