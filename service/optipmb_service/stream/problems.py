@@ -115,7 +115,7 @@ def problem_of(code: str, *, subject: str = "", **fields: Any) -> schemas.Proble
     Args:
         code: one of `CODES`.
         subject: begins the message, unless that is among the fields.
-        fields: those of the message.
+        fields: further fields of the message.
     """
     fields = {"path": "", "expected": "", "received": ""} | fields
     fields.setdefault("message", f"{subject}: expected {fields['expected']}, received {fields['received']}.")

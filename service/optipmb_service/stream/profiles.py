@@ -37,7 +37,7 @@ class Profiles:
 
     @classmethod
     def read(cls, default: str, patterns: Mapping[str, str]) -> Profiles:
-        """Load every profile named, and those that come with the tracker.
+        """Load every profile named, and the tracker's own.
 
         Raises:
             optipmb.ParameterError: one of them cannot be read or is not valid.
@@ -108,7 +108,7 @@ class Fusion:
     patterns: Sequence[str] = ()
 
     def session_of(self, stream: str) -> str:
-        """Return the name of the session that a stream feeds: its own, or that of its node."""
+        """Return the name of the session that a stream feeds: its own, or its node's."""
         if not self.patterns:
             return stream
         parts = tuple(stream.split("/"))
@@ -116,7 +116,7 @@ class Fusion:
         return f"{parts[0]}/{parts[1]}/{FUSED}" if matched else stream
 
     def is_session(self, name: str) -> bool:
-        """Whether a name is that of a session of several streams; no sensor may have it."""
+        """Return whether a name is of a fused session; no sensor may have it."""
         site, node, sensor = name.split("/")
         return sensor == FUSED and any(_matches((site, node), pattern) for pattern in self.patterns)
 

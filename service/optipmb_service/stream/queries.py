@@ -66,7 +66,7 @@ _Command: TypeAlias = "Callable[[Stream, Query], _State | None]"
 
 
 def guarded(request: Query, answer: Callable[[], Future[None] | None], *, instance: str = "", stream: str = "") -> None:
-    """Answer, and finish the request whatever happens: an asker must not wait for its timeout.
+    """Answer, and finish the request in any case: an asker must not wait for its timeout.
 
     Args:
         request: the query.
@@ -100,7 +100,7 @@ def problem_with(error: schemas.MessageError, *, instance: str, stream: str = ""
 
 
 class StreamQueries:
-    """Answers every request about streams, and finishes it whatever happens.
+    """Answers and finishes every request about streams.
 
     Args:
         streams: the streams.
@@ -329,13 +329,13 @@ class _Countdown:
 
 
 class ServiceQueries:
-    """Answers every request about the service, and finishes it whatever happens.
+    """Answers and finishes every request about the service.
 
     Args:
         streams: the streams.
         status: returns the status of the service.
         metrics: returns its metrics, in Prometheus' text format.
-        hand_over: gives what was received lately of sessions that are tracked elsewhere now.
+        hand_over: gives recent messages of sessions that are tracked elsewhere now.
         workers: number of processes of the service.
     """
 
@@ -382,7 +382,7 @@ class ServiceQueries:
             request.answer_text(metrics, self._metrics(), TEXT)
 
     def _hand_over(self, request: Query) -> None:
-        """Answer with what was received lately of sessions, whose names are lines, to who tracks them now."""
+        """Answer with recent messages of sessions, whose names are lines, to the member that tracks them."""
         key = self._keys.recent(self._streams.instance)
 
         def give(packet: Packet) -> None:

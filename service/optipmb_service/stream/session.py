@@ -4,7 +4,7 @@ No I/O, no threads, no clock of its own.
 
 Conventions: `now_ns` is the local monotonic clock, given by the caller and used only for waiting, for point clouds and,
 during recovery, for frames that were missed; everything else follows from the messages. So the same messages give the
-same tracks, byte for byte, and those of the window give the same state in whatever order they come.
+same tracks, byte for byte, and frames of the window give the same state in any order.
 
 A frame that arrives is judged by the timeline (`on_detections`) and waits in the queue of its sensor (`pending`) until
 it is ready (`_advance`). Then it goes into the window (`window`), which takes it, and the frames behind it, through the
@@ -72,10 +72,10 @@ class Session:
     """The state of one stream, or of several that share a density.
 
     Args:
-        stream: `site/node/sensor`; that of the tracks, where several sensors feed the session.
+        stream: `site/node/sensor`, or the name of a fused session.
         parameters: the profile to track with.
         policy: waiting, restarting, going back.
-        fused: whether frames are those of several sensors, by the streams of the messages.
+        fused: whether several sensors feed it, told apart by the streams of the messages.
         instance: name of the service, for problems.
         incarnation: ids that an earlier session of the stream used.
         tracker: makes the tracker; tests put their own here.
@@ -145,7 +145,7 @@ class Session:
             message: the frame.
             now_ns: monotonic time.
             arrived_ns: when the frame arrived, if before now: its wait for a cloud began then.
-            ticket: comes back with the tracks of the frame, and with those that it corrects.
+            ticket: comes back with the tracks of the frame and the tracks that it corrects.
         """
         frame_id = self._frame_id(message)
         since_ns = now_ns if arrived_ns is None else arrived_ns
@@ -171,7 +171,7 @@ class Session:
         return [*outputs, *self._not_admitted(queue, frame_id, judged, message)]
 
     def on_points(self, message: schemas.Points, now_ns: int, *, ticket: Any = None) -> list[Output]:
-        """Take a cloud; return the outputs of frames that waited for it and, by setting, those that it corrects.
+        """Take a cloud; return the outputs of frames that waited for it and, by setting, corrected ones.
 
         Args:
             message: the cloud.
@@ -239,7 +239,7 @@ class Session:
         Args:
             parameters: the profile; None: as before.
             cloud_wait_s: the longest wait for a cloud; None: as before.
-            horizons: those of predicted paths, valid ones; None: those of the profile that is set, else as before.
+            horizons: valid horizons of predicted paths; None: from the profile that is set, else as before.
             restart: whether the density may be discarded.
 
         Raises:
@@ -311,8 +311,8 @@ class Session:
     ) -> Self:
         """Return the session that a checkpoint was taken of. It is `recovering` for a while.
 
-        Its tracks belong to another `run`, whose number is that of the checkpoint and the fence together: of two
-        sessions that go on from one checkpoint the later one has the higher fence, whatever the other has written down.
+        Its tracks belong to another `run`, whose number is the sum of the checkpoint's and the fence: of two
+        sessions that go on from one checkpoint the later one has the higher fence, whichever wrote last.
 
         Args:
             checkpoint: its state; its profile goes on too.
@@ -408,7 +408,7 @@ class Session:
 
     @property
     def counters(self) -> Counters:
-        """Counts of the messages so far: by delivery, and those that follow from the frames alone."""
+        """Counts of the messages so far: by delivery, and by the frames alone."""
         counts, deliveries = self._window.head.counts, self._deliveries
         return Counters(
             frames=counts.frames,
@@ -544,7 +544,7 @@ class Session:
         self._recovery_ns, self._began, self._from_cache, self._young_ns = None, None, False, None
 
     def _is_behind_gap(self, frame_id: FrameId) -> bool:
-        """Return whether a frame waits for others that caches may hold: of its sensor, and of those that were live.
+        """Return whether a frame waits for others that caches may hold: of its sensor, and of live ones.
 
         After a restore the frames between the checkpoint and the crash come from the caches. When a fused session
         begins, the caches come one after the other: until it is known which sensors there are, none goes ahead of the
@@ -628,7 +628,7 @@ class Session:
         """Go on with the publisher of a frame, which another one has succeeded."""
         outputs = self.flush()
         if not self._fused:
-            self._begin(self._window.head)  # in the window the order of publishers is that of their first frames
+            self._begin(self._window.head)  # in the window publishers follow each other by their first frames
         self._timeline = self._timeline.reinstated(frame_id)
         self._follow()
         return outputs
@@ -707,7 +707,7 @@ class Session:
             frame_id: the frame that is new.
             ticket: its ticket.
             began_ns: when this began.
-            inputs: what was decoded of the new frame; None: frames are inserted or changed.
+            inputs: the new frame, decoded; None: frames are inserted or changed.
         """
         window = self._window
         before = window.head.session

@@ -3,7 +3,7 @@
 A stream opens its session, gives it what waits in the backlog, delivers its outputs, and ends it. All is on the
 tracking thread, so nothing is locked. Where several sensors share a session, the stream has the session's name.
 
-A stream is made for whatever arrives on a key whose partition this member holds, its session only for a valid message:
+A stream is made for any message on a key whose partition this member holds, its session only for a valid message:
 garbage costs a stream that is gone when its backlog is empty. Clocks: `now_ns` is monotonic and decides; the wall clock
 is only reported.
 """
@@ -63,7 +63,7 @@ class Arrival(NamedTuple):
 
 
 class Stream:
-    """One session: that of a sensor, or of several.
+    """Session of a sensor, or of several.
 
     Args:
         name: of the session, `site/node/sensor`.
@@ -185,7 +185,7 @@ class Stream:
             self.report("internal", "", "a message handled without an error", f"{type(error).__name__}: {error}")
 
     def _settle(self) -> None:
-        """Process what has waited long enough, and ask for a turn for what has not."""
+        """Process frames whose wait is over, and ask for a turn for the others."""
         for origin, shed in self.backlog.shed_since().items():
             expected, received = f"at most {self._streams.queue_frames} frames waiting", "more; the oldest were dropped"
             self.report("shed", "", expected, f"{shed} {received}", count=shed, stream=self._stream_of(origin))
@@ -345,7 +345,7 @@ class Stream:
                 )
 
     def _count_tracks(self, ids: bytes) -> None:
-        """Count the tracks that are new, and those that ended."""
+        """Count new and ended tracks."""
         if ids != self._ids:
             after, before = (set(memoryview(one).cast("q")) for one in (ids, self._ids))
             self._streams.metrics.tracks(started=len(after - before), ended=len(before - after))
@@ -360,10 +360,10 @@ class Stream:
             code: one of the codes of `Problem`.
             path: field of the message.
             expected: what would have been accepted.
-            received: what came.
+            received: the value received.
             what: its subject; a stream.
             count: number of messages that it concerns.
-            stream: the one it is reported on; that of the session.
+            stream: the stream it is reported on; by default the session's.
         """
         texts = {"path": path, "expected": expected, "received": received}
         about = {"stream": stream or self.name, "subject": f"{what or 'Stream'}: {path or 'message'}"}
@@ -412,7 +412,7 @@ class Stream:
     def take_up(self) -> None:
         """Go on with a session that has come here. One that is kept, and was not closed, goes on at once.
 
-        Else the first valid packet of those that wait begins one.
+        Else the first valid packet begins one.
         """
         if not self._member.holds(self.name):
             return
@@ -437,7 +437,7 @@ class Stream:
         return True
 
     def _load(self) -> None:
-        """Have the session restored on the thread of the store, and what it has missed read from the log."""
+        """Have the session restored on the thread of the store, and missed frames read from the log."""
         streams, fence = self._streams, self._member.fence(self.name)
         taken: list[Checkpoint] = []
 
@@ -526,7 +526,7 @@ class Stream:
         return None if same else wanted.name
 
     def _proceed(self) -> None:
-        """Go on with what came while a session was about to begin or end."""
+        """Go on with messages that came while a session was about to begin or end."""
         if self.backlog.state == "opening":
             if self._member.holds(self.name):
                 self.backlog.go_live()
@@ -539,7 +539,7 @@ class Stream:
     # Leaving
 
     def on_lost(self) -> None:
-        """Another instance has the stream: what is here is no longer the newest state."""
+        """Leave the stream: another instance has it, and the newest state."""
         if not self._member.holds(self.name):
             self.backlog.leave()
         if self._fence == self._member.fence(self.name):
@@ -568,10 +568,10 @@ class Stream:
             self.close_session("moved")
 
     def close_session(self, reason: str) -> None:
-        """End the session and free what it holds; the next valid message of the stream begins another, or goes on.
+        """End the session and free its memory; the next valid message of the stream begins another, or goes on.
 
         A session that is idle or moved is kept as it is; one that is closed by a query forgets its density and its
-        counters. Pending messages are processed, in a session that is moved by whoever goes on with it.
+        counters. Pending messages are processed, in a session that is moved by the next member.
         """
         session = self.session
         if session is None:
@@ -694,7 +694,7 @@ class StreamCounters:
     Written by the tracking thread, for any reader.
 
     Args:
-        backlog: counts what it sheds.
+        backlog: counts shed messages.
     """
 
     def __init__(self, backlog: Backlog) -> None:
@@ -736,7 +736,7 @@ class StreamCounters:
         return counted + MessageCounters(received=frames, shed=frames, clouds_shed=self._shed.clouds)
 
     def state(self, session: Session) -> schemas.SessionState:
-        """Return the state of a session with what was received and shed since it was opened."""
+        """Return the state of a session with the messages received and shed since it was opened."""
         waiting, shed, _ = self._backlog.counts()
         _, base, opened, traffic = self._accounts
         before = base.frames + base.duplicates + base.late + base.refused
@@ -754,7 +754,7 @@ class StreamCounters:
 class Sensors:
     """Sensors of one session: when each sent last, and which fell silent.
 
-    Written by the tracking thread; the control loop looks for those that are silent.
+    Written by the tracking thread; the control loop looks for silent ones.
 
     Args:
         session: its name.
