@@ -117,7 +117,7 @@ class Intake:
     def start(self) -> None:
         """Begin to receive."""
         streams = self._streams
-        self._inputs.receive(streams.receive, streams.receive, self._noticed, streams.passed_by, streams.cache_answered)
+        self._inputs.receive(streams.receive, self._noticed, streams.passed_by, streams.cache_answered)
         self._directory.began_ns = time.monotonic_ns()  # a start may take long before
         self._inputs.watch_streams(self._published, self._discovered)
         self._step()
@@ -191,7 +191,7 @@ class Intake:
 
         It is called on a thread that it must not keep.
         """
-        self._inputs.ask_cache(stream, lambda found, complete: then([packet for packet, _ in found], complete))
+        self._inputs.ask_cache(stream, then)
 
     # From the network
 
@@ -295,7 +295,7 @@ class Intake:
             self._inputs.subscribe(one.kind, one.stream, cached=one.cached)
             self._subscribed.add(one)
         left = before - wanted
-        self._inputs.unsubscribe((one.kind, one.stream, one.cached) for one in sorted(left))
+        self._inputs.unsubscribe(sorted(left))
         self._subscribed -= left
         if not everything and any(one.kind == "detections" for one in left):
             self._streams.forget_caches({one.stream for one in self._subscribed if one.kind == "detections"})
@@ -310,7 +310,7 @@ class Intake:
         """Go on with sessions that came here, each with what others have received of it lately."""
         packets: dict[str, list[Packet]] = {session: [] for session in sessions}
         try:
-            for packet, _ in self._inputs.ask_recent(sessions):
+            for packet in self._inputs.ask_recent(sessions):
                 _, session = self._streams.parsed(packet.key)
                 if session in packets:
                     packets[session].append(packet)
