@@ -25,23 +25,6 @@ if TYPE_CHECKING:
 log = structlog.get_logger("optipmb_service")
 
 
-class ClientReporter(Reporter):
-    """Health of a client of routers."""
-
-    def __init__(self, client: Client) -> None:
-        self._client = client
-
-    @property
-    def state(self) -> str:
-        """Ready while there is a router."""
-        return "unlinked" if self._client.failure else "ready"
-
-    @property
-    def failure(self) -> str:
-        """Why there is no router; empty while there is one."""
-        return self._client.failure
-
-
 async def run_router(settings: Settings) -> int:
     """Route until SIGINT or SIGTERM; returns the exit status, as `lifecycle.run` does."""
 
@@ -66,7 +49,7 @@ async def run_gateway(settings: Settings) -> int:
         server = Server(settings, client)
         health.metrics.add(GATEWAY_METRICS, lambda: server.metrics)
         await server.start()
-        health.report(ClientReporter(client))
+        health.report(Reporter(lambda: client.failure))
         settle()
         say_ready("grpc", server.address, settings.connect)
         log.info("ready", instance=settings.instance, grpc=server.address, connect=settings.connect)

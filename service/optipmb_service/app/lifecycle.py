@@ -25,7 +25,7 @@ import sys
 import threading
 import time
 import traceback
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeVar
 
 import structlog
@@ -142,30 +142,22 @@ class Steps:
     """Steps of an end that may hang, and behind which others must be done."""
 
     def __init__(self) -> None:
-        self._threads: list[threading.Thread] = []
+        self._done: dict[str, Future[object]] = {}
 
     def do(self, name: str, step: Callable[[], object]) -> None:
         """Do a step; one that hangs, or raises, delays the next ones by `STEP_S` at most."""
-
-        def work() -> None:
-            try:
-                step()
-            except Exception:
-                log.exception("internal_error", step=name)
-
-        thread = threading.Thread(target=work, name=name, daemon=True)
-        self._threads.append(thread)
+        self._done[name] = Future()
         with contextlib.suppress(RuntimeError):  # no thread can be started: it remains unfinished
-            thread.start()
-            thread.join(STEP_S)
+            self._done[name] = on_thread(name, step)
+            wait([self._done[name]], STEP_S)
 
     def unfinished(self, seconds: float) -> bool:
         """Return whether a step has not ended after `seconds`, or could not begin, and log it."""
-        deadline = Deadline(seconds)
-        for thread in self._threads:
-            if thread.is_alive():
-                thread.join(deadline.left())
-        names = [thread.name for thread in self._threads if thread.is_alive() or thread.ident is None]
+        done, _ = wait(self._done.values(), seconds)
+        for name, step in self._done.items():
+            if step in done and (error := step.exception()):
+                log.error("internal_error", step=name, exc_info=error)
+        names = [name for name, step in self._done.items() if step not in done]
         if names:
             log.error("step_hangs", steps=names)
         return bool(names)
@@ -254,19 +246,27 @@ class StopRequest:
             await asyncio.wait_for(self._event.wait(), seconds)
 
 
-async def unless(asked: StopRequest, work: Callable[[], _T]) -> _T | None:
-    """Do blocking work on a thread; None when the end was asked for before it was done, the work is then abandoned."""
+def on_thread(name: str, work: Callable[[], _T]) -> Future[_T]:
+    """Do blocking work on a daemon thread: what cannot be interrupted must not keep the process.
+
+    Raises:
+        RuntimeError: no thread can be started.
+    """
     done: Future[_T] = Future()
 
     def call() -> None:
         try:
             done.set_result(work())
-        except BaseException as error:  # noqa: BLE001 - raised where the result is awaited
+        except BaseException as error:  # noqa: BLE001 - raised where the result is read
             done.set_exception(error)
 
-    # A daemon: neither compiling nor waiting for a router can be interrupted, and neither may keep the process.
-    threading.Thread(target=call, name="start", daemon=True).start()
-    result = asyncio.wrap_future(done)
+    threading.Thread(target=call, name=name, daemon=True).start()
+    return done
+
+
+async def unless(asked: StopRequest, work: Callable[[], _T]) -> _T | None:
+    """Do blocking work on a thread; None when the end was asked for before it was done, the work is then abandoned."""
+    result = asyncio.wrap_future(on_thread("start", work))
     result.add_done_callback(lambda one: one.cancelled() or one.exception())  # an abandoned one may fail unseen
     stop = asyncio.create_task(asked.wait())
     waits: set[asyncio.Future[Any]] = {result, stop}

@@ -45,6 +45,7 @@ class LogBridge(Reporter):
     """From a network into the log; the client is closed by the caller, after this."""
 
     def __init__(self, settings: Settings, client: Client) -> None:
+        super().__init__(lambda: client.failure)
         self._client = client
         self._instance = settings.instance
         self._limits = settings.limits.limits()
@@ -61,13 +62,14 @@ class LogBridge(Reporter):
     @property
     def state(self) -> str:
         """Ready while it has a router and the servers."""
-        return "unlinked" if not self._client.linked() else "degraded" if self.failure else "ready"
+        state = super().state
+        return "degraded" if state == "ready" and self.failure else state
 
     @property
     def failure(self) -> str:
         """Why nothing can be received or written; empty while it can."""
         why = self.writer.failure
-        return self._client.failure or (f"log: {why}" if why else "")
+        return super().failure or (f"log: {why}" if why else "")
 
     def close(self) -> None:
         """Write what was received, within the grace, and end."""

@@ -62,6 +62,7 @@ class _Work(Reporter):
     """The node, the bridge and what wires them; what the process reports."""
 
     def __init__(self, settings: Settings, node: Ros2Node) -> None:
+        super().__init__(lambda: node.client.failure)
         self._settings = settings
         self._node = node
         self._types = own_types()
@@ -82,11 +83,6 @@ class _Work(Reporter):
         self._topics = tuple(self._wanted())
         single = frozenset(stream.detections for stream in settings.ros2.streams.values())
         self._matching = Matching(tuple(wanted for wanted, _ in self._topics), single)
-
-    @property
-    def state(self) -> str:
-        """Ready while it has a router."""
-        return "ready" if self._node.client.linked() else "unlinked"
 
     @property
     def stuck(self) -> bool:

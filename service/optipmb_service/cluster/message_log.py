@@ -33,7 +33,7 @@ from optipmb_service.cluster.nats_connection import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Awaitable, Callable, Mapping, Sequence
 
     from nats.aio.msg import Msg
 
@@ -368,19 +368,30 @@ class LogReader:
         for number, pause_s in enumerate((0.0, *again_s)):
             await asyncio.sleep(pause_s)
             messages: list[LogMessage] = []
-            try:
-                async with asyncio.timeout(WAIT_S), self._turns, asyncio.timeout(READ_S):
-                    streams = set(wanted.streams)
-                    if wanted.node:
-                        streams.update(filter(wanted.belongs, await self._log.streams("detections", wanted.node)))
-                    for stream in sorted(streams):
-                        await self._read(stream, wanted.positions.get(stream), following, messages)
-            except ERRORS as error:
-                log.warning("log_unread", streams=sorted(wanted.streams), error=self._log.connection.described(error))
-            except Exception:
-                log.exception("internal_error", streams=sorted(wanted.streams))  # the session waits for what there is
+
+            async def read(messages: list[LogMessage] = messages) -> None:
+                streams = set(wanted.streams)
+                if wanted.node:
+                    streams.update(filter(wanted.belongs, await self._log.streams("detections", wanted.node)))
+                for stream in sorted(streams):
+                    await self._read(stream, wanted.positions.get(stream), following, messages)
+
+            if failure := await self._bounded(read):
+                log.warning("log_unread", streams=sorted(wanted.streams), error=failure)
             if messages or number == 0:
                 take(messages)
+
+    async def _bounded(self, read: Callable[[], Awaitable[None]]) -> str:
+        """Read in turn, for a bounded time; return the failure, empty without one."""
+        try:
+            async with asyncio.timeout(WAIT_S), self._turns, asyncio.timeout(READ_S):
+                await read()
+        except ERRORS as error:
+            return self._log.connection.described(error)
+        except Exception as error:
+            log.exception("internal_error", thread="nats")  # the session waits for an answer
+            return f"{type(error).__name__}: {error}"
+        return ""
 
     async def _read(
         self, stream: str, position: Position | None, following: dict[str, int | None], messages: list[LogMessage]
@@ -413,20 +424,14 @@ class LogReader:
     async def _tracks(
         self, stream: str, from_ns: int, take: Callable[[list[LogMessage]], bool], end: Callable[[str], None]
     ) -> None:
-        failure = ""
-        try:
-            async with asyncio.timeout(WAIT_S), self._turns, asyncio.timeout(READ_S):
-                number = await self._log.since("tracks", stream, lambda one: one.stamp_ns < from_ns)
-                while number is not None and (found := await self._log.read("tracks", stream, number)):
-                    number = found[-1][0] + 1
-                    if not take([message for _, message in found]):
-                        break
-        except ERRORS as error:
-            failure = self._log.connection.described(error)
-        except Exception as error:
-            log.exception("internal_error", stream=stream)
-            failure = f"{type(error).__name__}: {error}"
-        end(failure)
+        async def read() -> None:
+            number = await self._log.since("tracks", stream, lambda one: one.stamp_ns < from_ns)
+            while number is not None and (found := await self._log.read("tracks", stream, number)):
+                number = found[-1][0] + 1
+                if not take([message for _, message in found]):
+                    break
+
+        end(await self._bounded(read))
 
 
 class LogWriter:

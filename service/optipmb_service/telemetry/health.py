@@ -27,17 +27,24 @@ USABLE: Final = frozenset({"ready", "degraded"})
 
 
 class Reporter:
-    """Part of a process that does its work, and reports how it is; by default one without streams that always works."""
+    """Part of a process that does its work, and reports its state; by default one without streams.
+
+    Args:
+        unlinked: returns why there is no router; empty while there is one.
+    """
+
+    def __init__(self, unlinked: Callable[[], str] = str) -> None:
+        self._unlinked = unlinked
 
     @property
     def state(self) -> str:
         """State of the process while this works."""
-        return "ready"
+        return "unlinked" if self._unlinked() else "ready"
 
     @property
     def failure(self) -> str:
         """Why it cannot be used, or works with a part missing; empty while it works."""
-        return ""
+        return self._unlinked()
 
     @property
     def stuck(self) -> bool:
