@@ -1,7 +1,7 @@
 """Processes that are edges alone: a Zenoh router, and a gRPC gateway.
 
 The router is the same as the one inside the service, with the same tuning; access control, TLS and limits come from
-the Zenoh configuration file. Health and readiness are those of the service.
+the Zenoh configuration file. Health and readiness are reported as by the service.
 """
 
 from __future__ import annotations

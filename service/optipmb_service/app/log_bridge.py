@@ -1,8 +1,8 @@
-"""The bridge into the log as a process of its own: what is published as detections and tracks goes to NATS.
+"""The bridge into the log as a process of its own: puts published detections and tracks into NATS.
 
-It keeps nothing, so any number of it may run: the servers drop what another one has put there. It is a process of its
-own, and no part of a member, because what it receives is not for one member, and a member that is killed must not take
-with it what a successor needs.
+It keeps nothing, so any number of it may run: the servers drop what another one has put there. It is no part
+of a member, because it receives the messages of all members, and a killed member must not take messages with it that
+its successor needs.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class LogBridge(Reporter):
         return super().failure or (f"log: {why}" if why else "")
 
     def close(self) -> None:
-        """Write what was received, within the grace, and end."""
+        """Write the waiting messages, within the grace, and end."""
         ends = time.monotonic() + self._grace_s
         for subscription in self._subscriptions:
             subscription.close(CLOSE_S)

@@ -177,7 +177,7 @@ class _Work(Reporter):
             if then is not None:
                 self._put(then)
 
-    # What comes in
+    # Incoming messages
 
     def _wanted(self) -> list[tuple[Wanted, Callable[[Any], None] | None]]:
         """Return our endpoints, and what takes the messages of subscriptions; None for publishers."""
@@ -204,7 +204,7 @@ class _Work(Reporter):
         return ours
 
     def _reading(self, wanted: Wanted, receive: Callable[[Any], None]) -> Callable[[graph.TopicKey, bytes], None]:
-        """Return what takes the bytes of a topic: those of the right type are read and handed over."""
+        """Return the receiver of a topic, which reads messages of the right type and hands them over."""
 
         def take(key: graph.TopicKey, payload: bytes) -> None:
             if key.type == wanted.type and key.hash in {wanted.hash, graph.NO_HASH}:  # else the graph has reported it

@@ -1,6 +1,6 @@
 """State of the process, for those who ask from outside: from before the service exists until after its end.
 
-The control loop beats; whoever asks sees for how long it has not. States: `starting`, then what the service says
+The age of the control loop's last beat is reported. States: `starting`, then that of the service
 (`ready`, `degraded` when it works with a part missing, `paused` when it may not publish, `unlinked` without a router,
 or `draining` when others track its streams), then `stopping`.
 """
@@ -128,5 +128,5 @@ class ProcessHealth:
         return None if self._service is None else self._service.status()
 
     def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None] | None:
-        """Hand over what comes on a stream to a viewer (`Reporter.tap`); None while the service starts."""
+        """Hand over the messages of a stream to a viewer (`Reporter.tap`); None while the service starts."""
         return None if self._service is None else self._service.tap(stream, receive)
