@@ -170,7 +170,7 @@ def _draw_failures(axes: "Axes", truth: Truth, results: "Sequence[ClearResult]")
         )
     label = "change of id"
     for result in results:
-        for switch in result.switches:
+        for switch in result.changes:
             x, y, _ = truth.center[place[switch.frame, switch.truth]].tolist()
             axes.plot(x, y, "o", color=_INK, markerfacecolor="none", markersize=11, label=label, zorder=8)
             axes.annotate(

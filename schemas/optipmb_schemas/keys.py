@@ -82,7 +82,7 @@ class Keys:
     def discovered(self, streams: Iterable[str], instance: str, run: str) -> str:
         """Return the liveliness key by which a process says that streams exist, for their publishers do not.
 
-        `run` tells it from all others, also from those of its name.
+        `run` tells it from all others, also from others of its name.
         """
         names = ",".join(_stream(stream).replace("/", "%") for stream in streams)
         return f"{self.prefix}/service/{_instance(instance)}/discovered/{_named('run', check_chunk, run)}/{names}"

@@ -50,7 +50,7 @@ def test_a_picture_shows_tracks_truth_sensor_and_failures(tmp_path: Path, monkey
     """Axes in metres, a legend for each kind of line and mark, every track's id, and the change of identity by name."""
     sequence, truth, tracks = scene()
     results: list[ClearResult] = [evaluate_clear(truth, tracks, name, RULES) for name in truth.labels]
-    assert sum(len(result.switches) for result in results) == 1
+    assert sum(result.switches for result in results) == 1
     path = tmp_path / "new" / "tracks.png"
     texts = text_of(path, monkeypatch, sequence, [Panel(tracks, results)], truth)
     assert path.read_bytes().startswith(PNG)

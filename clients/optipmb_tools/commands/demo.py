@@ -79,7 +79,7 @@ def demo(
     if (found := replayed.latency) is not None:
         lines.append(f"latency   p50 {found.p50_ms:.1f} ms, p99 {found.p99_ms:.1f} ms, from publishing to receiving")
     lines.append(
-        f"tracks    {figures.objects} objects, MOTA {figures.mota:.3f}, {len(figures.switches)} id switches, "
+        f"tracks    {figures.objects} objects, MOTA {figures.mota:.3f}, {figures.switches} id switches, "
         f"precision {figures.precision:.3f}, recall {figures.recall:.3f}"
     )
     lines.append(f"files     {', '.join(str(file) for file in (replayed.file, picture) if file is not None)}")

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     import optipmb_schemas as schemas
 
     import optipmb
-    from optipmb_service.session.values import MessageCounters
     from optipmb_service.telemetry.problem_reporter import ProblemReporter
+    from optipmb_service.telemetry.stream_meter import MessageCounters
 
 log = structlog.get_logger("optipmb_service")
 
