@@ -18,6 +18,7 @@ from optipmb_tools.colours import colour_of
 from optipmb_tools.datasets import DataSequence, DetectionFrame, Truth
 from optipmb_tools.geometry import Floats, Ints, box_corners, rotation_of, stack_poses, to_world
 from optipmb_tools.results import ResultTable
+from optipmb_tools.table_files import is_table, read_table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -376,7 +377,8 @@ def draw_results(
         sequence: The tracked sequence.
         folders: Where its result files are, or tables of tracks: one for each tracker.
         results: Figures of the classes of each tracker; their misses and identity changes are marked.
-        score: Least mean score of the tracks that are shown; default: the best threshold of each class, by `results`.
+        score: Least mean score of the tracks that are shown; default: the best threshold of each class by `results`, without them
+            the tracks that were confirmed.
 
     Raises:
         DatasetError: There is no such result file, or it is wrong.
@@ -391,11 +393,23 @@ def draw_results(
     for folder, name, own in zip(folders, names, results, strict=True):
         table = read_tracks(folder, sequence).to_world(sequence.poses)
         best = [result.sweep.results[result.sweep.best] for result in own]
+        if not own and score is None:
+            table = _confirmed(table, folder)
         panels.append(Panel(_from_score(table, own, score), best, name if len(names) > 1 else ""))
     if picture.suffix == ".gif":
         animate_tracks(picture, sequence, panels[0].tracks, sequence.truth())
     else:
         draw_tracks(picture, sequence, panels, sequence.truth())
+
+
+def _confirmed(table: ResultTable, file: Path) -> ResultTable:
+    """Return the tracks that were confirmed in some frame: all, where the file does not tell."""
+    if not (file.is_file() and is_table(file)):
+        return table
+    columns = read_table(file)
+    if not {"id", "confirmed"} <= columns.keys():
+        return table
+    return table.take(np.isin(table.id, columns["id"][columns["confirmed"] == 1]))
 
 
 def _from_score(table: ResultTable, results: "Sequence[ClassResult]", score: float | None) -> ResultTable:
