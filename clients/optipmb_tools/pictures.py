@@ -80,9 +80,8 @@ def draw_tracks(path: Path, sequence: DataSequence, panels: Sequence[Panel], tru
         from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  an extra
         from matplotlib.figure import Figure  # noqa: PLC0415  an extra
     _, sensor = stack_poses(sequence.poses)
-    low, high = _extent(
-        [*([sensor] if sensor.any() else []), *(one.center for one in (*(p.tracks for p in panels), truth) if one)]
-    )
+    boxes = [*(panel.tracks for panel in panels), *([truth] if truth else [])]
+    low, high = _extent([*(one.center for one in boxes), *([sensor] if sensor.any() else [])])
     longest = 11.0 if len(panels) == 1 else 8.0
     width, height = np.maximum(longest / max(high - low) * (high - low), (7.5, 3.0)).tolist()
     # Panels of a long street lie one below the other, others side by side.
@@ -192,7 +191,7 @@ def _draw_failures(axes: "Axes", truth: Truth, results: "Sequence[ClearResult]")
 
 def _legend(figure: "Figure", grid: "Sequence[Axes]") -> None:
     found = {label: one for axes in grid for one, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    columns = max(1, len(found))
+    columns = max(1, min(4, len(found)))
     figure.legend(found.values(), found, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
 
 
@@ -377,8 +376,7 @@ def draw_results(
         sequence: The tracked sequence.
         folders: Where its result files are, or tables of tracks: one for each tracker.
         results: Figures of the classes of each tracker; their misses and identity changes are marked.
-        score: Least mean score of the tracks that are shown; default: the best threshold of each class by `results`, without them
-            the tracks that were confirmed.
+        score: Least mean score of the tracks that are shown; default: the best threshold of each class by `results`, or the tracks that were confirmed.
 
     Raises:
         DatasetError: There is no such result file, or it is wrong.
