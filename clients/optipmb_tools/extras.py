@@ -28,7 +28,7 @@ def to_install(package: str, what: str = "this") -> str | None:
     return None if extra is None else f"{what} needs {package}, which is not installed: {install_command(extra)}"
 
 
-def needed(what: str, extra: str, *packages: str) -> None:
+def needed(what: str, extra: str, *packages: str, need: str = "needs") -> None:
     """Raise where packages of extras are missing, before anything else is done; name them all.
 
     Raises:
@@ -36,4 +36,4 @@ def needed(what: str, extra: str, *packages: str) -> None:
     """
     if missing := [package for package in packages if importlib.util.find_spec(package) is None]:
         verb = "are" if len(missing) > 1 else "is"
-        raise ClientError(f"{what} needs {', '.join(missing)}, which {verb} not installed: {install_command(extra)}")
+        raise ClientError(f"{what} {need} {', '.join(missing)}, which {verb} not installed: {install_command(extra)}")

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 from optipmb_schemas import Problem, ServiceStatus, SessionSummary
-from optipmb_tools.terminal import StatusView, parts, status_tables
+from optipmb_tools.views.terminal import StatusView, parts, status_tables
 from rich.console import Console
 from rich.table import Table
 
