@@ -35,6 +35,7 @@ from optipmb_service.settings import (
     SettingsInvalidError,
     address,
     load,
+    missing_files,
     state_home,
     without_password,
 )
@@ -144,6 +145,8 @@ def run_command(**given: Unpack[Options]) -> None:
     settings = _begin(_load(given))
     if settings.cluster:
         _needed("optipmb_service.cluster.jetstream", "cluster")
+    if settings.grpc:
+        _needed("grpc", "grpc")
     if settings.workers > 1:
         from optipmb_service.app.workers import supervise  # noqa: PLC0415 - a process that tracks needs none
 
@@ -184,8 +187,10 @@ def config_command(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, with where each value came from.")] = False,
     **given: Unpack[Options],
 ) -> None:
-    """Print the settings in force as TOML. Each comes with its origin; nothing is started."""
+    """Print the settings in force as TOML, each with its origin; nothing is started. A named file must exist."""
     loaded = _load(given)
+    if missing := missing_files(loaded.settings):
+        _wrong("; ".join(missing))
     values = loaded.settings.model_dump(mode="json")
     values |= {"router": loaded.settings.is_router, "listen": list(loaded.settings.endpoints)}
     values["cluster"] = [without_password(server) for server in loaded.settings.cluster]
