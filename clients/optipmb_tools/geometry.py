@@ -146,13 +146,3 @@ def box_corners(center: Floats, size: Floats, yaw: Floats) -> Floats:
     corners[..., 1] = center[:, None, 1] + sin * offset[..., 0] + cos * offset[..., 1]
     corners[..., 2] = center[:, None, 2] + offset[..., 2]
     return corners
-
-
-def points_in_box(xyz: Floats, center: Floats, size: Floats, yaw: float, *, margin: float = 0.0) -> Bools:
-    """Return which points (P, 3) lie in one box, grown by `margin` metres on every side."""
-    offset = xyz - center
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    along = np.abs(cos * offset[:, 0] + sin * offset[:, 1])
-    across = np.abs(cos * offset[:, 1] - sin * offset[:, 0])
-    half = 0.5 * size + margin
-    return np.asarray((along <= half[0]) & (across <= half[1]) & (np.abs(offset[:, 2]) <= half[2]), dtype=np.bool_)

@@ -188,7 +188,7 @@ def test_tracking_a_table_loads_nothing_else(tmp_path: Path) -> None:
     code = (
         "import sys; from optipmb_tools.cli import run; "
         f"run(['track', {str(table)!r}, '--out', {str(tmp_path / 'out')!r}]); "
-        "others = ('optuna', 'optipmb_tools.tuning', 'optipmb_tools.load', 'optipmb_tools.datasets.scene', "
+        "others = ('optuna', 'optipmb_tools.tuning', 'optipmb_tools.run.load', 'optipmb_tools.datasets.scene', "
         "'optipmb_tools.datasets.kitti', 'optipmb_tools.datasets.nuscenes', 'optipmb_tools.commands.replay'); "
         "sys.exit(','.join(sorted(set(others) & set(sys.modules))) or 0)"
     )

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from boxes import points_in_box
 from commands import run_here
 from optipmb_tools.camera import SENSOR_FROM_CAMERA, alpha_of, sensor_from_kitti
 from optipmb_tools.datasets import DatasetError, open_dataset
@@ -19,7 +20,7 @@ from optipmb_tools.datasets.kitti import (
     read_poses,
     read_scan,
 )
-from optipmb_tools.geometry import points_in_box, rotation_of, stack_poses, to_sensor, to_world, wrap_angle
+from optipmb_tools.geometry import rotation_of, stack_poses, to_sensor, to_world, wrap_angle
 from real_data import kitti_root
 
 ROW = "0,2,10,20,30,40,{score},1.5,1.6,4.0,1.0,1.7,20.0,-1.5,-1.6"

@@ -34,9 +34,9 @@ from optipmb_schemas import (
     encoding_of,
 )
 from optipmb_tools.datasets import DatasetError, dataset_at, open_dataset
-from optipmb_tools.foxglove_view import FoxgloveMessages, FoxgloveServer
 from optipmb_tools.recordings.files import Recorded, RecordingFile, RecordingWriter
 from optipmb_tools.recordings.plan import plan, renamed, steps
+from optipmb_tools.views.foxglove import FoxgloveMessages, FoxgloveServer
 
 KEYS = Keys()
 STREAM = "garage/robot-1/lidar"

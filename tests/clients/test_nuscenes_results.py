@@ -14,11 +14,11 @@ from nuscenes_tables import box, crowd, write_detections, write_root
 from optipmb_client import Connection
 from optipmb_tools.datasets import DatasetError
 from optipmb_tools.datasets.nuscenes import NuScenesDataset, NuScenesSequence
-from optipmb_tools.offline import read_profile
-from optipmb_tools.replay import Pace, Replaying, replay
 from optipmb_tools.results.nuscenes import NUSCENES_MAX_BOXES, read_nuscenes_results, result_table
 from optipmb_tools.results.output import Results
-from optipmb_tools.tracking import Tracking, track
+from optipmb_tools.run.profiles import read_profile
+from optipmb_tools.run.replay import Pace, Replaying, replay
+from optipmb_tools.run.tracking import Tracking, track
 
 SCENES = [crowd("scene-0103", 1, 6), crowd("scene-0916", 2, 5, 1_538_984_233_000_000)]
 FILE = "tracking_results.json"

@@ -8,9 +8,9 @@ import pytest
 from optipmb_client.errors import UsageError
 from optipmb_schemas import PATHS
 from optipmb_tools.datasets import Dataset, Preloaded, open_dataset, selected_frames
-from optipmb_tools.offline import read_profile, track_whole
 from optipmb_tools.results.output import latency
-from optipmb_tools.tracking import Tracking, track
+from optipmb_tools.run.profiles import read_profile
+from optipmb_tools.run.tracking import Tracking, track, track_whole
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from fake_service import Behaviour, FakeService
 from optipmb_client import Connection, ServiceRefused, ServiceUnavailable, UsageError
 from optipmb_schemas import Detections, Tracks
 from optipmb_tools.datasets import Dataset, open_dataset
-from optipmb_tools.replay import Pace, ReplayedSequence, Replaying, replay
+from optipmb_tools.run.replay import Pace, ReplayedSequence, Replaying, replay
 from router import until
 
 FRAMES = 24

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from optipmb_tools.camera import synthetic_camera
 from optipmb_tools.datasets import DatasetError, open_dataset
 from optipmb_tools.geometry import Floats, Ints, Pose, planar_pose, wrap_angle
-from optipmb_tools.offline import read_profile, track_whole
 from optipmb_tools.results import empty_table
 from optipmb_tools.results.kitti import SUBMISSION_SCORES, read_kitti_results, write_kitti_results
+from optipmb_tools.run.profiles import read_profile
+from optipmb_tools.run.tracking import track_whole
 from real_data import kitti_root
 
 LABELS = ("Car", "Pedestrian", "Cyclist")

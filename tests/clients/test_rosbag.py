@@ -15,9 +15,9 @@ from mcap_ros2.decoder import DecoderFactory
 from optipmb_tools.cli import run
 from optipmb_tools.datasets import DataSequence, dataset_at, open_dataset
 from optipmb_tools.files import DatasetError
-from optipmb_tools.offline import read_profile
 from optipmb_tools.results.full import FullTable, full_path, read_full
-from optipmb_tools.tracking import Tracking, track
+from optipmb_tools.run.profiles import read_profile
+from optipmb_tools.run.tracking import Tracking, track
 from real_data import kitti_root
 
 DETECTIONS = "/detector/boxes/tracks/detections"

@@ -34,7 +34,7 @@ from optipmb_schemas.installation import install_command
 
 from optipmb_service import __version__
 from optipmb_service.cluster.store import StoreError
-from optipmb_service.runtime.ports import EdgeError, TransportError
+from optipmb_service.stream.ports import EdgeError, TransportError
 from optipmb_service.telemetry import logs
 from optipmb_service.telemetry.certificates import Certificates
 from optipmb_service.telemetry.health import BEAT_S, ProcessHealth
