@@ -39,6 +39,11 @@ def test_nodes_need_the_messages_alone() -> None:
     ] * 3
 
 
+def test_the_messages_depend_on_no_other_part() -> None:
+    """Their package imports neither tracker nor client nor service."""
+    assert all(importers("optipmb_schemas", name) == set() for name in ("optipmb", "optipmb_client", "optipmb_service"))
+
+
 def test_the_tools_do_not_know_the_service() -> None:
     """No module imports optipmb_service: the demo starts it as a program. No other package imports the tools."""
     assert importers("optipmb_tools", "optipmb_service") == set()
