@@ -18,6 +18,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import faulthandler
+import functools
 import gc
 import os
 import signal
@@ -322,6 +323,8 @@ def _monitoring(settings: Settings, health: ProcessHealth) -> Iterator[None]:
     if not settings.http:
         yield
         return
+    from optipmb_schemas.asyncapi import document  # noqa: PLC0415 - as above
+
     from optipmb_service.http import Server, application  # noqa: PLC0415 - a third of a second that only this needs
 
     sites = {}
@@ -329,7 +332,8 @@ def _monitoring(settings: Settings, health: ProcessHealth) -> Iterator[None]:
         from optipmb import Georeference  # noqa: PLC0415 - the tracker, which a router does not load
 
         sites = {name: Georeference(site.origin, site.x_heading) for name, site in settings.sites.items()}
-    server = Server(application(health, settings.http_hosts, sites), settings.http)
+    interface = functools.partial(document, settings.prefix, (*settings.connect, *settings.endpoints)[0])
+    server = Server(application(health, settings.http_hosts, sites, interface), settings.http)
     log.info("http", address=server.address)
     try:
         yield

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import uvicorn
 from optipmb_client.errors import ClientError
+from optipmb_schemas.asyncapi import document
 from starlette.applications import Starlette
 from starlette.datastructures import Headers
 from starlette.responses import JSONResponse, PlainTextResponse, Response
@@ -28,7 +29,7 @@ from optipmb_service.telemetry.metrics import CONTENT_TYPE
 
 if TYPE_CHECKING:
     import asyncio
-    from collections.abc import Collection, Mapping
+    from collections.abc import Callable, Collection, Mapping
 
     from starlette.requests import Request
     from starlette.types import ASGIApp, Receive, Scope, Send
@@ -52,7 +53,10 @@ MONITORING: Final = PROBES | {"/metrics"}  # paths for programs, answered under 
 
 
 def application(
-    health: ProcessHealth, names: Collection[str] = (), sites: Mapping[str, Georeference] | None = None
+    health: ProcessHealth,
+    names: Collection[str] = (),
+    sites: Mapping[str, Georeference] | None = None,
+    interface: Callable[[], str] = document,
 ) -> ASGIApp:
     """Return the application: health, readiness, metrics, and the page.
 
@@ -60,6 +64,7 @@ def application(
         health: of the process.
         names: names of this service beside addresses and names without a dot; `*`: any.
         sites: place of the world frame of each site that has one.
+        interface: returns the AsyncAPI document.
     """
 
     # Coroutines: probes wait for no thread.
@@ -78,7 +83,11 @@ def application(
     def metrics(_: Request) -> Response:
         return Response(health.metrics.text(), media_type=CONTENT_TYPE, headers={"cache-control": "no-store"})
 
-    routes = [Route("/healthz", alive), Route("/readyz", ready), Route("/metrics", metrics), *page(health, sites)]
+    def asyncapi(_: Request) -> Response:
+        return Response(interface(), media_type="application/json", headers={"cache-control": "no-store"})
+
+    routes = [Route("/healthz", alive), Route("/readyz", ready), Route("/metrics", metrics)]
+    routes += [Route("/api/v1/asyncapi.json", asyncapi), *page(health, sites)]
     return _Guarded(Starlette(routes=routes), names)
 
 
