@@ -16,8 +16,7 @@ from optipmb_tools.evaluation.nuscenes import NuScenesConfig, evaluate_nuscenes,
 from optipmb_tools.results.kitti import read_kitti_results
 from optipmb_tools.tracking import Tracking, track
 from optipmb_tools.tuning.clips import Clip, Degradation, degrade, load, of_class, track_clip
-from optipmb_tools.tuning.objective import folds_of
-from optipmb_tools.tuning.scoring import rules_of, scorer_of
+from optipmb_tools.tuning.scoring import folds_of, rules_of, scorer_of
 from optipmb_tools.tuning.values import only
 from real_data import kitti_root, nuscenes_root
 from tuning_cases import Habits, recorded

@@ -31,8 +31,7 @@ from optipmb_tools.geometry import Bools, Floats
 from optipmb_tools.results import ResultTable
 from optipmb_tools.results.full import FullTable
 from optipmb_tools.tuning.clips import Clip, track_fully
-from optipmb_tools.tuning.objective import folds_of, standard_error, without_folds
-from optipmb_tools.tuning.scoring import Figures, Scorer, metric
+from optipmb_tools.tuning.scoring import Figures, Scorer, folds_of, metric, standard_error, without_folds
 from optipmb_tools.tuning.values import rounded, with_calibration, with_values
 
 MEMORIES = (0.3, 0.5, 0.7, 0.8)

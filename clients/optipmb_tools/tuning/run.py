@@ -21,9 +21,8 @@ from optipmb_tools.datasets import DataSequence, DatasetArguments
 from optipmb_tools.files import write_whole
 from optipmb_tools.tuning.clips import Clip, load, of_class
 from optipmb_tools.tuning.display import TrialDisplay
-from optipmb_tools.tuning.estimate import Estimate, estimate, pair_all
+from optipmb_tools.tuning.estimate import Estimate, estimate, pair_all, score_curve
 from optipmb_tools.tuning.refine import Plan, Refined, refine
-from optipmb_tools.tuning.score_curves import score_curve
 from optipmb_tools.tuning.scoring import rules_of, scorer_of
 from optipmb_tools.tuning.values import only, with_classes, with_score_calibration, with_values, write_profile
 
