@@ -119,6 +119,9 @@ class LimitSettings(BaseModel):
         return Limits(**self.model_dump())
 
 
+Latitude = Annotated[float, Field(ge=-90, le=90)]
+Longitude = Annotated[float, Field(ge=-180, le=180)]
+Height = Annotated[float, Field(ge=-1e5, le=1e5)]
 Topic = Annotated[str, _form(r"((/[A-Za-z_][A-Za-z0-9_]*)+)?", "a topic looks like /lidar/points")]
 
 
@@ -180,6 +183,17 @@ class Ros2Settings(BaseModel):
     """topic of `diagnostic_msgs/DiagnosticArray`"""
     streams: Annotated[dict[str, Ros2Stream], AfterValidator(_streams)] = Field(default_factory=dict)
     """topics by stream (`site/node/sensor`)"""
+
+
+class SiteSettings(BaseModel):
+    """Place of a site's world frame on the globe."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    origin: tuple[Latitude, Longitude, Height]
+    """latitude and longitude in degrees (WGS84) of the world's origin, and its height above the ellipsoid in m"""
+    x_heading: float = Field(default=90.0, ge=-360, le=360)
+    """direction of the world's x axis, degrees clockwise from true north; 90: x is east, y is north"""
 
 
 def _default_instance() -> str:
@@ -339,6 +353,8 @@ class Settings(BaseSettings):
     """form of the log lines on stderr"""
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     """lowest level that is logged"""
+    sites: dict[str, SiteSettings] = Field(default_factory=dict)
+    """place of each site's world frame, by which the live page shows latitude, longitude and true heading"""
     ros2: Ros2Settings = Ros2Settings()
     """topics of ROS 2, for `optipmb-service ros2`"""
     limits: LimitSettings = LimitSettings()

@@ -18,14 +18,15 @@ connection, inbox = Connection(sys.argv[1]), Inbox(10_000)
 """
 
 SUBSCRIBE = """
-sender = connection.cached_sender("a/b", "zenoh/bytes", cache=5000)
+sender = connection.cached_sender("a/b", "zenoh/bytes", cache=6000)
 for number in range(5000):
     sender.put(b"%d" % number)
 connection.subscribe("a/*", inbox)
 sender.put(b"5000")
-assert [inbox.get(30.0).payload for _ in range(5001)] == [b"%d" % number for number in range(5001)]
+assert sorted(int(inbox.get(30.0).payload) for _ in range(5001)) == list(range(5001))
 """
-"""Far more than any channel of Zenoh or of ours has room for."""
+"""Far more than any channel of Zenoh or of ours has room for. Where a heartbeat of the publisher falls into the
+answer, Zenoh leaves out its beginning, and more than `late_join.MAX_WAITING` messages do not wait for that."""
 
 QUERY = """
 sender = connection.cached_sender("a/b", "zenoh/bytes", cache=5000)
@@ -53,7 +54,7 @@ def ends(script: str, endpoint: str) -> None:
 
 
 def test_a_subscription_gets_all_that_the_same_connection_has_cached(endpoint: str) -> None:
-    """However much the connection's publishers have cached, a subscription begins, and gets it in order."""
+    """However much the connection's publishers have cached, a subscription begins, and gets it."""
     ends(SUBSCRIBE, endpoint)
 
 

@@ -56,6 +56,16 @@ Profile = Annotated[
         "--profile", help="Parameter profile, or auto for a detector that nobody tuned; default: the dataset's own."
     ),
 ]
+Origin = Annotated[
+    str | None,
+    typer.Option(
+        "--origin",
+        metavar="LAT,LON,HEIGHT[,X_HEADING]",
+        help="Place of the world frame on WGS84, and its x axis in degrees clockwise from true north (90: x is east): "
+        "tables get the columns lat, lon, alt and heading, and may have lat and lon in the place of x and y.",
+        show_default=False,
+    ),
+]
 Ray = Annotated[
     str | None,
     typer.Option(

@@ -16,6 +16,7 @@ from optipmb_tools.commands.options import (
     DataOptions,
     Full,
     JobOptions,
+    Origin,
     Out,
     Profile,
     number_or_text,
@@ -39,6 +40,7 @@ class TrackOptions:
     profile: Profile = None
     classes: Classes = None
     full: Full = False
+    origin: Origin = None
     smooth: Annotated[
         bool,
         typer.Option("--smooth", help="Estimate every state from all frames of its track, later ones too: for labels."),
@@ -96,6 +98,8 @@ def track(
     from optipmb_tools import offline, tracking  # noqa: PLC0415  loads the tracker and its compiler
 
     more: dict[str, float | str] = {name: 1 for name in ("keep_input", "fuse") if getattr(how, name)}
+    if how.origin is not None:
+        more["origin"] = how.origin
     if how.submission is not None:
         more["submission"] = number_or_text(how.submission)
     opened = data.open(**more)

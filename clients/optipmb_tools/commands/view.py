@@ -148,7 +148,8 @@ def _in_rerun(messages: Iterable[Message], followed: str | None, viewer: ViewerO
 def _live(service: ServiceOptions, timeout: float, shown: ShownOptions) -> Iterator[Message | None]:
     """Yield messages as they come; None now and then while there are none."""
     from optipmb_client.incoming import Inbox  # noqa: PLC0415  of a running service
-    from optipmb_client.queries import DensityQueries  # noqa: PLC0415  as above
+
+    from optipmb_tools.density_queries import DensityQueries  # noqa: PLC0415  as above
 
     keys = Keys(service.prefix)
     topics = [topic for topic in TOPICS if shown.points or topic != "points"]

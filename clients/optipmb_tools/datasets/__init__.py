@@ -58,7 +58,7 @@ def open_dataset(
         options: Of the data set. kitti: `clouds`, `poses`, `split`, `submission`; nuscenes: `clouds`, `z_bottom`,
             `submission`; scene: the fields of `SceneOptions`; mcap: none; rosbag: `points`, `odometry`, `fixed_frame`,
             `keep_input` and `class.NAME`; table: those of `optipmb_tools.datasets.table.OPTIONS`. For table and mcap
-            also `fuse`: the sensors of a recording share a density.
+            also `fuse`: the sensors of a recording share a density. For all `origin`: as of `Georeference.parse`.
 
     Raises:
         DatasetError: The name, the root, the detector or an option is not known.
@@ -76,12 +76,19 @@ def open_dataset(
     fuse = name != "scene" and str(options.pop("fuse", "0")) not in {"0", "0.0", "False"}
     if fuse and name not in {"table", "mcap"}:
         raise DatasetError("--fuse", "a table with a column `sensor`, or a recording (.mcap)", name)
+    georeference = None
+    if "origin" in options:
+        from optipmb_tools.georeference import georeference_of  # noqa: PLC0415  imports the tracker
+
+        georeference = georeference_of(options["origin"])
+    if name != "table":  # whose latitudes and longitudes need it
+        options.pop("origin", None)
     opened = _OPEN[name](place or Path(), detections, options)
     if fuse:
         from optipmb_tools.datasets.fused import FusedDataset  # noqa: PLC0415  of one format
 
         opened = FusedDataset(opened)
-    opened.arguments = arguments
+    opened.arguments, opened.georeference = arguments, georeference
     return opened
 
 

@@ -20,6 +20,9 @@ from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Bools, Floats, Ints, Pose
 from optipmb_tools.results.rows import BoxTable
 
+if TYPE_CHECKING:
+    from optipmb_tools.georeference import Georeference
+
 Points = NDArray[np.float32]
 _T = TypeVar("_T")
 
@@ -203,6 +206,7 @@ class Dataset(ABC):
 
     name: str  # as given to `open_dataset`
     arguments = DatasetArguments("")  # by which another process opens it; set by `open_dataset`
+    georeference: "Georeference | None" = None  # place of its world frame; set by `open_dataset`
 
     if TYPE_CHECKING:
 

@@ -33,7 +33,7 @@ from optipmb_schemas.installation import install_command
 
 from optipmb_service import __version__
 from optipmb_service.cluster.store import StoreError
-from optipmb_service.runtime.ports import EdgeError, TransportError
+from optipmb_service.stream.ports import EdgeError, TransportError
 from optipmb_service.telemetry import logs
 from optipmb_service.telemetry.certificates import Certificates
 from optipmb_service.telemetry.health import BEAT_S, ProcessHealth
@@ -325,7 +325,12 @@ def _monitoring(settings: Settings, health: ProcessHealth) -> Iterator[None]:
         return
     from optipmb_service.http import Server, application  # noqa: PLC0415 - a third of a second that only this needs
 
-    server = Server(application(health, settings.http_hosts), settings.http)
+    sites = {}
+    if settings.sites:
+        from optipmb import Georeference  # noqa: PLC0415 - the tracker, which a router does not load
+
+        sites = {name: Georeference(site.origin, site.x_heading) for name, site in settings.sites.items()}
+    server = Server(application(health, settings.http_hosts, sites), settings.http)
     log.info("http", address=server.address)
     try:
         yield

@@ -30,13 +30,13 @@ MAX_CACHE: Final = 4096
 MAX_CACHE_CLOUDS: Final = 64
 
 INLINE_BYTES: Final = 64 * 2**10
-"""What is larger is handed to the network on a thread: it is cut into fragments and may wait for the link."""
+"""Larger messages are handed to the network on a thread: each is cut into fragments and may wait for the link."""
 
 WINDOW: Final = 64
 """Frames of a `Track` call without tracks; beyond it the gateway reads no further, and the caller feels it."""
 
 STALL_S: Final = 1.0
-"""Frames that are without tracks when nothing has come for so long have been refused, or nobody tracks."""
+"""Frames that are without tracks when nothing has come for so long were refused, or are not tracked."""
 
 RESPONSES: Final = 256
 """Responses that may wait for a caller: more than the window, so that none are left out but for others' frames."""
@@ -237,12 +237,12 @@ class _Inputs:
 class _Answers:
     """Tracks and problems of a stream for the call that publishes it, each once.
 
-    What was published before the call is answered by the call itself.
+    The call itself answers for messages published before it.
 
     Attributes:
         in_flight: frames of the call without tracks.
         listener: takes tracks and problems.
-        begin: takes the tracks that the caches hold; what came before waits for it.
+        begin: takes the tracks that the caches hold; others wait for it.
     """
 
     def __init__(self, outbox: Outbox) -> None:

@@ -95,7 +95,7 @@ async def get_state(call: Call) -> None:
 
 
 async def reset(call: Call) -> None:
-    """Start a session anew, or end it."""
+    """Restart a session, or end it."""
     asked = await call.request(pb.ResetRequest)
     key = call.gateway.client.keys.query(asked.stream, "reset")
     call.caller.may_command(asked.stream)
@@ -144,7 +144,7 @@ async def _asked(call: Call, key: str, message: schemas.Message | None, kind: ty
     """Return the first good answer to a query, in protobuf.
 
     Raises:
-        EndCall: nobody answers, or a service refuses.
+        EndCall: no service answers, or one refuses.
     """
     payload = b"" if message is None else schemas.encode(message)
     encoding = "" if message is None else schemas.encoding_of(message)
@@ -165,7 +165,7 @@ async def _kept(call: Call, stream: str, wanted: schemas.TracksRequest) -> Async
     """Yield the tracks of one stream, asking the service that has them part by part.
 
     Raises:
-        EndCall: nobody answers, not completely, or with a refusal.
+        EndCall: no service answers, not completely, or with a refusal.
     """
     client, encoding = call.gateway.client, schemas.encoding_of(wanted)
     key = client.keys.query(stream, "tracks")
@@ -189,7 +189,7 @@ async def _kept(call: Call, stream: str, wanted: schemas.TracksRequest) -> Async
 
 
 def _newest(publications: Iterable[EncodedTracks]) -> list[EncodedTracks]:
-    """Return what holds of each frame, by stream and stamp: that of the latest run, and in it the latest revision."""
+    """Return the latest revision of the latest run of each frame, by stream and stamp."""
     newest: dict[tuple[str, bytes, int], EncodedTracks] = {}
     for tracks in sorted(publications, key=lambda one: (one.run, one.revision)):
         newest[tracks.stream, tracks.epoch, tracks.seq] = tracks

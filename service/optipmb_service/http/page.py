@@ -22,14 +22,15 @@ import optipmb_schemas as schemas
 from starlette.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from optipmb_service.runtime.ports import TransportError
+from optipmb_service.stream.ports import TransportError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Sequence
+    from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 
     from starlette.requests import Request
     from starlette.types import Receive, Scope, Send
 
+    from optipmb import Georeference
     from optipmb_service.telemetry.health import ProcessHealth
 
 PERIOD_S: Final = 0.1  # a viewer gets no more than one frame in this time
@@ -59,9 +60,9 @@ Sample = tuple[bytes, str]
 """Payload and encoding."""
 
 
-def page(health: ProcessHealth) -> list[Route]:
+def page(health: ProcessHealth, sites: Mapping[str, Georeference] | None = None) -> list[Route]:
     """Return the routes of the page."""
-    viewers = _Viewers(health)
+    viewers = _Viewers(health, sites or {})
     files = [Route(path, _file(name)) for path, name in FILES.items()]
     return [*files, Route("/status", _status(health)), Route("/live", viewers.live)]
 
@@ -104,8 +105,9 @@ class _Counted(StreamingResponse):
 class _Viewers:
     """Those who look at a stream now."""
 
-    def __init__(self, health: ProcessHealth) -> None:
+    def __init__(self, health: ProcessHealth, sites: Mapping[str, Georeference]) -> None:
         self._health = health
+        self._sites = sites
         self._count = 0
 
     async def live(self, request: Request) -> Response:
@@ -147,7 +149,7 @@ class _Viewers:
                         yield ": silent\n\n"
                     continue
                 heard = time.monotonic()
-                text = live_frame(*newest.take())
+                text = live_frame(*newest.take(), georeference=self._sites.get(stream.partition("/")[0]))
                 if text is not None:
                     yield f"data: {text}\n\n"
                 await asyncio.sleep(PERIOD_S)
@@ -202,7 +204,7 @@ class Newest:
             return tracks, *self._detections
 
 
-def live_frame(tracks: Sample | None, *detections: Sample) -> str | None:
+def live_frame(tracks: Sample | None, *detections: Sample, georeference: Georeference | None = None) -> str | None:
     """Return what the page draws, as JSON; None for what is no valid message.
 
     Of detections, the latest first, those of each stream are drawn that come before another of the same stream.
@@ -240,6 +242,10 @@ def live_frame(tracks: Sample | None, *detections: Sample) -> str | None:
         "sensor": sensor,
         "detections": found,
     }
+    if georeference is not None:
+        places = georeference.to_geographic(message.center[confirmed][:_MOST], message.yaw[confirmed][:_MOST])
+        rows = np.stack([np.round(one, digits) for one, digits in zip(places, (9, 9, 3, 1), strict=True)], axis=1)
+        frame["geographic"] = [None if np.isnan(row[0]) else row.tolist() for row in rows]
     return json.dumps(frame, separators=(",", ":"))
 
 

@@ -23,16 +23,17 @@ from starlette.routing import Route
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from optipmb_service.http.page import page
-from optipmb_service.runtime.ports import HttpError
+from optipmb_service.stream.ports import HttpError
 from optipmb_service.telemetry.metrics import CONTENT_TYPE
 
 if TYPE_CHECKING:
     import asyncio
-    from collections.abc import Collection
+    from collections.abc import Collection, Mapping
 
     from starlette.requests import Request
     from starlette.types import ASGIApp, Receive, Scope, Send
 
+    from optipmb import Georeference
     from optipmb_service.telemetry.health import ProcessHealth
 
 GRACE_S: Final = 1  # how long an answer under way may take at the end
@@ -50,12 +51,15 @@ PROBES: Final = frozenset({"/healthz", "/readyz"})  # paths that are answered ho
 MONITORING: Final = PROBES | {"/metrics"}  # paths that programs ask for, by whatever name the service has for them
 
 
-def application(health: ProcessHealth, names: Collection[str] = ()) -> ASGIApp:
+def application(
+    health: ProcessHealth, names: Collection[str] = (), sites: Mapping[str, Georeference] | None = None
+) -> ASGIApp:
     """Return the application: health, readiness, metrics, and the page.
 
     Args:
         health: of the process.
         names: names of this service beside addresses and names without a dot; `*`: any.
+        sites: place of the world frame of each site that has one.
     """
 
     # Coroutines: probes wait for no thread.
@@ -74,7 +78,7 @@ def application(health: ProcessHealth, names: Collection[str] = ()) -> ASGIApp:
     def metrics(_: Request) -> Response:
         return Response(health.metrics.text(), media_type=CONTENT_TYPE, headers={"cache-control": "no-store"})
 
-    routes = [Route("/healthz", alive), Route("/readyz", ready), Route("/metrics", metrics), *page(health)]
+    routes = [Route("/healthz", alive), Route("/readyz", ready), Route("/metrics", metrics), *page(health, sites)]
     return _Guarded(Starlette(routes=routes), names)
 
 

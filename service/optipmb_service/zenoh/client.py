@@ -1,7 +1,7 @@
 """The network as the service and its edges use it: publishes inputs, reads outputs, asks.
 
-What it declares for others is what `optipmb_client` declares for a program of its own, so that nothing on the network
-can tell the two apart.
+It declares the same as `optipmb_client` does for a program of its own, so that nothing on the network can tell the two
+apart.
 """
 
 from __future__ import annotations
@@ -9,17 +9,17 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Generic, Protocol, TypeVar
 
 import optipmb_schemas as schemas
 import structlog
 from optipmb_client.zenoh.session import Session
 
-from optipmb_service.runtime.ports import TransportError
+from optipmb_service.stream.ports import TransportError
 from optipmb_service.zenoh.connection import opened
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Hashable
 
     from optipmb_client.incoming import Arrival
     from optipmb_client.zenoh.handles import Reading, Sender
@@ -32,7 +32,76 @@ NEW_STREAMS: Final = 4000
 NEW_STREAM_S: Final = 0.5
 """Time after which there is a further one, in the long run."""
 
+IDLE_S: Final = 60.0
+"""Time after which a resource that is not used is closed; up to twice as long where few are kept."""
+
 log = structlog.get_logger("optipmb_service")
+
+
+class _Closable(Protocol):
+    def close(self) -> None:
+        """Release it."""
+
+
+R = TypeVar("R", bound=_Closable)
+
+
+class IdlePool(Generic[R]):
+    """Subscriptions and publishers that are not used at the moment, by key; may be used by any threads.
+
+    They are kept for the next user because Zenoh never gives back the number of a key. They are closed after
+    `IDLE_S`, and the oldest of more than `most` at once.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._lock = threading.Lock()
+        self._idle: dict[Hashable, tuple[float, R]] = {}
+        self._is_timed = False
+
+    def keep(self, key: Hashable, resource: R) -> bool:
+        """Add a resource; False when there is one of this key."""
+        with self._lock:
+            if key in self._idle:
+                return False
+            self._idle[key] = time.monotonic() + IDLE_S, resource
+            if len(self._idle) > self._most:
+                self._end_in(0.0)
+            elif not self._is_timed:
+                self._end_in(IDLE_S)
+        return True
+
+    def take(self, key: Hashable) -> R | None:
+        """Remove and return the resource of a key, None when there is none."""
+        with self._lock:
+            _, resource = self._idle.pop(key, (0.0, None))
+        return resource
+
+    def close(self) -> None:
+        """Close all resources."""
+        with self._lock:
+            left, self._idle = self._idle, {}
+        for _, resource in left.values():
+            resource.close()
+
+    def _end_in(self, seconds: float) -> None:
+        self._is_timed |= seconds > 0
+        timer = threading.Timer(seconds, self._end, (seconds > 0,))
+        timer.daemon = True
+        timer.start()
+
+    def _end(self, timed: bool) -> None:  # noqa: FBT001 - as the timer is given it
+        now = time.monotonic()
+        with self._lock:
+            surplus = len(self._idle) - self._most
+            ended = [key for at, (key, (ends, _)) in enumerate(self._idle.items()) if at < surplus or ends <= now]
+            resources = [self._idle.pop(key)[1] for key in ended]
+            if timed:
+                self._is_timed = False
+                if self._idle:
+                    self._end_in(IDLE_S)
+        for resource in resources:
+            resource.close()
 
 
 class Turns:
@@ -74,7 +143,7 @@ class Outgoing:
         self._senders = detections, points
         self.detections = detections.put
         self.points = points.put
-        points.on_wanted(lambda: self.wanted())  # noqa: PLW0108 - it is set anew for another call
+        points.on_wanted(lambda: self.wanted())  # noqa: PLW0108 - it changes with the call
 
     @property
     def points_wanted(self) -> bool:
@@ -125,7 +194,7 @@ class Client(Session):
                 self.put(self.keys.problems(problem.stream), schemas.encode(problem), schemas.encoding_of(problem))
 
     def subscribe(self, key: str, receive: Callable[[Arrival], object], *, history: bool = False) -> Reading:
-        """Hand over what is published under a key expression, as `Session` does.
+        """Hand over publications under a key expression, as `Session` does.
 
         Raises:
             TransportError: also where too many were opened.

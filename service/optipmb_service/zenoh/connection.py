@@ -14,7 +14,7 @@ import optipmb_schemas as schemas
 from optipmb_client.zenoh.configuration import BUSY, certificates, configured, loaded
 from optipmb_client.zenoh.session import opened as open_session
 
-from optipmb_service.runtime.ports import TransportError
+from optipmb_service.stream.ports import TransportError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -36,8 +36,8 @@ RUNTIME_VARIABLE: Final = "ZENOH_RUNTIME"
 RUNTIME: Final = "(rx: (handover: app))"
 """A client has one link, and one thread that waits for its socket and reads it; after that was lost, Zenoh has two.
 
-By default one thread waits and wakes one of two others to read: two more threads are woken for each message. What is
-sent has a thread of its own, so a callback that waits for the lock of the interpreter keeps nothing from leaving.
+By default one thread waits and wakes one of two others to read: two more threads are woken for each message.
+Sending has a thread of its own, so a callback that waits for the lock of the interpreter keeps nothing from leaving.
 """
 
 LISTENING: Final = "zenoh_listen"
@@ -100,7 +100,7 @@ def _values(settings: Settings) -> dict[str, object]:
         values["connect/exit_on_failure"] = False  # a router starts without the routers that it looks for
     else:
         values["transport/link/tx/queue/congestion_control/block/wait_before_close"] = WAIT_BEFORE_CLOSE_US
-    # One interest in the subscribers of all tracks, and one in those of heartbeats, in place of two for each stream:
+    # One interest in the subscribers of all tracks, and one in heartbeats, in place of two for each stream:
     # a router compares every subscription with all interests.
     tracks = schemas.Keys(settings.prefix).all("tracks")
     aggregated = json.loads(loaded(settings.zenoh_config).get_json("aggregation/publishers"))

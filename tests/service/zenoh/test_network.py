@@ -33,10 +33,10 @@ from optipmb_schemas import (
     encoding_of,
 )
 from optipmb_service.app.workers import QUERIES
-from optipmb_service.runtime.ports import TransportError
-from optipmb_service.session.session import Session
-from optipmb_service.session.values import Tracked
 from optipmb_service.settings import load
+from optipmb_service.stream.ports import TransportError
+from optipmb_service.stream.session import Session
+from optipmb_service.stream.values import Tracked
 from optipmb_service.zenoh.transport import Transport
 from router import Node, Sensor, plain, until
 from routers import free_endpoint, open_router
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from optipmb_service.runtime.ports import Request
+    from optipmb_service.stream.ports import Request
 
 KEYS = Keys()
 SENSOR = Sensor()

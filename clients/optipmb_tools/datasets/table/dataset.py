@@ -37,7 +37,7 @@ from optipmb_tools.table_files import SUFFIXES, line_of, read_table, tables_in, 
 # Options beside `column.MEANING=NAME` and `class.NAME=NAME`; `tracks` are tables that are yet to be read by them
 OPTIONS: Final = (
     *("time", "rate", "group", "yaw", "heading", "quaternion", "sizes", "axes", "velocity", "score", "invalid"),
-    *("poses", "truth", "tracks", "decimal", "encoding", "date"),
+    *("poses", "truth", "tracks", "decimal", "encoding", "date", "origin"),
 )
 GAP: Final = 1.5
 SPARSE: Final = 1.5
@@ -348,7 +348,7 @@ class TableDataset(Dataset):
         """Write `out/NAME.csv`, or the format of the detections."""
         suffix = self.path.suffix if self.path.is_file() and self.path.suffix.lower() in SUFFIXES else ".csv"
         path = out / f"{sequence.name}{suffix}"
-        write_table(path, track_columns(sequence.name, tracks, sequence))
+        write_table(path, track_columns(sequence.name, tracks, sequence, georeference=self.georeference))
         return path
 
 

@@ -178,7 +178,7 @@ class _Table:
         file = np.searchsorted([first for _, first in reading.files], np.arange(self._rows), side="right")
         series = np.unique(key, return_inverse=True)[1] * (len(reading.files) + 1) + file
         stamp, time, time_column = self._stamps(series)
-        center = np.column_stack([self._numbers("x"), self._numbers("y"), self._numbers("z", 0.0)])
+        center = self._centers()
         centres = not scored and not {"l", "w"} & found.keys()
         side = 1.0 if centres else None
         size = np.column_stack([self._numbers("l", side), self._numbers("w", side), self._numbers("h", 1.5)])
@@ -188,7 +188,7 @@ class _Table:
             reading.note("sizes", "no columns for the size or the heading: only centres can be compared")
         score = self._numbers("score", 1.0)
         names, id_ = self._names(), self._ids()
-        for role, text in (("z", "z = 0"), ("h", "a height of 1.5 m"), ("score", "a score of 1")):
+        for role, text in ((self._height, "z = 0"), ("h", "a height of 1.5 m"), ("score", "a score of 1")):
             if role not in found and (scored or role != "score"):
                 reading.note(role, f"no column for {role}: {text} for every box")
         empty = np.isnan(center[:, :2]).all(axis=1) & (centres | np.isnan(size[:, :2]).all(axis=1))
@@ -244,6 +244,23 @@ class _Table:
             sensor_column=found["sensor"].name if "sensor" in found else "",
             keys=keys,
         )
+
+    @property
+    def _height(self) -> str:
+        return "alt" if "alt" in self._found else "z"
+
+    def _centers(self) -> Floats:
+        """Return centres (R, 3): x, y, z, or latitude and longitude where an origin is given and x is not."""
+        origin, found = self._reading.options.get("origin"), self._found
+        if "x" in found or "lat" not in found or origin is None:
+            return np.column_stack([self._numbers("x"), self._numbers("y"), self._numbers("z", 0.0)])
+        from optipmb_tools.georeference import georeference_of  # noqa: PLC0415  imports the tracker
+
+        alt = self._numbers("alt") if self._height == "alt" else None
+        center = georeference_of(origin).to_world(self._numbers("lat"), self._numbers("lon"), alt)
+        if alt is None:
+            center[:, 2] = self._numbers("z", 0.0)
+        return center
 
     def _stamps(self, series: Ints) -> tuple[Ints, NDArray[Any], str]:
         """Return the stamps (R,) in nanoseconds, the times as the table has them, and the name of their column."""

@@ -250,6 +250,8 @@ function tell() {
     "faces": `${(track[YAW] * 180 / Math.PI).toFixed(0)}° at ${(100 * track[FACING]).toFixed(1)} %`,
     "age": `${track[AGE].toFixed(1)} s`, "last detected": track[MISSED] > 0 ? `${track[MISSED].toFixed(1)} s ago` : "now",
   };
+  const place = frame.geographic && frame.geographic[frame.tracks.indexOf(track)];
+  if (place) rows["lat, lon"] = `${place[0].toFixed(7)}, ${place[1].toFixed(7)}, facing ${place[3].toFixed(0)}° from north`;
   at("details").replaceChildren(...Object.entries(rows).flatMap(([name, value]) => [made("dt", name), made("dd", value)]));
 }
 
