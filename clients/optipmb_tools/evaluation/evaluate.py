@@ -55,7 +55,7 @@ def evaluate_files(
     Args:
         sequences: each must have a truth.
         results: the folder of the result files, or a table of tracks.
-        names: classes; those that occur neither in the truth nor in the results are left out.
+        names: classes; a class that occurs neither in the truth nor in the results is left out.
         rules: how to compare.
         warn: is called with each assumption.
 
@@ -130,7 +130,7 @@ class ClassFigures:
     """Likewise."""
 
     def summary(self) -> dict[str, object]:
-        """Return the figures by name; None for those that are not there."""
+        """Return the figures by name; None where missing."""
         parts = {"all": self.everything, "best": self.best}
         return {
             "ab3dmot": {f"{result.limit:g}": result.summary() for result in self.ab3dmot},
@@ -176,7 +176,7 @@ def _nuscenes_recordings(sequences: Sequence[DataSequence], results: Path) -> li
         if truth is None:
             raise DatasetError(f"sequence {sequence.name}", "annotations to compare with", "none")
         table = result_table(submission, sequence.name, sequence.samples)
-        # The benchmark compares only what is near, by class; truth farther away is ignored already.
+        # The benchmark compares near boxes only, by class; truth farther away is ignored already.
         reach = np.array([CLASS_RANGE.get(name, 0.0) for name in table.labels] or [0.0])
         near = sequence.ego_distance(table.frame, table.center) < reach[table.label]
         beside = full_path(submission.path.parent / "scenes" / f"{sequence.name}.json")
@@ -273,7 +273,7 @@ class Evaluation:
     tracks: Path
     settings: Settings
     classes: tuple[str, ...] = ()
-    """By whose names those of truth and tracks are called."""
+    """Names that classes of truth and tracks are mapped to."""
     here: Sequence[DataSequence] | None = None
     """The sequences, where this process has opened them."""
 

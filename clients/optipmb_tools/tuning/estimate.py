@@ -1,15 +1,15 @@
 """Estimates of a class from training data, without tracking: noise, motion, births, detections and false ones.
 
 Each figure comes from one place: R from detections minus labels, Q from the labels' trajectories, P^0 from the first
-detection of each object, p_d0 and mu_c / A from what is found and what is false. Standard deviations are winsorised
-(`spread`), for detections and labels are wrong in a few places by much. Estimates are where a search begins, not where
-it must end: a detector's errors last over frames, labels have errors of their own, and a motion model has to cover what
-it leaves out.
+detection of each object, p_d0 and mu_c / A from the found labels and the false detections. Standard deviations are
+winsorised (`spread`), for detections and labels are wrong in a few places by much. Estimates are where a search begins,
+not where it must end: a detector's errors last over frames, labels have errors of their own, and a motion model has to
+cover what it leaves out.
 
 Detections and labels belong together in the world frame: in each frame as many pairs as possible are made within a
 distance, and of those ways the one of least total distance is taken.
 
-The curve from a detector's scores to those of a reference detector is of equal precision, the share of detections with
+The curve from a detector's scores to a reference detector's scores is of equal precision, the share of detections with
 about this score that belong to a label. Detections are put into groups of neighbouring scores, equally many in each
 where scores do not tie. Isotonic regression of the groups' precision on their mean log odds (pool adjacent violators:
 Barlow et al., 1972) merges them into blocks of ascending precision, for both detectors. The curve has a knot for each
@@ -95,7 +95,7 @@ def trajectories(clip: Clip, name: str) -> dict[int, Trajectory]:
 
 
 def _velocities(given: Floats, time: Floats, position: Floats) -> Floats:
-    """Return the labels' velocities, or where they have none those of the positions before and after."""
+    """Return the labels' velocities; where they have none, from the positions before and after."""
     if len(time) < 3 or np.isfinite(given).all():  # noqa: PLR2004  one before, one after
         return given
     return np.where(np.isfinite(given), given, np.gradient(position, time, axis=0))
@@ -125,7 +125,7 @@ class Pairs:
     truth: int
     """Labels that count"""
     found: int
-    """Of these, those that a detection belongs to"""
+    """Labels that a detection belongs to"""
     frames: int
 
 
@@ -357,8 +357,8 @@ def _measurement(errors: Residuals) -> dict[str, float]:
 def _process(paths: Sequence[Trajectory], period: float) -> dict[str, float]:
     """Return Q: how much speed, acceleration, heading and turn rate change between neighbouring pieces.
 
-    The change of each over a time tau has the variance q^2 tau, beside what the model foresees and what the fit's own
-    error adds; position follows the model within the error of labels, and keeps what the profile has.
+    The change of each over a time tau has the variance q^2 tau, in addition to the model's prediction and the fit's own
+    error; position follows the model within the error of labels, and keeps what the profile has.
     """
     window = max(WINDOW_S, 4.0 * period)
     changes: list[Floats] = []
@@ -418,7 +418,7 @@ def _birth(errors: Residuals, pairs: Sequence[Pairs], paths: Sequence[dict[int, 
         "birth.position": spread(errors.position[first]),
         "birth.heading": spread(wrap_angle(2.0 * errors.heading[first]) / 2.0),
         "birth.speed": spread(velocity[np.isfinite(velocity).all(axis=1)]),
-        # Most objects of many classes stand; those that do not are the ones that need it.
+        # Most objects of many classes stand; the moving ones need it.
         "birth.unknown_speed": float(np.sqrt(np.mean(speeds**2))) if len(speeds) else math.nan,
     }
 
@@ -478,7 +478,7 @@ def _platt(score: Floats, true: np.ndarray) -> tuple[float, float]:
         bend = (design * (odds * (1.0 - odds))[:, None]).T @ design + 0.1 * np.eye(2)
         step = np.linalg.solve(bend, slope)
         weights = weights + np.clip(step, -1.0, 1.0)
-        if np.abs(step).max() < 1e-9:  # noqa: PLR2004  far below what is shown
+        if np.abs(step).max() < 1e-9:  # noqa: PLR2004  far below the digits shown
             break
     return float(weights[0]), float(weights[1])
 

@@ -1,6 +1,6 @@
 """Tuning of one class: estimate, search with folds left out, search on all sequences, report.
 
-The sequences that score a result and those that it was chosen on are never the same: for each fold that is left out
+The sequences that score a result never chose it: for each fold that is left out
 there is a search of its own on the rest, and its result is scored on the fold. The profile comes from one more search,
 on all sequences. Both are kept in one file, from which an interrupted session continues.
 """
@@ -44,7 +44,7 @@ class Plan:
     """Of each search with a fold left out."""
     folds: int = 3
     copies: int = 1
-    """Degraded copies of the detections beside the plain ones."""
+    """Degraded copies of the detections, in addition to the plain ones."""
     seed: int = 0
     everything: bool = False
     """Search the values of the paper's table too."""
@@ -261,9 +261,9 @@ class Candidates:
         return self.objective.gain(self.parameters(values), self.parameters({}), self.clips)
 
     def prune(self, values: Values) -> dict[str, Value]:
-        """Return those of the changed values that pay.
+        """Return the changed values that pay.
 
-        Values are put back one after the other, those of the paper's table first, and stay back unless the score and
+        Values are put back one after the other, the paper's table first, and stay back unless the score and
         the score less the margin are both lower without.
         """
         chosen = {path: value for path, value in values.items() if value != self.start(path)}

@@ -50,7 +50,7 @@ class Source:
         parameters: Parameters,
         classes: Sequence[str] | None,
     ) -> "Source":
-        """Read the sequences; the classes are those of the parameters that have labels, or those asked for.
+        """Read the sequences; by default the classes of the parameters that have labels.
 
         Raises:
             DatasetError: a sequence has no truth.
@@ -118,7 +118,7 @@ def calibrate_scores(
     Args:
         data: the dataset with the detector.
         reference: the name of the reference detector.
-        sequences: of the dataset; those that the reference has too are used.
+        sequences: of the dataset; used where the reference has them too.
         parameters: the profile; score calibrations that it has are replaced.
         classes: as of a `Source`.
         out: the folder.

@@ -1,12 +1,12 @@
 """Figures and scores of tracks: each sequence is measured on its own, and any choice of sequences is summed up.
 
-Conventions: scores of tracks are the mean scores of whole tracks. The averages over recalls are those of AB3DMOT's
-protocol, with 3D overlap for KITTI and with the distance of centres up to two metres elsewhere, and those of the
-nuScenes benchmark for nuScenes. All single figures are those at the threshold with the highest MOTA, `threshold`; HOTA
-is that of centres in the plane, `HOTA, all` that of all tracks.
+Conventions: scores of tracks are the mean scores of whole tracks. The averages over recalls follow AB3DMOT's protocol,
+with 3D overlap for KITTI and with the distance of centres up to two metres elsewhere, and for nuScenes its own
+benchmark. All single figures are those at the threshold with the highest MOTA, `threshold`; HOTA is computed of centres
+in the plane, `HOTA, all` of all tracks.
 
 The score of a candidate is the mean of the metric over all variants of the detections. A gain over other parameters is
-the difference of the scores over all sequences. Its standard error is that of the jackknife (Efron, 1982): the
+the difference of the scores over all sequences. Its standard error comes from the jackknife (Efron, 1982): the
 difference is taken again without each of five folds of whole sequences, since objects of one sequence have much in
 common. A search subtracts this margin, so that it leaves the start only for values that help in most places. Tracking
 one sequence is a task; the same parameters give the same score with any executor.
@@ -74,7 +74,7 @@ def metric(name: str, figures: Figures, objects: int) -> float:
 
 
 def plain_figures(figures: Figures) -> dict[str, float | int | None]:
-    """Return figures for JSON: whole numbers as such, None for those that are not defined."""
+    """Return figures for JSON: whole numbers as such, None where undefined."""
     return {
         name: int(value) if (known := defined(value)) is not None and value == int(value) and abs(value) > 1 else known
         for name, value in figures.items()
@@ -104,7 +104,7 @@ class Scorer:
     near: Rules
     """By the distance of centres, for HOTA."""
     scenes: Mapping[str, NuScenesScene] | None = None
-    """By sequence, where figures are those of the nuScenes benchmark."""
+    """By sequence, where the nuScenes benchmark gives the figures."""
 
     @property
     def config(self) -> NuScenesConfig:
