@@ -5,7 +5,7 @@ python benchmarks/frame_cost.py [--beside DIR] [--objects N] [--points N] [--rou
 A frame goes its way through one process, with everything real but the network and the store: a packet is handed over,
 decoded, tracked and published, and every tenth frame a checkpoint is encoded. What counts is the processor time of the
 thread. `--beside` names a checkout of another version: rounds of the two follow each other, each in a process of its
-own, and the medians of the rounds are compared. `service_cost.py` measures running services.
+own, and the medians of the rounds are compared.
 """
 
 from __future__ import annotations

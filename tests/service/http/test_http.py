@@ -226,6 +226,7 @@ def test_what_nobody_serves_is_not_found() -> None:
     with served(Said()) as address:
         assert get(address, "/")[1].startswith("<!")
         assert get(address, "/metrics") == (200, "one 1\n")
+        assert json.loads(get(address, "/api/v1/asyncapi.json")[1])["asyncapi"] == "3.0.0"
         assert get(address, "/nothing")[0] == 404
 
 
@@ -254,6 +255,8 @@ def test_a_service_tells_how_it_is_from_its_start_to_its_end() -> None:
         with open_router(endpoint):
             service.wait_ready()
             until(lambda: get(address, "/readyz")[0] == 200, "ready")
+            interface = json.loads(get(address, "/api/v1/asyncapi.json")[1])
+            assert interface["servers"]["router"]["host"] == endpoint.partition("/")[2]
             host, _, port = address.rpartition(":")
             with socket.create_connection((host, int(port))):
                 status, seconds = service.end(signal.SIGTERM)
