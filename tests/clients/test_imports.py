@@ -53,7 +53,11 @@ def test_the_tools_do_not_know_the_service() -> None:
 def test_the_tracker_is_imported_for_offline_tracking_alone() -> None:
     """Only what tracks offline, what tunes the tracker, and the matching of class names and places import optipmb."""
     offline = {path for path in importers("optipmb_tools", "optipmb") if not path.startswith("tuning/")}
-    assert offline == {"class_names.py", "dumps.py", "georeference.py", "offline.py", "smoothing.py", "tracking.py"}
+    assert offline == {
+        "class_names.py",
+        "georeference.py",
+        *(f"run/{name}.py" for name in ("dumps", "profiles", "smoothing", "tracking")),
+    }
 
 
 def test_zenoh_is_imported_in_one_folder() -> None:
