@@ -115,7 +115,7 @@ class Network:
 
 def packets(objects: int, points: int) -> Iterator[list[Any]]:
     """Yield the messages of each frame, its cloud first."""
-    load, keys = module_of("optipmb_tools.load", "optipmb_client.load"), schemas.Keys()
+    load, keys = module_of("optipmb_tools.run.load", "optipmb_client.load"), schemas.Keys()
     packet = part_of("Packet", "stream.backlog", "stream.ports", "runtime.ports")
     frames = load.generated(objects, points, RATE_HZ)
     for k in range(WARM + FRAMES):

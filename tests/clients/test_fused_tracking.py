@@ -14,8 +14,8 @@ from optipmb_service.stream.session import Session
 from optipmb_service.stream.values import Policy
 from optipmb_tools.datasets import DatasetError, open_dataset
 from optipmb_tools.datasets.fused import FusedSequence
-from optipmb_tools.offline import track_whole
 from optipmb_tools.recordings.files import RecordingWriter
+from optipmb_tools.run.tracking import track_whole
 from sessions import Merged
 
 import optipmb

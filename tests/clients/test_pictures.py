@@ -10,8 +10,8 @@ from commands import run_here
 from optipmb_client.errors import ClientError
 from optipmb_tools.datasets import DataSequence, Truth, open_dataset
 from optipmb_tools.evaluation import ClearResult, Rules, evaluate_clear
-from optipmb_tools.pictures import WIDTH_PX, Panel, animate_tracks, draw_tracks
 from optipmb_tools.results import ResultTable, empty_table
+from optipmb_tools.views.pictures import WIDTH_PX, Panel, animate_tracks, draw_tracks
 from PIL import Image
 
 PNG = b"\x89PNG\r\n\x1a\n"

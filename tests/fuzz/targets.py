@@ -26,7 +26,7 @@ POLICY = Policy(checkpoint_bytes=2000)
 
 
 def messages(data: bytes) -> None:
-    """A payload is read or refused; what is read is written and read again, and is equal.
+    """A payload is read or refused; a message is written and read again, and is equal.
 
     The first byte chooses the type of the message.
     """

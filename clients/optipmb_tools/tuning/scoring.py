@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optipmb import Parameters, warm_up
-from optipmb_tools.bulk import Executor, Here, values
 from optipmb_tools.datasets import DataSequence, Truth
 from optipmb_tools.datasets.nuscenes import NuScenesSequence
 from optipmb_tools.evaluation import Case, Counts, Rules, clear, combine, default_rules
@@ -38,6 +37,7 @@ from optipmb_tools.evaluation.nuscenes import (
 from optipmb_tools.geometry import Bools, Floats, to_sensor
 from optipmb_tools.results import ResultTable
 from optipmb_tools.results.nuscenes import NUSCENES_CLASSES
+from optipmb_tools.run.bulk import Executor, Here, values
 from optipmb_tools.tuning.clips import Clip, track_clip
 
 Figures = dict[str, float]

@@ -38,8 +38,7 @@ from optipmb_service.telemetry import logs
 from optipmb_service.telemetry.certificates import Certificates
 from optipmb_service.telemetry.health import BEAT_S, ProcessHealth
 from optipmb_service.telemetry.metrics import GATEWAY_METRICS, NETWORK_METRICS, TLS_METRICS, Metrics
-from optipmb_service.zenoh.client import Client
-from optipmb_service.zenoh.connection import LISTENING, certificates_of
+from optipmb_service.zenoh.client import LISTENING, Client, certificates_of
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Iterator

@@ -13,7 +13,7 @@ from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
 from optipmb_service.grpc.calls import Outbox
-from optipmb_service.grpc.network import Deduplicator, Item, Listener
+from optipmb_service.grpc.network import Item, Listener
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterable
@@ -66,7 +66,7 @@ async def track(call: Call) -> None:
     ):
         cached = await network.recent(keys.tracks(inputs.stream))
         known = _already_tracked(cached, message, outbox)
-        answers.begin(cached)
+        answers.listener.begin(cached)
         while message is not None:
             if isinstance(message, schemas.Problem):
                 answers.report(message)
@@ -99,7 +99,7 @@ async def publish(call: Call) -> None:
     if message is None:
         return
     acknowledgements, answers = _Acknowledgements(outbox), _Answers(outbox)
-    answers.begin(())
+    answers.listener.begin(())
     problems = call.gateway.client.keys.problems(inputs.stream)
     async with (
         call.gateway.network.subscribed(problems, answers.listener),
@@ -242,15 +242,13 @@ class _Answers:
     Attributes:
         in_flight: frames of the call without tracks.
         listener: takes tracks and problems.
-        begin: takes the tracks that the caches hold; others wait for it.
     """
 
     def __init__(self, outbox: Outbox) -> None:
         self._outbox = outbox
         self._reported: collections.deque[tuple[str, str]] = collections.deque(maxlen=RESPONSES)
         self.in_flight = _InFlight()
-        deduplicator = Deduplicator(self._answer)
-        self.listener, self.begin = Listener(deduplicator.put), deduplicator.begin
+        self.listener = Listener(self._answer)
 
     def report(self, problem: schemas.Problem) -> None:
         """Report a message that was refused here; the problem also comes back from the network."""

@@ -74,31 +74,25 @@ class Item:
         return cls(problem.stream, response.SerializeToString(), problem=(problem.code, problem.path))
 
 
-@dataclass(eq=False, frozen=True)
 class Listener:
-    """A call that receives items.
-
-    Attributes:
-        take: takes something; called on the loop.
-        selection: of its tracks.
-        passes: whether it wants the tracks of a frame; called on a thread of the subscription.
-    """
-
-    take: Callable[[Item], None]
-    selection: Selection = EVERYTHING
-    passes: Callable[[EncodedTracks], bool] = lambda _: True
-
-
-class Deduplicator:
-    """Passes on what the caches did not hold when they were asked.
+    """A call that receives items which the caches did not hold when they were asked. To be used on the loop.
 
     At the next heartbeat of a publisher, recovery sends a subscriber that has heard nothing yet all that is cached.
 
     Args:
-        take: called with new items.
+        take: called with each new item.
+        selection: of its tracks.
+        passes: whether it wants the tracks of a frame; called on a thread of the subscription.
     """
 
-    def __init__(self, take: Callable[[Item], None]) -> None:
+    def __init__(
+        self,
+        take: Callable[[Item], None],
+        selection: Selection = EVERYTHING,
+        passes: Callable[[EncodedTracks], bool] = lambda _: True,
+    ) -> None:
+        self.selection = selection
+        self.passes = passes
         self._take = take
         self._known: set[tuple[object, ...]] = set()
         self._early: list[Item] | None = []  # items from before the answer of the caches
@@ -111,7 +105,7 @@ class Deduplicator:
             self._take(item)
 
     def begin(self, held: Iterable[EncodedTracks]) -> None:
-        """Take in what the caches hold, and pass on what else came while they were asked."""
+        """Leave out the contents of the caches, and pass on the other items that came while they were asked."""
         self._known = {_publication(tracks) for tracks in held}
         early, self._early = self._early or [], None
         for item in early:
@@ -240,7 +234,7 @@ class Network:
         self._waking = False
         while self._arrived:
             listener, item = self._arrived.popleft()
-            listener.take(item)
+            listener.put(item)
 
     def _tracks(self, message: Answer | Arrival) -> EncodedTracks | None:
         try:

@@ -12,7 +12,7 @@ from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
 from optipmb_service.grpc.calls import EndCall, Outbox
-from optipmb_service.grpc.network import Deduplicator, Item, Listener
+from optipmb_service.grpc.network import Item, Listener
 from optipmb_service.grpc.selection import Pace, Selection
 
 if TYPE_CHECKING:
@@ -47,8 +47,7 @@ async def subscribe(call: Call) -> None:
     if asked.queue > MAX_QUEUE:
         raise schemas.MessageError("too_large", "queue", f"at most {MAX_QUEUE}", str(asked.queue))
     outbox = Outbox(asked.queue or QUEUE)
-    deduplicator = Deduplicator(lambda item: outbox.put(item.stream, item.response))
-    listener = Listener(deduplicator.put, selection, pace.passes)
+    listener = Listener(lambda item: outbox.put(item.stream, item.response), selection, pace.passes)
     async with contextlib.AsyncExitStack() as subscriptions:
         await subscriptions.enter_async_context(network.subscribed(tracks, listener))
         if asked.problems:
@@ -58,7 +57,7 @@ async def subscribe(call: Call) -> None:
         for one in history if asked.history else ():
             if pace.passes(one):
                 await call.write(Item.of_tracks(one, selection).response)
-        deduplicator.begin(history)
+        listener.begin(history)
         try:
             await call.drain(outbox)
         finally:

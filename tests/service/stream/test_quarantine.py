@@ -15,8 +15,8 @@ from optipmb_service.stream.checkpoint import decode_checkpoint, encode_checkpoi
 from optipmb_service.stream.persistence import DUMPS, MAX_DUMPS, save_dump
 from optipmb_service.stream.session import Session
 from optipmb_service.stream.values import Policy
-from optipmb_tools import dumps as client
 from optipmb_tools.cli import run
+from optipmb_tools.run import dumps as client
 from router import Sensor
 from sessions import Failing, Merged, begun, dumps, feed, problems, tracks
 

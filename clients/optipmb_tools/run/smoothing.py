@@ -11,7 +11,8 @@ Automatic Control 53(3), 2008), with the motion models of the tracker. From the 
     P^s_k = P_k + G (P^s_{k+1} - P-) G'
 
 m_k and P_k are the state and covariance of every frame in which the filter holds the object; in frames in which it is a
-track, those of its published box (`optipmb.calibration`). So frames without detection need no rule of their own.
+track, state and covariance of its published box (`optipmb.calibration`). So frames without detection need no rule of
+their own.
 
 An object does not turn by pi from frame to frame, so one sign of the heading holds for the whole track: the one in
 favour of which the mean of the log odds (`optipmb.lightweight`) is; and this mean is the confidence in it.
@@ -109,7 +110,7 @@ def smooth(
 
     Args:
         identity: (R,) ids of the objects.
-        stamp_ns: (R,) stamps of their frames; those of one id in the order of the frames.
+        stamp_ns: (R,) stamps of their frames, for each id in the order of the frames.
         label: (R,) classes.
         heading_odds: (R,) log odds that the object faces along phi.
         mean: (R, 6) filtered [x, y, v, phi, omega, a], world frame, m, rad, s; receives m^s.
@@ -167,7 +168,7 @@ def _backwards(identity: Ints, follows: Bools) -> Iterator[Ints]:
     """Yield the pairs of neighbouring states, of all tracks side by side, from the ends of the tracks on.
 
     Args:
-        identity: (R,) ids, those of one track one after the other.
+        identity: (R,) ids, sorted by track.
         follows: (R - 1,) whether a state is followed by one of the same id: the pairs.
     """
     end = np.concatenate((np.flatnonzero(identity[1:] != identity[:-1]), [len(identity) - 1]))

@@ -14,10 +14,10 @@ import numpy as np
 from optipmb_client.errors import ClientError
 from optipmb_schemas.installation import install_command
 
-from optipmb_tools.colours import colour_of
 from optipmb_tools.datasets import DataSequence, DetectionFrame, Truth
 from optipmb_tools.geometry import Floats, Ints, box_corners, rotation_of, stack_poses, to_world
 from optipmb_tools.results import ResultTable
+from optipmb_tools.views.colours import colour_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

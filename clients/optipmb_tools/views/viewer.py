@@ -15,8 +15,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 from optipmb_schemas import Density, Detections, Message, Points, Tracks
 
-from optipmb_tools.colours import rgb_of
 from optipmb_tools.geometry import Floats, rotation_of
+from optipmb_tools.views.colours import rgb_of
 
 TRAIL_S: Final = 5.0
 SIGMAS: Final = 2.0

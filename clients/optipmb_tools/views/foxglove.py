@@ -43,8 +43,8 @@ from foxglove.messages import (
 from optipmb_client.errors import UsageError
 from optipmb_schemas import Detections, Message, Points, Problem, Tracks
 
-from optipmb_tools.colours import rgb_of
 from optipmb_tools.geometry import rotation_of, to_world
+from optipmb_tools.views.colours import rgb_of
 
 FRAME: Final = "world"
 ARROW_S: Final = 1.0  # an arrow is as long as the way of one second

@@ -225,7 +225,7 @@ def executor_for(jobs: int, ray: str | None = None) -> Executor:
     """
     if ray is not None:
         needed("--ray", "ray", "ray")
-        from optipmb_tools.ray_cluster import RayCluster  # noqa: PLC0415  packages of an extra
+        from optipmb_tools.run.ray_cluster import RayCluster  # noqa: PLC0415  packages of an extra
 
         return RayCluster(ray, jobs)
     return Processes(jobs) if jobs > 1 else Here()

@@ -19,7 +19,7 @@ import ray
 from optipmb_client.errors import ClientError
 from ray.exceptions import RayError, RayTaskError
 
-from optipmb_tools.bulk import ATTEMPTS, Executor, Failed, Function, WorkerDiedError, attempt
+from optipmb_tools.run.bulk import ATTEMPTS, Executor, Failed, Function, WorkerDiedError, attempt
 
 LOCAL = "local"  # the address of a cluster that is started here and ends with the command
 STORE_BYTES = 256 * 2**20  # shared memory of a local cluster; the rest is written to disk

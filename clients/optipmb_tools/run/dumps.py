@@ -13,7 +13,7 @@ from optipmb_client.errors import UsageError
 from optipmb_schemas import Detections, Dump, DumpedFrame, MessageError, Points, Pose, Tracks, decode_dump
 
 import optipmb
-from optipmb_tools.offline import track_fields
+from optipmb_tools.run.tracking import track_fields
 
 
 class _Steps(Protocol):

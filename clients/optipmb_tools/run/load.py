@@ -31,9 +31,9 @@ from optipmb_client.zenoh.handles import Sender
 from optipmb_schemas import PREFIX, Detections, Keys, Points, Pose, SessionParameters, encode, encoding_of
 from rich.table import Table
 
-from optipmb_tools.colours import COLOURS
 from optipmb_tools.datasets import Cloud, DataSequence, DetectionFrame
-from optipmb_tools.pictures import matplotlib_needed
+from optipmb_tools.extras import needed
+from optipmb_tools.views.colours import COLOURS
 
 FIRST = 2**32  # number of the first frame: from here on msgpack writes nine bytes
 STREAM_BYTES = 24  # length of the names of streams
@@ -288,15 +288,36 @@ def run_load(
             cloud = connection.plain_sender(keys.points(name), encoding_of(Points))
             opened.callback(cloud.close)
             senders.append((frame, cloud))
-        sending = _Sending(load, frames, names, senders)
         began, cpu = time.monotonic(), time.process_time()
-        sending.run(on_frame)
+        sent_ns, due_ns = _send(load, frames, names, senders, on_frame)
         seconds, cpu = time.monotonic() - began, time.process_time() - cpu
         seen = -1
         while arrivals.received > seen and not arrivals.enough.is_set():
             seen = arrivals.received
             arrivals.enough.wait(STRAGGLERS_S)
-    return _result(load, frames, sending, arrivals, seconds, cpu)
+    came = arrivals.at_ns > 0
+    came[:, :SETTLED] = False
+    latency = (arrivals.at_ns[came] - sent_ns[came]) / 1e6
+    stages = arrivals.stages[came]
+    parts = dict(zip(STAGES, (*stages.T, latency - stages.sum(axis=1)), strict=True))
+    return Run(
+        streams=load.streams,
+        rate=load.rate,
+        objects=frames.objects,
+        points=frames.points,
+        seconds=seconds,
+        sent=sent_ns.size,
+        received=arrivals.received,
+        repeated=arrivals.repeated,
+        cloudless=int(arrivals.cloudless[came].sum()) if any(cloud is not None for cloud in frames.clouds) else 0,
+        p50_ms=_quantile(latency, 0.5),
+        p99_ms=_quantile(latency, 0.99),
+        max_ms=_quantile(latency, 1.0),
+        stages_p50_ms={name: _quantile(part, 0.5) for name, part in parts.items()},
+        stages_p99_ms={name: _quantile(part, 0.99) for name, part in parts.items()},
+        late_p99_ms=_quantile((sent_ns - due_ns).ravel() / 1e6, 0.99),
+        generator_cpu=cpu / seconds,
+    )
 
 
 def _closed(connection: Connection, name: str, prefix: str) -> None:
@@ -304,69 +325,30 @@ def _closed(connection: Connection, name: str, prefix: str) -> None:
         close_session(connection, name, prefix=prefix)
 
 
-class _Sending:
-    """Sends everything in time."""
-
-    def __init__(self, load: Load, frames: Frames, names: list[str], senders: list[tuple[Sender, Sender]]) -> None:
-        self._load = load
-        self._frames = frames
-        self._names = names
-        self._senders = senders
-        self._epoch = secrets.token_bytes(16)
-        self.sent_ns = np.zeros((load.streams, load.frames), np.int64)
-        self.due_ns = np.zeros_like(self.sent_ns)
-
-    def run(self, on_frame: Callable[[int], None]) -> None:
-        """Send all frames."""
-        streams, period_ns = self._load.streams, 1e9 / self._load.rate
-        first_ns = time.monotonic_ns()
-        for frame in range(self._load.frames):
-            for stream in range(streams):
-                due_ns = first_ns + round((frame + stream / streams) * period_ns)
-                if (pause_ns := due_ns - time.monotonic_ns()) > 0:
-                    time.sleep(pause_ns / 1e9)
-                self._send(stream, frame, round(frame * period_ns))
-                self.due_ns[stream, frame] = due_ns
-            on_frame(streams)
-
-    def _send(self, stream: int, frame: int, stamp_ns: int) -> None:
-        # Every stream is at another place of the round, so that not all do the same at once.
-        at = (frame + stream * 7) % len(self._frames)
-        begins = head(self._names[stream], self._epoch, FIRST + frame, EPOCH_NS + stamp_ns)
-        detections, points = self._senders[stream]
-        cloud = self._frames.clouds[at]
-        if cloud is not None:
-            points.put(message(cloud, begins))
-        payload = message(self._frames.detections[at], begins)
-        self.sent_ns[stream, frame] = time.monotonic_ns()
-        detections.put(payload)
-
-
-def _result(load: Load, frames: Frames, sending: _Sending, arrivals: _Arrivals, seconds: float, cpu: float) -> Run:
-    came = arrivals.at_ns > 0
-    came[:, :SETTLED] = False
-    latency = (arrivals.at_ns[came] - sending.sent_ns[came]) / 1e6
-    stages = arrivals.stages[came]
-    parts = [*stages.T, latency - stages.sum(axis=1)]
-    clouds = sum(cloud is not None for cloud in frames.clouds) > 0
-    return Run(
-        streams=load.streams,
-        rate=load.rate,
-        objects=frames.objects,
-        points=frames.points,
-        seconds=seconds,
-        sent=sending.sent_ns.size,
-        received=arrivals.received,
-        repeated=arrivals.repeated,
-        cloudless=int(arrivals.cloudless[came].sum()) if clouds else 0,
-        p50_ms=_quantile(latency, 0.5),
-        p99_ms=_quantile(latency, 0.99),
-        max_ms=_quantile(latency, 1.0),
-        stages_p50_ms={name: _quantile(part, 0.5) for name, part in zip(STAGES, parts, strict=True)},
-        stages_p99_ms={name: _quantile(part, 0.99) for name, part in zip(STAGES, parts, strict=True)},
-        late_p99_ms=_quantile((sending.sent_ns - sending.due_ns).ravel() / 1e6, 0.99),
-        generator_cpu=cpu / seconds,
-    )
+def _send(
+    load: Load, frames: Frames, names: list[str], senders: list[tuple[Sender, Sender]], on_frame: Callable[[int], None]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Send all frames in time; return when each was sent and due (streams, frames), monotonic ns."""
+    epoch = secrets.token_bytes(16)
+    sent_ns = np.zeros((load.streams, load.frames), np.int64)
+    due_ns = np.zeros_like(sent_ns)
+    period_ns, first_ns = 1e9 / load.rate, time.monotonic_ns()
+    for frame in range(load.frames):
+        for stream, (detections, points) in enumerate(senders):
+            # Every stream is at another place of the round, so that not all do the same at once.
+            at = (frame + stream * 7) % len(frames)
+            due = first_ns + round((frame + stream / load.streams) * period_ns)
+            if (pause_ns := due - time.monotonic_ns()) > 0:
+                time.sleep(pause_ns / 1e9)
+            begins = head(names[stream], epoch, FIRST + frame, EPOCH_NS + round(frame * period_ns))
+            if (cloud := frames.clouds[at]) is not None:
+                points.put(message(cloud, begins))
+            payload = message(frames.detections[at], begins)
+            sent_ns[stream, frame] = time.monotonic_ns()
+            detections.put(payload)
+            due_ns[stream, frame] = due
+        on_frame(load.streams)
+    return sent_ns, due_ns
 
 
 def _quantile(values: NDArray[Any], share: float) -> float:
@@ -428,9 +410,10 @@ def draw_runs(path: Path, runs: Sequence[Run], latency_ms: float | None = None) 
     Raises:
         ClientError: matplotlib is not installed.
     """
-    with matplotlib_needed():
-        from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  an extra
-        from matplotlib.figure import Figure  # noqa: PLC0415  an extra
+    needed("pictures", "plot", "matplotlib", need="need")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  an extra
+    from matplotlib.figure import Figure  # noqa: PLC0415  an extra
+
     runs = sorted(runs, key=lambda run: run.throughput)
     rates = [run.throughput for run in runs]
     figure = Figure(figsize=(8.0, 4.8), layout="constrained")
