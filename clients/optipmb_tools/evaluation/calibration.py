@@ -29,8 +29,7 @@ from optipmb_tools.evaluation.cases import Rules, assign_frames, counted, most_p
 from optipmb_tools.evaluation.figures import defined
 from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Bools, Floats, Ints
-from optipmb_tools.results import ResultTable
-from optipmb_tools.results.full import FullTable
+from optipmb_tools.results import FullTable, ResultTable
 
 DECILES = 10
 

@@ -18,8 +18,7 @@ from optipmb_tools.datasets import DataSequence, DatasetError, Truth
 from optipmb_tools.evaluation.calibration import NORMAL_95, rows_of, sample
 from optipmb_tools.evaluation.cases import Rules
 from optipmb_tools.geometry import Bools, Floats, Ints, stack_poses, to_world, wrap_angle
-from optipmb_tools.results import ResultTable
-from optipmb_tools.results.full import FullTable
+from optipmb_tools.results import FullTable, ResultTable
 
 DIRECTIONS = ("along", "across", "height", "heading", "length", "width", "tall")
 """Columns of the errors; the last three are errors of the size."""

@@ -23,8 +23,7 @@ from optipmb_tools.evaluation.figures import defined
 from optipmb_tools.evaluation.gospa import CUTOFF, ORDER, GospaResult, evaluate_gospa
 from optipmb_tools.evaluation.hota import HotaResult, evaluate_hota
 from optipmb_tools.evaluation.tracks import read_compared, read_full_tracks
-from optipmb_tools.results import ResultTable
-from optipmb_tools.results.full import FullTable, full_path, read_full
+from optipmb_tools.results import FullTable, ResultTable, full_path, read_full
 from optipmb_tools.results.nuscenes import read_nuscenes_results, result_table
 
 _ROUNDING = 1e-9

@@ -28,8 +28,7 @@ from scipy.optimize import brentq, isotonic_regression
 from optipmb import Calibration, Parameters
 from optipmb_tools.evaluation.calibration import CalibrationResult, calibration, sample
 from optipmb_tools.geometry import Bools, Floats
-from optipmb_tools.results import ResultTable
-from optipmb_tools.results.full import FullTable
+from optipmb_tools.results import FullTable, ResultTable
 from optipmb_tools.tuning.clips import Clip, track_fully
 from optipmb_tools.tuning.scoring import Figures, Scorer, folds_of, metric, standard_error, without_folds
 from optipmb_tools.tuning.values import rounded, with_calibration, with_values
