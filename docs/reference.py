@@ -14,14 +14,15 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args, get_origin
 
-from optipmb_service.session.problems import CODES
-from optipmb_service.settings import LimitSettings, Ros2Settings, Ros2Stream, Settings
+from optipmb_service.settings import LimitSettings, Ros2Settings, Ros2Stream, Settings, SiteSettings
+from optipmb_service.stream.problems import CODES
 from optipmb_service.telemetry.logs import EVENTS
 from optipmb_service.telemetry.metrics import METRICS, NAMESPACE
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
+    from pydantic import BaseModel
     from pydantic.fields import FieldInfo
 
 MOST_ALLOWED: Final = 60
@@ -38,7 +39,10 @@ def page(text: str) -> str:
 
 def settings() -> str:
     """Return the table of all settings."""
-    tables = (("", Settings), ("limits.", LimitSettings), ("ros2.", Ros2Settings), ("ros2.streams.NAME.", Ros2Stream))
+    tables: tuple[tuple[str, type[BaseModel]], ...] = (
+        *(("", Settings), ("limits.", LimitSettings), ("sites.NAME.", SiteSettings)),
+        *(("ros2.", Ros2Settings), ("ros2.streams.NAME.", Ros2Stream)),
+    )
     rows = []
     for prefix, table in tables:
         meanings = docstrings(table)

@@ -28,6 +28,7 @@ from optipmb.field_of_view import FieldOfView
 from optipmb.frame import Frame, PointCloud, Pose, make_frame
 from optipmb.generic import generic_parameters
 from optipmb.geometry import bev_iou
+from optipmb.georeference import Geographic, Georeference
 from optipmb.online import OnlineTracker, OnlineTracks
 from optipmb.parameters import (
     Calibration,
@@ -57,6 +58,8 @@ __all__ = [
     "FieldOfView",
     "Frame",
     "FrameError",
+    "Geographic",
+    "Georeference",
     "HeadingSign",
     "Modules",
     "OnlineTracker",

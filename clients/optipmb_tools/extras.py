@@ -28,12 +28,12 @@ def to_install(package: str, what: str = "this") -> str | None:
     return None if extra is None else f"{what} needs {package}, which is not installed: {install_command(extra)}"
 
 
-def needed(what: str, extra: str, *packages: str) -> None:
-    """Raise where one of the packages of an extra is missing, before anything else is done.
+def needed(what: str, extra: str, *packages: str, need: str = "needs") -> None:
+    """Raise where packages of extras are missing, before anything else is done; name them all.
 
     Raises:
-        ClientError: with the command that installs the extra.
+        ClientError: with the command that installs the extras.
     """
-    for package in packages:
-        if importlib.util.find_spec(package) is None:
-            raise ClientError(f"{what} needs {package}, which is not installed: {install_command(extra)}")
+    if missing := [package for package in packages if importlib.util.find_spec(package) is None]:
+        verb = "are" if len(missing) > 1 else "is"
+        raise ClientError(f"{what} {need} {', '.join(missing)}, which {verb} not installed: {install_command(extra)}")

@@ -1,11 +1,11 @@
-"""Writes the JSON Schemas of the messages: `python -m optipmb_schemas.export [--check] [--page FILE] DIR`.
+"""Writes the JSON Schemas of the messages: `python -m optipmb_schemas.export [OPTIONS] [DIR]`.
 
-One file per message type, `<Type>.v1.schema.json`, describing the JSON form. With `--page` the tables of a
-documentation page are brought up to date as well. With `--check` nothing is written: every file that is not up to date
-gets one line, and the exit status is 1.
+One file per message type, `<Type>.v1.schema.json`, describing the JSON form. With `--page FILE` the tables of a
+documentation page are brought up to date as well, with `--asyncapi FILE` the AsyncAPI document. With `--check` nothing
+is written: every file that is not up to date gets one line, and the exit status is 1.
 
 A page marks where a table belongs with the comment `<!-- table: NAME -->` and its end with `<!-- end -->`; what lies
-between is replaced. Names are those of the message types, `limits` and `codes`.
+between is replaced. Names are message types, `limits` and `codes`.
 """
 
 import argparse
@@ -125,12 +125,21 @@ def _markdown(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
     return "".join(f"| {' | '.join(cell.replace('|', '&#124;') for cell in line)} |\n" for line in lines)
 
 
-def stale(files: dict[Path, str], folder: Path) -> list[str]:
-    """Return one line for every file that is missing, not up to date, or a schema of a message that there is not."""
+def bring_up_to_date(files: dict[Path, str], command: str, *, check: bool, gone: Iterable[Path] = ()) -> int:
+    """Write files, and return the exit status 0.
+
+    With `check` nothing is written: each file that is not up to date, or `gone`, gets one line, and the status is 1.
+    """
     lines = [f"{path}: missing" for path in files if not path.is_file()]
-    lines += [f"{path}: not up to date" for path, text in files.items() if path.is_file() and _read(path) != text]
-    lines += [f"{path}: no such message" for path in sorted(folder.glob(f"*{SUFFIX}")) if path not in files]
-    return lines
+    lines += [f"{path}: not up to date" for path, text in files.items() if path.is_file() and read(path) != text]
+    lines += [f"{path}: no such message" for path in gone]
+    if check:
+        sys.stdout.writelines(f"{line}; run {command}\n" for line in lines)
+        return 1 if lines else 0
+    for path, text in files.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    return 0
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -140,27 +149,29 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--check", action="store_true", help="write nothing, report what is not up to date")
     parser.add_argument("--page", type=Path, metavar="FILE", help="a documentation page whose tables are updated too")
-    parser.add_argument("folder", type=Path, metavar="DIR", help="folder of the schema files")
+    parser.add_argument("--asyncapi", type=Path, metavar="FILE", help="the AsyncAPI document of the interface")
+    parser.add_argument("folder", type=Path, metavar="DIR", nargs="?", help="folder of the schema files")
     options = parser.parse_args(arguments)
+    folder: Path | None = options.folder
+    if folder is None and options.page is None and options.asyncapi is None:
+        parser.error("nothing to write: expected DIR, --page or --asyncapi")
     try:
-        files = {options.folder / name: text for name, text in schema_files().items()}
+        files = {} if folder is None else {folder / name: text for name, text in schema_files().items()}
         if options.page:
-            files[options.page] = fill(_read(options.page))
-        lines = stale(files, options.folder)
-        if options.check:
-            for line in lines:
-                sys.stdout.write(f"{line}; run python -m optipmb_schemas.export {options.folder}\n")
-            return 1 if lines else 0
-        options.folder.mkdir(parents=True, exist_ok=True)
-        for path, text in files.items():
-            path.write_text(text, encoding="utf-8")
+            files[options.page] = fill(read(options.page))
+        if options.asyncapi:
+            from optipmb_schemas.asyncapi import document  # noqa: PLC0415  it imports this module
+
+            files[options.asyncapi] = document()
+        gone = sorted(set(folder.glob(f"*{SUFFIX}")) - files.keys()) if folder else []
+        return bring_up_to_date(files, f"{parser.prog} without --check", check=options.check, gone=gone)
     except OSError as error:
         sys.stderr.write(f"error: {error}\n")
         return 2
-    return 0
 
 
-def _read(path: Path) -> str:
+def read(path: Path) -> str:
+    """Return the text of a file."""
     return path.read_text(encoding="utf-8")
 
 

@@ -10,12 +10,11 @@ from evaluation_cases import TrackRow, TruthRow, followed, parked, shuffled, tra
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_tools.datasets import open_dataset
+from optipmb_tools.evaluation import Counts
 from optipmb_tools.evaluation.ab3dmot import (
     POINTS,
     Ab3dmotResult,
-    Counts,
     evaluate_ab3dmot,
-    recall_points,
 )
 from optipmb_tools.evaluation.cases import Case, ab3dmot_rules, prepare
 from optipmb_tools.evaluation.evaluate import evaluate_figures, load_recordings
@@ -133,16 +132,6 @@ def test_stricter_overlaps_find_less() -> None:
         assert evaluate_ab3dmot([case]).amotp == pytest.approx((4.0 - dx) / (4.0 + dx))
 
 
-@PATIENT
-@given(st.lists(st.floats(0.0, 1.0), max_size=200), st.integers(0, 100))
-def test_recall_points_are_in_order(scores: list[float], missed: int) -> None:
-    """Thresholds fall and recalls rise by a fortieth, and each threshold is one of the scores."""
-    points = recall_points(np.array(scores), max(1, len(scores) + missed))
-    assert [threshold for threshold, _ in points] == sorted((threshold for threshold, _ in points), reverse=True)
-    assert [recall for _, recall in points] == pytest.approx([(k + 1) / POINTS for k in range(len(points))])
-    assert {threshold for threshold, _ in points} <= set(scores)
-
-
 def naive(case: Case, threshold: float) -> Counts:
     """Count as the published evaluation does, box by box."""
     means = {
@@ -154,7 +143,7 @@ def naive(case: Case, threshold: float) -> Counts:
     )
     match: dict[int, int] = {}
     counts = dict.fromkeys(vars(Counts()), 0)
-    counts["overlap"] = 0.0
+    counts["similarity"] = 0.0
     for frame in sorted({*case.truth_frame.tolist(), *case.track_frame.tolist()}):
         truth = np.flatnonzero(case.truth_frame == frame).tolist()
         tracks = [int(k) for k in np.flatnonzero(case.track_frame == frame) if means[case.track_id[k]] >= threshold]
@@ -169,7 +158,7 @@ def naive(case: Case, threshold: float) -> Counts:
     counts["truth"] = int((~case.ignored).sum())
     counts["true"] = len(match)
     counts["missed"] = sum(row not in match and not case.ignored[row] for row in range(len(case.truth_frame)))
-    counts["overlap"] = sum(overlap[pair] for pair in match.items())
+    counts["similarity"] = sum(overlap[pair] for pair in match.items())
     for one in sorted(set(case.truth_id.tolist())):
         rows = sorted(np.flatnonzero(case.truth_id == one).tolist(), key=lambda row: case.truth_frame[row])
         life = [int(case.track_id[match[row]]) if row in match else -1 for row in rows]
@@ -216,7 +205,7 @@ def test_counts_are_those_of_a_naive_twin(seed: int) -> None:
         errors = twin.false + twin.missed + twin.switches
         if twin.truth:
             scaled = 1.0 - (errors - (1.0 - point.recall) * twin.truth) / (point.recall * twin.truth)
-            assert point.counts.smota(point.recall) == pytest.approx(min(1.0, max(0.0, scaled)))
+            assert point.smota == pytest.approx(min(1.0, max(0.0, scaled)))
     if math.isinf(result.threshold):
         assert vars(result.best) == pytest.approx(vars(naive(case, -math.inf)))
     else:

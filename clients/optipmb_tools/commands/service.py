@@ -22,10 +22,10 @@ from optipmb_schemas import SessionParameters, encode_json
 from rich.console import Console
 from rich.live import Live
 
-from optipmb_tools.commands.options import AsJson, print_json, print_table, report
+from optipmb_tools.commands.options import AsJson, Origin, print_json, print_table, report
 from optipmb_tools.commands.service_options import ServiceOptions
 from optipmb_tools.table_files import SUFFIXES, write_table
-from optipmb_tools.terminal import StatusView, status_tables
+from optipmb_tools.views.terminal import StatusView, status_tables
 
 SECOND = 1_000_000_000
 STREAM = typer.Argument(help="Name of the stream, site/node/sensor.")
@@ -83,6 +83,7 @@ def tracks(
     last: Annotated[float | None, typer.Option(min=0.0, help="Instead: seconds up to the newest frame.")] = None,
     out: Annotated[Path | None, typer.Option(help="Write a table: .csv, .parquet, .jsonl or .feather.")] = None,
     *,
+    origin: Origin = None,
     service: ServiceOptions,
     as_json: AsJson = False,
 ) -> None:
@@ -91,6 +92,11 @@ def tracks(
         raise UsageError("--last: not together with --from and --to")
     if out is not None and out.suffix.lower() not in SUFFIXES:
         raise UsageError(f"--out: a table such as tracks.csv or tracks.parquet, not {out}")
+    georeference = None
+    if origin is not None:
+        from optipmb_tools.georeference import georeference_of  # noqa: PLC0415  imports the tracker
+
+        georeference = georeference_of(origin)
     with service.connection(2.0) as connection:
         if last is not None:
             state = session_state(connection, stream, prefix=service.prefix)
@@ -101,7 +107,7 @@ def tracks(
     if out is not None:
         from optipmb_tools.results.output import track_columns  # noqa: PLC0415  only with --out
 
-        write_table(out, track_columns(stream, dict(enumerate(found))))
+        write_table(out, track_columns(stream, dict(enumerate(found)), georeference=georeference))
     stamps = [found[0].stamp_ns, found[-1].stamp_ns] if found else []
     text = f"{stream}: no tracks are kept of this time"
     if found:

@@ -1,5 +1,163 @@
-"""Result files in the formats of the benchmarks, and tables of tracks."""
+"""Result files in the formats of the benchmarks, and tables of tracks.
 
-from optipmb_tools.results.rows import ResultTable, empty_table
+Conventions: columns with one row per box; metres, radians, z up; `label` indexes `labels`.
+"""
 
-__all__ = ["ResultTable", "empty_table"]
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Final, Self
+from zipfile import ZIP_DEFLATED, BadZipFile, ZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+from optipmb_schemas import PATHS, Tracks
+
+from optipmb_tools.files import DatasetError, write_whole
+from optipmb_tools.geometry import Bools, Floats, Ints, PoseLike, stack_poses, to_sensor, to_world
+
+
+@dataclass(frozen=True)
+class BoxTable:
+    """Boxes of one sequence, ordered by frame, in one frame of reference."""
+
+    labels: tuple[str, ...]
+    frame: Ints  # (R,)
+    id: Ints  # (R,)
+    label: Ints  # (R,) index into `labels`
+    center: Floats  # (R, 3)
+    size: Floats  # (R, 3) length, width, height
+    yaw: Floats  # (R,)
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @property
+    def names(self) -> NDArray[np.str_]:
+        """(R,) class names."""
+        return np.asarray(self.labels, dtype=np.str_)[self.label] if self.labels else np.empty(0, dtype=np.str_)
+
+    def take(self, rows: Ints | Bools) -> Self:
+        """Return the chosen rows."""
+        columns = [field.name for field in fields(self) if field.name not in _NOT_OF_ROWS]
+        return replace(self, **{name: getattr(self, name)[rows] for name in columns})
+
+    def of_class(self, name: str) -> Self:
+        """Return the rows of one class."""
+        return self.take(np.isin(self.label, [i for i, label in enumerate(self.labels) if label == name]))
+
+    def to_world(self, poses: Sequence[PoseLike]) -> Self:
+        """Return the boxes carried from the sensor frame of each row's frame to the world."""
+        rotation, translation = stack_poses(poses)
+        center, yaw = to_world(rotation[self.frame], translation[self.frame], self.center, self.yaw)
+        return replace(self, center=center, yaw=yaw)
+
+    def to_sensor(self, poses: Sequence[PoseLike]) -> Self:
+        """Return the boxes carried from the world to the sensor frame of each row's frame; velocities stay."""
+        rotation, translation = stack_poses(poses)
+        center, yaw = to_sensor(rotation[self.frame], translation[self.frame], self.center, self.yaw)
+        return replace(self, center=center, yaw=yaw)
+
+
+_NOT_OF_ROWS: Final = {"labels", "notes", "regions", "labelled"}  # fields that have no value for each row
+
+
+@dataclass(frozen=True)
+class ResultTable(BoxTable):
+    """All boxes of all tracks of one sequence."""
+
+    score: Floats  # (R,)
+    box2d: Floats  # (R, 4) x1 y1 x2 y2 in pixels; NaN where there is no image
+    notes: tuple[str, ...] = ()  # assumptions about them, a line each
+
+
+def empty_table(labels: tuple[str, ...] = ()) -> ResultTable:
+    """Return a table without rows."""
+    none = np.empty(0, dtype=np.int64)
+    return ResultTable(
+        labels, none, none, none, np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0), np.empty((0, 4))
+    )
+
+
+def column_shape(name: str) -> tuple[int, ...]:
+    """Return the shape of one row of a column of tracks."""
+    return tuple(length for length in Tracks.arrays[name].shape if isinstance(length, int))
+
+
+def stacked(parts: Sequence[Any], name: str) -> NDArray[Any]:
+    """Return a column of the tracks of many frames, one frame below the other."""
+    empty = np.empty((0, *column_shape(name)), Tracks.arrays[name].dtype)
+    return np.concatenate([empty, *(getattr(part, name) for part in parts)])
+
+
+@dataclass(frozen=True)
+class FullTable(BoxTable):
+    """All columns of the tracks of one sequence in the world frame, as in a file `NAME.npz` next to `NAME.txt`.
+
+    Result files of the benchmarks have no room for covariances and probabilities. This file holds every column as a
+    numpy array, one row per track and frame, ordered by frame and, in a frame, as in the result file; where tracks have
+    predicted paths, these too, named as in messages. The same tracks always give the same bytes.
+    """
+
+    velocity: Floats  # (R, 2)
+    yaw_rate: Floats  # (R,)
+    acceleration: Floats  # (R,) along the heading
+    existence: Floats  # (R,) probability
+    score: Floats  # (R,)
+    covariance: Floats  # (R, 6, 6) of x, y, speed, heading, turn rate, acceleration
+    age: Floats  # (R,) since the first detection
+    time_since_detection: Floats  # (R,)
+    detection: Ints  # (R,) index of the detection in its frame, -1 while missed
+
+
+COLUMNS: Final = tuple(field.name for field in fields(FullTable) if field.name not in {"labels", "frame"})
+"""Columns of tracks in the order of the fields of `FullTable`."""
+
+
+def full_path(result: Path) -> Path:
+    """Return the path of the file that belongs to a result file."""
+    return result.with_suffix(".npz")
+
+
+def write_full(path: Path, tracks: Mapping[int, Tracks]) -> None:
+    """Write the tracks of a sequence by frame index; the file appears complete, or not at all."""
+    order = sorted(tracks)
+    parts = [tracks[index] for index in order]
+    count = [len(one.id) for one in parts]
+    columns = {name: stacked(parts, name) for name in COLUMNS}
+    labels = parts[0].labels if parts else ()
+    horizons = [one.horizons for one in parts if one.horizons is not None]
+    if horizons and len(horizons) == len(order) and len({one.tobytes() for one in horizons}) == 1:
+        columns |= {name: np.concatenate([getattr(one, name) for one in parts]) for name in PATHS[1:]}
+        columns["horizons"] = horizons[0]
+    columns |= {"labels": np.array(labels, dtype=np.str_), "frame": np.repeat(np.array(order, dtype=np.int64), count)}
+    content = io.BytesIO()
+    with ZipFile(content, "w", ZIP_DEFLATED) as archive:  # as numpy's own savez, but without the time of day
+        for name, column in columns.items():
+            with archive.open(f"{name}.npy", "w") as entry:
+                np.lib.format.write_array(entry, column, allow_pickle=False)
+    write_whole(path, content.getvalue())
+
+
+def read_full(path: Path) -> FullTable:
+    """Return the tracks of a sequence.
+
+    Raises:
+        DatasetError: The file is missing, no such file, or lacks a column.
+    """
+    what = "a file of tracks with all columns"
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: np.asarray(file[name]) for name in file.files}
+    except OSError as error:
+        raise DatasetError(path, what, error.strerror or "an unreadable file") from error
+    except (BadZipFile, ValueError, EOFError) as error:
+        raise DatasetError(path, what, "another kind of file") from error
+    rows = len(arrays["frame"]) if arrays.get("frame", np.empty(())).ndim == 1 else -1
+    for name in ("labels", "frame", *COLUMNS):
+        shape = (rows, *(column_shape(name) if name in COLUMNS else ()))
+        if name not in arrays or (name != "labels" and arrays[name].shape != shape):
+            raise DatasetError(path, f"{what}: {name}", f"shape {arrays[name].shape}" if name in arrays else "none")
+    labels = tuple(str(label) for label in arrays.pop("labels"))
+    return FullTable(labels, *(arrays[name] for name in ("frame", *COLUMNS)))

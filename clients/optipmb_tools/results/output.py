@@ -5,7 +5,8 @@ that name the recording and the time in the table of detections (for other data 
 frame (its number in the table of detections, or else counted from 0), id, class, x, y, z, l, w, h, yaw, vx, vy,
 yaw_rate, acceleration, score, existence, confirmed (1 or 0), age, time_since_detection and detection_row: the row of
 the table (from 0; for other data sets the place in the frame) of the detection that the track was given, no value while
-it is missed. A velocity has no value until it is known: from the second detection on, where the detector gives none. On
+it is missed. A velocity has no value until it is known: from the second detection on, where the detector gives none.
+With a georeference lat, lon, alt and heading follow (degrees, m above the ellipsoid, degrees from true north). On
 request the upper triangle of the covariance of (x, y, v, phi, omega, a) follows, `cov_x_x` to `cov_a_a`. Metres,
 seconds, radians. The same tracks always give the same bytes.
 """
@@ -18,14 +19,14 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from optipmb_schemas import Tracks
 
-from optipmb_tools.results.full import full_path, write_full
-from optipmb_tools.results.rows import stacked
+from optipmb_tools.results import full_path, stacked, write_full
 from optipmb_tools.table_files import Columns, is_table, write_table
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from optipmb_tools.datasets.interface import DataSequence, Dataset
+    from optipmb_tools.georeference import Georeference
 
 _STATE: Final = ("x", "y", "v", "phi", "omega", "a")
 COVARIANCE: Final = {f"cov_{_STATE[i]}_{_STATE[j]}": (i, j) for i in range(6) for j in range(i, 6)}
@@ -33,7 +34,12 @@ COVARIANCE: Final = {f"cov_{_STATE[i]}_{_STATE[j]}": (i, j) for i in range(6) fo
 
 
 def track_columns(
-    name: str, tracks: Mapping[int, Tracks], sequence: "DataSequence | None" = None, *, full: bool = False
+    name: str,
+    tracks: Mapping[int, Tracks],
+    sequence: "DataSequence | None" = None,
+    *,
+    full: bool = False,
+    georeference: "Georeference | None" = None,
 ) -> Columns:
     """Return tracks (world frame) by frame index as columns, with `full` also the covariance.
 
@@ -42,6 +48,7 @@ def track_columns(
         tracks: The tracks of each frame.
         sequence: The tracked sequence; knows the columns and rows of its table of detections, if it came from one.
         full: Whether to add the covariance.
+        georeference: Place of the world frame; adds latitude, longitude, height and true heading.
     """
     order = sorted(tracks)
     parts = [tracks[index] for index in order]
@@ -72,6 +79,8 @@ def track_columns(
         place = part.detection.tolist()
         detection += [np.nan if one < 0 else one if rows is None else rows[one] for one in place]
     columns["detection_row"] = np.array(detection, dtype=np.float64)
+    if georeference is not None:
+        columns |= georeference.to_geographic(stacked(parts, "center"), columns["yaw"])._asdict()
     if full:
         covariance = stacked(parts, "covariance")
         columns |= {name: covariance[:, i, j] for name, (i, j) in COVARIANCE.items()}
@@ -122,8 +131,8 @@ class Results:
     Args:
         dataset: The tracked data set; it knows the format of its result files.
         out: The folder, or a file with the suffix of a table.
-        full: Whether all columns of the tracks are written: into a file beside each result file, or into further
-            columns of the table. Otherwise a file that an earlier run left beside a result file is removed.
+        full: Whether all columns of the tracks are written: into a file for each result file, or into further
+            columns of the table. Otherwise such files of an earlier run are removed.
     """
 
     def __init__(self, dataset: "Dataset", out: Path, *, full: bool = False) -> None:
@@ -136,7 +145,8 @@ class Results:
     def write(self, sequence: "DataSequence", tracks: Mapping[int, Tracks]) -> Path | Columns:
         """Write the tracks of a sequence by frame index; return the file, or its rows of the table of all."""
         if self._table:
-            return track_columns(sequence.name, tracks, sequence, full=self._full)
+            georeference = self._dataset.georeference
+            return track_columns(sequence.name, tracks, sequence, full=self._full, georeference=georeference)
         path = self._dataset.write(self._out, sequence, tracks)
         if self._full:
             write_full(full_path(path), tracks)

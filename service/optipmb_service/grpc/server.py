@@ -16,13 +16,14 @@ import optipmb_schemas as schemas
 import structlog
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
+from optipmb_client.errors import ClientError
+from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
 from optipmb_service.grpc import inputs, outputs
 from optipmb_service.grpc.access import Access, credentials
 from optipmb_service.grpc.calls import Call, CallerGoneError, EndCall, ending_with_caller
 from optipmb_service.grpc.network import Network
-from optipmb_service.runtime.ports import EdgeError, TransportError
 from optipmb_service.telemetry.problem_reporter import ProblemReporter, log_problem
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ SAID_BY: Final = "optipmb-gateway"
 """Trailing metadata by which a gateway signs its errors: others come of the way to it."""
 
 GRACE_S: Final = 1.0
-"""How long calls may take to finish what is under way at the end."""
+"""How long calls may take to finish at the end."""
 
 LINK_S: Final = 0.5
 """How often the gateway looks whether it has a router."""
@@ -103,7 +104,7 @@ class Server:
         client: of the network.
 
     Raises:
-        EdgeError: the address, the certificates or the access cannot be used.
+        ClientError: the address, the certificates or the access cannot be used.
     """
 
     def __init__(self, settings: Settings, client: Client) -> None:
@@ -138,14 +139,14 @@ class Server:
         self._watching = asyncio.create_task(self._watch())
 
     async def stop(self) -> None:
-        """Take no calls any more, finish what is under way, and end."""
+        """Refuse new calls, finish the open ones, and end."""
         if self._watching is not None:
             self._watching.cancel()
         await self._health.enter_graceful_shutdown()
         for call in tuple(self._calls):
             call.end()
         await self._server.stop(GRACE_S)
-        self.network.close()
+        await asyncio.to_thread(self.network.close)
 
     def refused(self, problem: schemas.Problem) -> None:
         """Count and report the problem of a message that is not valid."""
@@ -169,7 +170,7 @@ class Server:
             else:
                 port = self._server.add_secure_port(settings.grpc, credentials(settings.grpc_tls))
         except RuntimeError as error:
-            raise EdgeError(f"cannot listen on {settings.grpc} for gRPC: is the address in use?") from error
+            raise ClientError(f"cannot listen on {settings.grpc} for gRPC: is the address in use?") from error
         return f"{settings.grpc.rpartition(':')[0]}:{port}"
 
     async def _watch(self) -> None:
@@ -258,7 +259,7 @@ def serving(settings: Settings, client: Client) -> Iterator[CallMetrics]:
     """Serve meanwhile, on a thread with a loop of its own: neither side waits for the other.
 
     Raises:
-        EdgeError: the address, the certificates or the access cannot be used.
+        ClientError: the address, the certificates or the access cannot be used.
     """
     loop = asyncio.new_event_loop()
     thread = threading.Thread(target=loop.run_forever, name="grpc", daemon=True)

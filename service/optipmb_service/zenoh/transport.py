@@ -1,4 +1,4 @@
-"""A Zenoh session with what the service declares on it: what it reads, what it sends, who it is; and their end."""
+"""A Zenoh session with the declarations of a service: inputs, outputs, tokens, queries."""
 
 from __future__ import annotations
 
@@ -9,29 +9,27 @@ from typing import TYPE_CHECKING, Final
 
 import optipmb_schemas as schemas
 import structlog
+from optipmb_client.errors import ConnectionFailed as TransportError
 
-from optipmb_service.runtime.ports import Packet, TransportError
-from optipmb_service.runtime.queries import problem_with
 from optipmb_service.zenoh.client import Client
-from optipmb_service.zenoh.inputs import ReturnedPublishers, Topic
+from optipmb_service.zenoh.inputs import Packet, ReturnedPublishers, Topic
 from optipmb_service.zenoh.taps import Taps
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
     from collections.abc import Set as AbstractSet
 
-    from optipmb_client.zenoh.handles import Declared, Reading, Sender
+    from optipmb_client.zenoh.handles import Declared, Query, Reading, Sender
     from optipmb_client.zenoh.session import Sample, Session
 
-    from optipmb_service.runtime.intake import Kind
-    from optipmb_service.runtime.ports import Request
     from optipmb_service.settings import Settings
+    from optipmb_service.zenoh.inputs import Kind
 
 MOST_OPEN: Final = 256
 """Queries of one key expression that may be open; those beyond are refused."""
 
 RECENT_S: Final = 2.0
-"""How long other instances may take to answer what they have received of streams that have come here."""
+"""How long other instances may take to answer with their messages of streams that have moved here."""
 
 TRACKS_CACHE: Final = 100
 """Tracks kept per stream for subscribers that lost some or come late: 5 s at 20 Hz. Most of what a stream holds.
@@ -77,7 +75,7 @@ class Announcements:
         self._tokens: dict[tuple[str, ...], Declared] = {}
 
     def announce(self, streams: AbstractSet[str]) -> None:
-        """Announce these streams, and no others; those that stay are announced all the time."""
+        """Announce these streams, and no others; streams that stay are announced all the time."""
         new = sorted(streams - self._groups.keys())
         gone = self._groups.keys() - streams
         if not new and not gone:
@@ -114,7 +112,7 @@ class Transport:
         self._discover: Callable[[Sample], None] = lambda _: None
         self._all = False
         self._run = secrets.token_hex(8)
-        """Tells this process from all others, also from those of its name."""
+        """Tells this process from all others, also from others of its name."""
         self._announcements = Announcements(self._client, self._keys, self._instance, self._run)
         self._returned = ReturnedPublishers(self._client, lambda *_: 0)
         self._alive: Declared | None = None
@@ -125,8 +123,7 @@ class Transport:
 
     def receive(
         self,
-        on_frame: Callable[[Packet], None],
-        on_cloud: Callable[[Packet], None],
+        take: Callable[[Packet], None],
         noticed: Callable[[str, bool], bool],
         passed_by: Callable[[str, int], None],
         answered: Callable[[str], None],
@@ -134,8 +131,7 @@ class Transport:
         """Hand over the detections and point clouds that are subscribed to, on threads of the network.
 
         Args:
-            on_frame: takes detections.
-            on_cloud: takes clouds.
+            take: takes detections and clouds.
             noticed: called for detections that come by a subscription to all, by key and whether they can be recovered;
                 where that is `discovery`, those alone are handed over for which it returns True.
             passed_by: called with the keys and sizes of the others.
@@ -145,7 +141,7 @@ class Transport:
         def discover(sample: Sample) -> None:
             key = str(sample.key_expr)
             if noticed(key, sample.source_info is not None):
-                self._receive(sample, key, on_frame)
+                self._receive(sample, key, take)
             else:
                 passed_by(key, len(sample.payload))
 
@@ -153,12 +149,12 @@ class Transport:
             key = str(sample.key_expr)
             if self._all:
                 noticed(key, sample.source_info is not None)
-            self._receive(sample, key, on_frame)
+            self._receive(sample, key, take)
 
         self._discover = discover
         self._topics = {
             "detections": Topic("detections", self._client, detected, answered),
-            "points": Topic("points", self._client, lambda one: self._receive(one, str(one.key_expr), on_cloud)),
+            "points": Topic("points", self._client, lambda one: self._receive(one, str(one.key_expr), take)),
         }
         self._returned = ReturnedPublishers(self._client, self._topics["detections"].due)
         # A name with a part too few or too many matches no other subscription: it is received to be refused.
@@ -168,7 +164,7 @@ class Transport:
     def subscribe(self, kind: Kind, stream: str, *, cached: bool) -> None:
         """Receive the detections or clouds of a stream, or of all of them where it is empty; `discovery` is of all.
 
-        With `cached`, what was lost is recovered from the publisher's cache.
+        With `cached`, lost messages are recovered from the publisher's cache.
         """
         if kind == "discovery":
             self._topics["detections"].subscribe(kind, self._keys.all("detections"), self._discover)
@@ -201,11 +197,11 @@ class Transport:
     ) -> None:
         """Tell of publishers of detections with a cache, by key and token, and of others' announcements, by token."""
 
-        def announced(key: str, present: bool) -> None:  # noqa: FBT001 - as a token is told
+        def announced(key: str, present: bool) -> None:  # noqa: FBT001 - the signature of a watcher
             if not self._keys.discovered_by(key, self._run):
                 discovered(key, present)
 
-        def returned(key: str, present: bool) -> None:  # noqa: FBT001 - as a token is told
+        def returned(key: str, present: bool) -> None:  # noqa: FBT001 - the signature of a watcher
             published(key, key, present)
             if present:
                 self._returned.came(key)
@@ -217,8 +213,8 @@ class Transport:
         """Announce these streams, and no others."""
         self._announcements.announce(streams)
 
-    def ask_recent(self, sessions: Sequence[str]) -> list[tuple[Packet, bool]]:
-        """Return what other instances have received lately of sessions, each packet with whether it is a frame.
+    def ask_recent(self, sessions: Sequence[str]) -> list[Packet]:
+        """Return what other instances have received lately of sessions, as packets.
 
         The question has the lowest priority: it overtakes no message on the way to who is asked.
         """
@@ -227,19 +223,18 @@ class Transport:
         for answer in self._client.query(self._keys.recent(), payload, timeout=RECENT_S, background=True):
             if answer.ok and answer.about:
                 now = time.time_ns(), time.monotonic_ns()
-                packet = Packet(answer.about, answer.payload, len(answer.payload), answer.encoding, *now)
-                found.append((packet, answer.about.endswith("/detections")))
+                found.append(Packet(answer.about, answer.payload, len(answer.payload), answer.encoding, *now))
         return found
 
-    def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]], bool], None]) -> None:
+    def ask_cache(self, stream: str, then: Callable[[list[Packet], bool], None]) -> None:
         """Call `then`, on a thread of its own, with what the caches of a stream hold of its detections, all frames.
 
         It is called, too, with whether all caches have answered in time.
         """
-        found: list[tuple[Packet, bool]] = []
+        found: list[Packet] = []
 
         def reply(sample: Sample) -> None:
-            self._receive(sample, str(sample.key_expr), lambda packet: found.append((packet, True)))
+            self._receive(sample, str(sample.key_expr), found.append)
 
         self._client.ask(f"{self._keys.detections(stream)}/@adv/pub/**", reply, partial(then, found))
 
@@ -248,19 +243,19 @@ class Transport:
         self._client.ask(self._keys.metrics(self._instance), lambda _: found(), timeout=RECENT_S, background=True)
 
     def look_for_returned(self, report: Callable[[str, int, int], None]) -> None:
-        """Call `report` for each publisher that came back with numbers below those that it has sent.
+        """Call `report` for each publisher that came back with numbers below its last ones.
 
         It is called on a thread of the network, with the key of its token, the number expected next and its newest one.
         """
         self._returned.look(report)
 
-    def serve(self, about_streams: Callable[[Request], None], about_service: Callable[[Request], None]) -> None:
+    def serve(self, about_streams: Callable[[Query], None], about_service: Callable[[Query], None]) -> None:
         """Hand over the queries about streams and those about this instance, each on a thread of its own."""
         self._serve(f"{self._prefix}/*/*/*/q/*", about_streams)
         self.serve_service(about_service)
 
-    def serve_service(self, about_service: Callable[[Request], None], names: Sequence[str] = ("*",)) -> None:
-        """Hand over the queries about this instance alone, those of each name on a thread of its own.
+    def serve_service(self, about_service: Callable[[Query], None], names: Sequence[str] = ("*",)) -> None:
+        """Hand over the queries about this instance alone, each name on a thread of its own.
 
         Who asks all instances waits for each that declares the name, so one that takes no such query must not.
         """
@@ -275,16 +270,24 @@ class Transport:
             return None
         return next((answer.payload for answer in answers if answer.ok), None)
 
-    def _serve(self, key: str, answer: Callable[[Request], None]) -> None:
-        full = schemas.MessageError("too_large", "key", f"at most {MOST_OPEN} queries open at once", "another one")
-        refusal = problem_with(full, instance=self._instance, code="refused")
+    def _serve(self, key: str, answer: Callable[[Query], None]) -> None:
+        expected, received = f"at most {MOST_OPEN} queries open at once", "another one"
+        refusal = schemas.Problem(
+            stream="",
+            instance=self._instance,
+            code="refused",
+            path="key",
+            expected=expected,
+            received=received,
+            message=f"Query: key: expected {expected}, received {received}.",
+        )
         self._client.serve(key, answer, most=MOST_OPEN, refusal=refusal)
 
     def tap(self, stream: str, receive: Callable[[str, bytes, str], None], detections: str = "") -> Callable[[], None]:
         """Hand over topic, payload and encoding of the newest detections and tracks of a stream to a viewer.
 
         Viewers of a stream share its subscriptions, until the last of them has called the result. Detections of a
-        session of several streams are those of `detections`, a pattern of streams.
+        session of several streams come from `detections`, a pattern of streams.
 
         Raises:
             TransportError: the session is closed, or too many other streams were looked at.
@@ -318,7 +321,7 @@ class Transport:
 
     def open_publisher(self, stream: str) -> StreamPublisher:
         """Open the publisher of a stream's tracks, say that this instance tracks it, and declare its inputs' keys."""
-        # Who subscribes asks the caches, and hears by heartbeats of what it missed: nobody needs a token for that, and
+        # Who subscribes asks the caches, and hears by heartbeats of missed messages: no token is needed for that, and
         # each costs the router more the more there are.
         key, encoding = self._keys.tracks(stream), schemas.encoding_of(schemas.Tracks)
         sender = self._client.cached_sender(key, encoding, cache=TRACKS_CACHE, detected=False)
@@ -331,7 +334,7 @@ class Transport:
         self._client.publish_problem(problem)
 
     def watch_owners(self, on_owner: Callable[[str, str, bool], None] | None) -> None:
-        """Tell which instance tracks which stream, or does so no longer (False), from now on; None: nobody any more."""
+        """Tell which instance tracks which stream, or does so no longer (False), from now on; None: stop telling."""
         if self._owners is not None:
             self._owners.close(0.0)
             self._owners = None
@@ -350,7 +353,7 @@ class Transport:
             self._alive = None
 
     def stop(self, timeout: float) -> None:
-        """Receive nothing any more; what was received before is handed over within `timeout` seconds."""
+        """Receive nothing any more; messages received before are handed over within `timeout` seconds."""
         self.leave()
         for topic in self._topics.values():
             topic.close(timeout)
@@ -367,6 +370,6 @@ def _name(stream: str, *, cached: bool) -> str:
     return stream if cached else f"{stream} plain"
 
 
-def _log_link(peer: str, kind: str, came: bool) -> None:  # noqa: FBT001 - as a link is told
+def _log_link(peer: str, kind: str, came: bool) -> None:  # noqa: FBT001 - the signature of a watcher
     """Log that a node or a router has linked to the session, or has gone."""
     log.info("peer_connected" if came else "peer_lost", peer=peer, kind=kind)

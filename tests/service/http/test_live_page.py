@@ -18,6 +18,8 @@ from optipmb_service.http import Server
 from optipmb_service.http.page import VIEWERS, Newest, live_frame, page
 from starlette.applications import Starlette
 
+from optipmb import Georeference
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, MutableMapping
 
@@ -303,6 +305,15 @@ def test_a_frame_holds_what_is_drawn() -> None:
     assert frame["unconfirmed"] == 1
     assert frame["sensor"] == [10.0, 20.0, 1.571]
     assert frame["detections"] == [[9.0, 25.0]]
+    place = Georeference((48.0, 11.0, 500.0), x_heading=0.0)
+    placed = live_frame((tracks(1), ""), georeference=place)
+    assert placed is not None
+    ((lat, lon, alt, heading),) = json.loads(placed)["geographic"]
+    assert lat == pytest.approx(48.0 + 100.123 / 111_200, abs=1e-5)
+    assert lon == pytest.approx(11.0 + 7.0 / 74_600, abs=1e-5)
+    assert alt == pytest.approx(500.0, abs=3.0)
+    assert heading == pytest.approx(360.0 - np.degrees(0.333), abs=0.1)
+    assert "geographic" not in frame
     rear = detections.model_copy(update={"stream": "site/node/rear", "pose": None, "frame": "world"})
     older = detections.model_copy(update={"center": np.zeros((1, 3))})
     both = live_frame((tracks(1), ""), *((encode(one), encoding_of(one)) for one in (detections, rear, older)))

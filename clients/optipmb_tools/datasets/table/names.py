@@ -52,6 +52,9 @@ ALIASES: Final[Mapping[str, tuple[str, ...]]] = {
     "x": ("x", "cx", "px", "x_center", "tx", *_vector(_CENTER, "x", 0)),
     "y": ("y", "cy", "py", "y_center", "ty", *_vector(_CENTER, "y", 1)),
     "z": ("z", "cz", "pz", "z_center", "tz", *_vector(_CENTER, "z", 2)),
+    "lat": ("lat", "latitude"),
+    "lon": ("lon", "lng", "longitude"),
+    "alt": ("alt", "altitude"),
     "l": ("l", "length", "box_length", "dx", *_extent("x", "l", "length", 0)),
     "w": ("w", "width", "box_width", "dy", *_extent("y", "w", "width", 1)),
     "h": ("h", "height", "box_height", "dz", *_extent("z", "h", "height", 2)),
@@ -131,7 +134,7 @@ def _names_of(role: str) -> tuple[str, ...]:
 
 
 def _is_second_half(column: Column) -> bool:
-    """Tell whether a column may be the rest of a stamp, as `stamp.nanosec` beside `stamp.sec`; `stamp_ns` is not."""
+    """Tell whether a column may be the rest of a stamp, as `stamp.nanosec` of `stamp.sec`; `stamp_ns` is not."""
     return column.unit == "ns" and not _plain(column.name).endswith("ns")
 
 

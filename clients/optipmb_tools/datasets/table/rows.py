@@ -8,7 +8,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from optipmb_tools.camera import sensor_from_kitti
 from optipmb_tools.datasets.motion import SAME_DIRECTION, Moves, find_moves, overlapping
 from optipmb_tools.datasets.table.names import Column, find_columns
 from optipmb_tools.datasets.table.values import (
@@ -82,27 +81,20 @@ class Boxes:
 _OF_ROWS: Final = ("frame_stamp", "frame_key", "frame_pose", "frame_time", "frame_number")
 
 
-def read_boxes(reading: Reading, *, scored: bool) -> Boxes:
-    """Read the table of a `Reading`, which gets the findings.
-
-    Args:
-        reading: the file and the options of the user.
-        scored: whether boxes are detections, which have a score, a size and a heading.
-
-    Raises:
-        DatasetError: a column is missing or a value is not allowed; names the line.
-        ClientError: pyarrow is not installed.
-    """
-    ((_, boxes),) = read_tables([reading.path], reading, scored=scored)
-    return boxes
-
-
 def read_tables(
     paths: Sequence[Path], reading: Reading, *, scored: bool, loaded: Mapping[Path, Columns] | None = None
 ) -> list[tuple[Path, Boxes]]:
     """Read the tables of a recording; tables with the same columns share units and conventions.
 
-    Tables without rows give no boxes; `loaded` ones are not read again. Raises as `read_boxes` does.
+    Args:
+        paths: Files, or folders with a file for each frame. Tables without rows give no boxes.
+        reading: Options of the user; receives the findings.
+        scored: Whether boxes are detections, which have a score, a size and a heading.
+        loaded: Tables that were read already.
+
+    Raises:
+        DatasetError: A column is missing or a value is not allowed; names the line.
+        ClientError: pyarrow is not installed.
     """
     tables = loaded or {path: read_table(path, reading.options) for path in paths}
     groups: dict[tuple[str, ...], list[Path]] = {}
@@ -178,7 +170,7 @@ class _Table:
         file = np.searchsorted([first for _, first in reading.files], np.arange(self._rows), side="right")
         series = np.unique(key, return_inverse=True)[1] * (len(reading.files) + 1) + file
         stamp, time, time_column = self._stamps(series)
-        center = np.column_stack([self._numbers("x"), self._numbers("y"), self._numbers("z", 0.0)])
+        center = self._centers()
         centres = not scored and not {"l", "w"} & found.keys()
         side = 1.0 if centres else None
         size = np.column_stack([self._numbers("l", side), self._numbers("w", side), self._numbers("h", 1.5)])
@@ -188,7 +180,7 @@ class _Table:
             reading.note("sizes", "no columns for the size or the heading: only centres can be compared")
         score = self._numbers("score", 1.0)
         names, id_ = self._names(), self._ids()
-        for role, text in (("z", "z = 0"), ("h", "a height of 1.5 m"), ("score", "a score of 1")):
+        for role, text in ((self._height, "z = 0"), ("h", "a height of 1.5 m"), ("score", "a score of 1")):
             if role not in found and (scored or role != "score"):
                 reading.note(role, f"no column for {role}: {text} for every box")
         empty = np.isnan(center[:, :2]).all(axis=1) & (centres | np.isnan(size[:, :2]).all(axis=1))
@@ -206,7 +198,7 @@ class _Table:
         camera = read_axes(reading, center)
         if camera:
             yaw = yaw if yaw_unit in {"quaternion", "none"} else read_angle(reading, "yaw", yaw, yaw_unit)
-            center, size, yaw = sensor_from_kitti(center, np.ascontiguousarray(size[:, ::-1]), yaw)
+            center, size, yaw = _from_camera(center, size, yaw)
             yaw_unit = "rad"
         read_digits(reading, center)
         plane, sides = center[:, :2], size
@@ -244,6 +236,23 @@ class _Table:
             sensor_column=found["sensor"].name if "sensor" in found else "",
             keys=keys,
         )
+
+    @property
+    def _height(self) -> str:
+        return "alt" if "alt" in self._found else "z"
+
+    def _centers(self) -> Floats:
+        """Return centres (R, 3): x, y, z, or latitude and longitude where an origin is given and x is not."""
+        origin, found = self._reading.options.get("origin"), self._found
+        if "x" in found or "lat" not in found or origin is None:
+            return np.column_stack([self._numbers("x"), self._numbers("y"), self._numbers("z", 0.0)])
+        from optipmb_tools.georeference import georeference_of  # noqa: PLC0415  imports the tracker
+
+        alt = self._numbers("alt") if self._height == "alt" else None
+        center = georeference_of(origin).to_world(self._numbers("lat"), self._numbers("lon"), alt)
+        if alt is None:
+            center[:, 2] = self._numbers("z", 0.0)
+        return center
 
     def _stamps(self, series: Ints) -> tuple[Ints, NDArray[Any], str]:
         """Return the stamps (R,) in nanoseconds, the times as the table has them, and the name of their column."""
@@ -555,6 +564,12 @@ _FORWARD: Final = 0.8
 """Share of forward moves from which a common motion is that of traffic, not of the sensor."""
 _LEAST_TURN: Final = 1e-6
 _INVERSE: Final = np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def _from_camera(center: Floats, size: Floats, yaw: Floats) -> tuple[Floats, Floats, Floats]:
+    from optipmb_tools.camera import sensor_from_kitti  # noqa: PLC0415  of few tables
+
+    return sensor_from_kitti(center, np.ascontiguousarray(size[:, ::-1]), yaw)
 
 
 def _rotated(quaternion: Floats, vector: Floats) -> Floats:

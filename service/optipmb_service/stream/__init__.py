@@ -1,0 +1,1 @@
+"""Streams: their backlogs, turns, opening and recovery, with their network inputs and their checkpoints."""

@@ -1,0 +1,128 @@
+"""The problems that a service reports: their codes, and how a problem is made so that its texts fit the message."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import optipmb_schemas as schemas
+
+CODES: Final = {
+    "malformed": ("The bytes are not a message.", "Check the publisher's encoder; compare with the JSON Schemas."),
+    "wrong_type": ("The message type does not belong on this key.", "Check the key and the encoding of the publisher."),
+    "unsupported_version": ("The service does not support this major version.", "Update the service or the publisher."),
+    "too_large": ("A size, count or nesting above the limit.", "Send less, or raise `limits`."),
+    "missing_field": ("A required field is absent.", "Send the field that `path` names."),
+    "invalid_value": ("A field has a wrong value; the whole frame is refused.", "Look at `path`: NaN, sizes, scores?"),
+    "unknown_class": (
+        "Objects of a class that the profile lacks are left out; reported once per session.",
+        "Choose another profile, or send the names of its classes.",
+    ),
+    "score_filter": (
+        "Most detections of a class have scores below the profile's `score_filter`; reported once per session.",
+        "Choose the profile `generic`, or lower the filter of the class.",
+    ),
+    "no_pose": (
+        "The sensor moves, and its frames have no pose: the motion is estimated; reported once per session.",
+        "Send poses where they are known: tracks are in the axes of the sensor without them.",
+    ),
+    "late": (
+        "The frame came later than the window in which tracks are corrected.",
+        "Publish in order, or raise `rewind_s`.",
+    ),
+    "duplicate_epoch": (
+        "A publisher that was replaced by another one still sends; it is tracked again when the other one is silent.",
+        "Stop one of the two publishers: those with the `epoch` of the problem, and with that of the tracks.",
+    ),
+    "duplicate_seq": (
+        "A frame has the epoch and the number of another one, as of a publisher that began again; it is refused.",
+        "Give the publisher a new random epoch at every start, and number its frames upwards.",
+    ),
+    "shed": ("The queue was full and the oldest frames were dropped.", "Lower the rate, or add processors."),
+    "refused": (
+        "No room for another session, or a change that needs a restart.",
+        "Raise `max_sessions` or quotas; see `path`.",
+    ),
+    "quota": (
+        "The node, or its site, sends more than its quota.",
+        "Send less, or raise `node_rate`, `node_mb_s`, `site_rate`, `site_mb_s`.",
+    ),
+    "astray": (
+        "The sensor cannot have reached this pose since its last frame; the frame is refused.",
+        "Check the localisation; if it is right, raise `max_speed`.",
+    ),
+    "time_jump": (
+        "The stamp is over `gap_limit_s` ahead or `rewind_s` behind; frames are refused until three in a row agree.",
+        "Check the sensor's clock.",
+    ),
+    "clock": (
+        "The stamps of twenty frames do not advance, or not in nanoseconds; the frames are tracked nevertheless.",
+        "Send the time of the measurement, in nanoseconds, as `stamp_ns`.",
+    ),
+    "restarted": (
+        "The session restarted: its tracks ended (`clock`: objects found again keep ids). `received` has the reason.",
+        "After `jump`, `clock` or `pose`: check clock and localisation. After `publisher` (a restart): nothing.",
+    ),
+    "overload": (
+        "The frame, or the stream, exceeds its limit of computing time; the frame is refused.",
+        "Suppress overlapping boxes in the detector, send less, or raise `max_pairs`, `step_limit_s`.",
+    ),
+    "superseded": (
+        "The instance was frozen or cut off for longer than its lease; another one tracks the stream now.",
+        "Nothing. If it happens often, raise `lease_s`, or look for what stops the process.",
+    ),
+    "certificate": (
+        "A certificate of the service has ended; `received` names it.",
+        "Renew it; see `security.md`. A process that listens with it needs a restart.",
+    ),
+    "contested": (
+        "Two instances without the same `store` track the stream; reported until one is left.",
+        "Give them one `store` or `cluster`, or routers of their own.",
+    ),
+    "duplicate_name": (
+        "Another process answers by the name of this instance. Both track, but orders and status reach either.",
+        "Give each its own `instance`, or none: the default is unique.",
+    ),
+    "numbers_back": (
+        "A publisher began again with the Zenoh id of its last run: Zenoh drops as many messages as that had sent.",
+        "Remove `id` from its Zenoh configuration, and start it again.",
+    ),
+    "cut": (
+        "In answers to `q/tracks`: there are more tracks than one answer takes.",
+        "Ask again from `stamp_ns` on, as `optipmb_client.kept_tracks` does.",
+    ),
+    "unlogged": (
+        "A message is not in the log: NATS was away for too long, or does not take it.",
+        "Nothing for the tracks. See the NATS servers; a successor has to get the frame from the publisher's cache.",
+    ),
+    "internal": (
+        "A bug in the service. If a tracking step failed, the session is quarantined and its last frames are saved.",
+        "Report it, with the saved file if there is one; `optipmb track --dump` replays it.",
+    ),
+    "quarantined": (
+        "Tracking this stream failed, see `internal`; its frames are refused.",
+        "Reset the session, or restart the publisher.",
+    ),
+}
+"""Every code of a problem: what it means, and what to do."""
+
+MAX_TEXT: Final = 500
+"""Characters of a text in a problem."""
+
+
+def problem_of(code: str, *, subject: str = "", **fields: Any) -> schemas.Problem:
+    """Return a problem, its texts printable and cut to what the message allows.
+
+    Args:
+        code: one of `CODES`.
+        subject: begins the message, unless that is among the fields.
+        fields: further fields of the message.
+    """
+    fields = {"path": "", "expected": "", "received": ""} | fields
+    fields.setdefault("message", f"{subject}: expected {fields['expected']}, received {fields['received']}.")
+    texts = {name: _fit(fields[name]) for name in ("path", "expected", "received", "message")}
+    return schemas.Problem(code=code, **fields | texts)
+
+
+def _fit(text: str) -> str:
+    text = "".join(character if character.isprintable() else "?" for character in text[: MAX_TEXT + 1])
+    return text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 3] + "..."
