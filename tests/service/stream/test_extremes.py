@@ -89,49 +89,6 @@ def told(found: optipmb.Tracks, paths: optipmb.PredictedPaths | None = None) -> 
 
 
 @settings(max_examples=40, deadline=None)
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    weight=st.sampled_from([1e-300, 1e-200, 1e-30, 0.5, 1.0]),
-    scale=st.sampled_from([1e-160, 1e-8, 1.0, 1e2]),
-)
-def test_nothing_in_the_output_is_ever_nan(seed: int, weight: float, scale: float) -> None:
-    """From any such density the next frames are tracked, and all that comes out is finite: the messages check that."""
-    one = Session(SENSOR.stream, NUSCENES)
-    feed(one, range(4), SENSOR, score=np.array([0.9, 0.2, 0.05]))
-    two = Session.restore(spoiled(one.snapshot(), np.random.default_rng(seed), weight, scale), 0)
-    got = tracks(feed(two, range(4, 9), SENSOR))
-    assert (len(got), two.quarantine) == (5, "")
-    for name, column in optipmb.columns_of(two.density).items():
-        assert np.isfinite(column).all(), name
-
-
-def test_a_covariance_that_no_message_can_carry_is_not_published() -> None:
-    """Standard deviations of a million in all that moves a car grow beyond any bound: quarantine, which says why."""
-    one = Session(SENSOR.stream, NUSCENES)
-    feed(one, range(4), SENSOR, score=np.array([0.9, 0.2, 0.05]))
-    two = Session.restore(spoiled(one.snapshot(), np.random.default_rng(1), 1.0, 1e6), 0)
-    assert tracks(feed(two, range(4, 9), SENSOR)) == []
-    assert "covariance" in two.quarantine
-    assert "expected a number in" in two.quarantine
-
-
-def told(found: optipmb.Tracks, paths: optipmb.PredictedPaths | None = None) -> schemas.Tracks:
-    """The message for tracks."""
-    return convert.tracks_of(
-        found,
-        paths,
-        stream=SENSOR.stream,
-        frame_id=FrameId(SENSOR.epoch, 1, 2),
-        session="0" * 32,
-        revision=0,
-        parameters=NUSCENES,
-        cloud_used=False,
-        gap=0,
-        ignored=0,
-    ).tracks
-
-
-@settings(max_examples=40, deadline=None)
 @given(data=st.data(), count=st.integers(0, 3))
 def test_a_message_that_is_made_without_its_checks_would_pass_them(data: st.DataObject, count: int) -> None:
     """Whatever numbers the tracks hold, near every bound of the message: it is valid, or it is not made."""
