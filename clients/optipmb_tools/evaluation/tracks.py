@@ -19,7 +19,7 @@ from optipmb_tools.table_files import SUFFIXES, is_table
 __all__ = ["read_compared", "read_full_tracks", "read_tracks"]
 
 _OTHERS = ("Van", "Truck", "Person_sitting", "Person", "Tram")
-"""Classes of KITTI that are no other names of those that are evaluated."""
+"""Classes of KITTI that are no synonyms of evaluated ones."""
 
 
 def read_compared(
@@ -86,7 +86,7 @@ def read_tracks(results: Path, sequence: DataSequence) -> ResultTable:
     Args:
         results: a table of tracks of one or more sequences, or a folder with `NAME.txt` (KITTI) or a table `NAME.*`;
             for nuScenes also a result file of its benchmark, or its folder.
-        sequence: what was tracked.
+        sequence: the tracked sequence.
 
     Raises:
         DatasetError: there is no such file, or it is wrong, or has frames that the sequence lacks.
