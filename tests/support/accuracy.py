@@ -3,8 +3,7 @@
 from functools import cache
 
 from optipmb_tools.datasets import DataSequence, open_dataset
-from optipmb_tools.results import ResultTable
-from optipmb_tools.results.full import FullTable
+from optipmb_tools.results import FullTable, ResultTable
 from optipmb_tools.tuning.clips import Clip, load, of_class, track_fully
 from optipmb_tools.tuning.scoring import Figures, Scorer, rules_of, scorer_of
 from optipmb_tools.tuning.values import only
