@@ -139,7 +139,7 @@ repeat:
 	sh tests/repeat.sh $(N) $(LOAD)
 
 schemas: $(VENV)/.installed
-	$(BIN)/python -m optipmb_schemas.export --check --page docs/messages.md schemas/json
+	$(BIN)/python -m optipmb_schemas.export --check --page docs/messages.md --asyncapi schemas/asyncapi.json schemas/json
 	$(BIN)/python docs/reference.py --check docs/reference.md
 
 wheel: kernels

@@ -1,8 +1,8 @@
-"""Writes the JSON Schemas of the messages: `python -m optipmb_schemas.export [--check] [--page FILE] DIR`.
+"""Writes the JSON Schemas of the messages: `python -m optipmb_schemas.export [OPTIONS] [DIR]`.
 
-One file per message type, `<Type>.v1.schema.json`, describing the JSON form. With `--page` the tables of a
-documentation page are brought up to date as well. With `--check` nothing is written: every file that is not up to date
-gets one line, and the exit status is 1.
+One file per message type, `<Type>.v1.schema.json`, describing the JSON form. With `--page FILE` the tables of a
+documentation page are brought up to date as well, with `--asyncapi FILE` the AsyncAPI document. With `--check` nothing
+is written: every file that is not up to date gets one line, and the exit status is 1.
 
 A page marks where a table belongs with the comment `<!-- table: NAME -->` and its end with `<!-- end -->`; what lies
 between is replaced. Names are message types, `limits` and `codes`.
@@ -149,14 +149,22 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--check", action="store_true", help="write nothing, report what is not up to date")
     parser.add_argument("--page", type=Path, metavar="FILE", help="a documentation page whose tables are updated too")
-    parser.add_argument("folder", type=Path, metavar="DIR", help="folder of the schema files")
+    parser.add_argument("--asyncapi", type=Path, metavar="FILE", help="the AsyncAPI document of the interface")
+    parser.add_argument("folder", type=Path, metavar="DIR", nargs="?", help="folder of the schema files")
     options = parser.parse_args(arguments)
+    folder: Path | None = options.folder
+    if folder is None and options.page is None and options.asyncapi is None:
+        parser.error("nothing to write: expected DIR, --page or --asyncapi")
     try:
-        files = {options.folder / name: text for name, text in schema_files().items()}
+        files = {} if folder is None else {folder / name: text for name, text in schema_files().items()}
         if options.page:
             files[options.page] = fill(read(options.page))
-        gone = sorted(set(options.folder.glob(f"*{SUFFIX}")) - files.keys())
-        return bring_up_to_date(files, f"{parser.prog} {options.folder}", check=options.check, gone=gone)
+        if options.asyncapi:
+            from optipmb_schemas.asyncapi import document  # noqa: PLC0415  it imports this module
+
+            files[options.asyncapi] = document()
+        gone = sorted(set(folder.glob(f"*{SUFFIX}")) - files.keys()) if folder else []
+        return bring_up_to_date(files, f"{parser.prog} without --check", check=options.check, gone=gone)
     except OSError as error:
         sys.stderr.write(f"error: {error}\n")
         return 2

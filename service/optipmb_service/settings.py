@@ -45,7 +45,7 @@ DEFAULT_NATS: Final = "127.0.0.1:4222"
 
 
 def _form(pattern: str, expected: str) -> AfterValidator:
-    """Return the check of a text: it matches a regular expression in full, or the error says what was expected."""
+    """Return the check of a text: it matches a regular expression in full, or the error names the expected form."""
 
     def check(value: str) -> str:
         if not re.fullmatch(pattern, value):
@@ -100,7 +100,7 @@ Endpoints = Annotated[tuple[Endpoint, ...], NoDecode, BeforeValidator(_listed)]
 
 
 class LimitSettings(BaseModel):
-    """Bounds on what one message may hold; what is larger is refused before memory is taken for it."""
+    """Bounds on what one message may hold; larger ones are refused before memory is allocated."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

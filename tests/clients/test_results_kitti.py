@@ -118,15 +118,6 @@ def test_a_sequence_without_tracks_is_an_empty_file(tmp_path: Path) -> None:
     assert len(read_kitti_results(path)) == len(empty_table()) == 0
 
 
-def test_an_error_on_the_way_leaves_no_file(tmp_path: Path) -> None:
-    """When writing fails, neither the file nor a part of it is left."""
-    rows = some_rows(np.random.default_rng(0), 2)
-    broken = replace(rows, score=np.ones(1))
-    with pytest.raises(ValueError, match="dimension"):
-        write(tmp_path / "0000.txt", [(0, planar_pose(0, 0, 0, 0), rows), (1, planar_pose(0, 0, 0, 0), broken)])
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_the_same_tracks_give_the_same_bytes(tmp_path: Path) -> None:
     """Written twice the file is the same, and what rounds to zero is written without a sign."""
     rows = some_rows(np.random.default_rng(3), 5)

@@ -12,7 +12,7 @@ import optipmb_service
 import pytest
 from optipmb_schemas import Code
 from optipmb_service.app import cli
-from optipmb_service.settings import LimitSettings, Ros2Settings, Ros2Stream, Settings, load
+from optipmb_service.settings import LimitSettings, Ros2Settings, Ros2Stream, Settings, SiteSettings, load
 from optipmb_service.stream.problems import CODES
 from optipmb_service.telemetry.logs import EVENTS
 from reference import docstrings, main, page
@@ -59,7 +59,7 @@ def test_a_page_that_is_not_current_is_found(tmp_path: Path) -> None:
 
 def test_every_setting_is_described() -> None:
     """No setting without a word on what it does."""
-    for table in (Settings, LimitSettings, Ros2Settings, Ros2Stream):
+    for table in (Settings, LimitSettings, SiteSettings, Ros2Settings, Ros2Stream):
         assert docstrings(table).keys() >= table.model_fields.keys()
 
 
@@ -98,11 +98,12 @@ def test_the_exit_statuses_are_those_of_the_table(capsys: pytest.CaptureFixture[
     assert "No such option: --wrong" in capsys.readouterr().err
 
 
-def test_the_example_is_a_settings_file(tmp_path: Path) -> None:
+def test_the_examples_are_a_settings_file(tmp_path: Path) -> None:
     """The TOML on the page is accepted as it stands."""
-    (example,) = re.findall(r"```toml\n(.*?)```", OPERATION.read_text(encoding="utf-8"), re.DOTALL)
+    examples = re.findall(r"```toml\n(.*?)```", OPERATION.read_text(encoding="utf-8"), re.DOTALL)
     file = tmp_path / "settings.toml"
-    file.write_text(example, encoding="utf-8")
+    file.write_text("\n".join(examples), encoding="utf-8")
     settings = load(file).settings
     assert (settings.instance, settings.limits.max_points) == ("edge-1", 300_000)
     assert list(settings.profiles) == ["garage/*/lidar*", "yard/crane/*"]
+    assert settings.sites["garage"].x_heading == 90.0

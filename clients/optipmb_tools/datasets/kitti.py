@@ -4,11 +4,11 @@ Conventions: the sensor frame of detections is the rectified camera frame with i
 `optipmb_tools.camera`); the world is the same for the camera of frame 0. Clouds are in the velodyne frame. Frames are
 0.1 s apart. Truth boxes are ignored when largely invisible or cut by the image's border, as AB3DMOT's protocol has it.
 
-Layout, below a root that holds `training` or `testing`, or is itself such a folder: `calib/SSSS.txt`,
-`poses/SSSS.txt` or `oxts/SSSS.txt`, and, where there are any, `label_02/SSSS.txt` and `velodyne/SSSS/FFFFFF.bin`.
-Detections are `detections/DETECTOR/CLASS/SSSS.txt`, in the root or beside it; those of `testing` are in it where there
-is `training` too, for sequences have the same names in both. Only tracking needs them: truth, poses and clouds can be
-read of a root with several detectors of which none is named, and of one with none.
+Layout, below a root that holds `training` or `testing`, or is itself such a folder: `calib/SSSS.txt`, `poses/SSSS.txt`
+or `oxts/SSSS.txt`, and, where there are any, `label_02/SSSS.txt` and `velodyne/SSSS/FFFFFF.bin`. Detections are
+`detections/DETECTOR/CLASS/SSSS.txt`, in the root or its parent. Where there is `training` too, the detections of
+`testing` are in its folder, for sequences have the same names in both. Only tracking needs them: truth, poses and
+clouds can be read of a root with several detectors of which none is named, and of one with none.
 """
 
 import re
@@ -108,7 +108,7 @@ class KittiSequence(DataSequence):
 
     @property
     def camera(self) -> Camera:
-        """Camera 2, in whose images the benchmark counts; its image size is that of most sequences."""
+        """Camera 2, in whose images the benchmark counts; its image size is the one of most sequences."""
         return Camera(self.calibration.projection)
 
     @cached_property
@@ -288,7 +288,7 @@ class KittiDataset(Dataset):
     def sequences(self, names: Sequence[str]) -> list[KittiSequence]:
         """Return the sequences of these names; `train` and `val` are the splits.
 
-        `all` are those that the detector has, or all where none is chosen.
+        `all` are the sequences that the detector has, or all where none is chosen.
 
         Raises:
             DatasetError: A named sequence is not there, or none is.

@@ -1,16 +1,17 @@
 """nuScenes: the official tables, detections in the official submission layout, LiDAR scans where they are present.
 
 Conventions: the world is the global frame of the dataset. Detections are given in it, so the pose of their frames is
-the identity; `poses` of a sequence, and the pose of every cloud, are those of the LiDAR (LIDAR_TOP). Sequences are
-scenes, frames are keyframes (samples, 2 Hz), stamps are those of the samples. Only the seven classes of the tracking
+the identity; `poses` of a sequence, and the pose of every cloud, are poses of the LiDAR (LIDAR_TOP). Sequences are
+scenes, frames are keyframes (samples, 2 Hz) with the stamps of the samples. Only the seven classes of the tracking
 benchmark are kept.
 
 Layout, below the root: the tables in `v1.0-trainval`, `v1.0-mini` or `v1.0-test` (the root may also be that folder
-itself), scans in `samples/LIDAR_TOP`, detections in `detections/NAME.json`, splits of one's own in `splits.json` beside
-the tables: a map from the name of a split to a list of scene names, as the official tools read it.
+itself), scans in `samples/LIDAR_TOP`, detections in `detections/NAME.json`, splits of one's own in `splits.json` in the
+folder of the tables: a map from the name of a split to a list of scene names, as the official tools read it.
 
-The height of a detection is that of the box's centre, as the layout says. Some public detection files have that of its
-bottom instead: they say so by `"z_origin": "bottom"` in their `meta`, or the caller does by the option `z_bottom`.
+The height of a detection is the height of the box's centre, as the layout says. Some public detection files have the
+height of its bottom instead: they say so by `"z_origin": "bottom"` in their `meta`, or the caller does by the option
+`z_bottom`.
 """
 
 import json
@@ -168,7 +169,7 @@ class NuScenesSequence(DataSequence):
         return None if path is None else Cloud(partial(read_sweep, path), *self._keyframes[index].lidar)
 
     def annotations(self) -> Annotations:
-        """Return all annotations of the scene, whatever their category."""
+        """Return the annotations of the scene, of all categories."""
         return self._dataset.tables.annotations(self.name)
 
     def ego_distance(self, frame: Ints, center: Floats) -> Floats:
@@ -258,7 +259,7 @@ class NuScenesDataset(Dataset):
 
     @cached_property
     def z_bottom(self) -> bool:
-        """Whether the height of a detection is that of the bottom of its box."""
+        """Whether the height of a detection means the bottom of its box."""
         if self._z_bottom is not None:
             return self._z_bottom
         submission = self.need_submission()
@@ -275,10 +276,10 @@ class NuScenesDataset(Dataset):
         return (*found, *((all_written,) if self._submission else ()))
 
     def sequences(self, names: Sequence[str]) -> list[NuScenesSequence]:
-        """Return the scenes of these names, of official splits, and of those in `splits.json` beside the tables.
+        """Return the scenes of these names, of official splits, and of the splits in `splits.json`.
 
-        `all` are those that the tables have, and the detections if any are given. Of a split, those that the tables
-        have are taken.
+        `all` are the scenes that the tables have, and the detections if any are given. Scenes of a split that the
+        tables lack are left out.
 
         Raises:
             DatasetError: a named scene is not there, or none is.

@@ -37,7 +37,7 @@ USUAL_PERIOD: Final = 0.1
 FAR: Final = 1.6  # ratio of rates from which a profile does not fit
 LOOKED_AT: Final = 20  # sequences that tell rate and scores
 LOOKED_INTO: Final = 300  # frames of each of them
-GLANCE: Final = 20  # frames that tell whether the rate is about that of a profile: clouds, if any, take long to read
+GLANCE: Final = 20  # frames that tell whether the rate fits a profile: clouds, if any, take long to read
 
 
 def read_profile(profile: str) -> Parameters:

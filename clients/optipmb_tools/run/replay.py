@@ -58,7 +58,7 @@ class Replaying:
     classes: Sequence[str] = ()  # only detections of these; empty: all
     streams: int = 1  # sequences at once
     prefix: str = PREFIX  # first part of all keys
-    full: bool = False  # whether all columns of the tracks are written too, beside each result file
+    full: bool = False  # whether all columns of the tracks are written too
 
 
 @dataclass(frozen=True)

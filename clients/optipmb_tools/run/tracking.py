@@ -1,6 +1,6 @@
 """Offline tracking: one sequence in this process, or the recordings of a data set, one task each.
 
-Tracks have the same bytes as those of a replay through the service (`optipmb_tools.run.replay`).
+A replay through the service (`optipmb_tools.run.replay`) gives the same bytes.
 """
 
 import functools
@@ -184,7 +184,7 @@ class TrackedSequence:
     detections: int
     left_out: dict[str, int]  # detections of each class that the profile lacks, or that are below its score filter
     estimated: int  # frames in which the motion of the sensor was estimated
-    cut: tuple[int, int]  # boxes beyond those that a benchmark accepts in a sample, and such samples
+    cut: tuple[int, int]  # boxes above the limit of a benchmark in a sample, and such samples
     tracks: int
     confirmed: int  # tracks that were confirmed in some frame
     seconds: float

@@ -1,8 +1,7 @@
 """The colours of tracks, the same in every picture and view.
 
 A colour belongs to a track id. The colours are from a set that most people with a colour vision deficiency can tell
-apart (Okabe and Ito, 2008); after seven tracks they come round again, so a track also carries its id wherever it is
-drawn.
+apart (Okabe and Ito, 2008); after seven tracks they come round again, so pictures also show the id of each track.
 """
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#8C6D1F")

@@ -199,7 +199,7 @@ def config_command(
         return
     plain = {name: value for name, value in values.items() if not isinstance(value, dict)}
     for name, value in plain.items():
-        # TOML has no null: what is not set is a comment.
+        # TOML has no null: a setting without a value is a comment.
         shown = f"# {name} is not set" if value is None else f"{name} = {_toml(value)}"
         typer.echo(f"{shown}  # {loaded.sources[name]}")
     for name in values.keys() - plain.keys():
@@ -268,7 +268,7 @@ def nats_command(
 
 
 def nats_server() -> str | None:
-    """Return the path of the server, from the package beside this one or else from the system; None without one."""
+    """Return the path of the NATS server of this environment, else of the system; None without one."""
     return shutil.which(NATS, path=sysconfig.get_path("scripts")) or shutil.which(NATS)
 
 
@@ -331,7 +331,7 @@ def _load(given: Mapping[str, Any], **defaults: Any) -> Loaded:
 
 
 def _begin(loaded: Loaded) -> Settings:
-    """Configure the logs, and log what is wrong with the settings but allowed."""
+    """Configure the logs, and warn of settings that are allowed but unsafe or unknown."""
     logs.configure(loaded.settings.log_format, loaded.settings.log_level)
     log = structlog.get_logger("optipmb_service")
     if loaded.unknown:

@@ -1,4 +1,4 @@
-"""The network as the service and its edges use it: publishes inputs, reads outputs, asks.
+"""The session of the service and its edges on the network: publishes inputs, reads outputs, asks.
 
 It declares the same as `optipmb_client` does for a program of its own, so that nothing on the network can tell the two
 apart.
@@ -7,24 +7,52 @@ apart.
 from __future__ import annotations
 
 import contextlib
+import json
+import os
 import threading
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Final, Generic, Protocol, TypeVar
 
 import optipmb_schemas as schemas
 import structlog
+from optipmb_client.errors import ConnectionFailed as TransportError
+from optipmb_client.zenoh.configuration import BUSY, certificates, configured, loaded
 from optipmb_client.zenoh.session import Session
-
-from optipmb_service.stream.ports import TransportError
-from optipmb_service.zenoh.connection import opened
+from optipmb_client.zenoh.session import opened as open_session
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable
+    from pathlib import Path
 
     from optipmb_client.incoming import Arrival
     from optipmb_client.zenoh.handles import Reading, Sender
+    from optipmb_client.zenoh.session import Opened
 
     from optipmb_service.settings import Settings
+
+WAIT_BEFORE_CLOSE_US: Final = 30_000_000
+"""How long a client waits to declare something where its router is slow to read, before Zenoh closes the link.
+
+Zenoh's own 5 s make it worse: all that was declared on the link is withdrawn, and declared again on the next one. A
+router that does not answer at all is left when its lease ends.
+"""
+
+RETRY_MS: Final = {"period_init_ms": 100, "period_max_ms": 2000, "period_increase_factor": 2}
+
+RUNTIME_VARIABLE: Final = "ZENOH_RUNTIME"
+RUNTIME: Final = "(rx: (handover: app))"
+"""A client has one link, and one thread that waits for its socket and reads it; after that was lost, Zenoh has two.
+
+By default one thread waits and wakes one of two others to read: two more threads are woken for each message.
+Sending has a thread of its own, so a callback that waits for the lock of the interpreter keeps nothing from leaving.
+"""
+
+LISTENING: Final = "zenoh_listen"
+"""Use of the certificate of a listener, which Zenoh reads at its start alone."""
+
+MESSAGE_HEADROOM: Final = 4
+"""A message up to this many times the limit is received and answered by a problem; a larger one is dropped by Zenoh."""
 
 NEW_STREAMS: Final = 4000
 """Publishers and subscriptions that edges have declared at once."""
@@ -102,6 +130,64 @@ class IdlePool(Generic[R]):
                     self._end_in(IDLE_S)
         for resource in resources:
             resource.close()
+
+
+L = TypeVar("L")
+M = TypeVar("M")
+
+
+class _Feed(Generic[L]):
+    def __init__(self) -> None:
+        self.listeners: tuple[L, ...] = ()
+        self.subscription: Reading | None = None
+
+    def close(self) -> None:
+        if self.subscription is not None:
+            self.subscription.close()
+
+
+class SharedSubscriptions(Generic[L, M]):
+    """Subscriptions that listeners share, by key expression; kept for a while without any. For any threads.
+
+    Args:
+        subscribe: opens a subscription, which calls its second argument with each message.
+        receive: called for each message with the listeners, on a thread of the subscription.
+        most: subscriptions that are kept without listeners.
+    """
+
+    def __init__(
+        self,
+        subscribe: Callable[[str, Callable[[M], None]], Reading],
+        receive: Callable[[tuple[L, ...], M], None],
+        most: int,
+    ) -> None:
+        self._subscribe = subscribe
+        self._receive = receive
+        self._lock = threading.Lock()
+        self._feeds: dict[str, _Feed[L]] = {}
+        self._idle: IdlePool[_Feed[L]] = IdlePool(most)
+
+    def join(self, key: str, listener: L) -> Callable[[], None]:
+        """Add a listener until the result is called, which may be twice. Raises as `subscribe` does."""
+        with self._lock:
+            feed = self._feeds.get(key) or self._idle.take(key) or _Feed()
+            feed.listeners = (*feed.listeners, listener)
+            if feed.subscription is None:
+                feed.subscription = self._subscribe(key, lambda message: self._receive(feed.listeners, message))
+            self._feeds[key] = feed
+        return partial(self._leave, key, feed, listener)
+
+    def _leave(self, key: str, feed: _Feed[L], listener: L) -> None:
+        with self._lock:
+            left = tuple(one for one in feed.listeners if one is not listener)
+            if len(left) < len(feed.listeners):
+                feed.listeners = left
+                if not left:
+                    self._idle.keep(key, self._feeds.pop(key))
+
+    def close(self) -> None:
+        """Withdraw the subscriptions without listeners; may wait."""
+        self._idle.close()
 
 
 class Turns:
@@ -205,3 +291,64 @@ class Client(Session):
 
 def _log_failure(name: str) -> None:
     log.exception("internal_error", reader=name)  # noqa: LOG004 - called while the exception is handled
+
+
+def opened(settings: Settings) -> Opened:
+    """Open a session of Zenoh's; a client does not return before it has a router.
+
+    Raises:
+        TransportError: an endpoint is in use or unusable, or the file of the settings is.
+    """
+    config = configured(_values(settings), settings.zenoh_config, router=settings.is_router)
+    # Read when the first session of a process opens; neither a later router nor a child is to find it.
+    sets_runtime = not settings.is_router and RUNTIME_VARIABLE not in os.environ
+    if sets_runtime:
+        os.environ[RUNTIME_VARIABLE] = RUNTIME
+    try:
+        return open_session(config)
+    except TransportError as error:
+        where = ", ".join((*settings.endpoints, *settings.connect))
+        if "Address already in use" in str(error):
+            reason = f"cannot listen on {where}: the address is in use; is another optipmb-service running?"
+        else:
+            reason = f"cannot open {where}: {error}"
+        raise TransportError(reason) from error
+    finally:
+        if sets_runtime:
+            del os.environ[RUNTIME_VARIABLE]
+
+
+def certificates_of(settings: Settings) -> dict[str, Path]:
+    """Return the files of the certificates that the Zenoh configuration names, by their use.
+
+    Raises:
+        TransportError: the file of the configuration cannot be read.
+    """
+    uses = {"connect_certificate": "zenoh", "listen_certificate": LISTENING, "root_ca_certificate": "zenoh_authority"}
+    return {uses[name]: file for name, file in certificates(loaded(settings.zenoh_config)).items()}
+
+
+def _values(settings: Settings) -> dict[str, object]:
+    values: dict[str, object] = {
+        **BUSY,
+        "mode": "router" if settings.is_router else "client",
+        "listen/endpoints": list(settings.endpoints),
+        "connect/endpoints": list(settings.connect),
+        "connect/timeout_ms": -1,
+        "connect/retry": RETRY_MS,
+        "scouting/delay": 0,
+        "timestamping/enabled": True,
+        "transport/shared_memory/enabled": settings.shared_memory,
+        "transport/link/tx/lease": round(settings.lease_s * 1e3),
+        "transport/link/rx/max_message_size": MESSAGE_HEADROOM * settings.limits.max_bytes,
+    }
+    if settings.is_router:
+        values["connect/exit_on_failure"] = False  # a router starts without the routers that it looks for
+    else:
+        values["transport/link/tx/queue/congestion_control/block/wait_before_close"] = WAIT_BEFORE_CLOSE_US
+    # One interest in the subscribers of all tracks, and one in heartbeats, in place of two for each stream:
+    # a router compares every subscription with all interests.
+    tracks = schemas.Keys(settings.prefix).all("tracks")
+    aggregated = json.loads(loaded(settings.zenoh_config).get_json("aggregation/publishers"))
+    values["aggregation/publishers"] = [*aggregated, tracks, f"{tracks}/@adv/**"]
+    return values

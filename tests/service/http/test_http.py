@@ -19,13 +19,13 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from optipmb_client.errors import ClientError
 from optipmb_schemas import Keys, ServiceStatus
 from optipmb_service.app.health_command import ask
 from optipmb_service.http import Server, application
 from optipmb_service.http.server import CONNECTIONS, REQUESTS
-from optipmb_service.stream.ports import HttpError
 from optipmb_service.telemetry.metrics import NAMESPACE, SERVICE_METRICS
-from optipmb_service.zenoh.taps import BURST
+from optipmb_service.zenoh.transport import BURST
 from prometheus_client.parser import text_string_to_metric_families
 from router import Node, Sensor, until
 from routers import free_endpoint, open_router
@@ -226,6 +226,7 @@ def test_what_nobody_serves_is_not_found() -> None:
     with served(Said()) as address:
         assert get(address, "/")[1].startswith("<!")
         assert get(address, "/metrics") == (200, "one 1\n")
+        assert json.loads(get(address, "/api/v1/asyncapi.json")[1])["asyncapi"] == "3.0.0"
         assert get(address, "/nothing")[0] == 404
 
 
@@ -235,7 +236,7 @@ def test_an_address_in_use_is_one_error() -> None:
     served_here = application(source)
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"127.0.0.1:{taken.getsockname()[1]}"
-        with pytest.raises(HttpError, match=f"cannot listen on {address} for HTTP: Address already in use"):
+        with pytest.raises(ClientError, match=f"cannot listen on {address} for HTTP: Address already in use"):
             Server(served_here, address)
         with ServiceProcess("--http", address) as service:
             assert service.wait_end() == 1
@@ -254,6 +255,8 @@ def test_a_service_tells_how_it_is_from_its_start_to_its_end() -> None:
         with open_router(endpoint):
             service.wait_ready()
             until(lambda: get(address, "/readyz")[0] == 200, "ready")
+            interface = json.loads(get(address, "/api/v1/asyncapi.json")[1])
+            assert interface["servers"]["router"]["host"] == endpoint.partition("/")[2]
             host, _, port = address.rpartition(":")
             with socket.create_connection((host, int(port))):
                 status, seconds = service.end(signal.SIGTERM)
@@ -332,7 +335,7 @@ def test_viewers_use_up_no_keys() -> None:
             until(lambda: look("a/b/c") == b": hello\n", "a viewer is let in")
         assert declared() == before + 2
         until(lambda: look(f"a/b/stream-{next(NUMBERS)}") == b"retry: 15000\n", "no more streams are subscribed to")
-        assert declared() <= before + 2 * (BURST + 10)
+        assert declared() <= before + BURST + 20
         assert look("a/b/c") in {b": hello\n", b"retry: 15000\n"}
         assert get(address, "/healthz")[0] == 200
 

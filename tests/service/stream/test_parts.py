@@ -14,7 +14,7 @@ from optipmb_service.settings import SettingsInvalidError, load
 from optipmb_service.stream.pending import CloudBuffer
 from optipmb_service.stream.problems import problem_of
 from optipmb_service.stream.profiles import Profiles
-from optipmb_service.stream.scheduler import Scheduler
+from optipmb_service.stream.streams import Scheduler
 from optipmb_service.telemetry.problem_reporter import LOGGED_PER_SECOND, PUBLISHED_PER_SECOND, ProblemReporter
 from optipmb_service.telemetry.stream_meter import StreamMeter
 from router import SECOND, Sensor
@@ -199,22 +199,6 @@ def test_the_rate_is_of_the_last_seconds() -> None:
     for frame in range(10_000):
         meter.arrived(800 * SECOND + frame * SECOND // 1000, frame=True)
     assert meter.rate_hz(810 * SECOND) == pytest.approx(1000, rel=0.01)
-
-
-def test_clouds_are_found_by_stamp_and_bounded() -> None:
-    """The newest clouds stay; those before a stamp go, those of a jump away stay."""
-    clouds = CloudBuffer(3)
-
-    def found(seq: int, publishers: bytes = b"") -> bool:
-        return clouds.get(SENSOR.epoch, SENSOR.stamp_ns(seq), lambda epoch: epoch == publishers) is not None
-
-    for seq in range(5):
-        clouds.add(SENSOR.points(seq))
-    assert [found(seq) for seq in range(5)] == [False, False, True, True, True]
-    clouds.forget_before(SENSOR.stamp_ns(4), SECOND)
-    assert len(clouds) == 1
-    clouds.forget_before(SENSOR.stamp_ns(4) + 2 * SECOND, SECOND)
-    assert len(clouds) == 1
 
 
 def test_clouds_of_other_publishers() -> None:
