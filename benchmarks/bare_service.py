@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Final
 import optipmb_schemas as schemas
 from optipmb_service.app.lifecycle import settle
 from optipmb_service.app.worker import warm_up
-from optipmb_service.runtime.scheduler import Scheduler
-from optipmb_service.session import convert
-from optipmb_service.session.timeline import FrameId
 from optipmb_service.settings import Settings
+from optipmb_service.stream import convert
+from optipmb_service.stream.scheduler import Scheduler
+from optipmb_service.stream.timeline import FrameId
 from optipmb_service.zenoh.client import Client
 
 import optipmb

@@ -23,12 +23,6 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import optipmb_schemas as schemas
-from optipmb_service.runtime.ports import Packet
-from optipmb_service.runtime.profiles import Profiles
-from optipmb_service.runtime.track_publisher import TrackPublisher
-from optipmb_service.session import convert
-from optipmb_service.session.session import Session
-from optipmb_tools.load import generated
 
 import optipmb
 
@@ -74,25 +68,24 @@ class Parts:
 
 
 class Network:
-    """Everything around the streams: it grants them all, takes what they publish, and runs their actors."""
+    """Everything around the streams: it grants them all, takes what they publish, and gives them their turns."""
 
     strained = False
 
     def __init__(self) -> None:
-        self.waiting: list[Any] = []
+        self.waiting: list[Callable[[], bool]] = []
         self.published = 0
         self.problems: list[str] = []
 
-    def submit(self, actor: Any) -> None:
-        """Take an actor that has something to do."""
-        self.waiting.append(actor)
+    def submit(self, work: Callable[[], bool]) -> None:
+        """Take the work of a stream that has something to do."""
+        self.waiting.append(work)
 
     def run(self) -> None:
-        """Run the actors until none has anything to do."""
+        """Give turns until no stream has anything to do."""
         while self.waiting:
-            actor = self.waiting.pop(0)
-            if (actor if callable(actor) else actor.work)():
-                self.waiting.append(actor)
+            if (work := self.waiting.pop(0))():
+                self.waiting.append(work)
 
     def holds(self, stream: str) -> bool:
         """Every stream is tracked here."""
@@ -120,10 +113,11 @@ class Network:
         self.problems.append(str(problem))
 
 
-def packets(objects: int, points: int) -> Iterator[list[Packet]]:
+def packets(objects: int, points: int) -> Iterator[list[Any]]:
     """Yield the messages of each frame, its cloud first."""
-    frames, keys = generated(objects, points, RATE_HZ), schemas.Keys()
-    load = first_of("load.material", "load", package="optipmb_tools")
+    load, keys = module_of("optipmb_tools.run.load", "optipmb_client.load"), schemas.Keys()
+    packet = part_of("Packet", "stream.backlog", "stream.ports", "runtime.ports")
+    frames = load.generated(objects, points, RATE_HZ)
     for k in range(WARM + FRAMES):
         begins = load.head(STREAM, bytes(16), load.FIRST + k, 10**18 + round(k * 1e9 / RATE_HZ))
         made = []
@@ -136,85 +130,82 @@ def packets(objects: int, points: int) -> Iterator[list[Packet]]:
             if body is not None:
                 payload = load.message(body, begins)
                 encoding = schemas.encoding_of(kind)
-                made.append(Packet(key, payload, len(payload), encoding, time.time_ns(), time.monotonic_ns()))
+                made.append(packet(key, payload, len(payload), encoding, time.time_ns(), time.monotonic_ns()))
         yield made
 
 
-def first_of(*modules: str, package: str = "optipmb_service") -> Any:
-    """Return the first of these modules of a package that the checkout has: an earlier one has it all in another."""
-    for module in modules:
+def module_of(*names: str) -> Any:
+    """Return the first of these modules that the checkout has: another version may have it under another name."""
+    for name in names:
         with contextlib.suppress(ModuleNotFoundError):
-            return import_module(f"{package}.{module}")
-    raise ModuleNotFoundError(modules[-1])
+            return import_module(name)
+    raise ModuleNotFoundError(names[-1])
+
+
+def part_of(name: str, *modules: str) -> Any:
+    """Return what has a name in the first of these modules of the service that has it."""
+    for module in modules:
+        with contextlib.suppress(ModuleNotFoundError, AttributeError):
+            return getattr(import_module(f"optipmb_service.{module}"), name)
+    raise AttributeError(name)
 
 
 def measured(objects: int, points: int) -> dict[str, float]:
     """Return the median microseconds of each part of a frame."""
-    first_of("telemetry.logs", "observability.logs").configure("console", "error")
-    first_of("app.kernels", "app.worker").warm_up()
-    metrics = first_of("telemetry.metrics", "observability.metrics").Metrics
-    reporter = first_of("telemetry.problem_reporter", "observability.problem_reporter").ProblemReporter
+    part_of("configure", "telemetry.logs")("console", "error")
+    part_of("warm_up", "app.worker")()
+    metrics, reporter = (
+        part_of("Metrics", "telemetry.metrics"),
+        part_of("ProblemReporter", "telemetry.problem_reporter"),
+    )
+    streams_type = part_of("Streams", "stream.streams", "runtime.streams")
+    stream_type = part_of("Stream", "stream.stream", "runtime.stream")
+    session = part_of("Session", "stream.session", "session.session")
     parts = Parts()
     network: Any = Network()  # in the place of several parts
-    decoding = first_of("runtime.stream", "runtime.stream_tracking", "runtime.stream_actor")
-    table, persistence = first_of("runtime.streams", "runtime.registry"), first_of("runtime.persistence")
-    streams_type = getattr(table, "Streams", None) or table.Registry
-    turn_of = first_of("runtime.stream", "runtime.stream_actor")
     nothing: Any = None
-    encode_checkpoint = first_of("session.checkpoint_codec", "session.checkpoint").encode_checkpoint
     for part, owner, name in (
         ("handing over", streams_type, "receive"),
-        ("handing over", streams_type, "frame"),
-        ("handing over", streams_type, "cloud"),
-        ("decoding", decoding, "message_of"),
-        ("session", Session, "on_detections"),
-        ("session", Session, "on_points"),
-        ("conversion", convert, "frame_of"),
-        ("conversion", convert, "cloud_of"),
-        ("conversion", convert, "tracks_of"),
+        ("decoding", module_of(stream_type.__module__), "message_of"),
+        ("session", session, "on_detections"),
+        ("session", session, "on_points"),
+        ("conversion", part_of("convert", "stream", "session"), "frame_of"),
+        ("conversion", part_of("convert", "stream", "session"), "cloud_of"),
+        ("conversion", part_of("convert", "stream", "session"), "tracks_of"),
         ("step", optipmb.Tracker, "step"),
-        ("publishing", TrackPublisher, "send"),
+        ("publishing", part_of("TrackPublisher", "stream.track_publisher", "runtime.track_publisher"), "send"),
         ("metrics", metrics, "received"),
         ("metrics", metrics, "published"),
         ("metrics", metrics, "tracks"),
-        ("actor", getattr(turn_of, "Stream", None) or turn_of.StreamActor, "work"),
+        ("turn", stream_type, "work"),
     ):
-        if hasattr(owner, name):
-            setattr(owner, name, parts.time(part, getattr(owner, name)))
-    # Another checkout may have other parts.
-    if hasattr(streams_type, "receive"):
-        writer = persistence.CheckpointWriter(nothing, 1.0, network, off="")
-        others = {"open_publisher": network.open_publisher, "checkpoints": writer, "log": None}
-    else:
-        others = {"sink": network, "persistence": persistence.NoPersistence()}
-        with contextlib.suppress(ModuleNotFoundError):
-            others["missed"] = import_module("optipmb_service.runtime.missed_frames").NoLog()
+        setattr(owner, name, parts.time(part, getattr(owner, name)))
+    encode_checkpoint = part_of("encode_checkpoint", "stream.checkpoint", "session.checkpoint")
+    writer_type = part_of("CheckpointWriter", "stream.persistence", "runtime.persistence")
     streams = streams_type(
-        first_of("settings.model", "settings").Settings(instance="cost", store="none"),
-        Profiles.read("nuscenes", {}),
+        part_of("Settings", "settings")(instance="cost", store="none"),
+        part_of("Profiles", "stream.profiles", "runtime.profiles").read("nuscenes", {}),
+        open_publisher=network.open_publisher,
         reporter=reporter(network.publish_problem, lambda *_: None),
         scheduler=network,
         member=network,
+        checkpoints=writer_type(nothing, 1.0, network, off=""),
+        log=None,
         arm=lambda *_: None,
         metrics=metrics(),
-        **others,
     )
     rows: list[dict[str, float]] = []
     checkpoints: list[float] = []
     for k, frame in enumerate(packets(objects, points)):
         for packet in frame:
-            if hasattr(streams, "receive"):
-                streams.receive(packet)
-            else:
-                (streams.frame if packet.key.endswith("detections") else streams.cloud)(packet)
+            streams.receive(packet)
         network.run()
         row = parts.taken()
         if k >= WARM:
             rows.append(row)
             if k % CHECKPOINT_EVERY == 0:
-                session = (streams.of if hasattr(streams, "of") else streams.actor)(STREAM).session
                 began_ns = time.thread_time_ns()
-                encode_checkpoint(session.snapshot())
+                encode_checkpoint(streams.of(STREAM).session.snapshot())
                 checkpoints.append((time.thread_time_ns() - began_ns) / 1e3 / CHECKPOINT_EVERY)
     if network.published != WARM + FRAMES or network.problems:
         raise RuntimeError(f"{network.published} frames were answered, {network.problems[:1]}")

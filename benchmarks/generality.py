@@ -23,16 +23,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from optipmb_tools import offline
 from optipmb_tools.datasets import open_dataset
 from optipmb_tools.evaluation import default_rules
 from optipmb_tools.evaluation.calibration import calibration
 from optipmb_tools.evaluation.cases import CENTRE_DISTANCE
 from optipmb_tools.geometry import Pose, to_sensor, to_world
-from optipmb_tools.results import ResultTable
+from optipmb_tools.results import ResultTable, stacked
 from optipmb_tools.results.full import COLUMNS, FullTable
 from optipmb_tools.results.kitti import LEAST_SHOWN
-from optipmb_tools.results.rows import stacked
+from optipmb_tools.run import profiles
 from optipmb_tools.tuning.clips import Clip, load, of_class
 from optipmb_tools.tuning.scoring import plain_figures, rules_of, scorer_of
 
@@ -130,7 +129,7 @@ class Cell:
         taken = sequences if plain else [Thinned(one, self.stride, self.posed, self.distort) for one in sequences]
         tracked = []
         for one in taken:
-            parameters = offline.profile_for(self.profile, [one])
+            parameters = profiles.profile_for(self.profile, [one])
             clip = load(one, parameters, rules)
             tracked.append((clip, *track(clip, parameters, posed=self.posed)))
         rows = []

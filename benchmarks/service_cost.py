@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Final
 from optipmb_client import Connection
 from optipmb_client.incoming import Inbox
 from optipmb_schemas import Detections, Keys, Points, encoding_of
-from optipmb_tools.load import FIRST, chain, generated, head, message
+from optipmb_tools.run.load import FIRST, chain, generated, head, message
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 
@@ -35,7 +35,7 @@ from service_process import ServiceProcess
 
 if TYPE_CHECKING:
     from optipmb_client.incoming import Arrival
-    from optipmb_tools.load import Frames
+    from optipmb_tools.run.load import Frames
 
 HERE: Final = Path(__file__).resolve().parents[1]
 STREAMS: Final = 40

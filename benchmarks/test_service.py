@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from optipmb_client import Connection
-from optipmb_tools.load import Load, generated, run_load
+from optipmb_tools.run.load import Load, generated, run_load
 from router import Node, Sensor
 from service_process import ServiceProcess
 

@@ -18,9 +18,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from optipmb.class_names import class_indices
-from optipmb.errors import FrameError, ParameterError
+from optipmb.errors import FrameError
 from optipmb.frame import make_frame
-from optipmb.parameters import Parameters, load_profile
 from optipmb.tracker import Tracker
 
 if TYPE_CHECKING:
@@ -28,12 +27,15 @@ if TYPE_CHECKING:
 
     import pandas as pd
     import pyarrow as pa
+    import supervision as sv
+    from matplotlib.axes import Axes
     from numpy.typing import ArrayLike, NDArray
 
     from optipmb.density import Density
     from optipmb.extract import Tracks
     from optipmb.field_of_view import FieldOfView
     from optipmb.frame import PointCloud, Pose
+    from optipmb.parameters import Parameters
     from optipmb.paths import PredictedPaths
     from optipmb.rows import Array, Index
     from optipmb.tracker import Modules
@@ -52,6 +54,9 @@ BOXES: Final = ("center", "size", "yaw", "score", "label")
 KNOWN: Final = (*BOXES, "velocity", "position_covariance", *(part for _, parts in FLAT for part in parts), *ALIASES)
 SHOWN_ROWS: Final = 10
 """Tracks that the representation of `OnlineTracks` lists."""
+CLASS_COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#8C6D1F")
+NEAR_M: Final = 0.1
+"""Least distance from a camera at which a box is projected."""
 
 
 @dataclass(frozen=True)
@@ -151,6 +156,103 @@ class OnlineTracks:
             raise ImportError("to_dataframe needs pandas: pip install pandas") from error
         return pd.DataFrame(self.columns())
 
+    def to_kitti(self, frame: int, pose: Pose | None = None) -> list[str]:
+        """Return all tracks as lines of a KITTI result file, without image boxes (-1).
+
+        Args:
+            frame: number of the frame.
+            pose: world from sensor; None when the world frame is that of the sensor. The camera looks along its x axis.
+        """
+        center, yaw = self.center, self.yaw
+        if pose is not None:
+            center = (center - pose.translation) @ pose.rotation
+            forward = np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(self))]) @ pose.rotation
+            yaw = np.arctan2(forward[:, 1], forward[:, 0])
+        turn = np.remainder(0.5 * np.pi - yaw, 2.0 * np.pi) - np.pi
+        place = np.column_stack([-center[:, 1], 0.5 * self.size[:, 2] - center[:, 2], center[:, 0]])
+        alpha = np.remainder(turn - np.arctan2(place[:, 0], place[:, 2]) + np.pi, 2.0 * np.pi) - np.pi
+        rows = np.column_stack([self.size[:, ::-1], place, turn, self.score])
+        return [
+            f"{frame} {identity} {name} -1 -1 {angle:.6f} -1 -1 -1 -1 " + " ".join(f"{value:.6f}" for value in row)
+            for identity, name, angle, row in zip(self.id, self.name, alpha, rows.tolist(), strict=True)
+        ]
+
+    def to_nuscenes(self, sample_token: str) -> list[dict[str, Any]]:
+        """Return all tracks as the boxes of one sample of a nuScenes tracking submission."""
+        velocity = np.nan_to_num(self.velocity)  # the official reader refuses unknown velocities
+        half = 0.5 * self.yaw
+        return [
+            {
+                "sample_token": sample_token,
+                "translation": self.center[i].tolist(),
+                "size": self.size[i, [1, 0, 2]].tolist(),
+                "rotation": [float(np.cos(half[i])), 0.0, 0.0, float(np.sin(half[i]))],
+                "velocity": velocity[i].tolist(),
+                "tracking_id": str(self.id[i]),
+                "tracking_name": str(self.name[i]),
+                "tracking_score": float(self.score[i]),
+            }
+            for i in range(len(self))
+        ]
+
+    def to_supervision(self, projection: ArrayLike) -> sv.Detections:
+        """Return the confirmed tracks in front of a camera as image boxes of supervision.
+
+        Args:
+            projection: (3, 4) from world to pixels: intrinsics @ [R | t].
+
+        Raises:
+            ImportError: supervision is not installed.
+        """
+        try:
+            import supervision as sv  # noqa: PLC0415 - users bring it
+        except ImportError as error:
+            raise ImportError("to_supervision needs supervision: pip install supervision") from error
+        ground = self._outlines()
+        height = np.multiply.outer(0.5 * self.size[:, 2], (-1.0, 1.0)) + self.center[:, 2:]
+        corners = np.concatenate([np.insert(ground, 2, height[:, [side]], axis=2) for side in (0, 1)], axis=1)
+        pixels = np.insert(corners, 3, 1.0, axis=2) @ np.asarray(projection, np.float64).T
+        rows = np.flatnonzero(self.confirmed & (pixels[:, :, 2] > NEAR_M).all(axis=1))
+        image = pixels[rows, :, :2] / pixels[rows, :, 2:]
+        return sv.Detections(
+            xyxy=np.hstack([image.min(axis=1), image.max(axis=1)]),
+            confidence=self.existence[rows],
+            class_id=self.label[rows],
+            tracker_id=self.id[rows],
+            data={"class_name": self.name[rows]},
+        )
+
+    def plot(self, axes: Axes | None = None) -> Axes:
+        """Draw the confirmed tracks from above, with ids and a colour for each class.
+
+        Raises:
+            ImportError: matplotlib, of the extra `plot`, is not installed.
+        """
+        try:
+            from matplotlib import pyplot as plt  # noqa: PLC0415 - an extra
+        except ImportError as error:
+            raise ImportError("plot needs matplotlib: pip install matplotlib") from error
+        axes = plt.gca() if axes is None else axes
+        outlines, named = self._outlines(), set()
+        for i in np.flatnonzero(self.confirmed):
+            colour, name = CLASS_COLOURS[self.label[i] % len(CLASS_COLOURS)], str(self.name[i])
+            axes.fill(*outlines[i].T, fc=f"{colour}55", ec=colour, label=None if name in named else name)
+            (x, y, _), (vx, vy) = self.center[i], np.nan_to_num(self.velocity[i])
+            axes.plot([x, x + vx], [y, y + vy], color=colour)
+            axes.annotate(str(self.id[i]), (x, y), xytext=(5, 5), textcoords="offset points", color=colour)
+            named.add(name)
+        axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=f"{self.stamp_ns / 1e9:.3f} s")
+        if named:
+            axes.legend()
+        return axes
+
+    def _outlines(self) -> Array:
+        """Return the corners (N, 4, 2) of the boxes from above."""
+        forward = np.column_stack([np.cos(self.yaw), np.sin(self.yaw)]) * 0.5 * self.size[:, :1]
+        left = np.column_stack([-np.sin(self.yaw), np.cos(self.yaw)]) * 0.5 * self.size[:, 1:2]
+        corners = (forward + left, left - forward, -forward - left, forward - left)
+        return np.stack(corners, axis=1) + self.center[:, None, :2]
+
 
 class OnlineTracker:
     """Tracks one stream of frames.
@@ -175,11 +277,8 @@ class OnlineTracker:
     ) -> None:
         if unknown_classes not in {"refuse", "leave out"}:
             raise FrameError("unknown_classes", "'refuse' or 'leave out'", repr(unknown_classes))
-        if profile == "auto":
-            expected = "'generic', which is auto at 10 Hz, or generic_parameters(labels, period)"
-            raise ParameterError("profile", expected, "'auto', which needs a whole recording")
-        self.parameters = profile if isinstance(profile, Parameters) else load_profile(profile)
-        self._tracker = Tracker(self.parameters, modules)
+        self._tracker = Tracker(profile, modules)
+        self.parameters = self._tracker.parameters
         self._names = np.asarray(self.parameters.labels, dtype=np.object_)
         self._leave_out = unknown_classes == "leave out"
         self.density: Density = self._tracker.initial()

@@ -22,11 +22,12 @@ from optipmb.density import (
     objects_in,
 )
 from optipmb.detection_probability import detection_probability
-from optipmb.errors import FrameError
+from optipmb.errors import FrameError, ParameterError
 from optipmb.extract import extract
 from optipmb.field_of_view import follow_looks, look
 from optipmb.hypotheses import UNLIMITED, check_effort, local_hypotheses
 from optipmb.lightweight import light_weight_filter
+from optipmb.parameters import Parameters, load_profile
 from optipmb.paths import paths_of
 from optipmb.predict import predict
 from optipmb.preprocess import Measurements, preprocess
@@ -42,7 +43,6 @@ if TYPE_CHECKING:
 
     from optipmb.extract import Tracks
     from optipmb.frame import Frame
-    from optipmb.parameters import Parameters
     from optipmb.paths import PredictedPaths
     from optipmb.rows import Array, Columns, Index
     from optipmb.table import ClassRow
@@ -218,6 +218,9 @@ class Tracker:
             ▼ extract                     eta_ext1, eta_ext2, eta_cnt; calibration
         lambda_u, {(r, p)} at k, tracks
 
+    Args:
+        profile: parameters, or the name or file of a profile.
+
     Attributes:
         parameters: the profile.
         modules: which modules of the paper are on.
@@ -226,9 +229,14 @@ class Tracker:
     gates of objects. What a step costs is nearly proportional to them, about a microsecond each.
     """
 
-    def __init__(self, parameters: Parameters, modules: Modules | None = None, *, max_pairs: int = UNLIMITED) -> None:
+    def __init__(
+        self, profile: Parameters | str, modules: Modules | None = None, *, max_pairs: int = UNLIMITED
+    ) -> None:
+        if profile == "auto":
+            expected = "'generic', which is auto at 10 Hz, or generic_parameters(labels, period)"
+            raise ParameterError("profile", expected, "'auto', which needs a whole recording")
         self._max_pairs = max_pairs
-        self.parameters = parameters
+        self.parameters = parameters = profile if isinstance(profile, Parameters) else load_profile(profile)
         self.modules = modules if modules is not None else Modules()
         self._labels = parameters.labels
         self._table = ClassTable.of(parameters)

@@ -20,7 +20,7 @@ class ConnectionFailed(ClientError):  # noqa: N818  the name says what happened,
     A connection is used up when it is closed, or has declared all the keys that it can in its life.
 
     Attributes:
-        endpoints: What was tried.
+        endpoints: Endpoints that were tried.
         timeout: How long, in seconds.
     """
 

@@ -1,4 +1,4 @@
-"""What comes in over a connection, by Zenoh or gRPC: messages, the queue that a program reads them from, and answers.
+"""Messages and answers that arrive over Zenoh or gRPC, and the queue from which a program reads them.
 
 Payloads are bytes, keys are text, times are `time.monotonic_ns()`.
 """
@@ -92,7 +92,7 @@ class Inbox:
 
     @property
     def closed(self) -> bool:
-        """Whether nothing will come any more (what is there can still be read)."""
+        """Whether no further entries will come; those that wait can still be read."""
         return self._closed
 
     def close(self) -> None:

@@ -26,7 +26,7 @@ def linked(
     """Open a connection, over gRPC where the endpoints say so, over Zenoh otherwise; arguments as for `Connection`.
 
     Raises:
-        ConnectionFailed: nobody answers within `timeout`, or the endpoints are of both kinds.
+        ConnectionFailed: no router or gateway answers within `timeout`, or the endpoints are of both kinds.
     """
     endpoints = (connect,) if isinstance(connect, str) else tuple(connect or ())
     over_grpc = [endpoint.startswith(GRPC) for endpoint in endpoints]

@@ -2,8 +2,8 @@
 
 The service publishes the tracks of a frame again when a late frame corrects them (a higher `revision`), and after a
 restart when it goes over frames that it had published before (a higher `delivery.run`). Of each frame the latest run,
-and in it the latest revision, holds. A message whose tracks are those that are there already is a repetition, whatever
-its numbers say.
+and in it the latest revision, holds. A message with the same tracks again is a repetition, even if its numbers
+are higher.
 """
 
 import collections
@@ -23,7 +23,7 @@ class Novelty(enum.Enum):
 
 
 class _Frame(NamedTuple):
-    """What is known of a frame: the digest of what holds, and the newest (run, revision) of each session."""
+    """Digest of the tracks of a frame that hold, and the newest (run, revision) of each session."""
 
     digest: bytes
     newest: dict[str, tuple[int, int]]
@@ -41,7 +41,7 @@ class Merging:
         key = tracks.stream, tracks.sensor, tracks.epoch, tracks.seq
         order = (tracks.delivery.run if tracks.delivery else 0, tracks.revision)
         known = self._frames.get(key)
-        # A service without checkpoints begins a session anew, and counts from nothing: what comes from it holds too.
+        # A service without checkpoints starts a new session, and counts from 0: its tracks hold too.
         if known is not None and order <= known.newest.get(tracks.session, (-1, 0)):
             return Novelty.REPEATED
         digest = _digest(tracks)

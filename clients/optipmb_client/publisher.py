@@ -15,7 +15,6 @@ import threading
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from optipmb_schemas import PREFIX, Detections, FieldOfView, Keys, MessageError, Points, Pose
@@ -37,9 +36,9 @@ PoseLike = Pose | tuple[ArrayLike, ArrayLike]
 class Publisher:
     """Publishes the detections of one sensor, and its point clouds where somebody uses them.
 
-    What is published is checked first: a wrong shape or value raises `MessageError`, with the path of the field, before
+    Messages are checked first: a wrong shape or value raises `MessageError`, with the path of the field, before
     anything is sent. Detections are kept for some 20 s, so that a service that restarts or loses its link gets them
-    still. Publishing waits for nobody. One publisher may be used from several threads.
+    still. Publishing does not wait. One publisher may be used from several threads.
 
     Args:
         stream: Name of the stream, `site/node/sensor`. One publisher per stream at a time.
@@ -91,13 +90,11 @@ class Publisher:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
-        """Withdraw the publisher; what was published before is sent. May be called twice."""
+        """Withdraw the publisher; earlier messages are still sent. May be called twice."""
         self._detections.close()
         self._points.close()
         if self._own is not None:
@@ -141,7 +138,7 @@ class Publisher:
                 `frame="sensor"`.
             points: (P, 3 or more), the cloud of this frame, sent where somebody subscribes to it. Rows that are not
                 finite (no return) are left out, further columns too.
-            points_pose: Pose of the frame the points are in, when it is another than that of the boxes.
+            points_pose: Pose of the frame the points are in, when it differs from the pose of the boxes.
             has_points: Whether the service shall wait for a cloud of this stamp. Default: True when `points` are sent,
                 False when this publisher has sent clouds before, otherwise the service judges. True with `points` sends
                 them in any case.
@@ -199,7 +196,7 @@ class Publisher:
         Arguments as for `publish`, which is then called with `has_points=True`.
 
         Returns:
-            Its sequence number, which counts clouds; None when nobody subscribes to clouds, and nothing was sent.
+            Its sequence number, which counts clouds; None when there is no subscriber, and nothing was sent.
 
         Raises:
             MessageError: Something in the arguments is no valid message. Nothing was sent.
@@ -253,7 +250,7 @@ def _array(name: str, values: Any, *columns: int) -> Any:
 
 
 def _stamp(value: Any) -> Any:
-    """Return integers of any library as Python's; what is none is left for the message to refuse."""
+    """Return integers of any library as Python's, and other values as they are, for the message to refuse."""
     try:
         return operator.index(value)
     except TypeError:

@@ -75,7 +75,7 @@ def set_parameters(
 
 
 def close_session(connection: Link, stream: str, *, prefix: str = PREFIX) -> SessionState | None:
-    """End the session of a stream and free what it holds; None when no service answers, or it says no."""
+    """End the session of a stream and free its memory; None when no service answers, or it says no."""
     try:
         return _ask(connection, Keys(prefix).query(stream, "reset"), SessionState, ResetRequest(close=True))
     except ServiceRefused:
@@ -95,8 +95,8 @@ def kept_tracks(
 ) -> Iterator[Tracks]:
     """Yield the tracks of a stream in a range of stamps, by stamp, each frame once, as far as they are kept.
 
-    The service keeps the last 100 messages of a stream; with `--cluster` and `optipmb-service log` those of an hour, or
-    of what the setting `log_tracks_s` says. The range is asked for part by part, as the iterator goes on.
+    The service keeps the last 100 messages of a stream; with `--cluster` and `optipmb-service log` all of an hour, or
+    of the time in the setting `log_tracks_s`. The range is asked for part by part, as the iterator goes on.
 
     Args:
         connection: Where to ask.
@@ -133,9 +133,7 @@ def move_stream(connection: Connection, instance: str, stream: str, worker: int,
         ServiceUnavailable: No such instance.
         ServiceRefused: It has no such worker, or the move was not done in time.
     """
-    request = MoveRequest(stream=stream, worker=worker)
-    if _ask(connection, Keys(prefix).move(instance), MoveRequest, request, timeout=MOVE_S) is None:
-        raise ServiceUnavailable(f"no service {instance} answers")
+    _order(connection, Keys(prefix).move(instance), MoveRequest(stream=stream, worker=worker), instance)
 
 
 def drain_service(connection: Connection, member: str, *, drains: bool = True, prefix: str = PREFIX) -> None:
@@ -145,9 +143,12 @@ def drain_service(connection: Connection, member: str, *, drains: bool = True, p
         ServiceUnavailable: No such service.
         ServiceRefused: There is no other one, or it did not take all streams in time.
     """
-    request = DrainRequest(drain=drains)
-    if _ask(connection, Keys(prefix).drain(member), DrainRequest, request, timeout=MOVE_S) is None:
-        raise ServiceUnavailable(f"no service {member} answers")
+    _order(connection, Keys(prefix).drain(member), DrainRequest(drain=drains), member)
+
+
+def _order(connection: Connection, key: str, request: Message, instance: str) -> None:
+    if _ask(connection, key, type(request), request, timeout=MOVE_S) is None:
+        raise ServiceUnavailable(f"no service {instance} answers")
 
 
 def find_services(connection: Connection, *, prefix: str = PREFIX, patience_s: float = 1.0) -> list[ServiceStatus]:
@@ -181,7 +182,7 @@ def only_service(connection: Connection, option: str, *, prefix: str = PREFIX) -
 def _ask(
     connection: Link, key: str, expected: type[_Answer], request: Message | None = None, *, timeout: float = QUERY_S
 ) -> _Answer | None:
-    """Ask at a key and return the first good answer; None when nobody answers.
+    """Ask at a key and return the first good answer; None without an answer.
 
     Raises:
         ServiceRefused: All answers are errors; says what the first one was.

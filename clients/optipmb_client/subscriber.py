@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from optipmb_schemas import PREFIX, Keys, MessageError, Problem, Tracks
@@ -27,7 +26,7 @@ MISSED = 1024  # ranges of lost frames that are kept
 class Received:
     """Tracks, and the monotonic time (`time.monotonic_ns`) at which they arrived on this machine.
 
-    `corrects` says whether they replace what came for the same frame before.
+    `corrects` says whether they replace earlier tracks of the same frame.
     """
 
     tracks: Tracks
@@ -83,8 +82,8 @@ class Subscriber:
 
     Iterating gives `Tracks` messages as they come. The service may deliver a message again, after a restart for
     example: repetitions are left out, so that every message is given out once. When the service gets a frame late, it
-    puts it in its place and publishes the tracks of the frames behind it anew, with a higher `revision`: the latest one
-    of a frame holds. `corrections=False` leaves these out, for programs that act on what is new and do not look back.
+    inserts it and publishes the tracks of the frames behind it again, with a higher `revision`: the latest one
+    of a frame holds. `corrections=False` leaves these out, for programs that act on new frames alone.
 
     A subscriber that comes late first gets what the service keeps of each stream, some seconds.
     A program that is too slow loses the oldest waiting messages, never anybody else's; `statistics` counts them, and
@@ -144,9 +143,7 @@ class Subscriber:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -214,7 +211,7 @@ class Subscriber:
                 self._missed_count += 1
 
     def _read(self, arrival: Arrival) -> Tracks | None:
-        """Return the tracks that arrived; None for problems, and what is no message of ours."""
+        """Return the tracks that arrived; None for problems and other messages."""
         try:
             if arrival.key.endswith("/problems"):
                 problem = arrival.read(Problem)

@@ -80,7 +80,7 @@ class _Commands(TyperGroup):
 
 
 def _without_types_of_flags(parameters: list[Any]) -> list[Any]:
-    """Let the help show no type beside a flag, because a flag takes no value."""
+    """Remove the type of flags from the help, because a flag takes no value."""
     for one in parameters:
         if getattr(one, "is_flag", False):
             one.metavar = ""

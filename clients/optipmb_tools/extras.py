@@ -28,7 +28,7 @@ def to_install(package: str, what: str = "this") -> str | None:
     return None if extra is None else f"{what} needs {package}, which is not installed: {install_command(extra)}"
 
 
-def needed(what: str, extra: str, *packages: str) -> None:
+def needed(what: str, extra: str, *packages: str, need: str = "needs") -> None:
     """Raise where one of the packages of an extra is missing, before anything else is done.
 
     Raises:
@@ -36,4 +36,4 @@ def needed(what: str, extra: str, *packages: str) -> None:
     """
     for package in packages:
         if importlib.util.find_spec(package) is None:
-            raise ClientError(f"{what} needs {package}, which is not installed: {install_command(extra)}")
+            raise ClientError(f"{what} {need} {package}, which is not installed: {install_command(extra)}")

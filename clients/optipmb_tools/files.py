@@ -35,21 +35,16 @@ def read_text(path: Path, what: str) -> str:
         raise DatasetError(path, what, "bytes that are not text") from error
 
 
-def read_bytes(path: Path, what: str) -> bytes:
-    """Return the bytes of a file; `what` names its content in the error when it cannot be read."""
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise DatasetError(path, what, error.strerror or "an unreadable file") from error
-
-
 def read_points(path: Path, what: str, columns: int) -> NDArray[np.float32]:
     """Return x, y, z (P, 3) of a file of 32-bit numbers, `columns` per point.
 
     Raises:
         DatasetError: The file cannot be read, or its size fits no number of points.
     """
-    data = read_bytes(path, what)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DatasetError(path, what, error.strerror or "an unreadable file") from error
     if len(data) % (4 * columns):
         raise DatasetError(path, f"{4 * columns} bytes per point", f"{len(data)} bytes")
     return np.ascontiguousarray(np.frombuffer(data, dtype="<f4").reshape(-1, columns)[:, :3])

@@ -6,7 +6,7 @@ geometric centre, its size (length along the heading, width, height) and its yaw
 
 A heading is carried between two tilted frames by its projection: the world yaw is the direction of the rotated heading
 vector seen from above. The way back solves for the sensor heading whose projection is that yaw, so that a round trip
-gives the same yaw again whatever the tilt.
+gives the same yaw again for any tilt.
 """
 
 from collections.abc import Sequence
@@ -124,7 +124,7 @@ def to_sensor(rotation: Floats, translation: Floats, center: Floats, yaw: Floats
     """Carry boxes from the world to the sensor frame: the inverse of `to_world`, with the same shapes."""
     moved = np.einsum("...ji,...j->...i", rotation, center - translation)
     # The heading (c, s, 0) of the sensor frame is seen from above along A (c, s) with A the upper left block of R. The
-    # adjugate of A gives the direction of its inverse; its sign is that of det A, positive while the sensor stands
+    # adjugate of A gives the direction of its inverse; its sign is the sign of det A, positive while the sensor stands
     # upright.
     a, b = rotation[..., 0, 0], rotation[..., 0, 1]
     c, d = rotation[..., 1, 0], rotation[..., 1, 1]
@@ -146,13 +146,3 @@ def box_corners(center: Floats, size: Floats, yaw: Floats) -> Floats:
     corners[..., 1] = center[:, None, 1] + sin * offset[..., 0] + cos * offset[..., 1]
     corners[..., 2] = center[:, None, 2] + offset[..., 2]
     return corners
-
-
-def points_in_box(xyz: Floats, center: Floats, size: Floats, yaw: float, *, margin: float = 0.0) -> Bools:
-    """Return which points (P, 3) lie in one box, grown by `margin` metres on every side."""
-    offset = xyz - center
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    along = np.abs(cos * offset[:, 0] + sin * offset[:, 1])
-    across = np.abs(cos * offset[:, 1] - sin * offset[:, 0])
-    half = 0.5 * size + margin
-    return np.asarray((along <= half[0]) & (across <= half[1]) & (np.abs(offset[:, 2]) <= half[2]), dtype=np.bool_)

@@ -16,10 +16,9 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from optipmb_client.errors import ClientError
-from optipmb_schemas.installation import install_command
 
 from optipmb_tools.camera import sensor_from_kitti
+from optipmb_tools.extras import needed
 from optipmb_tools.files import DatasetError, numbers, read_rows, read_text, write_whole
 
 if TYPE_CHECKING:
@@ -84,10 +83,9 @@ def _kind(path: Path) -> str:
 
 
 def _pyarrow() -> Any:
-    try:
-        import pyarrow as pa  # noqa: PLC0415  packages of an extra
-    except ImportError as error:
-        raise ClientError(f"tables need pyarrow, which is not installed: {install_command('table')}") from error
+    needed("tables", "table", "pyarrow", need="need")
+    import pyarrow as pa  # noqa: PLC0415  packages of an extra
+
     return pa
 
 

@@ -1,13 +1,14 @@
 """Columnar arrays as pydantic fields: one value per column, checked with whole-array operations.
 
-`Annotated[Reals, Array("f8", ("M", 3), low, high)]` is an array of M rows of 3 numbers. Whatever a field
-is given (an array of another number type, nested lists), what it holds afterwards is always the same kind of array: the
-number type of the description, row by row and read-only: a numpy array (`numeric`), or, where numpy is not installed,
-`Numbers` (`plain`). An array or buffer that is all this already is held as a view, without a copy.
+`Annotated[Reals, Array("f8", ("M", 3), low, high)]` is an array of M rows of 3 numbers. A field may be
+given an array of another number type, or nested lists. It always holds an array of the number type of the description,
+row by row and read-only: of numpy (`numeric`), or, where numpy is not installed, `Numbers` (`plain`). An array
+or buffer that is all this already is held as a view, without a copy.
 
 A letter is a symbolic dimension: equal letters are equal numbers within one message (`Message` compares them).
 """
 
+import sys
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
@@ -21,6 +22,8 @@ from pydantic_core import CoreSchema, core_schema
 
 from optipmb_schemas.errors import MessageError, cut, invalid, shape_text
 
+if sys.byteorder != "little":
+    raise ImportError("the messages need a little-endian machine")
 try:
     from optipmb_schemas import numeric
 except ModuleNotFoundError as error:
@@ -36,7 +39,7 @@ if TYPE_CHECKING:
     Singles = NDArray[np.float32]
     Integers = NDArray[np.int64]
     Numeric = NDArray[Any]
-else:  # pydantic looks at the `Array` beside them alone
+else:  # pydantic looks at the `Array` in their metadata alone
     ArrayLike = Reals = Singles = Integers = Numeric = Any
 
 __all__ = [

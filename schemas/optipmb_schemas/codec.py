@@ -1,6 +1,6 @@
 """Messages to bytes and back: pure and deterministic, so equal messages give equal bytes.
 
-Decoding is total and bounded: it returns a message or raises `MessageError`, whatever the bytes are, and sizes, counts
+Decoding is total and bounded: for any bytes it returns a message or raises `MessageError`, and sizes, counts
 and nesting are checked before memory is taken for them. A msgpack header of five bytes can declare four thousand
 million items, and a byte per level can nest lists as deep as the payload is long. So the bytes are walked once, without
 building anything, before the models read them.
@@ -12,7 +12,8 @@ otherwise. The data of a large block lie at a multiple of 8 bytes from the start
 
 Most messages with columns need neither the walk nor the models: msgspec decodes them by structs that come from the
 models (`read_columns`). A payload that is not plainly a valid message is left to the models, which name the error. So
-there is one set of rules and one set of errors. Tests hold the messages of both ways equal.
+there is one set of rules and one set of errors. Tests hold the messages of both ways equal. By the models alone, a
+frame of 40 objects costs the service 27 % more processor time.
 """
 
 import json
@@ -107,7 +108,7 @@ def decode(payload: bytes, expected: type[T], *, encoding: str = "", limits: Lim
         payload: msgpack or JSON. Large arrays of the message are views of it.
         expected: the type of message that belongs on the key.
         encoding: the Zenoh encoding of the sample. Where it does not say, the first byte tells msgpack from JSON.
-        limits: what is accepted at most.
+        limits: of messages.
 
     Raises:
         MessageError: whenever the payload is not a valid message of this type within the limits.
@@ -129,7 +130,7 @@ def build(fields: dict[str, Any], expected: type[T], limits: Limits) -> T:
     """Return the message of fields as they were received, arrays as blocks or nested lists.
 
     Raises:
-        MessageError: whenever they are not those of a valid message of this type within the limits.
+        MessageError: they do not make a valid message of this type within the limits.
     """
     labels = fields.get("labels")
     if isinstance(labels, list) and len(labels) > limits.max_labels:
@@ -393,7 +394,7 @@ _PLAIN: Final = frozenset({str, bytes, int, float, bool})  # what msgpack takes 
 
 
 def _scalar(value: Any) -> Any:
-    """Return a number or text of a subclass, such as numpy's float64, as what it is."""
+    """Return a number or text of a subclass, such as numpy's float64, as its base type."""
     kinds: tuple[Any, ...] = (float, str, bytes, int)
     for kind in kinds:
         if isinstance(value, kind):
@@ -408,10 +409,10 @@ def encode(message: Message, **others: Any) -> bytes:
     """Return the message as msgpack, arrays as blocks. Fields that are None are left out.
 
     Args:
-        message: what is encoded.
-        others: values that are known to be valid, in place of those of the message.
+        message: the message.
+        others: values that are known to be valid; they replace fields of the message.
     """
-    return numeric.joined(_parts(type(message), message.__dict__ | others if others else message.__dict__))
+    return b"".join(_parts(type(message), message.__dict__ | others if others else message.__dict__))
 
 
 def _is_encoding(payload: bytes, message: Message) -> bool:
@@ -428,7 +429,7 @@ def _is_encoding(payload: bytes, message: Message) -> bool:
 
 
 def _parts(kind: type[Message], values: dict[str, Any]) -> list[Any]:
-    """Return the encoding in parts, bytes and arrays."""
+    """Return the encoding in parts, bytes and the memory of arrays."""
     fields = [(name, value) for name in kind.names if (value := values[name]) is not None]
     parts: list[Any] = [_head(len(fields))]
     offset, plain = len(parts[0]), {}
@@ -444,7 +445,7 @@ def _parts(kind: type[Message], values: dict[str, Any]) -> list[Any]:
         if not head:
             head = _large_head(name, kind.arrays[name].dtype, value.shape, offset)
             length += len(head)
-        parts += head, value
+        parts += head, numeric.memory_of(value)
         offset += length
     if plain:
         parts.append(_without_head(plain))
@@ -458,14 +459,14 @@ def encode_columns(
 
     Args:
         kind: type of the message.
-        header: the fields before the arrays, without those that are None.
+        header: the fields before the arrays, but for None.
         names: of the array fields in their order; they have numbers of 8 bytes, and no length but N may vary.
         columns: of float64, the numbers of all arrays as their bytes.
         others: the fields behind the arrays, likewise; a message in one as its fields.
     """
     parts: list[Any] = [_head(len(header) + len(names) + len(others)), _without_head(header)]
     heads, places = _column_heads(kind, names, columns.size, (len(parts[0]) + len(parts[1])) % ALIGNMENT)
-    parts += chain.from_iterable(zip(heads, map(numeric.memory_of(columns).__getitem__, places), strict=True))
+    parts += chain.from_iterable(zip(heads, map(numeric.memory_of(columns).cast("B").__getitem__, places), strict=True))
     parts.append(_without_head(others))
     return b"".join(parts)
 
@@ -518,7 +519,7 @@ def _plain(value: Any, *, blocks: bool) -> Any:
 
 def _block(array: Numeric, dtype: str) -> dict[str, Any]:
     """Return the block of an array of a number type."""
-    return {"dtype": dtype, "shape": array.shape, "data": numeric.bytes_of(array)}
+    return {"dtype": dtype, "shape": array.shape, "data": array.tobytes()}
 
 
 def _large_head(name: str, dtype: str, shape: tuple[int, ...], offset: int) -> bytes:
@@ -584,7 +585,6 @@ MOST_NUMBERS: Final = 2**13
 _TypedDict: Any = TypedDict  # made of types that are not known before
 _PARTS: Final[frozenset[type[Message]]] = frozenset({Pose, FieldOfView})
 """Messages inside others that have required float64 arrays of fixed lengths and closed ranges alone."""
-_LITTLE: Final = sys.byteorder == "little"
 _BOUNDS: Final = ("ge", "gt", "le", "lt")
 REFUSED: Final = (msgspec.MsgspecError, ValueError, TypeError, LookupError, RecursionError, struct.error)
 """Errors of a payload that is not valid, or not in this form."""
@@ -656,7 +656,7 @@ def _checker_of(kind: type[Message]) -> Callable[[dict[str, Any]], dict[str, Any
 
 @lru_cache(512)
 def _checked_scalars(kind: type[Message], *values: Any) -> tuple[dict[str, Any], frozenset[str]]:
-    """Return the scalars with the defaults of all fields, and the names of those that are there."""
+    """Return the scalars with the defaults of all fields, and the names of the given ones."""
     given = {name: value for name, value in zip(_scalars_of(kind), values, strict=True) if value is not UNSET}
     _need(None not in given.values())
     return kind.optional | _checker_of(kind)(given), frozenset((*given, *_numbers_of(kind)))
@@ -717,7 +717,7 @@ class _Builder:
             data = self._data_in(fields)
             plan = _plan_of(kind, self._shapes_in(fields))
             _need([*map(len, data)] == plan.sizes)
-            _need(plan.is_usual if limits.allows_default_rows else _are_within(plan.lengths, limits))
+            _need(all(length <= limits.rows(letter) for letter, length in plan.lengths.items()))
             for read in plan.readers:
                 read(data, values)
             given |= plan.names
@@ -789,8 +789,6 @@ class _Plan(NamedTuple):
     lengths: dict[str, int]
     """Symbolic dimensions."""
     readers: list[_Read]
-    is_usual: bool
-    """Whether they are within the default limits."""
 
 
 @lru_cache(128)
@@ -810,11 +808,7 @@ def _plan_of(kind: type[Message], shapes: tuple[tuple[int, ...] | None, ...]) ->
     for dtype in dict.fromkeys(described.dtype for _, _, described, _ in arrays):
         alike = [one for one in arrays if one[2].dtype == dtype]
         readers += [_column(*one) for one in alike] if many or len(alike) == 1 else [_columns(dtype, alike)]
-    return _Plan(frozenset(name for _, name, *_ in arrays), sizes, lengths, readers, _are_within(lengths, DEFAULT))
-
-
-def _are_within(lengths: dict[str, int], limits: Limits) -> bool:
-    return all(length <= limits.rows(letter) for letter, length in lengths.items())
+    return _Plan(frozenset(name for _, name, *_ in arrays), sizes, lengths, readers)
 
 
 def _least(described: Array) -> Any:
@@ -859,7 +853,7 @@ def read_columns(payload: bytes, kind: type[T], limits: Limits) -> T | None:
     of floats. Where it would copy a large payload, `_is_encoding` compares the payload without them.
     """
     builder: Any = _BUILDERS.get(kind)
-    if np is None or builder is None or not (_LITTLE and limits.allows_columns):
+    if np is None or builder is None or not limits.allows_columns:
         return None
     try:
         fields = DECODERS[kind](payload)

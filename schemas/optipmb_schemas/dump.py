@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Final, TypeVar
 
 import msgpack
-from pydantic import BeforeValidator, StrictBool, StrictBytes, StrictInt, TypeAdapter, ValidationError
+from pydantic import BeforeValidator, PlainSerializer, StrictBool, StrictBytes, StrictInt, TypeAdapter, ValidationError
 
 from optipmb_schemas.codec import decode, encode, read_map
 from optipmb_schemas.errors import MessageError, invalid, show
@@ -36,6 +36,9 @@ def _stored(data: object, kind: type[T]) -> T:
     return decode(data, kind, limits=STORED)
 
 
+_ENCODED: Final = PlainSerializer(lambda message: None if message is None else encode(message))
+
+
 @dataclass(frozen=True)
 class DumpedFrame:
     """One of the last frames.
@@ -46,8 +49,8 @@ class DumpedFrame:
         anew: whether the density is empty before it, but for the next track id.
     """
 
-    detections: Annotated[Detections, BeforeValidator(lambda data: _stored(data, Detections))]
-    points: Annotated[Points | None, BeforeValidator(lambda data: data if data is None else _stored(data, Points))]
+    detections: Annotated[Detections, BeforeValidator(lambda data: _stored(data, Detections)), _ENCODED]
+    points: Annotated[Points | None, BeforeValidator(lambda data: data and _stored(data, Points)), _ENCODED]
     anew: StrictBool
 
 
@@ -80,20 +83,7 @@ class Dump:
 
 def encode_dump(dump: Dump) -> bytes:
     """Return the bytes of a dump."""
-    fields = {
-        "format": FORMAT,
-        "version": VERSION,
-        **{name: value for name, value in vars(dump).items() if name != "frames"},
-        "frames": [
-            {
-                "detections": encode(frame.detections),
-                "points": None if frame.points is None else encode(frame.points),
-                "anew": frame.anew,
-            }
-            for frame in dump.frames
-        ],
-    }
-    packed: bytes = _msgpack.packb(fields)
+    packed: bytes = _msgpack.packb({"format": FORMAT, "version": VERSION} | _DUMP.dump_python(dump))
     return packed
 
 

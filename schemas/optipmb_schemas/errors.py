@@ -1,7 +1,7 @@
-"""The one error of the package: what was wrong, where, what was expected and what came instead.
+"""The one error of the package: the fault, its place, the expected and the received value.
 
 A path names a field and an element of it, as `score[3]`, `center[7][1]` or `sessions[2].stream`; the empty path is the
-message as a whole. Texts that quote a received value are short and printable whatever was received, so that they can go
+message as a whole. Texts that quote a received value are always short and printable, so that they can go
 into logs, terminals and `Problem` messages as they are.
 """
 
@@ -32,7 +32,7 @@ class MessageError(ValueError):
         code: one of `CODES`, for programs.
         path: the field and element, empty for the message as a whole.
         expected: what the description of the message asks for.
-        received: what was there, cut to a short printable text.
+        received: the value found there, as a short printable text.
     """
 
     def __init__(self, code: Code, path: str, expected: str, received: str) -> None:

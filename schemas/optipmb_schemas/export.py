@@ -5,7 +5,7 @@ documentation page are brought up to date as well, with `--asyncapi FILE` the As
 is written: every file that is not up to date gets one line, and the exit status is 1.
 
 A page marks where a table belongs with the comment `<!-- table: NAME -->` and its end with `<!-- end -->`; what lies
-between is replaced. Names are those of the message types, `limits` and `codes`.
+between is replaced. Names are message types, `limits` and `codes`.
 """
 
 import argparse
@@ -125,12 +125,21 @@ def _markdown(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
     return "".join(f"| {' | '.join(cell.replace('|', '&#124;') for cell in line)} |\n" for line in lines)
 
 
-def stale(files: dict[Path, str], folder: Path | None) -> list[str]:
-    """Return one line for every file that is missing, not up to date, or a schema of a message that there is not."""
+def bring_up_to_date(files: dict[Path, str], command: str, *, check: bool, gone: Iterable[Path] = ()) -> int:
+    """Write files, and return the exit status 0.
+
+    With `check` nothing is written: each file that is not up to date, or `gone`, gets one line, and the status is 1.
+    """
     lines = [f"{path}: missing" for path in files if not path.is_file()]
-    lines += [f"{path}: not up to date" for path, text in files.items() if path.is_file() and _read(path) != text]
-    found = () if folder is None else sorted(folder.glob(f"*{SUFFIX}"))
-    return lines + [f"{path}: no such message" for path in found if path not in files]
+    lines += [f"{path}: not up to date" for path, text in files.items() if path.is_file() and read(path) != text]
+    lines += [f"{path}: no such message" for path in gone]
+    if check:
+        sys.stdout.writelines(f"{line}; run {command}\n" for line in lines)
+        return 1 if lines else 0
+    for path, text in files.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    return 0
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -149,27 +158,20 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         files = {} if folder is None else {folder / name: text for name, text in schema_files().items()}
         if options.page:
-            files[options.page] = fill(_read(options.page))
+            files[options.page] = fill(read(options.page))
         if options.asyncapi:
             from optipmb_schemas.asyncapi import document  # noqa: PLC0415  it imports this module
 
             files[options.asyncapi] = document()
-        lines = stale(files, folder)
-        if options.check:
-            for line in lines:
-                sys.stdout.write(f"{line}; run python -m optipmb_schemas.export without --check\n")
-            return 1 if lines else 0
-        if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
-        for path, text in files.items():
-            path.write_text(text, encoding="utf-8")
+        gone = sorted(set(folder.glob(f"*{SUFFIX}")) - files.keys()) if folder else []
+        return bring_up_to_date(files, f"{parser.prog} without --check", check=options.check, gone=gone)
     except OSError as error:
         sys.stderr.write(f"error: {error}\n")
         return 2
-    return 0
 
 
-def _read(path: Path) -> str:
+def read(path: Path) -> str:
+    """Return the text of a file."""
     return path.read_text(encoding="utf-8")
 
 

@@ -67,10 +67,6 @@ class Keys:
         """Return the key of the metrics query of an instance."""
         return f"{self.prefix}/service/{_instance(instance)}/q/metrics"
 
-    def samples(self, instance: str) -> str:
-        """Return the key at which the parent of a worker asks it for its metrics as data; of no use to others."""
-        return f"{self.prefix}/service/{_instance(instance)}/q/samples"
-
     def move(self, instance: str) -> str:
         """Return the key of the query that moves a stream between the workers of an instance."""
         return f"{self.prefix}/service/{_instance(instance)}/q/move"
@@ -86,7 +82,7 @@ class Keys:
     def discovered(self, streams: Iterable[str], instance: str, run: str) -> str:
         """Return the liveliness key by which a process says that streams exist, for their publishers do not.
 
-        `run` tells it from all others, also from those of its name.
+        `run` tells it from all others, also from others of its name.
         """
         names = ",".join(_stream(stream).replace("/", "%") for stream in streams)
         return f"{self.prefix}/service/{_instance(instance)}/discovered/{_named('run', check_chunk, run)}/{names}"

@@ -1,4 +1,4 @@
-"""Named limits of what a receiver accepts. They are checked before memory is taken for what they limit.
+"""Limits of a receiver, by name. They are checked before memory is allocated.
 
 The defaults carry the largest LiDAR clouds in use with room to spare, and keep the memory that one hostile message can
 take in the tens of megabytes. A message above a limit is answered by a `too_large` problem that names it.
@@ -49,13 +49,8 @@ class Limits:
 
     @cached_property
     def allows_columns(self) -> bool:
-        """Whether a valid message with columns of binary numbers can be above no limit but those of its arrays."""
+        """Whether a valid message with columns of binary numbers can be above no limit but the rows of its arrays."""
         return all(getattr(self, name) >= most for name, most in _COLUMNS.items())
-
-    @cached_property
-    def allows_default_rows(self) -> bool:
-        """Whether no limit of an array dimension is below the default."""
-        return all(getattr(self, name) >= getattr(DEFAULT, name) for name in _DIMENSIONS.values())
 
     def described(self) -> list[tuple[str, int, str]]:
         """Return name, value and meaning of every limit, for people."""

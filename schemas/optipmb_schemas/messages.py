@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import AfterValidator, Field
 
 from optipmb_schemas.arrays import Array, Integers, Numeric, Reals, Singles, first_descent, numeric, unit_quaternion
-from optipmb_schemas.errors import MessageError, invalid, shape_text, show
+from optipmb_schemas.errors import MessageError, invalid, shape_text
 from optipmb_schemas.model import (
     Count,
     Epoch,
@@ -43,7 +43,7 @@ LEAST_VARIANCE = 1e-8
 ROUNDING = 8 * sys.float_info.epsilon
 """Share of the sum of variances by which one of them may be beyond its limit: errors of computation are smaller."""
 SYMMETRY = 1e-6
-"""Share of the largest variance by which opposite entries of a covariance may differ: those of float32 do."""
+"""Share of the largest variance by which opposite entries of a covariance may differ, as in float32."""
 
 
 class Pose(Message):
@@ -354,8 +354,9 @@ class Density(Message):
 
 
 def _check_labels(label: Integers, labels: tuple[str, ...]) -> None:
-    if len(label) and (most := label[at := numeric.largest(label)]) >= len(labels):
-        raise MessageError("invalid_value", f"label[{at}]", f"an index into the {len(labels)} labels", show(int(most)))
+    values = label.tolist()
+    if values and (most := max(values)) >= len(labels):
+        raise invalid(f"label[{values.index(most)}]", f"an index into the {len(labels)} labels", most)
 
 
 def _check_covariances(covariance: Reals) -> None:
@@ -368,7 +369,7 @@ def _check_covariances(covariance: Reals) -> None:
 def _is_covariance(matrix: Any) -> Any:
     """Return whether a matrix (3, 3) is symmetric with its eigenvalues within the limits, element by element.
 
-    The elements may be arrays, which hold those of several matrices: so is what is returned. NaN gives False.
+    The elements may be arrays, of several matrices; then the result is one too. NaN gives False.
     """
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = matrix
     good = True

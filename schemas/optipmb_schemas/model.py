@@ -145,7 +145,7 @@ class Message(BaseModel):
     """Base of every message and of what messages hold.
 
     Fields that are not known are ignored: a newer minor version may have added them. Arrays are views of what the
-    constructor was given wherever that is possible, so its arrays must not be changed afterwards.
+    constructor was given if possible, so its arrays must not be changed afterwards.
 
     Raises:
         MessageError: when a field is missing or not valid.

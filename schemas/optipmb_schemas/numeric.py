@@ -1,12 +1,11 @@
 """Fields of numbers as numpy arrays. `plain` has the same names for programs without numpy; `arrays` chooses.
 
-Whatever a field is given, what it holds is a numpy array of the number type of its description, in native byte order,
+A field always holds a numpy array of the number type of its description, in native byte order,
 C-contiguous, aligned and read-only, so compiled code that is specialised on array types sees one type. An array that is
 all this already is held as a view, without a copy.
 """
 
 import array
-import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
@@ -23,13 +22,11 @@ WHOLE: Final = (int, np.integer)
 REAL: Final = (int, float, np.integer, np.floating)
 """Types of the numbers in lists."""
 
-_LITTLE: Final = sys.byteorder == "little"
-
 _DTYPES: Final = {name: np.dtype("<" + name) for name in ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")}
 
 
 def asarray(value: Any) -> Any:
-    """Return what is no list as an array, as far as it is one."""
+    """Return a value that is no list as an array, as far as it is one."""
     return np.asarray(value)
 
 
@@ -50,19 +47,9 @@ def of_bytes(data: bytes | memoryview, dtype: str, shape: list[int]) -> NDArray[
     return np.frombuffer(data, _DTYPES[dtype]).reshape(shape) if data else np.empty(shape, _DTYPES[dtype])
 
 
-def bytes_of(array: NDArray[Any]) -> bytes:
-    """Return the bytes of an array as a field holds it, little-endian, row by row."""
-    return (array if _LITTLE else array.byteswap()).tobytes()
-
-
-def memory_of(array: NDArray[Any]) -> memoryview:
-    """Return the bytes of an array (N,), little-endian; where it is so already, they are not copied."""
-    return (array if _LITTLE else array.byteswap()).view(np.uint8).data
-
-
-def joined(parts: list[Any]) -> bytes:
-    """Return bytes and those of arrays, one behind the other."""
-    return b"".join(parts if _LITTLE else [one if type(one) is bytes else bytes_of(one) for one in parts])
+def memory_of(array: NDArray[Any]) -> Any:
+    """Return the numbers of an array in memory, row by row."""
+    return array.data
 
 
 def read_only(array: NDArray[Any]) -> NDArray[Any]:
@@ -110,13 +97,8 @@ def first_outside(array: NDArray[Any], description: "Array") -> int | None:
     return None if good.all() else int(np.argmin(good))
 
 
-def largest(array: NDArray[Any]) -> int:
-    """Return which number of a non-empty array (N,) is the first of the largest."""
-    return int(array.argmax())
-
-
 def finite(points: Any) -> Any:
-    """Return x, y, z of the points whose coordinates are finite; what is no cloud as it is."""
+    """Return x, y, z of the points whose coordinates are finite; other values as they are."""
     if not isinstance(points, np.ndarray) or points.ndim != 2 or points.dtype.kind != "f":  # noqa: PLR2004  a table: rows and columns
         return points
     xyz = np.ascontiguousarray(points[:, :3])

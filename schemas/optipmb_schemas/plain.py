@@ -4,7 +4,6 @@ import array
 import math
 import operator
 import struct
-import sys
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, Final
 
@@ -16,9 +15,6 @@ if TYPE_CHECKING:
 WHOLE: Final = (int,)
 REAL: Final = (int, float)
 
-if sys.byteorder != "little":
-    raise ImportError("on a big-endian machine the messages need numpy: pip install numpy")
-
 _CODES: Final = dict(zip(("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8"), "fdbhiqBHIQ", strict=True))
 """Number types of the wire, by the letters of `array` and `struct`."""
 
@@ -29,7 +25,7 @@ _BUFFERS: Final = frozenset("bBhHiIlLqQ") | _FLOATS
 class Numbers:
     """Numbers in rows, read-only: what a field holds where numpy is not installed.
 
-    `len`, loops, `[i]`, `shape`, `tolist` and `tobytes` do what those of a numpy array do; a row of a table is again of
+    `len`, loops, `[i]`, `shape`, `tolist` and `tobytes` work as on a numpy array; a row of a table is again of
     this type. Further operations need numpy: `pip install numpy`.
 
     Args:
@@ -118,7 +114,7 @@ def _rebuilt(data: bytes, code: str, shape: tuple[int, ...]) -> Numbers:
 
 
 def _flat(data: bytes | memoryview, code: str) -> memoryview:
-    if not data:  # what is empty cannot be cast
+    if not data:  # an empty buffer cannot be cast
         return memoryview(array.array(code))
     as_bytes: Any = memoryview(data).cast("B")
     flat: memoryview = as_bytes.cast(code)
@@ -135,19 +131,9 @@ def of_bytes(data: bytes | memoryview, dtype: str, shape: list[int]) -> Numbers:
     return Numbers(_flat(data, _CODES[dtype]), tuple(shape))
 
 
-def bytes_of(numbers: Numbers) -> bytes:
-    """Return the bytes of an array, little-endian, row by row."""
-    return numbers.tobytes()
-
-
 def memory_of(numbers: Numbers) -> memoryview:
-    """Return the bytes of numbers."""
-    return memoryview(numbers.tobytes())
-
-
-def joined(parts: list[Any]) -> bytes:
-    """Return bytes and those of arrays, one behind the other."""
-    return b"".join([one if type(one) is bytes else one.tobytes() for one in parts])
+    """Return the numbers of an array in memory, row by row."""
+    return numbers.flat
 
 
 def canonical(numbers: Numbers, description: "Array") -> Numbers:
@@ -185,13 +171,8 @@ def first_outside(numbers: Numbers, description: "Array") -> int | None:
     return outside[0] if outside else None
 
 
-def largest(numbers: Numbers) -> int:
-    """Return which number of a non-empty array (N,) is the first of the largest."""
-    return max(range(len(numbers)), key=numbers.flat.__getitem__)
-
-
 def finite(points: Any) -> Any:
-    """Return x, y, z of the points whose coordinates are finite; what is no cloud as it is."""
+    """Return x, y, z of the points whose coordinates are finite; other values as they are."""
     if not (isinstance(points, Numbers) and len(points.shape) == 2 and points.flat.format in _FLOATS):  # noqa: PLR2004  a table: rows and columns
         return points
     xyz = _columns(points, 3)

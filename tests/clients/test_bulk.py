@@ -13,12 +13,12 @@ from bulk_tasks import RECORDINGS, Dying, bytes_of, recordings, tracked_plainly
 from commands import run_here, start
 from optipmb_client.errors import ClientError, UsageError
 from optipmb_schemas.installation import install_command
-from optipmb_tools.bulk import Executor, Failed, Here, Processes, executor_for, run, values
 from optipmb_tools.cli import run as command
 from optipmb_tools.datasets import DatasetArguments
-from optipmb_tools.offline import profile_for
+from optipmb_tools.run.bulk import Executor, Failed, Here, Processes, executor_for, run, values
+from optipmb_tools.run.profiles import profile_for
+from optipmb_tools.run.tracking import Tracking, track
 from optipmb_tools.table_files import write_table
-from optipmb_tools.tracking import Tracking, track
 from own_tables import FRAMES, boxes
 
 ENDS_S = 120.0

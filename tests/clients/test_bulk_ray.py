@@ -11,10 +11,10 @@ import bulk_tasks
 import pytest
 from bulk_tasks import RECORDINGS, Dying, bytes_of, recordings, tracked_plainly
 from commands import optipmb
-from optipmb_tools.bulk import Executor, executor_for
 from optipmb_tools.datasets import DatasetArguments
-from optipmb_tools.offline import profile_for
-from optipmb_tools.tracking import TrackedSequence, Tracking, track
+from optipmb_tools.run.bulk import Executor, executor_for
+from optipmb_tools.run.profiles import profile_for
+from optipmb_tools.run.tracking import TrackedSequence, Tracking, track
 
 ray = pytest.importorskip("ray")
 cluster_utils = pytest.importorskip("ray.cluster_utils")

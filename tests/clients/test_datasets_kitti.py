@@ -4,8 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from boxes import points_in_box
 from commands import run_here
-from optipmb_tools.camera import SENSOR_FROM_CAMERA, alpha_of, sensor_from_kitti
+from optipmb_tools.camera import sensor_from_kitti
 from optipmb_tools.datasets import DatasetError, open_dataset
 from optipmb_tools.datasets.kitti import (
     EARTH_RADIUS_M,
@@ -14,12 +15,9 @@ from optipmb_tools.datasets.kitti import (
     KittiSequence,
     read_calibration,
     read_detections,
-    read_labels,
     read_oxts,
-    read_poses,
-    read_scan,
 )
-from optipmb_tools.geometry import points_in_box, rotation_of, stack_poses, to_sensor, to_world, wrap_angle
+from optipmb_tools.geometry import rotation_of, stack_poses
 from real_data import kitti_root
 
 ROW = "0,2,10,20,30,40,{score},1.5,1.6,4.0,1.0,1.7,20.0,-1.5,-1.6"
@@ -290,13 +288,6 @@ def test_a_sequence_with_oxts_needs_no_pose_file(tmp_path: Path) -> None:
     assert len(list(sequence.frames())) == len(sequence) == 5
 
 
-def test_a_scan_of_the_wrong_length_is_reported(tmp_path: Path) -> None:
-    """Sixteen bytes are a point."""
-    (tmp_path / "0.bin").write_bytes(b"\0" * 40)
-    with pytest.raises(DatasetError, match="16 bytes per point, received 40 bytes"):
-        read_scan(tmp_path / "0.bin")
-
-
 def test_clouds_are_read_when_they_are_asked_for(tmp_path: Path) -> None:
     """A broken scan hurts nobody who does not look at it, and option clouds=0 leaves all of them out."""
     write_root(tmp_path)
@@ -307,7 +298,7 @@ def test_clouds_are_read_when_they_are_asked_for(tmp_path: Path) -> None:
     assert [frame.cloud is not None for frame in frames] == [False, True, False]
     cloud = frames[1].cloud
     assert cloud is not None
-    with pytest.raises(DatasetError, match=r"000001.bin"):
+    with pytest.raises(DatasetError, match=r"000001.bin: expected 16 bytes per point, received 8 bytes"):
         _ = cloud.xyz
     # The written calibration has the velodyne 27 cm behind and 8 cm above the camera, looking the same way.
     np.testing.assert_allclose(
@@ -348,16 +339,6 @@ def test_real_sequences_have_the_known_numbers_of_frames_and_detections(real: Ki
     assert found == COUNTS
 
 
-def test_real_boxes_survive_the_way_to_the_world_and_back(real: KittiDataset) -> None:
-    """All detections of a hilly drive: camera to world to camera to 1e-9, quaternions included."""
-    (sequence,) = real.sequences(["0009"])
-    for frame in sequence.frames():
-        rotation, translation = rotation_of(frame.pose.quaternion), frame.pose.translation
-        center, yaw = to_sensor(rotation, translation, *to_world(rotation, translation, frame.center, frame.yaw))
-        np.testing.assert_allclose(center, frame.center, atol=1e-9)
-        assert abs(wrap_angle(yaw - frame.yaw)).max(initial=0.0) < 1e-9
-
-
 def test_projected_real_detections_are_where_the_detector_saw_them(real: KittiDataset) -> None:
     """The image boxes of the 3D boxes overlap the detector's own image boxes by more than 0.7 in 99 of 100 cases."""
     (sequence,) = real.sequences(["0011"])
@@ -370,16 +351,6 @@ def test_projected_real_detections_are_where_the_detector_saw_them(real: KittiDa
     overlap = common / (areas[0] + areas[1] - common)
     assert seen.mean() > 0.99
     assert (overlap > 0.7).mean() > 0.99
-
-
-def test_the_alpha_of_real_labels_is_the_heading_seen_from_the_camera(real: KittiDataset) -> None:
-    """Alpha is ry - atan2(x, z) in nearly every label; the rounding of annotated places leaves a little."""
-    (sequence,) = real.sequences(["0011"])
-    file = read_labels(kitti_root() / "training/label_02/0011.txt", len(sequence))
-    rows = np.array([name != "DontCare" for name in file.type])
-    error = abs(wrap_angle(alpha_of(file.bottom, file.rotation_y) - file.alpha))[rows]
-    assert np.median(error) < 0.01
-    assert np.quantile(error, 0.99) < 0.1
 
 
 @pytest.mark.parametrize("name", ["0009", "0011"])
@@ -435,18 +406,6 @@ def test_real_truth_has_types_and_regions(real: KittiDataset) -> None:
     assert len(truth) + len(truth.regions.frame) == 1089
     assert truth.ignored.sum() == ((truth.occlusion > 2) | (truth.truncation > 0)).sum() > 0
     assert (truth.id >= 0).all()
-
-
-def test_real_poses_are_read_as_written(real: KittiDataset) -> None:
-    """The sensor's pose is the file's with its axes named anew, and the first one is the identity."""
-    matrices = read_poses(kitti_root() / "training/poses/0009.txt")
-    (sequence,) = real.sequences(["0009"])
-    assert len(sequence.poses) == len(matrices)
-    for pose, matrix in zip(sequence.poses[::100], matrices[::100], strict=True):
-        turned = SENSOR_FROM_CAMERA @ matrix[:3, :3] @ SENSOR_FROM_CAMERA.T
-        np.testing.assert_allclose(rotation_of(pose.quaternion), turned, atol=1e-6)
-        np.testing.assert_allclose(pose.translation, SENSOR_FROM_CAMERA @ matrix[:3, 3], atol=1e-12)
-    np.testing.assert_allclose(sequence.poses[0].quaternion, [1, 0, 0, 0], atol=1e-9)
 
 
 def test_headings_across_the_motion_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

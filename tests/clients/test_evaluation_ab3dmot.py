@@ -10,10 +10,10 @@ from evaluation_cases import TrackRow, TruthRow, followed, parked, shuffled, tra
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_tools.datasets import open_dataset
+from optipmb_tools.evaluation import Counts
 from optipmb_tools.evaluation.ab3dmot import (
     POINTS,
     Ab3dmotResult,
-    Counts,
     evaluate_ab3dmot,
     recall_points,
 )
@@ -154,7 +154,7 @@ def naive(case: Case, threshold: float) -> Counts:
     )
     match: dict[int, int] = {}
     counts = dict.fromkeys(vars(Counts()), 0)
-    counts["overlap"] = 0.0
+    counts["similarity"] = 0.0
     for frame in sorted({*case.truth_frame.tolist(), *case.track_frame.tolist()}):
         truth = np.flatnonzero(case.truth_frame == frame).tolist()
         tracks = [int(k) for k in np.flatnonzero(case.track_frame == frame) if means[case.track_id[k]] >= threshold]
@@ -169,7 +169,7 @@ def naive(case: Case, threshold: float) -> Counts:
     counts["truth"] = int((~case.ignored).sum())
     counts["true"] = len(match)
     counts["missed"] = sum(row not in match and not case.ignored[row] for row in range(len(case.truth_frame)))
-    counts["overlap"] = sum(overlap[pair] for pair in match.items())
+    counts["similarity"] = sum(overlap[pair] for pair in match.items())
     for one in sorted(set(case.truth_id.tolist())):
         rows = sorted(np.flatnonzero(case.truth_id == one).tolist(), key=lambda row: case.truth_frame[row])
         life = [int(case.track_id[match[row]]) if row in match else -1 for row in rows]
@@ -216,7 +216,7 @@ def test_counts_are_those_of_a_naive_twin(seed: int) -> None:
         errors = twin.false + twin.missed + twin.switches
         if twin.truth:
             scaled = 1.0 - (errors - (1.0 - point.recall) * twin.truth) / (point.recall * twin.truth)
-            assert point.counts.smota(point.recall) == pytest.approx(min(1.0, max(0.0, scaled)))
+            assert point.smota == pytest.approx(min(1.0, max(0.0, scaled)))
     if math.isinf(result.threshold):
         assert vars(result.best) == pytest.approx(vars(naive(case, -math.inf)))
     else:

@@ -68,7 +68,7 @@ def tracks_of(rows: Iterable[Row], scores: dict[int, float] | None = None) -> Re
 
 def figures(result: ClearResult) -> tuple[int, int, int, int, int]:
     """Give GT, TP, FP, FN and IDS."""
-    return result.truth, result.true, result.false, result.missed, len(result.switches)
+    return result.truth, result.true, result.false, result.missed, result.switches
 
 
 TWO = [(f, i, 10.0 * i + f) for f in range(10) for i in (1, 2)]
@@ -82,7 +82,7 @@ def test_truth_as_tracks_is_perfect() -> None:
     assert (result.mota, result.precision, result.recall) == (1.0, 1.0, 1.0)
     assert result.motp == pytest.approx(1.0)
     assert (result.mostly_tracked, result.mostly_lost, result.fragments, result.objects) == (2, 0, 0, 2)
-    assert result.switches == result.misses == ()
+    assert result.changes == result.misses == ()
 
 
 def test_no_results_miss_everything() -> None:
@@ -114,14 +114,14 @@ def test_ids_shuffled_in_every_frame_are_all_switches() -> None:
     result = evaluate_clear(truth_of(TWO), tracks_of(swapped), "Car", sequence="0001")
     assert figures(result) == (20, 20, 0, 0, 18)
     assert result.mota == pytest.approx(1.0 - 18 / 20)
-    assert result.switches[:2] == (Switch("0001", 1, 1, 1, 2), Switch("0001", 1, 2, 2, 1))
+    assert result.changes[:2] == (Switch("0001", 1, 1, 1, 2), Switch("0001", 1, 2, 2, 1))
 
 
 def test_one_id_change_is_one_switch_at_its_frame() -> None:
     """Car 2 is followed by track 2 until frame 5 and by track 9 from frame 6 on."""
     tracks = [(f, 9 if i == 2 and f > 5 else i, x) for f, i, x in TWO]
     result = evaluate_clear(truth_of(TWO), tracks_of(tracks), "Car")
-    assert result.switches == (Switch("", 6, 2, 2, 9),)
+    assert result.changes == (Switch("", 6, 2, 2, 9),)
 
 
 def test_a_break_is_a_fragment_and_with_memory_a_change_over_it_counts() -> None:

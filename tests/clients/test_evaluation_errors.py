@@ -9,7 +9,7 @@ from optipmb_tools.datasets import DataSequence, DetectionFrame, open_dataset
 from optipmb_tools.evaluation.cases import Rules
 from optipmb_tools.evaluation.errors import DIRECTIONS, ErrorResult, evaluate_errors
 from optipmb_tools.evaluation.evaluate import evaluate_figures, load_recordings
-from optipmb_tools.tracking import Tracking, track
+from optipmb_tools.run.tracking import Tracking, track
 
 import optipmb
 

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+from boxes import points_in_box
 from hypothesis import given
 from hypothesis import strategies as st
 from optipmb_tools.evaluation import iou_3d, iou_bev
 from optipmb_tools.evaluation.overlap import intersection_area
-from optipmb_tools.geometry import Floats, points_in_box
+from optipmb_tools.geometry import Floats
 
 Boxes = tuple[Floats, Floats, Floats]
 

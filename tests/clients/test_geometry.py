@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from boxes import points_in_box
 from hypothesis import given
 from hypothesis import strategies as st
 from optipmb_tools.camera import Camera, kitti_from_sensor, sensor_from_kitti, synthetic_camera
 from optipmb_tools.geometry import (
     box_corners,
     planar_pose,
-    points_in_box,
     quaternion_of,
     rotation_of,
     stack_poses,
@@ -76,8 +76,8 @@ def test_corners_are_in_their_box_and_just_outside_a_smaller_one() -> None:
     """All eight corners are in the box with a hair's margin and none without it when it shrinks."""
     center, size, yaw = np.array([[3.0, 4.0, 1.0]]), np.array([[4.0, 2.0, 1.5]]), np.array([0.7])
     corners = box_corners(center, size, yaw)[0]
-    assert points_in_box(corners, center[0], size[0], 0.7, margin=1e-9).all()
-    assert not points_in_box(corners, center[0], size[0], 0.7, margin=-1e-3).any()
+    assert points_in_box(corners, center[0], size[0] + 2e-9, 0.7).all()
+    assert not points_in_box(corners, center[0], size[0] - 2e-3, 0.7).any()
     front = 0.5 * (corners[0] + corners[1])
     np.testing.assert_allclose(front[:2], center[0, :2] + 2.0 * np.array([np.cos(0.7), np.sin(0.7)]), atol=1e-12)
 

@@ -39,6 +39,11 @@ def test_nodes_need_the_messages_alone() -> None:
     ] * 3
 
 
+def test_the_messages_depend_on_no_other_part() -> None:
+    """Their package imports neither tracker nor client nor service."""
+    assert all(importers("optipmb_schemas", name) == set() for name in ("optipmb", "optipmb_client", "optipmb_service"))
+
+
 def test_the_tools_do_not_know_the_service() -> None:
     """No module imports optipmb_service: the demo starts it as a program. No other package imports the tools."""
     assert importers("optipmb_tools", "optipmb_service") == set()
@@ -48,7 +53,11 @@ def test_the_tools_do_not_know_the_service() -> None:
 def test_the_tracker_is_imported_for_offline_tracking_alone() -> None:
     """Only what tracks offline, what tunes the tracker, and the matching of class names and places import optipmb."""
     offline = {path for path in importers("optipmb_tools", "optipmb") if not path.startswith("tuning/")}
-    assert offline == {"class_names.py", "dumps.py", "georeference.py", "offline.py", "smoothing.py", "tracking.py"}
+    assert offline == {
+        "class_names.py",
+        "georeference.py",
+        *(f"run/{name}.py" for name in ("dumps", "profiles", "smoothing", "tracking")),
+    }
 
 
 def test_zenoh_is_imported_in_one_folder() -> None:

@@ -11,7 +11,7 @@ from commands import run_here
 from hypothesis import given
 from hypothesis import strategies as st
 from optipmb_schemas import Detections, Points, decode
-from optipmb_tools.load import FIRST, Run, chain, draw_runs, find_limit, generated, head, message, table_of
+from optipmb_tools.run.load import FIRST, Run, chain, draw_runs, find_limit, generated, head, message, table_of
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -1,7 +1,6 @@
 """Recordings: what is in the file, what is left of it after a cut, and what is played of it."""
 
 import concurrent.futures
-import importlib
 import json
 import os
 import subprocess
@@ -34,9 +33,9 @@ from optipmb_schemas import (
     encoding_of,
 )
 from optipmb_tools.datasets import DatasetError, dataset_at, open_dataset
-from optipmb_tools.foxglove_view import FoxgloveMessages, FoxgloveServer
 from optipmb_tools.recordings.files import Recorded, RecordingFile, RecordingWriter
-from optipmb_tools.recordings.plan import plan, renamed, steps
+from optipmb_tools.recordings.plan import plan, steps
+from optipmb_tools.views.foxglove import FoxgloveServer
 
 KEYS = Keys()
 STREAM = "garage/robot-1/lidar"
@@ -182,28 +181,6 @@ def test_foxglove_finds_boxes_plots_and_logs_beside_our_messages(tmp_path: Path)
     assert found["tracks/figures"]["tracks"] == 2
     assert (found["problems/log"].message, found["problems/log"].name) == ("it jumped", "pose")
     assert [one.topic for one in RecordingFile(tmp_path / "a.mcap")] == ["detections", "tracks", "problems"]
-
-
-def test_foxglove_reads_every_message_by_its_own_schemas() -> None:
-    """The schemas that Foxglove publishes read whatever is drawn, and leave nothing over; figures are as announced."""
-    problem = Problem(stream=STREAM, instance="one", code="pose", message="it jumped", stamp_ns=5)
-    pose = Pose(translation=np.array([0.0, 0.0, 1.0]), quaternion=np.array([1.0, 0.0, 0.0, 0.0]))
-    seen = detections(0).model_copy(update={"frame": "sensor", "pose": pose})
-    made = FoxgloveMessages()
-    messages = (seen, points(0, 700), tracks(0, [3, 4]), tracks(1, [4]), problem)
-    read = []
-    for one in (shown for message in messages for shown in made.of(message)):
-        if one.encoding == "json":
-            assert set(json.loads(one.payload)) <= set(json.loads(one.schema.data)["properties"])
-        else:
-            short = one.schema.name.removeprefix("foxglove.")
-            schema = getattr(importlib.import_module(f"foxglove_schemas_protobuf.{short}_pb2"), short)
-            content = schema.FromString(one.payload)
-            content.DiscardUnknownFields()
-            assert content.ByteSize() == len(one.payload)
-        read.append(one.schema.name.rpartition(".")[2])
-    tracked = ["SceneUpdate", "Figures"]
-    assert read == ["SceneUpdate", "FrameTransform", "PointCloud", *tracked, *tracked, "Log"]
 
 
 def test_foxglove_is_served_live(tmp_path: Path) -> None:
@@ -394,15 +371,6 @@ def test_a_recording_that_begins_late_is_known() -> None:
     late += [recorded(detections(n, stamp=1_500_000_000 + n), 2 + n) for n in (1, 2, 3)]
     (one,) = plan([*late, recorded(tracks(2, [1]), 9)]).values()
     assert (one.begins_late, one.never_tracked) == (True, 1)
-
-
-def test_another_name_changes_nothing_else() -> None:
-    """A renamed message is the same but for the stream; what is no message keeps its bytes."""
-    frame = detections(3)
-    other = renamed(recorded(frame, 1), "x/y/z")
-    assert decode(other.payload, Detections) == frame.model_copy(update={"stream": "x/y/z"})
-    broken = Recorded(STREAM, "detections", b"\xc1", "", 1, 1)
-    assert renamed(broken, "x/y/z").payload == b"\xc1"
 
 
 def test_a_recording_is_a_dataset(tmp_path: Path) -> None:

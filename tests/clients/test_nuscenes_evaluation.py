@@ -16,6 +16,7 @@ from nuscenes_tables import Scene, Thing, crowd, write_detections, write_root
 from optipmb_tools.cli import run
 from optipmb_tools.datasets import DatasetError
 from optipmb_tools.datasets.nuscenes import NuScenesDataset, NuScenesSequence
+from optipmb_tools.evaluation.cases import Case, lives
 from optipmb_tools.evaluation.nuscenes import (
     Event,
     Matching,
@@ -23,15 +24,12 @@ from optipmb_tools.evaluation.nuscenes import (
     NuScenesConfig,
     NuScenesScene,
     NuScenesScores,
-    Pairing,
     Racks,
     TrackBoxes,
-    _Paths,
     evaluate_nuscenes,
     evaluate_scenes,
     figures,
     interpolate,
-    match,
     pair,
     prepare_scene,
     score_thresholds,
@@ -284,15 +282,15 @@ def test_a_switch_counts_after_a_gap() -> None:
     assert (best.ids, best.fn, best.frag) == (1, 4, 1)
 
 
-def pairing(truth: Sequence[Row], tracks: Sequence[Row], score: Sequence[float] | float = 0.5) -> Pairing:
-    """Give the pairs of cars in ten frames."""
-    return pair(boxes(truth), boxes(tracks, score), CAR, 10, 2.0)
+def pairing(truth: Sequence[Row], tracks: Sequence[Row], score: Sequence[float] | float = 0.5) -> Case:
+    """Give the pairs of cars."""
+    return pair(boxes(truth), boxes(tracks, score), CAR, 2.0)
 
 
 def test_an_object_keeps_its_track_while_it_is_near_enough() -> None:
     """A track that matched before goes on, although another one has come nearer."""
     tracks = [(0, 7, 0.0, 0.0), (1, 7, 1.5, 0.0), (1, 8, 0.1, 0.0)]
-    found = match(pairing(still(1, 0.0, range(2)), tracks))
+    found = Matching.of(pairing(still(1, 0.0, range(2)), tracks))
     assert found.event.tolist() == [Event.MATCH, Event.MATCH]
     assert found.distance.tolist() == [0.0, 1.5]
     assert found.false_positives == 1
@@ -302,13 +300,13 @@ def test_the_first_of_two_that_claim_a_track_has_it() -> None:
     """When a track went from one object to another and both are near it, the first object has it."""
     truth = [(0, 1, 0.0, 0.0), (1, 2, 0.5, 0.0), (2, 1, 0.4, 0.0), (2, 2, 0.1, 0.0)]
     tracks = [(0, 7, 0.0, 0.0), (1, 7, 0.5, 0.0), (2, 7, 0.0, 0.0)]
-    found = match(pairing(truth, tracks))
+    found = Matching.of(pairing(truth, tracks))
     assert found.event.tolist() == [Event.MATCH, Event.MATCH, Event.MATCH, Event.MISS]
 
 
 def test_more_matches_go_before_shorter_ones() -> None:
     """Two long matches are taken rather than one short one."""
-    found = match(pairing([(0, 1, 0.0, 0.0), (0, 2, 1.0, 0.0)], [(0, 7, 0.9, 0.0), (0, 8, 2.8, 0.0)]))
+    found = Matching.of(pairing([(0, 1, 0.0, 0.0), (0, 2, 1.0, 0.0)], [(0, 7, 0.9, 0.0), (0, 8, 2.8, 0.0)]))
     assert found.event.tolist() == [Event.MATCH, Event.MATCH]
     assert found.distance == pytest.approx([0.9, 1.8])
 
@@ -336,7 +334,7 @@ def naive_match(truth: Sequence[Row], tracks: Sequence[tuple[Row, float]], thres
             chosen[one] = (Event.SWITCH if last.get(one[1], t[1]) != t[1] else Event.MATCH, t)
         for one in objects:
             event, row = chosen.get(one, (Event.MISS, None))
-            result.append((int(event), math.nan if row is None else metres[one, row]))
+            result.append((int(event), 0.0 if row is None else metres[one, row]))
             if row is not None:
                 last[one[1]] = row[1]
     return result
@@ -360,37 +358,28 @@ def test_matching_is_the_definition(seed: int) -> None:
     scores = {one: float(chance.random()) for one in range(10, 14)}
     made = pairing(truth, tracks, [scores[row[1]] for row in tracks])
     for threshold in (-math.inf, 0.5):
-        found = match(made, threshold)
+        found = Matching.of(made, threshold)
         wanted = naive_match(truth, [(row, scores[row[1]]) for row in tracks], threshold)
         assert found.event.tolist() == [event for event, _ in wanted]
-        assert found.distance == pytest.approx([metres for _, metres in wanted], nan_ok=True)
+        assert found.distance == pytest.approx([metres for _, metres in wanted])
         kept = [row for row in tracks if scores[row[1]] >= threshold]
         assert found.false_positives == len(kept) - sum(event != Event.MISS for event, _ in wanted)
         assert found.frames == len({row[0] for row in (*truth, *kept)})
 
 
 @PATIENT
-@given(st.lists(st.lists(st.sampled_from(list(Event)), min_size=1, max_size=12), min_size=1, max_size=5))
-def test_paths_of_objects_are_the_definition(lives: list[list[Event]]) -> None:
+@given(st.lists(st.lists(st.booleans(), min_size=1, max_size=12), min_size=1, max_size=5))
+def test_lives_of_objects_are_the_definition(given_lives: list[list[bool]]) -> None:
     """Share, delay, longest gap and breaks equal what walking along each object counts."""
-    rows = sorted((frame, one) for one, life in enumerate(lives) for frame in range(len(life)))
-    none = np.zeros(0, dtype=np.int64)
-    identity = np.array([one for _, one in rows], dtype=np.int64)
-    frame = np.array([when for when, _ in rows], dtype=np.int64)
-    made = Pairing(12, frame, identity, len(lives), none, none, np.zeros(0), none, none, np.zeros(0))
-    event = np.array([lives[one][when] for when, one in rows], dtype=np.int64)
-    paths = _Paths.of([made], [Matching(event, np.full(len(rows), -1), np.full(len(rows), np.nan), 0, 12)])
-    delays, gaps, breaks = [], [], 0
-    for life in lives:
-        text = "".join("." if event == Event.MISS else "x" for event in life)
-        if "x" in text:
-            delays.append(text.index("x"))
-            gaps.append(max(map(len, text.split("x"))))
-            breaks += sum(1 for part in text.strip(".").split("x") if part)
-    assert paths.share == pytest.approx([sum(event != Event.MISS for event in life) / len(life) for life in lives])
-    assert sorted(paths.delay.tolist()) == sorted(delays)
-    assert sorted(paths.longest.tolist()) == sorted(gaps)
-    assert paths.breaks == breaks
+    rows = sorted((frame, one) for one, life in enumerate(given_lives) for frame in range(len(life)))
+    frame, owner = np.array(rows, dtype=np.int64).T
+    found = lives(owner, frame, np.array([given_lives[one][when] for when, one in rows]))
+    texts = ["".join(".x"[matched] for matched in life) for life in given_lives]
+    tracked = [text for text in texts if "x" in text]
+    assert found.share == pytest.approx([text.count("x") / len(text) for text in texts])
+    assert found.delay.tolist() == [text.index("x") for text in tracked]
+    assert found.longest.tolist() == [max(map(len, text.split("x"))) for text in tracked]
+    assert found.breaks == sum(bool(part) for text in tracked for part in text.strip(".").split("x"))
 
 
 @PATIENT
@@ -588,7 +577,7 @@ def test_figures_at_a_threshold_keep_the_sums() -> None:
     truth = [(f, i, float(chance.uniform(0, 9)), 0.0) for f in range(10) for i in range(6)]
     tracks = [(f, i, float(chance.uniform(0, 9)), 0.0) for f in range(10) for i in range(6)]
     made = pairing(truth, tracks)
-    found = figures([made], [match(made)], 0.5)
+    found = figures([made], [Matching.of(made)], 0.5)
     assert found.tp + found.ids + found.fn == found.gt == 60
     assert found.tp + found.ids + found.fp == 60
 

@@ -14,11 +14,9 @@ from nuscenes_tables import box, crowd, write_detections, write_root
 from optipmb_client import Connection
 from optipmb_tools.datasets import DatasetError
 from optipmb_tools.datasets.nuscenes import NuScenesDataset, NuScenesSequence
-from optipmb_tools.offline import read_profile
-from optipmb_tools.replay import Pace, Replaying, replay
 from optipmb_tools.results.nuscenes import NUSCENES_MAX_BOXES, read_nuscenes_results, result_table
 from optipmb_tools.results.output import Results
-from optipmb_tools.tracking import Tracking, track
+from optipmb_tools.run.replay import Pace, Replaying, replay
 
 SCENES = [crowd("scene-0103", 1, 6), crowd("scene-0916", 2, 5, 1_538_984_233_000_000)]
 FILE = "tracking_results.json"
@@ -159,24 +157,6 @@ def test_the_file_of_all_scenes_comes_with_the_last(root: Path, tmp_path: Path) 
     assert list(part.rows) == list(first.samples)
 
 
-def test_a_second_run_replaces_the_first(root: Path, tmp_path: Path) -> None:
-    """The same dataset written again into the same folder gives the file of the second run."""
-    dataset = NuScenesDataset(root)
-    (sequence,) = dataset.sequences(["scene-0103"])
-    write(dataset, sequence, [rows(4)], tmp_path)
-    path = write(dataset, sequence, [rows(1)], tmp_path)
-    assert sum(map(len, read_nuscenes_results(path).rows.values())) == 1
-
-
-def test_ids_are_unique_over_scenes(root: Path, tmp_path: Path) -> None:
-    """The same id in two scenes is two ids in the file."""
-    dataset = NuScenesDataset(root)
-    for sequence in dataset.sequences(["all"]):
-        path = write(dataset, sequence, [rows(1)], tmp_path)
-    names = [name for boxes in read_nuscenes_results(path).rows.values() for name, _ in boxes]
-    assert sorted(names) == ["scene-0103-5", "scene-0916-5"]
-
-
 def test_other_classes_are_refused(root: Path, tmp_path: Path) -> None:
     """Tracks of a class that the benchmark does not have give one clear line, and no file."""
     dataset = NuScenesDataset(root)
@@ -185,16 +165,6 @@ def test_other_classes_are_refused(root: Path, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="'Tram'"):
         write(dataset, sequence, [wrong], tmp_path)
     assert not list(tmp_path.rglob("*.json"))
-
-
-def test_offline_tracking_writes_it(root: Path, tmp_path: Path) -> None:
-    """Tracking the dataset with its own profile gives a file that can be read, with all samples."""
-    dataset = NuScenesDataset(root)
-    sequences = dataset.sequences(["all"])
-    done = list(track(dataset, sequences, tmp_path, Tracking(read_profile(dataset.profile))))
-    assert [result.frames for result in done] == [6, 5]
-    results = read_nuscenes_results(tmp_path)
-    assert all(token in results.rows for sequence in sequences for token in sequence.samples)
 
 
 def test_replaying_scenes_at_once_writes_the_same_file(endpoint: str, root: Path, tmp_path: Path) -> None:

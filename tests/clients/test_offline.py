@@ -8,9 +8,8 @@ import pytest
 from optipmb_client.errors import UsageError
 from optipmb_schemas import PATHS
 from optipmb_tools.datasets import Dataset, Preloaded, open_dataset, selected_frames
-from optipmb_tools.offline import read_profile, track_whole
-from optipmb_tools.results.output import latency
-from optipmb_tools.tracking import Tracking, track
+from optipmb_tools.run.profiles import read_profile
+from optipmb_tools.run.tracking import Tracking, track, track_whole
 
 
 @pytest.fixture(scope="module")
@@ -117,30 +116,3 @@ def test_values_that_the_tracker_refuses_are_placed(dataset: Dataset) -> None:
     loaded._frames[3] = replace(loaded._frames[3], score=loaded._frames[3].score + 1.0)
     with pytest.raises(UsageError, match=r"sequence 0000, frame 3: score"):
         track_whole(read_profile("kitti"), loaded)
-
-
-def test_a_preloaded_sequence_is_the_same(dataset: Dataset) -> None:
-    """Frames, clouds, poses and truth in memory equal those of the sequence."""
-    (sequence,) = dataset.sequences(["0000"])
-    loaded = Preloaded(sequence)
-    assert (loaded.name, len(loaded), loaded.has_clouds) == (sequence.name, len(sequence), sequence.has_clouds)
-    points = 0
-    for one, other in zip(loaded.frames(), sequence.frames(), strict=True):
-        assert np.array_equal(one.center, other.center)
-        assert one.cloud is not None
-        assert other.cloud is not None
-        assert np.array_equal(one.cloud.xyz, other.cloud.xyz)
-        points += len(one.cloud.xyz)
-    assert loaded.points == points > 0
-    truth, expected = loaded.truth(), sequence.truth()
-    assert truth is not None
-    assert expected is not None
-    assert np.array_equal(truth.center, expected.center)
-
-
-def test_latency_of_nothing_is_none() -> None:
-    """Quantiles of no durations are not defined; of one duration all are that one, in milliseconds."""
-    assert latency([]) is None
-    one = latency([2_500_000])
-    assert one is not None
-    assert (one.p50_ms, one.p99_ms, one.max_ms) == (2.5, 2.5, 2.5)

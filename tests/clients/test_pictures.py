@@ -10,8 +10,8 @@ from commands import run_here
 from optipmb_client.errors import ClientError
 from optipmb_tools.datasets import DataSequence, Truth, open_dataset
 from optipmb_tools.evaluation import ClearResult, Rules, evaluate_clear
-from optipmb_tools.pictures import WIDTH_PX, Panel, animate_tracks, draw_tracks
 from optipmb_tools.results import ResultTable, empty_table
+from optipmb_tools.views.pictures import WIDTH_PX, Panel, animate_tracks, draw_tracks
 from PIL import Image
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -50,7 +50,7 @@ def test_a_picture_shows_tracks_truth_sensor_and_failures(tmp_path: Path, monkey
     """Axes in metres, a legend for each kind of line and mark, every track's id, and the change of identity by name."""
     sequence, truth, tracks = scene()
     results: list[ClearResult] = [evaluate_clear(truth, tracks, name, RULES) for name in truth.labels]
-    assert sum(len(result.switches) for result in results) == 1
+    assert sum(result.switches for result in results) == 1
     path = tmp_path / "new" / "tracks.png"
     texts = text_of(path, monkeypatch, sequence, [Panel(tracks, results)], truth)
     assert path.read_bytes().startswith(PNG)

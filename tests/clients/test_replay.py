@@ -11,7 +11,7 @@ from fake_service import Behaviour, FakeService
 from optipmb_client import Connection, ServiceRefused, ServiceUnavailable, UsageError
 from optipmb_schemas import Detections, Tracks
 from optipmb_tools.datasets import Dataset, open_dataset
-from optipmb_tools.replay import Pace, ReplayedSequence, Replaying, replay
+from optipmb_tools.run.replay import Pace, ReplayedSequence, Replaying, replay
 from router import until
 
 FRAMES = 24
@@ -45,13 +45,16 @@ def run(
 
 
 def test_every_frame_comes_back(endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path) -> None:
-    """All frames are sent and returned, latencies are measured for each, and the file holds one row per detection."""
+    """All frames are sent, with their clouds, and returned, with a latency each; the file has a row per detection."""
     with FakeService(endpoint) as service:
         (result,) = run(link, dataset, tmp_path)
     assert (result.frames, result.sent, result.returned, result.missing) == (FRAMES, FRAMES, FRAMES, 0)
     assert result.latency is not None
     assert 0.0 < result.latency.p50_ms <= result.latency.p99_ms <= result.latency.max_ms
     assert len(result.latencies_ns) == FRAMES
+    assert result.clouds == FRAMES
+    assert {message.has_points for message in service.seen.detections} == {True}
+    assert [message.stamp_ns for message in service.seen.points] == [m.stamp_ns for m in service.seen.detections]
     assert result.file == tmp_path / "0000.txt"
     rows = sum(len(message.label) for message in service.seen.detections)
     assert len(result.file.read_text().splitlines()) == rows > FRAMES
@@ -80,15 +83,6 @@ def test_streams_are_new_in_every_run(endpoint: str, link: Connection, dataset: 
         assert (site, node[:6], sensor) == ("replay", "scene-", "0000")
         assert int(node[6:], 16) < 16**6
     assert names[0] != names[1]
-
-
-def test_clouds_go_before_their_detections(endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path) -> None:
-    """Every frame says whether it has a cloud, and all clouds arrive."""
-    with FakeService(endpoint) as service:
-        (result,) = run(link, dataset, tmp_path)
-    assert result.clouds == FRAMES
-    assert {message.has_points for message in service.seen.detections} == {True}
-    assert [message.stamp_ns for message in service.seen.points] == [m.stamp_ns for m in service.seen.detections]
 
 
 def test_frames_without_clouds_say_that_none_comes(endpoint: str, link: Connection, tmp_path: Path) -> None:

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from optipmb_tools.camera import synthetic_camera
 from optipmb_tools.datasets import DatasetError, open_dataset
 from optipmb_tools.geometry import Floats, Ints, Pose, planar_pose, wrap_angle
-from optipmb_tools.offline import read_profile, track_whole
 from optipmb_tools.results import empty_table
 from optipmb_tools.results.kitti import SUBMISSION_SCORES, read_kitti_results, write_kitti_results
+from optipmb_tools.run.profiles import read_profile
+from optipmb_tools.run.tracking import track_whole
 from real_data import kitti_root
 
 LABELS = ("Car", "Pedestrian", "Cyclist")
@@ -115,15 +116,6 @@ def test_a_sequence_without_tracks_is_an_empty_file(tmp_path: Path) -> None:
     path = write(tmp_path / "out" / "0000.txt", [])
     assert path.read_bytes() == b""
     assert len(read_kitti_results(path)) == len(empty_table()) == 0
-
-
-def test_an_error_on_the_way_leaves_no_file(tmp_path: Path) -> None:
-    """When writing fails, neither the file nor a part of it is left."""
-    rows = some_rows(np.random.default_rng(0), 2)
-    broken = replace(rows, score=np.ones(1))
-    with pytest.raises(ValueError, match="dimension"):
-        write(tmp_path / "0000.txt", [(0, planar_pose(0, 0, 0, 0), rows), (1, planar_pose(0, 0, 0, 0), broken)])
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_same_tracks_give_the_same_bytes(tmp_path: Path) -> None:

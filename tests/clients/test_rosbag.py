@@ -15,10 +15,9 @@ from mcap_ros2.decoder import DecoderFactory
 from optipmb_tools.cli import run
 from optipmb_tools.datasets import DataSequence, dataset_at, open_dataset
 from optipmb_tools.files import DatasetError
-from optipmb_tools.offline import read_profile
 from optipmb_tools.results.full import FullTable, full_path, read_full
-from optipmb_tools.tracking import Tracking, track
-from real_data import kitti_root
+from optipmb_tools.run.profiles import read_profile
+from optipmb_tools.run.tracking import Tracking, track
 
 DETECTIONS = "/detector/boxes/tracks/detections"
 CLASSES = {"class.car": "Car", "class.bicycle": "Cyclist", "class.pedestrian": "Pedestrian"}
@@ -107,18 +106,6 @@ def test_covariances_in_a_bag_count_where_asked_for(tmp_path: Path) -> None:
         assert same.center.tobytes() == expected.center.tobytes()
         assert same.covariance.tobytes() == expected.covariance.tobytes()
     assert np.median(found.covariance[:, 0, 0]) > 3.0 * np.median(expected.covariance[:, 0, 0])
-
-
-def test_tracks_of_real_data_are_the_same_from_a_bag(tmp_path: Path) -> None:
-    """KITTI's first sequence with its clouds, as a bag, gives the tracks of the files."""
-    root = kitti_root()
-    (sequence,) = open_dataset("kitti", root, "pointrcnn").sequences(["0000"])
-    path = bags.write_mcap(tmp_path / "kitti.mcap", [*bags.messages(sequence)])
-    of_bag = tracks_of("rosbag", path, tmp_path / "bag", "kitti")
-    of_data = tracks_of("kitti", root, tmp_path / "data", "kitti", detections="pointrcnn")
-    assert np.array_equal(of_bag.id, of_data.id)
-    np.testing.assert_allclose(of_bag.center, of_data.center, atol=1e-9)
-    np.testing.assert_allclose(of_bag.covariance, of_data.covariance, rtol=1e-6, atol=1e-9)
 
 
 def test_a_bag_of_tracks_says_what_is_known_of_them(

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from optipmb_schemas import Tracks
 from optipmb_tools.datasets import DataSequence, Preloaded, open_dataset
 from optipmb_tools.geometry import wrap_angle
-from optipmb_tools.offline import read_profile, track_whole
-from optipmb_tools.smoothing import smooth
+from optipmb_tools.run.profiles import read_profile
+from optipmb_tools.run.smoothing import smooth
+from optipmb_tools.run.tracking import track_whole
 
 from optipmb import load_profile
 from optipmb.lightweight import turn_around

@@ -9,7 +9,7 @@ from optipmb_client import Connection
 from optipmb_client.sessions import find_services
 from optipmb_schemas import MemberSummary, Problem, ServiceStatus
 from optipmb_tools.cli import run
-from optipmb_tools.terminal import members_of, status_tables
+from optipmb_tools.views.terminal import members_of, status_tables
 from rich.console import Console
 
 

@@ -143,18 +143,6 @@ def test_what_cannot_be_read_is_refused_with_what_can(
     assert "np." not in str(refused.value)
 
 
-def test_a_pickle_and_results_of_nuscenes_are_known_by_the_command(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """`optipmb track` says of a pickle and of nuScenes results how they can be read."""
-    (tmp_path / "result.pkl").write_bytes(b"\x80\x04")
-    (tmp_path / "results.json").write_text(json.dumps({"meta": {}, "results": {"token": [{"translation": [1, 2, 3]}]}}))
-    for name, said in (("result.pkl", "Recipes"), ("results.json", "--dataset nuscenes --root ROOT --detections")):
-        done = run_here(capsys, "track", tmp_path / name, "--out", tmp_path / "t.csv")
-        assert done.returncode == 2
-        assert said in done.stderr.splitlines()[-1]
-
-
 def test_a_header_alone_gives_columns_without_rows(tmp_path: Path) -> None:
     """A table without rows has its columns, with a line end and without."""
     for text in ("t,x,class\n", "t,x,class"):

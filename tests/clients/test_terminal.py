@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 from optipmb_schemas import Problem, ServiceStatus, SessionSummary
-from optipmb_tools.terminal import StatusView
+from optipmb_tools.views.terminal import StatusView
 from rich.console import Console
 
 HEIGHT = 40

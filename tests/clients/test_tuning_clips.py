@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from optipmb_tools import offline
 from optipmb_tools.datasets import Dataset, open_dataset
 from optipmb_tools.datasets.scene.lidar import Scan, scan
 from optipmb_tools.evaluation.ab3dmot import evaluate_ab3dmot
@@ -14,7 +13,8 @@ from optipmb_tools.evaluation.cases import ab3dmot_rules, prepare
 from optipmb_tools.evaluation.evaluate import evaluate_figures, load_recordings
 from optipmb_tools.evaluation.nuscenes import NuScenesConfig, evaluate_nuscenes, evaluate_scenes, prepare_scene
 from optipmb_tools.results.kitti import read_kitti_results
-from optipmb_tools.tracking import Tracking, track
+from optipmb_tools.run import profiles
+from optipmb_tools.run.tracking import Tracking, track
 from optipmb_tools.tuning.clips import Clip, Degradation, degrade, load, of_class, track_clip
 from optipmb_tools.tuning.objective import folds_of
 from optipmb_tools.tuning.scoring import rules_of, scorer_of
@@ -77,7 +77,7 @@ _COLUMNS = ("center", "size", "yaw", "velocity", "score", "label", "source")
 
 def tracked(dataset: Dataset, names: list[str], out: Path) -> None:
     """Write the result files of some sequences."""
-    list(track(dataset, dataset.sequences(names), out, Tracking(offline.read_profile("kitti-paper"))))
+    list(track(dataset, dataset.sequences(names), out, Tracking(profiles.read_profile("kitti-paper"))))
 
 
 def test_figures_of_kitti_are_those_of_its_result_files(tmp_path: Path) -> None:
@@ -116,7 +116,7 @@ def test_figures_of_nuscenes_are_the_official_ones_of_its_result_file(tmp_path: 
     """A trial's figures are those of the benchmark's evaluation in memory, and of the file up to its rounding."""
     dataset = open_dataset("nuscenes", nuscenes_root(), "centerpoint", clouds=False)
     sequences = dataset.sequences(["all"])
-    list(track(dataset, sequences, tmp_path, Tracking(offline.read_profile("nuscenes-paper"))))
+    list(track(dataset, sequences, tmp_path, Tracking(profiles.read_profile("nuscenes-paper"))))
     official = evaluate_nuscenes(nuscenes_root(), tmp_path)
     parameters = optipmb.load_profile("nuscenes-paper")
     clips = [load(sequence, parameters, rules_of("nuscenes")) for sequence in sequences]

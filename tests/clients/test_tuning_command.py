@@ -65,12 +65,17 @@ def test_estimates_alone_need_no_search(tmp_path: Path, capsys: pytest.CaptureFi
     assert not (tmp_path / "trials.db").exists()
 
 
+def test_a_profile_is_matched_by_common_class_names(tmp_path: Path) -> None:
+    """Profile generic has car and bicycle; the new profile has the names of the truth, Car and Cyclist."""
+    assert run(["tune", *SCENE, "--profile", "generic", "--estimate-only", "--out", str(tmp_path)]) == 0
+    assert {"Car", "Cyclist"} <= set(optipmb.load_profile(tmp_path / "estimated.toml").labels)
+
+
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
         ([*SCENE, "--classes", "Tram"], "no class 'Tram'"),
         ([*CARS, "--metric", "beauty"], "one of combination"),
-        ([*SCENE, "--profile", "nuscenes"], "nothing would be tracked"),
     ],
 )
 def test_wrong_wishes_are_told_in_one_line(

@@ -13,12 +13,12 @@ import pyarrow as pa
 import pytest
 from commands import start
 from optipmb_client.incoming import Answer, Inbox
-from optipmb_client.queries import DensityQueries
 from optipmb_schemas import Density, Detections, Keys, Points, Pose, Tracks, encode, encoding_of
 from optipmb_tools.cli import run
-from optipmb_tools.colours import COLOURS, colour_of, rgb_of
 from optipmb_tools.recordings.files import RecordingWriter
-from optipmb_tools.viewer import LEGEND, View
+from optipmb_tools.views.colours import COLOURS, colour_of, rgb_of
+from optipmb_tools.views.density_queries import DensityQueries
+from optipmb_tools.views.viewer import LEGEND, View
 from routers import free_endpoint
 
 STREAM = "garage/robot-1/lidar"

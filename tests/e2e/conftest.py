@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 import pytest
-from optipmb_tools.service_process import ServiceProcess
+from optipmb_tools.run.service_process import ServiceProcess
 
 START_S = 240.0  # the first start on a machine compiles
 

@@ -13,7 +13,7 @@ from optipmb_client import Connection, Publisher, Subscriber
 from optipmb_client.sessions import find_services
 from optipmb_schemas import Detections, Keys, Points, Problem, SessionParameters, Tracks, encoding_of
 from optipmb_tools.cli import run
-from optipmb_tools.service_process import ServiceProcess
+from optipmb_tools.run.service_process import ServiceProcess
 from routers import open_client
 
 SCENE = ("--dataset", "scene", "--option", "frames=40", "--option", "clouds=0")

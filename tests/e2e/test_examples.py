@@ -11,7 +11,7 @@ from typing import IO
 import pytest
 from optipmb_client import Publisher
 from optipmb_client.zenoh import DEFAULT_ENDPOINT
-from optipmb_tools.service_process import ServiceProcess
+from optipmb_tools.run.service_process import ServiceProcess
 from real_data import REPOSITORY
 from without_numpy import command
 

@@ -9,7 +9,7 @@ from commands import optipmb, result_of, run_here
 
 if TYPE_CHECKING:
     import pytest
-    from optipmb_tools.service_process import ServiceProcess
+    from optipmb_tools.run.service_process import ServiceProcess
 
 STREAMS, RATE, SECONDS = 3, 20, 2
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from commands import start
 from optipmb_client import Connection, ServiceUnavailable
-from optipmb_tools.service_process import ServiceProcess
+from optipmb_tools.run.service_process import ServiceProcess
 from processes import descendants, running, wait_until_ended
 
 START_S = 240.0
@@ -56,7 +56,7 @@ def test_a_frozen_service_is_killed() -> None:
 def test_the_service_ends_when_its_parent_is_killed() -> None:
     """SIGKILL of the parent, which can clean up nothing, takes the service along, also while that starts."""
     code = (
-        "from optipmb_tools.service_process import ServiceProcess\n"
+        "from optipmb_tools.run.service_process import ServiceProcess\n"
         "with ServiceProcess() as service:\n"
         "    print(service.process.pid, flush=True)\n"
         "    service.process.wait()\n"

@@ -17,8 +17,8 @@ from optipmb_schemas import Tracks, decode, encode
 from optipmb_tools.cli import run
 from optipmb_tools.datasets import DatasetError, open_dataset
 from optipmb_tools.recordings.files import RecordingFile
-from optipmb_tools.replay import Pace, Replaying, replay
-from optipmb_tools.service_process import ServiceProcess
+from optipmb_tools.run.replay import Pace, Replaying, replay
+from optipmb_tools.run.service_process import ServiceProcess
 from real_data import kitti_root
 
 if TYPE_CHECKING:

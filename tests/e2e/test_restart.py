@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 from alone import tracked_alone
 from optipmb_schemas import Keys, ResetRequest
-from optipmb_service.session.checkpoint import DIGEST, HEAD, MAGIC, VERSION
+from optipmb_service.stream.checkpoint import DIGEST, HEAD, MAGIC, VERSION
 from router import Node, Sensor, plain
 from service_process import ServiceProcess
 

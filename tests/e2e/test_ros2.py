@@ -19,7 +19,8 @@ from optipmb_schemas.ros2.types import own_types
 from optipmb_service.app import cli
 from optipmb_service.ros2 import graph
 from optipmb_tools.datasets import DataSequence, open_dataset
-from optipmb_tools.offline import read_profile, track_whole
+from optipmb_tools.run.profiles import read_profile
+from optipmb_tools.run.tracking import track_whole
 from ros2_client import Ros2Client, hash_by_sdk
 from router import until
 from routers import open_client

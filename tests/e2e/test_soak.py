@@ -15,7 +15,7 @@ from fleet import Fleet
 from optipmb_client import Connection
 from optipmb_client.sessions import find_services
 from optipmb_schemas import Detections, Keys, ServiceStatus, encode, encoding_of
-from optipmb_tools.load import Load, Run, generated, run_load
+from optipmb_tools.run.load import Load, Run, generated, run_load
 from router import Sensor
 
 import optipmb

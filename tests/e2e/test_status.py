@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from commands import kill, result_of, run_here, start
 from optipmb_client import Subscriber
-from optipmb_tools.service_process import ServiceProcess
+from optipmb_tools.run.service_process import ServiceProcess
 
 
 def test_streams_at_work_are_shown(service: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

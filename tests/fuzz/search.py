@@ -1,7 +1,7 @@
 """Coverage-guided search for bytes that a decoder neither reads nor refuses.
 
-Run it as `python search.py TARGET SECONDS [OPTION...]`; further options are those of libFuzzer. It goes on from what
-earlier searches learned (out/fuzz), and from the kept files beside this one. What it finds it writes to `found/TARGET`,
+Run it as `python search.py TARGET SECONDS [OPTION...]`; further options are those of libFuzzer. It goes on from the
+results of earlier searches (out/fuzz), and from the kept files in this folder. Its findings go to `found/TARGET`,
 where the tests take it up, and ends.
 """
 
@@ -14,7 +14,7 @@ HERE = Path(__file__).parent
 LEARNED = HERE.parents[1] / "out" / "fuzz"
 sys.path[:0] = [str(HERE), str(HERE.parent / "support")]
 
-from mutation import mutated  # noqa: E402 - beside this file
+from mutation import mutated  # noqa: E402 - of this folder
 
 import optipmb  # noqa: E402 - first, and not instrumented: its kernels are compiled
 

@@ -12,10 +12,10 @@ from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf.convert import EncodedTracks, transcode
 from optipmb_service.grpc.selection import Pace, Selection
-from optipmb_service.session.checkpoint import CheckpointError, decode_checkpoint, encode_checkpoint, seal
-from optipmb_service.session.convert import density_of
-from optipmb_service.session.session import Session
-from optipmb_service.session.values import Incarnation, Policy
+from optipmb_service.stream.checkpoint import CheckpointError, decode_checkpoint, encode_checkpoint, seal
+from optipmb_service.stream.convert import density_of
+from optipmb_service.stream.session import Session
+from optipmb_service.stream.values import Incarnation, Policy
 from router import Sensor
 
 LIMITS = schemas.Limits(max_bytes=2**16, max_json_bytes=2**16, max_values=2**12)
@@ -26,7 +26,7 @@ POLICY = Policy(checkpoint_bytes=2000)
 
 
 def messages(data: bytes) -> None:
-    """A payload is read or refused; what is read is written and read again, and is equal.
+    """A payload is read or refused; a message is written and read again, and is equal.
 
     The first byte chooses the type of the message.
     """

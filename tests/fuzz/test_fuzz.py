@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from optipmb_service.session.checkpoint import decode_checkpoint
+from optipmb_service.stream.checkpoint import decode_checkpoint
 
 FOLDER = Path(__file__).parent
 
@@ -27,13 +27,13 @@ FILES = sorted(path for place in ("corpus", "found") for path in FOLDER.glob(f"{
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: "/".join(path.parts[-3:]))
 def test_known_bytes_are_read_or_refused(path: Path) -> None:
-    """They are read, or refused with the one error of the decoder; what is read is usable; nothing else is raised."""
+    """They are read and usable, or refused with the one error of the decoder; nothing else is raised."""
     targets.TARGETS[path.parent.name](path.read_bytes())
 
 
 @pytest.mark.parametrize("name", ["empty", "window"])
 def test_a_search_of_checkpoints_begins_with_some_that_are_taken_up(name: str) -> None:
-    """A decoder that refuses every seed is not searched (`python tests/fuzz/seeds.py` writes them anew)."""
+    """A decoder that refuses every seed is not searched (`python tests/fuzz/seeds.py` writes them again)."""
     decode_checkpoint(targets.seal((FOLDER / "corpus" / "checkpoints" / name).read_bytes(), targets.Incarnation()))
 
 

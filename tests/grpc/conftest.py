@@ -1,4 +1,4 @@
-"""A service with its own router and a gateway beside it, as processes, for all tests; each test has its own stream."""
+"""A service with its own router and a gateway, as processes, for all tests; each test has its own stream."""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ def test_a_viewer_reads_everything_and_changes_nothing(network: Network, secured
 
 
 def test_a_name_that_is_not_listed_is_not_let_in(network: Network, secured: GatewayProcess, tmp_path: Path) -> None:
-    """A certificate of the authority whose name nobody listed may do nothing, as on Zenoh."""
+    """A certificate of the authority with an unlisted name may do nothing, as on Zenoh."""
     del tmp_path
     network.make("--node", "garage/stranger")
     stranger = stub(network, "node/garage/stranger", secured)

@@ -78,7 +78,7 @@ def test_metrics_count_calls_and_messages_by_method(metered: tuple[GatewayProces
 
 
 def test_calls_that_come_again_use_up_no_keys(metered: tuple[GatewayProcess, str], stream: str) -> None:
-    """Whatever is called again and again for one stream declares no keys but those of the first call."""
+    """Repeated calls for one stream declare no keys beyond the first call's."""
     gateway, address = metered
     stub: Any = gateway.stub()
 

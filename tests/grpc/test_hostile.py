@@ -159,7 +159,7 @@ def test_a_refused_cloud_is_told_to_all(gateway: GatewayProcess, stream: str) ->
 
 
 def test_idle_connections(gateway: GatewayProcess, stream: str) -> None:
-    """Thousands of connections without calls keep nobody from being served and take little; their files come back."""
+    """Thousands of connections without calls hinder no client and take little; their files come back."""
     pid = gateway.process.pid
     served(gateway, stream)
     before, memory = files(pid), resident(pid)

@@ -49,7 +49,7 @@ def test_a_gateway_that_hangs(service: ServiceProcess, gateway: GatewayProcess, 
             hanging.process.send_signal(signal.SIGSTOP)
             try:
                 while subscriber.receive(0.5) is not None:
-                    pass  # what was on its way
+                    pass  # messages on their way
                 assert arrives(publisher, subscriber, seqs)
             finally:
                 hanging.process.send_signal(signal.SIGCONT)

@@ -66,7 +66,7 @@ def test_a_stream_without_a_session_is_new(stub: Any, stream: str) -> None:
     ],
 )
 def test_wrong_questions_have_clear_answers(stub: Any, method: str, request_: Any, code: str) -> None:
-    """A status code, and a line that says what was expected and what came."""
+    """A status code, and a line with the expected and the received value."""
     with pytest.raises(grpc.RpcError) as raised:
         getattr(stub, method)(request_)
     assert raised.value.code().name == code
@@ -75,7 +75,7 @@ def test_wrong_questions_have_clear_answers(stub: Any, method: str, request_: An
 
 
 def test_without_a_service_the_answer_is_unavailable() -> None:
-    """A gateway of a network on which nobody tracks says so."""
+    """A gateway of a network without a tracking service says so."""
     from gateway import GatewayProcess  # noqa: PLC0415 - this test's own
 
     endpoint = free_endpoint()

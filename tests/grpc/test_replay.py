@@ -1,4 +1,4 @@
-"""`optipmb replay --connect grpc://…`: the same files as over Zenoh and offline, whatever happens to a gateway."""
+"""`optipmb replay --connect grpc://…`: the same files as over Zenoh and offline, also when a gateway goes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`Subscribe` and `QueryTracks`: what is asked for, in order, and no slow reader in anybody's way."""
+"""`Subscribe` and `QueryTracks`: the selected tracks, in order; a slow reader delays no other."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_tracks_come_as_they_are_published(stub: Any, stream: str) -> None:
 
 
 def test_history_comes_first_and_once(stub: Any, stream: str) -> None:
-    """With history a late subscriber first gets what the service keeps, then what is new, without repetition."""
+    """With history a late subscriber first gets the tracks that are kept, then new ones, without repetition."""
     tracked(stub, stream, range(20))
     call = subscribed(stub, pattern=stream, history=True)
     early = [next(call).tracks.seq for _ in range(20)]
@@ -75,7 +75,7 @@ def test_without_history_only_new_frames_come(stub: Any, stream: str) -> None:
 
 
 def test_filters(stub: Any, stream: str) -> None:
-    """Classes, confirmation, an area and columns are chosen by the gateway; what is left is as it was."""
+    """Classes, confirmation, an area and columns are chosen by the gateway; the rest is unchanged."""
     answers = [convert.from_proto(one, Tracks) for one in tracked(stub, stream)]
 
     def last(**chosen: Any) -> Any:
@@ -222,8 +222,8 @@ def test_what_is_left_of_a_frame_is_a_message(stub: Any, stream: str) -> None:
 
 
 def test_200_subscribers_and_one_asleep(gateway: GatewayProcess, stream: str) -> None:
-    """All that read get every frame, the one that sleeps is told what it missed, and little memory is taken for all."""
-    # A connection of its own for each, whose window does not grow: what nobody reads waits in the gateway.
+    """All that read get every frame, the sleeping one is told how many it missed, and all take little memory."""
+    # A connection of its own for each, whose window does not grow: unread responses wait in the gateway.
     options = [("grpc.use_local_subchannel_pool", 1), ("grpc.http2.bdp_probe", 0)]
     many = {"label": np.zeros(100, dtype=int), "center": np.random.default_rng(1).uniform(-90, 90, (100, 3))}
     many |= {"size": np.tile([4.5, 1.9, 1.6], (100, 1)), "yaw": np.zeros(100), "score": np.full(100, 0.9)}

@@ -1,4 +1,4 @@
-"""`Track`: what goes in is what a native publisher sends, what comes back is what a native subscriber gets."""
+"""`Track`: input as of a native publisher, output as for a native subscriber."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def violation(raised: pytest.ExceptionInfo[grpc.RpcError]) -> Any:
 
 
 def test_tracks_are_those_on_zenoh(service: ServiceProcess, stub: Any, stream: str) -> None:
-    """The tracks of every frame come back, byte-equal, as msgpack, to what was published on Zenoh."""
+    """The tracks of every frame come back, byte-equal, as msgpack, to the ones on Zenoh."""
     with Heard(service.endpoint, KEYS.tracks(stream)) as heard:
         responses = list(stub.Track(detections(frame(seq, stream)) for seq in range(40)))
         published = heard.take(40)

@@ -156,7 +156,7 @@ def examples() -> dict[str, Message]:
 
 @pytest.fixture(scope="session")
 def example_of(examples: dict[str, Message]) -> Callable[[type[Message]], Message]:
-    """Gives the valid message of a type, also of those that messages hold."""
+    """Gives the valid message of a type, also of nested ones."""
     tracks, status = examples["Tracks"], examples["ServiceStatus"]
     assert isinstance(tracks, Tracks)
     assert isinstance(status, ServiceStatus)

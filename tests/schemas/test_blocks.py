@@ -1,4 +1,4 @@
-"""Array blocks: what is accepted, what is viewed, what is refused."""
+"""Array blocks: accepted, viewed and refused ones."""
 
 from typing import Any
 
@@ -123,7 +123,7 @@ def test_other_fields_of_a_block_are_ignored() -> None:
 @settings(max_examples=60, deadline=None)
 @given(name=st.text("abc", min_size=1, max_size=40), rows=st.integers(2000, 4000))
 def test_large_arrays_are_views_of_the_payload(name: str, rows: int) -> None:
-    """What `encode` wrote is decoded without a copy, aligned and read-only, wherever the array lies in the message."""
+    """An array in the form of `encode` is decoded without a copy, aligned and read-only, at any place in it."""
     xyz = np.arange(3 * rows, dtype="f4").reshape(rows, 3)
     payload = encode(Points(**{**HEADER, "stream": f"{name}/b/c"}, xyz=xyz))
     received = decode(payload, Points).xyz

@@ -1,4 +1,4 @@
-"""Messages that msgspec decodes are what the models make of the same bytes; whatever these refuse is theirs."""
+"""Messages decoded by msgspec equal those by the models; payloads that these refuse are left to them."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def many(example: Message, count: int, **changes: Any) -> Detections:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_byte_replaced_by_others(examples: dict[str, Message], name: str) -> None:
-    """Whatever byte is another one, in the values or between them: what is read is what the models make of it."""
+    """With any byte replaced, in the values or between them, a message that is read equals the one by the models."""
     example, found = examples[name], 0
     payload = encode(example)
     for at, byte in enumerate(payload):
@@ -166,7 +166,7 @@ def test_limits_of_a_service_need_no_models(examples: dict[str, Message]) -> Non
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_value_replaced_by_every_other(examples: dict[str, Message], name: str) -> None:
-    """Any value of the message replaced, left out, or written twice: what is read is what the models make of it."""
+    """Any value of the message replaced, left out, or written twice: what is read equals the one by the models."""
     kind, tree, found = type(examples[name]), msgpack.unpackb(encode(examples[name])), 0
     for path in places(tree)[1:]:
         for value in (*SCALARS, ...):
@@ -184,7 +184,7 @@ def test_every_value_replaced_by_every_other(examples: dict[str, Message], name:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_fields_that_are_there_twice_or_unknown(examples: dict[str, Message], name: str) -> None:
-    """A map with a field twice, or one that nobody knows, is left to the models, in the message and inside it."""
+    """A map with a field twice, or an unknown one, is left to the models, in the message and inside it."""
     tree = msgpack.unpackb(encode(examples[name]))
     for path in places(tree):
         inner = tree
@@ -234,7 +234,7 @@ def written_with(example: Message, data: st.DataObject) -> bytes:
 @settings(max_examples=200)
 @given(data=st.data())
 def test_damaged_bytes(examples: dict[str, Message], data: st.DataObject) -> None:
-    """Bytes flipped, cut and put in: what is read is what the models make of it."""
+    """Bytes flipped, cut and put in: a message that is read equals the one by the models."""
     payload = bytearray(encode(examples["Detections"]))
     for _ in range(data.draw(st.integers(1, 3))):
         at = data.draw(st.integers(0, len(payload) - 1))
@@ -254,7 +254,7 @@ def test_damaged_bytes(examples: dict[str, Message], data: st.DataObject) -> Non
 
 @pytest.mark.parametrize("file", sorted(CORPUS.iterdir()), ids=lambda one: one.name)
 def test_files_that_a_search_found(file: Path) -> None:
-    """Every file kept for the search, whatever message it was meant to be."""
+    """Every file kept for the search, as any message."""
     for kind in DECODERS:
         check(file.read_bytes()[1:], kind)
 

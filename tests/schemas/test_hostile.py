@@ -1,4 +1,4 @@
-"""Whatever the bytes are, decoding gives a message or a `MessageError`, in bounded memory."""
+"""For any bytes, decoding gives a message or a `MessageError`, in bounded memory."""
 
 import json
 import math
@@ -223,7 +223,7 @@ WASTEFUL = {
 def test_the_worst_within_the_limits(payload: bytes) -> None:
     """As much as is allowed, in its most wasteful form, is read to the end and takes less than 70 MB.
 
-    Memory grows with what is allowed, so an eighth of the limits is allowed and an eighth of that memory.
+    Memory grows with the limits, so an eighth of the limits is allowed and an eighth of that memory.
     """
     # The least of three: keys are interned, and whose key makes the interpreter enlarge its table of them is chance.
     results = [measured(payload, Detections, limits=EIGHTH) for _ in range(3)]
@@ -254,7 +254,7 @@ def test_size_is_checked_first() -> None:
 
 @pytest.mark.parametrize("limit", ["max_values", "max_depth", "max_text", "max_labels", "max_detections"])
 def test_every_limit_is_kept(detections: Detections, limit: str) -> None:
-    """A message is refused as too large when any limit is lower than what it has, in both forms."""
+    """A message is refused as too large when it exceeds any limit, in both forms."""
     tight = {"max_values": 20, "max_depth": 1, "max_text": 5, "max_labels": 1, "max_detections": 2}
     limits = Limits(**{limit: tight[limit]})
     error = attempt(encode(detections), Detections, limits=limits)

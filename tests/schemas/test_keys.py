@@ -10,7 +10,7 @@ STREAM = "site/node/sensor"
 
 
 def test_the_keys_of_a_stream() -> None:
-    """The keys are those of the documentation."""
+    """The keys are as documented."""
     assert KEYS.detections(STREAM) == "optipmb/v1/site/node/sensor/detections"
     assert KEYS.points(STREAM) == "optipmb/v1/site/node/sensor/points"
     assert KEYS.tracks(STREAM) == "optipmb/v1/site/node/sensor/tracks"

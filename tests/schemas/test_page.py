@@ -44,7 +44,7 @@ def dumped(text: str) -> bytes:
 
 
 def test_the_tables_are_current(capsys: pytest.CaptureFixture[str]) -> None:
-    """The tables of fields, limits and codes are those of the code, and the command says when they are not."""
+    """The tables of fields, limits and codes are current, and the command reports when they are not."""
     assert fill(PAGE) == PAGE
     assert main(["--check", "--page", str(FILE), str(ROOT / "schemas" / "json")]) == 0, capsys.readouterr().out
     assert fill("<!-- table: codes -->\nold\n<!-- end -->") == f"<!-- table: codes -->\n{table('codes')}<!-- end -->"
@@ -85,7 +85,7 @@ def test_the_example_is_what_encode_produces() -> None:
 
 
 def test_the_explained_bytes_are_where_they_are_said_to_be() -> None:
-    """Every row of the table of bytes quotes those of the dump at its offset."""
+    """Every row of the table of bytes quotes the dump at its offset."""
     payload = dumped(DUMP)
     rows = re.findall(r"^\| ([0-9a-f]{4}) \| ([0-9a-f ]+) \|", PAGE, re.MULTILINE)
     assert len(rows) > 10
@@ -115,7 +115,7 @@ def test_all_keys_are_on_the_page() -> None:
 
 
 def test_encodings_on_the_page() -> None:
-    """The encoding strings on the page are those of the code."""
+    """The encoding strings on the page are current."""
     said = set(re.findall(r"`(application/[^`]*)`", PAGE))
     assert said == {encoding_of(Detections), encoding_of(Detections, form="json")}
 

@@ -31,7 +31,7 @@ def buf(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 
 
 def test_what_is_generated_is_current(capsys: pytest.CaptureFixture[str]) -> None:
-    """Comments of the schema are those of the models, and the Python modules are those of the schema."""
+    """Comments of the schema come from the models, and the Python modules from the schema."""
     assert export.main(["--check", str(SCHEMAS)]) == 0, capsys.readouterr()
 
 
@@ -118,7 +118,7 @@ def test_columns_of_any_length_survive(rows: int) -> None:
     ],
 )
 def test_errors_name_the_field(change: dict[str, Any], path: str, example_of: Any) -> None:
-    """What is not valid is refused with the path of the field, as in msgpack."""
+    """An invalid value is refused with the path of the field, as in msgpack."""
     proto = proto_of(example_of(Detections))
     for name in change:
         proto.ClearField(name)
@@ -144,20 +144,6 @@ def test_bytes_that_are_no_message() -> None:
         convert.parse(b"\xff\xff\xff", pb.TrackRequest)
 
 
-@pytest.mark.parametrize("change", [{}, {"velocity": None}, {"pose": None, "frame": "world"}, {"has_points": None}])
-def test_the_usual_form_is_read_as_any_other(change: dict[str, Any], example_of: Any) -> None:
-    """Detections whose columns are float64 and int64 become the same, bit by bit, as those that the models read."""
-    message = example_of(Detections)
-    message = Detections(**{name: getattr(message, name) for name in message.names} | change)
-    usual = convert.from_proto(proto_of(message), Detections)
-    other = proto_of(message)
-    other.label.CopyFrom(pb.Array(dtype=pb.DATA_TYPE_U1, shape=[3], data=message.label.astype("u1").tobytes()))
-    by_models = convert.from_proto(other, Detections)
-    assert usual == by_models == message
-    assert encode(usual) == encode(by_models)
-    assert usual.model_fields_set == by_models.model_fields_set == {name for name, _ in message.present()}
-
-
 def test_unknown_fields_are_ignored(example_of: Any) -> None:
     """A field of a later version changes nothing."""
     message = example_of(Detections)
@@ -167,7 +153,7 @@ def test_unknown_fields_are_ignored(example_of: Any) -> None:
 
 
 def test_tracks_are_transcoded_as_they_are(example_of: Any) -> None:
-    """Without a model between them they become what the model becomes, whatever the form."""
+    """Without a model between them the result is the same, in any form."""
     tracks = example_of(Tracks)
     expected = convert.to_proto(tracks)
     assert transcode(encode(tracks), encoding=encoding_of(Tracks)).message() == expected
@@ -179,7 +165,7 @@ def test_tracks_are_transcoded_as_they_are(example_of: Any) -> None:
 
 @pytest.mark.parametrize("rows", [0, 1, 300, 5000])
 def test_tracks_of_any_number_are_transcoded(rows: int, example_of: Any) -> None:
-    """An empty frame and one beyond what is read in one go are no exceptions; what tells frames apart is at hand."""
+    """An empty frame and a very large one are no exceptions; the identity of the frame is at hand."""
     tracks = example_of(Tracks)
     columns = {
         name: np.resize(getattr(tracks, name), (rows, *getattr(tracks, name).shape[1:]))

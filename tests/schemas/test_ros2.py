@@ -37,7 +37,7 @@ def as_fields(value: Any) -> Any:
 
 @pytest.mark.parametrize("name", REFERENCE)
 def test_types_are_those_of_ros(name: str) -> None:
-    """Hashes, fields and bytes of every type that is used live are those of ROS 2's own code (`ros2_reference.py`)."""
+    """Hashes, fields and bytes of every type in use equal those by ROS 2's own code (`ros2_reference.py`)."""
     reference, types = REFERENCE[name], own_types()
     assert types.hash_of(name) == reference["hash"]
     theirs = base64.b64decode(reference["cdr"])
@@ -127,7 +127,7 @@ def test_what_is_not_known_is_told_and_whether_it_can_come() -> None:
 
 
 def test_transforms_are_bounded() -> None:
-    """The oldest stamps go first, frames beyond the limit are refused, and so is what is no pose."""
+    """The oldest stamps go first, frames beyond the limit are refused, and invalid poses."""
     transforms = Transforms(kept=3, frames=2)
     for stamp in range(10):
         transforms.add("map", "base", stamp, np.zeros(3), UPRIGHT)
@@ -202,7 +202,7 @@ def test_every_layout_of_floats_gives_the_same_points(
 
 
 def test_clouds_that_contradict_themselves_are_refused() -> None:
-    """No read goes beyond the data, whatever the sizes say."""
+    """No read goes beyond the data, for any sizes."""
     fields = cloud().fields
     for changes, path in (
         ({"height": 3}, "data"),
@@ -270,7 +270,7 @@ def test_an_object_of_autoware_is_read_whole() -> None:
 
 
 def test_covariances_of_positions_are_read_where_asked_for() -> None:
-    """Those of a pose's x, y and z, if the message says that it has them; zeros are unknown."""
+    """Covariances of a pose's x, y and z, if the message says that it has them; zeros are unknown."""
     types, spread = own_types(), np.arange(36.0)
     message = autoware()
     kinematics = message.objects[0].kinematics

@@ -160,7 +160,7 @@ def test_quaternions_of_single_precision_pass() -> None:
 
 
 def test_errors_are_one_clear_line() -> None:
-    """The text of an error says where, what was expected and what came, and never more than a line."""
+    """The text of an error has the place, the expected and the received value, and never more than a line."""
     with pytest.raises(MessageError) as caught:
         Pose(translation=[0, float("nan"), 0], quaternion=[1, 0, 0, 0])
     expected = "translation[1]: expected a number in [-1e8, 1e8], received nan [invalid_value]"
@@ -180,7 +180,7 @@ RECEIVED = {
 
 @pytest.mark.parametrize("name", RECEIVED)
 def test_received_values_are_cut(name: str) -> None:
-    """Whatever was received, the error quotes at most 80 printable ASCII characters of it."""
+    """For any received value, the error quotes at most 80 printable ASCII characters of it."""
     with pytest.raises(MessageError) as caught:
         Tracks(stream=RECEIVED[name])
     assert len(caught.value.received) <= 80

@@ -18,12 +18,12 @@ import optipmb_schemas as schemas
 import pytest
 from fusing import FUSED
 from optipmb_service.cluster.leases import Change, partition_of
-from optipmb_service.runtime.ports import Packet
-from optipmb_service.runtime.profiles import Profiles
-from optipmb_service.runtime.queries import StreamQueries
-from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint
-from optipmb_service.session.session import Session
-from optipmb_service.session.values import Policy, Quarantined, RefusedError, Tracked
+from optipmb_service.stream.checkpoint import decode_checkpoint, encode_checkpoint
+from optipmb_service.stream.ports import Packet
+from optipmb_service.stream.profiles import Profiles
+from optipmb_service.stream.queries import StreamQueries
+from optipmb_service.stream.session import Session
+from optipmb_service.stream.values import Policy, Quarantined, RefusedError, Tracked
 from registries import Around, packet_of, streams_of
 from router import SECOND
 from scenarios import FILE, PROFILE, SCENARIOS, SENSOR, STREAM, Raw, Recorded, Step, delivery
@@ -34,7 +34,7 @@ import optipmb
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from optipmb_service.session.values import Output
+    from optipmb_service.stream.values import Output
 
 RECORD: Final = bool(os.environ.get("OPTIPMB_TEST_RECORD"))
 BETWEEN_NS: Final = SECOND // 50

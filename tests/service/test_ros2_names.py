@@ -6,7 +6,6 @@ import re
 import pytest
 import ros2_client  # noqa: F401 - tells the SDK not to look for git
 from optipmb_service.ros2 import graph
-from optipmb_service.ros2.matching import Matching, Wanted
 from zenoh_ros2_sdk.attachment import Attachment
 from zenoh_ros2_sdk.entity import EndpointEntity, EntityKind, NodeEntity
 from zenoh_ros2_sdk.keyexpr import endpoint_liveliness_keyexpr, node_liveliness_keyexpr, topic_keyexpr
@@ -67,7 +66,7 @@ def test_an_attachment_is_read_by_another_program() -> None:
 )
 def test_what_does_not_match_is_named_once(other: graph.Endpoint, text: str) -> None:
     """Another type, another definition and a weaker offer are problems from when a node comes until it goes."""
-    matching = Matching((Wanted(graph.SUBSCRIPTION, TOPIC, TYPE, HASH, graph.Qos()),), frozenset())
+    matching = graph.Matching((endpoint(graph.SUBSCRIPTION, name="bridge"),), frozenset())
     new = matching.change(other, came=True)
     assert len(new) == bool(text)
     for problem in new:
@@ -80,7 +79,7 @@ def test_what_does_not_match_is_named_once(other: graph.Endpoint, text: str) -> 
 
 def test_two_publishers_of_detections_are_a_problem() -> None:
     """The second one is reported, and no longer when it has gone."""
-    matching = Matching((Wanted(graph.SUBSCRIPTION, TOPIC, TYPE, HASH, graph.Qos()),), frozenset({TOPIC}))
+    matching = graph.Matching((endpoint(graph.SUBSCRIPTION, name="bridge"),), frozenset({TOPIC}))
     assert matching.change(endpoint(), came=True) == ()
     assert "2 publishers" in matching.change(endpoint(name="other"), came=True)[0]
     matching.change(endpoint(), came=False)

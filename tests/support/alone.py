@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from optipmb_service.session.session import Session
-from optipmb_service.session.values import Tracked
+from optipmb_service.stream.session import Session
+from optipmb_service.stream.values import Tracked
 from router import plain
 
 import optipmb

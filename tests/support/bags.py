@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from mcap.reader import make_reader
 from mcap_ros2.writer import Writer as McapWriter
-from optipmb_schemas.ros2.definitions import CLASS_NAMES
+from optipmb_schemas.ros2.tracks import CLASS_NAMES
 from optipmb_schemas.ros2.types import own_types
 from optipmb_tools.datasets import DataSequence, DetectionFrame
 from optipmb_tools.geometry import Pose, pose_of, rotation_of

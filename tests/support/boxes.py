@@ -1,4 +1,4 @@
-"""Rows of a simple tracker as a table of results."""
+"""Rows of a simple tracker as a table of results, and the points in a box."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from optipmb_tools.results.kitti import LEAST_SHOWN
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+    from optipmb_tools.geometry import Bools, Floats
     from optipmb_tools.tuning.clips import Clip
 
 Row = tuple[int, int, "NDArray[np.float64]", "NDArray[np.float64]", float, float]
@@ -38,3 +39,13 @@ def table_of(clip: Clip, name: str, rows: list[Row]) -> ResultTable:
         score=np.array(score, dtype=np.float64),
         box2d=image,
     )
+
+
+def points_in_box(xyz: Floats, center: Floats, size: Floats, yaw: float) -> Bools:
+    """Return which points (P, 3) lie in one box."""
+    offset = xyz - center
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    along = np.abs(cos * offset[:, 0] + sin * offset[:, 1])
+    across = np.abs(cos * offset[:, 1] - sin * offset[:, 0])
+    half = 0.5 * size
+    return np.asarray((along <= half[0]) & (across <= half[1]) & (np.abs(offset[:, 2]) <= half[2]), dtype=np.bool_)

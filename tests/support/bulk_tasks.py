@@ -11,11 +11,11 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
-from optipmb_tools.bulk import Executor
 from optipmb_tools.datasets import DatasetArguments
-from optipmb_tools.offline import profile_for
+from optipmb_tools.run.bulk import Executor
+from optipmb_tools.run.profiles import profile_for
+from optipmb_tools.run.tracking import Tracking, track
 from optipmb_tools.table_files import write_table
-from optipmb_tools.tracking import Tracking, track
 from own_tables import FRAMES, boxes
 
 RECORDINGS = 200

@@ -10,9 +10,9 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 from optipmb_schemas import Detections, Keys, Points, Pose, SessionState, Tracks, decode, encode, encoding_of
-from optipmb_service.session.checkpoint import digest_of
-from optipmb_service.session.session import Session
-from optipmb_service.session.values import Policy, Tracked
+from optipmb_service.stream.checkpoint import digest_of
+from optipmb_service.stream.session import Session
+from optipmb_service.stream.values import Policy, Tracked
 from optipmb_tools.datasets import open_dataset
 from router import plain
 

@@ -6,10 +6,10 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from optipmb_schemas import Detections, Keys, Points, encode, encoding_of
-from optipmb_service.runtime.ports import Packet
-from optipmb_service.runtime.profiles import Profiles
-from optipmb_service.runtime.streams import Streams
 from optipmb_service.settings import Settings
+from optipmb_service.stream.ports import Packet
+from optipmb_service.stream.profiles import Profiles
+from optipmb_service.stream.streams import Streams
 from optipmb_service.telemetry.metrics import Metrics
 from optipmb_service.telemetry.problem_reporter import ProblemReporter
 from sessions import chained
@@ -17,7 +17,7 @@ from sessions import chained
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from optipmb_service.session.checkpoint import Checkpoint
+    from optipmb_service.stream.checkpoint import Checkpoint
 
 
 class Around:

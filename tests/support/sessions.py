@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from optipmb_schemas import Problem, Tracks, encode
-from optipmb_service.session.values import Begun, Output, Quarantined, Tracked
+from optipmb_service.stream.values import Begun, Output, Quarantined, Tracked
 
 import optipmb
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from optipmb_service.session.session import Session
+    from optipmb_service.stream.session import Session
     from router import Sensor
 
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 from fleet import PROFILE
 from optipmb_schemas import Keys, SessionState, Tracks, decode
-from optipmb_service.session.checkpoint import digest_of
-from optipmb_service.session.session import Session
-from optipmb_service.session.values import Tracked
+from optipmb_service.stream.checkpoint import digest_of
+from optipmb_service.stream.session import Session
+from optipmb_service.stream.values import Tracked
 from router import Sensor, plain, until
 
 import optipmb

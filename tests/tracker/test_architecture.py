@@ -21,7 +21,7 @@ ALLOWED = {
 EXCEPTIONS = {
     "compiled": {"logging", "os", "stat", "tempfile", "time"},  # to show why a first frame takes a minute; a folder
     "warm": {"gc"},  # to collect less often while a compiler fills the memory
-    "online": {"datetime", "pandas", "pyarrow"},  # to take dates, and give tracks in the tables that users ask for
+    "online": {"datetime", "matplotlib", "pandas", "pyarrow", "supervision"},  # dates, and forms that users ask for
 }
 TOUCHES_FILES = {"compiled", "parameters", "prepared"}
 DOES_IO = {"open", "print", "input", "exec", "eval", "__import__"}

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import sys
 from datetime import UTC, datetime
 from importlib.metadata import version
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pytest
+from matplotlib.figure import Figure
 
 import optipmb
 
@@ -161,7 +164,32 @@ def test_classes_that_are_left_out_are_counted() -> None:
 def test_auto_needs_a_recording() -> None:
     """The error names what to take in its place."""
     with pytest.raises(optipmb.ParameterError, match="generic_parameters"):
-        optipmb.OnlineTracker("auto")
+        optipmb.Tracker("auto")
+    assert optipmb.Tracker("kitti").parameters == optipmb.load_profile("kitti")
+
+
+def test_tracks_go_to_other_tools(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lines of KITTI, boxes of nuScenes, image boxes of supervision, and a picture with ids and classes."""
+    tracks = run([flat(10 + k) for k in range(6)])[-1]
+    pose = optipmb.Pose(np.array([5.0, 0.0, 0.0]), np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]))  # looks along y
+    for given, (x, y, z), turn in ((None, (0.0, 0.0, 15.0), -np.pi / 2), (pose, (10.0, 0.0, 0.0), 0.0)):
+        (line,) = tracks.to_kitti(7, given)
+        fields = line.split()
+        assert fields[:3] == ["7", "1", "car"]
+        assert [float(one) for one in fields[10:17]] == pytest.approx([1.6, 1.9, 4.5, x, y, z, turn], abs=0.3)
+    (box,) = tracks.to_nuscenes("token")
+    assert (box["sample_token"], box["tracking_id"], box["tracking_name"]) == ("token", "1", "car")
+    assert box["size"] == pytest.approx([1.9, 4.5, 1.6])
+    monkeypatch.setitem(sys.modules, "supervision", SimpleNamespace(Detections=SimpleNamespace))
+    camera = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
+    axes = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.8], [1.0, 0.0, 0.0, 0.0]])
+    seen = tracks.to_supervision(camera @ axes)
+    half = 500 / (15 - 2.25)
+    expected = [320 - 0.95 * half, 240 - 0.8 * half, 320 + 0.95 * half, 240 + 0.8 * half]
+    assert seen.xyxy[0] == pytest.approx(expected, abs=3.0)
+    assert seen.tracker_id.tolist() == [1]
+    drawn = tracks.plot(Figure().subplots())
+    assert [text.get_text() for text in (*drawn.texts, *drawn.get_legend().get_texts())] == ["1", "car"]
 
 
 def test_a_reset_uses_no_id_again() -> None:

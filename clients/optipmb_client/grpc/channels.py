@@ -13,7 +13,7 @@ from optipmb_schemas.protobuf import tracking_pb2 as pb
 
 from optipmb_client.errors import ClientError, ConnectionFailed, ServiceRefused
 
-__all__ = ["Channels", "ResumedCall", "from_gateway", "lasting"]
+__all__ = ["CLOSE_S", "Channels", "ResumedCall", "from_gateway", "lasting"]
 
 SERVICE: Final = pb.DESCRIPTOR.services_by_name["TrackingService"].full_name
 
@@ -22,6 +22,7 @@ SAID_BY: Final = "optipmb-gateway"
 
 FIRST_PAUSE_S: Final = 0.05
 LONGEST_PAUSE_S: Final = 1.0
+CLOSE_S: Final = 5.0
 
 OPTIONS: Final = (
     ("grpc.keepalive_time_ms", 10_000),
@@ -115,18 +116,24 @@ class Channels:
 
 
 class ResumedCall(ABC):
-    """A call that is made anew when it ends, at the next gateway; on a thread of its own.
+    """A call that is made again when it ends, at the next gateway; on a thread of its own.
 
     Args:
         channels: to gateways.
         method: that is called.
         name: of the thread.
+
+    Attributes:
+        error: why no further call is made; None while calls are made.
     """
 
     def __init__(self, channels: Channels, method: str, name: str) -> None:
+        self.error: ClientError | None = None
         self._channels = channels
         self._method = method
         self._call: Any = None
+        self._settled = threading.Event()  # the first call is in force, or there will be none
+        self._is_last = False  # whether a call that ends without an error is the last one
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
@@ -136,25 +143,42 @@ class ResumedCall(ABC):
 
     @abstractmethod
     def _take(self, response: bytes) -> None:
-        """Take a response."""
-
-    @abstractmethod
-    def _fail(self, error: ClientError) -> None:
-        """End: every other call would end in the same way."""
+        """Process a response."""
 
     @abstractmethod
     def _began(self) -> None:
-        """Take in that a call was made."""
+        """Note that a call was made."""
 
     @abstractmethod
-    def _is_done(self) -> bool:
-        """Return whether a call that ended without an error was the last one."""
+    def _ended(self) -> None:
+        """Note that no further call is made."""
 
-    def _cancel(self) -> None:
-        """End the call, and make none any more."""
+    def _open(self, what: str, timeout: float) -> None:
+        """Make the first call, and wait until it is in force.
+
+        Raises:
+            ConnectionFailed: it is not in time.
+            ServiceRefused: the gateway refuses it.
+        """
+        self._thread.start()
+        if not self._settled.wait(timeout):
+            self.error = ConnectionFailed(f"no gRPC gateway took the {what} within {timeout:g} s")
+        if self.error is not None:
+            self._end()
+            raise self.error
+
+    def _end(self) -> None:
+        """Cancel the call, and make none any more."""
         self._over.set()
         if self._call is not None:
             self._call.cancel()
+        self._ended()
+        self._thread.join(CLOSE_S)
+
+    def _fail(self, error: ClientError) -> None:
+        self.error = error
+        self._settled.set()
+        self._ended()
 
     def _run(self) -> None:
         pause = FIRST_PAUSE_S
@@ -166,7 +190,7 @@ class ResumedCall(ABC):
                 for response in self._call:
                     pause = FIRST_PAUSE_S
                     self._take(response)
-                if self._is_done():
+                if self._is_last:
                     return
             except grpc.RpcError as error:
                 if lasting(error):

@@ -12,15 +12,14 @@ from optipmb_schemas import Keys, Message
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
-from optipmb_client.errors import ClientError, ConnectionFailed
-from optipmb_client.grpc.channels import Channels, ResumedCall
+from optipmb_client.errors import ConnectionFailed
+from optipmb_client.grpc.channels import CLOSE_S, Channels, ResumedCall
 from optipmb_client.incoming import Arrival, Inbox
 
 __all__ = ["GrpcSender", "GrpcSubscription", "Publishing"]
 
 T = TypeVar("T", bound=Message)
 
-CLOSE_S: Final = 5.0
 CLOUDS: Final = 4
 """Clouds that may wait for a gateway in any case."""
 WAITING_BYTES: Final = 64 * 2**20
@@ -30,10 +29,10 @@ _Numbered = tuple[int, bytes]
 
 
 class Publishing(ResumedCall):
-    """The detections and clouds of one stream in a `Publish` call, opened anew at the next gateway when it fails.
+    """The detections and clouds of one stream in a `Publish` call, opened again at the next gateway when it fails.
 
-    The newest messages are kept and sent again then: nobody knows which of them the old gateway had passed on, and
-    whoever has them already drops them.
+    The newest messages are kept and sent again then, as the old gateway may not have passed them on. Receivers drop
+    repetitions.
 
     Args:
         channels: to gateways.
@@ -60,21 +59,12 @@ class Publishing(ResumedCall):
         self._number = itertools.count()
         self._calls = 0
         self._changed = threading.Condition()
-        self._closing = False
-        self._opened = False
         self._senders = 2
         self.points_wanted = self._keeps_clouds
-        self.error: ClientError | None = None
-        self._thread.start()
-        with self._changed:
-            self._changed.wait_for(lambda: self._opened or self.error is not None, timeout)
-        if self._opened:
-            return
-        self.release(self._senders)
-        raise self.error or ConnectionFailed(f"no gRPC gateway took the stream {stream} within {timeout:g} s")
+        self._open(f"stream {stream}", timeout)
 
     def put(self, topic: str, payload: bytes) -> None:
-        """Send a message; waits for nobody.
+        """Send a message without waiting.
 
         Raises:
             ConnectionFailed: after the end.
@@ -83,43 +73,38 @@ class Publishing(ResumedCall):
         with self._changed:
             if self.error is not None:
                 raise self.error
-            if self._closing:
+            if self._is_last:
                 raise ConnectionFailed("this publisher has been closed")
             self._waiting[topic].append((next(self._number), payload))
             self._changed.notify_all()
 
-    def release(self, senders: int = 1) -> None:
+    def release(self) -> None:
         """Send what waits, and end, when all senders are closed."""
         with self._changed:
-            self._senders -= senders
-            if self._senders > 0 or self._closing:
+            self._senders -= 1
+            if self._senders > 0:
                 return
-            self._closing = True
+            self._is_last = True
             self._changed.notify_all()
         self._thread.join(CLOSE_S)
-        self._cancel()
+        self._end()
 
     def _take(self, response: bytes) -> None:
         said = pb.PublishResponse.FromString(response)
         if said.WhichOneof("response") == "acknowledgement":
-            with self._changed:
-                self.points_wanted = self._keeps_clouds or said.acknowledgement.points_wanted
-                self._opened = True
-                self._changed.notify_all()
+            self.points_wanted = self._keeps_clouds or said.acknowledgement.points_wanted
+            self._settled.set()
 
     def _began(self) -> None:
         """Wait for the first acknowledgement."""
 
-    def _is_done(self) -> bool:
-        return self._closing
-
-    def _fail(self, error: ClientError) -> None:
-        with self._changed:
-            self.error = error
+    def _ended(self) -> None:
+        with self._changed:  # for the thread that waits for requests
+            self._calls += 1
             self._changed.notify_all()
 
     def _requests(self) -> Iterator[bytes]:
-        """Iterate over the options, what is kept, and what comes, until the next call; run by a thread of gRPC."""
+        """Yield the options, kept messages and new ones, until the next call; run by a thread of gRPC."""
         with self._changed:
             self._calls += 1
             call = self._calls
@@ -134,7 +119,7 @@ class Publishing(ResumedCall):
     def _next(self, call: int) -> bytes | None:
         """Return the oldest message that waits, detections and clouds in their order; None when the call is over."""
         with self._changed:
-            self._changed.wait_for(lambda: any(self._waiting.values()) or self._closing or self._calls != call)
+            self._changed.wait_for(lambda: any(self._waiting.values()) or self._is_last or self._calls != call)
             waiting = [topic for topic, queue in self._waiting.items() if queue]
             if self._calls != call or not waiting:
                 return None
@@ -168,7 +153,7 @@ class _Waiting:
             self.popleft()
 
     def prepend(self, messages: Sequence[_Numbered]) -> None:
-        """Add what was given to a call that failed."""
+        """Add the messages of a call that failed."""
         self._messages.extendleft(reversed(messages))
         self._bytes += sum(len(payload) for _, payload in messages)
 
@@ -202,7 +187,7 @@ class GrpcSender:
         self._publishing.put(self._topic, payload)
 
     def close(self) -> None:
-        """Withdraw; what was sent before goes out."""
+        """Withdraw; earlier messages still go out."""
         if not self._closed:
             self._closed = True
             self._publishing.release()
@@ -228,12 +213,12 @@ class _ProtoArrival(Arrival):
 
 
 class GrpcSubscription(ResumedCall):
-    """A `Subscribe` call, made anew when it ends; what the services keep comes first each time.
+    """A `Subscribe` call, made again when it ends; kept tracks come first each time.
 
     Args:
         channels: to gateways.
         pattern: of streams.
-        inbox: for what comes.
+        inbox: for the messages.
         keys: of the network, for the names of arrivals.
         problems: whether problems come too.
         timeout: seconds to wait until it is in force.
@@ -251,19 +236,11 @@ class GrpcSubscription(ResumedCall):
         self._request = request.SerializeToString()
         self._inbox = inbox
         self._keys = keys
-        self._settled = threading.Event()
-        self._error: ClientError | None = None
-        self._thread.start()
-        if not self._settled.wait(timeout):
-            self._error = ConnectionFailed(f"no gRPC gateway took the subscription within {timeout:g} s")
-        if self._error is not None:
-            self.close()
-            raise self._error
+        self._open("subscription", timeout)
 
     def close(self) -> None:
-        """End it; what is in the inbox stays readable."""
-        self._cancel()
-        self._thread.join(CLOSE_S)
+        """End it; the inbox stays readable."""
+        self._end()
 
     def _requests(self) -> Iterator[bytes]:
         return iter((self._request,))
@@ -273,12 +250,7 @@ class GrpcSubscription(ResumedCall):
         if self._call.is_active():
             self._settled.set()
 
-    def _is_done(self) -> bool:
-        return False
-
-    def _fail(self, error: ClientError) -> None:
-        self._error = error
-        self._settled.set()
+    def _ended(self) -> None:
         if not self._over.is_set():
             self._inbox.close()  # nothing will come any more
 

@@ -42,8 +42,8 @@ def configured(values: Mapping[str, object], file: str | Path | None = None, *, 
     """Return a configuration file, or Zenoh's defaults, with values over it.
 
     Raises:
-        ConnectionFailed: The file or a value cannot be used, or the file gives an id to what is no router. Zenoh
-            numbers what a session sends, and drops what comes again from a session of the same id.
+        ConnectionFailed: The file or a value cannot be used, or the file gives an id to a session that is no router.
+            Zenoh numbers the messages of a session, and drops repeated numbers of the same id.
     """
     config = loaded(file)
     own = json.loads(config.get_json("id"))

@@ -7,7 +7,6 @@ import time
 import weakref
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 import zenoh
@@ -29,7 +28,7 @@ POLL_S = 0.02
 
 
 class Connection:
-    """A Zenoh session. Publishers and subscribers may share one; whoever opens it closes it.
+    """A Zenoh session. Publishers and subscribers may share one; the caller that opens it closes it.
 
     It can declare 65,535 keys in its life, and closing gives none back: a `Publisher` declares three, with a cache of
     clouds four, and a `Subscriber` two, with `on_problem` four. What a program opens beyond is refused with
@@ -62,7 +61,7 @@ class Connection:
             self._session = Session(opened(settings))
         except ConnectionFailed as error:
             raise self._unanswered(endpoints, timeout, settings) from error
-        # A router that starts at this moment may be known and not linked yet: what is sent then is lost.
+        # A router that starts at this moment may be known and not linked yet: messages would be lost.
         ends = time.monotonic() + timeout
         while json.loads(settings.get_json("mode")) == "client" and not self._session.linked():
             if time.monotonic() > ends:
@@ -76,9 +75,7 @@ class Connection:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -120,7 +117,7 @@ class Connection:
         return subscriptions
 
     def query(self, key: str, payload: bytes = b"", encoding: str = "", *, timeout: float = 2.0) -> tuple[Answer, ...]:
-        """Ask everybody who answers at `key`; an empty result means that nobody did within `timeout` seconds."""
+        """Send a query to all that answer at `key`; an empty result means no answer within `timeout` seconds."""
         return self._session.query(key, payload, encoding, timeout=timeout)
 
     def alive(self, pattern: str, *, timeout: float = 2.0) -> tuple[str, ...]:

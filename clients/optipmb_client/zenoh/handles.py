@@ -1,4 +1,4 @@
-"""What is declared on a Zenoh session: publishers, subscriptions and queryables, and the threads that read them."""
+"""Publishers, subscriptions and queryables of a Zenoh session, and the threads that read them."""
 
 import contextlib
 import ctypes
@@ -18,7 +18,7 @@ from optipmb_client.errors import ConnectionFailed
 __all__ = ["Channel", "Declared", "Query", "Reading", "Sender", "directly", "reason", "usable"]
 
 CLOSE_S = 5.0
-"""Longest wait of `close` until what has come is handed over."""
+"""Longest wait of `close` until received items are handed over."""
 
 FULL_S = 0.005
 """Pause of the network's thread before it looks again for room in a channel."""
@@ -100,7 +100,7 @@ class Reading:
     """A subscription or queryable whose items a daemon thread hands over, one after the other.
 
     Args:
-        name: What is read, for messages.
+        name: Name of the reading, for messages.
         declared: The subscription or queryable.
         items: A channel of Zenoh's, or one of ours.
         receive: Called for each item.
@@ -132,13 +132,13 @@ class Reading:
         self._thread.start()
 
     def withdraw(self) -> None:
-        """Withdraw it; what was received before is still handed over."""
+        """Withdraw it; items received before are still handed over."""
         self._declared.close()
         if isinstance(self._items, Channel):
             self._items.close()
 
     def close(self, timeout: float = CLOSE_S) -> None:
-        """End it; what was received before is handed over within `timeout` seconds. May be called again."""
+        """End it; items received before are handed over within `timeout` seconds. May be called again."""
         self.withdraw()
         if self._thread is not threading.current_thread():
             self._thread.join(timeout)
@@ -152,7 +152,7 @@ class Channel(Generic[_Item]):
 
     Args:
         most: Items that may wait once they are read; the thread of the network waits beyond that. Before, there is no
-            bound: publishers of the same session send what they cache on the thread that subscribes, before it reads.
+            bound: publishers of the same session send their caches on the thread that subscribes, before it reads.
     """
 
     def __init__(self, most: int) -> None:
@@ -167,11 +167,11 @@ class Channel(Generic[_Item]):
         while (item := self._waiting.get()) is not None:
             yield item
         with contextlib.suppress(queue.Empty):
-            while (item := self._waiting.get_nowait()) is not None:  # those that waited for room
+            while (item := self._waiting.get_nowait()) is not None:  # items that waited for room
                 yield item
 
     def close(self) -> None:
-        """End the reading after what has come."""
+        """End the reading after the items that wait."""
         self._closed = True
         self._waiting.put(None)
 
@@ -187,7 +187,7 @@ class Query:
 
     Args:
         query: Zenoh's query.
-        ended: Called once, when it is finished or nobody refers to it any more.
+        ended: Called once, when it is finished or has no references left.
     """
 
     def __init__(self, query: Any, ended: Callable[[], None] = lambda: None) -> None:
@@ -237,7 +237,7 @@ def directly(take: Callable[[Any], None]) -> Any:
     """Return a handler with which Zenoh calls `take` on the thread of the network.
 
     It is a pair with something that could be read: with a callback alone Zenoh lets a subscription run in the
-    background, and does not withdraw what it has declared for recovery beside it.
+    background, and does not withdraw its declarations for recovery.
     """
 
     def receive(item: Any) -> None:

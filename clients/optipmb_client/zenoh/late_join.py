@@ -2,9 +2,9 @@
 
 A publisher sends to the subscriptions that it knows of. While the declaration of a new one is on its way, messages go
 to the cache alone, and Zenoh's own query of the caches may have been answered before. Once a later message has come,
-Zenoh takes those that are recovered for old ones, and drops them. So the number of a message decides here: unless it
-follows that of the one before, or is 0 where there was none, the cache is asked for those in between, and what comes of
-this publisher meanwhile waits. Most gaps have been filled by Zenoh's advanced subscriber before. One is left where a
+Zenoh takes recovered messages for old ones, and drops them. So the number of a message decides here: unless it follows
+the number before it, or is 0 at the beginning, the cache is asked for the messages in between, and further messages of
+this publisher wait meanwhile. Most gaps have been filled by Zenoh's advanced subscriber before. One is left where a
 new subscription takes over: the cache's answer to it may overtake messages on their way, which Zenoh then drops.
 
 It takes Zenoh's samples and imports no Zenoh.
@@ -43,7 +43,7 @@ _Source = tuple[str, int]
 
 @dataclass(slots=True)
 class _Publisher(Generic[_S]):
-    """What is known of a publisher with a cache.
+    """Reading state of a publisher with a cache.
 
     Attributes:
         key: where it publishes.
@@ -69,7 +69,7 @@ class _Query(Generic[_S]):
     """A query that is sent again while nothing is heard of it, and ends with the first of these that ends.
 
     Args:
-        selector: what is asked.
+        selector: of the query.
         reply: called with each answer; where it was sent twice, perhaps with the same one twice.
         end: called when no more will come, with whether all that were asked have answered.
     """
@@ -152,7 +152,7 @@ class CacheQueries(Generic[_S]):
 
 
 class LateJoin(Generic[_S]):
-    """Hands over the samples of one subscription, those of a publisher in order, from the oldest in its cache on.
+    """Hands over the samples of one subscription, of each publisher in order, from the oldest in its cache on.
 
     Args:
         receive: takes a sample; never called by two threads at once, nor after `close`. It must not raise.
@@ -266,7 +266,7 @@ class LateJoin(Generic[_S]):
         return 0 if info is None else info.source_sn
 
     def _ask_for(self, source: _Source, key: str, gap: "_Gap[_S] | None") -> None:
-        """Ask the cache for what is missing; what it no longer has is not waited for any longer."""
+        """Ask the cache for missing samples; its answer ends the wait for them."""
         if gap is None:
             return
         early: list[_S] = []
@@ -288,7 +288,7 @@ class LateJoin(Generic[_S]):
                 waiting = self._taken(publisher)
                 self._hand_over(publisher, waiting[0])
                 further = self._follow(publisher, waiting[1:])
-            # Else a later gap is still asked for, or the cache may hold what has not come.
+            # Else a later gap is still asked for, or the cache may hold more.
             if complete and further is None and (waits is gap.behind or waits is None):
                 self._on_answered(key)
         self._ask_for(source, key, further)

@@ -1,4 +1,4 @@
-"""The link to Zenoh: a session, what is declared on it, and what is asked over it."""
+"""The link to Zenoh: a session with its declarations and queries."""
 
 import contextlib
 import logging
@@ -24,12 +24,12 @@ __all__ = ["EVERYTHING", "NEWEST", "KeyNumbers", "Opened", "Sample", "Session", 
 
 MOST_KEYS = 0xFFFF
 """Keys that a Zenoh session can declare in its life: it numbers them by 16 bits and gives no number back. Beyond, it
-would use numbers again that are in use, and what is sent with these would be lost without an error."""
+would use numbers again that are in use, and messages with these would be lost without an error."""
 
 PLAIN = 1
 """Key numbers of a publisher, a subscriber, a queryable or a declared key. Tokens and queries need none."""
 CACHED = 2
-"""Those of a publisher with a cache, and of a subscriber that recovers what was lost: they also declare `@adv` keys."""
+"""Key numbers of a publisher with a cache, and of a subscriber with recovery: they also declare `@adv` keys."""
 
 CHANNEL = 4096
 """Tokens and links between Zenoh and a reading thread."""
@@ -48,13 +48,13 @@ again. For that they are not often: thousands of silent publishers cost little.
 """
 
 EVERYTHING = zenoh.ext.HistoryConfig(detect_late_publishers=True)
-"""History of a subscription: all that caches hold, also those of publishers that come later."""
+"""History of a subscription: all that caches hold, also caches of later publishers."""
 
 NEWEST = zenoh.ext.HistoryConfig(detect_late_publishers=False, max_samples=1)
 """Without the newest message, the first heartbeat of each publisher would bring all that its cache holds.
 
-Late publishers are not detected: after a link was lost, the newest message would come so before those that it follows,
-and Zenoh would take these for lost. Heartbeats tell of what was missed.
+Late publishers are not detected: after a link was lost, the newest message would come so before its predecessors, and
+Zenoh would take these for lost. Heartbeats tell of missed messages.
 """
 
 _RECOVERY = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
@@ -67,7 +67,7 @@ _log_failure = partial(logging.getLogger("optipmb_client").exception, "the recei
 
 @dataclass(frozen=True)
 class KeyNumbers:
-    """Keys that a session has declared in its life, and those of them that are still declared."""
+    """Keys that a session has declared in its life, and those still declared."""
 
     declared: int = 0
     open: int = 0
@@ -77,7 +77,7 @@ def opened(config: zenoh.Config) -> Opened:
     """Open a session of Zenoh's.
 
     Raises:
-        ConnectionFailed: The configuration or an endpoint cannot be used, or nobody answers.
+        ConnectionFailed: The configuration or an endpoint cannot be used, or there is no answer.
     """
     try:
         return zenoh.open(config)
@@ -92,10 +92,10 @@ def close_session(session: Opened) -> None:
 
 
 class Session:
-    """A Zenoh session with what is declared on it; may be used by any threads, but not by callbacks of the network.
+    """A Zenoh session with its declarations; may be used by any threads, but not by callbacks of the network.
 
     It can declare `MOST_KEYS` keys in its life, and closing gives none back. All methods raise `ConnectionFailed` when
-    it is closed; those that declare keys also when there are none left.
+    it is closed; methods that declare keys also when none is left.
 
     Args:
         session: Zenoh's.
@@ -109,7 +109,7 @@ class Session:
         self._keys = self._open_keys = 0
         self._readings: set[Reading] = set()
         self._declared: set[Declared] = set()
-        """References: Zenoh withdraws what nobody refers to. Senders are withdrawn so."""
+        """References: Zenoh withdraws declarations without any. Senders are withdrawn so."""
         self._senders: weakref.WeakSet[Sender] = weakref.WeakSet()
 
     @property
@@ -133,7 +133,7 @@ class Session:
             return KeyNumbers(self._keys, self._open_keys)
 
     def stop(self, timeout: float = CLOSE_S) -> None:
-        """Read nothing any more; what was received before is handed over, within `timeout` seconds for each reading."""
+        """Read nothing any more; items received before are handed over, within `timeout` seconds for each reading."""
         readings = tuple(self._readings)
         for one in readings:
             one.withdraw()
@@ -141,7 +141,7 @@ class Session:
             one.close(timeout)
 
     def close(self, timeout: float = CLOSE_S) -> None:
-        """Close everything from the outside in: what is read, publishers and tokens, the session."""
+        """Close everything from the outside in: readings, publishers and tokens, the session."""
         self.stop(timeout)
         for one in (*self._senders, *self._declared):
             one.close()
@@ -176,7 +176,7 @@ class Session:
         express: bool = False,
         detected: bool = True,
     ) -> Sender:
-        """Open a publisher that waits for nobody; with `cache` it keeps its newest messages for recovery."""
+        """Open a publisher that does not wait; with `cache` it keeps its newest messages for recovery."""
         options: dict[str, Any] = {
             "encoding": encoding or None,
             "congestion_control": zenoh.CongestionControl.DROP,
@@ -241,7 +241,7 @@ class Session:
         return self._read(key, declared, samples, late_join.take, ended)
 
     def read_newest(self, key: str, receive: Callable[[Sample], None], *, most: int = 1) -> Reading:
-        """Hand over samples on a thread of its own; of those that wait the newest `most` stay."""
+        """Hand over samples on a thread of its own; the newest `most` may wait."""
         with self._counted(PLAIN):
             subscriber = self._session.declare_subscriber(key, zenoh.handlers.RingChannel(most))
 
@@ -261,7 +261,7 @@ class Session:
             receive: Called for each sample.
             recovers: Whether losses are recovered from the publishers' caches. To declare that takes Zenoh several
                 times as long, and longer the more is declared already.
-            history: What is asked of caches at the beginning: `EVERYTHING`, `NEWEST` or None.
+            history: Messages of caches at the beginning: `EVERYTHING`, `NEWEST` or None.
         """
 
         def take(sample: Sample) -> None:
@@ -356,7 +356,7 @@ class Session:
     def query(
         self, key: str, payload: bytes = b"", encoding: str = "", *, timeout: float = 2.0, background: bool = False
     ) -> tuple[Answer, ...]:
-        """Ask everybody who answers at `key`; an empty result means that nobody did within `timeout` seconds.
+        """Send a query to all that answer at `key`; an empty result means no answer within `timeout` seconds.
 
         With `background` only other sessions are asked, at the lowest priority: the question overtakes no message.
         """
@@ -373,7 +373,7 @@ class Session:
         return tuple(answers)
 
     def cached(self, key: str, *, timeout: float) -> list[Answer]:
-        """Return what the caches of publishers hold under a key expression, those of a publisher in order."""
+        """Return the messages in publishers' caches under a key expression, in the order of each publisher."""
         return [one for one in self.query(f"{key}/@adv/**", timeout=timeout) if one.ok]
 
     def ask(
@@ -387,7 +387,7 @@ class Session:
     ) -> None:
         """Ask without waiting: `reply` is called with each answer, and `end` when no more comes, on another thread.
 
-        `end` gets whether all have answered in time. In a closed session nobody does. With `background` only other
+        `end` gets whether all have answered in time; in a closed session, False. With `background` only other
         sessions are asked, at the lowest priority, and not at all where the link is congested.
         """
         errors = []
@@ -410,7 +410,7 @@ class Session:
     def _replies(timeout: float, ask: Callable[[Any], object]) -> Iterator[zenoh.Reply]:
         """Yield the replies to a query that `ask` sends; none that comes later than the query may take.
 
-        What is in the same session answers on the thread that asks, before it can read: a channel with a bound, as
+        Queryables of the same session answer on the thread that asks, before it can read: a channel with a bound, as
         Zenoh's own, would wait for room for ever, with the lock of a cache held. The bound is the time.
         """
         replies: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
@@ -420,7 +420,7 @@ class Session:
             while (reply := replies.get(timeout=max(0.0, ends - time.monotonic()))) is not None:
                 yield reply
 
-    # What is declared
+    # Declarations
 
     def _read(
         self,

@@ -22,7 +22,7 @@ from optipmb_tools.commands.options import (
     warn,
 )
 from optipmb_tools.extras import to_install
-from optipmb_tools.progress import FrameProgress
+from optipmb_tools.views.progress import FrameProgress
 
 if TYPE_CHECKING:
     from collections.abc import Sequence as Many
@@ -117,7 +117,7 @@ def sweep(
 def _source(opened: Data, profile: str | None, classes: list[str] | None) -> "tuple[str, Any, tuning.Source]":
     """Return the name of the profile, its parameters, and the data to measure."""
     from optipmb_tools import tuning  # noqa: PLC0415  loads the tracker and its compiler
-    from optipmb_tools.offline import profile_compared  # noqa: PLC0415  as above
+    from optipmb_tools.run.profiles import profile_compared  # noqa: PLC0415  as above
 
     name = profile or opened.dataset.profile
     parameters = profile_compared(name, opened.sequences)

@@ -10,7 +10,7 @@ from optipmb_tools.commands.options import AsJson, Out, report
 from optipmb_tools.commands.replay import complain
 from optipmb_tools.commands.service_options import Speed, speed_of
 from optipmb_tools.extras import needed
-from optipmb_tools.progress import FrameProgress
+from optipmb_tools.views.progress import FrameProgress
 
 START_S = 300.0  # the first start after an installation compiles
 PATIENCE_S = 20.0
@@ -34,9 +34,9 @@ def demo(
 
     from optipmb_tools.datasets import Preloaded, open_dataset  # noqa: PLC0415  packages of this command alone
     from optipmb_tools.evaluation import combine, default_rules, evaluate_files  # noqa: PLC0415  as above
-    from optipmb_tools.pictures import draw_results  # noqa: PLC0415  as above
-    from optipmb_tools.replay import Pace, Replaying, replay  # noqa: PLC0415  as above
-    from optipmb_tools.service_process import ServiceProcess  # noqa: PLC0415  as above
+    from optipmb_tools.run.replay import Pace, Replaying, replay  # noqa: PLC0415  as above
+    from optipmb_tools.run.service_process import ServiceProcess  # noqa: PLC0415  as above
+    from optipmb_tools.views.pictures import draw_results  # noqa: PLC0415  as above
 
     pace = speed_of(speed)
     with FrameProgress("replaying", frames) as progress:
@@ -79,7 +79,7 @@ def demo(
     if (found := replayed.latency) is not None:
         lines.append(f"latency   p50 {found.p50_ms:.1f} ms, p99 {found.p99_ms:.1f} ms, from publishing to receiving")
     lines.append(
-        f"tracks    {figures.objects} objects, MOTA {figures.mota:.3f}, {len(figures.switches)} id switches, "
+        f"tracks    {figures.objects} objects, MOTA {figures.mota:.3f}, {figures.switches} id switches, "
         f"precision {figures.precision:.3f}, recall {figures.recall:.3f}"
     )
     lines.append(f"files     {', '.join(str(file) for file in (replayed.file, picture) if file is not None)}")

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from optipmb_client.errors import UsageError
 
-from optipmb_tools import bulk
 from optipmb_tools.commands.options import (
     AsJson,
     Data,
@@ -20,6 +19,7 @@ from optipmb_tools.commands.options import (
     warn,
 )
 from optipmb_tools.extras import needed
+from optipmb_tools.run import bulk
 
 if TYPE_CHECKING:
     from rich.console import RenderableType

@@ -9,8 +9,8 @@ from optipmb_client.errors import UsageError
 
 from optipmb_tools.commands.options import AsJson, DatasetOptions, Profile, print_json, print_table, say
 from optipmb_tools.commands.service_options import ServiceOptions
-from optipmb_tools.load import Frames, Load, Run, draw_runs, find_limit, generated, recorded, run_load, table_of
-from optipmb_tools.progress import FrameProgress
+from optipmb_tools.run.load import Frames, Load, Run, draw_runs, find_limit, generated, recorded, run_load, table_of
+from optipmb_tools.views.progress import FrameProgress
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,25 +1,23 @@
 """Options that several commands share, and printing."""
 
-import contextlib
 import dataclasses
 import inspect
 import json
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from optipmb_client.errors import ClientError, UsageError
-from optipmb_schemas.installation import install_command
+from optipmb_client.errors import UsageError
 from rich.console import Console, Group, RenderableType
 from rich.table import Table
 
-from optipmb_tools.bulk import Executor, executor_for
 from optipmb_tools.datasets import DATASETS, DataSequence, Dataset, dataset_at, open_dataset
+from optipmb_tools.run.bulk import Executor, executor_for
 from optipmb_tools.table_files import SUFFIXES
 
 WORTH_PROCESSES = 3000  # frames from which further processes are faster than this one alone
@@ -265,15 +263,6 @@ def number_or_text(value: str) -> float | str:
     return int(number) if number.is_integer() else number
 
 
-@contextlib.contextmanager
-def mcap_needed() -> Iterator[None]:
-    """Raise the command that installs the packages for recordings where they are missing."""
-    try:
-        yield
-    except ImportError as error:
-        raise ClientError(f"recordings need mcap, which is not installed: {install_command('record')}") from error
-
-
 def plain_table(left: Sequence[str], right: Sequence[str] = (), *, title: str | None = None) -> Table:
     """Return a table without lines; the columns `right`, of numbers, are aligned to the right."""
     table = Table(title=title, title_justify="left", box=None, pad_edge=False)
@@ -287,7 +276,7 @@ def print_table(table: RenderableType) -> None:
 
     A table that is wider than the terminal is printed in parts, one below the other, each with the first columns.
     """
-    from optipmb_tools.terminal import parts  # noqa: PLC0415  most commands print no table
+    from optipmb_tools.views.terminal import parts  # noqa: PLC0415  most commands print no table
 
     console = Console()
     width = console.width if console.is_terminal or "COLUMNS" in os.environ else WIDE

@@ -13,7 +13,7 @@ from optipmb_tools.commands.options import AsJson, plain_table, print_json, prin
 from optipmb_tools.files import write_whole
 
 if TYPE_CHECKING:
-    from optipmb_tools.offline import FieldOfProfile
+    from optipmb_tools.run.profiles import FieldOfProfile
 
 
 def profiles(
@@ -31,25 +31,25 @@ def profiles(
 
     A profile of your own is checked by showing it: `optipmb profiles mine.toml`.
     """
-    from optipmb_tools import offline  # noqa: PLC0415  loads the tracker and its compiler
+    from optipmb_tools.run import profiles as library  # noqa: PLC0415  loads the tracker and its compiler
 
     if name is None:
         if copy is not None or explain:
-            raise UsageError("which profile? " + ", ".join(offline.profiles()))
+            raise UsageError("which profile? " + ", ".join(library.profiles()))
         _list(as_json=as_json)
         return
-    parameters = offline.read_profile(name)
+    parameters = library.read_profile(name)
     if copy is not None:
         if copy.exists():
             raise UsageError(f"--copy {copy}: it is there already")
-        write_whole(copy, [offline.profile_source(name)])
+        write_whole(copy, [library.profile_source(name)])
         say(f"{name} in {copy}; its name field is still {parameters.name!r}")
     elif as_json:
         print_json({"command": "profiles", "profile": parameters.model_dump()})
     elif explain:
-        print_table(Group(*(Text(_line(field)) for field in offline.fields_of(parameters))))
+        print_table(Group(*(Text(_line(field)) for field in library.fields_of(parameters))))
     else:
-        say(offline.profile_source(name).rstrip())
+        say(library.profile_source(name).rstrip())
 
 
 def _line(field: "FieldOfProfile") -> str:
@@ -58,9 +58,9 @@ def _line(field: "FieldOfProfile") -> str:
 
 
 def _list(*, as_json: bool) -> None:
-    from optipmb_tools import offline  # noqa: PLC0415  as above
+    from optipmb_tools.run import profiles as library  # noqa: PLC0415  as above
 
-    known = {one: offline.read_profile(one) for one in offline.profiles()}
+    known = {one: library.read_profile(one) for one in library.profiles()}
     if as_json:
         print_json({"command": "profiles", "profiles": {one: list(it.labels) for one, it in known.items()}})
         return
@@ -70,16 +70,16 @@ def _list(*, as_json: bool) -> None:
         column.no_wrap = False
     for one, it in known.items():
         table.add_row(one, f"{1.0 / it.nominal_period:g}", ", ".join(it.labels))
-    table.add_row(offline.AUTO, "any", "any: made for the data by track and tune")
+    table.add_row(library.AUTO, "any", "any: made for the data by track and tune")
     print_table(table)
 
 
 def warm_up(*, as_json: AsJson = False) -> None:
     """Compile the tracker into its cache, as the last step of an installation or of an image."""
-    from optipmb_tools import offline  # noqa: PLC0415  the help does not load the tracker
+    from optipmb_tools.run import profiles as library  # noqa: PLC0415  the help does not load the tracker
 
     begun = time.monotonic()
-    compiled = offline.warm_up()
+    compiled = library.warm_up()
     seconds = round(time.monotonic() - begun, 1)
     text = f"compiled {compiled} kernels in {seconds} s" if compiled else f"all kernels were compiled ({seconds} s)"
     report({"command": "warm-up", "compiled": compiled, "seconds": seconds}, text, as_json=as_json)

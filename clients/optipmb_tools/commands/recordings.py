@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from optipmb_client.errors import UsageError
 
-from optipmb_tools.commands.options import AsJson, Full, mcap_needed, print_json, report, say, warn
+from optipmb_tools.commands.options import AsJson, Full, print_json, report, say, warn
 from optipmb_tools.commands.service_options import PaceOptions, ServiceOptions
-from optipmb_tools.progress import FrameProgress, StatusLine
+from optipmb_tools.extras import needed
+from optipmb_tools.views.progress import FrameProgress, StatusLine
 
 if TYPE_CHECKING:
     from optipmb_tools.recordings.play import PlayedStream
@@ -41,9 +42,10 @@ def record(
     The file opens in Foxglove, which draws the tracks, and plays back with `optipmb play`. It is written out every
     second, so that a recording that is killed still opens.
     """
-    with mcap_needed():
-        from optipmb_tools.recordings.record import Wanted  # noqa: PLC0415  packages of an extra
-        from optipmb_tools.recordings.record import record as record_streams  # noqa: PLC0415  as above
+    needed("recordings", "record", "mcap", need="need")
+    from optipmb_tools.recordings.record import Wanted  # noqa: PLC0415  packages of an extra
+    from optipmb_tools.recordings.record import record as record_streams  # noqa: PLC0415  as above
+
     stop = threading.Event()
     if out.exists():
         raise UsageError(f"--out: expected a new file, there is {out} already")
@@ -114,10 +116,11 @@ def play(
     out the names of stream and session, and `delivery`. Ends with status 1 when tracks do not come back, or come back
     different.
     """
-    with mcap_needed():
-        from optipmb_tools.recordings.files import RecordingFile  # noqa: PLC0415  packages of an extra
-        from optipmb_tools.recordings.play import Playing, choose  # noqa: PLC0415  as above
-        from optipmb_tools.recordings.play import play as play_streams  # noqa: PLC0415  as above
+    needed("recordings", "record", "mcap", need="need")
+    from optipmb_tools.recordings.files import RecordingFile  # noqa: PLC0415  packages of an extra
+    from optipmb_tools.recordings.play import Playing, choose  # noqa: PLC0415  as above
+    from optipmb_tools.recordings.play import play as play_streams  # noqa: PLC0415  as above
+
     chosen_pace = pace.pace()
     recording = RecordingFile(file)
     plans = choose(recording, how.streams or ())

@@ -12,10 +12,10 @@ from optipmb_client.links import linked
 
 from optipmb_tools.commands.options import AsJson, Classes, DataOptions, Full, Out, Profile, report, warn
 from optipmb_tools.commands.service_options import PaceOptions, ServiceOptions
-from optipmb_tools.progress import FrameProgress
-from optipmb_tools.replay import ReplayedSequence, Replaying
-from optipmb_tools.replay import replay as replay_sequences
 from optipmb_tools.results.output import latency
+from optipmb_tools.run.replay import ReplayedSequence, Replaying
+from optipmb_tools.run.replay import replay as replay_sequences
+from optipmb_tools.views.progress import FrameProgress
 
 
 @dataclass(frozen=True, kw_only=True)

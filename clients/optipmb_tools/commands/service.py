@@ -25,7 +25,7 @@ from rich.live import Live
 from optipmb_tools.commands.options import AsJson, Origin, print_json, print_table, report
 from optipmb_tools.commands.service_options import ServiceOptions
 from optipmb_tools.table_files import SUFFIXES, write_table
-from optipmb_tools.terminal import StatusView, status_tables
+from optipmb_tools.views.terminal import StatusView, status_tables
 
 SECOND = 1_000_000_000
 STREAM = typer.Argument(help="Name of the stream, site/node/sensor.")

@@ -8,7 +8,7 @@ import typer
 from optipmb_client.zenoh import DEFAULT_ENDPOINT, Connection
 from optipmb_schemas import PREFIX
 
-from optipmb_tools.replay import Pace
+from optipmb_tools.run.replay import Pace
 
 Speed = Annotated[
     str, typer.Option("--speed", help="1: as recorded, 10: ten times as fast, max: as fast as tracks come back.")

@@ -25,11 +25,11 @@ from optipmb_tools.commands.options import (
     say,
     warn,
 )
-from optipmb_tools.progress import FrameProgress
 from optipmb_tools.table_files import is_table
+from optipmb_tools.views.progress import FrameProgress
 
 if TYPE_CHECKING:
-    from optipmb_tools.tracking import TrackedSequence
+    from optipmb_tools.run.tracking import TrackedSequence
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +95,7 @@ def track(
     if dump is not None:
         _replay_dump(dump, trace=trace, as_json=as_json)
         return
-    from optipmb_tools import offline, tracking  # noqa: PLC0415  loads the tracker and its compiler
+    from optipmb_tools.run import profiles, tracking  # noqa: PLC0415  loads the tracker and its compiler
 
     more: dict[str, float | str] = {name: 1 for name in ("keep_input", "fuse") if getattr(how, name)}
     if how.origin is not None:
@@ -106,10 +106,10 @@ def track(
     how.check_out(opened)
     chosen = opened.sequences
     name = how.profile or opened.dataset.profile
-    parameters = offline.profile_for(name, chosen)
-    for doubt in offline.doubts(parameters, chosen):
+    parameters = profiles.profile_for(name, chosen)
+    for doubt in profiles.doubts(parameters, chosen):
         warn(doubt)
-    if name == offline.AUTO:
+    if name == profiles.AUTO:
         warn(f"profile auto: {parameters.provenance}")
     results = []
     failed = None
@@ -169,7 +169,7 @@ def _complain(results: "list[TrackedSequence]", profile: str) -> None:
 
 
 def _replay_dump(file: Path, *, trace: bool, as_json: bool) -> None:
-    from optipmb_tools import dumps  # noqa: PLC0415  loads the tracker and its compiler
+    from optipmb_tools.run import dumps  # noqa: PLC0415  loads the tracker and its compiler
 
     result = dumps.replay(dumps.read(file))
     if as_json:

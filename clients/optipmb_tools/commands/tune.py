@@ -97,7 +97,7 @@ def tune(
     A second call with the same --out continues where the first one ended.
     """
     from optipmb_tools import tuning  # noqa: PLC0415  loads the tracker and its compiler
-    from optipmb_tools.offline import profile_compared  # noqa: PLC0415  as above
+    from optipmb_tools.run.profiles import profile_compared  # noqa: PLC0415  as above
 
     reference, out = estimation.reference, into.out
     if not estimation.estimate_only:

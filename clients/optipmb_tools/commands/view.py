@@ -13,7 +13,7 @@ import typer
 from optipmb_client.errors import UsageError
 from optipmb_schemas import Density, Detections, Keys, Message, MessageError, Points, Problem, Topic, Tracks, decode
 
-from optipmb_tools.commands.options import AsJson, LabelledOptions, mcap_needed, report, say
+from optipmb_tools.commands.options import AsJson, LabelledOptions, report, say
 from optipmb_tools.commands.service_options import ServiceOptions, speed_of
 from optipmb_tools.extras import needed
 
@@ -109,7 +109,7 @@ def _stay(ends: float | None) -> None:
 
 
 def _in_foxglove(messages: Iterable[Message], viewer: ViewerOptions, ends: float | None) -> None:
-    from optipmb_tools.foxglove_view import FoxgloveServer  # noqa: PLC0415  an extra of the installation
+    from optipmb_tools.views.foxglove import FoxgloveServer  # noqa: PLC0415  an extra of the installation
 
     with FoxgloveServer(viewer.host, viewer.foxglove_port) as server:
         say(f"open {server.address} in Foxglove (Open connection, Foxglove WebSocket)")
@@ -121,7 +121,7 @@ def _in_foxglove(messages: Iterable[Message], viewer: ViewerOptions, ends: float
 def _in_rerun(messages: Iterable[Message], followed: str | None, viewer: ViewerOptions, ends: float | None) -> None:
     import rerun as rr  # noqa: PLC0415  an extra of the installation
 
-    from optipmb_tools.viewer import View  # noqa: PLC0415  as above
+    from optipmb_tools.views.viewer import View  # noqa: PLC0415  as above
 
     recording = rr.RecordingStream("optipmb")
     if viewer.web:
@@ -148,7 +148,8 @@ def _in_rerun(messages: Iterable[Message], followed: str | None, viewer: ViewerO
 def _live(service: ServiceOptions, timeout: float, shown: ShownOptions) -> Iterator[Message | None]:
     """Yield messages as they come; None now and then while there are none."""
     from optipmb_client.incoming import Inbox  # noqa: PLC0415  of a running service
-    from optipmb_client.queries import DensityQueries  # noqa: PLC0415  as above
+
+    from optipmb_tools.views.density_queries import DensityQueries  # noqa: PLC0415  as above
 
     keys = Keys(service.prefix)
     topics = [topic for topic in TOPICS if shown.points or topic != "points"]
@@ -169,8 +170,9 @@ def _live(service: ServiceOptions, timeout: float, shown: ShownOptions) -> Itera
 
 def _recorded(file: Path, speed: float | None, shown: ShownOptions) -> Iterator[Message | None]:
     """Yield the messages of a recording, at its pace."""
-    with mcap_needed():
-        from optipmb_tools.recordings.files import RecordingFile  # noqa: PLC0415  packages of an extra
+    needed("recordings", "record", "mcap", need="need")
+    from optipmb_tools.recordings.files import RecordingFile  # noqa: PLC0415  packages of an extra
+
     zero: float | None = None
     for one in RecordingFile(file):
         if (shown.streams and one.stream not in shown.streams) or (one.topic == "points" and not shown.points):
@@ -206,7 +208,7 @@ def plot(
 ) -> None:
     """Draw the tracks of one sequence from above, with what was missed and confused where the truth is known."""
     from optipmb_tools.evaluation import default_rules, evaluate_files  # noqa: PLC0415  loads the solvers of scipy
-    from optipmb_tools.pictures import draw_results  # noqa: PLC0415  as above
+    from optipmb_tools.views.pictures import draw_results  # noqa: PLC0415  as above
 
     if out.suffix == ".gif" and len(tracks) > 1:
         raise UsageError(f"--out {out}: a moving picture shows one --tracks, received {len(tracks)}; name a PNG file")

@@ -1,12 +1,7 @@
 """Data sets: detections, poses, clouds and truth, read or generated, behind one interface."""
 
-import contextlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeAlias
-
-from optipmb_client.errors import ClientError
-from optipmb_schemas.installation import install_command
 
 from optipmb_tools.datasets.interface import (
     Cloud,
@@ -19,6 +14,7 @@ from optipmb_tools.datasets.interface import (
     Truth,
     selected_frames,
 )
+from optipmb_tools.extras import needed
 from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Pose
 from optipmb_tools.table_files import tables_in
@@ -115,8 +111,8 @@ def _nuscenes(root: Path, detections: str | Path | None, options: _Options) -> D
 
 
 def _mcap(root: Path, _: str | Path | None, options: _Options) -> Dataset:
-    with _needed("recordings need mcap", "record"):
-        from optipmb_tools.datasets.mcap import RecordedDataset  # noqa: PLC0415  of one format
+    needed("recordings", "record", "mcap", need="need")
+    from optipmb_tools.datasets.mcap import RecordedDataset  # noqa: PLC0415  of one format
 
     _check(options)
     return RecordedDataset(root)
@@ -129,8 +125,8 @@ def _table(root: Path, _: str | Path | None, options: _Options) -> Dataset:
 
 
 def _rosbag(root: Path, _: str | Path | None, options: _Options) -> Dataset:
-    with _needed("bags need rosbags", "ros2"):
-        from optipmb_tools.datasets.rosbag import RosbagDataset  # noqa: PLC0415  of one format
+    needed("bags", "ros2", "rosbags", need="need")
+    from optipmb_tools.datasets.rosbag import RosbagDataset  # noqa: PLC0415  of one format
 
     return RosbagDataset(root, options)
 
@@ -147,14 +143,6 @@ def _scene(_root: Path, _: str | Path | None, options: _Options) -> Dataset:
 
 
 _OPEN = {"kitti": _kitti, "nuscenes": _nuscenes, "scene": _scene, "mcap": _mcap, "rosbag": _rosbag, "table": _table}
-
-
-@contextlib.contextmanager
-def _needed(what: str, extra: str) -> Iterator[None]:
-    try:
-        yield
-    except ImportError as error:
-        raise ClientError(f"{what}, which is not installed: {install_command(extra)}") from error
 
 
 def _check(options: _Options, *known: str) -> None:

@@ -1,7 +1,7 @@
 """Sensors that share one density: the sequences of a recording as one, their frames in the order of the service.
 
-That order is by stamp, equal stamps by the name of the sensor. So the tracks are those of a service with the setting
-`fuse` for the same frames.
+That order is by stamp, equal stamps by the name of the sensor. A service with the setting
+`fuse` gives the same tracks for the same frames.
 """
 
 import heapq

@@ -18,7 +18,7 @@ from optipmb_schemas import FieldOfView, Tracks
 from optipmb_tools.class_names import class_like
 from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Bools, Floats, Ints, Pose
-from optipmb_tools.results.rows import BoxTable
+from optipmb_tools.results import BoxTable
 
 if TYPE_CHECKING:
     from optipmb_tools.georeference import Georeference

@@ -4,11 +4,11 @@ Conventions: the sensor frame of detections is the rectified camera frame with i
 `optipmb_tools.camera`); the world is the same for the camera of frame 0. Clouds are in the velodyne frame. Frames are
 0.1 s apart. Truth boxes are ignored when largely invisible or cut by the image's border, as AB3DMOT's protocol has it.
 
-Layout, below a root that holds `training` or `testing`, or is itself such a folder: `calib/SSSS.txt`,
-`poses/SSSS.txt` or `oxts/SSSS.txt`, and, where there are any, `label_02/SSSS.txt` and `velodyne/SSSS/FFFFFF.bin`.
-Detections are `detections/DETECTOR/CLASS/SSSS.txt`, in the root or beside it; those of `testing` are in it where there
-is `training` too, for sequences have the same names in both. Only tracking needs them: truth, poses and clouds can be
-read of a root with several detectors of which none is named, and of one with none.
+Layout, below a root that holds `training` or `testing`, or is itself such a folder: `calib/SSSS.txt`, `poses/SSSS.txt`
+or `oxts/SSSS.txt`, and, where there are any, `label_02/SSSS.txt` and `velodyne/SSSS/FFFFFF.bin`. Detections are
+`detections/DETECTOR/CLASS/SSSS.txt`, in the root or its parent. Where there is `training` too, the detections of
+`testing` are in its folder, for sequences have the same names in both. Only tracking needs them: truth, poses and
+clouds can be read of a root with several detectors of which none is named, and of one with none.
 """
 
 import re
@@ -83,60 +83,20 @@ class BoxFile:
     occlusion: Ints
 
 
-@dataclass(frozen=True)
-class Layout:
-    """Places of the files of a KITTI root."""
-
-    root: Path
-    base: Path
-    detector: Path | None  # folder with one folder per class; None where no detector is named and there is not just one
-    clouds: bool  # clouds are wanted
-    still: bool = False  # the sensor is taken to stand still; no poses are read
-
-    @cached_property
-    def probability(self) -> bool:
-        """Whether the scores of the detector are probabilities already, not logits: all lie in (0, 1]."""
-        for path in sorted(self.need_detector().glob("*/*.txt")):
-            for _, fields in read_rows(path, "a detection file", ","):
-                try:
-                    if not 0.0 < float(fields[6]) <= 1.0:
-                        return False
-                except (IndexError, ValueError):
-                    continue  # the reader of the file names the place when the file is used
-        return True
-
-    def need_detector(self) -> Path:
-        """Return the folder of the detector, which only tracking needs."""
-        if self.detector is None:
-            names = ", ".join(sorted(path.name for path in _detectors(self.root, self.base)))
-            received = f"several: {names}" if names else "none"
-            raise DatasetError(self.root, "the name of a detector, or just one in detections/", received)
-        return self.detector
-
-    def text(self, kind: str, sequence: str) -> Path:
-        """Return the path of one of the text files of a sequence."""
-        return self.base / kind / f"{sequence}.txt"
-
-    def present(self) -> list[str]:
-        """Return the sequences that have a calibration and, if a detector is named, detections."""
-        calibrated = {path.stem for path in (self.base / "calib").glob("*.txt")}
-        detected = None if self.detector is None else {path.stem for path in self.detector.glob("*/*.txt")}
-        return sorted(calibrated if detected is None else calibrated & detected)
-
-
 class KittiSequence(DataSequence):
     """One sequence; files are read on first use, and once."""
 
-    def __init__(self, name: str, layout: Layout) -> None:
+    def __init__(self, name: str, dataset: "KittiDataset") -> None:
         self.name = name
-        self._layout = layout
-        folders = [path.parent for path in sorted(layout.detector.glob(f"*/{name}.txt"))] if layout.detector else []
+        self._dataset = dataset
+        detector = dataset.detector
+        folders = [path.parent for path in sorted(detector.glob(f"*/{name}.txt"))] if detector else []
         self._folders = {_OFFICIAL.get(folder.name.lower(), folder.name): folder for folder in folders}
-        self.labels: tuple[str, ...] = tuple(self._folders) if layout.detector else _CLASSES
+        self.labels: tuple[str, ...] = tuple(self._folders) if detector else _CLASSES
         if len(self._folders) < len(folders):
-            raise DatasetError(layout.detector or "", "one folder of a class", "several that differ in case")
+            raise DatasetError(detector or "", "one folder of a class", "several that differ in case")
         if not self.labels:
-            raise DatasetError(f"{layout.detector}/CLASS/{name}.txt", "detections of at least one class", "none")
+            raise DatasetError(f"{detector}/CLASS/{name}.txt", "detections of at least one class", "none")
 
     def __len__(self) -> int:
         return len(self._world_from_camera)
@@ -144,19 +104,19 @@ class KittiSequence(DataSequence):
     @cached_property
     def calibration(self) -> Calibration:
         """Calibration of the recording."""
-        return read_calibration(self._layout.text("calib", self.name))
+        return read_calibration(self._dataset.text("calib", self.name))
 
     @property
     def camera(self) -> Camera:
-        """Camera 2, in whose images the benchmark counts; its image size is that of most sequences."""
+        """Camera 2, in whose images the benchmark counts; its image size is the one of most sequences."""
         return Camera(self.calibration.projection)
 
     @cached_property
     def _world_from_camera(self) -> Floats:
         """(F, 4, 4) in camera axes."""
-        if self._layout.still:
+        if self._dataset.still:
             return np.tile(np.eye(4), (self._last_frame() + 1, 1, 1))
-        poses, oxts = self._layout.text("poses", self.name), self._layout.text("oxts", self.name)
+        poses, oxts = self._dataset.text("poses", self.name), self._dataset.text("oxts", self.name)
         if poses.exists():
             return read_poses(poses)
         if oxts.exists():
@@ -166,10 +126,10 @@ class KittiSequence(DataSequence):
 
     def _last_frame(self) -> int:
         """Return the last frame that detections, labels, scans or images have; -1 without any."""
-        images = (self._layout.base / "image_02" / self.name).glob("*.*")
+        images = (self._dataset.base / "image_02" / self.name).glob("*.*")
         frames = [*self._scans, *(int(path.stem) for path in images if path.stem.isdigit())]
         files = [(folder / f"{self.name}.txt", ",") for folder in self._folders.values()]
-        for path, separator in (*files, (self._layout.text("label_02", self.name), None)):
+        for path, separator in (*files, (self._dataset.text("label_02", self.name), None)):
             rows = read_rows(path, "frames", separator) if path.is_file() else []
             frames += [int(fields[0]) for _, fields in rows if fields[0].strip().isdigit()]
         return max(frames, default=-1)
@@ -186,9 +146,9 @@ class KittiSequence(DataSequence):
 
     @cached_property
     def _scans(self) -> dict[int, Path]:
-        if not self._layout.clouds:
+        if not self._dataset.clouds:
             return {}
-        folder = self._layout.base / "velodyne" / self.name
+        folder = self._dataset.base / "velodyne" / self.name
         return {int(path.stem): path for path in folder.glob("*.bin") if path.stem.isdigit()}
 
     @cached_property
@@ -198,7 +158,7 @@ class KittiSequence(DataSequence):
 
     def frames(self) -> Iterator[DetectionFrame]:
         """Yield every frame in order, also those without detections."""
-        self._layout.need_detector()
+        self._dataset.need_detector()
         count = len(self)
         files = [
             read_detections(folder / f"{self.name}.txt", count, _TYPE_CODES.get(label))
@@ -211,7 +171,7 @@ class KittiSequence(DataSequence):
         )
         order = np.argsort(frame, kind="stable")
         center, size, yaw = sensor_from_kitti(bottom, hwl, rotation_y)
-        if not self._layout.probability:
+        if not self._dataset.probability:
             # tanh does not overflow; the floor keeps hopeless scores inside (0, 1].
             score = np.maximum(0.5 * (1.0 + np.tanh(0.5 * score)), 1e-12)
         bounds = np.searchsorted(frame[order], np.arange(count + 1))
@@ -229,7 +189,7 @@ class KittiSequence(DataSequence):
 
     def truth(self) -> Truth | None:
         """Return the annotations in the world frame; None where the sequence has no label file."""
-        path = self._layout.text("label_02", self.name)
+        path = self._dataset.text("label_02", self.name)
         if not path.exists():
             return None
         file = read_labels(path, len(self))
@@ -281,7 +241,10 @@ class KittiDataset(Dataset):
             raise DatasetError(root, f"a KITTI tracking root (with {expected})", received)
         if poses not in {None, "none"}:
             raise DatasetError("option poses", "none: the sensor is taken to stand still", repr(poses))
-        self._layout = Layout(root, base, _find_detector(root, base, detections), clouds, poses == "none")
+        self.root, self.base = root, base
+        self.detector = _find_detector(root, base, detections)  # None where none is named and there is not just one
+        self.clouds = clouds
+        self.still = poses == "none"  # the sensor is taken to stand still; no poses are read
         self._submitted = None if submission is None else _thresholds(submission)
         self.notes: list[str] = (
             ["poses=none: the sensor is taken to stand still, and tracks are in its frame"] if poses else []
@@ -289,33 +252,63 @@ class KittiDataset(Dataset):
         if self._submitted is not None:
             least = ", ".join(f"{name} {score:g}" for name, score in self._submitted.items())
             self.notes.append(f"submission: confirmed tracks from these mean scores on, in the image: {least}")
-            if missing := sorted({path.stem for path in (base / "calib").glob("*.txt")} - set(self._layout.present())):
+            if missing := sorted({path.stem for path in (base / "calib").glob("*.txt")} - set(self.present())):
                 self.notes.append(f"submission: no detections, so no file, of {' '.join(missing)}")
+
+    @cached_property
+    def probability(self) -> bool:
+        """Whether the scores of the detector are probabilities already, not logits: all lie in (0, 1]."""
+        for path in sorted(self.need_detector().glob("*/*.txt")):
+            for _, fields in read_rows(path, "a detection file", ","):
+                try:
+                    if not 0.0 < float(fields[6]) <= 1.0:
+                        return False
+                except (IndexError, ValueError):
+                    continue  # the reader of the file names the place when the file is used
+        return True
+
+    def need_detector(self) -> Path:
+        """Return the folder of the detector, which only tracking needs."""
+        if self.detector is None:
+            names = ", ".join(sorted(path.name for path in _detectors(self.root, self.base)))
+            received = f"several: {names}" if names else "none"
+            raise DatasetError(self.root, "the name of a detector, or just one in detections/", received)
+        return self.detector
+
+    def text(self, kind: str, sequence: str) -> Path:
+        """Return the path of one of the text files of a sequence."""
+        return self.base / kind / f"{sequence}.txt"
+
+    def present(self) -> list[str]:
+        """Return the sequences that have a calibration and, if a detector is named, detections."""
+        calibrated = {path.stem for path in (self.base / "calib").glob("*.txt")}
+        detected = None if self.detector is None else {path.stem for path in self.detector.glob("*/*.txt")}
+        return sorted(calibrated if detected is None else calibrated & detected)
 
     def sequences(self, names: Sequence[str]) -> list[KittiSequence]:
         """Return the sequences of these names; `train` and `val` are the splits.
 
-        `all` are those that the detector has, or all where none is chosen.
+        `all` are the sequences that the detector has, or all where none is chosen.
 
         Raises:
             DatasetError: A named sequence is not there, or none is.
         """
-        layout, present = self._layout, self._layout.present()
+        present = self.present()
         wanted: list[str] = []
         for name in names:
             wanted += present if name == "all" else SPLITS.get(name, (name,))
         missing = sorted(set(wanted) - set(present))
         if missing:
-            needed = "calib" if layout.detector is None else f"calib and detections ({layout.detector})"
+            needed = "calib" if self.detector is None else f"calib and detections ({self.detector})"
             received = f"none for {' '.join(missing)}; there are {' '.join(present) or 'none'}"
-            raise DatasetError(layout.base, f"{needed} of the sequences asked for", received)
+            raise DatasetError(self.base, f"{needed} of the sequences asked for", received)
         if not wanted:
-            raise DatasetError(layout.base, "at least one sequence", "none")
-        return [KittiSequence(name, layout) for name in dict.fromkeys(wanted)]
+            raise DatasetError(self.base, "at least one sequence", "none")
+        return [KittiSequence(name, self) for name in dict.fromkeys(wanted)]
 
     def write(self, out: Path, sequence: DataSequence, tracks: Mapping[int, Tracks]) -> Path:
         """Write `out/SSSS.txt`."""
-        one = KittiSequence(sequence.name, self._layout)
+        one = KittiSequence(sequence.name, self)
         return write_kitti_results(out / f"{one.name}.txt", one.camera, sequence.poses, tracks, self._submitted)
 
 

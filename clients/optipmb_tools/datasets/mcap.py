@@ -2,8 +2,8 @@
 
 Of a folder of recordings the name of the file comes first: `monday.garage.robot-1.lidar` is in `monday.mcap`.
 
-The frames are those that the service would track from the recording: each once, with the clouds that took part.
- Frames must be in the order of their stamps here; a recording in which they are not needs a service that is there
+The frames are the ones that the service would track from the recording: each once, with the clouds that took part.
+Frames must be in the order of their stamps here; a recording in which they are not needs a service that is there
 when they come late (`optipmb play`). There is no truth.
 """
 
@@ -88,7 +88,7 @@ class RecordedDataset(Dataset):
     """The streams of one recording, or of all recordings of a folder.
 
     Args:
-        path: The MCAP file, or the folder: then the name of a stream follows that of its file, with a dot.
+        path: The MCAP file, or the folder: then the names of streams begin with the name of their file and a dot.
 
     Raises:
         DatasetError: There is none, or it cannot be read.

@@ -1,16 +1,17 @@
 """nuScenes: the official tables, detections in the official submission layout, LiDAR scans where they are present.
 
 Conventions: the world is the global frame of the dataset. Detections are given in it, so the pose of their frames is
-the identity; `poses` of a sequence, and the pose of every cloud, are those of the LiDAR (LIDAR_TOP). Sequences are
-scenes, frames are keyframes (samples, 2 Hz), stamps are those of the samples. Only the seven classes of the tracking
+the identity; `poses` of a sequence, and the pose of every cloud, are poses of the LiDAR (LIDAR_TOP). Sequences are
+scenes, frames are keyframes (samples, 2 Hz) with the stamps of the samples. Only the seven classes of the tracking
 benchmark are kept.
 
 Layout, below the root: the tables in `v1.0-trainval`, `v1.0-mini` or `v1.0-test` (the root may also be that folder
-itself), scans in `samples/LIDAR_TOP`, detections in `detections/NAME.json`, splits of one's own in `splits.json` beside
-the tables: a map from the name of a split to a list of scene names, as the official tools read it.
+itself), scans in `samples/LIDAR_TOP`, detections in `detections/NAME.json`, splits of one's own in `splits.json` in the
+folder of the tables: a map from the name of a split to a list of scene names, as the official tools read it.
 
-The height of a detection is that of the box's centre, as the layout says. Some public detection files have that of its
-bottom instead: they say so by `"z_origin": "bottom"` in their `meta`, or the caller does by the option `z_bottom`.
+The height of a detection is the height of the box's centre, as the layout says. Some public detection files have the
+height of its bottom instead: they say so by `"z_origin": "bottom"` in their `meta`, or the caller does by the option
+`z_bottom`.
 """
 
 import json
@@ -90,61 +91,26 @@ _OCCLUSION = np.array([3, 2, 1, 1, 0])  # KITTI's level for each level of visibi
 _LEAST_SCORE = 1e-12
 
 
-class _Source:
-    """Files of a data set, shared by its sequences; each is read on first use, and once."""
-
-    def __init__(self, folder: Path, detections: Path | None, *, clouds: bool, z_bottom: bool | None) -> None:
-        self.root = folder.parent
-        self.tables = NuScenesTables(folder)
-        self.clouds = clouds
-        self._detections = detections
-        self._z_bottom = z_bottom
-
-    @cached_property
-    def submission(self) -> Submission | None:
-        """The detections; None where no detector is named and there is not just one."""
-        return None if self._detections is None else read_submission(self._detections, "detection")
-
-    def need_submission(self) -> Submission:
-        """Return the detections, which only tracking needs."""
-        if self.submission is None:
-            names = ", ".join(path.stem for path in _detectors(self.root))
-            received = f"several: {names}" if names else "none"
-            raise DatasetError(self.root, "the name of a detector, or just one in detections/", received)
-        return self.submission
-
-    @cached_property
-    def z_bottom(self) -> bool:
-        """Whether the height of a detection is that of the bottom of its box."""
-        if self._z_bottom is not None:
-            return self._z_bottom
-        submission = self.need_submission()
-        origin = submission.meta.get("z_origin", "center")
-        if origin not in ("center", "bottom"):
-            raise DatasetError(submission.path, 'meta.z_origin "center" or "bottom"', repr(origin))
-        return bool(origin == "bottom")
-
-
 class NuScenesSequence(DataSequence):
     """One scene."""
 
     labels = NUSCENES_CLASSES
 
-    def __init__(self, samples: SceneSamples, source: _Source) -> None:
+    def __init__(self, samples: SceneSamples, dataset: "NuScenesDataset") -> None:
         self.name = samples.name
         self.samples = samples.tokens  # one per frame
         self.stamp_us = samples.stamp_us  # (F,)
-        self._source = source
+        self._dataset = dataset
 
     def __len__(self) -> int:
         return len(self.samples)
 
     @cached_property
     def _keyframes(self) -> tuple[Keyframe, ...]:
-        keyframes = self._source.tables.keyframes
+        keyframes = self._dataset.tables.keyframes
         for token in self.samples:
             if token not in keyframes:
-                path = self._source.tables.folder / "sample_data.json"
+                path = self._dataset.tables.folder / "sample_data.json"
                 raise DatasetError(path, f"a LIDAR_TOP keyframe of sample {token}", "none")
         return tuple(keyframes[token] for token in self.samples)
 
@@ -160,9 +126,9 @@ class NuScenesSequence(DataSequence):
 
     @cached_property
     def _scans(self) -> tuple[Path | None, ...]:
-        if not self._source.clouds:
+        if not self._dataset.clouds:
             return (None,) * len(self)
-        paths = (self._source.root / keyframe.filename for keyframe in self._keyframes)
+        paths = (self._dataset.root / keyframe.filename for keyframe in self._keyframes)
         return tuple(path if path.is_file() else None for path in paths)
 
     @cached_property
@@ -176,13 +142,13 @@ class NuScenesSequence(DataSequence):
         Raises:
             DatasetError: The file of detections lacks a sample, or a score is not in [0, 1].
         """
-        submission = self._source.need_submission()
+        submission = self._dataset.need_submission()
         for index, token in enumerate(self.samples):
             boxes = submission.boxes(token)
             if len(boxes) and not (boxes.score.min() >= 0.0 and boxes.score.max() <= 1.0):
                 raise DatasetError(submission.path, f"scores from 0 to 1 in results.{token}", "others")
             center = boxes.center.copy()
-            if self._source.z_bottom:
+            if self._dataset.z_bottom:
                 center[:, 2] += 0.5 * boxes.size[:, 2]
             yield DetectionFrame(
                 index=index,
@@ -203,8 +169,8 @@ class NuScenesSequence(DataSequence):
         return None if path is None else Cloud(partial(read_sweep, path), *self._keyframes[index].lidar)
 
     def annotations(self) -> Annotations:
-        """Return all annotations of the scene, whatever their category."""
-        return self._source.tables.annotations(self.name)
+        """Return the annotations of the scene, of all categories."""
+        return self._dataset.tables.annotations(self.name)
 
     def ego_distance(self, frame: Ints, center: Floats) -> Floats:
         """Return the distances (R,) in the plane of boxes (R, 3) from the car in their frames (R,)."""
@@ -256,7 +222,7 @@ def read_sweep(path: Path) -> Points:
 
 
 class NuScenesDataset(Dataset):
-    """A nuScenes root together with one detector's results."""
+    """A nuScenes root together with one detector's results; each file is read on first use, and once."""
 
     name = "nuscenes"
     profile = "nuscenes-megvii"
@@ -271,27 +237,49 @@ class NuScenesDataset(Dataset):
         submission: bool = False,
     ) -> None:
         folder = _find_tables(root)
-        detections = _find_detector(folder.parent, detections)
-        self._source = _Source(folder, detections, clouds=clouds, z_bottom=z_bottom)
+        self.root = folder.parent
+        self.tables = NuScenesTables(folder)
+        self.clouds = clouds
+        self._detections = _find_detector(self.root, detections)
+        self._z_bottom = z_bottom
         self._submission = submission
+
+    @cached_property
+    def submission(self) -> Submission | None:
+        """The detections; None where no detector is named and there is not just one."""
+        return None if self._detections is None else read_submission(self._detections, "detection")
+
+    def need_submission(self) -> Submission:
+        """Return the detections, which only tracking needs."""
+        if self.submission is None:
+            names = ", ".join(path.stem for path in _detectors(self.root))
+            received = f"several: {names}" if names else "none"
+            raise DatasetError(self.root, "the name of a detector, or just one in detections/", received)
+        return self.submission
+
+    @cached_property
+    def z_bottom(self) -> bool:
+        """Whether the height of a detection means the bottom of its box."""
+        if self._z_bottom is not None:
+            return self._z_bottom
+        submission = self.need_submission()
+        origin = submission.meta.get("z_origin", "center")
+        if origin not in ("center", "bottom"):
+            raise DatasetError(submission.path, 'meta.z_origin "center" or "bottom"', repr(origin))
+        return bool(origin == "bottom")
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
         """Assumptions about the detections, and the content of a submission."""
-        found = () if self._source.submission is None else self._source.submission.notes
+        found = () if self.submission is None else self.submission.notes
         all_written = "submission: all tracks are written, whatever their score, as AMOTA is over all scores"
         return (*found, *((all_written,) if self._submission else ()))
 
-    @property
-    def tables(self) -> NuScenesTables:
-        """The tables."""
-        return self._source.tables
-
     def sequences(self, names: Sequence[str]) -> list[NuScenesSequence]:
-        """Return the scenes of these names, of official splits, and of those in `splits.json` beside the tables.
+        """Return the scenes of these names, of official splits, and of the splits in `splits.json`.
 
-        `all` are those that the tables have, and the detections if any are given. Of a split, those that the tables
-        have are taken.
+        `all` are the scenes that the tables have, and the detections if any are given. Scenes of a split that the
+        tables lack are left out.
 
         Raises:
             DatasetError: a named scene is not there, or none is.
@@ -313,7 +301,7 @@ class NuScenesDataset(Dataset):
                 raise DatasetError(self.tables.folder, f"a scene or a split ({known}{more})", repr(name))
         if not wanted:
             raise DatasetError(self.tables.folder, f"scenes of {' '.join(names) or 'some name'}", "none")
-        return [NuScenesSequence(scenes[name], self._source) for name in dict.fromkeys(wanted)]
+        return [NuScenesSequence(scenes[name], self) for name in dict.fromkeys(wanted)]
 
     def write(self, out: Path, sequence: DataSequence, tracks: Mapping[int, Tracks]) -> Path:
         """Write `out/scenes/NAME.json`."""
@@ -325,14 +313,13 @@ class NuScenesDataset(Dataset):
 
     @property
     def _meta(self) -> Mapping[str, Any]:
-        return {} if self._source.submission is None else self._source.submission.meta
+        return {} if self.submission is None else self.submission.meta
 
     def _detected(self) -> list[str]:
-        submission = self._source.submission
         return [
             scene.name
             for scene in self.tables.scenes.values()
-            if submission is None or any(token in submission.rows for token in scene.tokens)
+            if self.submission is None or any(token in self.submission.rows for token in scene.tokens)
         ]
 
 

@@ -1,13 +1,13 @@
 """Bags of ROS 2 as a data set: each topic of detections is a sequence, `/lidar/boxes` is called `lidar.boxes`.
 
 A frame is a message of detections, at the stamp of its header. Its cloud is the one with the same stamp. Its pose is
-that of its frame in the fixed frame, from tf and, for frames that have no parent there, from odometry. Tracks are in
-the fixed frame. There is no truth. What a bag leaves open is chosen by options: `points`, `odometry`, `fixed_frame`,
+the pose of its frame in the fixed frame, from tf and, for frames that have no parent there, from odometry. Tracks are
+in the fixed frame. There is no truth. What a bag leaves open is chosen by options: `points`, `odometry`, `fixed_frame`,
 and `class.NAME=OTHER` for names of classes.
 
 Tracks can be written as a bag: one MCAP file with objects, detections with ids, and markers, as all of ROS 2 reads
-them. Topics stand below that of the detections: `…/tracks` and, below it, `detections`, `markers`, `predicted`. A
-message is received, as far as the bag is concerned, when its detections were.
+them. Their topics begin with the topic of the detections: `…/tracks` and, below it, `detections`, `markers`,
+`predicted`. A message is received, as far as the bag is concerned, when its detections were.
 """
 
 import contextlib

@@ -1,7 +1,17 @@
 """Evaluation: tracks against the truth."""
 
 from optipmb_tools.evaluation.cases import Case, Rules, default_rules, prepare
-from optipmb_tools.evaluation.clear import ClearResult, Miss, Sweep, Switch, clear, combine, evaluate_clear, sweep
+from optipmb_tools.evaluation.clear import (
+    ClearResult,
+    Counts,
+    Miss,
+    Sweep,
+    Switch,
+    clear,
+    combine,
+    evaluate_clear,
+    sweep,
+)
 from optipmb_tools.evaluation.evaluate import ClassResult, evaluate_files
 from optipmb_tools.evaluation.overlap import iou_3d, iou_bev
 
@@ -9,6 +19,7 @@ __all__ = [
     "Case",
     "ClassResult",
     "ClearResult",
+    "Counts",
     "Miss",
     "Rules",
     "Sweep",

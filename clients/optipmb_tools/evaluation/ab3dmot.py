@@ -33,7 +33,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from optipmb_tools.evaluation.cases import Case, by_frame, most_pairs, uncontested
-from optipmb_tools.evaluation.figures import defined
+from optipmb_tools.evaluation.clear import Counts
+from optipmb_tools.evaluation.figures import defined, ratio
 from optipmb_tools.geometry import Floats, Ints
 
 IOU_LIMITS = (0.25, 0.5, 0.7)
@@ -46,49 +47,6 @@ _HARDLY = 0.2
 
 
 @dataclass(frozen=True)
-class Counts:
-    """Counts of the tracks from some score on; those of several sequences add up."""
-
-    truth: int = 0
-    """Truth boxes that count (GT)."""
-    true: int = 0
-    """Matched boxes, also those of truth that does not count (TP)."""
-    false: int = 0
-    missed: int = 0
-    switches: int = 0
-    fragments: int = 0
-    objects: int = 0
-    """Truth objects that count in some frame."""
-    mostly_tracked: int = 0
-    mostly_lost: int = 0
-    overlap: float = 0.0
-    """Sum of the overlap of the matched boxes."""
-
-    def __add__(self, other: "Counts") -> "Counts":
-        return Counts(**{name: value + getattr(other, name) for name, value in vars(self).items()})
-
-    @property
-    def errors(self) -> int:
-        """FP + FN + IDS."""
-        return self.false + self.missed + self.switches
-
-    @property
-    def mota(self) -> float:
-        """NaN where no truth counts."""
-        return 1.0 - _ratio(self.errors, self.truth)
-
-    def smota(self, recall: float) -> float:
-        """Return MOTA scaled to what is possible at a recall, in [0, 1]; NaN where no truth counts."""
-        scaled = 1.0 - _ratio(self.errors - (1.0 - recall) * self.truth, recall * self.truth)
-        return float(np.clip(scaled, 0.0, 1.0))
-
-    @property
-    def motp(self) -> float:
-        """Mean overlap of the matched boxes, 0 where there are none."""
-        return self.overlap / self.true if self.true else 0.0
-
-
-@dataclass(frozen=True)
 class Point:
     """The counts at one recall point."""
 
@@ -96,6 +54,14 @@ class Point:
     """r"""
     threshold: float
     counts: Counts
+    """TP has the matched boxes of truth that does not count, too."""
+
+    @property
+    def smota(self) -> float:
+        """MOTA scaled to what is possible at the recall, in [0, 1]; NaN where no truth counts."""
+        counts, recall = self.counts, self.recall
+        scaled = 1.0 - ratio(counts.errors - (1.0 - recall) * counts.truth, recall * counts.truth)
+        return float(np.clip(scaled, 0.0, 1.0))
 
 
 @dataclass(frozen=True)
@@ -114,7 +80,7 @@ class Ab3dmotResult:
     @property
     def samota(self) -> float:
         """Average of sMOTA_r over 40 recall points."""
-        return self._average([point.counts.smota(point.recall) for point in self.points])
+        return self._average([point.smota for point in self.points])
 
     @property
     def amota(self) -> float:
@@ -124,7 +90,7 @@ class Ab3dmotResult:
     @property
     def amotp(self) -> float:
         """Average of MOTP_r over 40 recall points."""
-        return self._average([point.counts.motp for point in self.points])
+        return self._average([_overlap(point.counts) for point in self.points])
 
     def _average(self, values: list[float]) -> float:
         return sum(values) / POINTS if self.best.truth else float("nan")
@@ -138,18 +104,10 @@ class Ab3dmotResult:
             "AMOTP": self.amotp,
             "points": len(self.points),
             "score": self.threshold,
-            "MOTA": best.mota,
-            "MOTP": best.motp,
-            "precision": _ratio(best.true, best.true + best.false),
-            "recall": _ratio(best.true, best.true + best.missed),
-            "GT": best.truth,
-            "TP": best.true,
-            "FP": best.false,
-            "FN": best.missed,
-            "IDS": best.switches,
-            "FRAG": best.fragments,
-            "MT": _ratio(best.mostly_tracked, best.objects),
-            "ML": _ratio(best.mostly_lost, best.objects),
+            **best.figures(),
+            "MOTP": _overlap(best),
+            "MT": ratio(best.mostly_tracked, best.objects),
+            "ML": ratio(best.mostly_lost, best.objects),
         }
         return {name: defined(value) for name, value in figures.items()}
 
@@ -247,13 +205,9 @@ class _Sequence:
             true=int(hit.sum()),
             false=int((unused & ~case.excused).sum()),
             missed=int((~hit & ~case.ignored).sum()),
-            overlap=float(self._overlap(match)),
+            similarity=float(case.similarity[case.matched(match)].sum()),
             **self._lives(match),
         )
-
-    def _overlap(self, match: Ints) -> float:
-        case = self.case
-        return float(case.similarity[match[case.truth_row] == case.track_row].sum())
 
     def _lives(self, match: Ints) -> dict[str, int]:
         """Return the counts along the lives of objects."""
@@ -303,5 +257,6 @@ class _Contest:
         return self._solved[count]
 
 
-def _ratio(part: float, whole: float) -> float:
-    return part / whole if whole else float("nan")
+def _overlap(counts: Counts) -> float:
+    """Return the mean overlap of the matched boxes, 0 where there are none."""
+    return counts.motp if counts.true else 0.0

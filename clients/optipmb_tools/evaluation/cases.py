@@ -121,6 +121,10 @@ class Case:
         """(P,) frame of each pair."""
         return self.truth_frame[self.truth_row]
 
+    def matched(self, match: Ints) -> Bools:
+        """Return which pairs (P,) are those of a match (T,), as `match_frames` returns it."""
+        return np.asarray(match[self.truth_row] == self.track_row, dtype=np.bool_)
+
     def pairs(self, kept: Bools) -> "Case":
         """Return the case with only some of its pairs (P,)."""
         columns = ("truth_row", "track_row", "cost", "similarity")
@@ -316,3 +320,107 @@ def assign_frames(frame: Ints, row: Ints, column: Ints, value: Floats, solver: S
     contested = by_frame(frame, np.flatnonzero(~alone))
     taken = [pairs[solver(row[pairs], column[pairs], value[pairs])] for pairs in contested]
     return np.sort(np.concatenate([np.flatnonzero(alone), *taken]))
+
+
+Claim = Literal["latest", "first"]
+"""Which of several objects that were with one track keeps it: the one that was last, or the one with the first row."""
+
+
+def match_frames(case: Case, *, continuity: Claim | None = None) -> Ints:
+    """Return the track row (T,) that each truth row matches, -1 for none.
+
+    In each frame the matches of most pairs with the least total cost are taken; with continuity, pairs of an object and
+    the track that it matched last are taken first.
+    """
+    match = np.full(len(case.truth_frame), -1, dtype=np.int64)
+    alone = uncontested(case.truth_row, case.track_row)
+    match[case.truth_row[alone]] = case.track_row[alone]
+    contested = np.flatnonzero(~alone)
+    earlier = _earlier_rows(case) if continuity and len(contested) else np.empty(0, dtype=np.int64)
+    for pairs in by_frame(case.pair_frame, contested):
+        truth, track = case.truth_row[pairs], case.track_row[pairs]
+        chosen = np.zeros(len(pairs), dtype=np.bool_)
+        if continuity:
+            chosen[_continued(case, pairs, match, earlier, continuity)] = True
+        free = ~np.isin(truth, truth[chosen]) & ~np.isin(track, track[chosen])
+        if free.any():
+            chosen[np.flatnonzero(free)[most_pairs(truth[free], track[free], case.cost[pairs][free])]] = True
+        match[truth[chosen]] = track[chosen]
+    return match
+
+
+def _continued(case: Case, pairs: Ints, match: Ints, earlier: Ints, claim: Claim) -> list[int]:
+    """Return the places of the pairs of one frame that are of an object and the track that it matched last."""
+    claims: dict[int, tuple[int, int]] = {}
+    rows = zip(case.truth_row[pairs].tolist(), case.track_row[pairs].tolist(), strict=True)
+    for place, (truth, track) in enumerate(rows):
+        row = int(earlier[truth])
+        while row >= 0 and match[row] < 0:
+            row = int(earlier[row])
+        if row >= 0 and case.track_id[match[row]] == case.track_id[track]:
+            frame = int(case.truth_frame[row])
+            if track not in claims or (claim == "latest" and frame > claims[track][0]):
+                claims[track] = frame, place
+    return [place for _, place in claims.values()]
+
+
+def _earlier_rows(case: Case) -> Ints:
+    """Return for each truth row (T,) the row of the same object before it, -1 for the first."""
+    order = np.lexsort((case.truth_frame, case.truth_id))
+    earlier = np.full(len(order), -1, dtype=np.int64)
+    same = case.truth_id[order[1:]] == case.truth_id[order[:-1]]
+    earlier[order[1:][same]] = order[:-1][same]
+    return earlier
+
+
+def track_changes(case: Case, match: Ints, counted: Bools, *, memory: bool = True) -> tuple[Ints, Ints]:
+    """Return the truth rows (C,) at which an object changes its track, and the rows (C,) of its matches before them.
+
+    Args:
+        case: truth and tracks.
+        match: (T,) as `match_frames` returns it.
+        counted: (T,) truth rows; matches of the others are no matches.
+        memory: the match before may be any earlier one; otherwise that of the object's row before.
+
+    """
+    order = np.lexsort((case.truth_frame, case.truth_id))
+    place = np.flatnonzero((counted & (match >= 0))[order])
+    before, after = order[place[:-1]], order[place[1:]]
+    changed = case.truth_id[before] == case.truth_id[after]
+    changed &= case.track_id[match[before]] != case.track_id[match[after]]
+    if not memory:
+        changed &= np.diff(place) == 1
+    return after[changed], before[changed]
+
+
+@dataclass(frozen=True)
+class Lives:
+    """How well each object was followed."""
+
+    share: Floats
+    """(O,) of its boxes that are matched."""
+    delay: Ints
+    """(O',) boxes before the first match of objects that have one."""
+    longest: Ints
+    """(O',) the most boxes in a row without a match, of objects that have one."""
+    breaks: int
+    """Times without a match between times with one."""
+
+
+def lives(owner: Ints, frame: Ints, matched: Bools) -> Lives:
+    """Return how well objects were followed, from the owner (R,), frame (R,) and state (R,) of their boxes."""
+    order = np.lexsort((frame, owner))
+    _, owner = np.unique(owner[order], return_inverse=True)
+    matched = matched[order]
+    # Cut into runs of equal state within one object.
+    start = np.flatnonzero(np.diff(owner, prepend=-1) | np.diff(matched.astype(np.int64), prepend=-1))
+    length = np.diff(np.append(start, len(owner)))
+    run_owner, missed = owner[start], ~matched[start]
+    first = np.diff(run_owner, prepend=-1) != 0
+    last = np.append(first[1:], True)[: len(first)]
+    count = np.bincount(owner)
+    found = np.bincount(owner, matched, len(count))
+    longest, delay = np.zeros((2, len(count)), dtype=np.int64)
+    np.maximum.at(longest, run_owner[missed], length[missed])
+    delay[run_owner[first & missed]] = length[first & missed]
+    return Lives(found / count, delay[found > 0], longest[found > 0], int((missed & ~first & ~last).sum()))

@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
-__all__ = ["FIGURES", "Figure", "cell", "defined", "number", "overall"]
+__all__ = ["FIGURES", "Figure", "cell", "defined", "number", "overall", "ratio"]
 
 Kind = Literal["share", "count", "metres", "match", "plain"]
 """Unit of a figure; `match` is the mean similarity of matched boxes: an overlap, or a distance in metres."""
@@ -59,6 +59,11 @@ FIGURES: Mapping[str, Figure] = {
 def defined(value: float) -> float | None:
     """Return a figure, or None if it is not defined."""
     return value if math.isfinite(value) else None
+
+
+def ratio(part: float, whole: float) -> float:
+    """Return part / whole, NaN for a whole of zero."""
+    return part / whole if whole else math.nan
 
 
 def overall(classes: Sequence[Mapping[str, float]]) -> dict[str, float]:

@@ -28,15 +28,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from enum import IntEnum
-from itertools import groupby
-from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from optipmb_tools.datasets.nuscenes import CLASS_RANGE, NuScenesDataset, NuScenesSequence, tracking_labels
-from optipmb_tools.evaluation.cases import by_frame, most_pairs, same_frame, uncontested
+from optipmb_tools.evaluation.cases import Case, by_frame, lives, match_frames, same_frame, track_changes
 from optipmb_tools.evaluation.figures import defined, overall
 from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Bools, Floats, Ints, rotation_of
@@ -221,125 +219,53 @@ class Event(IntEnum):
     SWITCH = 2
 
 
-@dataclass(frozen=True)
-class Pairing:
-    """One class in one scene, and the pairs that are near enough to match."""
-
-    frames: int
-    """Of the scene."""
-    truth_frame: Ints
-    """(T,) ascending"""
-    truth_id: Ints
-    """(T,) from 0 on, without holes"""
-    objects: int
-    track_frame: Ints
-    """(K,) ascending"""
-    track_id: Ints
-    """(K,)"""
-    track_score: Floats
-    """(K,)"""
-    truth_row: Ints
-    """(P,) ascending"""
-    track_row: Ints
-    """(P,)"""
-    distance: Floats
-    """(P,) metres"""
+def pair(truth: TrackBoxes, tracks: TrackBoxes, label: int, limit: float) -> Case:
+    """Return one class of one scene, with the pairs of centres less than `limit` metres apart in the plane."""
+    truth, tracks = truth.take(truth.label == label), tracks.take(tracks.label == label)
+    rows, other = same_frame(truth.frame, tracks.frame)
+    distance = np.linalg.norm(truth.center[rows, :2] - tracks.center[other, :2], axis=1)
+    return Case(
+        sequence="",
+        truth_frame=truth.frame,
+        truth_id=truth.id,
+        ignored=np.zeros(len(truth), dtype=np.bool_),
+        track_frame=tracks.frame,
+        track_id=tracks.id,
+        excused=np.zeros(len(tracks), dtype=np.bool_),
+        track_score=tracks.score,
+        truth_row=rows,
+        track_row=other,
+        cost=distance,
+        similarity=distance,
+    ).pairs(distance < limit)
 
 
 @dataclass(frozen=True)
 class Matching:
-    """Matches of the tracks from a threshold on."""
+    """Matches of the tracks with a score from a threshold on."""
 
     event: Ints
     """(T,) `Event` of each object in each of its frames."""
-    track_row: Ints
-    """(T,) the track's row; -1 for misses."""
+    score: Floats
+    """(T,) of the track; NaN for misses."""
     distance: Floats
-    """(T,) metres; NaN for misses."""
+    """(T,) metres; 0 for misses."""
     false_positives: int
     frames: int
     """In which there is an object or a track."""
 
-
-def pair(truth: TrackBoxes, tracks: TrackBoxes, label: int, frames: int, limit: float) -> Pairing:
-    """Return the pairs of one class with centres less than `limit` metres apart in the plane."""
-    truth, tracks = truth.take(truth.label == label), tracks.take(tracks.label == label)
-    rows, other = same_frame(truth.frame, tracks.frame)
-    distance = np.linalg.norm(truth.center[rows, :2] - tracks.center[other, :2], axis=1)
-    near = distance < limit
-    objects, number = np.unique(truth.id, return_inverse=True)
-    return Pairing(
-        frames=frames,
-        truth_frame=truth.frame,
-        truth_id=number.astype(np.int64),
-        objects=len(objects),
-        track_frame=tracks.frame,
-        track_id=tracks.id,
-        track_score=tracks.score,
-        truth_row=rows[near],
-        track_row=other[near],
-        distance=distance[near],
-    )
-
-
-def match(pairing: Pairing, threshold: float = -np.inf) -> Matching:
-    """Match the tracks with a score from `threshold` on."""
-    kept = pairing.track_score >= threshold
-    use = kept[pairing.track_row]
-    rows, other, metres = pairing.truth_row[use], pairing.track_row[use], pairing.distance[use]
-    keys = zip(
-        pairing.truth_frame[rows].tolist(),
-        rows.tolist(),
-        other.tolist(),
-        metres.tolist(),
-        pairing.truth_id[rows].tolist(),
-        pairing.track_id[other].tolist(),
-        strict=True,
-    )
-    event = np.zeros(len(pairing.truth_frame), dtype=np.int64)
-    chosen = np.full(len(event), -1, dtype=np.int64)
-    distance = np.full(len(event), np.nan)
-    last: dict[int, int] = {}
-    for _, group in groupby(keys, itemgetter(0)):
-        pairs = list(group)
-        taken = _continued(pairs, last)
-        objects, tracks = {one[1] for one in taken}, {one[2] for one in taken}
-        taken += _assigned([one for one in pairs if one[1] not in objects and one[2] not in tracks])
-        for _, row, track, apart, identity, follower in taken:
-            event[row] = Event.SWITCH if last.get(identity, follower) != follower else Event.MATCH
-            chosen[row], distance[row] = track, apart
-            last[identity] = follower
-    present = _present(pairing.truth_frame, pairing.frames) | _present(pairing.track_frame[kept], pairing.frames)
-    return Matching(event, chosen, distance, int(kept.sum() - (chosen >= 0).sum()), int(present.sum()))
-
-
-_Pair = tuple[int, int, int, float, int, int]
-"""Frame, row of the object, row of the track, metres, id of the object, id of the track."""
-
-
-def _continued(pairs: list[_Pair], last: dict[int, int]) -> list[_Pair]:
-    """Return the pairs of one frame that go on from earlier ones."""
-    taken: list[_Pair] = []
-    used: set[int] = set()
-    for one in pairs:
-        if one[5] not in used and last.get(one[4]) == one[5]:
-            taken.append(one)
-            used.add(one[5])
-    return taken
-
-
-def _assigned(pairs: list[_Pair]) -> list[_Pair]:
-    """Return the most pairs without common members and, of those, the ones with the least total distance."""
-    rows, columns, metres = (np.array([one[place] for one in pairs]) for place in (1, 2, 3))
-    if uncontested(rows.astype(np.int64), columns.astype(np.int64)).all():
-        return pairs
-    return [pairs[i] for i in most_pairs(rows, columns, metres)]
-
-
-def _present(frame: Ints, frames: int) -> Bools:
-    present = np.zeros(frames, dtype=np.bool_)
-    present[frame] = True
-    return present
+    @classmethod
+    def of(cls, case: Case, threshold: float = -np.inf) -> "Matching":
+        """Match the tracks of a class in a scene."""
+        case = case.keep(case.track_score >= threshold)
+        match = match_frames(case, continuity="first")
+        hit, pairs = match >= 0, case.matched(match)
+        event = np.where(hit, Event.MATCH, Event.MISS).astype(np.int64)
+        event[track_changes(case, match, hit)[0]] = Event.SWITCH
+        score, distance = np.full(len(match), np.nan), np.zeros(len(match))
+        score[hit], distance[case.truth_row[pairs]] = case.track_score[match[hit]], case.cost[pairs]
+        frames = np.union1d(case.truth_frame, case.track_frame)
+        return cls(event, score, distance, len(case.track_frame) - int(hit.sum()), len(frames))
 
 
 @dataclass(frozen=True)
@@ -400,21 +326,23 @@ class NuScenesClass:
 UNDEFINED = NuScenesFigures(*(math.nan,) * len(fields(NuScenesFigures)))
 
 
-def evaluate_class(pairings: Sequence[Pairing], config: NuScenesConfig) -> NuScenesClass:
-    """Return the figures of one class over all scenes."""
+def evaluate_class(cases: Sequence[Case], config: NuScenesConfig) -> NuScenesClass:
+    """Return the figures of one class over all scenes, each prepared by `pair`."""
     recalls = np.linspace(config.min_recall, 1.0, config.thresholds).round(_DECIMALS)
     named = tuple(recalls[::-1].tolist())
-    count = sum(len(pairing.truth_id) for pairing in pairings)
+    count = sum(len(case.truth_id) for case in cases)
     if not count:
         return NuScenesClass(math.nan, math.nan, UNDEFINED, named, (None,) * len(named))
-    thresholds = score_thresholds(_true_scores(pairings), count, recalls)[::-1]
+    everything = [Matching.of(case) for case in cases]
+    scores = np.concatenate([one.score[one.event == Event.MATCH] for one in everything])
+    thresholds = score_thresholds(scores, count, recalls)[::-1]
     known = {
-        threshold: figures(pairings, [match(pairing, threshold) for pairing in pairings], threshold)
+        threshold: figures(cases, [Matching.of(case, threshold) for case in cases], threshold)
         for threshold in np.unique(thresholds[~np.isnan(thresholds)]).tolist()
     }
     curve = tuple(known.get(threshold) for threshold in thresholds.tolist())
     if not known:
-        return NuScenesClass(0.0, config.worst_motp, _worst(pairings, config), named, curve)
+        return NuScenesClass(0.0, config.worst_motp, _worst(cases, config), named, curve)
     return NuScenesClass(
         amota=_average([point.motar if point else math.nan for point in curve], 0.0),
         amotp=_average([point.motp if point else math.nan for point in curve], config.worst_motp),
@@ -443,15 +371,18 @@ def score_thresholds(scores: Floats, count: int, recalls: Floats) -> Floats:
     return np.asarray(thresholds, dtype=np.float64)
 
 
-def figures(pairings: Sequence[Pairing], matchings: Sequence[Matching], threshold: float) -> NuScenesFigures:
+def figures(cases: Sequence[Case], matchings: Sequence[Matching], threshold: float) -> NuScenesFigures:
     """Return the figures of one class from the matchings of all scenes at a threshold."""
     events = np.concatenate([matching.event for matching in matchings])
     gt = len(events)
     tp, ids, fn = (int((events == kind).sum()) for kind in (Event.MATCH, Event.SWITCH, Event.MISS))
     fp = sum(matching.false_positives for matching in matchings)
     frames = sum(matching.frames for matching in matchings)
-    metres = sum(float(np.nansum(matching.distance)) for matching in matchings)
-    paths = _Paths.of(pairings, matchings)
+    metres = sum(float(matching.distance.sum()) for matching in matchings)
+    first = np.cumsum([0, *(len(np.unique(case.truth_id)) for case in cases)])
+    owner = [np.unique(case.truth_id, return_inverse=True)[1] + k for case, k in zip(cases, first[:-1], strict=True)]
+    # Objects are filled in: in every frame from the first to the last.
+    paths = lives(np.concatenate(owner), np.concatenate([case.truth_frame for case in cases]), events != Event.MISS)
     share = tp / gt
     return NuScenesFigures(
         threshold=threshold,
@@ -473,64 +404,11 @@ def figures(pairings: Sequence[Pairing], matchings: Sequence[Matching], threshol
     )
 
 
-@dataclass(frozen=True)
-class _Paths:
-    """How well each object was followed."""
-
-    share: Floats
-    """(O,) of its frames in which it is tracked."""
-    delay: Ints
-    """(O',) frames until objects that are tracked at all first are."""
-    longest: Ints
-    """(O',) the most frames in a row in which objects that are tracked at all are not."""
-    breaks: int
-    """Times without tracking between times with it."""
-
-    @classmethod
-    def of(cls, pairings: Sequence[Pairing], matchings: Sequence[Matching]) -> "_Paths":
-        """Return the paths of all objects of one class.
-
-        The rows are put in order of objects and time, and cut into runs of equal state within one object. An object is
-        in every frame from its first to its last, so rows are frames.
-        """
-        number = np.cumsum([0, *(pairing.objects for pairing in pairings)])
-        owner = np.concatenate([pairing.truth_id + first for pairing, first in zip(pairings, number[:-1], strict=True)])
-        order = np.argsort(owner, kind="stable")
-        owner = owner[order]
-        tracked = np.concatenate([matching.event for matching in matchings])[order] != Event.MISS
-        start = np.flatnonzero(np.append(True, (np.diff(owner) != 0) | (np.diff(tracked.astype(np.int64)) != 0)))
-        length = np.diff(np.append(start, len(owner)))
-        run_owner, missed = owner[start], ~tracked[start]
-        first = np.append(True, np.diff(run_owner) != 0)
-        last = np.append(first[1:], True)
-        count = int(number[-1])
-        found = np.bincount(owner, tracked, count)
-        longest = np.zeros(count, dtype=np.int64)
-        np.maximum.at(longest, run_owner[missed], length[missed])
-        delay = np.zeros(count, dtype=np.int64)
-        delay[run_owner[first & missed]] = length[first & missed]
-        return cls(
-            share=found / np.bincount(owner, minlength=count),
-            delay=delay[found > 0],
-            longest=longest[found > 0],
-            breaks=int((missed & ~first & ~last).sum()),
-        )
-
-
-def _true_scores(pairings: Sequence[Pairing]) -> Floats:
-    """Return the scores of the matches when all tracks are there; switches are none."""
-    scores = []
-    for pairing in pairings:
-        found = match(pairing)
-        scores.append(pairing.track_score[found.track_row[found.event == Event.MATCH]])
-    return np.concatenate(scores)
-
-
-def _worst(pairings: Sequence[Pairing], config: NuScenesConfig) -> NuScenesFigures:
+def _worst(cases: Sequence[Case], config: NuScenesConfig) -> NuScenesFigures:
     """Return the figures of a class of which nothing is found."""
-    gt = float(sum(len(pairing.truth_id) for pairing in pairings))
+    gt = float(sum(len(case.truth_id) for case in cases))
     found = {"recall": 0.0, "motar": 0.0, "gt": gt, "mota": 0.0, "motp": config.worst_motp, "tp": 0.0, "fn": gt}
-    lost = float(sum(pairing.objects for pairing in pairings))
+    lost = float(sum(len(np.unique(case.truth_id)) for case in cases))
     return replace(UNDEFINED, **found, mt=0.0, ml=lost, faf=500.0, tid=20.0, lgd=20.0)
 
 
@@ -613,8 +491,7 @@ def evaluate_scenes(
     for name in config.class_range:
         label = NUSCENES_CLASSES.index(name)
         classes[name] = evaluate_class(
-            [pair(scene.truth, tracks, label, len(scene.stamp_us), config.match_distance) for scene, tracks in scenes],
-            config,
+            [pair(scene.truth, tracks, label, config.match_distance) for scene, tracks in scenes], config
         )
     total = overall([one.figures() for one in classes.values()])
     total.pop("threshold", None)

@@ -12,11 +12,10 @@ from optipmb_tools.datasets.kitti import KittiSequence
 from optipmb_tools.datasets.nuscenes import NuScenesSequence
 from optipmb_tools.datasets.table import TableSequence
 from optipmb_tools.datasets.table.dataset import ObjectTable, TableOptions, read_objects
-from optipmb_tools.results import ResultTable
+from optipmb_tools.results import ResultTable, empty_table
 from optipmb_tools.results.full import FullTable, full_path, read_full
 from optipmb_tools.results.kitti import LEAST_SHOWN, read_kitti_results
 from optipmb_tools.results.nuscenes import NUSCENES_FILE, read_nuscenes_results, result_table
-from optipmb_tools.results.rows import empty_table
 from optipmb_tools.table_files import SUFFIXES, is_table
 
 __all__ = ["read_compared", "read_full_tracks", "read_tracks"]

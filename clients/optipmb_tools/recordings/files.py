@@ -21,7 +21,7 @@ from optipmb_schemas.export import schema_of
 from optipmb_schemas.model import check_stream
 
 from optipmb_tools.files import DatasetError
-from optipmb_tools.foxglove_view import FoxgloveMessages, Shown
+from optipmb_tools.views.foxglove import FoxgloveMessages, Shown
 
 # Message types by the last part of their keys
 KINDS: Final[dict[str, type[Message]]] = {

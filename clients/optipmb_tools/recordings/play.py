@@ -18,8 +18,8 @@ from optipmb_schemas import PREFIX, Keys, Problem, SessionParameters, Tracks
 
 from optipmb_tools.recordings.files import Recorded, RecordingFile
 from optipmb_tools.recordings.plan import FrameId, Step, StreamPlan, content, plan, renamed, steps
-from optipmb_tools.replay import CLOUD_WAIT_S, Exchange, Pace, await_wanted
 from optipmb_tools.results.output import Latency, latency
+from optipmb_tools.run.replay import CLOUD_WAIT_S, Exchange, Pace, await_wanted
 
 
 @dataclass(frozen=True)

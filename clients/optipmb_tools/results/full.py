@@ -17,7 +17,7 @@ from optipmb_schemas import PATHS, Tracks
 
 from optipmb_tools.files import DatasetError, write_whole
 from optipmb_tools.geometry import Floats, Ints
-from optipmb_tools.results.rows import BoxTable, column_shape, stacked
+from optipmb_tools.results import BoxTable, column_shape, stacked
 
 
 @dataclass(frozen=True)

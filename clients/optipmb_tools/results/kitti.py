@@ -23,7 +23,7 @@ from optipmb_tools.camera import Camera, alpha_of, kitti_from_sensor, sensor_fro
 from optipmb_tools.class_names import class_like
 from optipmb_tools.files import DatasetError, numbers, read_rows, write_whole
 from optipmb_tools.geometry import PoseLike, rotation_of, to_sensor
-from optipmb_tools.results.rows import ResultTable
+from optipmb_tools.results import ResultTable
 
 LEAST_SHOWN = 0.5  # part of a projected box that must lie in the image for its line to have an image box
 

@@ -30,7 +30,7 @@ from optipmb_schemas import Tracks
 from optipmb_tools.class_names import class_like
 from optipmb_tools.files import DatasetError, read_text, write_whole
 from optipmb_tools.geometry import Floats, Ints
-from optipmb_tools.results.rows import ResultTable, stacked
+from optipmb_tools.results import ResultTable, stacked
 
 NUSCENES_CLASSES = ("bicycle", "bus", "car", "motorcycle", "pedestrian", "trailer", "truck")
 """The classes of the tracking benchmark; others that a file holds are left out."""

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from optipmb_schemas import Tracks
 
+from optipmb_tools.results import stacked
 from optipmb_tools.results.full import full_path, write_full
-from optipmb_tools.results.rows import stacked
 from optipmb_tools.table_files import Columns, is_table, write_table
 
 if TYPE_CHECKING:
@@ -132,8 +132,8 @@ class Results:
     Args:
         dataset: The tracked data set; it knows the format of its result files.
         out: The folder, or a file with the suffix of a table.
-        full: Whether all columns of the tracks are written: into a file beside each result file, or into further
-            columns of the table. Otherwise a file that an earlier run left beside a result file is removed.
+        full: Whether all columns of the tracks are written: into a file for each result file, or into further
+            columns of the table. Otherwise such files of an earlier run are removed.
     """
 
     def __init__(self, dataset: "Dataset", out: Path, *, full: bool = False) -> None:

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from optipmb import Parameters, warm_up
-from optipmb_tools.bulk import Executor, Here, values
 from optipmb_tools.datasets import Truth
 from optipmb_tools.geometry import Floats
+from optipmb_tools.run.bulk import Executor, Here, values
 from optipmb_tools.tuning.clips import Clip, track_clip
 from optipmb_tools.tuning.scoring import Figures, Measured, Scorer, metric
 

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from optipmb import Parameters
-from optipmb_tools.bulk import Executor
 from optipmb_tools.evaluation.calibration import CalibrationResult
+from optipmb_tools.run.bulk import Executor
 from optipmb_tools.tuning.calibrate import Ranking, calibrate, cross_calibration, rank
 from optipmb_tools.tuning.clips import Clip, Degradation, degrade
 from optipmb_tools.tuning.display import TrialDisplay

@@ -16,9 +16,9 @@ from typing import Any
 from optipmb_client.errors import UsageError
 
 from optipmb import Parameters, ScoreCalibration
-from optipmb_tools.bulk import Executor
 from optipmb_tools.datasets import DataSequence, DatasetArguments
 from optipmb_tools.files import write_whole
+from optipmb_tools.run.bulk import Executor
 from optipmb_tools.tuning.clips import Clip, load, of_class
 from optipmb_tools.tuning.display import TrialDisplay
 from optipmb_tools.tuning.estimate import Estimate, estimate, pair_all

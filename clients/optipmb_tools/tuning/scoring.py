@@ -14,15 +14,14 @@ import numpy as np
 
 from optipmb_tools.datasets import DataSequence
 from optipmb_tools.datasets.nuscenes import NuScenesSequence
-from optipmb_tools.evaluation import Case, ClearResult, Rules, clear, combine, default_rules
-from optipmb_tools.evaluation.ab3dmot import Counts, evaluate_ab3dmot
+from optipmb_tools.evaluation import Case, Counts, Rules, clear, combine, default_rules
+from optipmb_tools.evaluation.ab3dmot import evaluate_ab3dmot
 from optipmb_tools.evaluation.cases import ab3dmot_rules, prepare
 from optipmb_tools.evaluation.figures import defined
 from optipmb_tools.evaluation.hota import HotaResult, evaluate_hota
 from optipmb_tools.evaluation.nuscenes import (
     NuScenesConfig,
     NuScenesScene,
-    Pairing,
     evaluate_class,
     pair,
     prepare_scene,
@@ -75,7 +74,7 @@ class Measured:
     """By the rules of the benchmark."""
     near: Case
     """By the distance of the centres, for HOTA."""
-    official: Pairing | None = None
+    official: Case | None = None
     """By the rules of the nuScenes benchmark."""
 
 
@@ -110,7 +109,7 @@ class Scorer:
         if self.scenes is not None:
             scene, label = self.scenes[clip.name], NUSCENES_CLASSES.index(self.name)
             boxes = scene.tracks(tracks, self.config)
-            official = pair(scene.truth, boxes, label, len(scene.stamp_us), self.config.match_distance)
+            official = pair(scene.truth, boxes, label, self.config.match_distance)
             tracks = tracks.take(self.counts(clip, tracks))
         near = prepare(clip.world, tracks, self.name, self.near, clip.name)
         if self.rules.measure == "distance":
@@ -123,16 +122,14 @@ class Scorer:
     def figures(self, measured: Sequence[Measured]) -> Figures:
         """Return the figures of some sequences together."""
         near = [one.near for one in measured]
-        best: ClearResult | Counts
         if self.rules.measure == "distance":
             found = evaluate_ab3dmot([replace(one, similarity=1.0 - one.cost / self.near.limit) for one in near], 0.0)
             amotp = self.near.limit * (1.0 - found.amotp)
             # Of CLEAR MOT, where changes of identity over breaks count too.
-            best = combine(clear(case.from_score(found.threshold), self.near) for case in near)
-            switches = len(best.switches)
+            best: Counts = combine(clear(case.from_score(found.threshold), self.near) for case in near)
         else:
             found = evaluate_ab3dmot([one.case for one in measured], self.rules.limit)
-            amotp, best, switches = found.amotp, found.best, found.best.switches
+            amotp, best = found.amotp, found.best
         hota = self._hota(near, found.threshold)
         figures = {
             "sAMOTA": found.samota,
@@ -143,7 +140,7 @@ class Scorer:
             "HOTA": hota.hota,
             "DetA": hota.deta,
             "AssA": hota.assa,
-            "IDS": switches,
+            "IDS": best.switches,
             "FRAG": best.fragments,
             "FP": best.false,
             "FN": best.missed,

@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Any
 
 from optipmb import Modules, Parameters, warm_up
-from optipmb_tools.colours import colour_of
 from optipmb_tools.evaluation.figures import overall
 from optipmb_tools.files import write_whole
 from optipmb_tools.tuning.clips import track_clip
 from optipmb_tools.tuning.run import Source
 from optipmb_tools.tuning.scoring import Figures, Scorer, plain_figures, scorer_of
 from optipmb_tools.tuning.values import with_values
+from optipmb_tools.views.colours import colour_of
 
 _ADP, _HABM, _RPP, _OTE = "adp", "habm", "rpp", "ote"
 ROWS: tuple[frozenset[str], ...] = tuple(

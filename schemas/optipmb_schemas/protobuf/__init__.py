@@ -2,5 +2,5 @@
 
     from optipmb_schemas.protobuf import tracking_pb2, tracking_pb2_grpc
 
-`convert` takes one form to the other. Values and checks are those of the models, whichever form they come in.
+`convert` takes one form to the other. The models check the values of both forms.
 """

@@ -3,8 +3,8 @@
 `from_proto` builds what `decode` builds of msgpack and checks it in the same way, so that both forms have the same
 limits and the same errors. It is total: it returns a model or raises `MessageError`.
 
-`transcode` takes tracks from msgpack to protobuf without a model between them: a service has checked what it has
-published. What is checked is what can be known without looking at the values: the structure, the types, and that each
+`transcode` takes tracks from msgpack to protobuf without a model between them: a service has checked the
+tracks that it publishes. The checks here do not look at values: the structure, the types, and that each
 column has the rows of the others and the bytes of its shape. A receiver that wants more has `from_proto`.
 """
 
@@ -12,10 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from math import prod
-from struct import pack
 from typing import Any, Final, Self, TypeVar
 
-import msgspec
 import numpy as np
 from google.protobuf import struct_pb2
 from google.protobuf.descriptor import FieldDescriptor
@@ -29,12 +27,10 @@ from numpy.typing import NDArray
 from optipmb_schemas.codec import (
     DECODERS,
     DTYPES,
-    MOST_BYTES,
     REFUSED,
     build,
     decode,
     encoding_of,
-    read_columns,
 )
 from optipmb_schemas.errors import MessageError, invalid
 from optipmb_schemas.limits import DEFAULT, Limits
@@ -51,7 +47,6 @@ _DTYPE_NAMES: Final[dict[int, str]] = {
 _DTYPES: Final = {code: np.dtype(f"<{name}") for code, name in _DTYPE_NAMES.items()}
 DTYPE_CODES: Final[dict[str, Any]] = {name: code for code, name in _DTYPE_NAMES.items()}
 _FRAMES: Final[dict[int, str]] = {pb.FRAME_WORLD: "world", pb.FRAME_SENSOR: "sensor"}
-_pack: Final = msgspec.msgpack.Encoder().encode
 _FRAME_CODES: Final = {name: code for code, name in _FRAMES.items()}
 _ENCODING: Final = encoding_of(Tracks)
 _SCALARS: Final = tuple(name for name in Tracks.names if name not in Tracks.arrays)
@@ -76,13 +71,14 @@ def to_proto(message: Message) -> Any:
     fields: dict[str, Any] = {}
     for name, value in message.present():
         if isinstance(value, np.ndarray):
-            fields[name] = value.tolist() if name in _repeated(kind) else _array(value, kind.arrays[name].dtype)
+            described = kind.arrays[name]  # arrays of a fixed size are lists of numbers in protobuf
+            fields[name] = _array(value, described.dtype) if described.rows else value.tolist()
         elif isinstance(value, Message):
             fields[name] = to_proto(value)
         elif name == "frame":
             fields[name] = _FRAME_CODES[value]
         else:
-            fields[name] = _struct(value) if isinstance(value, dict) else value
+            fields[name] = value  # protobuf makes a Struct of a map
     return getattr(pb, kind.__name__)(**fields)
 
 
@@ -92,12 +88,7 @@ def from_proto(proto: ProtoMessage, kind: type[T], limits: Limits = DEFAULT) -> 
     Raises:
         MessageError: whenever it is not a valid message within the limits.
     """
-    fields = _fields(proto)
-    if kind in DECODERS and proto.ByteSize() <= MOST_BYTES:
-        message = read_columns(_pack(_with_blocks(fields, kind)), kind, limits)
-        if message is not None:
-            return message
-    return build(fields, kind, limits)
+    return build(_fields(proto), kind, limits)
 
 
 def column(array: pb.Array) -> NDArray[Any]:
@@ -116,13 +107,6 @@ def select(array: pb.Array, rows: NDArray[np.bool_]) -> None:
 def _array(array: NDArray[Any], dtype: str) -> pb.Array:
     data = np.ascontiguousarray(array, f"<{dtype}").tobytes()
     return pb.Array(dtype=DTYPE_CODES[dtype], shape=array.shape, data=data)
-
-
-def _with_blocks(fields: dict[str, Any], kind: type[Message]) -> dict[str, Any]:
-    """Return the fields with arrays in place of the lists of numbers that protobuf has for arrays of a fixed size."""
-    lists = {name: fields[name] for name in _repeated(kind) & fields.keys()}
-    inner = {name: _with_blocks(fields[name], inner) for name, inner in kind.nested.items() if name in fields}
-    return fields | inner | {name: _doubles(values) for name, values in lists.items()}
 
 
 def _fields(proto: ProtoMessage) -> dict[str, Any]:
@@ -147,16 +131,12 @@ def _reader(field: FieldDescriptor) -> Callable[[Any], Any]:
     if field.enum_type is not None:
         return _frame
     if field.message_type is None:
-        return _same
+        return lambda value: value
     if field.message_type.full_name == pb.Array.DESCRIPTOR.full_name:
         return _block
     if field.message_type.full_name == struct_pb2.Struct.DESCRIPTOR.full_name:
         return MessageToDict
     return _fields
-
-
-def _same(value: Any) -> Any:
-    return value
 
 
 def _frame(code: int) -> str:
@@ -169,22 +149,6 @@ def _frame(code: int) -> str:
 def _block(array: pb.Array) -> dict[str, Any]:
     """Return an array as the block that msgpack has."""
     return {"dtype": _DTYPE_NAMES.get(array.dtype, array.dtype), "shape": list(array.shape), "data": array.data}
-
-
-def _doubles(values: list[float]) -> dict[str, Any]:
-    return {"dtype": "f8", "shape": [len(values)], "data": pack(f"<{len(values)}d", *values)}
-
-
-@cache
-def _repeated(kind: type[Message]) -> frozenset[str]:
-    """Return the names of the arrays that are lists of numbers in protobuf: those of a fixed small size."""
-    return frozenset(name for name, array in kind.arrays.items() if array.rows is None)
-
-
-def _struct(values: dict[str, Any]) -> struct_pb2.Struct:
-    struct = struct_pb2.Struct()
-    struct.update(values)
-    return struct
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,7 +184,7 @@ def transcode(payload: bytes, *, encoding: str = "", limits: Limits = DEFAULT) -
     Args:
         payload: msgpack or JSON.
         encoding: the Zenoh encoding of the sample.
-        limits: what is accepted at most.
+        limits: of messages.
 
     Raises:
         MessageError: they are no tracks within the limits.
@@ -229,7 +193,7 @@ def transcode(payload: bytes, *, encoding: str = "", limits: Limits = DEFAULT) -
         try:
             tracks = _tracks(DECODERS[Tracks](payload), limits)
         except REFUSED:
-            tracks = None  # decoding says what is wrong, if anything is
+            tracks = None  # decoding names the fault, if any
         if tracks is not None:
             return tracks
     return EncodedTracks.of(to_proto(decode(payload, Tracks, encoding=encoding, limits=limits)))

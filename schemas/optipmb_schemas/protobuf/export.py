@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from optipmb_schemas.control import Problem, SessionParameters, SessionState, SessionSummary
+from optipmb_schemas.export import bring_up_to_date, read
 from optipmb_schemas.messages import Delivery, Detections, FieldOfView, Points, Pose, Tracks
 from optipmb_schemas.model import Message
 
@@ -80,7 +81,7 @@ def generated(proto: Path) -> dict[str, str]:
         made = sorted((Path(folder) / SOURCE).parent.iterdir())
         # protoc imports by the path of the schema, where the tracker's own package would be found.
         return {
-            file.name: _HEADER + _read(file).replace("from optipmb.v1 import", "from optipmb_schemas.protobuf import")
+            file.name: _HEADER + read(file).replace("from optipmb.v1 import", "from optipmb_schemas.protobuf import")
             for file in made
         }
 
@@ -95,34 +96,20 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     source, package = options.folder / "proto" / SOURCE, Path(__file__).parent
     try:
-        files = {source: commented(_read(source))}
+        files = {source: commented(read(source))}
         if not options.check:
             source.write_text(files[source], encoding="utf-8")
         files |= {package / name: text for name, text in generated(options.folder / "proto").items()}
-    except (OSError, ValueError) as error:
-        sys.stderr.write(f"error: {error}\n")
+        return bring_up_to_date(files, f"{parser.prog} {options.folder}", check=options.check)
+    except (OSError, ValueError, subprocess.CalledProcessError) as error:
+        sys.stderr.write(f"error: {getattr(error, 'stderr', error)}\n")
         return 2
-    except subprocess.CalledProcessError as error:
-        sys.stderr.write(f"error: {error.stderr}")
-        return 2
-    old = [path for path, text in files.items() if not path.is_file() or _read(path) != text]
-    if options.check:
-        for path in old:
-            sys.stdout.write(f"{path}: not up to date; run {parser.prog} {options.folder}\n")
-        return 1 if old else 0
-    for path in old:
-        path.write_text(files[path], encoding="utf-8")
-    return 0
 
 
 def _comment(text: str, indent: str) -> list[str]:
     return textwrap.wrap(
         text, WIDTH, initial_indent=f"{indent}// ", subsequent_indent=f"{indent}// ", break_on_hyphens=False
     )
-
-
-def _read(path: Path) -> str:
-    return path.read_text(encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optipmb_schemas.errors import invalid
-from optipmb_schemas.ros2.definitions import CLASS_NAMES, OBJECTS
+from optipmb_schemas.ros2.tracks import CLASS_NAMES, DETECTION_ARRAY
+from optipmb_schemas.ros2.types import AUTOWARE
 
 __all__ = ["CLOUD", "DETECTIONS", "Boxes", "boxes_of", "frame_of", "points_of", "stamp_of"]
 
 CLOUD: Final = "sensor_msgs/msg/PointCloud2"
-_ARRAY: Final = "vision_msgs/msg/Detection3DArray"
-DETECTIONS: Final = (_ARRAY, *OBJECTS)
+DETECTIONS: Final = (DETECTION_ARRAY, *(f"{package}/DetectedObjects" for package in AUTOWARE))
 """Types of messages that hold detections."""
 
 _FLOATS: Final = {7: "f4", 8: "f8"}
@@ -29,7 +29,7 @@ _NORM: Final = 1e-2
 """How far the norm of a quaternion may be from one: some detectors write 32-bit numbers."""
 _SECOND: Final = 10**9
 _UNKNOWN: Final = (0.0,) * 36
-"""The covariance of a pose that nobody knows, row by row."""
+"""The covariance of an unknown pose, row by row."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ def _of_vision(number: int, detection: Any) -> _Row:
 
 
 def _hypothesis(result: Any) -> Any:
-    """Return what has class and score: versions before 4 of vision_msgs have no hypothesis around them."""
+    """Return the object with class and score; versions before 4 of vision_msgs have no hypothesis around them."""
     return getattr(result, "hypothesis", result)
 
 

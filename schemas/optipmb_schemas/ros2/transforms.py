@@ -37,7 +37,7 @@ class TransformError(Exception):
     """A transform is not known.
 
     Attributes:
-        later: Whether a later message can make it known: the stamp lies ahead of what has come so far.
+        later: Whether a later message can make it known: the stamp lies ahead of the known ones.
     """
 
     def __init__(self, text: str, *, later: bool = False) -> None:
@@ -97,10 +97,9 @@ class Transforms:
     def add(
         self, parent: str, child: str, stamp_ns: int, translation: Vector, quaternion: Vector, *, static: bool = False
     ) -> None:
-        """Take in the pose of a frame in its parent.
+        """Add the pose of a frame in its parent.
 
-        A frame that comes with another parent, or static after moving, starts anew. An older value of the same stamp is
-        replaced.
+        A frame with another parent, or static after moving, starts again. An older value of the same stamp is replaced.
 
         Args:
             parent: the frame that the pose is given in.

@@ -34,13 +34,12 @@ from optipmb_schemas.installation import install_command
 
 from optipmb_service import __version__
 from optipmb_service.cluster.store import StoreError
-from optipmb_service.runtime.ports import EdgeError, TransportError
+from optipmb_service.stream.ports import EdgeError, TransportError
 from optipmb_service.telemetry import logs
 from optipmb_service.telemetry.certificates import Certificates
 from optipmb_service.telemetry.health import BEAT_S, ProcessHealth
 from optipmb_service.telemetry.metrics import GATEWAY_METRICS, NETWORK_METRICS, TLS_METRICS, Metrics
-from optipmb_service.zenoh.client import Client
-from optipmb_service.zenoh.connection import LISTENING, certificates_of
+from optipmb_service.zenoh.client import LISTENING, Client, certificates_of
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Iterator

@@ -21,15 +21,15 @@ from optipmb_service import __version__
 from optipmb_service.app.lifecycle import CLOSE_S, HANDOVER_S, LAST_S, Deadline, Steps
 from optipmb_service.app.storage import open_log, open_store
 from optipmb_service.cluster.member import Member
-from optipmb_service.runtime.intake import Intake
-from optipmb_service.runtime.kept_tracks import TrackQuery
-from optipmb_service.runtime.persistence import DAY_S, CheckpointWriter
-from optipmb_service.runtime.ports import TransportError
-from optipmb_service.runtime.queries import ServiceQueries, StreamQueries, members_of
-from optipmb_service.runtime.scheduler import Scheduler
-from optipmb_service.runtime.streams import Streams
-from optipmb_service.session.problems import problem_of
-from optipmb_service.session.values import SECOND
+from optipmb_service.stream.intake import Intake
+from optipmb_service.stream.kept_tracks import TrackQuery
+from optipmb_service.stream.persistence import DAY_S, CheckpointWriter
+from optipmb_service.stream.ports import TransportError
+from optipmb_service.stream.problems import problem_of
+from optipmb_service.stream.queries import ServiceQueries, StreamQueries, members_of
+from optipmb_service.stream.scheduler import Scheduler
+from optipmb_service.stream.streams import Streams
+from optipmb_service.stream.values import SECOND
 from optipmb_service.telemetry.health import Reporter
 from optipmb_service.telemetry.metrics import (
     NETWORK_METRICS,
@@ -47,8 +47,8 @@ if TYPE_CHECKING:
 
     from optipmb_client.zenoh.session import KeyNumbers
 
-    from optipmb_service.runtime.profiles import Profiles
     from optipmb_service.settings import Settings
+    from optipmb_service.stream.profiles import Profiles
     from optipmb_service.zenoh.client import Client
 
 log = structlog.get_logger("optipmb_service")
@@ -133,7 +133,6 @@ class Service(Reporter):
             self._streams,
             status=self.status,
             metrics=self._metrics.text,
-            samples=self._metrics.samples,
             hand_over=self._intake.hand_over,
             workers=settings.workers,
         )

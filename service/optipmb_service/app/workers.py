@@ -33,8 +33,8 @@ from optipmb_service import __version__
 from optipmb_service.app import lifecycle
 from optipmb_service.app.lifecycle import LATE_S, RESTART, SLICE_S, grpc_edge, say_ready, unless, watch_keys
 from optipmb_service.cluster.leases import ALIVE, instance_of
-from optipmb_service.runtime.profiles import Fusion
-from optipmb_service.runtime.queries import TEXT, UNDRAINED, drain_asked, guarded, move_asked
+from optipmb_service.stream.profiles import Fusion
+from optipmb_service.stream.queries import TEXT, UNDRAINED, drain_asked, guarded, move_asked
 from optipmb_service.telemetry.health import BEAT_S, Reporter
 from optipmb_service.telemetry.metrics import NETWORK_METRICS
 from optipmb_service.zenoh.transport import Transport
@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from optipmb_service.app.lifecycle import StopRequest
-    from optipmb_service.runtime.ports import Request
     from optipmb_service.settings import Settings
+    from optipmb_service.stream.ports import Request
     from optipmb_service.telemetry.health import ProcessHealth
     from optipmb_service.telemetry.metrics import Metrics
 
@@ -373,7 +373,7 @@ class AggregateView(Reporter):
 
     def _samples(self) -> Iterator[tuple[int, bytes]]:
         """Yield the metrics of the workers that answer, each with its number."""
-        for index, answer in enumerate(self._ask(self._keys.samples)):
+        for index, answer in enumerate(self._ask(self._keys.metrics)):
             if answer is not None:
                 yield index, answer
 

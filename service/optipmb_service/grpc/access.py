@@ -22,7 +22,7 @@ import grpc
 import structlog
 
 from optipmb_service.grpc.calls import EndCall
-from optipmb_service.runtime.ports import EdgeError
+from optipmb_service.stream.ports import EdgeError
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping

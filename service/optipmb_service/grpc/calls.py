@@ -1,4 +1,4 @@
-"""One call: what it reads, the responses that wait for its reader, and how it ends."""
+"""One call: its requests, the responses that wait for its reader, and its end."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class Outbox:
         self._changed.set()
 
     def replace(self, response: bytes) -> None:
-        """Add a response that stands for those of its kind before it, which need not be sent."""
+        """Add a response that replaces the waiting ones of its kind."""
         queue = self._waiting.setdefault("", collections.deque())
         self._bytes += len(response) - sum(map(len, queue))
         queue.clear()
@@ -222,7 +222,7 @@ class Call:
         """Tell the caller that the call is in force, before the first response.
 
         Raises:
-            CallerGoneError: there is nobody to tell.
+            CallerGoneError: the caller has gone.
         """
         with ending_with_caller():
             await self._context.send_initial_metadata(())
@@ -231,27 +231,27 @@ class Call:
         """Write a response; waits while the caller reads too slowly.
 
         Raises:
-            CallerGoneError: nobody reads it.
+            CallerGoneError: the caller has gone.
         """
         with ending_with_caller():
             await self._context.write(response)
         self.gateway.metrics.responses[self._method] += 1
 
     async def drain(self, outbox: Outbox) -> None:
-        """Write what comes into an outbox until it is closed."""
+        """Write the responses of an outbox until it is closed."""
         self._outbox = outbox
         while (response := await outbox.take()) is not None:
             await self.write(response)
 
     @contextlib.asynccontextmanager
     async def writing(self, outbox: Outbox) -> AsyncIterator[None]:
-        """Write what comes into an outbox meanwhile, and at the end what is left in it."""
+        """Write the responses of an outbox meanwhile, and the rest of them at the end."""
         task = asyncio.create_task(self.drain(outbox))
         try:
             try:
                 yield
             except Exception:
-                # A write that is cancelled would keep the status from being sent: what is left is written before it.
+                # A write that is cancelled would keep the status from being sent: the rest is written before it.
                 outbox.close()
                 await asyncio.wait((task,))
                 raise

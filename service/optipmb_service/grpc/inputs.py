@@ -13,7 +13,7 @@ from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
 from optipmb_service.grpc.calls import Outbox
-from optipmb_service.grpc.network import Deduplicator, Item, Listener
+from optipmb_service.grpc.network import Item, Listener
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterable
@@ -30,13 +30,13 @@ MAX_CACHE: Final = 4096
 MAX_CACHE_CLOUDS: Final = 64
 
 INLINE_BYTES: Final = 64 * 2**10
-"""What is larger is handed to the network on a thread: it is cut into fragments and may wait for the link."""
+"""Larger messages are handed to the network on a thread: each is cut into fragments and may wait for the link."""
 
 WINDOW: Final = 64
 """Frames of a `Track` call without tracks; beyond it the gateway reads no further, and the caller feels it."""
 
 STALL_S: Final = 1.0
-"""Frames that are without tracks when nothing has come for so long have been refused, or nobody tracks."""
+"""Frames that are without tracks when nothing has come for so long were refused, or are not tracked."""
 
 RESPONSES: Final = 256
 """Responses that may wait for a caller: more than the window, so that none are left out but for others' frames."""
@@ -66,7 +66,7 @@ async def track(call: Call) -> None:
     ):
         cached = await network.recent(keys.tracks(inputs.stream))
         known = _already_tracked(cached, message, outbox)
-        answers.begin(cached)
+        answers.listener.begin(cached)
         while message is not None:
             if isinstance(message, schemas.Problem):
                 answers.report(message)
@@ -99,7 +99,7 @@ async def publish(call: Call) -> None:
     if message is None:
         return
     acknowledgements, answers = _Acknowledgements(outbox), _Answers(outbox)
-    answers.begin(())
+    answers.listener.begin(())
     problems = call.gateway.client.keys.problems(inputs.stream)
     async with (
         call.gateway.network.subscribed(problems, answers.listener),
@@ -237,20 +237,18 @@ class _Inputs:
 class _Answers:
     """Tracks and problems of a stream for the call that publishes it, each once.
 
-    What was published before the call is answered by the call itself.
+    The call itself answers for messages published before it.
 
     Attributes:
         in_flight: frames of the call without tracks.
         listener: takes tracks and problems.
-        begin: takes the tracks that the caches hold; what came before waits for it.
     """
 
     def __init__(self, outbox: Outbox) -> None:
         self._outbox = outbox
         self._reported: collections.deque[tuple[str, str]] = collections.deque(maxlen=RESPONSES)
         self.in_flight = _InFlight()
-        deduplicator = Deduplicator(self._answer)
-        self.listener, self.begin = Listener(deduplicator.put), deduplicator.begin
+        self.listener = Listener(self._answer)
 
     def report(self, problem: schemas.Problem) -> None:
         """Report a message that was refused here; the problem also comes back from the network."""

@@ -1,6 +1,6 @@
 """The network as calls use it: subscriptions that they share, and publishers that they use in turn.
 
-What is wanted by many calls is received, decoded and encoded once. What no call has any more is kept for the next one,
+Messages for many calls are received, decoded and encoded once. Unused subscriptions are kept for the next call,
 because Zenoh never gives back the number of a key.
 """
 
@@ -10,7 +10,7 @@ import asyncio
 import collections
 import contextlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Final
 
 import optipmb_schemas as schemas
 from optipmb_schemas.protobuf import convert
@@ -18,9 +18,10 @@ from optipmb_schemas.protobuf import tracking_pb2 as pb
 
 from optipmb_service.grpc.calls import varint
 from optipmb_service.grpc.selection import EVERYTHING
+from optipmb_service.zenoh.client import IdlePool
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Hashable, Iterable
+    from collections.abc import AsyncIterator, Callable, Iterable
 
     from optipmb_client.incoming import Answer, Arrival
     from optipmb_client.zenoh.handles import Reading
@@ -29,12 +30,9 @@ if TYPE_CHECKING:
     from optipmb_service.grpc.selection import Selection
     from optipmb_service.zenoh.client import Client, Outgoing
 
-IDLE_S: Final = 60.0
-"""Time after which a subscription or publisher that no call has taken is closed."""
-
 IDLE_SUBSCRIPTIONS: Final = 256
 IDLE_PUBLISHERS: Final = 64
-"""How many are kept; a publisher is kept with what it caches."""
+"""How many are kept without a call; a publisher is kept with its cache."""
 
 HISTORY_S: Final = 2.0
 """Longest wait for the caches of the services."""
@@ -47,14 +45,6 @@ _TRACKS: Final = b"\x0a"
 
 PublisherKey = tuple[str, int, int]
 """Stream, cached detections, cached clouds."""
-
-
-class _Closable(Protocol):
-    def close(self) -> None:
-        """Release it."""
-
-
-R = TypeVar("R", bound=_Closable)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +63,7 @@ class Item:
 
     @classmethod
     def of_tracks(cls, tracks: EncodedTracks, selection: Selection = EVERYTHING) -> Item:
-        """Return what is wanted of tracks as a response."""
+        """Return a selection of tracks as a response."""
         payload = selection.of(tracks.message()).SerializeToString() if selection.key else tracks.payload
         return cls(tracks.stream, b"".join((_TRACKS, varint(len(payload)), payload)), tracks)
 
@@ -84,34 +74,28 @@ class Item:
         return cls(problem.stream, response.SerializeToString(), problem=(problem.code, problem.path))
 
 
-@dataclass(eq=False, frozen=True)
 class Listener:
-    """A call that takes what comes.
-
-    Attributes:
-        take: takes something; called on the loop.
-        selection: what it wants of tracks.
-        passes: whether it wants the tracks of a frame; called on a thread of the subscription.
-    """
-
-    take: Callable[[Item], None]
-    selection: Selection = EVERYTHING
-    passes: Callable[[EncodedTracks], bool] = lambda _: True
-
-
-class Deduplicator:
-    """Passes on what the caches did not hold when they were asked.
+    """A call that receives items which the caches did not hold when they were asked. To be used on the loop.
 
     At the next heartbeat of a publisher, recovery sends a subscriber that has heard nothing yet all that is cached.
 
     Args:
-        take: called with what is new.
+        take: called with each new item.
+        selection: of its tracks.
+        passes: whether it wants the tracks of a frame; called on a thread of the subscription.
     """
 
-    def __init__(self, take: Callable[[Item], None]) -> None:
+    def __init__(
+        self,
+        take: Callable[[Item], None],
+        selection: Selection = EVERYTHING,
+        passes: Callable[[EncodedTracks], bool] = lambda _: True,
+    ) -> None:
+        self.selection = selection
+        self.passes = passes
         self._take = take
         self._known: set[tuple[object, ...]] = set()
-        self._early: list[Item] | None = []  # what came before it was known what the caches hold
+        self._early: list[Item] | None = []  # items from before the answer of the caches
 
     def put(self, item: Item) -> None:
         """Pass on an item, now or when the caches have been asked, or leave it out."""
@@ -121,7 +105,7 @@ class Deduplicator:
             self._take(item)
 
     def begin(self, held: Iterable[EncodedTracks]) -> None:
-        """Take in what the caches hold, and pass on what else came while they were asked."""
+        """Leave out the contents of the caches, and pass on the other items that came while they were asked."""
         self._known = {_publication(tracks) for tracks in held}
         early, self._early = self._early or [], None
         for item in early:
@@ -130,40 +114,6 @@ class Deduplicator:
 
 def _publication(tracks: EncodedTracks) -> tuple[object, ...]:
     return tracks.stream, tracks.sensor, tracks.epoch, tracks.seq, tracks.run, tracks.revision
-
-
-class _IdlePool(Generic[R]):
-    """Idle resources by key, each closed after `IDLE_S`; beyond `most` the oldest is closed."""
-
-    def __init__(self, most: int) -> None:
-        self._loop = asyncio.get_running_loop()
-        self._most = most
-        self._idle: collections.OrderedDict[Hashable, tuple[asyncio.TimerHandle, R]] = collections.OrderedDict()
-
-    def keep(self, key: Hashable, resource: R) -> bool:
-        """Add a resource; False when there is one of this key."""
-        if key in self._idle:
-            return False
-        self._idle[key] = self._loop.call_later(IDLE_S, self._end, key), resource
-        if len(self._idle) > self._most:
-            self._end(next(iter(self._idle)))
-        return True
-
-    def take(self, key: Hashable) -> R | None:
-        """Remove and return the resource of a key, None when there is none."""
-        timer, resource = self._idle.pop(key, (None, None))
-        if timer is not None:
-            timer.cancel()
-        return resource
-
-    def close(self) -> None:
-        """Close all resources."""
-        for key in list(self._idle):
-            self._end(key)
-
-    def _end(self, key: Hashable) -> None:
-        if (resource := self.take(key)) is not None:
-            self._loop.run_in_executor(None, resource.close)
 
 
 class _Feed:
@@ -184,7 +134,7 @@ class Network:
 
     Args:
         client: of the network.
-        invalid: called for what comes and is no valid message, on any thread.
+        invalid: called for each message that is not valid, on any thread.
     """
 
     def __init__(self, client: Client, invalid: Callable[[str], None]) -> None:
@@ -192,19 +142,19 @@ class Network:
         self._loop = asyncio.get_running_loop()
         self._invalid = invalid
         self._feeds: dict[str, _Feed] = {}
-        self._idle_feeds: _IdlePool[_Feed] = _IdlePool(IDLE_SUBSCRIPTIONS)
-        self._idle_publishers: _IdlePool[Outgoing] = _IdlePool(IDLE_PUBLISHERS)
+        self._idle_feeds: IdlePool[_Feed] = IdlePool(IDLE_SUBSCRIPTIONS)
+        self._idle_publishers: IdlePool[Outgoing] = IdlePool(IDLE_PUBLISHERS)
         self._arrived: collections.deque[tuple[Listener, Item]] = collections.deque()
         self._waking = False
 
     def close(self) -> None:
-        """Withdraw what no call has any more."""
+        """Withdraw what no call has any more; may wait."""
         self._idle_feeds.close()
         self._idle_publishers.close()
 
     @contextlib.asynccontextmanager
     async def subscribed(self, key: str, listener: Listener) -> AsyncIterator[None]:
-        """Have a listener take what is published under a key expression.
+        """Have a listener receive the publications under a key expression.
 
         Raises:
             TransportError: the network cannot be used.
@@ -274,7 +224,7 @@ class Network:
                 items = {key: Item.of_tracks(tracks, selection) for key, selection in selections.items()}
                 arrived = [(one, items[one.selection.key]) for one in wanting]
         self._arrived.extend(arrived)
-        if arrived and not self._waking:  # what is added after this was seen is still handed over
+        if arrived and not self._waking:  # items that are added after this are still handed over
             self._waking = True
             with contextlib.suppress(RuntimeError):  # the loop has ended
                 self._loop.call_soon_threadsafe(self._hand_over)
@@ -284,7 +234,7 @@ class Network:
         self._waking = False
         while self._arrived:
             listener, item = self._arrived.popleft()
-            listener.take(item)
+            listener.put(item)
 
     def _tracks(self, message: Answer | Arrival) -> EncodedTracks | None:
         try:

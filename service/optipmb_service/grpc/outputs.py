@@ -12,7 +12,7 @@ from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
 from optipmb_service.grpc.calls import EndCall, Outbox
-from optipmb_service.grpc.network import Deduplicator, Item, Listener
+from optipmb_service.grpc.network import Item, Listener
 from optipmb_service.grpc.selection import Pace, Selection
 
 if TYPE_CHECKING:
@@ -47,8 +47,7 @@ async def subscribe(call: Call) -> None:
     if asked.queue > MAX_QUEUE:
         raise schemas.MessageError("too_large", "queue", f"at most {MAX_QUEUE}", str(asked.queue))
     outbox = Outbox(asked.queue or QUEUE)
-    deduplicator = Deduplicator(lambda item: outbox.put(item.stream, item.response))
-    listener = Listener(deduplicator.put, selection, pace.passes)
+    listener = Listener(lambda item: outbox.put(item.stream, item.response), selection, pace.passes)
     async with contextlib.AsyncExitStack() as subscriptions:
         await subscriptions.enter_async_context(network.subscribed(tracks, listener))
         if asked.problems:
@@ -58,7 +57,7 @@ async def subscribe(call: Call) -> None:
         for one in history if asked.history else ():
             if pace.passes(one):
                 await call.write(Item.of_tracks(one, selection).response)
-        deduplicator.begin(history)
+        listener.begin(history)
         try:
             await call.drain(outbox)
         finally:
@@ -95,7 +94,7 @@ async def get_state(call: Call) -> None:
 
 
 async def reset(call: Call) -> None:
-    """Start a session anew, or end it."""
+    """Restart a session, or end it."""
     asked = await call.request(pb.ResetRequest)
     key = call.gateway.client.keys.query(asked.stream, "reset")
     call.caller.may_command(asked.stream)
@@ -144,7 +143,7 @@ async def _asked(call: Call, key: str, message: schemas.Message | None, kind: ty
     """Return the first good answer to a query, in protobuf.
 
     Raises:
-        EndCall: nobody answers, or a service refuses.
+        EndCall: no service answers, or one refuses.
     """
     payload = b"" if message is None else schemas.encode(message)
     encoding = "" if message is None else schemas.encoding_of(message)
@@ -165,7 +164,7 @@ async def _kept(call: Call, stream: str, wanted: schemas.TracksRequest) -> Async
     """Yield the tracks of one stream, asking the service that has them part by part.
 
     Raises:
-        EndCall: nobody answers, not completely, or with a refusal.
+        EndCall: no service answers, not completely, or with a refusal.
     """
     client, encoding = call.gateway.client, schemas.encoding_of(wanted)
     key = client.keys.query(stream, "tracks")
@@ -189,7 +188,7 @@ async def _kept(call: Call, stream: str, wanted: schemas.TracksRequest) -> Async
 
 
 def _newest(publications: Iterable[EncodedTracks]) -> list[EncodedTracks]:
-    """Return what holds of each frame, by stream and stamp: that of the latest run, and in it the latest revision."""
+    """Return the latest revision of the latest run of each frame, by stream and stamp."""
     newest: dict[tuple[str, bytes, int], EncodedTracks] = {}
     for tracks in sorted(publications, key=lambda one: (one.run, one.revision)):
         newest[tracks.stream, tracks.epoch, tracks.seq] = tracks

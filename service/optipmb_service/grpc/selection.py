@@ -35,7 +35,7 @@ class Selection:
 
     def __init__(self, asked: pb.TrackFilter) -> None:
         self.key = asked.SerializeToString(deterministic=True)
-        """Equal filters have equal keys; that of a filter which leaves nothing out is empty."""
+        """Equal filters have equal keys; a filter of everything has an empty one."""
         for name, values in (("classes", asked.classes), ("fields", asked.fields)):
             if len(values) > MAX_NAMES:
                 raise schemas.MessageError("too_large", f"filter.{name}", f"at most {MAX_NAMES}", str(len(values)))
@@ -55,7 +55,7 @@ class Selection:
         self._fields = frozenset((*asked.fields, "id", *paths)) if asked.fields else None
 
     def of(self, tracks: pb.Tracks) -> pb.Tracks:
-        """Return what is wanted of the tracks of a frame."""
+        """Return the selection of the tracks of a frame."""
         rows = self._rows(tracks)
         chosen = pb.Tracks()
         chosen.CopyFrom(tracks)

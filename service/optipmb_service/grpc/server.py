@@ -22,7 +22,7 @@ from optipmb_service.grpc import inputs, outputs
 from optipmb_service.grpc.access import Access, credentials
 from optipmb_service.grpc.calls import Call, CallerGoneError, EndCall, ending_with_caller
 from optipmb_service.grpc.network import Network
-from optipmb_service.runtime.ports import EdgeError, TransportError
+from optipmb_service.stream.ports import EdgeError, TransportError
 from optipmb_service.telemetry.problem_reporter import ProblemReporter, log_problem
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ SAID_BY: Final = "optipmb-gateway"
 """Trailing metadata by which a gateway signs its errors: others come of the way to it."""
 
 GRACE_S: Final = 1.0
-"""How long calls may take to finish what is under way at the end."""
+"""How long calls may take to finish at the end."""
 
 LINK_S: Final = 0.5
 """How often the gateway looks whether it has a router."""
@@ -138,14 +138,14 @@ class Server:
         self._watching = asyncio.create_task(self._watch())
 
     async def stop(self) -> None:
-        """Take no calls any more, finish what is under way, and end."""
+        """Refuse new calls, finish the open ones, and end."""
         if self._watching is not None:
             self._watching.cancel()
         await self._health.enter_graceful_shutdown()
         for call in tuple(self._calls):
             call.end()
         await self._server.stop(GRACE_S)
-        self.network.close()
+        await asyncio.to_thread(self.network.close)
 
     def refused(self, problem: schemas.Problem) -> None:
         """Count and report the problem of a message that is not valid."""

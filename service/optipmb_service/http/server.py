@@ -24,7 +24,7 @@ from starlette.routing import Route
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from optipmb_service.http.page import page
-from optipmb_service.runtime.ports import HttpError
+from optipmb_service.stream.ports import HttpError
 from optipmb_service.telemetry.metrics import CONTENT_TYPE
 
 if TYPE_CHECKING:

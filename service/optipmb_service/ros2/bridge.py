@@ -1,8 +1,8 @@
-"""What becomes of each message between ROS 2 and the service: free of the network, the clock is handed in.
+"""Conversion of messages between ROS 2 and the service, and the state of the bridge as `DiagnosticArray`.
 
 Detections and clouds need the pose of their frame. They wait for it, at most `tf_wait_s` and at most `WAITING` of them
-per stream, and go out in the order in which they came. What is refused or lost is counted, and reported as a
-problem of the stream.
+per stream, and go out in the order in which they came. Refused and lost messages are counted, and reported as problems
+of the stream.
 """
 
 from __future__ import annotations
@@ -10,8 +10,9 @@ from __future__ import annotations
 import collections
 import math
 import secrets
+import time
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 import optipmb_schemas as schemas
@@ -19,16 +20,15 @@ from optipmb_schemas.ros2 import arrays, tracks
 from optipmb_schemas.ros2.transforms import TransformError, Transforms
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Mapping
 
-    from optipmb_schemas.ros2.types import Types
-
-    from optipmb_service.settings import Ros2Settings, Ros2Stream
+    from optipmb_service.ros2.node import Ros2Node
+    from optipmb_service.settings import Ros2Stream, Settings
 
 Kind = Literal["detections", "points"]
 
-__all__ = ["WAITING", "Bridge", "Counts", "Sink"]
-
+DIAGNOSTICS: Final = "diagnostic_msgs/msg/DiagnosticArray"
+OK, WARN, ERROR, STALE = range(4)
 WAITING: Final[dict[Kind, int]] = {"detections": 64, "points": 16}
 """Messages of a stream that wait for their pose."""
 KEPT: Final = 4096
@@ -41,45 +41,7 @@ RESTART_S: Final = 5.0
 CLOUDS_S: Final = 2.0
 """Without a cloud for so long none is waited for."""
 CLOCK_BACK_NS: Final = 5 * 10**9
-"""Stamps of detections that go back by more are those of a clock that was set back, as a simulation's that restarts."""
-
-
-class Sink(Protocol):
-    """Where things go."""
-
-    def send(self, stream: str, message: schemas.Detections | schemas.Points) -> None:
-        """Publish to the service."""
-
-    def tell(self, problem: schemas.Problem) -> None:
-        """Publish a problem of a stream."""
-
-    def publish(self, topic: str, message: Any) -> None:
-        """Publish to ROS."""
-
-    def listened(self, topic: str) -> bool:
-        """Whether ROS has a subscription to a topic."""
-
-    def ask(self, stream: str, parameters: schemas.SessionParameters, then: Callable[[], None] | None = None) -> None:
-        """Set parameters of a stream's session; `then` is called when that is done, or has failed."""
-
-
-@dataclass
-class Counts:
-    """What became of the messages of a stream since the start."""
-
-    detections: int = 0
-    points: int = 0
-    refused: int = 0
-    tracks: int = 0
-    problems: int = 0
-    problem: str = ""
-    """The newest of the bridge."""
-    service_problem: str = ""
-    """The newest of the service."""
-    newest_s: float | None = None
-    """When the newest detections came; clock of the bridge."""
-    latency_ms: float = 0.0
-    """Of the newest tracks, from the arrival of the detections."""
+"""Stamps of detections that go back by more: the clock was set back, as of a simulation that restarts."""
 
 
 @dataclass
@@ -102,7 +64,6 @@ class _Stream:
     """Until when messages wait for the session to restart in another world; clock of the bridge."""
     ended: str = ""
     """Id of the session in the world before, whose tracks may still come."""
-    seq: dict[Kind, int] = field(default_factory=lambda: {"detections": 0, "points": 0})
     waiting: dict[Kind, collections.deque[_Waiting]] = field(
         default_factory=lambda: {"detections": collections.deque(), "points": collections.deque()}
     )
@@ -117,38 +78,35 @@ class _Stream:
     """Id of the session of these tracks."""
     shown_ns: int = -1
     """Stamp of the newest tracks that went to ROS."""
-    counts: Counts = field(default_factory=Counts)
+    newest_s: float | None = None
+    """When the newest detections came; clock of the bridge."""
+    latency_ms: float = 0.0
+    """Of the newest tracks, from the arrival of the detections."""
+    sent: collections.Counter[Kind] = field(default_factory=collections.Counter)
+    refused: int = 0
+    tracks: int = 0
+    problems: int = 0
+    diagnosed: int = 0
+    """Problems at the last diagnosis."""
+    problem: str = ""
+    """The newest of the bridge."""
+    service_problem: str = ""
+    """The newest of the service."""
 
 
 class Bridge:
-    """The streams of the settings, and the transforms that they share. Not for several threads.
+    """The streams of the settings, and the transforms that they share. Not for several threads."""
 
-    Args:
-        settings: topics and streams.
-        instance: who tells problems.
-        types: makes ROS's messages.
-        sink: where things go.
-        clock: seconds, monotonic.
-    """
-
-    def __init__(
-        self, settings: Ros2Settings, instance: str, types: Types, sink: Sink, clock: Callable[[], float]
-    ) -> None:
-        self._settings = settings
-        self._instance = instance
-        self._types = types
-        self._sink = sink
-        self._clock = clock
+    def __init__(self, settings: Settings, node: Ros2Node) -> None:
+        self._settings = settings.ros2
+        self._instance = settings.instance
+        self._stale_s = settings.stale_s
+        self._node = node
         self._transforms = Transforms(kept=KEPT, frames=FRAMES)
-        self._streams = {name: _Stream(name, topics) for name, topics in settings.streams.items()}
-
-    @property
-    def counts(self) -> dict[str, Counts]:
-        """What became of the messages, by stream."""
-        return {name: stream.counts for name, stream in self._streams.items()}
+        self._streams = {name: _Stream(name, topics) for name, topics in settings.ros2.streams.items()}
 
     def take_transforms(self, message: Any, *, static: bool) -> None:
-        """Take in a `TFMessage`; what waited for it goes out.
+        """Apply a `TFMessage`; messages that waited for it go out.
 
         Raises:
             MessageError: one of them is no transform; those before it are taken.
@@ -159,7 +117,7 @@ class Bridge:
         self.go_on()
 
     def take_odometry(self, message: Any) -> None:
-        """Take in an `Odometry` as the transform of its child frame.
+        """Apply an `Odometry` as the transform of its child frame.
 
         Raises:
             MessageError: it is no pose.
@@ -169,10 +127,10 @@ class Bridge:
         self.go_on()
 
     def take(self, stream: str, kind: Kind, message: Any) -> None:
-        """Take in detections or a cloud of a stream; it goes out as soon as its pose is known."""
-        one, now = self._streams[stream], self._clock()
+        """Accept detections or a cloud of a stream; it goes out as soon as its pose is known."""
+        one, now = self._streams[stream], time.monotonic()
         if kind == "detections":
-            one.counts.newest_s = now
+            one.newest_s = now
         else:
             one.cloud_s = now
         try:
@@ -197,21 +155,21 @@ class Bridge:
         self.go_on()
 
     def refuse(self, stream: str, error: schemas.MessageError) -> None:
-        """Count and tell a message that cannot be read."""
+        """Count and report a message that cannot be read."""
         self._refuse(self._streams[stream], error)
 
     def go_on(self) -> None:
-        """Send what has its pose by now, and give up what has waited for too long; to be called now and then."""
-        now = self._clock()
+        """Send messages whose poses are known, drop messages that waited for too long; to be called regularly."""
+        now = time.monotonic()
         for stream in self._streams.values():
             for queue in stream.waiting.values():
                 while queue and now >= stream.restart_s and self._sent(stream, queue[0], now):
                     queue.popleft()
 
     def take_tracks(self, message: schemas.Tracks) -> None:
-        """Publish the tracks of a stream to ROS; those of frames before the newest one are left out."""
+        """Publish the tracks of a stream to ROS, but for frames before the newest one."""
         stream = self._streams[message.stream]
-        if self._clock() < stream.restart_s or message.session == stream.ended:
+        if time.monotonic() < stream.restart_s or message.session == stream.ended:
             return
         if message.session != stream.session and not message.revision:
             stream.session, stream.shown_ns = message.session, -1  # its clock may have stepped back
@@ -220,32 +178,67 @@ class Bridge:
         stream.shown_ns = message.stamp_ns
         arrived = stream.arrived.get(message.stamp_ns)
         if arrived is not None:
-            stream.counts.latency_ms = 1e3 * (self._clock() - arrived)
-        stream.counts.tracks += 1
+            stream.latency_ms = 1e3 * (time.monotonic() - arrived)
+        stream.tracks += 1
         if not tracks.has_paths(message):
             self._ask_paths(stream, message)
-        made = tracks.messages(self._types, message, message.stamp_ns, stream.world, stream.name)
+        made = tracks.messages(self._node.types, message, message.stamp_ns, stream.world, stream.name)
         for end, one in made:
-            self._sink.publish(stream.topics.tracks_topic + end, one)
+            self._node.publish(stream.topics.tracks_topic + end, one)
 
     def take_problem(self, problem: schemas.Problem) -> None:
-        """Take in a problem that the service tells of a stream."""
+        """Note a problem that the service reports of a stream."""
         if problem.instance != self._instance and (stream := self._streams.get(problem.stream)) is not None:
-            stream.counts.problems += 1
-            stream.counts.service_problem = f"{problem.instance}: {problem.message}"
+            stream.problems += 1
+            stream.service_problem = f"{problem.instance}: {problem.message}"
+
+    def diagnose(self, mismatches: tuple[str, ...]) -> None:
+        """Publish the state of all streams, and the endpoints of others that do not fit."""
+        statuses = []
+        for name, one in self._streams.items():
+            level, text = OK, "tracking"
+            if one.newest_s is None or time.monotonic() - one.newest_s > self._stale_s:
+                level, text = STALE, "no detections"
+            elif one.problems > one.diagnosed:
+                level, text = WARN, "; ".join(filter(None, (one.problem, one.service_problem)))
+            elif not one.tracks:
+                level, text = WARN, "no tracks come back: is optipmb-service running, with the same prefix?"
+            one.diagnosed = one.problems
+            values = {
+                "detections": one.sent["detections"],
+                "points": one.sent["points"],
+                "refused": one.refused,
+                "tracks": one.tracks,
+                "latency_ms": f"{one.latency_ms:.1f}",
+                "problems": one.problems,
+                "last_problem": one.problem,
+                "last_service_problem": one.service_problem,
+            }
+            statuses.append(self._status(level, name, text, values))
+        values = {f"mismatch_{number}": line for number, line in enumerate(mismatches)}
+        level, text = (ERROR, mismatches[0]) if mismatches else (OK, "all endpoints fit")
+        statuses.append(self._status(level, "topics", text, values))
+        header = tracks.header_of(time.time_ns(), "")
+        message = self._node.types.new(DIAGNOSTICS, header=header, status=statuses)
+        self._node.publish(self._settings.diagnostics, message)
+
+    def _status(self, level: int, name: str, text: str, values: Mapping[str, object]) -> dict[str, Any]:
+        pairs = [{"key": key, "value": str(value)} for key, value in values.items()]
+        about = {"level": level, "name": f"optipmb: {name}", "message": text}
+        return about | {"hardware_id": self._instance, "values": pairs}
 
     def _ask_paths(self, stream: _Stream, message: schemas.Tracks) -> None:
-        """Ask the service for paths at the horizons of ROS beside those that the session has, now and then."""
-        now, present = self._clock(), () if message.horizons is None else message.horizons.tolist()
+        """Have the session predict paths at the horizons of ROS, in addition to its own."""
+        now, present = time.monotonic(), () if message.horizons is None else message.horizons.tolist()
         horizons = sorted({*tracks.HORIZONS, *present})
         if now < stream.ask_s or len(horizons) > schemas.DEFAULT.max_horizons:
             return
-        if self._sink.listened(f"{stream.topics.tracks_topic}/predicted"):
+        if self._node.listened(f"{stream.topics.tracks_topic}/predicted"):
             stream.ask_s = now + ASK_S
-            self._sink.ask(stream.name, schemas.SessionParameters(horizons=np.array(horizons)))
+            self._node.set_parameters(stream.name, schemas.SessionParameters(horizons=np.array(horizons)))
 
     def _sent(self, stream: _Stream, waiting: _Waiting, now: float) -> bool:
-        """Send a message, or give it up; False while it has to wait."""
+        """Send or drop a message; False while it has to wait."""
         frame = arrays.frame_of(waiting.message.header)
         try:
             pose = self._pose(stream, frame, waiting.stamp_ns)
@@ -261,25 +254,22 @@ class Bridge:
             self._refuse(stream, error)
             return True
         try:
-            self._sink.send(stream.name, self._message(stream, waiting, pose))
+            self._node.send(stream.name, self._message(stream, waiting, pose))
         except schemas.MessageError as error:
             self._refuse(stream, error, waiting.stamp_ns)
             return True
-        stream.seq[waiting.kind] += 1
+        stream.sent[waiting.kind] += 1
         if waiting.kind == "detections":
-            stream.counts.detections += 1
             stream.arrived[waiting.stamp_ns] = waiting.arrived_s
             if len(stream.arrived) > WAITING["detections"]:
                 stream.arrived.popitem(last=False)
-        else:
-            stream.counts.points += 1
         return True
 
     def _message(self, stream: _Stream, waiting: _Waiting, pose: schemas.Pose) -> schemas.Detections | schemas.Points:
         header: Any = {
             "stream": stream.name,
             "epoch": stream.epoch,
-            "seq": stream.seq[waiting.kind],
+            "seq": stream.sent[waiting.kind],
             "stamp_ns": waiting.stamp_ns,
             "frame": "sensor",
             "pose": pose,
@@ -287,24 +277,13 @@ class Bridge:
         if waiting.kind == "points":
             return schemas.Points(**header, xyz=arrays.points_of(waiting.message))
         boxes = arrays.boxes_of(waiting.message, stream.topics.classes, covariance=stream.topics.covariance)
-        return schemas.Detections(
-            **header,
-            labels=boxes.labels,
-            label=boxes.label,
-            center=boxes.center,
-            size=boxes.size,
-            yaw=boxes.yaw,
-            score=boxes.score,
-            velocity=boxes.velocity,
-            position_covariance=boxes.position_covariance,
-            has_points=self._has_points(stream),
-        )
+        return schemas.Detections(**header, **vars(boxes), has_points=self._has_points(stream))
 
     def _has_points(self, stream: _Stream) -> bool | None:
         """Whether the service shall wait for a cloud: while clouds come, and before it is known whether they do."""
         if not stream.topics.points:
             return False
-        expected = not stream.counts.detections or self._clock() - stream.cloud_s < CLOUDS_S
+        expected = not stream.sent["detections"] or time.monotonic() - stream.cloud_s < CLOUDS_S
         return True if expected else None
 
     def _pose(self, stream: _Stream, frame: str, stamp_ns: int) -> schemas.Pose:
@@ -325,16 +304,15 @@ class Bridge:
         return schemas.Pose(translation=translation, quaternion=quaternion)
 
     def _restart(self, stream: _Stream, before: str, stamp_ns: int) -> None:
-        """Have the session begin anew in another world than before, while messages wait."""
+        """Restart the session in another world, while messages wait."""
         text = f"the root of tf is now {stream.world!r}, where tracks begin anew; it was {before!r}"
         self._tell(stream, "world_changed", f"{text}. Set `fixed_frame` to wait for a frame", stamp_ns, refused=0)
-        stream.restart_s, stream.ended = self._clock() + RESTART_S, stream.session
+        stream.restart_s, stream.ended = time.monotonic() + RESTART_S, stream.session
 
-        def restarted() -> None:
+        def restarted() -> None:  # on another thread: what waits goes out at the next `go_on`
             stream.restart_s = -math.inf
-            self.go_on()
 
-        self._sink.ask(stream.name, schemas.SessionParameters(restart=True), restarted)
+        self._node.set_parameters(stream.name, schemas.SessionParameters(restart=True), restarted)
 
     def _add(self, path: str, header: Any, child: Any, place: Any, turn: Any, *, static: bool) -> None:
         try:
@@ -350,18 +328,18 @@ class Bridge:
             raise error.under(path) from None
 
     def _refuse(self, stream: _Stream, error: schemas.MessageError, stamp_ns: int | None = None) -> None:
-        stream.counts.refused += 1
+        stream.refused += 1
         problem = schemas.Problem.of(error, stream=stream.name, instance=self._instance)
-        stream.counts.problems += 1
-        stream.counts.problem = problem.message
-        self._sink.tell(problem.model_copy(update={"stamp_ns": stamp_ns}))
+        stream.problems += 1
+        stream.problem = problem.message
+        self._node.report(problem.model_copy(update={"stamp_ns": stamp_ns}))
 
     def _tell(self, stream: _Stream, code: str, text: str, stamp_ns: int, *, refused: int = 1) -> None:
-        stream.counts.refused += refused
+        stream.refused += refused
         text = text[:500]
-        stream.counts.problems += 1
-        stream.counts.problem = text
-        self._sink.tell(
+        stream.problems += 1
+        stream.problem = text
+        self._node.report(
             schemas.Problem(stream=stream.name, instance=self._instance, code=code, message=text, stamp_ns=stamp_ns)
         )
 

@@ -7,6 +7,9 @@ A message of a topic goes to `<domain>/<topic>/<type>/<hash>`. Nodes and endpoin
 
 in which `%` stands for `/`. Quality of service is `reliability:durability:history,depth:deadline:lifespan:liveliness`
 as numbers of rmw, empty where it is the default. Humble has no hashes of types and writes `TypeHashNotSupported`.
+
+rmw_zenoh delivers whatever the quality of service, and a type with another definition has another key, so its messages
+do not arrive. `Matching` reports what DDS would refuse.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ __all__ = [
     "PUBLISHER",
     "SUBSCRIPTION",
     "Endpoint",
+    "Matching",
     "Node",
     "Qos",
     "TopicKey",
@@ -53,13 +57,13 @@ def dds_type(name: str) -> str:
 
 
 def ros_type(name: str) -> str:
-    """Return the name of a type as ROS has it; what is none stays as it is."""
+    """Return the name of a type as ROS has it, and other text as it is."""
     return name.replace("::dds_::", "::").removesuffix("_").replace("::", "/")
 
 
 @dataclass(frozen=True)
 class Qos:
-    """What two endpoints must agree on, as DDS has it: the offer must be at least what is asked for."""
+    """Quality of service, as DDS has it: the offer must be at least what is asked for."""
 
     reliable: bool = True
     transient_local: bool = False
@@ -109,7 +113,7 @@ def topic_pattern(domain: int, topic: str) -> str:
 
 
 def parse_topic(key: str) -> TopicKey | None:
-    """Return the parts of a key; None when it is that of no topic."""
+    """Return the parts of a key; None when it is no topic's."""
     parts = key.split("/")
     if len(parts) < 4 or not parts[0].isdecimal():  # noqa: PLR2004 - domain, topic, type, hash
         return None
@@ -163,7 +167,7 @@ def graph_pattern(domain: int) -> str:
 
 
 def parse_endpoint(key: str) -> Endpoint | None:
-    """Return the publisher or subscription of a token; None for other tokens, and for what is none."""
+    """Return the publisher or subscription of a token; None for other tokens and other text."""
     parts = key.split("/")
     if len(parts) < _PARTS or parts[0] != _SPACE or parts[5] not in {PUBLISHER, SUBSCRIPTION}:
         return None
@@ -176,5 +180,52 @@ def parse_endpoint(key: str) -> Endpoint | None:
 
 
 def attachment(number: int, stamp_ns: int, gid: bytes) -> bytes:
-    """Return what goes with each message: its number, when it was sent (ns since 1970), and who sent it (16 bytes)."""
+    """Return the attachment of a message: its number, its time (ns since 1970), and its publisher (16 bytes)."""
     return struct.pack("<qqB", number, stamp_ns, GID) + gid
+
+
+class Matching:
+    """Endpoints of others that do not fit ours, with advice in words. Not for several threads.
+
+    Args:
+        ours: our endpoints.
+        single: topics that one publisher alone may have.
+    """
+
+    def __init__(self, ours: tuple[Endpoint, ...], single: frozenset[str]) -> None:
+        self._ours = ours
+        self._single = single
+        self._others: dict[str, Endpoint] = {}
+
+    def change(self, endpoint: Endpoint, *, came: bool) -> tuple[str, ...]:
+        """Note that an endpoint of another node came or went; return new problems."""
+        before = set(self.problems())
+        if came:
+            self._others[endpoint.token()] = endpoint
+        else:
+            self._others.pop(endpoint.token(), None)
+        return tuple(problem for problem in self.problems() if problem not in before)
+
+    def problems(self) -> tuple[str, ...]:
+        """Return all present problems, ordered."""
+        found = {text for ours in self._ours for other in self._others.values() if (text := _wrong(ours, other))}
+        for topic in self._single:
+            count = sum(other.kind == PUBLISHER and other.topic == topic for other in self._others.values())
+            if count > 1:
+                found.add(f"{topic}: {count} publishers, their detections are taken for those of one sensor")
+        return tuple(sorted(found))
+
+
+def _wrong(ours: Endpoint, other: Endpoint) -> str:
+    """Return the problem between two endpoints; empty when there is none, or they are no pair."""
+    if ours.topic != other.topic or {ours.kind, other.kind} != {PUBLISHER, SUBSCRIPTION}:
+        return ""
+    verb = "publishes" if other.kind == PUBLISHER else "subscribes to"
+    head = f"{ours.topic}: node {other.name} {verb} "
+    if other.type != ours.type:
+        return f"{head}{other.type}, expected {ours.type}"
+    if other.hash not in {ours.hash, NO_HASH}:
+        return f"{head}another definition of {ours.type} ({other.hash}, expected {ours.hash}): nothing is exchanged"
+    request, offer = (ours.qos, other.qos) if ours.kind == SUBSCRIPTION else (other.qos, ours.qos)
+    lack = request.lacks(offer)
+    return f"{head}with a quality of service that does not match: {lack}" if lack else ""

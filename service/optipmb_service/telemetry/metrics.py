@@ -9,7 +9,6 @@ and only so many streams have them.
 
 from __future__ import annotations
 
-import json
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Mapping
@@ -21,7 +20,7 @@ import structlog
 from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 from prometheus_client.metrics_core import Metric
-from prometheus_client.samples import Sample
+from prometheus_client.parser import text_string_to_metric_families
 
 from optipmb_service import __version__
 from optipmb_service.telemetry.logs import lines_dropped
@@ -32,8 +31,8 @@ if TYPE_CHECKING:
     import optipmb_schemas as schemas
 
     import optipmb
-    from optipmb_service.session.values import MessageCounters
     from optipmb_service.telemetry.problem_reporter import ProblemReporter
+    from optipmb_service.telemetry.stream_meter import MessageCounters
 
 log = structlog.get_logger("optipmb_service")
 
@@ -298,7 +297,7 @@ class Metrics:
 
     def __init__(self, *, counts: bool = True) -> None:
         self.workers: Callable[[], Iterable[tuple[int, bytes]]] = tuple
-        """Returns the `samples` of worker processes, each with its number; `text` has them too."""
+        """Returns the `text` of worker processes, each with its number; that of this process has them too."""
         self.latency, self.queue, self.decode, self.step = Durations(), Durations(), Durations(), Durations()
         self.messages, self.bytes, self.foreign_messages, self.foreign_bytes = (
             {"detections": 0, "points": 0} for _ in range(4)
@@ -350,26 +349,12 @@ class Metrics:
         registry.register(Collected(self._merged))
         return generate_latest(registry)
 
-    def samples(self) -> bytes:
-        """Return all metrics as `families` reads them."""
-        return json.dumps(
-            [
-                [
-                    one.name,
-                    one.documentation,
-                    one.type,
-                    [[sample.name, sample.labels, sample.value] for sample in one.samples],
-                ]
-                for one in self._registry.collect()
-            ]
-        ).encode()
-
     def _merged(self) -> Iterable[Metric]:
         merged: dict[str, Metric] = {}
         parts: list[tuple[dict[str, str], Iterable[Metric]]] = [({}, self._registry.collect())]
-        for worker, data in self.workers():
+        for worker, text in self.workers():
             try:
-                parts.append(({"worker": str(worker)}, families(data)))
+                parts.append(({"worker": str(worker)}, list(text_string_to_metric_families(text.decode()))))
             except ValueError as error:
                 log.warning("metrics_unreadable", worker=worker, error=str(error))
         for labels, metrics in parts:
@@ -377,24 +362,6 @@ class Metrics:
                 into = merged.setdefault(metric.name, Metric(metric.name, metric.documentation, metric.type))
                 into.samples += [sample._replace(labels={**sample.labels, **labels}) for sample in metric.samples]
         return merged.values()
-
-
-def families(data: bytes) -> list[Metric]:
-    """Return the metrics that `Metrics.samples` of another process gave.
-
-    Raises:
-        ValueError: they are none.
-    """
-    made = []
-    try:
-        for name, meaning, kind, samples in json.loads(data):
-            one = Metric(str(name), str(meaning), kind)
-            for sample, labels, value in samples:
-                one.samples.append(Sample(str(sample), {str(key): str(labels[key]) for key in labels}, float(value)))
-            made.append(one)
-    except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
-        raise ValueError(f"expected the metrics of a worker as JSON: {error}") from error
-    return made
 
 
 class Collected:

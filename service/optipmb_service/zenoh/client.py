@@ -1,30 +1,58 @@
-"""The network as the service and its edges use it: publishes inputs, reads outputs, asks.
+"""The session of the service and its edges on the network: publishes inputs, reads outputs, asks.
 
-What it declares for others is what `optipmb_client` declares for a program of its own, so that nothing on the network
-can tell the two apart.
+It declares the same as `optipmb_client` does for a program of its own, so that nothing on the network can tell the two
+apart.
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
+import os
 import threading
 import time
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Generic, Protocol, TypeVar
 
 import optipmb_schemas as schemas
 import structlog
+from optipmb_client.zenoh.configuration import BUSY, certificates, configured, loaded
 from optipmb_client.zenoh.session import Session
+from optipmb_client.zenoh.session import opened as open_session
 
-from optipmb_service.runtime.ports import TransportError
-from optipmb_service.zenoh.connection import opened
+from optipmb_service.stream.ports import TransportError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Hashable
+    from pathlib import Path
 
     from optipmb_client.incoming import Arrival
     from optipmb_client.zenoh.handles import Reading, Sender
+    from optipmb_client.zenoh.session import Opened
 
     from optipmb_service.settings import Settings
+
+WAIT_BEFORE_CLOSE_US: Final = 30_000_000
+"""How long a client waits to declare something where its router is slow to read, before Zenoh closes the link.
+
+Zenoh's own 5 s make it worse: all that was declared on the link is withdrawn, and declared again on the next one. A
+router that does not answer at all is left when its lease ends.
+"""
+
+RETRY_MS: Final = {"period_init_ms": 100, "period_max_ms": 2000, "period_increase_factor": 2}
+
+RUNTIME_VARIABLE: Final = "ZENOH_RUNTIME"
+RUNTIME: Final = "(rx: (handover: app))"
+"""A client has one link, and one thread that waits for its socket and reads it; after that was lost, Zenoh has two.
+
+By default one thread waits and wakes one of two others to read: two more threads are woken for each message.
+Sending has a thread of its own, so a callback that waits for the lock of the interpreter keeps nothing from leaving.
+"""
+
+LISTENING: Final = "zenoh_listen"
+"""Use of the certificate of a listener, which Zenoh reads at its start alone."""
+
+MESSAGE_HEADROOM: Final = 4
+"""A message up to this many times the limit is received and answered by a problem; a larger one is dropped by Zenoh."""
 
 NEW_STREAMS: Final = 4000
 """Publishers and subscriptions that edges have declared at once."""
@@ -32,7 +60,76 @@ NEW_STREAMS: Final = 4000
 NEW_STREAM_S: Final = 0.5
 """Time after which there is a further one, in the long run."""
 
+IDLE_S: Final = 60.0
+"""Time after which a resource that is not used is closed; up to twice as long where few are kept."""
+
 log = structlog.get_logger("optipmb_service")
+
+
+class _Closable(Protocol):
+    def close(self) -> None:
+        """Release it."""
+
+
+R = TypeVar("R", bound=_Closable)
+
+
+class IdlePool(Generic[R]):
+    """Subscriptions and publishers that are not used at the moment, by key; may be used by any threads.
+
+    They are kept for the next user because Zenoh never gives back the number of a key. They are closed after
+    `IDLE_S`, and the oldest of more than `most` at once.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._lock = threading.Lock()
+        self._idle: dict[Hashable, tuple[float, R]] = {}
+        self._is_timed = False
+
+    def keep(self, key: Hashable, resource: R) -> bool:
+        """Add a resource; False when there is one of this key."""
+        with self._lock:
+            if key in self._idle:
+                return False
+            self._idle[key] = time.monotonic() + IDLE_S, resource
+            if len(self._idle) > self._most:
+                self._end_in(0.0)
+            elif not self._is_timed:
+                self._end_in(IDLE_S)
+        return True
+
+    def take(self, key: Hashable) -> R | None:
+        """Remove and return the resource of a key, None when there is none."""
+        with self._lock:
+            _, resource = self._idle.pop(key, (0.0, None))
+        return resource
+
+    def close(self) -> None:
+        """Close all resources."""
+        with self._lock:
+            left, self._idle = self._idle, {}
+        for _, resource in left.values():
+            resource.close()
+
+    def _end_in(self, seconds: float) -> None:
+        self._is_timed |= seconds > 0
+        timer = threading.Timer(seconds, self._end, (seconds > 0,))
+        timer.daemon = True
+        timer.start()
+
+    def _end(self, timed: bool) -> None:  # noqa: FBT001 - as the timer is given it
+        now = time.monotonic()
+        with self._lock:
+            surplus = len(self._idle) - self._most
+            ended = [key for at, (key, (ends, _)) in enumerate(self._idle.items()) if at < surplus or ends <= now]
+            resources = [self._idle.pop(key)[1] for key in ended]
+            if timed:
+                self._is_timed = False
+                if self._idle:
+                    self._end_in(IDLE_S)
+        for resource in resources:
+            resource.close()
 
 
 class Turns:
@@ -74,7 +171,7 @@ class Outgoing:
         self._senders = detections, points
         self.detections = detections.put
         self.points = points.put
-        points.on_wanted(lambda: self.wanted())  # noqa: PLW0108 - it is set anew for another call
+        points.on_wanted(lambda: self.wanted())  # noqa: PLW0108 - it changes with the call
 
     @property
     def points_wanted(self) -> bool:
@@ -125,7 +222,7 @@ class Client(Session):
                 self.put(self.keys.problems(problem.stream), schemas.encode(problem), schemas.encoding_of(problem))
 
     def subscribe(self, key: str, receive: Callable[[Arrival], object], *, history: bool = False) -> Reading:
-        """Hand over what is published under a key expression, as `Session` does.
+        """Hand over publications under a key expression, as `Session` does.
 
         Raises:
             TransportError: also where too many were opened.
@@ -136,3 +233,64 @@ class Client(Session):
 
 def _log_failure(name: str) -> None:
     log.exception("internal_error", reader=name)  # noqa: LOG004 - called while the exception is handled
+
+
+def opened(settings: Settings) -> Opened:
+    """Open a session of Zenoh's; a client does not return before it has a router.
+
+    Raises:
+        TransportError: an endpoint is in use or unusable, or the file of the settings is.
+    """
+    config = configured(_values(settings), settings.zenoh_config, router=settings.is_router)
+    # Read when the first session of a process opens; neither a later router nor a child is to find it.
+    sets_runtime = not settings.is_router and RUNTIME_VARIABLE not in os.environ
+    if sets_runtime:
+        os.environ[RUNTIME_VARIABLE] = RUNTIME
+    try:
+        return open_session(config)
+    except TransportError as error:
+        where = ", ".join((*settings.endpoints, *settings.connect))
+        if "Address already in use" in str(error):
+            reason = f"cannot listen on {where}: the address is in use; is another optipmb-service running?"
+        else:
+            reason = f"cannot open {where}: {error}"
+        raise TransportError(reason) from error
+    finally:
+        if sets_runtime:
+            del os.environ[RUNTIME_VARIABLE]
+
+
+def certificates_of(settings: Settings) -> dict[str, Path]:
+    """Return the files of the certificates that the Zenoh configuration names, by their use.
+
+    Raises:
+        TransportError: the file of the configuration cannot be read.
+    """
+    uses = {"connect_certificate": "zenoh", "listen_certificate": LISTENING, "root_ca_certificate": "zenoh_authority"}
+    return {uses[name]: file for name, file in certificates(loaded(settings.zenoh_config)).items()}
+
+
+def _values(settings: Settings) -> dict[str, object]:
+    values: dict[str, object] = {
+        **BUSY,
+        "mode": "router" if settings.is_router else "client",
+        "listen/endpoints": list(settings.endpoints),
+        "connect/endpoints": list(settings.connect),
+        "connect/timeout_ms": -1,
+        "connect/retry": RETRY_MS,
+        "scouting/delay": 0,
+        "timestamping/enabled": True,
+        "transport/shared_memory/enabled": settings.shared_memory,
+        "transport/link/tx/lease": round(settings.lease_s * 1e3),
+        "transport/link/rx/max_message_size": MESSAGE_HEADROOM * settings.limits.max_bytes,
+    }
+    if settings.is_router:
+        values["connect/exit_on_failure"] = False  # a router starts without the routers that it looks for
+    else:
+        values["transport/link/tx/queue/congestion_control/block/wait_before_close"] = WAIT_BEFORE_CLOSE_US
+    # One interest in the subscribers of all tracks, and one in heartbeats, in place of two for each stream:
+    # a router compares every subscription with all interests.
+    tracks = schemas.Keys(settings.prefix).all("tracks")
+    aggregated = json.loads(loaded(settings.zenoh_config).get_json("aggregation/publishers"))
+    values["aggregation/publishers"] = [*aggregated, tracks, f"{tracks}/@adv/**"]
+    return values

@@ -2,9 +2,9 @@
 
 A subscription is known by its topic and its key. However many there are, the samples of a topic are handed over one
 after the other, in their order, on the thread of the network that brings them: a queue and a thread in between would
-cost each message two more changes of the thread. When the subscription of a stream takes over from that of all
-streams, or the other way round, nothing is missing in between, and what comes twice is the newest message at most: that
-is what a new subscription asks Zenoh for. What caches hold from before is asked for once for each publisher
+cost each message two more changes of the thread. When the subscription of a stream replaces the subscription of
+all streams, or the other way round, nothing is missing in between, and only the newest message comes twice: a new
+subscription asks Zenoh for it. The messages that caches hold from before are asked for once for each publisher
 (`late_join`), and again after the stream was not subscribed to.
 """
 
@@ -21,7 +21,7 @@ import structlog
 from optipmb_client.zenoh.late_join import CacheQueries, LateJoin
 from optipmb_client.zenoh.session import NEWEST
 
-from optipmb_service.runtime.intake import ALL
+from optipmb_service.stream.intake import ALL
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -72,13 +72,13 @@ class Topic:
     def subscribe(
         self, name: str, key: str, passing: Callable[[Sample], None] | None = None, *, cached: bool = True
     ) -> None:
-        """Receive what is published under a key expression from now on, and what caches hold of it.
+        """Receive publications under a key expression, and those in caches.
 
         Args:
-            name: of the subscription; `ALL` for that of all streams.
+            name: of the subscription; `ALL` for all streams.
             key: the key expression.
             passing: called for each sample instead of the topic's function; nothing is recovered then.
-            cached: whether what was lost is recovered from caches.
+            cached: whether lost messages are recovered from caches.
 
         Raises:
             TransportError: the session is closed, or has declared all keys that it can.
@@ -89,16 +89,16 @@ class Topic:
         self._subscribers[name] = key, subscriber
 
     def leave(self, names: Iterable[str]) -> None:
-        """Withdraw subscriptions; what came before is handed over. Caches are asked again when their keys come again.
+        """Withdraw subscriptions; messages received before are handed over.
 
-        While all streams are received, none has gone.
+        Caches are asked again when their keys come again. While all streams are received, none has gone.
         """
         left = [self._subscribers.pop(name) for name in names]
         for _, subscriber in left:
             subscriber.close()
         if left and ALL not in self._subscribers:
             kept = frozenset(key for key, _ in self._subscribers.values())
-            # After what has come, which would be known again.
+            # After the messages that wait, whose publishers would be known again.
             self._in_turn(self._late_join.keep, kept)
 
     def due(self, zid: str, eid: int) -> int:
@@ -110,8 +110,8 @@ class Topic:
         self._in_turn(then)
 
     def close(self, timeout: float) -> None:
-        """End it; what came before is handed over within `timeout` seconds, and nothing afterwards."""
-        # One that does not return is left behind with its thread; whoever closes again goes on with the others.
+        """End it; messages received before are handed over within `timeout` seconds, and nothing afterwards."""
+        # One that does not return is left behind with its thread; a second close goes on with the others.
         with contextlib.suppress(KeyError):
             while True:
                 _, (_, subscriber) = self._subscribers.popitem()
@@ -157,8 +157,8 @@ class Topic:
 class ReturnedPublishers:
     """Publishers whose tokens came back, and who are asked for the newest number in their caches.
 
-    After a lost link the numbers go on. Those of a program that was started again with the Zenoh id of its last run
-    begin anew, and Zenoh drops its messages, up to the highest number before, without a word.
+    After a lost link the numbers go on. The numbers of a program that was started again with the Zenoh id of its last
+    run begin at 0, and Zenoh drops its messages, up to the highest number before, without a word.
 
     Args:
         due: returns the number that is expected next of a publisher, by Zenoh id and number of the entity; 0: it is not
@@ -177,7 +177,7 @@ class ReturnedPublishers:
             self._waiting[token] = time.monotonic_ns() + FIRST_PAUSE_NS, FIRST_PAUSE_NS
 
     def look(self, report: Callable[[str, int, int], None]) -> None:
-        """Ask those that are due, without waiting for the answers.
+        """Ask the publishers that are due, without waiting for the answers.
 
         Args:
             report: called, on a thread of the network, with the token of a publisher whose numbers went back, the

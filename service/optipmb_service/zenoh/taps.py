@@ -1,19 +1,18 @@
-"""Subscriptions of viewers: shared by those of one stream, kept for a while for who comes back, and bounded in rate.
+"""Subscriptions of viewers: shared by the viewers of a stream, kept for a while, and bounded in rate.
 
 Each subscription takes a number for its key that Zenoh never gives back. A browser that connects again and again takes
-none while its subscriptions are kept, and whoever asks for ever new streams soon has to wait.
+none while its subscriptions are kept, and a viewer of ever new streams soon has to wait.
 """
 
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from optipmb_service.runtime.ports import TransportError
-from optipmb_service.zenoh.client import Turns
+from optipmb_service.stream.ports import TransportError
+from optipmb_service.zenoh.client import IdlePool, Turns
 
 if TYPE_CHECKING:
     from optipmb_client.zenoh.handles import Reading
@@ -22,11 +21,8 @@ if TYPE_CHECKING:
 Receive = Callable[[str, bytes, str], None]
 """Takes topic, payload and encoding."""
 
-KEPT_S: Final = 60.0
-"""How long subscriptions without viewers are kept."""
-
 KEPT: Final = 16
-"""Streams of which they are."""
+"""Streams without viewers whose subscriptions are kept."""
 
 BURST: Final = 100
 """Streams that are subscribed to at once."""
@@ -43,7 +39,7 @@ class Taps:
         self._prefix = prefix
         self._lock = threading.Lock()
         self._taps: dict[tuple[str, str], _Tap] = {}
-        self._timed = False
+        self._idle: IdlePool[_Tap] = IdlePool(KEPT)
         self._turns = Turns(BURST, PERIOD_S)
 
     def join(self, names: tuple[str, str], receive: Receive) -> Callable[[], None]:
@@ -55,45 +51,21 @@ class Taps:
             TransportError: the session is closed, or too many streams were subscribed to.
         """
         with self._lock:
-            tap = self._taps.get(names)
+            tap = self._taps.get(names) or self._idle.take(names)
             if tap is None:
                 self._turns.take()
-                tap = self._taps[names] = _Tap(self._session, self._prefix, *names)
+                tap = _Tap(self._session, self._prefix, *names)
+            self._taps[names] = tap
             listener = object()
             tap.listeners = tap.listeners | {listener: receive}
         return partial(self._leave, names, tap, listener)
 
     def _leave(self, names: tuple[str, str], tap: _Tap, listener: object) -> None:
         with self._lock:
-            if listener not in tap.listeners:
-                return
-            tap.listeners = {one: receive for one, receive in tap.listeners.items() if one is not listener}
-            if tap.listeners:
-                return
-            tap.left_s = time.monotonic()
-            self._taps[names] = self._taps.pop(names)  # behind those that were left before
-        self._close_left()
-
-    def _on_timer(self) -> None:
-        self._timed = False
-        self._close_left()
-
-    def _close_left(self) -> None:
-        """Withdraw subscriptions that were left for long, or are too many; look again later where others are left."""
-        latest = time.monotonic() - KEPT_S
-        with self._lock:
-            left = [(names, tap) for names, tap in self._taps.items() if not tap.listeners]
-            ended = [one for number, one in enumerate(left) if number < len(left) - KEPT or one[1].left_s <= latest]
-            for names, _ in ended:
-                del self._taps[names]
-            starts = not self._timed and len(ended) < len(left)
-            self._timed |= starts
-        if starts:
-            timer = threading.Timer(KEPT_S, self._on_timer)
-            timer.daemon = True
-            timer.start()
-        for _, tap in ended:
-            tap.close()
+            if listener in tap.listeners:
+                tap.listeners = {one: receive for one, receive in tap.listeners.items() if one is not listener}
+                if not tap.listeners:
+                    self._idle.keep(names, self._taps.pop(names))
 
 
 class _Tap:
@@ -101,7 +73,6 @@ class _Tap:
 
     def __init__(self, session: Session, prefix: str, tracks: str, detections: str) -> None:
         self.listeners: dict[object, Receive] = {}
-        self.left_s = 0.0
         self._readings: list[Reading] = []
         try:
             for topic, names in (("tracks", tracks), ("detections", detections)):

@@ -1,4 +1,4 @@
-"""A Zenoh session with what the service declares on it: what it reads, what it sends, who it is; and their end."""
+"""A Zenoh session with the declarations of a service: inputs, outputs, tokens, queries."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Final
 import optipmb_schemas as schemas
 import structlog
 
-from optipmb_service.runtime.ports import Packet, TransportError
-from optipmb_service.runtime.queries import problem_with
+from optipmb_service.stream.ports import Packet, TransportError
+from optipmb_service.stream.queries import problem_with
 from optipmb_service.zenoh.client import Client
 from optipmb_service.zenoh.inputs import ReturnedPublishers, Topic
 from optipmb_service.zenoh.taps import Taps
@@ -23,15 +23,15 @@ if TYPE_CHECKING:
     from optipmb_client.zenoh.handles import Declared, Reading, Sender
     from optipmb_client.zenoh.session import Sample, Session
 
-    from optipmb_service.runtime.intake import Kind
-    from optipmb_service.runtime.ports import Request
     from optipmb_service.settings import Settings
+    from optipmb_service.stream.intake import Kind
+    from optipmb_service.stream.ports import Request
 
 MOST_OPEN: Final = 256
 """Queries of one key expression that may be open; those beyond are refused."""
 
 RECENT_S: Final = 2.0
-"""How long other instances may take to answer what they have received of streams that have come here."""
+"""How long other instances may take to answer with their messages of streams that have moved here."""
 
 TRACKS_CACHE: Final = 100
 """Tracks kept per stream for subscribers that lost some or come late: 5 s at 20 Hz. Most of what a stream holds.
@@ -77,7 +77,7 @@ class Announcements:
         self._tokens: dict[tuple[str, ...], Declared] = {}
 
     def announce(self, streams: AbstractSet[str]) -> None:
-        """Announce these streams, and no others; those that stay are announced all the time."""
+        """Announce these streams, and no others; streams that stay are announced all the time."""
         new = sorted(streams - self._groups.keys())
         gone = self._groups.keys() - streams
         if not new and not gone:
@@ -114,7 +114,7 @@ class Transport:
         self._discover: Callable[[Sample], None] = lambda _: None
         self._all = False
         self._run = secrets.token_hex(8)
-        """Tells this process from all others, also from those of its name."""
+        """Tells this process from all others, also from others of its name."""
         self._announcements = Announcements(self._client, self._keys, self._instance, self._run)
         self._returned = ReturnedPublishers(self._client, lambda *_: 0)
         self._alive: Declared | None = None
@@ -168,7 +168,7 @@ class Transport:
     def subscribe(self, kind: Kind, stream: str, *, cached: bool) -> None:
         """Receive the detections or clouds of a stream, or of all of them where it is empty; `discovery` is of all.
 
-        With `cached`, what was lost is recovered from the publisher's cache.
+        With `cached`, lost messages are recovered from the publisher's cache.
         """
         if kind == "discovery":
             self._topics["detections"].subscribe(kind, self._keys.all("detections"), self._discover)
@@ -201,11 +201,11 @@ class Transport:
     ) -> None:
         """Tell of publishers of detections with a cache, by key and token, and of others' announcements, by token."""
 
-        def announced(key: str, present: bool) -> None:  # noqa: FBT001 - as a token is told
+        def announced(key: str, present: bool) -> None:  # noqa: FBT001 - the signature of a watcher
             if not self._keys.discovered_by(key, self._run):
                 discovered(key, present)
 
-        def returned(key: str, present: bool) -> None:  # noqa: FBT001 - as a token is told
+        def returned(key: str, present: bool) -> None:  # noqa: FBT001 - the signature of a watcher
             published(key, key, present)
             if present:
                 self._returned.came(key)
@@ -248,7 +248,7 @@ class Transport:
         self._client.ask(self._keys.metrics(self._instance), lambda _: found(), timeout=RECENT_S, background=True)
 
     def look_for_returned(self, report: Callable[[str, int, int], None]) -> None:
-        """Call `report` for each publisher that came back with numbers below those that it has sent.
+        """Call `report` for each publisher that came back with numbers below its last ones.
 
         It is called on a thread of the network, with the key of its token, the number expected next and its newest one.
         """
@@ -260,7 +260,7 @@ class Transport:
         self.serve_service(about_service)
 
     def serve_service(self, about_service: Callable[[Request], None], names: Sequence[str] = ("*",)) -> None:
-        """Hand over the queries about this instance alone, those of each name on a thread of its own.
+        """Hand over the queries about this instance alone, each name on a thread of its own.
 
         Who asks all instances waits for each that declares the name, so one that takes no such query must not.
         """
@@ -284,7 +284,7 @@ class Transport:
         """Hand over topic, payload and encoding of the newest detections and tracks of a stream to a viewer.
 
         Viewers of a stream share its subscriptions, until the last of them has called the result. Detections of a
-        session of several streams are those of `detections`, a pattern of streams.
+        session of several streams come from `detections`, a pattern of streams.
 
         Raises:
             TransportError: the session is closed, or too many other streams were looked at.
@@ -318,7 +318,7 @@ class Transport:
 
     def open_publisher(self, stream: str) -> StreamPublisher:
         """Open the publisher of a stream's tracks, say that this instance tracks it, and declare its inputs' keys."""
-        # Who subscribes asks the caches, and hears by heartbeats of what it missed: nobody needs a token for that, and
+        # Who subscribes asks the caches, and hears by heartbeats of missed messages: no token is needed for that, and
         # each costs the router more the more there are.
         key, encoding = self._keys.tracks(stream), schemas.encoding_of(schemas.Tracks)
         sender = self._client.cached_sender(key, encoding, cache=TRACKS_CACHE, detected=False)
@@ -331,7 +331,7 @@ class Transport:
         self._client.publish_problem(problem)
 
     def watch_owners(self, on_owner: Callable[[str, str, bool], None] | None) -> None:
-        """Tell which instance tracks which stream, or does so no longer (False), from now on; None: nobody any more."""
+        """Tell which instance tracks which stream, or does so no longer (False), from now on; None: stop telling."""
         if self._owners is not None:
             self._owners.close(0.0)
             self._owners = None
@@ -350,7 +350,7 @@ class Transport:
             self._alive = None
 
     def stop(self, timeout: float) -> None:
-        """Receive nothing any more; what was received before is handed over within `timeout` seconds."""
+        """Receive nothing any more; messages received before are handed over within `timeout` seconds."""
         self.leave()
         for topic in self._topics.values():
             topic.close(timeout)
@@ -367,6 +367,6 @@ def _name(stream: str, *, cached: bool) -> str:
     return stream if cached else f"{stream} plain"
 
 
-def _log_link(peer: str, kind: str, came: bool) -> None:  # noqa: FBT001 - as a link is told
+def _log_link(peer: str, kind: str, came: bool) -> None:  # noqa: FBT001 - the signature of a watcher
     """Log that a node or a router has linked to the session, or has gone."""
     log.info("peer_connected" if came else "peer_lost", peer=peer, kind=kind)

@@ -13,11 +13,11 @@ from optipmb_schemas import Keys
 from optipmb_service.cluster import message_log
 from optipmb_service.cluster.log_position import Missed, Position
 from optipmb_service.cluster.message_log import LogMessage, LogReader, MessageLog, Retention
-from optipmb_service.runtime.profiles import Fusion
-from optipmb_service.runtime.recovery import Log
-from optipmb_service.session.checkpoint import forgotten
-from optipmb_service.session.session import Session
-from optipmb_service.session.values import Policy
+from optipmb_service.stream.checkpoint import forgotten
+from optipmb_service.stream.profiles import Fusion
+from optipmb_service.stream.recovery import Log
+from optipmb_service.stream.session import Session
+from optipmb_service.stream.values import Policy
 from router import until
 
 import optipmb
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
-    from optipmb_service.runtime.ports import Packet
+    from optipmb_service.stream.ports import Packet
 
 STREAM = "a/b/c"
 EPOCH = bytes(16)

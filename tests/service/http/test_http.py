@@ -23,7 +23,7 @@ from optipmb_schemas import Keys, ServiceStatus
 from optipmb_service.app.health_command import ask
 from optipmb_service.http import Server, application
 from optipmb_service.http.server import CONNECTIONS, REQUESTS
-from optipmb_service.runtime.ports import HttpError
+from optipmb_service.stream.ports import HttpError
 from optipmb_service.telemetry.metrics import NAMESPACE, SERVICE_METRICS
 from optipmb_service.zenoh.taps import BURST
 from prometheus_client.parser import text_string_to_metric_families

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import re
 from types import SimpleNamespace
-from typing import Any
 
-import pytest
-from optipmb_service.telemetry.metrics import METRICS, SECONDS, Collected, Metrics, families
+from optipmb_service.telemetry.metrics import METRICS, SECONDS, Metrics
 from prometheus_client import CollectorRegistry, Histogram, generate_latest
+from structlog.testing import capture_logs
 
 DURATIONS = (0.0, 1e-9, 0.0005, 0.00051, 0.001, 0.0999, 0.1, 1.0, 5.0, 5.1, 1e9)
 NAMES = ("latency", "queue", "decode", "step")
@@ -34,6 +33,11 @@ def own(text: bytes) -> list[str]:
     return [line for line in text.decode().splitlines() if not re.match(r"(# \w+ )?process_", line)]
 
 
+def without_worker(line: str) -> str:
+    """Return a line without the label that the parent adds."""
+    return re.sub(r'[,{]worker="3"(})?', lambda found: "}" if found[0].startswith(",") else "", line)
+
+
 def test_durations_are_counted_as_prometheus_counts_them() -> None:
     """Buckets, their ends, counts and sums are those of the client's own histogram."""
     registry = CollectorRegistry()
@@ -52,21 +56,16 @@ def test_counts_are_there_from_the_start() -> None:
         assert f"optipmb_{name} 0.0" in lines
 
 
-def test_what_a_worker_hands_over_is_what_it_shows() -> None:
-    """Metrics that went as data to another process give the same text there."""
-    metrics = filled()
-    registry = CollectorRegistry()
-    registry.register(Collected(lambda: families(metrics.samples())))
-    assert own(generate_latest(registry)) == own(metrics.text())
-
-
-@pytest.mark.parametrize(
-    "data",
-    [b"", b"\xff", b"{", b"1", b"[1]", b'[["a"]]', b'[["a","b","no kind",[]]]', b'[["a","b","gauge",[["a",1,2]]]]',
-     b'[["a","b","gauge",[["a",{},"x"]]]]', b'[["a","b","gauge",[["a",{},null]]]]', b'[["a","b","gauge",1]]',
-     b'[["a","b",[],[]]]', b"[" * 100_000],
-)  # fmt: skip
-def test_other_data_are_refused(data: Any) -> None:
-    """Whatever an answer is, it gives metrics or one kind of error."""
-    with pytest.raises(ValueError, match="expected the metrics of a worker"):
-        families(data)
+def test_the_parent_shows_what_its_workers_show() -> None:
+    """The series of a worker have its number; of an answer that is no metrics nothing is shown but a warning."""
+    worker, parent = filled(), Metrics(counts=False)
+    parent.workers = lambda: [(3, worker.text()), (4, b"\xff"), (5, b"{")]
+    with capture_logs() as logs:
+        shown = own(parent.text())
+    values = [line for line in own(worker.text()) if not line.startswith("#")]
+    assert sorted(without_worker(line) for line in shown if not line.startswith("#")) == sorted(values)
+    assert [line for line in shown if line.startswith("#")] == [
+        line for line in own(worker.text()) if line.startswith("#")
+    ]
+    assert all('worker="3"' in line for line in shown if not line.startswith("#"))
+    assert [(one["event"], one["worker"]) for one in logs] == [("metrics_unreadable", one) for one in (4, 5)]

@@ -1,11 +1,11 @@
-"""Streams that a discoverer announces: which tokens there are, whatever came and went before."""
+"""Streams that a discoverer announces: the tokens after any changes."""
 
 import random
 from typing import Any
 
 import pytest
 from optipmb_schemas import Keys
-from optipmb_service.runtime.directory import StreamDirectory
+from optipmb_service.stream.directory import StreamDirectory
 from optipmb_service.zenoh.transport import ANNOUNCED, Announcements
 
 KEYS = Keys()
@@ -52,7 +52,7 @@ class Token:
 
 
 def test_each_stream_is_in_one_token_and_all_tokens_but_one_are_full(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever came and went; who hears of the tokens knows these streams, and none of them was away in between."""
+    """After any changes, listeners to the tokens know these streams, and none of them was away in between."""
     chance = random.Random(1)
     tokens = Tokens()
     session: Any = tokens

@@ -1,4 +1,4 @@
-"""Clocks and identities of publishers over real Zenoh: what is wrong with them is said, and nothing is lost by it."""
+"""Clocks and identities of publishers over real Zenoh: faults are reported, and nothing is lost by them."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_stamps_in_another_unit_are_reported(node: Node, unit: str, per_second: 
     while not said(node, "clock") and time.monotonic() < ends:
         node.send(SENSOR.detections(seq, stamp_ns=time.time_ns() * per_second // SECOND))
         seq += 1
-        time.sleep(0.02)  # the stamps are those of the true time
+        time.sleep(0.02)  # the stamps are of the true time
     assert {one.received.rpartition(": ")[2] for one in said(node, "clock")} == {f"stamps look like {unit}"}
 
 
@@ -168,7 +168,7 @@ def stray(back_s: float = 0.0) -> Detections:
 
 @pytest.mark.parametrize("back_s", [0.0, 0.5, -3600.0, 3600.0])
 def test_one_stray_frame_locks_nobody_out(node: Node, back_s: float) -> None:
-    """After a frame with another epoch, whatever its stamp, who is alive is tracked again in a second."""
+    """After a frame with another epoch and any stamp, the live publisher is tracked again in a second."""
     node.send(*map(SENSOR.detections, range(20)))
     node.tracks(SENSOR.stream, 20)
     node.send_plain(stray(back_s))

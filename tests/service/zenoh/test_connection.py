@@ -28,7 +28,7 @@ ECHO = "echo"
 
 @pytest.fixture
 def endpoint() -> Iterator[str]:
-    """Where a router listens that tells of what is declared at it."""
+    """Endpoint of a router that lists its declarations."""
     endpoint = free_endpoint()
     with open_router(endpoint, adminspace=True) as router:
         router.declare_queryable(ECHO, lambda query: query.reply(ECHO, b""))
@@ -81,7 +81,7 @@ def test_a_router_knows_one_interest_however_many_streams_there_are(endpoint: st
 
 
 def test_tracks_come_whichever_publisher_was_declared_first(endpoint: str) -> None:
-    """The interest is that of all publishers: it ends with the last one, and begins again with the next.
+    """All publishers share the interest: it ends with the last one, and begins again with the next.
 
     Who subscribes late gets what the cache holds, too.
     """

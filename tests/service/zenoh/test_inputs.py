@@ -1,4 +1,4 @@
-"""Subscriptions of a topic that come and go, and what is asked of the caches of publishers meanwhile."""
+"""Subscriptions of a topic that come and go, and queries of publishers' caches meanwhile."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 import zenoh
 from optipmb_client.zenoh.session import Session
 from optipmb_schemas import Keys
-from optipmb_service.runtime.intake import ALL
+from optipmb_service.stream.intake import ALL
 from optipmb_service.zenoh.inputs import Topic
 from router import Collected
 from routers import free_endpoint, open_router
@@ -77,7 +77,7 @@ def test_no_cache_is_asked_again_where_all_streams_take_over_from_one(network: N
 
 @pytest.mark.parametrize(("name", "key"), [(STREAM, KEY), (ALL, KEYS.all("detections"))], ids=["one", "all"])
 def test_a_stream_that_comes_again_lacks_nothing(network: Network, name: str, key: str) -> None:
-    """What is sent while neither the stream nor all are subscribed to comes from the cache, whichever was before."""
+    """Messages sent while neither the stream nor all are subscribed to come from the cache, after either."""
     network.topic.subscribe(name, key)
     network.publish(b"2")
     network.counts(b"0", b"1", b"2")
@@ -91,7 +91,7 @@ def test_a_stream_that_comes_again_lacks_nothing(network: Network, name: str, ke
 def test_messages_on_their_way_when_their_stream_is_left_do_not_hide_what_follows(
     network: Network, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A message that is being handed over while its stream is left keeps nobody from asking its cache later."""
+    """A message that is being handed over while its stream is left does not hinder a later query of its cache."""
     network.topic.subscribe(STREAM, KEY)
     network.publish(b"2")
     network.counts(b"0", b"1", b"2")

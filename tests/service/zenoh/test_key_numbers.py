@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 import zenoh
 from optipmb_client.zenoh.session import CACHED, MOST_KEYS, PLAIN, Session
-from optipmb_service.runtime.ports import TransportError
+from optipmb_service.stream.ports import TransportError
 from optipmb_service.zenoh.inputs import Topic
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def _known(session: Session, key: str) -> Callable[[], object]:
 
 @pytest.mark.parametrize("declare", [_published, _received, _received_plainly, _known])
 def test_no_number_is_given_twice(session: Session, declare: Callable[[Session, str], Callable[[], object]]) -> None:
-    """Whatever comes and goes: when a session has used up its numbers, nothing is declared, and what is open delivers.
+    """When a session has used up its numbers, nothing is declared, and open subscriptions still deliver.
 
     Zenoh alone goes on with numbers that are in use, and what these publishers send is lost without an error.
     """
@@ -70,7 +70,7 @@ def test_no_number_is_given_twice(session: Session, declare: Callable[[Session, 
 
 
 def test_numbers_are_in_use_until_what_has_them_is_withdrawn(session: Session) -> None:
-    """Withdrawn again, nothing is given back twice; those that are used up stay so."""
+    """Withdrawn again, nothing is given back twice; used-up numbers stay so."""
     subscription = session.subscribe("some/**", lambda _: None)
     key = session.declare_key("some/key")
     assert (session.key_numbers.declared, session.key_numbers.open) == (CACHED + PLAIN, CACHED + PLAIN)

@@ -33,10 +33,10 @@ from optipmb_schemas import (
     encoding_of,
 )
 from optipmb_service.app.workers import QUERIES
-from optipmb_service.runtime.ports import TransportError
-from optipmb_service.session.session import Session
-from optipmb_service.session.values import Tracked
 from optipmb_service.settings import load
+from optipmb_service.stream.ports import TransportError
+from optipmb_service.stream.session import Session
+from optipmb_service.stream.values import Tracked
 from optipmb_service.zenoh.transport import Transport
 from router import Node, Sensor, plain, until
 from routers import free_endpoint, open_router
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from optipmb_service.runtime.ports import Request
+    from optipmb_service.stream.ports import Request
 
 KEYS = Keys()
 SENSOR = Sensor()
@@ -74,7 +74,7 @@ def test_frames_become_tracks(node: Node) -> None:
 
 
 def test_a_parent_that_is_busy_keeps_no_member_waiting() -> None:
-    """While it carries out an order, nobody who asks all members waits for it, and it tells its status."""
+    """While it carries out an order, no query to all members waits for it, and it answers with its status."""
     endpoint, began, gate = free_endpoint(), threading.Event(), threading.Event()
 
     def answer(request: Request) -> None:
@@ -97,7 +97,7 @@ def test_a_parent_that_is_busy_keeps_no_member_waiting() -> None:
             until(ordered, "the order is taken")
             try:
                 assert pool.submit(node.query, KEYS.recent(), b"", 100.0).result(30.0) == []
-                until(lambda: [one[2] for one in node.query(KEYS.status("test"))] == [b"here"], "its status is told")
+                until(lambda: [one[2] for one in node.query(KEYS.status("test"))] == [b"here"], "its status")
             finally:
                 gate.set()
     finally:
@@ -328,7 +328,7 @@ def test_state_of_a_stream(node: Node) -> None:
 
 def test_density_of_a_stream(node: Node) -> None:
     """q/density gives the Poisson components that the tracker holds, to the bit; none without a session."""
-    parameters = optipmb.load_profile("kitti")  # makes Poisson components of what it detects for the first time
+    parameters = optipmb.load_profile("kitti")  # makes Poisson components of first detections
     frame = SENSOR.detections(0, labels=("Car", "Cyclist"), score=np.full(3, 0.4))
     session = Session(SENSOR.stream, parameters)
     session.on_detections(frame, 0)
@@ -359,7 +359,7 @@ def test_questions_that_are_none_are_refused(node: Node) -> None:
 
 
 def test_reset(node: Node) -> None:
-    """q/reset starts the session anew, with close it frees it; what follows is a new session with new ids."""
+    """q/reset restarts the session, with close it frees it; then a new session has new ids."""
     node.send(*(SENSOR.detections(seq) for seq in range(3)))
     first = node.tracks(SENSOR.stream, 3)[-1]
     state = node.ask(KEYS.query(SENSOR.stream, "reset"), SessionState)
@@ -379,7 +379,7 @@ def test_reset(node: Node) -> None:
 
 
 def test_parameters(node: Node) -> None:
-    """q/parameters asks and sets, ahead of the first frame or with a restart; what is not possible is refused."""
+    """q/parameters asks and sets, ahead of the first frame or with a restart; impossible values are refused."""
     key = KEYS.query(SENSOR.stream, "parameters")
     asked = node.ask(key, SessionParameters)
     assert (asked.profile, asked.cloud_wait_s, len(asked.horizons)) == ("nuscenes", 0.1, 0)
@@ -479,7 +479,7 @@ def test_an_overloaded_stream_sheds_its_oldest(start: Callable[..., Any]) -> Non
 
 
 def test_a_problem_says_it_in_one_sentence(node: Node) -> None:
-    """Problems are readable by people and bounded, whatever was received."""
+    """Problems are readable by people and bounded, for any input."""
     node.send_raw(KEYS.detections("a/b/c"), b"{" + b'"x":"\x1b[31m' * 1000)
     problem = node.problems("a/b/c")[0]
     assert isinstance(problem, Problem)
@@ -523,7 +523,7 @@ def test_a_step_that_does_not_end_does_not_keep_the_service(start: Callable[...,
 
 
 def test_a_router_that_goes_and_comes_loses_nothing(start: Callable[..., Any]) -> None:
-    """While the router is away publisher and service wait; afterwards what was missed is recovered, nothing twice."""
+    """While the router is away publisher and service wait; afterwards missed messages are recovered, none twice."""
     endpoint = free_endpoint()
     router = open_router(endpoint)
     start(listen=None, connect=[endpoint])
@@ -545,7 +545,7 @@ def test_a_router_that_goes_and_comes_loses_nothing(start: Callable[..., Any]) -
 
 
 def test_what_a_client_sent_last_while_the_router_was_away_is_recovered(start: Callable[..., Any]) -> None:
-    """A last frame that nobody could receive, and silence: the next heartbeat after the router is back tells of it."""
+    """A last frame that could not be received, and silence: the next heartbeat after the router is back tells of it."""
     endpoint = free_endpoint()
     router = open_router(endpoint)
     start(listen=None, connect=[endpoint])

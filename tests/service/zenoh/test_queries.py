@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 import optipmb_service.zenoh.transport
 import pytest
 from optipmb_schemas import Keys, Problem, SessionState, decode
-from optipmb_service.runtime import queries
-from optipmb_service.runtime.queries import StreamQueries
+from optipmb_service.stream import queries
+from optipmb_service.stream.queries import StreamQueries
 from router import Node, Sensor, until
 
 if TYPE_CHECKING:

@@ -44,7 +44,7 @@ def ends(work: Callable[[], object]) -> None:
 
 
 def test_a_question_has_as_many_answers_as_there_are(session: Session) -> None:
-    """The caches of one's own hold more than any channel of Zenoh; what they cache is sent meanwhile."""
+    """The caches of one's own hold more than any channel of Zenoh; messages are sent meanwhile."""
     publishers = [session.cached_sender(KEYS.tracks(f"site/node/{one}"), "", cache=50) for one in range(8)]
     for publisher in publishers:
         for _ in range(50):
@@ -56,7 +56,7 @@ def test_a_question_has_as_many_answers_as_there_are(session: Session) -> None:
 
 
 def test_as_many_tokens_may_be_there_as_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is watched may be more than waits for a thread: owners, and the links of a router."""
+    """More may be watched than a channel holds: owners, and the links of a router."""
     monkeypatch.setattr(optipmb_client.zenoh.session, "CHANNEL", 1)
     endpoint = free_endpoint()
     transport = Transport(load(None, {"listen": [endpoint], "instance": "one", "store": "none"}).settings)

@@ -1,4 +1,4 @@
-"""The threads of Zenoh: how many a message wakes, and what the interpreter knows of those that call into it."""
+"""The threads of Zenoh: how many a message wakes, and their states in the interpreter."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_a_thread_of_the_network_keeps_its_state() -> None:
     with open_router(endpoint), open_client(endpoint) as receiver, open_client(endpoint) as sender:
         Session(receiver).listen("some/*/messages", take)
         publisher = sender.declare_publisher("some/other/messages")
-        while not enough.wait(0.01):  # one after the other: those that came together would share a state anyway
+        while not enough.wait(0.01):  # one after the other: messages at once would share a state anyway
             publisher.put(b"message")
     assert len(states) == len({thread for thread, _ in states})
 
@@ -51,7 +51,7 @@ def _state() -> int:
 
 
 def test_one_thread_waits_for_the_router_and_reads() -> None:
-    """A service that is a client reads what comes on the thread that waits for it, and wakes no other one for it."""
+    """A service that is a client reads on the thread that waits for the socket, and wakes no other one."""
     with ServiceProcess("router", "--instance", "router") as router:
         router.wait_ready()
         options = ("--connect", router.endpoint, "--instance", "client")

@@ -1,4 +1,4 @@
-"""Withdrawing what was declared, while the threads of the network call into Python."""
+"""Withdrawal of declarations, while the threads of the network call into Python."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def _publisher(session: zenoh.Session, key: str) -> Any:
 
 
 def test_withdrawing_never_stops_the_process(session: zenoh.Session) -> None:
-    """A publisher is withdrawn at once, and with its token, whatever the threads of the network wait for."""
+    """A publisher is withdrawn at once, and with its token, in any state of the network's threads."""
     link = Session(session)
     for number in range(ROUNDS):
         sender = link.cached_sender(f"stream/{number}", "", cache=1)

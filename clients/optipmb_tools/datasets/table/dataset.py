@@ -34,7 +34,7 @@ from optipmb_tools.geometry import Bools, Floats, Ints, Pose, stack_poses, to_wo
 from optipmb_tools.results.output import track_columns
 from optipmb_tools.table_files import SUFFIXES, line_of, read_table, tables_in, write_table
 
-# Options beside `column.MEANING=NAME` and `class.NAME=NAME`; `tracks` are tables that are yet to be read by them
+# Options, besides `column.MEANING=NAME` and `class.NAME=NAME`; `tracks` are tables that are yet to be read by them
 OPTIONS: Final = (
     *("time", "rate", "group", "yaw", "heading", "quaternion", "sizes", "axes", "velocity", "score", "invalid"),
     *("poses", "truth", "tracks", "decimal", "encoding", "date", "origin"),
@@ -245,7 +245,7 @@ class TableSequence(DataSequence):
 
     @property
     def stamps(self) -> Ints:
-        """(F,) nanoseconds, of any origin; those of frames are counted from an origin before them."""
+        """(F,) nanoseconds, of any origin; `frames` counts from an origin before them."""
         return self._stamps
 
     @cached_property

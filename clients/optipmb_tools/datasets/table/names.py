@@ -134,7 +134,7 @@ def _names_of(role: str) -> tuple[str, ...]:
 
 
 def _is_second_half(column: Column) -> bool:
-    """Tell whether a column may be the rest of a stamp, as `stamp.nanosec` beside `stamp.sec`; `stamp_ns` is not."""
+    """Tell whether a column may be the rest of a stamp, as `stamp.nanosec` of `stamp.sec`; `stamp_ns` is not."""
     return column.unit == "ns" and not _plain(column.name).endswith("ns")
 
 

@@ -82,27 +82,20 @@ class Boxes:
 _OF_ROWS: Final = ("frame_stamp", "frame_key", "frame_pose", "frame_time", "frame_number")
 
 
-def read_boxes(reading: Reading, *, scored: bool) -> Boxes:
-    """Read the table of a `Reading`, which gets the findings.
-
-    Args:
-        reading: the file and the options of the user.
-        scored: whether boxes are detections, which have a score, a size and a heading.
-
-    Raises:
-        DatasetError: a column is missing or a value is not allowed; names the line.
-        ClientError: pyarrow is not installed.
-    """
-    ((_, boxes),) = read_tables([reading.path], reading, scored=scored)
-    return boxes
-
-
 def read_tables(
     paths: Sequence[Path], reading: Reading, *, scored: bool, loaded: Mapping[Path, Columns] | None = None
 ) -> list[tuple[Path, Boxes]]:
     """Read the tables of a recording; tables with the same columns share units and conventions.
 
-    Tables without rows give no boxes; `loaded` ones are not read again. Raises as `read_boxes` does.
+    Args:
+        paths: Files, or folders with a file for each frame. Tables without rows give no boxes.
+        reading: Options of the user; receives the findings.
+        scored: Whether boxes are detections, which have a score, a size and a heading.
+        loaded: Tables that were read already.
+
+    Raises:
+        DatasetError: A column is missing or a value is not allowed; names the line.
+        ClientError: pyarrow is not installed.
     """
     tables = loaded or {path: read_table(path, reading.options) for path in paths}
     groups: dict[tuple[str, ...], list[Path]] = {}

@@ -167,8 +167,8 @@ def _steps(numbers: np.ndarray, key: Ints) -> np.ndarray:
 def _longest_inside(steps: np.ndarray) -> float:
     """Return the longest step between stamps of one frame; 0 where frames have one stamp.
 
-    Steps inside of frames and between frames are told apart by the widest gap of the sorted steps: the next longer step
-    is at least three times as long, and many steps are on either side.
+    The widest gap of the sorted steps divides steps inside of frames from steps between frames: the next longer step is
+    at least three times as long, and many steps are on either side.
     """
     ordered = np.sort(steps)
     count = len(ordered)

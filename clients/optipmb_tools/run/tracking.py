@@ -1,0 +1,326 @@
+"""Offline tracking: one sequence in this process, or the recordings of a data set, one task each.
+
+A replay through the service (`optipmb_tools.run.replay`) gives the same bytes.
+"""
+
+import functools
+import itertools
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from optipmb_client.errors import ClientError, UsageError
+from optipmb_schemas import Tracks, class_fields, path_fields
+
+import optipmb
+from optipmb import (
+    FieldOfView,
+    Frame,
+    Modules,
+    OptipmbError,
+    Parameters,
+    PointCloud,
+    Pose,
+    PredictedPaths,
+    StepResult,
+    Tracker,
+    make_frame,
+    predict_tracks,
+    warm_up,
+)
+from optipmb_tools.datasets import DataSequence, Dataset, DatasetArguments, DetectionFrame, selected_frames
+from optipmb_tools.files import remove_unfinished
+from optipmb_tools.geometry import Floats
+from optipmb_tools.results.output import Latency, Results, horizons_for, latency
+from optipmb_tools.run.bulk import Executor, Failed, Here, in_order, run
+from optipmb_tools.table_files import Columns
+
+SHOWN = 20  # recordings that failed, named in the error
+
+
+def _ignored() -> None:
+    """Do nothing, as the default of a callback."""
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """Tracks of one sequence by frame index, and counts."""
+
+    tracks: dict[int, Tracks]
+    clouds: int
+    detections: int
+    left_out: dict[str, int]  # detections of each class that the profile lacks, or that are below its score filter
+    estimated: int  # frames in which the motion of the sensor was estimated
+    steps_ns: tuple[int, ...]
+    seconds: float
+
+
+def tracker_frame(parameters: Parameters, sequence: str, given: DetectionFrame) -> Frame:
+    """Return a frame of a sequence for the tracker.
+
+    Raises:
+        UsageError: It holds values that the tracker refuses.
+    """
+    cloud = given.cloud
+    try:
+        frame, _ = make_frame(
+            parameters,
+            stamp_ns=given.stamp_ns,
+            labels=given.labels,
+            pose=Pose(*given.pose),
+            cloud=None if cloud is None else PointCloud(cloud.xyz, Pose(*cloud.pose)),
+            field_of_view=FieldOfView.of(given.field_of_view, None),
+            **given.columns,
+        )
+    except OptipmbError as error:
+        raise UsageError(f"sequence {sequence}, frame {given.index}: {error}") from error
+    return frame
+
+
+_warm = functools.cache(warm_up)  # once in each process
+
+
+def track_whole(
+    parameters: Parameters,
+    sequence: DataSequence,
+    classes: Sequence[str] = (),
+    modules: Modules | None = None,
+    *,
+    smooth: bool = False,
+    on_frame: Callable[[], None] = lambda: None,
+) -> Tracked:
+    """Track one sequence, with `smooth` so that states are given all frames of their track.
+
+    Raises:
+        UsageError: A frame holds values that the tracker refuses.
+        DatasetError: The sequence cannot be read.
+    """
+    _warm()
+    begun = time.monotonic()
+    found: dict[int, Tracks] = {}
+    steps: list[int] = []
+    clouds = detections = estimated = 0
+    left_out: Counter[str] = Counter()
+    least = np.array([one.score_filter for one in parameters.classes.values()])
+    given, low = np.zeros(len(least), np.int64), np.zeros(len(least), np.int64)
+    smoother = None
+    if smooth:
+        from optipmb_tools.run.smoothing import Smoother  # noqa: PLC0415  of --smooth alone
+
+        smoother = Smoother(parameters)
+    # A smoother joins the frames of a track, which an estimated motion has in axes of their own.
+    tracker = Tracker(parameters.model_copy(update={"sensor_motion": False}) if smooth else parameters, modules)
+    density = tracker.initial()
+    for frame in selected_frames(sequence, classes):
+        taken = tracker_frame(parameters, sequence.name, frame)
+        started = time.perf_counter_ns()
+        result = tracker.step(density, taken)
+        steps.append(time.perf_counter_ns() - started)
+        density = result.density
+        found[frame.index] = _message(parameters, sequence, frame, result)
+        if smoother is not None:
+            smoother.add(frame.index, density, result.tracks)
+        clouds += frame.cloud is not None
+        estimated += density.sensor_motion is not None
+        detections += len(frame)
+        if len(taken.source) < len(frame):
+            left_out.update(frame.labels[i] for i in np.delete(frame.label, taken.source).tolist())
+        given += np.bincount(taken.label, minlength=len(least))
+        if not parameters.self_calibration:  # which never filters the upper half of a class
+            low += np.bincount(taken.label[taken.score < least[taken.label]], minlength=len(least))
+        on_frame()
+    for name, count, total in zip(parameters.labels, low.tolist(), given.tolist(), strict=True):
+        if count:
+            most = ", most of the class" if count > total / 2 else ""
+            left_out[f"{name} below its score_filter{most}"] = count
+    if smoother is not None:
+        for index, one in smoother.tracks():
+            paths = predict_tracks(one, parameters.horizons, parameters) if parameters.horizons else None
+            found[index] = found[index].model_copy(update=track_fields(one, paths))
+    return Tracked(found, clouds, detections, dict(left_out), estimated, tuple(steps), time.monotonic() - begun)
+
+
+def track_fields(
+    tracks: optipmb.Tracks, paths: PredictedPaths | None, class_probability: Floats | None = None
+) -> dict[str, Any]:
+    """Return tracks, their paths and classes as fields of the message.
+
+    Raises:
+        MessageError: Paths or classes hold numbers that no message may.
+    """
+    fields = dict(tracks.columns()) | {"confirmed": tracks.confirmed.astype(np.int64)}
+    if paths is not None:
+        fields |= path_fields(paths.horizons, paths.mean, paths.covariance)
+    return fields if class_probability is None else fields | class_fields(class_probability)
+
+
+def _message(parameters: Parameters, sequence: DataSequence, frame: DetectionFrame, result: StepResult) -> Tracks:
+    """Return the tracks of a frame as the service publishes them, in a session that has no name."""
+    header = {
+        "stream": sequence.name,
+        "epoch": bytes(16),
+        "seq": frame.index,
+        "stamp_ns": frame.stamp_ns,
+        "session": "0" * 32,
+        "profile": parameters.name,
+        "cloud_used": frame.cloud is not None,
+        "labels": parameters.labels,
+    }
+    return Tracks.trusted(header | track_fields(result.tracks, result.paths, result.class_probability))
+
+
+@dataclass(frozen=True)
+class TrackedSequence:
+    """Result of tracking one sequence."""
+
+    name: str
+    file: Path
+    frames: int
+    clouds: int
+    detections: int
+    left_out: dict[str, int]  # detections of each class that the profile lacks, or that are below its score filter
+    estimated: int  # frames in which the motion of the sensor was estimated
+    cut: tuple[int, int]  # boxes above the limit of a benchmark in a sample, and such samples
+    tracks: int
+    confirmed: int  # tracks that were confirmed in some frame
+    seconds: float
+    step: Latency | None  # durations of the tracker's steps
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """How sequences are tracked."""
+
+    parameters: Parameters
+    classes: Sequence[str] = ()  # only detections of these; empty: all
+    modules: Modules | None = None
+    full: bool = False  # also write all columns of the tracks
+    smooth: bool = False  # estimate states from all frames of their track (`optipmb_tools.run.smoothing`)
+
+
+@dataclass(frozen=True)
+class _Job:
+    """Arguments of all tasks of a run."""
+
+    data: DatasetArguments
+    out: Path
+    how: Tracking
+    here: Dataset | None = None  # opened already, with its sequences; another process opens the data set itself
+    sequences: Mapping[str, DataSequence] = field(default_factory=dict)
+    on_frame: Callable[[], None] = _ignored
+
+    @functools.cached_property
+    def dataset(self) -> Dataset:
+        return self.here or self.data.open()
+
+
+class RecordingsFailed(ClientError):  # noqa: N818  as its siblings
+    """Some of several recordings failed; the others are tracked, and their results are written.
+
+    Attributes:
+        failures: Reason by name of the recording.
+    """
+
+    def __init__(self, failures: Mapping[str, Failed], count: int) -> None:
+        self.failures = dict(failures)
+        names = " ".join([*itertools.islice(failures, SHOWN), *(["…"] if len(failures) > SHOWN else [])])
+        super().__init__(f"{len(failures)} of {count} recordings failed, the others are tracked: {names}")
+
+
+def _track_one(job: _Job, name: str) -> tuple[TrackedSequence, Path | Columns]:
+    """Track one sequence and write its results; idempotent. Return the rows where all sequences share one table."""
+    dataset, how = job.dataset, job.how
+    sequence = job.sequences[name] if name in job.sequences else dataset.sequences([name])[0]
+    found = track_whole(how.parameters, sequence, how.classes, how.modules, smooth=how.smooth, on_frame=job.on_frame)
+    written = Results(dataset, job.out, full=how.full).write(sequence, found.tracks)
+    beyond = []
+    if dataset.name == "nuscenes" and isinstance(written, Path):
+        from optipmb_tools.results.nuscenes import NUSCENES_MAX_BOXES  # noqa: PLC0415  of one format
+
+        counts = [len(one.id) for one in found.tracks.values()]
+        beyond = [count - NUSCENES_MAX_BOXES for count in counts if count > NUSCENES_MAX_BOXES]
+    return TrackedSequence(
+        name,
+        written if isinstance(written, Path) else job.out,
+        len(found.tracks),
+        found.clouds,
+        found.detections,
+        found.left_out,
+        found.estimated,
+        (sum(beyond), len(beyond)),
+        len({number for one in found.tracks.values() for number in one.id.tolist()}),
+        len({number for one in found.tracks.values() for number in one.id[one.confirmed == 1].tolist()}),
+        found.seconds,
+        latency(found.steps_ns),
+    ), written
+
+
+def _taken(
+    ended: Iterable[tuple[int, Any]],
+    sequences: Sequence[DataSequence],
+    results: Results,
+    note: Callable[[str], None],
+    on_frame: Callable[[], None],
+) -> Iterator[tuple[int, TrackedSequence | Failed]]:
+    """Yield the place and result of each sequence that ended, and count its frames."""
+    for place, value in ended:
+        sequence, result = sequences[place], value
+        if not isinstance(value, Failed):
+            result, written = value
+            if not results.take(sequence, written):
+                result = Failed(f"{written} is on another machine: --out needs a folder that all machines share")
+        if isinstance(result, Failed) and len(sequences) > 1:
+            note(f"recording {sequence.name} failed: {result.reason}")
+        yield place, result
+        for _ in range(len(sequence)):
+            on_frame()
+
+
+def track(
+    dataset: Dataset,
+    sequences: Sequence[DataSequence],
+    out: Path,
+    how: Tracking,
+    *,
+    executor: Executor | None = None,
+    on_frame: Callable[[], None] = lambda: None,
+    note: Callable[[str], None] = lambda _: None,
+) -> Iterator[TrackedSequence]:
+    """Track sequences, one task each, and write their results into `out`, a folder or a table.
+
+    Yields each sequence when it and those before it are done and written. The results are the same bytes with any
+    executor; other processes open the data set themselves. A sequence that fails does not stop the others.
+
+    Raises:
+        RecordingsFailed: Some of several sequences failed; raised when all others are done and written.
+        UsageError, ClientError: All of them failed.
+    """
+    executor = executor or Here()
+    if (horizons := horizons_for(out)) is not None:
+        how = replace(how, parameters=how.parameters.model_copy(update={"horizons": horizons}))
+    names = tuple(one.name for one in sequences)
+    job = _Job(dataset.arguments, out, replace(how, classes=tuple(how.classes)))
+    if executor.here:
+        job = replace(job, here=dataset, sequences={one.name: one for one in sequences}, on_frame=on_frame)
+        on_frame = _ignored  # frames are counted while they are tracked
+    executor.start(_track_one, job)
+    results = Results(dataset, out, full=how.full)
+    failures: dict[str, Failed] = {}
+    ended = run(executor, names, lambda name: f"recording {name}", note)
+    taken = _taken(ended, sequences, results, note, on_frame)
+    for name, one in zip(names, in_order(taken), strict=True):
+        if isinstance(one, Failed):
+            failures[name] = one
+        else:
+            yield one
+    if len(failures) == len(names) > 0:
+        raise failures[names[0]].error()
+    results.close(sequences)
+    if not executor.here:
+        remove_unfinished(results.files)
+    if failures:
+        raise RecordingsFailed(failures, len(names))

@@ -1,0 +1,1 @@
+"""Pictures of tracks, viewers, and what commands draw in the terminal."""

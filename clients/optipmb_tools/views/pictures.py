@@ -1,0 +1,392 @@
+"""Pictures of a sequence from above, as PNG files, and moving pictures, as GIF files.
+
+Conventions: world frame, metres, x to the right and y up; one second of a moving picture is one second of the sequence.
+Colours belong to track ids, which are written at the tracks too. matplotlib, which brings Pillow, is an extra of
+the installation and is imported when the first picture is drawn.
+"""
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from optipmb_client.errors import ClientError
+from optipmb_schemas.installation import install_command
+
+from optipmb_tools.datasets import DataSequence, DetectionFrame, Truth
+from optipmb_tools.geometry import Floats, Ints, box_corners, rotation_of, stack_poses, to_world
+from optipmb_tools.results import ResultTable
+from optipmb_tools.views.colours import colour_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from optipmb_tools.evaluation import ClassResult, ClearResult
+
+_INK, _TRUTH = "#222222", "#B5B5B5"
+_MARGIN = 6.0
+_BREAK = 5  # a path is not drawn across more missing frames than this
+
+# Of moving pictures
+FRAMES = 70  # of a longer sequence every second frame is drawn, or every third …
+TRAIL_S = 3.0
+REACH_M = 45.0  # on each side of the sensor, where the picture follows it
+WIDEST_M = 140.0  # a wider scene does not fit one view: the picture follows the sensor
+INSIDE = (0.03, 0.97)  # quantiles of the places of tracks between which the view lies, with a margin
+MARGIN_M = 4.0
+NARROWEST_M = 30.0
+SCALE_M = 10.0
+WIDTH_PX = 560
+COLOURS = 16
+WHITE = 250
+_SHADE, _DETECTION = "#C4C4C4", "#5A5A5A"
+
+
+class Panel(NamedTuple):
+    """Tracks of one tracker, in the world frame."""
+
+    tracks: ResultTable
+    results: "Sequence[ClearResult]" = ()  # CLEAR figures of the classes; their misses and identity switches are marked
+    title: str = ""
+
+
+@contextlib.contextmanager
+def matplotlib_needed() -> Iterator[None]:
+    """Say what to install where matplotlib is missing."""
+    try:
+        yield
+    except ImportError as error:
+        raise ClientError(f"pictures need matplotlib, which is not installed: {install_command('plot')}") from error
+
+
+def draw_tracks(path: Path, sequence: DataSequence, panels: Sequence[Panel], truth: Truth | None = None) -> None:
+    """Draw the tracks of a sequence from above, several trackers side by side on the same axes.
+
+    Args:
+        path: The PNG file.
+        sequence: The tracked sequence; its poses give the sensor's path.
+        panels: One for each tracker.
+        truth: Annotations in the world frame, drawn thin below the tracks.
+
+    Raises:
+        ClientError: matplotlib is not installed.
+    """
+    with matplotlib_needed():
+        from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  an extra
+        from matplotlib.figure import Figure  # noqa: PLC0415  an extra
+    _, sensor = stack_poses(sequence.poses)
+    low, high = _extent([sensor, *(panel.tracks.center for panel in panels), truth.center if truth else sensor])
+    longest = 11.0 if len(panels) == 1 else 8.0
+    width, height = np.maximum(longest / max(high - low) * (high - low), (7.5, 3.0)).tolist()
+    # Panels of a long street lie one below the other, others side by side.
+    rows, columns = (1, len(panels)) if height > 0.4 * width else (len(panels), 1)
+    figure = Figure(figsize=(columns * width + 0.6, rows * height + 1.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel().tolist()
+    for axes, panel in zip(grid, panels, strict=True):
+        axes.set_aspect("equal")
+        axes.set_xlim(low[0], high[0])
+        axes.set_ylim(low[1], high[1])
+        axes.set_xlabel("x in the world frame (m)")
+        axes.set_ylabel("y in the world frame (m)")
+        title = panel.title or f"Sequence {sequence.name}"
+        axes.set_title(f"{title}: {len(np.unique(panel.tracks.id))} tracks in {len(sequence)} frames")
+        axes.grid(visible=True, color="#EEEEEE", linewidth=0.6)
+        axes.set_axisbelow(True)
+        if truth is not None:
+            _draw_truth(axes, truth)
+        _draw_sensor(axes, sensor, sequence)
+        _draw_paths(axes, panel.tracks, last_frame=len(sequence) - 1)
+        if truth is not None:
+            _draw_failures(axes, truth, panel.results)
+        axes.label_outer()
+    _legend(figure, grid)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110, metadata={"Software": None})
+
+
+def _extent(places: Sequence[Floats]) -> tuple[Floats, Floats]:
+    """Return the corners (2,) of the view, at least a few metres apart."""
+    points = np.vstack([place[:, :2] for place in places] + [np.zeros((1, 2))] * (not sum(len(p) for p in places)))
+    low, high = points.min(axis=0) - _MARGIN, points.max(axis=0) + _MARGIN
+    # A long street is to be wider than a line: the short side is at least a quarter of the long one.
+    lack = np.maximum(0.25 * float(max(high - low)) - (high - low), 0.0)
+    return low - 0.5 * lack, high + 0.5 * lack
+
+
+def _draw_truth(axes: "Axes", truth: Truth) -> None:
+    label = "truth"
+    for rows in _rows_by_id(truth.id):
+        axes.plot(*_broken(truth.frame[rows], truth.center[rows]), color=_TRUTH, linewidth=3.0, label=label, zorder=2)
+        label = "_"
+
+
+def _draw_sensor(axes: "Axes", sensor: Floats, sequence: DataSequence) -> None:
+    axes.plot(sensor[:, 0], sensor[:, 1], color=_INK, linewidth=1.2, linestyle=(0, (6, 3)), label="sensor", zorder=3)
+    if len(sequence):
+        axes.plot(*sensor[0, :2], "o", color=_INK, markersize=4, zorder=3)
+        axes.plot(*sensor[-1, :2], ">", color=_INK, markersize=6, zorder=3)
+
+
+def _draw_paths(axes: "Axes", tracks: ResultTable, last_frame: int) -> None:
+    label, box_label = "track (colour and number: its id)", "last box, a line to its front"
+    for rows in _rows_by_id(tracks.id):
+        identity = int(tracks.id[rows[0]])
+        colour = colour_of(identity)
+        axes.plot(*_broken(tracks.frame[rows], tracks.center[rows]), color=colour, linewidth=1.2, label=label, zorder=4)
+        end = rows[-1:]
+        (corners,) = _outlines(tracks, end)
+        front, middle = 0.5 * (corners[0] + corners[1]), tracks.center[end[0], :2]
+        alive = int(tracks.frame[end[0]]) == last_frame
+        axes.fill(*corners.T, facecolor=colour, alpha=0.35 if alive else 0.0, zorder=5)
+        axes.plot(
+            *np.vstack([corners, corners[:1]]).T,
+            color=colour,
+            linewidth=1.0 if alive else 0.5,
+            label=box_label,
+            zorder=5,
+        )
+        axes.plot(*np.vstack([middle, front]).T, color=colour, linewidth=1.0 if alive else 0.5, zorder=5)
+        axes.annotate(
+            str(identity),
+            (float(tracks.center[rows[0], 0]), float(tracks.center[rows[0], 1])),
+            xytext=(2, 2),
+            textcoords="offset points",
+            color=colour,
+            fontsize=7,
+            zorder=7,
+        )
+        label = box_label = "_"
+
+
+def _draw_failures(axes: "Axes", truth: Truth, results: "Sequence[ClearResult]") -> None:
+    place = {(int(f), int(i)): row for row, (f, i) in enumerate(zip(truth.frame, truth.id, strict=True))}
+    misses = [place[miss.frame, miss.truth] for result in results for miss in result.misses]
+    if misses:
+        axes.plot(
+            *truth.center[misses, :2].T, "x", color=_INK, markersize=3, markeredgewidth=0.6, label="miss", zorder=6
+        )
+    label = "change of id"
+    for result in results:
+        for switch in result.changes:
+            x, y, _ = truth.center[place[switch.frame, switch.truth]].tolist()
+            axes.plot(x, y, "o", color=_INK, markerfacecolor="none", markersize=11, label=label, zorder=8)
+            axes.annotate(
+                f"{switch.old} to {switch.new}", (x, y), xytext=(8, -9), textcoords="offset points", fontsize=8
+            )
+            label = "_"
+
+
+def _legend(figure: "Figure", grid: "Sequence[Axes]") -> None:
+    found = {label: one for axes in grid for one, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    columns = max(1, len(found))
+    figure.legend(found.values(), found, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
+
+
+def _rows_by_id(identity: np.ndarray) -> list[np.ndarray]:
+    """Return the rows of each id, in the order of ids."""
+    order = np.argsort(identity, kind="stable")
+    bounds = np.flatnonzero(np.diff(identity[order])) + 1
+    return np.split(order, bounds) if len(order) else []
+
+
+def _broken(frame: np.ndarray, center: Floats) -> tuple[Floats, Floats]:
+    """Return the path of one object with a NaN where it was away."""
+    gaps = np.flatnonzero(np.diff(frame) > _BREAK) + 1
+    return np.insert(center[:, 0], gaps, np.nan), np.insert(center[:, 1], gaps, np.nan)
+
+
+def animate_tracks(path: Path, sequence: DataSequence, tracks: ResultTable, truth: Truth | None = None) -> None:
+    """Draw the tracks of a sequence from above, frame after frame.
+
+    Args:
+        path: The GIF file.
+        sequence: The tracked sequence; its poses give the sensor's places, its detections are drawn as crosses.
+        tracks: The tracks in the world frame.
+        truth: Annotations in the world frame, drawn grey below the tracks; hardly visible ones are left out.
+
+    Raises:
+        ClientError: matplotlib is not installed.
+    """
+    with matplotlib_needed():
+        from PIL import Image  # noqa: PLC0415  an extra
+    step = -(-len(sequence) // FRAMES)
+    given = [frame for frame in sequence.frames() if frame.index % step == 0]
+    if not given:
+        raise ClientError(f"sequence {sequence.name}: expected frames to draw, received none")
+    view = _View(sequence, tracks, None if truth is None else truth.take(~truth.ignored), given)
+    pictures = [Image.fromarray(view.drawn(frame)) for frame in given]
+    # One palette for all frames: still parts have the same bytes in each, and are stored once.
+    sample = Image.new("RGB", (pictures[0].width, 3 * pictures[0].height))
+    for place, chosen in enumerate((pictures[0], pictures[len(pictures) // 2], pictures[-1])):
+        sample.paste(chosen, (0, place * chosen.height))
+    found = sample.quantize(COLOURS, dither=Image.Dither.NONE).getpalette() or []
+    shades = np.array(found, dtype=np.int64).reshape(-1, 3)
+    shades[shades.min(axis=1) >= WHITE] = 255  # the ground; an entry near white would replace it
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(shades.ravel().tolist())
+    first, *others = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    first.save(path, save_all=True, append_images=others, duration=_durations_ms(given), loop=0, optimize=True)
+
+
+def _durations_ms(given: list[DetectionFrame]) -> list[int]:
+    """Return how long each picture is shown; the last one a second, before it begins again. GIF counts hundredths."""
+    stamps = np.array([frame.stamp_ns for frame in given], dtype=np.int64)
+    return [*np.clip(np.diff(stamps) // 10_000_000 * 10, 20, 2000).tolist(), 1000]
+
+
+class _View:
+    """A figure of one frame at a time."""
+
+    def __init__(
+        self, sequence: DataSequence, tracks: ResultTable, truth: Truth | None, given: list[DetectionFrame]
+    ) -> None:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  an extra
+        from matplotlib.figure import Figure  # noqa: PLC0415  an extra
+
+        self._tracks, self._truth = tracks, truth
+        self._begin_ns = given[0].stamp_ns
+        period_s = (given[-1].stamp_ns - self._begin_ns) * 1e-9 / max(1, given[-1].index - given[0].index)
+        self._trail = round(TRAIL_S / period_s) if period_s > 0.0 else 1
+        _, self._sensor = stack_poses(sequence.poses)
+        places = tracks.center if len(tracks) else self._sensor
+        low, high = np.quantile(places[:, :2], INSIDE, axis=0)
+        lack = np.maximum(NARROWEST_M - (high - low), 0.0)
+        low, high = low - MARGIN_M - 0.5 * lack, high + MARGIN_M + 0.5 * lack
+        self._follows = bool((high - low).max() > WIDEST_M)
+        if self._follows:
+            low, high = np.array([-REACH_M, -0.6 * REACH_M]), np.array([REACH_M, 0.6 * REACH_M])
+        wide, tall = high - low
+        figure = Figure(figsize=(WIDTH_PX / 100, WIDTH_PX / 100 * tall / wide + 0.3), dpi=100)
+        self._canvas: Any = FigureCanvasAgg(figure)  # two of its methods have no annotations
+        share = 0.3 / figure.get_figheight()
+        self._axes: Axes = figure.add_axes((0.0, share, 1.0, 1.0 - share))
+        self._low, self._high = low, high
+        self._legend(figure)
+
+    def drawn(self, frame: DetectionFrame) -> "np.ndarray[tuple[int, ...], np.dtype[np.uint8]]":
+        """Return the picture of a frame, (height, width, 3)."""
+        axes, sensor = self._axes, self._sensor[frame.index, :2]
+        axes.clear()
+        axes.set_axis_off()
+        origin = sensor if self._follows else np.zeros(2)
+        axes.set_xlim(self._low[0] + origin[0], self._high[0] + origin[0])
+        axes.set_ylim(self._low[1] + origin[1], self._high[1] + origin[1])
+        self._draw_truth(frame.index)
+        center, _ = to_world(rotation_of(frame.pose.quaternion), frame.pose.translation, frame.center, frame.yaw)
+        axes.plot(*center[:, :2].T, "+", color=_DETECTION, markersize=4, markeredgewidth=0.8, zorder=6)
+        self._draw_tracks(frame)
+        axes.plot(*sensor, "^", color=_INK, markersize=7, zorder=7)
+        seconds = (frame.stamp_ns - self._begin_ns) * 1e-9
+        axes.text(0.012, 0.975, f"{seconds:.1f} s", transform=axes.transAxes, fontsize=12, va="top", color=_INK)
+        left, bottom = self._low + origin + 0.03 * (self._high - self._low)
+        axes.plot([left, left + SCALE_M], [bottom, bottom], color=_INK, linewidth=1.5)
+        axes.text(left, bottom, f"{SCALE_M:.0f} m", fontsize=9, va="bottom", color=_INK)
+        self._canvas.draw()
+        return np.array(self._canvas.buffer_rgba())[:, :, :3]
+
+    def _draw_truth(self, frame: int) -> None:
+        from matplotlib.collections import PolyCollection  # noqa: PLC0415  an extra
+
+        if self._truth is not None:
+            rows = np.flatnonzero(self._truth.frame == frame)
+            outlines = _outlines(self._truth, rows)
+            self._axes.add_collection(PolyCollection(outlines, facecolors=_SHADE, edgecolors=_SHADE, zorder=2))
+
+    def _draw_tracks(self, frame: DetectionFrame) -> None:
+        from matplotlib.collections import LineCollection, PolyCollection  # noqa: PLC0415  an extra
+
+        tracks = self._tracks
+        rows = np.flatnonzero(tracks.frame == frame.index)
+        colours = [colour_of(int(identity)) for identity in tracks.id[rows]]
+        outlines = _outlines(tracks, rows)
+        fronts = [np.stack([box.mean(axis=0), 0.5 * (box[0] + box[1])]) for box in outlines]
+        since = frame.index - self._trail
+        recent = np.flatnonzero((tracks.frame > since) & (tracks.frame <= frame.index))
+        trails = [tracks.center[recent[tracks.id[recent] == identity], :2] for identity in tracks.id[rows]]
+        self._axes.add_collection(LineCollection(trails, colors=colours, linewidths=1.6, zorder=4))
+        faces = [f"{colour}66" for colour in colours]
+        self._axes.add_collection(
+            PolyCollection(outlines, facecolors=faces, edgecolors=colours, linewidths=1.2, zorder=5)
+        )
+        self._axes.add_collection(LineCollection(fronts, colors=colours, linewidths=1.2, zorder=5))
+        for place, identity, colour in zip(tracks.center[rows], tracks.id[rows].tolist(), colours, strict=True):
+            self._axes.annotate(
+                str(identity),
+                (float(place[0]), float(place[1])),
+                xytext=(6, 5),
+                textcoords="offset points",
+                color=colour,
+                fontsize=8,
+                annotation_clip=True,
+                zorder=8,
+            )
+
+    def _legend(self, figure: "Figure") -> None:
+        from matplotlib.lines import Line2D  # noqa: PLC0415  an extra
+
+        colour, path = colour_of(0), f"track: box, id, path of {TRAIL_S:.0f} s"
+        handles = [
+            Line2D([], [], label="detection", marker="+", linestyle="", color=_DETECTION, markersize=6),
+            Line2D([], [], label="truth", marker="s", linestyle="", color=_SHADE, markersize=8),
+            Line2D([], [], label=path, marker="s", color=colour, markerfacecolor=f"{colour}66"),
+            Line2D([], [], label="sensor", marker="^", linestyle="", color=_INK, markersize=7),
+        ]
+        if self._truth is None:
+            del handles[1]
+        figure.legend(handles=handles, loc="lower center", ncols=len(handles), frameon=False, fontsize=9)
+
+
+def _outlines(boxes: "Truth | ResultTable", rows: Ints) -> list[Floats]:
+    """Return the corners (4, 2) of boxes from above, the front ones first."""
+    return list(box_corners(boxes.center[rows], boxes.size[rows], boxes.yaw[rows])[:, :4, :2])
+
+
+def draw_results(
+    picture: Path,
+    sequence: DataSequence,
+    folders: Sequence[Path],
+    results: "Sequence[Sequence[ClassResult]]",
+    score: float | None = None,
+) -> None:
+    """Draw the result files of a sequence from above.
+
+    Args:
+        picture: The PNG file, or the GIF file of a moving picture of the first tracker.
+        sequence: The tracked sequence.
+        folders: Where its result files are, or tables of tracks: one for each tracker.
+        results: Figures of the classes of each tracker; their misses and identity changes are marked.
+        score: Least mean score of the tracks that are shown; default: the best threshold of each class, by `results`.
+
+    Raises:
+        DatasetError: There is no such result file, or it is wrong.
+        ClientError: matplotlib is not installed.
+    """
+    from optipmb_tools.evaluation.tracks import read_tracks  # noqa: PLC0415  loads the solvers of scipy
+
+    names = [folder.name for folder in folders]
+    if len(set(names)) < len(names):
+        names = [str(folder) for folder in folders]
+    panels = []
+    for folder, name, own in zip(folders, names, results, strict=True):
+        table = read_tracks(folder, sequence).to_world(sequence.poses)
+        best = [result.sweep.results[result.sweep.best] for result in own]
+        panels.append(Panel(_from_score(table, own, score), best, name if len(names) > 1 else ""))
+    if picture.suffix == ".gif":
+        animate_tracks(picture, sequence, panels[0].tracks, sequence.truth())
+    else:
+        draw_tracks(picture, sequence, panels, sequence.truth())
+
+
+def _from_score(table: ResultTable, results: "Sequence[ClassResult]", score: float | None) -> ResultTable:
+    """Return the tracks whose mean score reaches the threshold of their class."""
+    if not len(table):
+        return table
+    best = {result.name: result.sweep.thresholds[result.sweep.best] for result in results}
+    least = np.array([score if score is not None else best.get(label, 0.0) for label in table.labels])
+    _, which = np.unique(table.id, return_inverse=True)
+    mean = np.round(np.bincount(which, table.score) / np.bincount(which), 12)  # as thresholds are
+    return table.take(np.asarray(mean[which] >= least[table.label], dtype=np.bool_))

@@ -1,0 +1,179 @@
+"""Between the messages of the wire and the values of the tracker.
+
+Conventions: a message says itself whether its arrays are in the `world` or in the `sensor` frame; the tracker's frame
+is always the world (right-handed, z up, metres, radians), and so are the tracks that go out. Nothing is copied that can
+be viewed.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from operator import attrgetter
+from struct import unpack
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import optipmb_schemas as schemas
+
+import optipmb
+from optipmb.frame import frame_of_checked
+from optipmb_service.stream.values import Tracked
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from optipmb_service.stream.timeline import FrameId
+
+IDENTITY = optipmb.Pose(translation=np.zeros(3), quaternion=np.array([1.0, 0.0, 0.0, 0.0]))
+"""The pose of arrays that are in the world frame already."""
+
+_intervals: Final = attrgetter("azimuth", "elevation", "range")
+_boxes: Final = attrgetter("label", "center", "size", "yaw", "score", "velocity")
+
+
+def pose_of(message: schemas.Detections | schemas.Points) -> optipmb.Pose | None:
+    """Return world from sensor, or None for a message in the world frame.
+
+    Raises:
+        optipmb.FrameError: the pose is missing or no rigid motion.
+    """
+    if message.frame == "world":
+        return None
+    if message.pose is None:
+        raise optipmb.FrameError("pose", "the pose of the sensor", "nothing")
+    return _pose(message.pose.translation.tobytes(), message.pose.quaternion.tobytes())
+
+
+@lru_cache(1024)
+def _pose(translation: bytes, quaternion: bytes) -> optipmb.Pose:
+    """Return a pose, of which many sensors have the same in every message."""
+    return optipmb.Pose(np.frombuffer(translation), np.frombuffer(quaternion))
+
+
+def view_of(message: schemas.Detections, pose: optipmb.Pose | None) -> optipmb.FieldOfView | None:
+    """Return the field of view of a frame in the axes of its sensor, None when the sensor sees everything.
+
+    Args:
+        message: the message of the frame.
+        pose: `pose_of` the message.
+
+    Raises:
+        optipmb.FrameError: an interval is none.
+    """
+    if message.field_of_view is None:
+        return None
+    view = _view(*(interval.tobytes() for interval in _intervals(message.field_of_view)))
+    if pose is None and message.pose is not None:
+        pose = _pose(message.pose.translation.tobytes(), message.pose.quaternion.tobytes())
+    return view if pose is None else view.at(pose)
+
+
+@lru_cache(1024)
+def _view(*intervals: bytes) -> optipmb.FieldOfView:
+    """Return a field of view without its pose; a sensor has the same in every message."""
+    azimuth, elevation, distance = (unpack("2d", interval) for interval in intervals)
+    return optipmb.FieldOfView(azimuth, elevation, distance)
+
+
+def cloud_of(message: schemas.Points) -> optipmb.PointCloud:
+    """Return the cloud as the tracker reads it.
+
+    Raises:
+        optipmb.FrameError: wrong shape or pose.
+    """
+    return optipmb.PointCloud(xyz=message.xyz, pose=pose_of(message) or IDENTITY)
+
+
+def frame_of(parameters: optipmb.Parameters, message: schemas.Detections) -> tuple[optipmb.Frame, int]:
+    """Return the frame without its cloud, and how many objects were left out because the profile lacks their class.
+
+    The message was checked when it was made, within bounds that no frame has narrower: arrays are shared, not looked at
+    once more.
+
+    Raises:
+        optipmb.FrameError: a pose or covariance is none, or an object is too far in the world frame; `path` names it.
+    """
+    columns, pose, spread = _boxes(message), pose_of(message), message.position_covariance
+    view = view_of(message, pose)
+    return frame_of_checked(parameters, message.stamp_ns, message.labels, columns, pose, None, view, spread)
+
+
+def unknown_labels(parameters: optipmb.Parameters, message: schemas.Detections) -> dict[str, int]:
+    """Return the classes that the profile lacks, with the number of objects of each in the message."""
+    missing = (optipmb.class_indices(message.labels, parameters.labels) < 0).nonzero()[0]
+    if not len(missing):
+        return {}
+    counts = np.bincount(message.label, minlength=len(message.labels))
+    unknown: dict[str, int] = {}
+    for index in missing.tolist():
+        if counts[index]:
+            name = message.labels[index]
+            unknown[name] = unknown.get(name, 0) + int(counts[index])
+    return unknown
+
+
+def density_of(
+    density: optipmb.Density, *, stream: str, session: str, parameters: optipmb.Parameters
+) -> schemas.Density:
+    """Return the message for the Poisson components of a density."""
+    poisson = density.poisson
+    return schemas.Density(
+        stream=stream,
+        session=session,
+        stamp_ns=density.stamp_ns if density.stamp_ns >= 0 else None,
+        labels=tuple(parameters.classes),
+        label=poisson.label,
+        weight=poisson.weight,
+        mean=poisson.mean,
+        covariance=poisson.covariance,
+        z=poisson.auxiliary[:, 3],
+    )
+
+
+def tracks_of(  # noqa: PLR0913 - all keywords, each a field of the message
+    tracks: optipmb.Tracks,
+    paths: optipmb.PredictedPaths | None,
+    class_probability: NDArray[np.float64] | None = None,
+    *,
+    stream: str,
+    frame_id: FrameId,
+    session: str,
+    revision: int,
+    parameters: optipmb.Parameters,
+    cloud_used: bool,
+    gap: int,
+    ignored: int,
+) -> Tracked:
+    """Return the tracks of a frame, with paths and classes if there are any.
+
+    What the tracker made of checked detections needs one look, not the checks of a message from elsewhere; where that
+    look finds something odd, those checks say what it is.
+
+    Raises:
+        schemas.MessageError: the tracks hold numbers that no message may.
+    """
+    header: dict[str, Any] = {
+        "stream": stream,
+        "epoch": frame_id.epoch,
+        "seq": frame_id.seq,
+        "stamp_ns": frame_id.stamp_ns,
+        "sensor": frame_id.sensor,
+        "session": session,
+        "revision": revision,
+        "profile": parameters.name,
+        "cloud_used": cloud_used,
+        "gap": gap,
+        "ignored": ignored,
+        "labels": parameters.labels,
+    }
+    if not frame_id.sensor:
+        del header["sensor"]
+    others: dict[str, Any] = {}
+    if class_probability is not None:
+        others |= schemas.class_fields(class_probability)
+    if paths is not None:
+        others |= schemas.path_fields(paths.horizons, paths.mean, paths.covariance)
+    if not optipmb.sound(tracks):
+        columns: dict[str, Any] = dict(tracks.columns()) | {"confirmed": tracks.confirmed.astype(np.int64)}
+        schemas.Tracks(**header, **columns, **others)
+    return Tracked(tracks, header, others)

@@ -1,0 +1,129 @@
+"""Settings by stream name: its profile, and the session that it shares with others.
+
+All profiles are read once, at the start, so that a bad file ends the start and not a session. Over the network only
+these and the profiles that come with the tracker can be asked for, never a path.
+
+The sensors of a node that the setting `fuse` names share a session, `site/node/fused`: its tracks, queries, owner and
+checkpoint are found by that name, as if it were a stream's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import TYPE_CHECKING, Final
+
+import optipmb_schemas as schemas
+
+import optipmb
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from optipmb_service.stream.values import Steps
+
+
+@dataclass(frozen=True)
+class Profiles:
+    """The profiles in force.
+
+    Attributes:
+        default: name of the profile of streams that no pattern names, as the settings give it.
+        patterns: pairs of stream pattern and profile name, the first that matches holds.
+        known: all profiles by the name that the settings give, and by the name inside the file.
+    """
+
+    default: str
+    patterns: tuple[tuple[str, str], ...]
+    known: Mapping[str, optipmb.Parameters]
+
+    @classmethod
+    def read(cls, default: str, patterns: Mapping[str, str]) -> Profiles:
+        """Load every profile named, and those that come with the tracker.
+
+        Raises:
+            optipmb.ParameterError: one of them cannot be read or is not valid.
+        """
+        known: dict[str, optipmb.Parameters] = {}
+        for name in (default, *patterns.values(), *optipmb.profiles()):
+            if name not in known:
+                known[name] = _loaded(name)
+        for parameters in tuple(known.values()):
+            known.setdefault(parameters.name, parameters)
+        return cls(default, tuple(patterns.items()), known)
+
+    def of(self, stream: str) -> optipmb.Parameters:
+        """Return the parameters of a stream, `site/node/sensor`."""
+        for pattern, name in self.patterns:
+            if fnmatchcase(stream, pattern):
+                return self.known[name]
+        return self.known[self.default]
+
+    def named(self, name: str) -> optipmb.Parameters | None:
+        """Return a profile by its name, None when there is none."""
+        return self.known.get(name)
+
+    def trackers(self, make: Callable[[optipmb.Parameters], optipmb.Tracker]) -> Callable[[optipmb.Parameters], Steps]:
+        """Return what gives all streams of a profile one tracker, for it keeps nothing of them (0.6 ms each)."""
+        made = {parameters.name: make(parameters) for parameters in self.known.values()}
+
+        def tracker(parameters: optipmb.Parameters) -> optipmb.Tracker:
+            found = made.get(parameters.name)
+            same = found is not None and (found.parameters is parameters or found.parameters == parameters)
+            return found if found is not None and same else make(parameters)
+
+        return tracker
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names that can be asked for."""
+        return tuple(sorted({parameters.name for parameters in self.known.values()}))
+
+
+def _loaded(name: str) -> optipmb.Parameters:
+    try:
+        parameters = optipmb.load_profile(name)
+    except optipmb.ParameterError as error:
+        path = error.path if error.path == "profile" else f"profile {name}: {error.path}"
+        raise optipmb.ParameterError(path, error.expected, error.received) from error
+    try:
+        schemas.SessionParameters(profile=parameters.name)
+    except schemas.MessageError as error:
+        raise optipmb.ParameterError(f"profile {name}: name", error.expected, error.received) from error
+    return parameters
+
+
+FUSED: Final = "fused"
+"""The sensor in the name of such a session."""
+
+
+@dataclass(frozen=True)
+class Fusion:
+    """Streams that share sessions.
+
+    Attributes:
+        patterns: of streams, `site/node/sensor`, each part with `*` for any text.
+    """
+
+    patterns: Sequence[str] = ()
+
+    def session_of(self, stream: str) -> str:
+        """Return the name of the session that a stream feeds: its own, or that of its node."""
+        if not self.patterns:
+            return stream
+        parts = tuple(stream.split("/"))
+        matched = any(_matches(parts, pattern) for pattern in self.patterns)
+        return f"{parts[0]}/{parts[1]}/{FUSED}" if matched else stream
+
+    def is_session(self, name: str) -> bool:
+        """Whether a name is that of a session of several streams; no sensor may have it."""
+        site, node, sensor = name.split("/")
+        return sensor == FUSED and any(_matches((site, node), pattern) for pattern in self.patterns)
+
+    def seen_by(self, name: str) -> str:
+        """Return the pattern of the streams whose detections belong to the tracks of a session, in Zenoh's words."""
+        return f"{name.rpartition('/')[0]}/*" if self.is_session(name) else name
+
+
+def _matches(parts: tuple[str, ...], pattern: str) -> bool:
+    return all(fnmatchcase(part, wanted) for part, wanted in zip(parts, pattern.split("/"), strict=False))

@@ -1,0 +1,226 @@
+"""Recovery of frames that a session has missed: from the log of messages, and from the caches of publishers.
+
+What they give goes into the backlog before all that waits. The session drops what it has tracked already, or has from
+another source. The log is read when a session is opened, and when it is silent: its frames may be there and not arrive,
+as behind a cut between two routers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+import structlog
+
+from optipmb_service.cluster.log_position import Missed, Position
+from optipmb_service.stream.directory import BACK_NS
+from optipmb_service.stream.ports import Packet, TransportError
+from optipmb_service.stream.timeline import number_of
+from optipmb_service.stream.values import MAX_SENSORS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+    import optipmb_schemas as schemas
+
+    from optipmb_service.cluster.message_log import LogMessage, LogReader
+    from optipmb_service.stream.checkpoint import Checkpoint
+    from optipmb_service.stream.profiles import Fusion
+    from optipmb_service.stream.session import Session
+    from optipmb_service.stream.streams import Streams
+
+    Take = Callable[[list[Packet]], None]
+
+log = structlog.get_logger("optipmb_service")
+
+MOST_PAUSES: Final = 8
+"""Longest pause between two reads that find nothing, in times of the silence before the first one."""
+
+MOST: Final = 4 * MAX_SENSORS
+"""Complete caches that are remembered; when there are more, those are forgotten whose publishers have gone."""
+
+
+class Log:
+    """Frames and tracks in the log.
+
+    Args:
+        reader: reads it; closed with this.
+        keys: the keys of streams.
+        fusion: sensors that share a session.
+    """
+
+    def __init__(self, reader: LogReader, keys: schemas.Keys, fusion: Fusion) -> None:
+        self._reader = reader
+        self._keys = keys
+        self._fusion = fusion
+
+    def fetch(self, session: str, checkpoint: Checkpoint | None, first: Take, later: Take) -> None:
+        """Call `first` soon, once in any case, with what came after a checkpoint, and `later` with what follows.
+
+        They are called on a thread that they must not keep.
+        """
+        fused = self._fusion.is_session(session)
+        if checkpoint is not None and checkpoint.fused and not checkpoint.seen:
+            first([])  # it was closed by a query, and knows no longer what it has tracked
+            return
+        takes = iter((first,))
+        try:
+            wanted = Missed(
+                streams=() if fused else (session,),
+                node=session.rpartition("/")[0] if fused else "",
+                belongs=lambda stream: self._fusion.session_of(stream) == session,
+                positions={} if checkpoint is None else positions_of(checkpoint),
+            )
+            self._reader.missed(wanted, lambda messages: next(takes, later)(self._packets(messages)))
+        except Exception:
+            log.exception("internal_error", stream=session)
+            first([])
+
+    def look(self, checkpoint: Checkpoint, then: Take) -> None:
+        """Call `then` soon, once, with what came after the newest frames of a checkpoint."""
+        positions = newest_of(checkpoint)
+        wanted = Missed(tuple(positions), node="", belongs=lambda _: False, positions=positions)
+        self._reader.missed(wanted, lambda messages: then(self._packets(messages)), again_s=())
+
+    def tracks(
+        self, stream: str, from_ns: int, take: Callable[[Sequence[LogMessage]], bool], end: Callable[[str], None]
+    ) -> None:
+        """Read the tracks of a stream from a stamp on; see `LogReader.tracks`."""
+        self._reader.tracks(stream, from_ns, take, end)
+
+    def close(self, timeout: float) -> None:
+        """Close the connection."""
+        self._reader.close(timeout)
+
+    def _packets(self, messages: Iterable[LogMessage]) -> list[Packet]:
+        now = time.time_ns(), time.monotonic_ns()
+        key = self._keys.detections
+        return [Packet(key(one.stream), one.payload, len(one.payload), one.encoding, *now) for one in messages]
+
+
+def newest_of(checkpoint: Checkpoint) -> dict[str, Position]:
+    """Return, for each sensor of a session, the newest frame that has come."""
+    return {
+        name or checkpoint.stream: Position(
+            frozenset(one.epoch for one in epochs[:-1]), epochs[-1].epoch, epochs[-1].highest, tracked=True
+        )
+        for name, epochs in checkpoint.seen.items()
+        if epochs
+    }
+
+
+def positions_of(checkpoint: Checkpoint) -> dict[str, Position]:
+    """Return, for each sensor of a session, the last frame before the window of a checkpoint.
+
+    Where all frames of a sensor are in the window, it is the one before the first of them.
+    """
+    positions = {}
+    for name, epochs in checkpoint.seen.items():
+        cursor = checkpoint.base.sensor(name).cursor
+        if cursor.epoch is not None:
+            before = epochs[: max(0, number_of(epochs, cursor.epoch))]
+            at = Position(frozenset(one.epoch for one in before), cursor.epoch, cursor.seq, tracked=True)
+        else:
+            ids = [one.frame_id for one in checkpoint.window if one.frame_id.sensor == name]
+            if not ids:
+                continue
+            first = min(ids, key=lambda one: (number_of(epochs, one.epoch), one.seq))
+            at = Position(frozenset(), first.epoch, first.seq - 1, tracked=False)
+        positions[name or checkpoint.stream] = at
+    return positions
+
+
+class LogCheck:
+    """Schedule of the reads of the log for one session whose frames do not arrive.
+
+    The control loop begins a read; the tracking thread, or the thread of the log, ends it.
+
+    Args:
+        silent_ns: silence after which the log is read; pauses double up to `MOST_PAUSES` times as long.
+    """
+
+    def __init__(self, silent_ns: int) -> None:
+        self._silent_ns = self._pause_ns = silent_ns
+        self._next_ns = 0
+        self.under_way = False
+
+    def due_ns(self, age_ns: int, now_ns: int) -> int | None:
+        """Return since when the log is to be read; None: it is not now.
+
+        Args:
+            age_ns: time since the last frame of the sensor that is silent for longest.
+            now_ns: monotonic time.
+        """
+        if age_ns < self._silent_ns:
+            self._pause_ns, self._next_ns = self._silent_ns, 0
+        waits = self.under_way or now_ns < self._next_ns or age_ns < self._silent_ns
+        return None if waits else self._next_ns
+
+    def begin(self, now_ns: int) -> None:
+        """Begin a read."""
+        self.under_way = True
+        self._next_ns = now_ns + self._pause_ns
+        self._pause_ns = min(2 * self._pause_ns, MOST_PAUSES * self._silent_ns)
+
+    def end(self, *, found: bool) -> None:
+        """End a read; where it found frames, the next one is due at once."""
+        if found:
+            self._pause_ns, self._next_ns = self._silent_ns, 0
+        self.under_way = False
+
+
+class CacheRecovery:
+    """Publishers' caches that one session waits for; for the tracking thread alone.
+
+    Args:
+        session: its name.
+        streams: have the caches.
+    """
+
+    def __init__(self, session: str, streams: Streams) -> None:
+        self._session = session
+        self._streams = streams
+        self._answered: set[str] = set()
+        self._asked: set[str] = set()
+        self._most = MOST
+
+    def answered(self, *streams: str) -> None:
+        """Note that all has come which the caches of these streams held."""
+        self._answered.update(streams)
+        self._asked.update(streams)
+        if len(self._answered) > self._most:
+            there = self._streams.caches.awaited(self._session, self._answered).keys()
+            self._answered &= there
+            self._asked &= there
+            self._most = max(MOST, 2 * len(self._answered))  # publishers that are there are not gone over each time
+
+    def ask_again(self, stream: str) -> None:
+        """Note that the cache of a stream has not answered in full."""
+        self._asked.discard(stream)
+
+    def forget(self) -> None:
+        """Begin again: the session has ended."""
+        self._answered.clear()
+        self._asked.clear()
+        self._most = MOST
+
+    def awaited(self, session: Session, take: Callable[[str, list[Packet], bool], None]) -> bool:
+        """Return whether caches may hold what has not come; ask those that were not.
+
+        Args:
+            session: has the sensors.
+            take: called on any thread with a stream, what its cache held, and whether it has answered in full.
+        """
+        caches = self._streams.caches
+        awaited = caches.awaited(self._session, session.sensors)
+        for stream, is_there in awaited.items():
+            if is_there and stream not in self._asked:
+                self._asked.add(stream)
+                with contextlib.suppress(TransportError):  # the end
+                    caches.ask_cache(stream, partial(take, stream))
+        # Tokens of sensors that a young session does not know may be on their way.
+        young_ns = session.young_since_ns
+        is_young = young_ns is not None and time.monotonic_ns() - young_ns < BACK_NS
+        return is_young or not awaited.keys() <= self._answered

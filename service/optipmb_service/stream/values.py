@@ -1,0 +1,239 @@
+"""Settings, outputs and counts of sessions as plain values; times in nanoseconds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any, Final, Literal, NamedTuple, Protocol
+
+import numpy as np
+import optipmb_schemas as schemas
+from pydantic import AfterValidator, Field
+
+import optipmb
+from optipmb_service.telemetry.stream_meter import MAX_COUNT
+
+SECOND: Final = 1_000_000_000
+
+COLUMNS: Final = tuple(optipmb.Tracks.described)
+"""Columns of the tracks in the order of the message."""
+
+# What checkpoints hold, as pydantic reads it.
+Whole = Annotated[int, Field(strict=True, ge=0, lt=2**63)]
+Count = Annotated[int, Field(strict=True, ge=0, le=MAX_COUNT)]
+Binary = Annotated[bytes, Field(strict=True)]
+Epoch = Annotated[bytes, Field(strict=True, min_length=16, max_length=16)]
+
+
+def _check_sensor(name: str) -> str:
+    if name:
+        schemas.Keys().tracks(name)
+    return name
+
+
+SensorName = Annotated[str, Field(strict=True), AfterValidator(_check_sensor)]
+"""Stream of a sensor; empty for the only one of a stream's own session."""
+
+
+class JumpLimits(NamedTuple):
+    """Steps of the stamps, in the order of a publisher, beyond which they jumped.
+
+    Attributes:
+        back_ns: largest step back: within it a late frame is inserted.
+        ahead_ns: largest step ahead.
+    """
+
+    back_ns: int
+    ahead_ns: int
+
+
+MAX_CLOUD_WAIT_NS: Final = 60 * SECOND
+"""The longest wait for a cloud that can be asked for."""
+
+MAX_SENSORS: Final = 64
+"""Sensors of one session."""
+
+MAX_ERROR: Final = 400
+"""Characters kept of an error."""
+
+MAX_LABELS: Final = 256
+"""Unknown class names remembered as reported."""
+
+
+class Steps(Protocol):
+    """Tracker of a session; `optipmb.Tracker` is one."""
+
+    def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
+        """Return the density after the frame, and its tracks."""
+
+
+@dataclass(frozen=True, slots=True)
+class Policy:
+    """The settings that a session follows; lengths in metres, speeds in metres per second.
+
+    Attributes:
+        gap_limit_ns: a larger step of the stamps starts the session anew.
+        cloud_wait_ns: longest wait of a frame for its cloud.
+        cloud_memory_ns: how lately a cloud must have come for a frame that does not say whether it has one.
+        clouds: number of clouds kept.
+        cloud_bytes: most bytes of these.
+        held_bytes: most bytes of frames held for clouds or for missed frames.
+        rewind_ns: sensor time within which a late frame is put in its place; 0: late frames are refused.
+        rewind_frames: most frames kept for it.
+        rewind_bytes: most bytes of messages kept for it.
+        checkpoint_bytes: most bytes of messages that a checkpoint takes along; with large clouds a restored session
+            goes back less far.
+        late_clouds: whether a cloud that comes after its frame was tracked is put in too, inside the window.
+        recovery_wait_ns: longest time after a restore that frames behind a gap are held for those missing.
+        max_speed: fastest that a sensor moves; 0: any pose is taken.
+        pose_margin: how far a pose may lie from where that speed allows.
+        astray_frames: frames in a row that agree on another place until the session begins anew there.
+        at_once: frames that are ready which one call takes through the tracker; the next calls take the others. More
+            are taken only while more than `held_bytes` are held.
+    """
+
+    gap_limit_ns: int = 5 * SECOND
+    cloud_wait_ns: int = SECOND // 10
+    cloud_memory_ns: int = 2 * SECOND
+    clouds: int = 16
+    cloud_bytes: int = 32 * 2**20
+    held_bytes: int = 32 * 2**20
+    rewind_ns: int = SECOND
+    rewind_frames: int = 64
+    rewind_bytes: int = 32 * 2**20
+    checkpoint_bytes: int = 2**20
+    late_clouds: bool = False
+    recovery_wait_ns: int = 2 * SECOND
+    max_speed: float = 100.0
+    pose_margin: float = 10.0
+    astray_frames: int = 5
+    at_once: int = 2**62
+
+    @property
+    def jump_limits(self) -> JumpLimits:
+        """The steps of a publisher's stamps beyond which they jumped."""
+        return JumpLimits(min(self.rewind_ns, self.gap_limit_ns), self.gap_limit_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class Incarnation:
+    """Numbers that the next session of a stream continues, so that neither its id nor its track ids come again.
+
+    Attributes:
+        starts: incarnations of the density so far.
+        next_id: the next track id.
+        run: see `Session.run`; of the next session, higher than that of any which may have published before.
+    """
+
+    starts: int = 0
+    next_id: int = 1
+    run: int = 0
+
+
+@dataclass(slots=True)
+class Tracked:
+    """Tracks of a frame.
+
+    The message is built when somebody reads it. The bytes to publish are put together without it: the columns of the
+    tracks lie one behind the other in one array, in the order in which the message has them.
+
+    Attributes:
+        estimates: tracks of the tracker, with numbers that a message may hold.
+        header: the fields of the message before the columns, those without a value left out.
+        others: the fields behind the columns: classes and predicted paths, where the profile has them.
+        ticket: value that the caller gave with the detections.
+        step_ns: time that conversion and tracking took.
+        run: see `Session.run`.
+    """
+
+    estimates: optipmb.Tracks
+    header: dict[str, Any]
+    others: dict[str, Any]
+    ticket: Any = None
+    step_ns: int = 0
+    run: int = 0
+
+    @property
+    def tracks(self) -> schemas.Tracks:
+        """The message, without its delivery part."""
+        columns: dict[str, Any] = dict(self.estimates.columns())
+        columns["confirmed"] = columns["confirmed"].astype(np.int64)
+        for column in columns.values():
+            column.flags.writeable = False
+        return schemas.Tracks.trusted(self.header | columns | self.others)
+
+    def encoded(self, delivery: dict[str, Any]) -> bytes:
+        """Return the bytes of the message with a delivery part of these values, all that it has, in its order."""
+        if self.others:
+            return schemas.encode(self.tracks, delivery=schemas.Delivery.trusted(delivery))
+        words = self.estimates.words
+        return schemas.encode_columns(schemas.Tracks, self.header, COLUMNS, words, {"delivery": delivery})
+
+
+Reason = Literal["first", "jump", "clock", "publisher", "pose", "effort", "reset", "parameters", "quarantine"]
+"""Why the density started again; `clock`: after a step back, with its objects."""
+
+
+@dataclass(frozen=True, slots=True)
+class Begun:
+    """Start of a session id: at the first frame, at a jump, by a reset.
+
+    Attributes:
+        session: the id.
+        reason: why.
+        jump_ns: how far the stamps jumped.
+    """
+
+    session: str
+    reason: Reason
+    jump_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Quarantined:
+    """A step raised: the session takes no more frames until it is reset or another publisher begins.
+
+    Attributes:
+        error: type and text of what was raised.
+        dump: what `optipmb track --dump` replays to the same error.
+    """
+
+    error: str
+    dump: bytes
+
+
+Output = Tracked | schemas.Problem | Begun | Quarantined
+
+
+@dataclass(slots=True)
+class Deliveries:
+    """Counts of frames that were not tracked, and of corrections: they depend on how messages were delivered.
+
+    Attributes:
+        duplicates: frames that came again.
+        late: frames that came too late.
+        refused: messages that were not valid, or not wanted.
+        inserted: late frames and clouds that were put in their place.
+        corrected: tracks that were published anew because of these.
+    """
+
+    duplicates: Count = 0
+    late: Count = 0
+    refused: Count = 0
+    inserted: Count = 0
+    corrected: Count = 0
+
+
+class RefusedError(ValueError):
+    """A command was refused.
+
+    Attributes:
+        path: the field of the request.
+        expected: what would have been accepted.
+        received: what was asked for.
+    """
+
+    def __init__(self, path: str, expected: str, received: str) -> None:
+        super().__init__(f"{path}: expected {expected}, received {received}")
+        self.path = path
+        self.expected = expected
+        self.received = received

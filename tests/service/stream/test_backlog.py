@@ -1,0 +1,269 @@
+"""The backlog of a session: what waits there is bounded, in order, and in one place; what leaves unprocessed counts."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from optipmb_service.stream.backlog import UNASKED_NS, UNLIMITED, Backlog, Bounds, ByteBudget
+from optipmb_service.stream.ports import PACKET_BYTES, Packet
+from optipmb_service.stream.values import SECOND
+
+TOPICS = {True: "detections", False: "points"}
+
+
+class Lost:
+    """What backlogs lose of what they hold."""
+
+    def __init__(self) -> None:
+        self.packets: list[Packet] = []
+
+    def __call__(self, _: str, packets: list[Packet]) -> None:
+        """Note it."""
+        self.packets += packets
+
+
+def bounds_of(**limits: Any) -> Bounds:
+    """Return bounds, none but those that are given."""
+    bounds = Bounds(Lost(), UNLIMITED, UNLIMITED, UNLIMITED, ByteBudget(), ByteBudget(), UNLIMITED)
+    return replace(bounds, **limits)
+
+
+def live(**limits: Any) -> Backlog:
+    """Return a backlog whose stream processes messages as they come."""
+    backlog = Backlog("a/b/c", bounds_of(**limits), 0)
+    backlog.attach(lambda: None)
+    backlog.go_live()
+    return backlog
+
+
+def packet(number: int = 0, *, frame: bool = True, size: int = 0, at_s: float = 0, stream: str = "s") -> Packet:
+    """Return a packet known by its number."""
+    return Packet(f"{stream}/{TOPICS[frame]}", bytes(size), size, "", number, round(at_s * SECOND))
+
+
+def taken(backlog: Backlog) -> list[Packet]:
+    """Take all packets; commands are run."""
+    packets = []
+    while (item := backlog.take()) is not None:
+        if isinstance(item, Packet):
+            packets.append(item)
+        else:
+            item()
+    return packets
+
+
+def numbers(packets: list[Packet]) -> list[int]:
+    """Return the numbers of packets."""
+    return [one.wall_ns for one in packets]
+
+
+@settings(deadline=None)
+@given(st.lists(st.integers(0, 2), max_size=60), st.integers(1, 5), st.integers(1, 5))
+def test_a_live_backlog_is_bounded_ordered_and_counts(kinds: list[int], frames: int, clouds: int) -> None:
+    """The newest frames and clouds stay, in order, clouds first; commands are never lost; the rest is counted."""
+    backlog, ran = live(frames=frames, clouds=clouds), list[int]()
+    for number, kind in enumerate(kinds):
+        if kind == 2:
+            backlog.command(lambda number=number: ran.append(number), urgent=False)  # type: ignore[misc]  # bound now
+        else:
+            backlog.push(packet(number, frame=kind == 0))
+    sent = [[number for number, kind in enumerate(kinds) if kind == wanted] for wanted in range(3)]
+    assert numbers(taken(backlog)) == sent[1][-clouds:] + sent[0][-frames:]
+    assert ran == sent[2]
+    assert backlog.counts() == (0, max(0, len(sent[0]) - frames), max(0, len(sent[1]) - clouds))
+
+
+def test_a_backlog_asks_for_one_turn() -> None:
+    """Only the first message asks for a turn, until that one ends; a closed backlog takes nothing."""
+    turns: list[int] = []
+    backlog = live()
+    backlog.attach(lambda: turns.append(1))
+    backlog.push(packet())
+    backlog.push(packet(frame=False))
+    backlog.wake()
+    assert len(turns) == 1
+    backlog.take()
+    assert backlog.end_turn(close=True) is True
+    backlog.take()
+    assert backlog.end_turn(close=False) is False
+    backlog.push(packet())
+    assert len(turns) == 2
+    backlog.take()
+    assert backlog.end_turn(close=True) is None
+    assert not backlog.push(packet())
+    assert not backlog.command(print, urgent=True)
+    assert len(turns) == 2
+
+
+def test_urgent_commands_go_first() -> None:
+    """A question overtakes the frames that wait, an ordinary command does not."""
+    backlog, order = live(), []
+    backlog.push(packet())
+    backlog.command(lambda: order.append("later"), urgent=False)
+    backlog.command(lambda: order.append("now"), urgent=True)
+    while (item := backlog.take()) is not None:
+        order.append("frame") if isinstance(item, Packet) else item()
+    assert order == ["now", "frame", "later"]
+
+
+def test_no_sensor_takes_the_room_of_another() -> None:
+    """A sensor that floods a session loses its own frames and clouds, and what is lost is counted for it."""
+    backlog = live(frames=3, clouds=2, bytes=4000)
+    for frame in (True, False):
+        backlog.push(packet(frame=frame, stream="slow"))
+    for number in range(9):
+        for frame in (True, False):
+            backlog.push(packet(number, frame=frame, size=10, stream="fast"))
+    backlog.push(packet(9, size=3000, stream="fast"))
+    assert backlog.shed_since().keys() == {"fast"}
+    assert not backlog.shed_since()
+    assert {("slow", True), ("slow", False)} <= {(one.origin, one.frame) for one in taken(backlog)}
+
+
+def test_a_live_backlog_gives_back_what_it_took() -> None:
+    """Frames and clouds beyond the bytes go, the oldest clouds first; what is larger than all is not taken."""
+    budget = ByteBudget(10 * PACKET_BYTES)
+    backlog = live(bytes=6 * PACKET_BYTES, queued=budget)
+    for number in range(4):
+        backlog.push(packet(number, frame=False))
+    for number in range(4):
+        backlog.push(packet(number))
+    assert (backlog.counts(), budget.used) == ((4, 0, 2), 6 * PACKET_BYTES)
+    backlog.push(packet(9, size=7 * PACKET_BYTES))
+    assert (backlog.counts(), budget.used) == ((0, 5, 4), 0)
+    assert backlog.take() is None
+
+
+@given(st.lists(st.tuples(st.integers(1, 50), st.booleans(), st.floats(0, 2)), max_size=60))
+def test_what_waits_for_a_takeover_is_bounded(arrivals: list[tuple[int, bool, float]]) -> None:
+    """By bytes over all streams and by age; what is left is in order, clouds go before frames."""
+    budget = ByteBudget(4 * PACKET_BYTES)
+    bounds = bounds_of(held=budget, keep_ns=5 * SECOND)
+    backlogs = [Backlog("a/b/c", bounds, 0), Backlog("a/b/d", bounds, 0)]
+    now_s = 0.0
+    for number, (size, frame, pause_s) in enumerate(arrivals):
+        now_s += pause_s
+        backlogs[number % 2].push(packet(size=size, frame=frame, at_s=now_s), own=False)
+        assert 0 <= budget.used <= 4 * PACKET_BYTES
+    for one in backlogs:
+        one.trim(round(now_s * SECOND))
+        times = [entry.now_ns for entry in one.recent()]
+        assert times == sorted(times)
+        assert all(now_s * SECOND - at <= 5 * SECOND + 1 for at in times)
+        one.attach(lambda: None)
+        one.go_live()
+        taken(one)
+    assert budget.used == 0
+
+
+def test_clouds_of_a_takeover_go_first() -> None:
+    """When there is no room a session gives up its clouds, then its oldest frames."""
+    backlog = Backlog("a/b/c", bounds_of(held=ByteBudget(6 * PACKET_BYTES)), 0)
+    for number in range(5):
+        backlog.push(packet(number, size=10))
+        backlog.push(packet(number, size=30, frame=False))
+    assert sum(one.frame for one in backlog.recent()) == 5
+
+
+def test_what_was_missed_goes_before_what_waits() -> None:
+    """Packets from the log or a cache, then those that came while the session was opened, then newer ones."""
+    backlog = live()
+    backlog.push(packet(1))
+    backlog.open(packet(0))
+    backlog.push(packet(2, frame=False))
+    assert backlog.take() is None
+    backlog.recover([packet(100), packet(101)])
+    backlog.go_live()
+    backlog.push(packet(3))
+    assert numbers(taken(backlog)) == [100, 101, 0, 1, 2, 3]
+
+
+def test_what_others_received_goes_before_what_was_held_here() -> None:
+    """A session that comes here goes on with what others received of it; what both have is taken once."""
+    backlog = Backlog("a/b/c", bounds_of(), 0)
+    for number in (1, 2):
+        backlog.push(packet(number, size=number))
+    backlog.bring([packet(0), packet(1, size=1)])
+    backlog.attach(lambda: None)
+    backlog.go_live()
+    assert numbers(taken(backlog)) == [0, 1, 2]
+
+
+ACTIONS = st.sampled_from(["own", "cloud", "foreign", "take", "open", "live", "leave", "give", "recover", "trim"])
+
+
+@settings(deadline=None)
+@given(st.lists(ACTIONS, max_size=80), st.integers(1, 12))
+def test_every_message_ends_in_one_place(actions: list[str], room: int) -> None:
+    """Whatever becomes of a session: each message to be tracked here is taken, handed over, or counted, once."""
+    queued, held, lost = ByteBudget(room * PACKET_BYTES), ByteBudget(room * PACKET_BYTES), Lost()
+    backlog = Backlog("a/b/c", bounds_of(lost=lost, frames=4, clouds=2, queued=queued, held=held, keep_ns=0), 0)
+    backlog.attach(lambda: None)
+    sent, ended = list[int](), list[int]()
+    changes: dict[str, Any] = {
+        "foreign": lambda number: backlog.push(packet(1000 + number), own=False),
+        "open": lambda _: backlog.open(),
+        "live": lambda _: backlog.go_live(),
+        "leave": lambda _: backlog.leave(asked_for=True),
+        "recover": lambda number: backlog.recover([packet(1000 + number)]),
+        "trim": lambda _: backlog.trim(UNASKED_NS + SECOND),
+    }
+    for number, action in enumerate(actions):
+        if action in {"own", "cloud"}:
+            assert backlog.push(packet(number, frame=action == "own"))
+            sent.append(number)
+        elif action == "take":
+            ended += numbers([item]) if isinstance(item := backlog.take(), Packet) else []
+        elif action == "give":
+            ended += numbers(backlog.recent()) if backlog.state == "foreign" else []
+            backlog.trim(UNASKED_NS + SECOND)  # what was given is dropped uncounted
+        else:
+            changes[action](number)
+    backlog.go_live()
+    ended += numbers(taken(backlog)) + numbers(lost.packets)
+    own = [number for number in ended if number < 1000]
+    _, frames, clouds = backlog.counts()
+    assert len(own) == len(set(own))
+    assert len(sent) == len(own) + frames + clouds
+    assert (queued.used, held.used) == (0, 0)
+
+
+@pytest.mark.parametrize("expected", [True, False])
+def test_first_messages_are_kept_until_they_are_asked_for(*, expected: bool) -> None:
+    """What a new stream sent is kept beyond the usual time until its member has asked; no other stream's is."""
+    backlog = Backlog("a/b/c", bounds_of(keep_ns=10 * SECOND), 0)
+    backlog.unasked = expected
+    backlog.push(packet(), own=False)
+    assert backlog.trim(UNASKED_NS) is not expected
+    assert len(backlog.recent()) == expected
+    backlog.trim(10 * SECOND + 1)
+    assert not backlog.recent()
+
+
+def test_messages_from_many_threads_are_all_taken() -> None:
+    """While the session is opened, left and live in turn, as threads of the network and the tracking thread do."""
+    backlog, ended, count = live(), list[Packet](), 2000
+
+    def send(origin: int) -> None:
+        for number in range(count):
+            backlog.push(packet(number, stream=str(origin)))
+
+    threads = [threading.Thread(target=send, args=(origin,)) for origin in range(3)]
+    for thread in threads:
+        thread.start()
+    for change in [backlog.open, backlog.leave, backlog.go_live] * 200:
+        change()
+        while (item := backlog.take()) is not None:
+            assert isinstance(item, Packet)
+            ended.append(item)
+    for thread in threads:
+        thread.join()
+    backlog.go_live()
+    ended += taken(backlog)
+    for origin in map(str, range(3)):
+        assert numbers([one for one in ended if one.origin == origin]) == list(range(count))

@@ -1,0 +1,89 @@
+"""Tracks on their way out: the bytes that are put together without a message are those of the message."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import optipmb_schemas as schemas
+from hypothesis import example, given
+from hypothesis import strategies as st
+from optipmb_service.stream.convert import tracks_of
+from optipmb_service.stream.timeline import FrameId
+from optipmb_service.stream.values import COLUMNS, Tracked
+
+import optipmb
+
+PARAMETERS = optipmb.load_profile("generic")
+
+
+def sound_tracks(count: int) -> optipmb.Tracks:
+    """Tracks whose numbers a message may hold."""
+    rng = np.random.default_rng(count)
+    columns: dict[str, Any] = {}
+    for name, one in optipmb.Tracks.described.items():
+        numbers = rng.uniform(0.01, 1.0, (count, *one.shape))
+        columns[name] = numbers > 0.5 if one.number == np.bool_ else numbers.astype(one.number)
+    return optipmb.Tracks(**columns | {"id": np.arange(count) * 3})
+
+
+def made(tracks: optipmb.Tracks, paths: optipmb.PredictedPaths | None = None, **fields: Any) -> Tracked:
+    """Tracks of a frame."""
+    header: dict[str, Any] = {"stream": "a/b/c", "session": "0" * 32, "revision": 0, "cloud_used": False}
+    header |= {"gap": 0, "ignored": 0, "parameters": PARAMETERS, "frame_id": FrameId(b"0" * 16, 1, 2)}
+    return tracks_of(tracks, paths, **header | fields)
+
+
+def delivery(run: int) -> dict[str, Any]:
+    """The values of a delivery part."""
+    times = {"queue_ms": 0.5, "decode_ms": 0.0, "step_ms": 1e-3}
+    return {"instance": "one", "received_ns": 2**60, "published_ns": 2**61, **times, "run": run}
+
+
+def test_the_columns_are_those_of_the_message_in_its_order() -> None:
+    """All that are there in every message, one behind the other and nothing between them; all of 8 bytes."""
+    names = [*schemas.Tracks.names]
+    assert [one for one in names if one in COLUMNS] == [*COLUMNS]
+    assert names[names.index("id") :][: len(COLUMNS)] == [*COLUMNS]
+    for name, one in optipmb.Tracks.described.items():
+        described = schemas.Tracks.arrays[name]
+        assert (described.dtype[1], described.shape) == ("8", ("N", *one.shape))
+
+
+@given(
+    count=st.integers(0, 150),
+    node=st.integers(1, 60),
+    sensor=st.booleans(),
+    seq=st.sampled_from([0, 127, 128, 2**16, 2**63 - 1]),
+    run=st.integers(0, 300),
+)
+@example(count=0, node=1, sensor=False, seq=0, run=0)
+@example(count=14, node=2, sensor=True, seq=1, run=0)
+@example(count=15, node=3, sensor=False, seq=1, run=1)
+def test_bytes_are_those_of_the_message(*, count: int, node: int, sensor: bool, seq: int, run: int) -> None:
+    """Any number of tracks, at any place in the message, of one sensor or of several."""
+    frame_id = FrameId(b"0" * 16, seq, 2**60, "a/b/d" if sensor else "")
+    stream = f"site/{'n' * node}/lidar"
+    tracks = made(sound_tracks(count), stream=stream, frame_id=frame_id, gap=run, revision=run)
+    values = delivery(run)
+    payload = tracks.encoded(values)
+    assert payload == schemas.encode(tracks.tracks, delivery=schemas.Delivery(**values))
+    message = schemas.decode(payload, schemas.Tracks)
+    assert (message.seq, message.sensor, len(message.id)) == (seq, frame_id.sensor or None, count)
+    for name, column in tracks.estimates.columns():
+        np.testing.assert_array_equal(getattr(message, name), column)
+
+
+def test_paths_and_classes_are_in_the_bytes() -> None:
+    """What only some profiles have comes behind the columns, as in the message."""
+    one = sound_tracks(3)
+    mean, covariance = np.zeros((3, 2, 6)), np.broadcast_to(np.eye(6), (3, 2, 6, 6))
+    paths = optipmb.PredictedPaths(one.id, one.label, np.array([0.5, 1.0]), mean, covariance)
+    probability = np.full((3, len(PARAMETERS.labels)), 1 / len(PARAMETERS.labels))
+    tracks = made(one, paths, class_probability=probability)
+    message = schemas.decode(tracks.encoded(delivery(0)), schemas.Tracks)
+    assert message.path_position is not None
+    assert message.class_probability is not None
+    assert message.path_position.shape == (3, 2, 2)
+    assert message.class_probability.shape == probability.shape
+    assert message.delivery == schemas.Delivery(**delivery(0))

@@ -1,0 +1,409 @@
+"""Several sensors feed one session by turns: what comes of it follows from their frames alone, none harms another."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from fusing import FRONT, FUSED, REAR, SIDE, drive
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from optipmb_schemas import Pose
+from optipmb_service.stream.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
+from optipmb_service.stream.pending import SensorQueue
+from optipmb_service.stream.session import Session
+from optipmb_service.stream.timeline import FusedTimeline
+from optipmb_service.stream.values import MAX_SENSORS, Policy
+from router import SECOND, Sensor
+from sessions import Failing, Merged, begun, chained, delayed, feed, problems, tracks
+
+import optipmb
+
+if TYPE_CHECKING:
+    from optipmb_schemas import Detections
+    from optipmb_service.stream.timeline import FrameId
+
+NUSCENES = optipmb.load_profile("nuscenes")
+
+
+def fused(policy: Policy | None = None, **options: Any) -> Session:
+    """A session of several sensors; what it costs is hashing. Nothing is waited for at its beginning."""
+    policy = policy or Policy(recovery_wait_ns=0)
+    return Session(FUSED, NUSCENES, policy, fused=True, **{"tracker": chained, **options})
+
+
+def in_order(count: int = 6) -> list[Detections]:
+    """Frames of three sensors by stamp; the publisher of one of them is started anew between."""
+    again = delayed(replace(REAR, epoch=b"R" * 16), 0.1 * count)
+    frames = [sensor.detections(seq) for sensor in (FRONT, REAR, SIDE) for seq in range(count)]
+    frames += [again.detections(seq) for seq in range(count // 2)]
+    return sorted(frames, key=lambda one: (one.stamp_ns, one.stream, one.seq))
+
+
+def given_to(session: Session, frames: list[Detections]) -> list[Any]:
+    """What a session makes of frames."""
+    return [output for frame in frames for output in session.on_detections(frame, 0)]
+
+
+IN_ORDER = in_order()
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.permutations(range(len(IN_ORDER))), st.integers(0, len(IN_ORDER)))
+def test_any_interleaving_gives_the_state_of_frames_in_order(order: list[int], cut: int) -> None:
+    """Tracks and state are the same bytes in whatever order frames come, and over a restart in between."""
+    epochs = [IN_ORDER[at].epoch for at in order]
+    first, later = epochs.index(REAR.epoch), epochs.index(b"R" * 16)
+    if later < first:  # which publisher is the later one is told by who came first
+        order[first], order[later] = order[later], order[first]
+    one, other, merged, again = fused(), fused(), Merged(), Merged()
+    merged.take(given_to(one, IN_ORDER))
+    again.take(given_to(other, [IN_ORDER[at] for at in order[:cut]]))
+    other = Session.restore(decode_checkpoint(encode_checkpoint(other.snapshot())), 0, tracker=chained)
+    again.take(given_to(other, [IN_ORDER[at] for at in order[cut:]]), other.run)
+    again.take(other.recovered(0), other.run)
+    assert state_bytes(one.snapshot()) == state_bytes(other.snapshot())
+    assert merged.plain() == again.plain()
+    assert len(merged.newest) == len(IN_ORDER)
+
+
+def test_a_frame_of_another_sensor_does_not_go_before_those_that_are_ready() -> None:
+    """Where frames go one at a time, those of one sensor that were left are still due when one of another comes."""
+    one, policy = fused(Policy(recovery_wait_ns=0, at_once=1)), Policy()
+    for seq in range(3):
+        one.on_detections(FRONT.detections(seq, has_points=True), 0)
+    assert len(tracks(one.on_tick(policy.cloud_wait_ns))) == 1
+    assert (one.held, one.deadline_ns) == (2, 0)
+    found = tracks(one.on_detections(SIDE.detections(3, has_points=False), policy.cloud_wait_ns))
+    assert [(message.sensor, message.seq) for message in found] == [(FRONT.stream, 1)]
+    assert (one.held, one.deadline_ns) == (2, 0)
+
+
+def test_tracks_name_the_session_and_the_sensor() -> None:
+    """The stream is that of the session, the sensor that of the frame; equal stamps go by the names of the sensors."""
+    one = fused()
+    found = tracks(given_to(one, [SIDE.detections(0), REAR.detections(0), FRONT.detections(0)]))
+    assert {m.stream for m in found} == {FUSED}
+    assert [(m.sensor, m.epoch, m.revision) for m in found[-3:]] == [
+        (FRONT.stream, FRONT.epoch, 0),
+        (SIDE.stream, SIDE.epoch, 1),
+        (REAR.stream, REAR.epoch, 1),
+    ]
+
+
+def test_gaps_and_duplicates_are_those_of_each_sensor() -> None:
+    """Sequence numbers are counted by sensor, though publishers of one program may share an epoch."""
+    one, side = fused(), replace(SIDE, epoch=FRONT.epoch)
+    found = tracks(given_to(one, [FRONT.detections(0), side.detections(0), FRONT.detections(3), side.detections(1)]))
+    assert [(m.sensor, m.seq, m.gap) for m in found if not m.revision] == [
+        (FRONT.stream, 0, 0),
+        (side.stream, 0, 0),
+        (FRONT.stream, 3, 2),
+        (side.stream, 1, 0),
+    ]
+    assert not given_to(one, [side.detections(1)])
+    assert (one.counters.duplicates, one.counters.gaps) == (1, 2)
+
+
+def test_a_sensor_that_starts_anew_ends_no_tracks() -> None:
+    """Neither soon, nor after longer than the gap limit, nor with stamps of before, of which only these are refused."""
+    one, policy = fused(), Policy()
+    given_to(one, [FRONT.detections(0), REAR.detections(0)])
+    session, away = one.session, policy.gap_limit_ns // SECOND + 2
+    feed(one, range(1, away * 10), FRONT)
+    again = delayed(replace(REAR, epoch=b"R" * 16), away - 0.3)
+    assert [m.sensor for m in tracks(feed(one, [0], again)) if not m.revision] == [REAR.stream]
+    third = delayed(again, -0.15)
+    outputs = feed(one, range(3), replace(third, epoch=b"3" * 16))
+    assert [(p.code, p.stream) for p in problems(outputs)] == [("late", REAR.stream)] * 2
+    assert [m.seq for m in tracks(outputs) if m.sensor == REAR.stream] == [2]
+    assert one.session == session
+    assert one.counters.new_epochs == 2
+    late = problems(given_to(one, [replace(again, epoch=b"R" * 16).detections(3)]))
+    assert [(p.code, p.stream) for p in late] == [("duplicate_epoch", REAR.stream)]
+
+
+def test_no_sensor_waits_for_another() -> None:
+    """Neither for one that is silent, nor for one whose frame is held for its cloud."""
+    one = fused()
+    assert len(tracks(feed(one, range(3), FRONT))) == 3
+    assert not feed(one, [0], REAR, has_points=True)
+    assert one.state().queue == 1
+    assert len(tracks(feed(one, [3], FRONT))) == 1
+    found = tracks(one.on_tick(SECOND))
+    assert [(m.sensor, m.seq, m.revision) for m in found] == [
+        (REAR.stream, 0, 0),
+        (FRONT.stream, 1, 1),
+        (FRONT.stream, 2, 1),
+        (FRONT.stream, 3, 1),
+    ]
+
+
+def test_a_cloud_is_that_of_its_sensor() -> None:
+    """Clouds of other sensors at the same time are of no use, and a late one is put in where it belongs."""
+    one = fused(Policy(late_clouds=True, recovery_wait_ns=0))
+    one.on_points(SIDE.points(0, epoch=b"c" * 16), 0)
+    assert not feed(one, [0], FRONT, has_points=True)
+    assert [m.cloud_used for m in tracks(feed(one, [0], SIDE, has_points=True))] == [True]
+    given_to(one, [FRONT.detections(1), SIDE.detections(1, has_points=None)])
+    one.on_tick(SECOND)
+    outputs = one.on_points(FRONT.points(1, epoch=b"c" * 16), SECOND)
+    assert [(m.sensor, m.cloud_used) for m in tracks(outputs)] == [(FRONT.stream, True), (SIDE.stream, False)]
+
+
+def test_one_wrong_clock_is_refused_and_all_of_them_are_believed() -> None:
+    """A sensor hours ahead harms nobody however long it sends; when the others follow, the session begins anew."""
+    one, wrong = fused(), delayed(REAR, 3600.0)
+    given_to(one, [FRONT.detections(0), SIDE.detections(0), REAR.detections(0)])
+    session = one.session
+    for seq in range(1, 100):
+        found = tracks(given_to(one, [FRONT.detections(seq), SIDE.detections(seq)]))
+        assert [m.sensor for m in found] == [FRONT.stream, SIDE.stream]
+        assert [(p.code, p.stream) for p in problems(feed(one, [seq], wrong))] == [("time_jump", REAR.stream)]
+    assert one.session == session
+    outputs = [*feed(one, range(100, 103), delayed(FRONT, 3600.0)), *feed(one, range(100, 103), delayed(SIDE, 3600.0))]
+    assert begun(outputs) == ["jump"]
+    assert [(p.code, p.stream) for p in problems(outputs)][-1] == ("restarted", SIDE.stream)
+    assert one.session != session
+    assert all(tracks(feed(one, [seq], delayed(sensor, 3600.0))) for sensor in (FRONT, REAR) for seq in (103, 104))
+
+
+def test_a_clock_that_nobody_moves_is_left() -> None:
+    """Where the others are silent, a sensor whose stamps jumped is believed after the gap limit of its own time."""
+    one, later = fused(), delayed(REAR, -3600.0)
+    given_to(one, [FRONT.detections(0), REAR.detections(0)])
+    outputs = feed(one, range(1, 60), later)
+    refused = [p for p in problems(outputs) if p.code == "time_jump"]
+    assert 50 <= len(refused) <= 52
+    assert begun(outputs) == ["jump"]
+    restored = Session.restore(decode_checkpoint(encode_checkpoint(one.snapshot())), 0, tracker=chained)
+    assert len(tracks([*feed(restored, range(60, 63), later), *restored.recovered(0)])) == 3
+
+
+def test_a_pose_is_believed_when_all_sensors_say_the_same() -> None:
+    """One sensor that is told elsewhere is refused; a vehicle that was carried off begins anew, once."""
+
+    def at(sensor: Sensor, seq: int, x: float) -> Detections:
+        return sensor.detections(seq, pose=Pose(translation=np.array([x, 0, 0]), quaternion=np.array([1.0, 0, 0, 0])))
+
+    one = fused()
+    given_to(one, [at(FRONT, 0, 0.0), at(REAR, 0, 0.0)])
+    for seq in range(1, 20):
+        outputs = given_to(one, [at(FRONT, seq, 0.0), at(REAR, seq, 1e5)])
+        assert [(p.code, p.stream) for p in problems(outputs)] == [("astray", REAR.stream)]
+        assert [m.sensor for m in tracks(outputs)] == [FRONT.stream]
+    outputs = [output for seq in range(20, 30) for output in given_to(one, [at(FRONT, seq, 1e5), at(REAR, seq, 1e5)])]
+    assert begun(outputs) == ["pose"]
+    assert [m.sensor for m in tracks(outputs)][-4:] == [FRONT.stream, REAR.stream] * 2
+
+
+def test_a_step_that_fails_quarantines_its_sensor() -> None:
+    """The others go on with the density as it was; the sensor comes back when its publisher starts anew."""
+    one = fused(tracker=Failing)
+    given_to(one, [FRONT.detections(0), REAR.detections(0)])
+    session = one.session
+    outputs = given_to(one, [REAR.detections(1, objects=7), FRONT.detections(1), REAR.detections(2)])
+    assert [(p.code, p.stream) for p in problems(outputs)] == [("internal", REAR.stream), ("quarantined", REAR.stream)]
+    assert [m.sensor for m in tracks(outputs)] == [FRONT.stream]
+    assert one.state().state == "running"
+    one = Session.restore(decode_checkpoint(encode_checkpoint(one.snapshot())), 0, tracker=Failing)
+    one.recovered(0)
+    assert [p.code for p in problems(feed(one, [3], REAR))] == ["quarantined"]
+    assert tracks(feed(one, [4], delayed(replace(REAR, epoch=b"R" * 16), 0.1)))
+    assert one.session == session
+
+
+def test_a_session_takes_so_many_sensors() -> None:
+    """One more is refused on its own stream."""
+    one = fused()
+    for number in range(MAX_SENSORS):
+        feed(one, [0], replace(FRONT, stream=f"site/node/s{number}"))
+    outputs = feed(one, [0], replace(FRONT, stream="site/node/more"))
+    assert [(p.code, p.stream) for p in problems(outputs)] == [("refused", "site/node/more")]
+    assert len(one.density.bernoulli) == 1
+
+
+def test_the_state_can_be_told_while_a_sensor_comes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The state of a session may be asked for by any thread, also when a sensor comes while they are counted."""
+    one, length = fused(), SensorQueue.__len__
+    given_to(one, [FRONT.detections(0), REAR.detections(0)])
+
+    def interrupted(pending: SensorQueue) -> int:
+        one.on_detections(replace(SIDE, stream=f"site/car/lidar-{len(one.sensors)}").detections(0), 0)
+        return length(pending)
+
+    monkeypatch.setattr(SensorQueue, "__len__", interrupted)
+    before = len(one.sensors)
+    assert one.state().queue == 0
+    assert len(one.sensors) == before + 2
+
+
+def test_a_sensor_that_is_silent_makes_room_for_another() -> None:
+    """Names may come and go for ever: of more than a session takes, those that were silent longest are forgotten.
+
+    So it goes on when it was written down and restored in between.
+    """
+    one = fused()
+    names = [f"site/node/s{number}" for number in range(6 * 30)]
+    for number, name in enumerate(names):
+        passed_s = 3.0 * (number // 30) + 0.01 * (number % 30)
+        assert len(tracks(feed(one, [0], delayed(replace(FRONT, stream=name), passed_s)))) == 1
+        if number % 30 == 29:
+            assert len(tracks(feed(one, [number], delayed(FRONT, passed_s - 0.1 * number + 0.001)))) == 1
+            one = Session.restore(
+                decode_checkpoint(encode_checkpoint(one.snapshot())), 0, Policy(recovery_wait_ns=0), tracker=chained
+            )
+            one.recovered(0)
+    for kept in (one.sensors, one._window.head.sensors, one._timeline.seen):
+        assert len(kept) == MAX_SENSORS
+        assert names[-1] in kept
+        assert FRONT.stream in kept
+
+
+def test_what_is_remembered_of_sensors_is_bounded() -> None:
+    """Names may come, go and come again without a restart, too; one in between changes neither state nor tracks."""
+    one, other, merged, again = fused(), fused(), Merged(), Merged()
+    for seq in range(400):  # twenty of them were heard lately, and each comes again when it is forgotten
+        frame = replace(FRONT, stream=f"site/node/s{seq * 7 % 150}").detections(seq)
+        merged.take(given_to(one, [frame]))
+        if seq % 90 == 0:
+            other = Session.restore(decode_checkpoint(encode_checkpoint(other.snapshot())), 0, tracker=chained)
+            other.recovered(0)
+        again.take(given_to(other, [frame]), other.run)
+    assert len(one._timeline.seen) == MAX_SENSORS
+    assert len(one._timeline.clock) == MAX_SENSORS
+    assert state_bytes(one.snapshot()) == state_bytes(other.snapshot())
+    assert merged.plain() == again.plain()
+
+
+class Tired(optipmb.Tracker):
+    """Refuses frames of seven objects for their effort."""
+
+    def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
+        """Refuse, or go on."""
+        if len(frame.score) == 7:
+            raise optipmb.EffortError("pairs", "at most 7", "8")
+        return super().step(density, frame)
+
+
+def test_a_jump_stays_believed_when_its_first_frame_is_refused() -> None:
+    """The frame with which all agree needs too much computing: also after a restart the new clock is the session's."""
+    one, later = fused(tracker=Tired), delayed(FRONT, 3600.0)
+    feed(one, [0], FRONT)
+    assert [p.code for p in problems(feed(one, range(100, 103), later, objects=7))][-1] == "overload"
+    restored = Session.restore(decode_checkpoint(encode_checkpoint(one.snapshot())), 0, tracker=Tired)
+    restored.recovered(0)
+    for session in (one, restored):
+        outputs = feed(session, [103], later)
+        assert (begun(outputs), len(tracks(outputs))) == (["jump"], 1)
+    assert state_bytes(restored.snapshot()) == state_bytes(one.snapshot())
+
+
+def test_frames_held_are_judged_once_when_many_are_let_go() -> None:
+    """Letting n held frames go after a restore takes a number of judgements that grows with n, not with its square."""
+    one = fused()
+    given_to(one, in_order(4))
+    restored = Session.restore(decode_checkpoint(encode_checkpoint(one.snapshot())), 0, tracker=chained)
+    for sensor in (FRONT, SIDE):
+        feed(restored, range(6, 106), sensor)  # behind a gap: 4 and 5 are missing
+    judged, judge = [0], FusedTimeline.judge
+
+    def counted(timeline: FusedTimeline, frame_id: FrameId) -> Any:
+        judged[0] += 1
+        return judge(timeline, frame_id)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(FusedTimeline, "judge", counted)
+        assert len(tracks(restored.recovered(0))) == 200
+    assert judged[0] < 1000
+
+
+def test_after_a_restart_the_caches_of_all_sensors_are_waited_for() -> None:
+    """The cache of one may come before that of another, each longer than the window: nothing is late."""
+    policy = Policy(rewind_ns=SECOND // 2)
+    first = replace(policy, recovery_wait_ns=0)
+    one, other, merged, again = fused(first), fused(first), Merged(), Merged()
+    frames = in_order(40)
+    merged.take(given_to(one, frames))
+    again.take(given_to(other, frames[:20]))
+    other = Session.restore(decode_checkpoint(encode_checkpoint(other.snapshot())), 0, policy, tracker=chained)
+    rest = sorted(frames[18:], key=lambda frame: frame.stream)
+    again.take(given_to(other, rest), other.run)
+    again.take(other.recovered(0), other.run)
+    assert other.counters.late == 0
+    assert merged.plain() == again.plain()
+    assert state_bytes(one.snapshot()) == state_bytes(other.snapshot())
+
+
+def test_when_a_session_begins_the_caches_of_all_sensors_are_waited_for() -> None:
+    """What comes faster than time passes is held until the wait is over; what comes in time is not."""
+    one, merged, frames = Session(FUSED, NUSCENES, fused=True, tracker=chained), Merged(), in_order(40)
+    other, again = fused(), Merged()
+    merged.take(given_to(one, sorted(frames, key=lambda frame: frame.stream)))
+    assert len(merged.newest) < len(frames)
+    merged.take(one.on_tick(2 * SECOND))
+    again.take(given_to(other, frames))
+    assert one.counters.late == 0
+    assert merged.plain() == again.plain()
+    live = Session(FUSED, NUSCENES, fused=True, tracker=chained)
+    for frame in frames:
+        now_ns = frame.stamp_ns - frames[0].stamp_ns
+        assert tracks(live.on_detections(frame, now_ns))
+    assert state_bytes(live.snapshot()) == state_bytes(other.snapshot())
+
+
+def test_a_cache_that_is_handed_over_slowly_leaves_room_for_another() -> None:
+    """Two seconds of one sensor come within 0.3 s; what comes then of another, which began earlier, is not late."""
+    one, frames = fused(Policy()), drive(40)
+    other, merged, again = fused(), Merged(), Merged()
+    rear, front = ([frame for frame in frames if frame.stream == sensor.stream] for sensor in (REAR, FRONT))
+    assert front[0].stamp_ns < rear[0].stamp_ns
+    for frame in rear[:20]:
+        merged.take(one.on_detections(frame, 15_000_000 * frame.seq))
+    for frame in front + rear[20:]:
+        merged.take(one.on_detections(frame, 300_000_000))
+    merged.take(one.recovered(400_000_000))
+    again.take(given_to(other, frames))
+    assert one.counters.late == 0
+    assert merged.plain() == again.plain()
+
+
+def test_a_silent_sensor_holds_up_nobody_for_longer_than_the_wait_for_recovery() -> None:
+    """After a restart a sensor that does not come back is waited for as long as missing frames are."""
+    one = fused()
+    given_to(one, [FRONT.detections(0), REAR.detections(0)])
+    one = Session.restore(decode_checkpoint(encode_checkpoint(one.snapshot())), 0, tracker=chained)
+    assert not feed(one, range(1, 4), FRONT)
+    assert one.deadline_ns == 2 * SECOND
+    assert [m.seq for m in tracks(one.on_tick(2 * SECOND))] == [1, 2, 3]
+    assert not one.recovering
+
+
+@pytest.mark.parametrize("close", [False, True])
+def test_a_session_that_was_closed_takes_any_clock(close: bool) -> None:  # noqa: FBT001 - pytest's way
+    """A recording is played again: after a session was closed its first frames are tracked, else refused."""
+    one = fused()
+    given_to(one, IN_ORDER)
+    if close:
+        from optipmb_service.stream.checkpoint import forgotten  # noqa: PLC0415 - of the closing alone
+
+        one.reset()
+        one = Session.restore(forgotten(one.snapshot()), 0, tracker=chained)
+    outputs = feed(one, range(2), delayed(replace(FRONT, epoch=b"2" * 16), -100.0))
+    assert (len(tracks(outputs)), len(problems(outputs))) == ((2, 0) if close else (0, 2))
+
+
+# With the tracker
+
+
+def test_a_car_keeps_its_id_from_one_sensor_to_another() -> None:
+    """From the front sensor's view through a gap into the rear sensor's, though each sees nothing for long."""
+    one = fused(tracker=optipmb.Tracker)
+    found = tracks(given_to(one, drive()))
+    seen = {name: {int(i) for m in found if m.sensor == name for i in m.id} for name in (FRONT.stream, REAR.stream)}
+    assert seen[FRONT.stream] == seen[REAR.stream] == {1}
+    by = {m.sensor for m in found if (m.detection >= 0).any()}
+    assert by == {FRONT.stream, REAR.stream}
+    assert len(found[-1].id) == 1

@@ -1,0 +1,234 @@
+"""Sensors of one node in the service: one session, tracks on one key; what is wrong with one is said to it alone."""
+
+from __future__ import annotations
+
+import contextlib
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import optipmb_service.stream.directory
+import optipmb_service.stream.recovery
+import pytest
+from fusing import FRONT, FUSED, REAR, drive
+from optipmb_schemas import Keys, SessionParameters, SessionState, Tracks, decode
+from optipmb_service.cluster.leases import partition_of
+from optipmb_service.settings import SettingsInvalidError, load
+from optipmb_service.stream.checkpoint import digest_of
+from optipmb_service.stream.profiles import Fusion
+from optipmb_service.stream.session import Session
+from optipmb_service.stream.values import SECOND, Policy
+from router import Node, Sensor, until
+from sessions import Merged, tracks
+
+import optipmb
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from optipmb_schemas import Detections
+
+KEYS = Keys()
+OTHER = Sensor("site/other/lidar", b"o" * 16)
+
+
+def undisturbed(frames: list[Detections]) -> dict[tuple[bytes, int], bytes]:
+    """What a session gives that gets the frames in order."""
+    one, merged = Session(FUSED, optipmb.load_profile("nuscenes"), Policy(recovery_wait_ns=0), fused=True), Merged()
+    for frame in frames:
+        merged.take(one.on_detections(frame, 0))
+    return merged.plain()
+
+
+def undisturbed_digest(frames: list[Detections]) -> str:
+    """The digest of the state of such a session."""
+    one = Session(FUSED, optipmb.load_profile("nuscenes"), Policy(recovery_wait_ns=0), fused=True)
+    for frame in frames:
+        one.on_detections(frame, 0)
+    return digest_of(one.snapshot())
+
+
+def test_a_car_keeps_its_id_through_the_service(start: Callable[..., Any]) -> None:
+    """Two sensors publish, each on its key; the tracks on the key of both are those of the frames in order."""
+    _, endpoint = start(fuse=["site/node/*"])
+    frames, merged = drive(), Merged()
+    wanted = undisturbed(frames)
+    with Node(endpoint) as node:
+        node.send(*frames, OTHER.detections(0))
+        node.tracks(OTHER.stream, 1)
+        until(lambda: node.ask(KEYS.query(FUSED, "state"), SessionState).frames == len(frames), "all are tracked")
+
+        def complete(items: list[tuple[str, bytes, str]]) -> bool:
+            for key, payload, _ in items:
+                if key == KEYS.tracks(FUSED):
+                    message = decode(payload, Tracks)
+                    where = message.epoch + (message.sensor or "").encode(), message.seq
+                    if where not in merged.newest or message.revision > merged.newest[where][1].revision:
+                        merged.newest[where] = 0, message
+            return len(merged.newest) == len(frames) and merged.plain() == wanted
+
+        node.tracks_seen.wait(complete, "the tracks of the frames in order")
+        assert {key for key, _, _ in node.tracks_seen.items} == {KEYS.tracks(FUSED), KEYS.tracks(OTHER.stream)}
+        owners = node.alive(KEYS.all_owners())
+    found = [message for _, message in merged.newest.values()]
+    assert {int(one) for message in found for one in message.id} == {1}
+    assert {message.sensor for message in found if (message.detection >= 0).any()} == {FRONT.stream, REAR.stream}
+    assert {KEYS.stream_of(one) for one in owners} == {FUSED, OTHER.stream}
+
+
+@pytest.mark.parametrize("gone", [False, True])
+def test_after_a_restart_no_cache_is_waited_for_that_has_answered_or_is_gone(
+    start: Callable[..., Any],
+    tmp_path: Path,
+    *,
+    gone: bool,
+) -> None:
+    """The session goes on with what the caches of all its sensors held, long before `recovery_wait_s`."""
+    frames = drive(40)
+    options = {"fuse": ["site/node/*"], "store": str(tmp_path)}
+    service, endpoint = start(recovery_wait_s=0, **options)
+    with Node(endpoint) as front, contextlib.ExitStack() as nodes:
+        rear = nodes.enter_context(Node(endpoint))
+
+        def send(*messages: Detections) -> None:
+            for message in messages:
+                (front if message.stream == FRONT.stream else rear).send(message)
+
+        def tracked() -> SessionState | None:
+            service.housekeeping()
+            answers = front.query(KEYS.query(FUSED, "state"))
+            return decode(answers[0][2], SessionState) if answers and answers[0][0] else None
+
+        def reached(frames: int) -> bool:
+            return (state := tracked()) is not None and state.frames == frames
+
+        for first in range(0, 40, 8):
+            send(*frames[first : first + 8])
+            until(partial(reached, first + 8), "they are tracked")
+        assert service.stop()
+        if gone:
+            nodes.close()
+        else:
+            send(*(one for one in frames[40:] if one.stream == REAR.stream))
+        send(*(one for one in frames[40:] if one.stream == FRONT.stream))
+        rest = frames[:40] + [one for one in frames[40:] if not gone or one.stream == FRONT.stream]
+        service, _ = start(listen=[endpoint], recovery_wait_s=60, **options)
+        until(partial(reached, len(rest)), "all are tracked", 50.0)
+        state = tracked()
+    assert state is not None
+    assert (state.digest, state.late, state.gaps) == (undisturbed_digest(rest), 0, 0)
+
+
+def test_a_sensor_that_is_heard_of_after_the_session_began_loses_no_frame(
+    start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While its token may be on its way, what a cache holds of another sensor goes no second ahead of its frames."""
+    monkeypatch.setattr(optipmb_service.stream.directory, "BACK_NS", 0)
+    monkeypatch.setattr(optipmb_service.stream.recovery, "BACK_NS", 600 * SECOND)
+    frames = drive(40)
+    service, endpoint = start(fuse=["site/node/*"], recovery_wait_s=60)
+    with Node(endpoint) as node:
+
+        def heard_of(*sensors: str) -> bool:
+            service.housekeeping()
+            return [one.sensors for one in service.status().sessions] == [sensors]
+
+        def reached(frames: int) -> bool:
+            service.housekeeping()
+            return node.ask(KEYS.query(FUSED, "state"), SessionState).frames >= frames
+
+        node.send(*(one for one in frames if one.stream == REAR.stream))
+        until(lambda: heard_of(REAR.stream) and reached(1), "the rear sensor is heard of")
+        node.send(*(one for one in frames if one.stream == FRONT.stream))
+        until(lambda: heard_of(FRONT.stream, REAR.stream), "the front sensor is heard of")
+        monkeypatch.setattr(optipmb_service.stream.recovery, "BACK_NS", 0)
+        until(lambda: reached(80), "all are tracked")
+        state = node.ask(KEYS.query(FUSED, "state"), SessionState)
+    assert (state.digest, state.late, state.gaps) == (undisturbed_digest(frames), 0, 0)
+
+
+def test_queries_are_answered_for_the_session(start: Callable[..., Any]) -> None:
+    """State, parameters and a reset on its key; on that of a sensor the reply names it."""
+    service, endpoint = start(fuse=["site/node/*"], profiles={FUSED: "kitti"}, stale_s=0.2)
+    with Node(endpoint) as node:
+        node.send(FRONT.detections(0), REAR.detections(0))
+        until(lambda: node.ask(KEYS.query(FUSED, "state"), SessionState).frames == 2, "both are tracked")
+        assert node.ask(KEYS.query(FUSED, "parameters"), SessionParameters).profile == "kitti"
+        state = node.ask(KEYS.query(FUSED, "reset"), SessionState)
+        assert (state.stream, state.tracks, state.frames) == (FUSED, 0, 2)
+        for what in ("state", "reset", "parameters", "density"):
+            refused = node.refused(KEYS.query(FRONT.stream, what))
+            assert (refused.path, refused.stream) == ("key", FRONT.stream)
+            assert FUSED in refused.expected
+        node.send(FRONT.detections(1))
+
+        def silent() -> bool:
+            service.housekeeping()
+            (line,) = service.status().sessions
+            return bool(line.silent)
+
+        until(silent, "a sensor is silent")
+        (line,) = service.status().sessions
+        assert (line.stream, line.sensors) == (FUSED, (FRONT.stream, REAR.stream))
+
+
+def test_what_is_wrong_is_said_to_the_sensor(start: Callable[..., Any]) -> None:
+    """Bytes that are no message, another's message, a wrong clock: the other sensor is tracked on."""
+    _, endpoint = start(fuse=["site/node/*"])
+    with Node(endpoint) as node:
+        node.send(FRONT.detections(0), REAR.detections(0))
+        node.tracks(FUSED, 2)
+        node.send_raw(KEYS.detections(REAR.stream), b"no message")
+        assert node.problem(REAR.stream, "malformed").stream == REAR.stream
+        node.send(REAR.detections(1, stamp_ns=5))
+        assert node.problem(REAR.stream, "time_jump").seq == 1
+        node.send(REAR.detections(2, score=np.full(3, 0.5), size=np.full((3, 3), 1e-300)), FRONT.detections(3))
+        until(lambda: node.ask(KEYS.query(FUSED, "state"), SessionState).seq == 3, "the front sensor is tracked")
+        node.send_raw(KEYS.detections(FUSED), b"")  # the name of the tracks is none of a sensor
+        until(lambda: node.ask(KEYS.query(FUSED, "state"), SessionState).frames >= 3, "nobody is harmed")
+        assert not [key for key, _, _ in node.problems_seen.items if key == KEYS.problems(FRONT.stream)]
+
+
+def test_the_sensors_of_a_session_have_one_owner() -> None:
+    """A session is given to a process by its name; a sensor outside the patterns has a session of its own."""
+    fusion = Fusion(("site/*/lidar*", "yard/crane/*"))
+    assert fusion.session_of("site/car-7/lidar-front") == fusion.session_of("site/car-7/lidar-rear")
+    assert fusion.session_of("site/car-7/lidar-front") == "site/car-7/fused"
+    assert fusion.session_of("site/car-7/radar") == "site/car-7/radar"
+    assert fusion.session_of("site/car-8/lidar") == "site/car-8/fused"
+    assert fusion.session_of("yard/crane/x") == fusion.session_of("yard/crane/fused") == "yard/crane/fused"
+    assert fusion.is_session("site/car-7/fused")
+    assert not fusion.is_session("street/car-7/fused")
+    names = [f"yard/crane/s{number}" for number in range(20)]
+    assert len({partition_of(fusion.session_of(name)) for name in names}) == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"fuse": ["site/node"]}, "a pattern of streams looks like site/*/lidar*, received 'site/node'"),
+        ({"fuse": ["site/node/*"], "rewind_s": 0}, "rewind_s must not be 0"),
+    ],
+)
+def test_a_wrong_setting_is_named(options: dict[str, Any], text: str) -> None:
+    """A pattern has three parts, and sensors do not come in order."""
+    with pytest.raises(SettingsInvalidError) as caught:
+        load(None, options)
+    assert text in str(caught.value)
+
+
+def test_a_list_of_patterns_comes_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With commas, as other lists do."""
+    monkeypatch.setenv("OPTIPMB_FUSE", "site/*/lidar*, yard/*/*")
+    assert load().settings.fuse == ("site/*/lidar*", "yard/*/*")
+
+
+def test_tracks_of_a_session_are_merged_by_sensor() -> None:
+    """Two sensors may share an epoch and a number: their tracks are those of two frames."""
+    from optipmb_client.merging import Merging, Novelty  # noqa: PLC0415 - of the client
+
+    one, merging = Session(FUSED, optipmb.load_profile("nuscenes"), Policy(recovery_wait_ns=0), fused=True), Merging(10)
+    side = Sensor("site/node/side", FRONT.epoch)
+    found = [*tracks(one.on_detections(FRONT.detections(0), 0)), *tracks(one.on_detections(side.detections(0), 0))]
+    assert [merging.take(message) for message in found] == [Novelty.NEW] * 2

@@ -1,0 +1,309 @@
+"""The small parts: turns, problems, figures, profiles, settings, and what imports what."""
+
+from __future__ import annotations
+
+import re
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from optipmb_service.settings import SettingsInvalidError, load
+from optipmb_service.stream.pending import CloudBuffer
+from optipmb_service.stream.problems import problem_of
+from optipmb_service.stream.profiles import Profiles
+from optipmb_service.stream.scheduler import Scheduler
+from optipmb_service.telemetry.problem_reporter import LOGGED_PER_SECOND, PUBLISHED_PER_SECOND, ProblemReporter
+from optipmb_service.telemetry.stream_meter import StreamMeter
+from router import SECOND, Sensor
+
+import optipmb
+
+if TYPE_CHECKING:
+    from optipmb_schemas import Problem
+
+SENSOR = Sensor()
+
+
+# Turns
+
+
+def test_workers_take_turns() -> None:
+    """With one thread, what has more to do waits until the others had their turn."""
+    turns: list[str] = []
+    done = threading.Event()
+
+    class Work:
+        def __init__(self, name: str, times: int) -> None:
+            self.name, self.left = name, times
+
+        def work(self) -> bool:
+            turns.append(self.name)
+            self.left -= 1
+            if len(turns) == 5:
+                done.set()
+            return self.left > 0
+
+    scheduler = Scheduler()
+    gate = threading.Event()
+
+    class Gate:
+        def work(self) -> bool:
+            return gate.wait(60) and False
+
+    scheduler.submit(Gate().work)
+    scheduler.submit(Work("long", 3).work)
+    scheduler.submit(Work("short", 2).work)
+    gate.set()
+    assert done.wait(60)
+    assert turns == ["long", "short", "long", "short", "long"]
+    assert scheduler.close(5)
+
+
+def test_an_error_does_not_end_the_tracking_thread() -> None:
+    """What raises is not called again for what it had; others have their turns."""
+    gate = threading.Event()
+
+    class Broken:
+        def work(self) -> bool:
+            raise RuntimeError
+
+    class Sound:
+        def work(self) -> bool:
+            gate.set()
+            return False
+
+    scheduler = Scheduler()
+    scheduler.submit(Broken().work)
+    scheduler.submit(Sound().work)
+    assert gate.wait(60)
+    assert scheduler.close(5)
+
+
+def test_a_step_that_does_not_end_does_not_keep_the_scheduler() -> None:
+    """Closing gives up on a step that does not end, and says so."""
+    entered, gate = threading.Event(), threading.Event()
+
+    class Stuck:
+        def work(self) -> bool:
+            entered.set()
+            return gate.wait(60) and False
+
+    scheduler = Scheduler()
+    scheduler.submit(Stuck().work)
+    assert entered.wait(60)
+    assert not scheduler.close(0.05)
+    gate.set()
+
+
+# Problems
+
+
+def reporter() -> tuple[ProblemReporter, list[Problem], list[tuple[str, int]]]:
+    """A problem reporter, what it publishes, what it logs."""
+    published: list[Problem] = []
+    logged: list[tuple[str, int]] = []
+    return (
+        ProblemReporter(published.append, lambda problem, count: logged.append((problem.code, count))),
+        published,
+        logged,
+    )
+
+
+def problem(stream: str = "a/b/c", code: str = "late", count: int = 1) -> Problem:
+    """Some problem."""
+    return problem_of(code, stream=stream, instance="x", message="m", count=count)
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, SECOND)), max_size=80))
+def test_no_problem_is_lost_and_few_are_published(steps: list[tuple[int, int]]) -> None:
+    """Counts on the key and in the log add up to what was reported, each kind at most once a second, once in ten."""
+    one, published, logged = reporter()
+    now, last = 0, dict[str, int]()
+    for kind, step in steps:
+        now += step
+        before = len(published)
+        one.report(problem(stream=f"a/b/{kind}"), now)
+        for told in published[before:]:
+            assert now - last.get(told.stream, -SECOND) >= SECOND
+            last[told.stream] = now
+    one.flush(now + 10 * SECOND)
+    assert (
+        sum(told.count for told in published)
+        == sum(count for _, count in logged)
+        == len(steps)
+        == sum(one.counts().values())
+    )
+
+
+def test_a_flood_on_ever_new_keys_is_bounded() -> None:
+    """Ten thousand kinds in one second make a few lines and messages, and a bounded memory."""
+    one, published, logged = reporter()
+    for number in range(10_000):
+        one.report(problem(stream=f"a/b/{number}"), 5)
+    assert (len(published), len(logged)) == (PUBLISHED_PER_SECOND, LOGGED_PER_SECOND)
+    assert len(one.newest()) == 20
+
+
+def test_elements_of_an_array_are_one_kind() -> None:
+    """Which element was wrong does not make a new kind of problem; a new class name does."""
+    one, published, _ = reporter()
+    for number in range(5):
+        one.report(problem_of("invalid_value", stream="a/b/c", instance="x", message="m", path=f"score[{number}]"), 0)
+        one.report(problem_of("unknown_class", stream="a/b/c", instance="x", message="m", received=f"'{number}'"), 0)
+    assert [told.code for told in published].count("invalid_value") == 1
+    assert [told.code for told in published].count("unknown_class") == 5
+
+
+@settings(deadline=None)
+@given(st.text(max_size=2000))
+def test_a_problem_takes_any_text(text: str) -> None:
+    """Whatever was received, the problem can be made and its texts are printable."""
+    made = problem_of("x", stream="", instance="x", message=text, received=text, expected=text, path=text)
+    assert made.message.isprintable()
+
+
+# Figures
+
+
+def test_figures_of_a_stream() -> None:
+    """Rate and latencies of the last frames; the rate falls to zero in silence; without frames all are zero."""
+    meter = StreamMeter(0)
+    assert (meter.rate_hz(SECOND), meter.latency_ms(), meter.age_s(SECOND)) == (0.0, (0.0, 0.0), None)
+    for frame in range(21):
+        meter.arrived(frame * SECOND // 10, frame=True)
+        meter.published((frame + 1) * 1_000_000)
+    assert meter.rate_hz(2 * SECOND) == pytest.approx(10)
+    assert meter.rate_hz(5 * SECOND) == pytest.approx(21 / 5)
+    assert meter.rate_hz(6 * SECOND) == pytest.approx(11 / 5)
+    assert meter.rate_hz(20 * SECOND) == 0.0
+    assert meter.latency_ms() == (11.0, 21.0)
+    assert meter.age_s(3 * SECOND) == 1.0
+
+
+def test_the_rate_is_of_the_last_seconds() -> None:
+    """A pause, and another rate before, are forgotten after five seconds; a slow stream has the rate of two frames."""
+    meter = StreamMeter(0)
+    for frame in range(50):
+        meter.arrived(frame * SECOND // 50, frame=True)
+    for frame in range(26):
+        meter.arrived(600 * SECOND + frame * SECOND // 5, frame=True)
+    assert meter.rate_hz(605 * SECOND) == pytest.approx(5)
+    for frame in range(2):
+        meter.arrived((620 + 10 * frame) * SECOND, frame=True)
+    assert meter.rate_hz(631 * SECOND) == pytest.approx(0.1)
+    assert meter.rate_hz(700 * SECOND) == 0.0
+    for frame in range(10_000):
+        meter.arrived(800 * SECOND + frame * SECOND // 1000, frame=True)
+    assert meter.rate_hz(810 * SECOND) == pytest.approx(1000, rel=0.01)
+
+
+def test_clouds_are_found_by_stamp_and_bounded() -> None:
+    """The newest clouds stay; those before a stamp go, those of a jump away stay."""
+    clouds = CloudBuffer(3)
+
+    def found(seq: int, publishers: bytes = b"") -> bool:
+        return clouds.get(SENSOR.epoch, SENSOR.stamp_ns(seq), lambda epoch: epoch == publishers) is not None
+
+    for seq in range(5):
+        clouds.add(SENSOR.points(seq))
+    assert [found(seq) for seq in range(5)] == [False, False, True, True, True]
+    clouds.forget_before(SENSOR.stamp_ns(4), SECOND)
+    assert len(clouds) == 1
+    clouds.forget_before(SENSOR.stamp_ns(4) + 2 * SECOND, SECOND)
+    assert len(clouds) == 1
+
+
+def test_clouds_of_other_publishers() -> None:
+    """A cloud of an epoch with detections belongs to them alone; one of a program of its own to any frame."""
+    clouds = CloudBuffer(3)
+    clouds.add(SENSOR.points(0, epoch=b"f" * 16))
+    assert clouds.get(SENSOR.epoch, SENSOR.stamp_ns(0), lambda _: True) is None
+    assert clouds.get(SENSOR.epoch, SENSOR.stamp_ns(0), lambda _: False) is not None
+
+
+# Settings and profiles
+
+
+def test_profiles_that_cannot_be_named_in_messages_are_refused(tmp_path: Path) -> None:
+    """A profile whose name no message could carry ends the start, not the first frame."""
+    values = optipmb.load_profile("kitti").model_dump(mode="json")
+    own = tmp_path / "own.toml"
+    text = Path(optipmb.__file__).parent.joinpath("profiles", "kitti.toml").read_text()
+    own.write_text(text.replace('name = "kitti"', 'name = "not a name"'))
+    assert values["name"] == "kitti"
+    with pytest.raises(optipmb.ParameterError, match="name"):
+        Profiles.read(str(own), {})
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "says"),
+    [
+        ("OPTIPMB_CLOUD_WAIT_S", "soon", "cloud_wait_s (from the environment)"),
+        ("OPTIPMB_LISTEN", "tcp/1.2.3.4:1,7447", "listen.1 (from the environment)"),
+        ("OPTIPMB_CONNECT", "[tcp", "connect (from the environment): names separated by commas"),
+        ("OPTIPMB_PROFILES", "a:b", "OPTIPMB_PROFILES: tables are written as JSON"),
+        ("OPTIPMB_PREFIX", "a//b", "prefix"),
+        ("OPTIPMB_LIMITS__MAX_BYTES", "0", "limits.max_bytes"),
+    ],
+)
+def test_a_wrong_variable_is_named(monkeypatch: pytest.MonkeyPatch, variable: str, value: str, says: str) -> None:
+    """An environment variable that cannot be used is one clear error."""
+    monkeypatch.setenv(variable, value)
+    with pytest.raises(SettingsInvalidError, match=re.escape(says)) as raised:
+        load()
+    assert "\n" not in str(raised.value)
+
+
+def test_a_misspelt_variable_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A variable that looks like a setting and is none is reported."""
+    monkeypatch.setenv("OPTIPMB_CLOUD_WAIT", "1")
+    assert load().unknown == ("OPTIPMB_CLOUD_WAIT",)
+
+
+def test_a_variable_in_a_table_leaves_the_rest_of_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A variable inside a table replaces its one setting of the file; the table of profiles is replaced as a whole."""
+    file = tmp_path / "service.toml"
+    file.write_text(
+        '[limits]\nmax_points = 5\n[profiles]\n"a/*/*" = "kitti"\n[ros2]\ndomain = 3\nnode = "of_file"\n'
+        '[ros2.streams."a/b/c"]\ndetections = "/of/file"\n'
+    )
+    monkeypatch.setenv("OPTIPMB_ROS2__DOMAIN", "7")
+    monkeypatch.setenv("OPTIPMB_LIMITS__MAX_BYTES", "2048")
+    monkeypatch.setenv("OPTIPMB_PROFILES", '{"b/*/*": "nuscenes"}')
+    settings = load(file).settings
+    assert (settings.ros2.domain, settings.ros2.node, list(settings.ros2.streams)) == (7, "of_file", ["a/b/c"])
+    assert (settings.limits.max_bytes, settings.limits.max_points) == (2048, 5)
+    assert settings.profiles == {"b/*/*": "nuscenes"}
+
+
+@pytest.mark.parametrize("value", ["tcp/1.2.3.4:1,tcp/[::]:2", '["tcp/1.2.3.4:1", "tcp/[::]:2"]'])
+def test_lists_in_the_environment(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
+    """Several endpoints in one variable, with commas or as JSON."""
+    monkeypatch.setenv("OPTIPMB_LISTEN", value)
+    monkeypatch.setenv("OPTIPMB_CONNECT", value)
+    settings = load().settings
+    assert settings.listen == settings.connect == ("tcp/1.2.3.4:1", "tcp/[::]:2")
+
+
+def test_router_or_client() -> None:
+    """A router listens by default; with routers to connect to it is a client, unless both are wanted."""
+    router, client = load().settings, load(None, {"connect": ["tcp/1.2.3.4:7447"]}).settings
+    both = load(None, {"connect": ["tcp/1.2.3.4:7447"], "router": True}).settings
+    assert (router.is_router, router.endpoints) == (True, ("tcp/127.0.0.1:7447",))
+    assert (client.is_router, client.endpoints) == (False, ())
+    assert (both.is_router, both.endpoints) == (True, ("tcp/127.0.0.1:7447",))
+
+
+def test_streams_of_a_profile_share_a_tracker() -> None:
+    """A tracker keeps nothing of a stream: those of one profile have the same, other parameters have their own."""
+    profiles = Profiles.read("kitti", {})
+    tracker = profiles.trackers(optipmb.Tracker)
+    known = profiles.of("a/b/c")
+    equal, other = known.model_copy(deep=True), known.model_copy(update={"nominal_period": 0.5})
+    assert tracker(known) is tracker(equal)
+    assert tracker(other) is not tracker(known)
+    assert tracker(other).parameters.nominal_period == 0.5

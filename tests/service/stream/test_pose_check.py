@@ -1,0 +1,95 @@
+"""Poses that no sensor can have: refused with the reason, until they are many that agree."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from optipmb_schemas import Detections, Pose
+from optipmb_service.stream.checkpoint import state_bytes
+from optipmb_service.stream.session import Session
+from optipmb_service.stream.values import Output, Policy
+from router import Sensor
+from sessions import begun, chained, problems, tracks
+
+import optipmb
+
+NUSCENES = optipmb.load_profile("nuscenes")
+SENSOR = Sensor()
+POLICY = Policy()
+
+
+def frame(seq: int, x: float) -> Detections:
+    """A frame of a sensor at x, with objects around it."""
+    pose = Pose(translation=np.array([x, 0.0, 0.0]), quaternion=np.array([1.0, 0, 0, 0]))
+    center = SENSOR.detections(seq).center
+    return SENSOR.detections(seq, frame="sensor", pose=pose, center=center)
+
+
+def feed(one: Session, places: dict[int, float]) -> list[Output]:
+    """Give frames by number and place."""
+    return [output for seq, x in places.items() for output in one.on_detections(frame(seq, x), 0)]
+
+
+def session(**changes: Any) -> Session:
+    """A session of the sensor's stream."""
+    return Session(SENSOR.stream, NUSCENES, **changes)
+
+
+def test_a_jump_of_the_pose_is_refused() -> None:
+    """A frame a hundred metres off is refused with its position, counted, and gives birth to nothing."""
+    one = session()
+    feed(one, {seq: seq * 1.0 for seq in range(5)})
+    density = one.density
+    outputs = feed(one, {5: 105.0})
+    assert [(p.code, p.path, p.seq) for p in problems(outputs)] == [("astray", "pose.translation", 5)]
+    assert "105.0" in problems(outputs)[0].received
+    assert tracks(outputs) == []
+    assert one.density is density
+    assert one.counters.refused == 1
+    assert [(m.seq, m.gap) for m in tracks(feed(one, {6: 6.0}))] == [(6, 1)]
+
+
+def test_a_sensor_that_stays_elsewhere_begins_anew() -> None:
+    """When frames in a row agree on the new place, the last of them begins a new life there; ids go on."""
+    one = session()
+    before = tracks(feed(one, dict.fromkeys(range(4), 0.0)))[-1]
+    outputs = feed(one, dict.fromkeys(range(4, 10), 500.0))
+    codes = [problem.code for problem in problems(outputs)]
+    assert codes == ["astray"] * (POLICY.astray_frames - 1) + ["restarted"]
+    assert begun(outputs) == ["pose"]
+    after = tracks(outputs)
+    assert [message.seq for message in after] == [4 + POLICY.astray_frames - 1, 4 + POLICY.astray_frames]
+    assert after[-1].session != before.session
+    assert min(after[-1].id) > max(before.id)
+
+
+def test_poses_that_do_not_agree_never_begin_anything() -> None:
+    """A localisation that throws the sensor about is refused for as long as it does."""
+    one = session()
+    feed(one, {0: 0.0})
+    outputs = feed(one, {seq: 500.0 * seq for seq in range(1, 20)})
+    assert begun(outputs) == []
+    assert len(problems(outputs)) == 19
+
+
+def test_silence_gives_a_sensor_time_to_move() -> None:
+    """What can be reached in the time that passed is no jump; without the check any pose is taken."""
+    one = session()
+    feed(one, {0: 0.0})
+    assert len(tracks(feed(one, {20: 150.0}))) == 1
+    free = session(policy=Policy(max_speed=0))
+    assert len(tracks(feed(free, {0: 0.0, 1: 10_000.0}))) == 2
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.permutations(range(8)), st.sets(st.integers(1, 7), max_size=6))
+def test_refusals_do_not_depend_on_arrival(order: list[int], far: set[int]) -> None:
+    """Which frames are astray follows from the frames in order, whatever came when."""
+    places = {seq: 300.0 if seq in far else 0.0 for seq in range(8)}
+    one, other = session(tracker=chained), session(tracker=chained)
+    feed(one, {seq: places[seq] for seq in order})
+    feed(other, places)
+    assert state_bytes(one.snapshot()) == state_bytes(other.snapshot())

@@ -1,0 +1,99 @@
+"""The counts of messages over all streams, as the metrics show them: they only grow, and each message counts once."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from optipmb_service.stream import backlog, stream
+from optipmb_service.stream import streams as table
+from optipmb_service.stream.ports import Packet
+from optipmb_service.stream.values import MAX_SENSORS
+from optipmb_service.telemetry.stream_meter import MessageCounters
+from registries import Around, packet_of, streams_of
+from router import Sensor
+
+if TYPE_CHECKING:
+    from types import FrameType
+
+    import pytest
+
+SENSOR = Sensor()
+TRACED = {str(Path(module.__file__)) for module in (stream, backlog)}
+
+
+def packet(seq: int) -> Packet:
+    """Return a frame as it comes."""
+    return packet_of(SENSOR.detections(seq))
+
+
+def test_totals_never_fall_and_count_nothing_twice() -> None:
+    """Between any two lines that open, close or restore a session the totals are what they were, or more."""
+    around = Around()
+    streams, seen = streams_of(around), [MessageCounters()]
+
+    def look(frame: FrameType, *_: object) -> Any:
+        if frame.f_code.co_filename not in TRACED:
+            return None
+        if not streams._lock.locked():  # another thread would wait for it
+            seen.append(streams.totals())
+        return look
+
+    before = sys.gettrace()
+    sys.settrace(look)
+    try:
+        for seq in (0, 1, 2, 2, 3):
+            streams.receive(packet(seq))
+        around.run()
+        streams.command(SENSOR.stream, lambda one: one.close_session("idle"), urgent=False)
+        around.run()
+        assert streams.of(SENSOR.stream) is None
+        for seq in (3, 4, 5):
+            streams.receive(packet(seq))
+        around.run()
+    finally:
+        sys.settrace(before)
+    for name in (field.name for field in fields(MessageCounters)):
+        values = [getattr(one, name) for one in seen]
+        assert values == sorted(values), name
+    assert (seen[-1].received, seen[-1].frames, seen[-1].duplicates) == (8, 6, 2)
+    assert streams.totals() == seen[-1]
+
+
+def test_a_command_without_room_is_no_message(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A query on a stream that finds no room among those that are new is told so, and counts as no frame."""
+    monkeypatch.setattr(table, "MAX_UNPROVEN", 0)
+    streams = streams_of(Around())
+    assert not streams.command(SENSOR.stream, lambda _: None, urgent=True)
+    assert streams.totals() == MessageCounters()
+
+
+def test_a_message_on_a_key_of_no_stream_is_refused_as_what_it_is() -> None:
+    """A cloud on a key that names no stream counts among the clouds refused, detections among the frames."""
+    streams = streams_of(Around())
+    streams.receive(Packet("optipmb/v1/nothing/points", b"", 0, "", 0, 0))
+    assert streams.totals() == MessageCounters(clouds_refused=1)
+    streams.receive(Packet("optipmb/v1/nothing/detections", b"", 0, "", 0, 0))
+    assert streams.totals() == MessageCounters(received=1, refused=1, clouds_refused=1)
+
+
+def test_what_one_sensor_too_many_sends_is_counted_as_what_it_is() -> None:
+    """Of a sensor beyond those that a session takes, a frame counts as refused, and a cloud as a refused cloud."""
+    around = Around()
+    streams = streams_of(around, fuse=("site/node/*",), recovery_wait_s=0)
+    for number in range(MAX_SENSORS):
+        streams.receive(packet_of(replace(SENSOR, stream=f"site/node/s{number}").detections(0)))
+    around.run()
+    more = replace(SENSOR, stream="site/node/more")
+    streams.receive(packet_of(more.detections(0)))
+    streams.receive(packet_of(more.points(0)))
+    around.run()
+    totals = streams.totals()
+    assert (totals.received, totals.frames, totals.refused, totals.clouds_refused) == (
+        MAX_SENSORS + 1,
+        MAX_SENSORS,
+        1,
+        1,
+    )
