@@ -11,6 +11,7 @@ come when it is confirmed.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping  # noqa: TC003 - checkpoints read the records by their annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol
 
@@ -20,7 +21,7 @@ from optipmb.compiled import kernel
 from optipmb.errors import ParameterError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -95,6 +96,11 @@ class Zone:
         if self.polygon and _crosses_itself(self.polygon):
             raise ParameterError(f"{self.name}.polygon", "edges that do not cross", "others")
 
+    @property
+    def digest(self) -> str:
+        """All that its events follow from."""
+        return repr(self)
+
 
 class Event(NamedTuple):
     """What happened; `n` counts the events of a zone and kind from 1."""
@@ -151,6 +157,10 @@ class ZoneState:
     """by zone, name of `COUNTS` and class"""
     numbers: Mapping[str, int] = field(default_factory=dict)
     """events so far, by `zone/kind`"""
+    zones: tuple[str, ...] = ()
+    """the zones that it is of, as `Zone.digest`"""
+    session: str = ""
+    """in which the ids of its tracks are unique"""
 
 
 class Shapes(NamedTuple):
@@ -305,6 +315,26 @@ def observe(
         if silent_ns > longest_ns and identity not in here:
             del known[identity]
     return _counted(replace(state, tracks=known), events)
+
+
+def adapted(zones: Sequence[Zone], state: ZoneState) -> ZoneState:
+    """Return the state for these zones: those that are new or were changed begin anew, but for their numbers."""
+    digests = tuple(one.digest for one in zones)
+    if digests == state.zones:
+        return state
+    old = {digest: 1 << place for place, digest in enumerate(state.zones)}
+    kept = {one.name for one in zones if one.digest in old}
+    tracks = {
+        identity: seen._replace(
+            known=sum(1 << place for place, one in enumerate(digests) if seen.known & old.get(one, 0)),
+            visits={name: one for name, one in seen.visits.items() if name in kept},
+            beside={name: one for name, one in seen.beside.items() if name in kept},
+            held=tuple(one for one in seen.held if one.zone in kept),
+        )
+        for identity, seen in state.tracks.items()
+    }
+    counts = {name: one for name, one in state.counts.items() if name in kept}
+    return replace(state, tracks=tracks, counts=counts, zones=digests)
 
 
 def end(zones: Sequence[Zone], state: ZoneState) -> tuple[ZoneState, tuple[Event, ...]]:

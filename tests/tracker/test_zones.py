@@ -21,6 +21,7 @@ STEP_NS = 100_000_000
 LABELS = ("car", "pedestrian")
 CROSSING = Zone("crossing", polygon=((0, 0), (20, 0), (20, 12), (0, 12)), dwell_s=(1.0, 4.0))
 GATE = Zone("gate", line=((0, -5), (0, 5)))
+LOST = [("entered", "appeared"), ("left", "lost")]
 
 
 @dataclass
@@ -112,8 +113,8 @@ def test_a_visit() -> None:
         ([(5, 5)] * 4 + [(5, -9)] * 9, []),  # too short
         ([(5, 5)] * 8 + [None] * 15 + [(5, 5)] * 9, [("entered", "appeared")]),  # not seen for 1.6 s
         ([(5, 5)] * 8 + [None] * 25, [("entered", "appeared"), ("left", "lost")]),
-        ([(5, 5)] * 8 + [None] * 25 + [(5, 5)] * 8, [("entered", "appeared"), ("left", "lost"), ("entered", "appeared")]),
-        ([(5, 5)] * 8 + [None] * 25 + [(5, -9), *[(5, 5)] * 8], [("entered", "appeared"), ("left", "lost"), ("entered", "crossed")]),
+        ([(5, 5)] * 8 + [None] * 25 + [(5, 5)] * 8, [*LOST, ("entered", "appeared")]),
+        ([(5, 5)] * 8 + [None] * 25 + [(5, -9), *[(5, 5)] * 8], [*LOST, ("entered", "crossed")]),
         ([(5, -9), *[(5, 5)] * 8, *[(5, -0.2), (5, 0.2)] * 20], [("entered", "crossed")]),  # within the margin
         ([(5, -9), *[(5, 5)] * 8, (5, -0.4)], [("entered", "crossed"), ("left", "crossed")]),
         ([(5, 5, 9)] * 8, []),  # another storey

@@ -10,6 +10,7 @@ import optipmb_schemas as schemas
 from pydantic import AfterValidator, Field
 
 import optipmb
+from optipmb.zones import Event, Zone  # noqa: TC001 - at run time as the others
 from optipmb_service.telemetry.stream_meter import MAX_COUNT
 
 SECOND: Final = 1_000_000_000
@@ -87,6 +88,7 @@ class Policy:
         max_speed: fastest that a sensor moves; 0: any pose is taken.
         pose_margin: how far a pose may lie from where that speed allows.
         astray_frames: frames in a row that agree on another place until the session begins anew there.
+        zones: those whose events the session finds.
         at_once: frames that are ready which one call takes through the tracker; the next calls take the others. More
             are taken only while more than `held_bytes` are held.
     """
@@ -107,6 +109,7 @@ class Policy:
     pose_margin: float = 10.0
     astray_frames: int = 5
     at_once: int = 2**62
+    zones: tuple[Zone, ...] = ()
 
     @property
     def jump_limits(self) -> JumpLimits:
@@ -143,6 +146,7 @@ class Tracked:
         ticket: value that the caller gave with the detections.
         step_ns: time that conversion and tracking took.
         run: see `Session.run`.
+        events: those of the zones.
     """
 
     estimates: optipmb.Tracks
@@ -151,6 +155,7 @@ class Tracked:
     ticket: Any = None
     step_ns: int = 0
     run: int = 0
+    events: tuple[Event, ...] = ()
 
     @property
     def tracks(self) -> schemas.Tracks:
