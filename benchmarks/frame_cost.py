@@ -5,7 +5,7 @@ python benchmarks/frame_cost.py [--beside DIR] [--objects N] [--points N] [--rou
 A frame goes its way through one process, with everything real but the network and the store: a packet is handed over,
 decoded, tracked and published, and every tenth frame a checkpoint is encoded. What counts is the processor time of the
 thread. `--beside` names a checkout of another version: rounds of the two follow each other, each in a process of its
-own, and the medians of the rounds are compared. `service_cost.py` measures running services.
+own, and the medians of the rounds are compared.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ class Network:
 def packets(objects: int, points: int) -> Iterator[list[Any]]:
     """Yield the messages of each frame, its cloud first."""
     load, keys = module_of("optipmb_tools.run.load", "optipmb_client.load"), schemas.Keys()
-    packet = part_of("Packet", "stream.backlog", "stream.ports", "runtime.ports")
+    packet = part_of("Packet", "zenoh.inputs", "runtime.ports")
     frames = load.generated(objects, points, RATE_HZ)
     for k in range(WARM + FRAMES):
         begins = load.head(STREAM, bytes(16), load.FIRST + k, 10**18 + round(k * 1e9 / RATE_HZ))
@@ -161,6 +161,9 @@ def measured(objects: int, points: int) -> dict[str, float]:
     streams_type = part_of("Streams", "stream.streams", "runtime.streams")
     stream_type = part_of("Stream", "stream.stream", "runtime.stream")
     session = part_of("Session", "stream.session", "session.session")
+    publishing = (stream_type, "_send")
+    if not hasattr(*publishing):
+        publishing = (part_of("TrackPublisher", "runtime.track_publisher"), "send")
     parts = Parts()
     network: Any = Network()  # in the place of several parts
     nothing: Any = None
@@ -173,7 +176,7 @@ def measured(objects: int, points: int) -> dict[str, float]:
         ("conversion", part_of("convert", "stream", "session"), "cloud_of"),
         ("conversion", part_of("convert", "stream", "session"), "tracks_of"),
         ("step", optipmb.Tracker, "step"),
-        ("publishing", part_of("TrackPublisher", "stream.track_publisher", "runtime.track_publisher"), "send"),
+        ("publishing", *publishing),
         ("metrics", metrics, "received"),
         ("metrics", metrics, "published"),
         ("metrics", metrics, "tracks"),

@@ -28,8 +28,7 @@ from optipmb_tools.evaluation import default_rules
 from optipmb_tools.evaluation.calibration import calibration
 from optipmb_tools.evaluation.cases import CENTRE_DISTANCE
 from optipmb_tools.geometry import Pose, to_sensor, to_world
-from optipmb_tools.results import ResultTable, stacked
-from optipmb_tools.results.full import COLUMNS, FullTable
+from optipmb_tools.results import COLUMNS, FullTable, ResultTable, stacked
 from optipmb_tools.results.kitti import LEAST_SHOWN
 from optipmb_tools.run import profiles
 from optipmb_tools.tuning.clips import Clip, load, of_class

@@ -29,11 +29,11 @@ def to_install(package: str, what: str = "this") -> str | None:
 
 
 def needed(what: str, extra: str, *packages: str, need: str = "needs") -> None:
-    """Raise where one of the packages of an extra is missing, before anything else is done.
+    """Raise where packages of extras are missing, before anything else is done; name them all.
 
     Raises:
-        ClientError: with the command that installs the extra.
+        ClientError: with the command that installs the extras.
     """
-    for package in packages:
-        if importlib.util.find_spec(package) is None:
-            raise ClientError(f"{what} {need} {package}, which is not installed: {install_command(extra)}")
+    if missing := [package for package in packages if importlib.util.find_spec(package) is None]:
+        verb = "are" if len(missing) > 1 else "is"
+        raise ClientError(f"{what} {need} {', '.join(missing)}, which {verb} not installed: {install_command(extra)}")

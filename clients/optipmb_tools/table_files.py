@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from optipmb_tools.camera import sensor_from_kitti
 from optipmb_tools.extras import needed
 from optipmb_tools.files import DatasetError, numbers, read_rows, read_text, write_whole
 
@@ -413,6 +412,8 @@ def _kitti_frame(path: Path) -> list[_Record]:
     rows = [(line, fields) for line, fields in read_rows(path, "boxes") if fields[0] != "DontCare"]
     boxes = [(line, fields[_FIRST:] + ["1"] * (len(fields) == _FIRST + 7)) for line, fields in rows]  # labels: no score
     values = numbers(path, boxes, 8, f"h w l x y z rotation_y score from field {_FIRST + 1} on")
+    from optipmb_tools.camera import sensor_from_kitti  # noqa: PLC0415  of one format
+
     center, size, yaw = sensor_from_kitti(values[:, 3:6], values[:, :3], values[:, 6])
     lists = np.column_stack((center, size, yaw)).tolist()
     return [{"labels_3d": [fields[0] for _, fields in rows], "scores_3d": values[:, 7].tolist(), "bboxes_3d": lists}]

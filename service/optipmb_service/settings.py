@@ -9,6 +9,7 @@ Times are in seconds. Every setting is described by its docstring, which `docs/r
 
 from __future__ import annotations
 
+import difflib
 import ipaddress
 import json
 import os
@@ -44,7 +45,7 @@ DEFAULT_NATS: Final = "127.0.0.1:4222"
 
 
 def _form(pattern: str, expected: str) -> AfterValidator:
-    """Return the check of a text: it matches a regular expression in full, or the error says what was expected."""
+    """Return the check of a text: it matches a regular expression in full, or the error names the expected form."""
 
     def check(value: str) -> str:
         if not re.fullmatch(pattern, value):
@@ -99,7 +100,7 @@ Endpoints = Annotated[tuple[Endpoint, ...], NoDecode, BeforeValidator(_listed)]
 
 
 class LimitSettings(BaseModel):
-    """Bounds on what one message may hold; what is larger is refused before memory is taken for it."""
+    """Bounds on what one message may hold; larger ones are refused before memory is allocated."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -417,6 +418,10 @@ TABLES: Final = frozenset(
 """The settings that are tables of settings and merged name by name; `profiles` is one value, whose order matters."""
 
 
+FILES: Final = tuple(name for name, field in Settings.model_fields.items() if field.annotation == Path | None)
+"""The settings that are files or folders."""
+
+
 class SettingsInvalidError(ValueError):
     """The settings cannot be used; the text is one clear line."""
 
@@ -463,6 +468,8 @@ def load(
         source = sources.get(str(first["loc"][0]) if first["loc"] else "", "default")
         where = f" (from the {source})" if source != "default" else ""
         message = first["msg"].removeprefix("Value error, ")
+        if first["type"] == "extra_forbidden":
+            message = f"unknown setting{_near(first['loc'])}"
         raise SettingsInvalidError(f"setting {path}{where}: {message}") from error
     if not settings.endpoints and not settings.connect:
         raise SettingsInvalidError("setting listen: neither an endpoint to listen on nor one to connect to")
@@ -477,6 +484,25 @@ def load(
     known = {f"{PREFIX}{name.upper()}" for name in Settings.model_fields}
     unknown = (name for name in os.environ if name.startswith(PREFIX) and name.split("__")[0] not in known)
     return Loaded(settings, sources, tuple(sorted(unknown)))
+
+
+def missing_files(settings: Settings) -> list[str]:
+    """Return a text for each file and folder that the settings name and that is not there."""
+    named: dict[str, Any] = {name: getattr(settings, name) for name in FILES}
+    named |= {"profile": settings.profile} | {f"profiles.{key}": value for key, value in settings.profiles.items()}
+    return [
+        f"setting {name}: {value}: no such file"
+        for name, value in named.items()
+        if value is not None and (name in FILES or value.endswith(".toml")) and not Path(value).exists()
+    ]
+
+
+def _near(place: tuple[int | str, ...]) -> str:
+    """Return the setting whose name is like an unknown one, as a question; nothing where there is none."""
+    field = Settings.model_fields.get(str(place[0])) if len(place) > 1 else None
+    table: Any = Settings if field is None else field.annotation
+    near = difflib.get_close_matches(str(place[-1]), getattr(table, "model_fields", ()), 1)
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 def _check_cluster(settings: Settings) -> None:

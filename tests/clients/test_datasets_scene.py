@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from optipmb_tools.datasets import DatasetError, Truth, open_dataset
 from optipmb_tools.datasets.scene.dataset import MIN_POINTS, RADIUS, SceneSequence, visits
-from optipmb_tools.datasets.scene.detector import CLASSES, FALSE, MIN_SCORE, Found, detection_probability
-from optipmb_tools.datasets.scene.lidar import BEAMS, GROUND, NOTHING, cast, scan
-from optipmb_tools.datasets.scene.traffic import HALF_WIDTH, fixed_boxes, parking_places
+from optipmb_tools.datasets.scene.detector import CLASSES, FALSE, MIN_SCORE, Found
+from optipmb_tools.datasets.scene.lidar import GROUND, cast
+from optipmb_tools.datasets.scene.traffic import HALF_WIDTH, fixed_boxes
 from optipmb_tools.evaluation import Rules, evaluate_clear, iou_bev
 from optipmb_tools.geometry import points_in_box, rotation_of, wrap_angle
 from optipmb_tools.results import ResultTable
@@ -276,20 +276,6 @@ def box_at(x: float, y: float, length: float = 2.0, width: float = 2.0, height: 
     return [np.array([[x, y, 0.5 * height - 1.75]]), np.array([[length, width, height]]), np.zeros(1)]
 
 
-def test_a_box_is_hit_where_its_near_side_is() -> None:
-    """A wall 10 m ahead returns every ray at 10 m / cos(azimuth), and hides nothing beside it."""
-    distance, owner, covered = cast(*box_at(11.0, 0.0), 1.75)
-    rows, columns = np.nonzero(owner == 0)
-    azimuth = columns * (2 * np.pi / owner.shape[1]) - np.pi
-    np.testing.assert_allclose(distance[rows, columns] * np.cos(azimuth), 10.0, rtol=1e-9)
-    assert np.abs(azimuth).max() <= np.arctan2(1.0, 10.0) + 1e-9
-    assert covered.tolist() == [0.0]
-    free = np.setdiff1d(np.arange(owner.shape[1]), columns)
-    assert ((owner[:, free] == GROUND) | (owner[:, free] == NOTHING)).all()
-    assert BEAMS[rows].max() > 0.0
-    assert BEAMS[rows].min() < -0.1
-
-
 def test_what_stands_before_a_box_covers_it() -> None:
     """Wholly behind a wider wall a box has no points and is covered; half behind, half; without rays, unknown."""
     both = [
@@ -311,14 +297,6 @@ def test_a_box_behind_the_seam_of_the_scan_is_hit_on_both_sides() -> None:
     columns = np.unique(np.nonzero(owner == 0)[1])
     assert columns.min() == 0
     assert columns.max() == owner.shape[1] - 1
-
-
-def test_without_boxes_the_scan_is_ground() -> None:
-    """An empty place returns the ground and nothing else."""
-    nothing = (np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
-    view = scan(*nothing, 1.75, np.random.default_rng(0))
-    assert (view.owner == GROUND).all()
-    assert len(view.xyz) > 5000
 
 
 def test_hidden_objects_have_few_points(scenes: list[SceneSequence], observed: Observed) -> None:
@@ -385,18 +363,6 @@ def test_detection_and_scores_mean_something(scenes: list[SceneSequence], observ
     assert 0.02 < (~real).mean() < 0.4
 
 
-def test_the_chance_to_be_found_grows_with_points_and_ease() -> None:
-    """It is monotone in both and zero without points."""
-    points = np.arange(0, 1000)
-    chance = detection_probability(points, np.zeros(1000))
-    assert chance[0] == 0.0
-    assert (np.diff(chance) > 0).all()
-    assert chance[-1] < 1.0
-    assert detection_probability(np.array([5]), np.array([1.0])) > detection_probability(
-        np.array([5]), np.array([-1.0])
-    )
-
-
 def test_errors_of_detections_are_those_of_a_detector(scenes: list[SceneSequence], observed: Observed) -> None:
     """Centimetres with many points, decimetres with few; headings are right but for a few that are turned round."""
     errors, flips, many = [], [], []
@@ -435,15 +401,6 @@ def visible(truth: Truth) -> ResultTable:
     rows = truth.take(~truth.ignored)
     columns = (rows.frame, rows.id, rows.label, rows.center, rows.size, rows.yaw)
     return ResultTable(rows.labels, *columns, np.ones(len(rows)), rows.box2d)
-
-
-def test_parking_places_do_not_overlap() -> None:
-    """Cars on any two places keep clear of each other."""
-    places, headings = parking_places()
-    center = np.column_stack([places, np.zeros(len(places))])
-    first, second = np.triu_indices(len(places), 1)
-    size = np.tile([4.9, 2.1, 1.5], (len(first), 1))
-    assert iou_bev((center[first], size, headings[first]), (center[second], size, headings[second])).max() == 0.0
 
 
 def test_the_profile_of_scenes_knows_their_classes() -> None:

@@ -15,7 +15,6 @@ from optipmb_tools.evaluation.ab3dmot import (
     POINTS,
     Ab3dmotResult,
     evaluate_ab3dmot,
-    recall_points,
 )
 from optipmb_tools.evaluation.cases import Case, ab3dmot_rules, prepare
 from optipmb_tools.evaluation.evaluate import evaluate_figures, load_recordings
@@ -131,16 +130,6 @@ def test_stricter_overlaps_find_less() -> None:
         found = tuple(limit for limit in (0.25, 0.5, 0.7) if evaluate_ab3dmot([case], limit).best.true == 160)
         assert found == limits
         assert evaluate_ab3dmot([case]).amotp == pytest.approx((4.0 - dx) / (4.0 + dx))
-
-
-@PATIENT
-@given(st.lists(st.floats(0.0, 1.0), max_size=200), st.integers(0, 100))
-def test_recall_points_are_in_order(scores: list[float], missed: int) -> None:
-    """Thresholds fall and recalls rise by a fortieth, and each threshold is one of the scores."""
-    points = recall_points(np.array(scores), max(1, len(scores) + missed))
-    assert [threshold for threshold, _ in points] == sorted((threshold for threshold, _ in points), reverse=True)
-    assert [recall for _, recall in points] == pytest.approx([(k + 1) / POINTS for k in range(len(points))])
-    assert {threshold for threshold, _ in points} <= set(scores)
 
 
 def naive(case: Case, threshold: float) -> Counts:

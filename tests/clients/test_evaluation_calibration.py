@@ -10,7 +10,7 @@ from optipmb_tools.evaluation.calibration import CalibrationResult, calibration,
 from optipmb_tools.evaluation.cases import Rules
 from optipmb_tools.evaluation.evaluate import evaluate_figures, load_recordings
 from optipmb_tools.geometry import Floats
-from optipmb_tools.results.full import FullTable, full_path, read_full, write_full
+from optipmb_tools.results import FullTable, full_path, read_full, write_full
 from optipmb_tools.run.tracking import Tracking, track
 
 import optipmb

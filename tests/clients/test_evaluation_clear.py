@@ -1,69 +1,37 @@
-"""CLEAR MOT on hand-made cases with known answers, and on the real truth."""
+"""CLEAR MOT on hand-made cases with known answers."""
 
 from collections.abc import Iterable
 from dataclasses import replace
-from pathlib import Path
 
+import evaluation_cases
 import numpy as np
 import pytest
-from optipmb_tools.datasets import DatasetError, Regions, Truth, open_dataset
+from optipmb_tools.datasets import Regions, Truth
 from optipmb_tools.evaluation import (
     ClearResult,
     Rules,
     Switch,
     combine,
-    default_rules,
     evaluate_clear,
-    evaluate_files,
     prepare,
     sweep,
 )
 from optipmb_tools.results import ResultTable
-from real_data import kitti_root
 
 Row = tuple[int, int, float]
 """Frame, id and place along x."""
 
 
-def truth_of(rows: Iterable[Row], *, ignored: Iterable[Row] = (), label: str = "Car", extra: str = "Van") -> Truth:
-    """Give truth cars of 4 m along x; the ignored rows are those that are in both."""
-    table = sorted(rows)
-    count = len(table)
-    hidden = set(ignored)
-    return Truth(
-        labels=(label, extra),
-        frame=np.array([f for f, _, _ in table], dtype=np.int64),
-        id=np.array([i for _, i, _ in table], dtype=np.int64),
-        label=np.zeros(count, dtype=np.int64),
-        center=np.array([[x, 0.0, 0.0] for _, _, x in table]).reshape(-1, 3),
-        size=np.tile([4.0, 2.0, 1.5], (count, 1)),
-        yaw=np.zeros(count),
-        velocity=np.full((count, 2), np.nan),
-        occlusion=np.zeros(count, dtype=np.int64),
-        truncation=np.zeros(count, dtype=np.int64),
-        covered=np.full(count, np.nan),
-        points=np.full(count, -1, dtype=np.int64),
-        box2d=np.full((count, 4), np.nan),
-        ignored=np.array([row in hidden for row in table], dtype=np.bool_),
-        regions=Regions(np.empty(0, dtype=np.int64), np.empty((0, 4))),
-    )
+def truth_of(rows: Iterable[Row], *, ignored: Iterable[Row] = ()) -> Truth:
+    """Give truth cars along x; the ignored rows are those that are in both."""
+    table, hidden = sorted(rows), set(ignored)
+    places = [place for place, row in enumerate(table) if row in hidden]
+    return evaluation_cases.truth_of([(*row, 0.0) for row in table], ignored=places)
 
 
 def tracks_of(rows: Iterable[Row], scores: dict[int, float] | None = None) -> ResultTable:
     """Give tracks of the same cars."""
-    table = sorted(rows)
-    count = len(table)
-    return ResultTable(
-        labels=("Car",),
-        frame=np.array([f for f, _, _ in table], dtype=np.int64),
-        id=np.array([i for _, i, _ in table], dtype=np.int64),
-        label=np.zeros(count, dtype=np.int64),
-        center=np.array([[x, 0.0, 0.0] for _, _, x in table]).reshape(-1, 3),
-        size=np.tile([4.0, 2.0, 1.5], (count, 1)),
-        yaw=np.zeros(count),
-        score=np.array([(scores or {}).get(i, 1.0) for _, i, _ in table]),
-        box2d=np.tile([0.0, 0.0, 100.0, 100.0], (count, 1)),
-    )
+    return evaluation_cases.tracks_of([(*row, 0.0, (scores or {}).get(row[1], 1.0)) for row in sorted(rows)])
 
 
 def figures(result: ClearResult) -> tuple[int, int, int, int, int]:
@@ -222,41 +190,3 @@ def test_the_best_threshold_leaves_the_false_tracks_out() -> None:
     assert found.results[0].mota == 0.5
     assert found.results[found.best].mota == 1.0
     assert 0.2 < found.thresholds[found.best] <= 0.8
-
-
-def test_real_truth_as_results_is_perfect(tmp_path: Path) -> None:
-    """The truth of a real sequence, written as result file, has MOTA 1 under the rules of the benchmark."""
-    dataset = open_dataset("kitti", kitti_root())
-    sequences = dataset.sequences(["0000", "0011"])
-    for sequence in sequences:
-        truth = sequence.truth()
-        assert truth is not None
-        frames = {index: _Now(truth.take(truth.frame == index)) for index in range(len(sequence))}
-        dataset.write(tmp_path, sequence, frames)
-    results = evaluate_files(sequences, tmp_path, ("Car", "Pedestrian", "Tram"), default_rules("kitti"))
-    assert [result.name for result in results] == ["Car", "Pedestrian"]
-    for result in results:
-        assert result.total.mota == 1.0
-        assert result.total.motp == pytest.approx(1.0, abs=1e-4)
-        assert set(result.sequences) == {"0000", "0011"}
-        assert result.sweep.results[result.sweep.best].mota == 1.0
-
-
-def test_results_of_a_missing_sequence_or_beyond_its_end_are_reported(tmp_path: Path) -> None:
-    """A missing result file and a frame that the sequence has not are errors that name the file."""
-    sequences = open_dataset("scene", frames=2, vehicles=2, pedestrians=0, cyclists=0).sequences(["all"])
-    with pytest.raises(DatasetError, match=r"0000.txt: expected a KITTI result file"):
-        evaluate_files(sequences, tmp_path, ("Car",), default_rules("scene"))
-    (tmp_path / "0000.txt").write_text("2 1 Car -1 -1 0 0 0 1 1 1.5 1.6 4 0 1.7 20 0 0.9\n")
-    with pytest.raises(DatasetError, match="frames from 0 to 1"):
-        evaluate_files(sequences, tmp_path, ("Car",), default_rules("scene"))
-
-
-class _Now:
-    """The truth of one frame in the shape of tracks."""
-
-    def __init__(self, truth: Truth) -> None:
-        self.id, self.labels, self.label = truth.id, truth.labels, truth.label
-        self.center, self.size, self.yaw = truth.center, truth.size, truth.yaw
-        self.velocity = truth.velocity
-        self.score = self.existence = np.ones(len(truth))

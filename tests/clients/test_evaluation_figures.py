@@ -12,6 +12,7 @@ from evaluation_cases import write_kitti
 from optipmb_tools.cli import run
 from optipmb_tools.datasets import DatasetError, open_dataset
 from optipmb_tools.datasets.kitti import KittiSequence
+from optipmb_tools.evaluation import default_rules, evaluate_files
 from optipmb_tools.evaluation.evaluate import Settings, evaluate_figures, load_recordings
 from optipmb_tools.results.kitti import LEAST_SHOWN, read_kitti_results
 from optipmb_tools.table_files import write_table
@@ -48,6 +49,10 @@ def test_the_real_truth_scores_a_hundred(tmp_path: Path) -> None:
         if one.everything.hota_2d is not None:
             assert one.everything.hota_2d.hota == pytest.approx(1.0)
         assert one.everything.gospa.gospa == pytest.approx(0.0, abs=1e-6)
+    for result in evaluate_files(sequences, tmp_path, ("Car", "Pedestrian", "Tram"), default_rules("kitti")):
+        assert result.name != "Tram", "it occurs nowhere"
+        assert (result.total.mota, result.sweep.results[result.sweep.best].mota) == (1.0, 1.0)
+        assert set(result.sequences) == {"0000", "0011"}
     for sequence in sequences:
         fresh = [
             " ".join([line[0], str(number), *line[2:], "0.9\n"]) for number, line in enumerate(lines[sequence.name])

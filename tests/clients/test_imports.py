@@ -54,7 +54,7 @@ def test_the_tracker_is_imported_for_offline_tracking_alone() -> None:
     """Only what tracks offline, what tunes the tracker, and the matching of class names and places import optipmb."""
     offline = {path for path in importers("optipmb_tools", "optipmb") if not path.startswith("tuning/")}
     assert offline == {
-        "class_names.py",
+        "datasets/interface.py",
         "georeference.py",
         *(f"run/{name}.py" for name in ("dumps", "profiles", "smoothing", "tracking")),
     }

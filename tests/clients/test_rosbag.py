@@ -15,7 +15,7 @@ from mcap_ros2.decoder import DecoderFactory
 from optipmb_tools.cli import run
 from optipmb_tools.datasets import DataSequence, dataset_at, open_dataset
 from optipmb_tools.files import DatasetError
-from optipmb_tools.results.full import FullTable, full_path, read_full
+from optipmb_tools.results import FullTable, full_path, read_full
 from optipmb_tools.run.profiles import read_profile
 from optipmb_tools.run.tracking import Tracking, track
 

@@ -5,8 +5,9 @@ from typing import Any
 
 import pytest
 from optipmb_schemas import Problem, ServiceStatus, SessionSummary
-from optipmb_tools.views.terminal import StatusView
+from optipmb_tools.views.terminal import StatusView, parts, status_tables
 from rich.console import Console
+from rich.table import Table
 
 HEIGHT = 40
 
@@ -80,7 +81,7 @@ def test_problems_are_shown_once_with_their_age() -> None:
         view.take([service("one", session("a/b/c"), problems=(problem,))], float(second))
     lines = [line for line in text(view).splitlines() if "Frame 7" in line]
     assert len(lines) == 1
-    assert lines[0].split()[:4] == ["4.0", "s", "ago", "late"]
+    assert lines[0].split()[:4] == ["4.0", "s", "ago", "a/b/c:"]
     assert "(3 times)" in lines[0]
 
 
@@ -96,6 +97,26 @@ def test_a_narrow_terminal_shows_fewer_columns(width: int) -> None:
     for word in ("edge-1", "degraded", "garage/robot-1/lidar-front", "running", "p99 ms", "lost/s"):
         assert any(word in line for line in lines)
     assert any("nuscenes" in line for line in lines) == (width > 80)
+
+
+def test_long_names_fit_80_columns_and_problems_are_in_words() -> None:
+    """Of a long name the end is seen, in the view and in the tables; a problem is a sentence."""
+    name = "plant-north-hall-3/forklift-0012/lidar-front-left"
+    problem = Problem(
+        stream=name, instance="one", code="restarted", received="publisher, +24.064 s", message="expected a stream"
+    )
+    status = service("one", session(name), problems=(problem,))
+    view = StatusView("tcp/127.0.0.1:7447")
+    view.take([status], 1.0)
+    console = Console(width=80, record=True, file=io.StringIO())
+    for part in status_tables([status]).renderables:
+        for table in parts(part, 80) if isinstance(part, Table) else (part,):
+            console.print(table)
+    for shown in (text(view, width=80), console.export_text()):
+        assert max(map(len, shown.splitlines())) <= 80
+        assert "lidar-front-left" in shown.replace("\n", "") or "-left" in shown
+        assert "publisher restarted, 24.1 s gap" in shown.replace("\n", " ")
+        assert "running" in shown
 
 
 def test_nothing_there_is_said() -> None:

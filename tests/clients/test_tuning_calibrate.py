@@ -10,7 +10,7 @@ from optipmb_tools.datasets import open_dataset
 from optipmb_tools.tuning.calibrate import calibrate, measured_calibration, rank
 from optipmb_tools.tuning.clips import Clip, load, of_class, track_clip, track_fully
 from optipmb_tools.tuning.scoring import rules_of, scorer_of
-from optipmb_tools.tuning.values import only, profile_text, with_calibration, with_values
+from optipmb_tools.tuning.values import only, with_calibration, with_values
 from tuning_cases import Habits, recorded
 
 import optipmb
@@ -78,17 +78,6 @@ def test_with_little_to_measure_nothing_is_said() -> None:
     """A handful of tracks gives no calibration; then existence is r and the covariance is P."""
     (clip,) = clips_of(range(1), Habits())
     assert calibrate([replace(clip, frames=clip.frames[:4])], SCORER, CARS) is None
-
-
-def test_a_profile_with_a_calibration_is_written_and_read(tmp_path: pytest.TempPathFactory) -> None:
-    """The text of a profile gives the same calibration again."""
-    found = calibrate(clips_of(range(2), Habits()), SCORER, CARS, 0.5)
-    assert found is not None
-    told = with_calibration(PAPER, "Car", found)
-    path = f"{tmp_path}/told.toml"
-    with open(path, "w", encoding="utf-8") as file:  # noqa: PTH123  one line
-        file.write(profile_text(told))
-    assert optipmb.load_profile(path) == told
 
 
 @settings(max_examples=5, deadline=None)

@@ -2,12 +2,10 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from optipmb_tools.datasets import Dataset, open_dataset
-from optipmb_tools.datasets.scene.lidar import Scan, scan
 from optipmb_tools.evaluation.ab3dmot import evaluate_ab3dmot
 from optipmb_tools.evaluation.cases import ab3dmot_rules, prepare
 from optipmb_tools.evaluation.evaluate import evaluate_figures, load_recordings
@@ -16,7 +14,6 @@ from optipmb_tools.results.kitti import read_kitti_results
 from optipmb_tools.run import profiles
 from optipmb_tools.run.tracking import Tracking, track
 from optipmb_tools.tuning.clips import Clip, Degradation, degrade, load, of_class, track_clip
-from optipmb_tools.tuning.objective import folds_of
 from optipmb_tools.tuning.scoring import rules_of, scorer_of
 from optipmb_tools.tuning.values import only
 from real_data import kitti_root, nuscenes_root
@@ -45,20 +42,6 @@ def test_a_class_alone_is_tracked_as_among_others() -> None:
         order, other = (np.lexsort((one.center[:, 0], one.frame)) for one in (alone, together))
         for column in ("frame", "center", "size", "yaw", "score"):
             assert np.array_equal(getattr(alone, column)[order], getattr(together, column)[other])
-
-
-def test_a_generated_scene_is_scanned_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Detections and truth come from the same scan of each frame."""
-    taken = []
-
-    def counted(*arguments: Any) -> Scan:
-        taken.append(1)
-        return scan(*arguments)
-
-    monkeypatch.setattr("optipmb_tools.datasets.scene.dataset.scan", counted)
-    (sequence,) = open_dataset("scene", frames=3, clouds=False).sequences(["0000"])
-    load(sequence, PARAMETERS, rules_of("scene"))
-    assert len(taken) == 3
 
 
 def test_frames_in_which_nothing_can_happen_are_left_out_without_effect() -> None:
@@ -159,14 +142,3 @@ def test_degraded_detections_are_as_much_worse_as_asked() -> None:
         assert ((other.score > 0.0) & (other.score <= 1.0)).all()
     assert np.concatenate(shifts).std() == pytest.approx(0.3, rel=0.03)
     assert worse.truth is clip.truth
-
-
-def test_groups_are_even_and_leave_out_what_has_no_truth() -> None:
-    """Every sequence with truth is in one group; groups weigh about the same; too few sequences make no groups."""
-    weights = [100, 0, 50, 49, 30, 21, 3]
-    groups = folds_of(weights, 3)
-    assert sorted(i for group in groups for i in group) == [0, 2, 3, 4, 5, 6]
-    totals = [sum(weights[i] for i in group) for group in groups]
-    assert max(totals) - min(totals) <= 30
-    assert folds_of([5, 0, 0], 3) == []
-    assert len(folds_of([5, 4], 3)) == 2

@@ -1,13 +1,10 @@
 """The objective of tuning: gains over recordings, and the changes that are kept."""
 
-from functools import partial
-
 import pytest
 from optipmb_tools.tuning.clips import load, of_class
-from optipmb_tools.tuning.objective import MARGIN, Objective
-from optipmb_tools.tuning.refine import prune, weigh
-from optipmb_tools.tuning.scoring import rules_of, scorer_of
-from optipmb_tools.tuning.values import Value, only, value_of, with_values
+from optipmb_tools.tuning.refine import Candidates
+from optipmb_tools.tuning.scoring import MARGIN, Objective, rules_of, scorer_of
+from optipmb_tools.tuning.values import only, with_values
 from tuning_cases import Habits, recorded
 
 import optipmb
@@ -25,11 +22,10 @@ def objective() -> Objective:
 def test_a_change_that_does_not_pay_is_taken_back(objective: Objective) -> None:
     """Of two changed values, the one with a use is kept and the idle one is put back; the use is told."""
     start = with_values(only(optipmb.load_profile("kitti-paper"), "Car"), "Car", {"gate": 0.1})
-    before: dict[str, Value] = {"gate": 0.1, "birth.acceleration": value_of(start, "Car", "birth.acceleration")}
-    made = partial(with_values, start, "Car")
-    chosen = prune(objective, range(3), made, before, {"gate": 4.0, "birth.acceleration": 1.1})
+    candidates = Candidates(objective, range(3), start)
+    chosen = candidates.prune({"gate": 4.0, "birth.acceleration": 1.1})
     assert chosen == {"gate": 4.0}
-    (found,) = weigh(objective, range(3), made, before, chosen)
+    (found,) = candidates.weigh(chosen)
     assert (found.path, found.start, found.value, found.positive, found.groups) == ("gate", 0.1, 4.0, 3, 3)
     assert found.gain > 3.0 * found.error > 0.0
 

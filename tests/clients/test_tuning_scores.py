@@ -9,8 +9,7 @@ import pytest
 from nuscenes_tables import Scene, Thing, box, write_detections, write_root
 from optipmb_tools.cli import run
 from optipmb_tools.tuning.clips import Clip, load, of_class
-from optipmb_tools.tuning.estimate import pair_all
-from optipmb_tools.tuning.score_curves import score_curve
+from optipmb_tools.tuning.estimate import pair_all, score_curve
 from optipmb_tools.tuning.scoring import rules_of
 from optipmb_tools.tuning.values import only
 from tuning_cases import Habits, Recorded, recorded

@@ -8,7 +8,15 @@ from typing import Any
 import pytest
 from optipmb_client.errors import UsageError
 from optipmb_tools.tuning.search import Dimension, dimensions, penalty, repaired
-from optipmb_tools.tuning.values import Value, profile_text, value_of, with_classes, with_values, write_profile
+from optipmb_tools.tuning.values import (
+    Value,
+    profile_text,
+    value_of,
+    with_calibration,
+    with_classes,
+    with_values,
+    write_profile,
+)
 
 import optipmb
 
@@ -146,7 +154,9 @@ def test_a_profile_is_written_as_it_is_read(tmp_path: Path) -> None:
     """Writing a profile and reading it gives the same parameters, whatever its texts hold."""
     parameters = optipmb.load_profile("nuscenes-paper")
     odd = with_classes(parameters, {}, "odd", 'one "line"\nanother \\ line\tand a \x07 bell')
-    for one in (parameters, odd):
+    calibrated = with_calibration(parameters, "car", optipmb.load_profile("nuscenes").classes["car"].calibration)
+    assert calibrated.classes["car"].calibration is not None
+    for one in (parameters, odd, calibrated):
         write_profile(tmp_path / "p.toml", one)
         assert optipmb.load_profile(tmp_path / "p.toml") == one
     assert profile_text(parameters) == profile_text(parameters)

@@ -18,7 +18,8 @@ import optipmb
 KEYS = Keys()
 STREAM = "site/node/lidar"
 RATE_S = 0.05
-FRAMES = 300
+FRAMES = 160
+"""More after the link has died than a cache of tracks holds."""
 FRAME = {"label": ["car"], "center": [[1.0, 2.0, 0.0]], "size": [[4.0, 2.0, 1.5]], "yaw": [0.0], "score": [0.9]}
 
 

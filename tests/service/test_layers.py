@@ -21,9 +21,9 @@ LINK = ("optipmb_client.zenoh.", "optipmb_client.incoming.", "optipmb_client.err
 ARROWS = {
     "cluster": set(),
     "telemetry": {"__version__"},
-    "stream": {"cluster", "telemetry", "settings"},
+    "stream": {"cluster", "telemetry", "zenoh", "settings"},
     "ros2": {"settings", "zenoh"},
-    "zenoh": {"stream", "settings"},
+    "zenoh": {"settings"},
     "http": {"stream", "telemetry"},
     "grpc": {"stream", "telemetry", "settings", "zenoh"},
     "app": {
@@ -78,7 +78,7 @@ def imported(text: str) -> set[str]:
 
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: f"{path.parent.name}/{path.stem}")
 def test_arrows_run_one_way(source: Path) -> None:
-    """App and edges import the streams, these the cluster, and that imports none of the others."""
+    """App and edges import the streams, these the cluster and the transport, which import none of the others."""
     own = {name.split(".")[1] for name in imported(source.read_text()) if name.startswith("optipmb_service.")}
     assert own - {place_of(source)} <= ARROWS[place_of(source)]
 

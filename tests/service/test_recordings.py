@@ -19,11 +19,11 @@ import pytest
 from fusing import FUSED
 from optipmb_service.cluster.leases import Change, partition_of
 from optipmb_service.stream.checkpoint import decode_checkpoint, encode_checkpoint
-from optipmb_service.stream.ports import Packet
 from optipmb_service.stream.profiles import Profiles
 from optipmb_service.stream.queries import StreamQueries
 from optipmb_service.stream.session import Session
 from optipmb_service.stream.values import Policy, Quarantined, RefusedError, Tracked
+from optipmb_service.zenoh.inputs import Packet
 from registries import Around, packet_of, streams_of
 from router import SECOND
 from scenarios import FILE, PROFILE, SCENARIOS, SENSOR, STREAM, Raw, Recorded, Step, delivery

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from optipmb_schemas import Detections, Keys, Points, encode, encoding_of
 from optipmb_service.settings import Settings
-from optipmb_service.stream.ports import Packet
 from optipmb_service.stream.profiles import Profiles
 from optipmb_service.stream.streams import Streams
 from optipmb_service.telemetry.metrics import Metrics
 from optipmb_service.telemetry.problem_reporter import ProblemReporter
+from optipmb_service.zenoh.inputs import Packet
 from sessions import chained
 
 if TYPE_CHECKING:

@@ -59,8 +59,8 @@ class Connection:
         settings = _configuration(endpoints, config, timeout)
         try:
             self._session = Session(opened(settings))
-        except ConnectionFailed as error:
-            raise self._unanswered(endpoints, timeout, settings) from error
+        except ConnectionFailed:
+            raise self._unanswered(endpoints, timeout, settings) from None
         # A router that starts at this moment may be known and not linked yet: messages would be lost.
         ends = time.monotonic() + timeout
         while json.loads(settings.get_json("mode")) == "client" and not self._session.linked():

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import typer
 
-from optipmb_tools.class_names import class_like
 from optipmb_tools.commands.options import AsJson, DataOptions, plain_table, print_json, print_table
+from optipmb_tools.datasets.interface import class_like
 from optipmb_tools.datasets.motion import headings_along
 
 # Kinds of objects that a profile for unknown detectors tells apart

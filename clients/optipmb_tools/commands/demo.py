@@ -57,12 +57,13 @@ def demo(
         progress.note("comparing the tracks with the truth, drawing them")
         results = evaluate_files([sequence], out, sequence.labels, default_rules(dataset.name))
         figures = combine(result.sweep.results[result.sweep.best] for result in results)
-        picture: Path | None = out / "tracks.png"
+        pictures = [out / "tracks.png", out / "tracks.gif"]
         try:
-            draw_results(out / "tracks.png", sequence, [out], [results])
-        except ClientError as error:  # the picture is worth having, not worth failing for
+            for one in pictures:
+                draw_results(one, sequence, [out], [results])
+        except ClientError as error:  # pictures are worth having, not worth failing for
             progress.note(str(error))
-            picture = None
+            pictures = []
     shown = {
         "command": "demo",
         "frames": replayed.frames,
@@ -73,7 +74,8 @@ def demo(
         "latency": replayed.latency,
         **figures.summary(),
         "file": replayed.file,
-        "picture": picture,
+        "picture": pictures[0] if pictures else None,
+        "animation": pictures[1] if pictures else None,
     }
     lines = [f"frames    {replayed.returned} of {replayed.frames} tracked, {replayed.clouds} with a point cloud"]
     if (found := replayed.latency) is not None:
@@ -82,6 +84,7 @@ def demo(
         f"tracks    {figures.objects} objects, MOTA {figures.mota:.3f}, {figures.switches} id switches, "
         f"precision {figures.precision:.3f}, recall {figures.recall:.3f}"
     )
-    lines.append(f"files     {', '.join(str(file) for file in (replayed.file, picture) if file is not None)}")
+    lines.append(f"files     {replayed.file}: the tracks, a line for each box, in the format of KITTI's results")
+    lines += [f"          {one}" for one in pictures]
     report(shown, *lines, as_json=as_json)
     complain([replayed])

@@ -135,7 +135,6 @@ def _evaluated(
     from optipmb_tools.evaluation import evaluate_files  # noqa: PLC0415  as above
     from optipmb_tools.evaluation.evaluate import (  # noqa: PLC0415  as above
         Evaluation,
-        FiguresTask,
         Settings,
         class_average,
         figures_of,
@@ -161,9 +160,10 @@ def _evaluated(
         if opened.name != "kitti" or how.distance is not None:  # AB3DMOT's protocol gives them at its own threshold
             head = [clear_table(results, metres=how.iou is None)]
     here = opened.sequences if executor.here else None
-    executor.start(figures_of, Evaluation(asked, tuple(opened.names), settings, names, here))
-    tasks = [FiguresTask(tracks, name, best.get(name)) for name in names]
-    figures = [one for found in bulk.values(executor, tasks, str, warn) for one in found]
+    executor.start(figures_of, Evaluation(asked, tuple(opened.names), tracks, settings, names, here))
+    tasks = [(name, best.get(name)) for name in names]
+    found = bulk.values(executor, tasks, lambda task: f"{task[0]} of {tracks}", warn)
+    figures = [one for each in found for one in each]
     if not figures:
         raise UsageError(f"{tracks}: neither the truth nor the tracks have objects of these classes")
     by_class = {one.name: {**parts.get(one.name, {}), **one.summary()} for one in figures}

@@ -189,11 +189,11 @@ def _report(refined: "Refined") -> Group:
         ("cross-validated", refined.crossed),
         ("after (on the tuning data)", refined.after),
     ):
-        for copy, row in zip(copies, rows, strict=False):
+        for copy, row in zip(copies, rows.figures if rows else (), strict=False):
             figures.add_row(title + copy, *cells_of(row, SHOWN))
     for fold in refined.folds:
-        figures.add_row(f"without {' '.join(fold.sequences)}: before", *cells_of(fold.before[0], SHOWN))
-        figures.add_row(f"without {' '.join(fold.sequences)}: after", *cells_of(fold.after[0], SHOWN))
+        figures.add_row(f"without {' '.join(fold.sequences)}: before", *cells_of(fold.before.figures[0], SHOWN))
+        figures.add_row(f"without {' '.join(fold.sequences)}: after", *cells_of(fold.after.figures[0], SHOWN))
     changes = _table("changed", "from", "to", "gain", "+-", "gains")
     for one in refined.changes:
         gains = f"{one.positive} of {one.groups}"
@@ -222,9 +222,8 @@ def _calibration(refined: "Refined") -> str:
 
 
 def _objective(refined: "Refined") -> str:
-    text = f"{refined.plan.metric}: before {refined.value_before:.4f}, after {refined.value_after:.4f}"
-    if refined.value_crossed is None:
+    text = f"{refined.plan.metric}: before {refined.before.value:.4f}, after {refined.after.value:.4f}"
+    if refined.crossed is None:
         return f"{text}; no sequences were left out, so how much of it holds elsewhere is not known"
-    gains = [fold.value_after - fold.value_before for fold in refined.folds]
-    shown = ", ".join(f"{gain:+.4f}" for gain in gains)
-    return f"{text}, cross-validated {refined.value_crossed:.4f}; gains on what was left out: {shown}"
+    shown = ", ".join(f"{fold.gain:+.4f}" for fold in refined.folds)
+    return f"{text}, cross-validated {refined.crossed.value:.4f}; gains on what was left out: {shown}"

@@ -16,6 +16,7 @@ from optipmb_schemas import Density, Detections, Keys, Message, MessageError, Po
 from optipmb_tools.commands.options import AsJson, LabelledOptions, report, say
 from optipmb_tools.commands.service_options import ServiceOptions, speed_of
 from optipmb_tools.extras import needed
+from optipmb_tools.table_files import SUFFIXES
 
 TOPICS: tuple[Topic, ...] = ("tracks", "detections", "problems", "points")
 KINDS: dict[str, type[Message]] = {
@@ -207,6 +208,8 @@ def plot(
     as_json: AsJson = False,
 ) -> None:
     """Draw the tracks of one sequence from above, with what was missed and confused where the truth is known."""
+    tables = ("table", "pyarrow") if any(one and one.suffix in SUFFIXES for one in (data.data, *tracks)) else ()
+    needed("optipmb plot", ",".join(("plot", *tables[:1])), "matplotlib", "scipy", *tables[1:])
     from optipmb_tools.evaluation import default_rules, evaluate_files  # noqa: PLC0415  loads the solvers of scipy
     from optipmb_tools.views.pictures import draw_results  # noqa: PLC0415  as above
 

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from optipmb_client.errors import UsageError
 from optipmb_schemas import FieldOfView, Tracks
 
-from optipmb_tools.class_names import class_like
 from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Bools, Floats, Ints, Pose
 from optipmb_tools.results import BoxTable
@@ -249,6 +248,18 @@ def chosen(names: Iterable[str], known: Mapping[str, _T], what: str, spelt: Call
                 raise DatasetError("--sequences", what, repr(name))
             wanted[one] = None
     return [known[one] for one in wanted]
+
+
+def class_like(name: str, names: Sequence[str]) -> str | None:
+    """Return the one of `names` that means the same class, as profiles match them; None for none or several.
+
+    `Car`, `car` and `vehicle.car` are one class. An equal name comes first, then one that differs in case only.
+    """
+    if name in names:
+        return name
+    from optipmb.class_names import like  # noqa: PLC0415  loads the tracker, which equal names do not need
+
+    return like(name, tuple(names))
 
 
 def relabelled(label: Ints, names: Sequence[str], labels: Sequence[str]) -> Ints:

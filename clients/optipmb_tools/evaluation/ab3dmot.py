@@ -11,7 +11,7 @@ nearest to r,
 and sAMOTA, AMOTA and AMOTP are the sums of sMOTA_r, MOTA_r and MOTP_r over the points that are reached, divided by L: a
 recall point that is missing counts zero. The single figures are those at the threshold with the highest MOTA.
 
-Where the paper leaves a choice, the choices are those of its published evaluation, so that figures can be compared:
+Where the paper leaves a choice, its published evaluation decides, so that figures can be compared:
 
 - Each frame is matched on its own: most pairs, then the greatest total overlap.
 - Truth boxes that are largely invisible, cut by the image's border, or vans (for cars) do not count, whether they are
@@ -96,7 +96,7 @@ class Ab3dmotResult:
         return sum(values) / POINTS if self.best.truth else float("nan")
 
     def summary(self) -> dict[str, float | int | None]:
-        """Return the figures by their usual names; None for those that are not defined."""
+        """Return the figures by their usual names; None where undefined."""
         best = self.best
         figures = {
             "sAMOTA": self.samota,
@@ -141,8 +141,8 @@ def evaluate_ab3dmot(cases: Sequence[Case], limit: float = IOU_LIMITS[0]) -> Ab3
 def recall_points(scores: Floats, count: int) -> list[tuple[float, float]]:
     """Return the thresholds and the recalls of the points that are reached.
 
-    The scores are gone through from the highest on, each adding 1 / count to the recall; a point is set at the first
-    score that is not farther from it than the next score is, and the last score sets one in any case.
+    From the highest on, each score adds 1 / count to the recall; a point is set at the first score that is not farther
+    from it than the next score is, and the last score sets one in any case.
 
     Args:
         scores: (S,) mean scores of the tracks of all matched boxes.

@@ -7,15 +7,15 @@ e = (x, y) and whose position has the covariance P, the normalised estimation er
 
 For a consistent tracker it is chi-square distributed with 2 degrees of freedom: its mean is 2, and 95 % of the errors
 lie in the 95 % ellipse, NEES <= 5.99. A larger mean says that the covariances are too small. The mean of N independent
-values lies with 95 % in the band of the chi-square distribution with 2 N degrees of freedom, divided by N
-(Bar-Shalom et al., 2001, section 5.4). Errors of one track in successive frames are not independent; the interval that
-is given beside the band is that of the mean itself, with whole objects as its independent samples.
+values lies with 95 % in the band of the chi-square distribution with 2 N degrees of freedom, divided by N (Bar-Shalom
+et al., 2001, section 5.4). Errors of one track in successive frames are not independent; the interval that follows the
+band is the interval of the mean itself, with whole objects as its independent samples.
 
 An existence probability is reliable when, of all tracks that are said to exist with about that probability, this share
 are matched to an object. The table has one row for each tenth.
 
-Matches are made in each frame on its own: most pairs up to 2 m apart, then the least total distance. What is ignored in
-`optipmb_tools.evaluation.cases.counted` is so here too.
+Matches are made in each frame on its own: most pairs up to 2 m apart, then the least total distance. Boxes that
+`optipmb_tools.evaluation.cases.counted` ignores are ignored here too.
 """
 
 from collections.abc import Iterable
@@ -29,8 +29,7 @@ from optipmb_tools.evaluation.cases import Rules, assign_frames, counted, most_p
 from optipmb_tools.evaluation.figures import defined
 from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Bools, Floats, Ints
-from optipmb_tools.results import ResultTable
-from optipmb_tools.results.full import FullTable
+from optipmb_tools.results import FullTable, ResultTable
 
 DECILES = 10
 
@@ -51,12 +50,12 @@ class Decile:
     predicted: float
     """Their mean probability; NaN where there are none."""
     observed: float
-    """Share of those that are matched to an object; NaN where there are none."""
+    """Share of these boxes that is matched to an object; NaN without any."""
 
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """Samples of one class; those of several sequences add up."""
+    """Samples of one class; results of several sequences add up."""
 
     nees: Floats
     """(N,) of the matched track boxes."""
@@ -124,7 +123,7 @@ class CalibrationResult:
         )
 
     def summary(self) -> dict[str, object]:
-        """Return the figures by name; None for those that are not defined."""
+        """Return the figures by name; None where undefined."""
         return {
             "NEES": defined(self.mean),
             "band": [defined(value) for value in self.band],
@@ -175,7 +174,7 @@ class Sample:
     true: Bools
     """(K,) whether the track is matched to an object."""
     offset: Floats
-    """(K, 2) centre of the track minus that of its object, metres; NaN where it has none."""
+    """(K, 2) offset of the track from its object, metres; NaN where it has none."""
     owner: Ints
     """(K,) id of the object, -1 where it has none."""
 

@@ -122,7 +122,7 @@ class Case:
         return self.truth_frame[self.truth_row]
 
     def matched(self, match: Ints) -> Bools:
-        """Return which pairs (P,) are those of a match (T,), as `match_frames` returns it."""
+        """Return which pairs (P,) belong to a match (T,) of `match_frames`."""
         return np.asarray(match[self.truth_row] == self.track_row, dtype=np.bool_)
 
     def pairs(self, kept: Bools) -> "Case":
@@ -149,7 +149,7 @@ class Case:
         """Return for each track row (K,) the mean score of its whole track."""
         _, which = np.unique(self.track_id, return_inverse=True)
         count = np.bincount(which)
-        # Tracks of equal scores are to have equal means, whatever summing them up has rounded.
+        # Rounding in the sum must not tell tracks of equal scores apart.
         return np.round(np.bincount(which, self.track_score) / np.maximum(count, 1), _DECIMALS)[which]
 
 
@@ -380,7 +380,7 @@ def track_changes(case: Case, match: Ints, counted: Bools, *, memory: bool = Tru
         case: truth and tracks.
         match: (T,) as `match_frames` returns it.
         counted: (T,) truth rows; matches of the others are no matches.
-        memory: the match before may be any earlier one; otherwise that of the object's row before.
+        memory: the match before may be any earlier one; otherwise only the object's previous row counts.
 
     """
     order = np.lexsort((case.truth_frame, case.truth_id))

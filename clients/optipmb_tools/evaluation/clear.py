@@ -48,7 +48,7 @@ class Miss(NamedTuple):
 
 @dataclass(frozen=True)
 class Counts:
-    """Counts of boxes and objects of one class; those of several sequences add up."""
+    """Counts of boxes and objects of one class; results of several sequences add up."""
 
     truth: int = 0
     """Truth boxes that count (GT)."""
@@ -115,14 +115,14 @@ class Counts:
 
 @dataclass(frozen=True)
 class ClearResult(Counts):
-    """CLEAR figures of one class; those of several sequences add up."""
+    """CLEAR figures of one class; results of several sequences add up."""
 
     changes: tuple[Switch, ...] = ()
     """Of identity, in order of sequences and frames."""
     misses: tuple[Miss, ...] = ()
 
     def summary(self) -> dict[str, float | None]:
-        """Return the figures by their usual names; None for those that are not defined."""
+        """Return the figures by their usual names; None where undefined."""
         objects = {"MT": self.mostly_tracked, "ML": self.mostly_lost, "objects": self.objects}
         return {name: defined(value) for name, value in {**self.figures(), **objects}.items()}
 

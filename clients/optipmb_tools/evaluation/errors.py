@@ -1,4 +1,4 @@
-"""Errors of boxes in every direction: those of tracks beside those of the detections that they are made of.
+"""Errors of boxes in every direction, of tracks and of the detections that they are made of.
 
 Conventions: world frame, metres and radians, box minus label. `along` and `across` are offsets of the centre along and
 across the heading of the label, `height` is that of the centre upwards. Headings are compared modulo pi; a box is
@@ -18,11 +18,10 @@ from optipmb_tools.datasets import DataSequence, DatasetError, Truth
 from optipmb_tools.evaluation.calibration import NORMAL_95, rows_of, sample
 from optipmb_tools.evaluation.cases import Rules
 from optipmb_tools.geometry import Bools, Floats, Ints, stack_poses, to_world, wrap_angle
-from optipmb_tools.results import ResultTable
-from optipmb_tools.results.full import FullTable
+from optipmb_tools.results import FullTable, ResultTable
 
 DIRECTIONS = ("along", "across", "height", "heading", "length", "width", "tall")
-"""Columns of the errors; the last three are those of the size."""
+"""Columns of the errors; the last three are errors of the size."""
 CONFIRMED = 0.5
 """Existence probability from which tracks count."""
 RANGES = (0.0, 20.0, 40.0, np.inf)
@@ -35,14 +34,14 @@ _HALF = 0.5 * np.pi
 
 @dataclass(frozen=True)
 class ErrorResult:
-    """Boxes of confirmed tracks of one class that are matched to a label; those of several sequences add up."""
+    """Boxes of confirmed tracks of one class that match a label; results of several sequences add up."""
 
     track: Floats
     """(N, 7) errors of tracks, headings in (-pi, pi]."""
     detection: Floats
     """(N, 7) errors of their detections; NaN where they were missed."""
     heading_variance: Floats
-    """(N,) that the tracks tell, rad^2."""
+    """(N,) of the tracks, rad^2."""
     distance: Floats
     """(N,) from the sensor, m."""
     speed: Floats
@@ -61,7 +60,7 @@ class ErrorResult:
         return np.asarray(np.isfinite(self.detection[:, 0]), dtype=np.bool_)
 
     def groups(self) -> Iterator[tuple[str, Bools]]:
-        """Yield what boxes are told apart by, with the boxes (N,) of each group: all, by range, by speed."""
+        """Yield the name and the boxes (N,) of each group: all, by range, by speed."""
         yield "all", np.ones(len(self.distance), dtype=np.bool_)
         for values, edges, unit in ((self.distance, RANGES, "m"), (self.speed, SPEEDS, "m/s")):
             for low, high in itertools.pairwise(edges):
@@ -103,13 +102,12 @@ def evaluate_errors(
 
     """
     none, boxes = np.empty(0), np.empty((0, len(DIRECTIONS)))
-    return sum((errors(*part, name, rules) for part in parts), ErrorResult(boxes, boxes, none, none, none))
+    return sum((_sequence_errors(*part, name, rules) for part in parts), ErrorResult(boxes, boxes, none, none, none))
 
 
-def errors(
+def _sequence_errors(
     sequence: DataSequence, truth: Truth, tracks: ResultTable, full: FullTable, name: str, rules: Rules
 ) -> ErrorResult:
-    """Return the errors of one class in one sequence; arguments as for `evaluate_errors`."""
     found = sample(truth, tracks, full, name, rules)
     rows, owner = found.row[found.true], found.owner[found.true]
     sure = full.existence[rows] >= CONFIRMED

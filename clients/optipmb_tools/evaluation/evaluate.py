@@ -6,7 +6,7 @@ taken in the world frame.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -23,8 +23,7 @@ from optipmb_tools.evaluation.figures import defined
 from optipmb_tools.evaluation.gospa import CUTOFF, ORDER, GospaResult, evaluate_gospa
 from optipmb_tools.evaluation.hota import HotaResult, evaluate_hota
 from optipmb_tools.evaluation.tracks import read_compared, read_full_tracks
-from optipmb_tools.results import ResultTable
-from optipmb_tools.results.full import FullTable, full_path, read_full
+from optipmb_tools.results import FullTable, ResultTable, full_path, read_full
 from optipmb_tools.results.nuscenes import read_nuscenes_results, result_table
 
 _ROUNDING = 1e-9
@@ -55,7 +54,7 @@ def evaluate_files(
     Args:
         sequences: each must have a truth.
         results: the folder of the result files, or a table of tracks.
-        names: classes; those that occur neither in the truth nor in the results are left out.
+        names: classes; a class that occurs neither in the truth nor in the results is left out.
         rules: how to compare.
         warn: is called with each assumption.
 
@@ -130,7 +129,7 @@ class ClassFigures:
     """Likewise."""
 
     def summary(self) -> dict[str, object]:
-        """Return the figures by name; None for those that are not there."""
+        """Return the figures by name; None where missing."""
         parts = {"all": self.everything, "best": self.best}
         return {
             "ab3dmot": {f"{result.limit:g}": result.summary() for result in self.ab3dmot},
@@ -176,7 +175,7 @@ def _nuscenes_recordings(sequences: Sequence[DataSequence], results: Path) -> li
         if truth is None:
             raise DatasetError(f"sequence {sequence.name}", "annotations to compare with", "none")
         table = result_table(submission, sequence.name, sequence.samples)
-        # The benchmark compares only what is near, by class; truth farther away is ignored already.
+        # The benchmark compares near boxes only, by class; truth farther away is ignored already.
         reach = np.array([CLASS_RANGE.get(name, 0.0) for name in table.labels] or [0.0])
         near = sequence.ego_distance(table.frame, table.center) < reach[table.label]
         beside = full_path(submission.path.parent / "scenes" / f"{sequence.name}.json")
@@ -265,50 +264,37 @@ def evaluate_figures(
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Data that all tasks share; can be sent to another process without `here`."""
+    """Data of one tracker that all tasks share; can be sent to another process without `here`."""
 
     data: DatasetArguments
     names: tuple[str, ...]
     """Of the sequences."""
+    tracks: Path
     settings: Settings
     classes: tuple[str, ...] = ()
-    """By whose names those of truth and tracks are called."""
+    """Names that classes of truth and tracks are mapped to."""
     here: Sequence[DataSequence] | None = None
     """The sequences, where this process has opened them."""
-    _loaded: dict[Path, Sequence[Recording]] = field(default_factory=dict)
 
     @cached_property
-    def sequences(self) -> Sequence[DataSequence]:
-        """The sequences; a process opens them once."""
-        return self.here or self.data.open().sequences(self.names)
-
-    def recordings(self, tracks: Path) -> Sequence[Recording]:
-        """Return truth and tracks; those of the last tracker are kept."""
-        if tracks not in self._loaded:
-            self._loaded.clear()
-            self._loaded[tracks] = load_recordings(self.data.name, self.sequences, tracks, self.classes)
-        return self._loaded[tracks]
+    def recordings(self) -> Sequence[Recording]:
+        """Truth and tracks; a process reads them once."""
+        sequences = self.here or self.data.open().sequences(self.names)
+        return load_recordings(self.data.name, sequences, self.tracks, self.classes)
 
 
-@dataclass(frozen=True)
-class FiguresTask:
-    """The figures of one class of one tracker."""
+def figures_of(shared: Evaluation, task: tuple[str, float | None]) -> list[ClassFigures]:
+    """Return the figures of one class; none for a class that neither truth nor tracks have.
 
-    tracks: Path
-    name: str
-    threshold: float | None
-    """Of the tracks that are also evaluated without the others; None: as `evaluate_figures` chooses it."""
-
-    def __str__(self) -> str:
-        return f"{self.name} of {self.tracks}"
-
-
-def figures_of(shared: Evaluation, task: FiguresTask) -> list[ClassFigures]:
-    """Return the figures of one class of one tracker; none for a class that neither truth nor tracks have.
+    Args:
+        shared: data.
+        task: the class, and the threshold of the tracks that are also evaluated without the others; None: as
+            `evaluate_figures` chooses it.
 
     Raises:
         DatasetError: as `load_recordings`.
+
     """
-    thresholds: Mapping[str, float] = {} if task.threshold is None else {task.name: task.threshold}
-    recordings = shared.recordings(task.tracks)
-    return evaluate_figures(shared.data.name, recordings, (task.name,), shared.settings, thresholds)
+    name, threshold = task
+    thresholds: Mapping[str, float] = {} if threshold is None else {name: threshold}
+    return evaluate_figures(shared.data.name, shared.recordings, (name,), shared.settings, thresholds)

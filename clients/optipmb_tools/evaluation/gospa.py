@@ -5,9 +5,10 @@ optimal sub-pattern assignment metric (Rahmathullah et al., 2017; alpha = 2) of 
 
     GOSPA = ( sum over pairs of d^p + c^p / 2 (missed + false) )^(1/p)
 
-for the best choice of pairs with d < c: what is not paired is missed or false. Its three parts, each raised to 1/p, are
-given too; the p-th power of GOSPA is the sum of the p-th powers of the parts. The optimal sub-pattern assignment metric
-(Schuhmacher et al., 2008) is bounded by c; with m <= n the sizes of the two sets, all m are paired and
+for the best choice of pairs with d < c; an object without a pair is missed, a track without one is false. Its three
+parts, each raised to 1/p, are given too; the p-th power of GOSPA is the sum of the p-th powers of the parts. The
+optimal sub-pattern assignment metric (Schuhmacher et al., 2008) is bounded by c; with m <= n the sizes of the two sets,
+all m are paired and
 
     OSPA = ( 1/n ( sum over pairs of min(d, c)^p + c^p (n - m) ) )^(1/p)
 
@@ -65,19 +66,11 @@ def evaluate_gospa(parts: Iterable[tuple[Case, int]], rules: Rules, order: float
         order: p, at least 1.
 
     """
-    return sum((gospa(counted(case, rules), frames, rules.limit, order) for case, frames in parts), GospaResult())
+    return sum((_gospa(counted(case, rules), frames, rules.limit, order) for case, frames in parts), GospaResult())
 
 
-def gospa(case: Case, frames: int, cutoff: float = CUTOFF, order: float = ORDER) -> GospaResult:
-    """Return the figures of one sequence in which everything counts.
-
-    Args:
-        case: truth, tracks, and the pairs up to the cut-off with their distance as cost.
-        frames: how many are compared.
-        cutoff: c, metres.
-        order: p, at least 1.
-
-    """
+def _gospa(case: Case, frames: int, cutoff: float, order: float) -> GospaResult:
+    """Return the figures of one sequence in which everything counts."""
     near = case.pairs(case.cost < cutoff)
     power = near.cost**order
     limit = cutoff**order

@@ -87,7 +87,7 @@ class HotaResult:
         return np.asarray(self.true + self.missed + self.false > 0, dtype=np.bool_)
 
     def summary(self) -> dict[str, float | None]:
-        """Return the figures by their usual names; None for those that are not defined."""
+        """Return the figures by their usual names; None where undefined."""
         figures = {"HOTA": self.hota, "DetA": self.deta, "AssA": self.assa, "LocA": self.loca}
         return {name: defined(value) for name, value in figures.items()}
 
@@ -104,17 +104,11 @@ def evaluate_hota(cases: Iterable[Case], rules: Rules) -> HotaResult:
         rules: those by which the cases were prepared.
 
     """
-    return sum((hota(part, similarity(part, rules)) for part in (counted(case, rules) for case in cases)), NOTHING)
+    return sum((_hota(part, similarity(part, rules)) for part in (counted(case, rules) for case in cases)), NOTHING)
 
 
-def hota(case: Case, alike: Floats) -> HotaResult:
-    """Return the figures of one sequence in which everything counts.
-
-    Args:
-        case: truth, tracks and pairs.
-        alike: (P,) similarity of the pairs in [0, 1]; pairs that are not listed have 0.
-
-    """
+def _hota(case: Case, alike: Floats) -> HotaResult:
+    """Return the figures of one sequence in which everything counts, with the similarity (P,) of its pairs."""
     pairs = np.flatnonzero(alike > 0.0)
     truth, track, alike = case.truth_row[pairs], case.track_row[pairs], alike[pairs]
     lives = _Lives(case, truth, track)

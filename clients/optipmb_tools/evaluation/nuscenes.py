@@ -6,8 +6,8 @@ for truth and tracks alike: a box must be nearer to the car than the range of it
 centre lies in an annotated bicycle rack are dropped. Truth without LiDAR and radar points is dropped as well. Then
 every object and every track is filled in between its first and its last remaining box.
 
-Matching. In a frame, an object keeps the track that it matched last, wherever that was, if the two are near enough; of
-several objects that claim one track the first has it. What is left is matched so that there are as many matches as
+Matching. In a frame, an object keeps the track that it matched last, in any earlier frame, if the two are near enough;
+of several objects that claim one track the first has it. The others are matched so that there are as many matches as
 possible and their total distance is the least (CLEAR MOT; Bernardin and Stiefelhagen, 2008). A match with another track
 than the last one is a switch.
 
@@ -54,7 +54,7 @@ class NuScenesConfig:
     """The settings of the benchmark; the defaults are the official ones (tracking_nips_2019)."""
 
     class_range: Mapping[str, float] = field(default_factory=lambda: dict(CLASS_RANGE))
-    """Metres from the car, by class; its classes are those that are evaluated."""
+    """Metres from the car, by class; these classes are evaluated."""
     match_distance: float = 2.0
     """Metres in the plane below which a track may match an object."""
     min_recall: float = 0.1
@@ -177,7 +177,7 @@ def interpolate(boxes: TrackBoxes, stamp_us: Ints) -> TrackBoxes:
 
     A missing box lies on the line between its neighbours in time. The official tools weigh the later neighbour by how
     far it is away instead of by how near; this does as they do, for only so the figures can be compared. For a single
-    missing frame, the usual case, both come to nearly the same. Its class is that of the later neighbour.
+    missing frame, the usual case, both come to nearly the same. Its class is taken from the later neighbour.
 
     Args:
         boxes: ordered by frame; an id at most once in a frame.
@@ -297,7 +297,7 @@ class NuScenesFigures:
     """Mean longest time for which an object is not tracked, seconds."""
 
     def to_json(self) -> dict[str, float | None]:
-        """Return the figures by name; None for those that are not defined."""
+        """Return the figures by name; None where undefined."""
         return {name: defined(value) for name, value in asdict(self).items()}
 
 
@@ -315,7 +315,7 @@ class NuScenesClass:
     """At each of `recalls`; None where it is not reached."""
 
     def to_json(self) -> dict[str, float | None]:
-        """Return the figures by name; None for those that are not defined."""
+        """Return the figures by name; None where undefined."""
         return {name: defined(value) for name, value in self.figures().items()}
 
     def figures(self) -> dict[str, float]:
@@ -450,7 +450,7 @@ def evaluate_nuscenes(
     Args:
         root: the folder of the dataset.
         results: a file in the layout of tracking submissions, or the folder with `tracking_results.json`.
-        sequences: scenes and splits to evaluate; by default those of which the file has samples.
+        sequences: scenes and splits to evaluate; by default all with samples in the file.
         config: other settings than the official ones.
 
     Raises:

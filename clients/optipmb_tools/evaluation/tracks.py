@@ -6,14 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from optipmb_tools.class_names import class_like
 from optipmb_tools.datasets import DataSequence, DatasetError, Truth
+from optipmb_tools.datasets.interface import class_like
 from optipmb_tools.datasets.kitti import KittiSequence
 from optipmb_tools.datasets.nuscenes import NuScenesSequence
-from optipmb_tools.datasets.table import TableSequence
-from optipmb_tools.datasets.table.dataset import ObjectTable, TableOptions, read_objects
-from optipmb_tools.results import ResultTable, empty_table
-from optipmb_tools.results.full import FullTable, full_path, read_full
+from optipmb_tools.datasets.table import ObjectTable, TableOptions, TableSequence, read_objects
+from optipmb_tools.results import FullTable, ResultTable, empty_table, full_path, read_full
 from optipmb_tools.results.kitti import LEAST_SHOWN, read_kitti_results
 from optipmb_tools.results.nuscenes import NUSCENES_FILE, read_nuscenes_results, result_table
 from optipmb_tools.table_files import SUFFIXES, is_table
@@ -21,7 +19,7 @@ from optipmb_tools.table_files import SUFFIXES, is_table
 __all__ = ["read_compared", "read_full_tracks", "read_tracks"]
 
 _OTHERS = ("Van", "Truck", "Person_sitting", "Person", "Tram")
-"""Classes of KITTI that are no other names of those that are evaluated."""
+"""Classes of KITTI that are no synonyms of evaluated ones."""
 
 
 def read_compared(
@@ -88,7 +86,7 @@ def read_tracks(results: Path, sequence: DataSequence) -> ResultTable:
     Args:
         results: a table of tracks of one or more sequences, or a folder with `NAME.txt` (KITTI) or a table `NAME.*`;
             for nuScenes also a result file of its benchmark, or its folder.
-        sequence: what was tracked.
+        sequence: the tracked sequence.
 
     Raises:
         DatasetError: there is no such file, or it is wrong, or has frames that the sequence lacks.

@@ -20,7 +20,7 @@ import numpy as np
 from optipmb_schemas import Tracks
 
 from optipmb_tools.camera import Camera, alpha_of, kitti_from_sensor, sensor_from_kitti
-from optipmb_tools.class_names import class_like
+from optipmb_tools.datasets.interface import class_like
 from optipmb_tools.files import DatasetError, numbers, read_rows, write_whole
 from optipmb_tools.geometry import PoseLike, rotation_of, to_sensor
 from optipmb_tools.results import ResultTable

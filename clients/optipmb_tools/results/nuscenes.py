@@ -27,7 +27,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from optipmb_schemas import Tracks
 
-from optipmb_tools.class_names import class_like
+from optipmb_tools.datasets.interface import class_like
 from optipmb_tools.files import DatasetError, read_text, write_whole
 from optipmb_tools.geometry import Floats, Ints
 from optipmb_tools.results import ResultTable, stacked

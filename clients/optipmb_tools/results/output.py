@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from optipmb_schemas import Tracks
 
-from optipmb_tools.results import stacked
-from optipmb_tools.results.full import full_path, write_full
+from optipmb_tools.results import full_path, stacked, write_full
 from optipmb_tools.table_files import Columns, is_table, write_table
 
 if TYPE_CHECKING:

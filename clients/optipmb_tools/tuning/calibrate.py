@@ -6,13 +6,13 @@ Everything is tracked once for each memory that is tried. Then, of the tracks by
   knots, one for each range of probability that occurs. The memory is the one with the least log loss in sequences that
   are left out in turn.
 - along, across: in each fifth of the matched tracks, the standard deviation that has to be added to the filter's for
-  the mean squared error to be what is expected, NEES = 2; then both times one factor, so that NEES = 2 in sequences
+  the mean squared error to be the expected one, NEES = 2; then both times one factor, so that NEES = 2 in sequences
   that are left out in turn, too, where errors are always a little larger than where they were measured.
 
 Centres within two metres match, as in `optipmb_tools.evaluation.calibration`.
 
 Benchmarks rank a track by the mean of its scores, on which the averages over recalls and the best threshold depend. The
-same tracks are ranked by several scores that are known when a frame is published: that of the paper,
+same tracks are ranked by several scores that are known when a frame is published: the score of the paper,
 x_s = [1 - exp(-x_len)] z_s; the mean of the detections' scores so far; the existence probability; the product and the
 mean of it and x_s; the evidence, and the mean of it and x_s.
 """
@@ -28,11 +28,9 @@ from scipy.optimize import brentq, isotonic_regression
 from optipmb import Calibration, Parameters
 from optipmb_tools.evaluation.calibration import CalibrationResult, calibration, sample
 from optipmb_tools.geometry import Bools, Floats
-from optipmb_tools.results import ResultTable
-from optipmb_tools.results.full import FullTable
+from optipmb_tools.results import FullTable, ResultTable
 from optipmb_tools.tuning.clips import Clip, track_fully
-from optipmb_tools.tuning.objective import folds_of, standard_error, without_folds
-from optipmb_tools.tuning.scoring import Figures, Scorer, metric
+from optipmb_tools.tuning.scoring import Figures, Scorer, folds_of, metric, standard_error, without_folds
 from optipmb_tools.tuning.values import rounded, with_calibration, with_values
 
 MEMORIES = (0.3, 0.5, 0.7, 0.8)
@@ -80,7 +78,7 @@ def calibrate(
     Args:
         clips: with this class only.
         scorer: of the class.
-        parameters: those that the tracks are made with, with this class only.
+        parameters: of the tracks, with this class only.
         memory: the one to take; None tries several.
 
     """

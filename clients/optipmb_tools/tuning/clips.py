@@ -15,8 +15,7 @@ from optipmb_tools.camera import Camera
 from optipmb_tools.datasets import DataSequence, DatasetError, Truth
 from optipmb_tools.evaluation import Rules
 from optipmb_tools.geometry import Floats, Ints, stack_poses, to_sensor, wrap_angle
-from optipmb_tools.results import ResultTable, stacked
-from optipmb_tools.results.full import COLUMNS, FullTable
+from optipmb_tools.results import COLUMNS, FullTable, ResultTable, stacked
 from optipmb_tools.results.kitti import LEAST_SHOWN
 from optipmb_tools.run.tracking import tracker_frame
 

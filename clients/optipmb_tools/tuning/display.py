@@ -62,7 +62,7 @@ class TrialDisplay:
             self._print(f"{self._name}: trial {self._done} of {self._total}, {text}, {left:.0f} s left")
 
     def note(self, text: str) -> None:
-        """Show what is being done."""
+        """Show the current step."""
         if self._bar is not None:
             self._bar.update(self._task, description=text)
         else:

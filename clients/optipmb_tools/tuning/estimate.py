@@ -1,33 +1,37 @@
 """Estimates of a class from training data, without tracking: noise, motion, births, detections and false ones.
 
 Each figure comes from one place: R from detections minus labels, Q from the labels' trajectories, P^0 from the first
-detection of each object, p_d0 and mu_c / A from what is found and what is false. Standard deviations are winsorised
-(`spread`), for detections and labels are wrong in a few places by much. Estimates are where a search begins, not where
-it must end: a detector's errors last over frames, labels have errors of their own, and a motion model has to cover what
-it leaves out.
+detection of each object, p_d0 and mu_c / A from the found labels and the false detections. Standard deviations are
+winsorised (`spread`), for detections and labels are wrong in a few places by much. Estimates are where a search begins,
+not where it must end: a detector's errors last over frames, labels have errors of their own, and a motion model has to
+cover what it leaves out.
+
+Detections and labels belong together in the world frame: in each frame as many pairs as possible are made within a
+distance, and of those ways the one of least total distance is taken.
+
+The curve from a detector's scores to a reference detector's scores is of equal precision, the share of detections with
+about this score that belong to a label. Detections are put into groups of neighbouring scores, equally many in each
+where scores do not tie. Isotonic regression of the groups' precision on their mean log odds (pool adjacent violators:
+Barlow et al., 1972) merges them into blocks of ascending precision, for both detectors. The curve has a knot for each
+block of the detector: from its score to the score at which the reference, linear in log odds between its own blocks,
+has the same precision. Outside the precisions that the reference reaches the curve has one knot at their end.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from scipy.optimize import isotonic_regression
 
-from optipmb import Parameters
+from optipmb import Parameters, ScoreCalibration
 from optipmb_tools.evaluation import Rules
-from optipmb_tools.geometry import Floats, Ints, wrap_angle
+from optipmb_tools.evaluation.cases import assign_frames, most_pairs, prepare
+from optipmb_tools.evaluation.figures import ratio
+from optipmb_tools.geometry import Bools, Floats, Ints, to_sensor, wrap_angle
+from optipmb_tools.results import ResultTable
 from optipmb_tools.tuning.clips import Clip
-from optipmb_tools.tuning.pairing import (
-    Pairs,
-    Residuals,
-    Trajectory,
-    detected,
-    pair_detections,
-    residuals,
-    trajectories,
-)
-from optipmb_tools.tuning.score_curves import counted_scores
 from optipmb_tools.tuning.values import Value, rounded, value_of
 
 WINDOW_S = 1.0
@@ -45,6 +49,180 @@ _NORMAL = 1.482602218505602
 """Standard deviation of a Gaussian in units of its median absolute value."""
 _REACH = 3.0
 _LEAST_POINTS = 4
+GROUPS = 25
+LEAST_TRUE = 50
+"""With fewer detections on labels, of either detector, there is no curve."""
+_BOUND = 1e-6
+_DIGITS = 3
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """One labelled object."""
+
+    frame: Ints
+    """(R,) ascending"""
+    time: Floats
+    """(R,) s"""
+    position: Floats
+    """(R, 2) m"""
+    yaw: Floats
+    """(R,) rad"""
+    velocity: Floats
+    """(R, 2) m/s; NaN where unknown"""
+    ignored: Bools
+    """(R,)"""
+
+
+def trajectories(clip: Clip, name: str) -> dict[int, Trajectory]:
+    """Return the labelled objects of a class by id."""
+    truth = clip.world.take(clip.world.names == name)
+    stamps = clip.stamps
+    found = {}
+    for identity in np.unique(truth.id).tolist():
+        rows = np.flatnonzero(truth.id == identity)
+        rows = rows[np.argsort(truth.frame[rows], kind="stable")]
+        frame = truth.frame[rows]
+        found[identity] = Trajectory(
+            frame=frame,
+            time=(stamps[frame] - stamps[0]) * 1e-9,
+            position=truth.center[rows, :2],
+            yaw=truth.yaw[rows],
+            velocity=_velocities(truth.velocity[rows], (stamps[frame] - stamps[0]) * 1e-9, truth.center[rows, :2]),
+            ignored=truth.ignored[rows],
+        )
+    return found
+
+
+def _velocities(given: Floats, time: Floats, position: Floats) -> Floats:
+    """Return the labels' velocities; where they have none, from the positions before and after."""
+    if len(time) < 3 or np.isfinite(given).all():  # noqa: PLR2004  one before, one after
+        return given
+    return np.where(np.isfinite(given), given, np.gradient(position, time, axis=0))
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Detections of one class, and which label each belongs to; rows are ordered by frame."""
+
+    clip: str
+    frame: Ints
+    """(M,)"""
+    score: Floats
+    """(M,)"""
+    place: Floats
+    """(M, 2) in the sensor frame, m"""
+    position: Floats
+    """(M, 2)"""
+    yaw: Floats
+    """(M,)"""
+    velocity: Floats
+    """(M, 2); NaN where unknown"""
+    object: Ints
+    """(M,) id of the label; -1 for none"""
+    false: Bools
+    """(M,) belongs to no label and is not excused"""
+    truth: int
+    """Labels that count"""
+    found: int
+    """Labels that a detection belongs to"""
+    frames: int
+
+
+def pair_detections(clip: Clip, name: str, least: float, limit: float, rules: Rules) -> Pairs:
+    """Pair the detections of a class with its labels.
+
+    Args:
+        clip: with this class only.
+        name: the class.
+        least: lowest score of the detections that are used.
+        limit: largest distance of a pair, m.
+        rules: which labels are ignored, and which detections are excused.
+
+    """
+    frames = clip.frames
+    when: Ints = np.repeat(np.arange(len(frames)), [len(frame.score) for frame in frames]).astype(np.int64)
+    columns: dict[str, Floats] = {key: np.concatenate([getattr(frame, key) for frame in frames]) for key in _COLUMNS}
+    use = columns["score"] >= least
+    when = when[use]
+    center, size, yaw, velocity, score = (columns[key][use] for key in _COLUMNS)
+    local, turned = to_sensor(clip.rotation[when], clip.translation[when], center, yaw)
+    image = clip.camera.boxes(local, size, turned)[0] if clip.camera else np.full((len(when), 4), np.nan)
+    rows = np.arange(len(when))
+    table = ResultTable((name,), when, rows, np.zeros_like(rows), local, size, turned, score, image)
+    near = Rules("distance", limit, neighbours=rules.neighbours, min_height=rules.min_height, regions=rules.regions)
+    case = prepare(clip.truth, table, name, near)
+    pairs = assign_frames(case.pair_frame, case.truth_row, case.track_row, case.cost, most_pairs)
+    label, matched = case.truth_row[pairs], case.track_row[pairs]
+    owner = np.full(len(when), -1, dtype=np.int64)
+    # Labels of a class alike are ignored, and no examples of this one.
+    names = clip.truth.take(np.argsort(clip.truth.frame, kind="stable")).names
+    same = names[label] == name
+    owner[matched[same]] = case.truth_id[label[same]]
+    false = ~case.excused
+    false[matched] = False
+    return Pairs(
+        clip=clip.name,
+        frame=when,
+        score=score,
+        place=local[:, :2],
+        position=center[:, :2],
+        yaw=yaw,
+        velocity=velocity,
+        object=owner,
+        false=false,
+        truth=int((~case.ignored).sum()),
+        found=int((~case.ignored[label]).sum()),
+        frames=len(frames),
+    )
+
+
+_COLUMNS = ("center", "size", "yaw", "velocity", "score")
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Detections against their labels, ordered by object and then by frame."""
+
+    gap: Floats
+    """(H,) s since the detection before of the same object; NaN for the first"""
+    position: Floats
+    """(H, 2) m"""
+    heading: Floats
+    """(H,) rad in [-pi, pi)"""
+    velocity: Floats
+    """(H, 2) m/s; NaN where one of the two is unknown"""
+
+    @property
+    def first(self) -> Bools:
+        """(H,) the first detection of an object."""
+        return np.isnan(self.gap)
+
+
+def residuals(pairs: Sequence[Pairs], paths: Sequence[dict[int, Trajectory]]) -> Residuals:
+    """Return detection minus label of all pairs."""
+    parts = [(np.empty(0), np.empty((0, 2)), np.empty(0), np.empty((0, 2)))]
+    parts += [
+        (
+            np.diff(path.time[at], prepend=np.nan),
+            found.position[rows] - path.position[at],
+            wrap_angle(found.yaw[rows] - path.yaw[at]),
+            found.velocity[rows] - path.velocity[at],
+        )
+        for found, path, rows, at in detected(pairs, paths)
+    ]
+    return Residuals(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def detected(
+    pairs: Sequence[Pairs], paths: Sequence[dict[int, Trajectory]]
+) -> Iterator[tuple[Pairs, Trajectory, Ints, Ints]]:
+    """Yield each detected object: its recording, its path, and the rows of its detections in both."""
+    for found, objects in zip(pairs, paths, strict=True):
+        for identity, path in objects.items():
+            rows = np.flatnonzero(found.object == identity)
+            if len(rows):
+                yield found, path, rows, np.searchsorted(path.frame, found.frame[rows])
 
 
 @dataclass(frozen=True)
@@ -121,7 +299,7 @@ def estimate(clips: Sequence[Clip], name: str, parameters: Parameters, rules: Ru
     count = len(errors.heading)
     values: dict[str, float] = {}
     clutter_area = _area(pairs)
-    clutter = _ratio(sum(int(one.false.sum()) for one in pairs), sum(one.frames for one in pairs))
+    clutter = ratio(sum(int(one.false.sum()) for one in pairs), sum(one.frames for one in pairs))
     gap = _longest_gap(pairs, paths, parameters.nominal_period)
     if count >= LEAST_PAIRS:
         values |= _measurement(errors)
@@ -146,7 +324,7 @@ def estimate(clips: Sequence[Clip], name: str, parameters: Parameters, rules: Ru
         flip_rate=flips,
         lasting=_lasting(errors, parameters.nominal_period),
         usual_position=usual(errors.position),
-        detection=_ratio(sum(one.found for one in pairs), sum(one.truth for one in pairs)),
+        detection=ratio(sum(one.found for one in pairs), sum(one.truth for one in pairs)),
         clutter=clutter,
         clutter_area=clutter_area,
         longest_gap=gap,
@@ -179,8 +357,8 @@ def _measurement(errors: Residuals) -> dict[str, float]:
 def _process(paths: Sequence[Trajectory], period: float) -> dict[str, float]:
     """Return Q: how much speed, acceleration, heading and turn rate change between neighbouring pieces.
 
-    The change of each over a time tau has the variance q^2 tau, beside what the model foresees and what the fit's own
-    error adds; position follows the model within the error of labels, and keeps what the profile has.
+    The change of each over a time tau has the variance q^2 tau, in addition to the model's prediction and the fit's own
+    error; position follows the model within the error of labels, and keeps what the profile has.
     """
     window = max(WINDOW_S, 4.0 * period)
     changes: list[Floats] = []
@@ -240,7 +418,7 @@ def _birth(errors: Residuals, pairs: Sequence[Pairs], paths: Sequence[dict[int, 
         "birth.position": spread(errors.position[first]),
         "birth.heading": spread(wrap_angle(2.0 * errors.heading[first]) / 2.0),
         "birth.speed": spread(velocity[np.isfinite(velocity).all(axis=1)]),
-        # Most objects of many classes stand; those that do not are the ones that need it.
+        # Most objects of many classes stand; the moving ones need it.
         "birth.unknown_speed": float(np.sqrt(np.mean(speeds**2))) if len(speeds) else math.nan,
     }
 
@@ -300,13 +478,9 @@ def _platt(score: Floats, true: np.ndarray) -> tuple[float, float]:
         bend = (design * (odds * (1.0 - odds))[:, None]).T @ design + 0.1 * np.eye(2)
         step = np.linalg.solve(bend, slope)
         weights = weights + np.clip(step, -1.0, 1.0)
-        if np.abs(step).max() < 1e-9:  # noqa: PLR2004  far below what is shown
+        if np.abs(step).max() < 1e-9:  # noqa: PLR2004  far below the digits shown
             break
     return float(weights[0]), float(weights[1])
-
-
-def _ratio(part: float, whole: float) -> float:
-    return part / whole if whole else math.nan
 
 
 def usual(errors: Floats) -> float:
@@ -385,3 +559,56 @@ def _fit(time: Floats, position: Floats, yaw: Floats) -> tuple[float, ...]:
         scatter_yaw * float(inverse_yaw[0, 0]),
         scatter_yaw * float(inverse_yaw[1, 1]),
     )
+
+
+def counted_scores(pairs: Sequence[Pairs]) -> tuple[Floats, Bools]:
+    """Return the scores of the detections that belong to a label or to none without excuse, and which do."""
+    score = np.concatenate([one.score for one in pairs]) if pairs else np.empty(0)
+    true = np.concatenate([one.object >= 0 for one in pairs]) if pairs else np.empty(0, dtype=np.bool_)
+    counted = true | (np.concatenate([one.false for one in pairs]) if pairs else true)
+    return score[counted], true[counted]
+
+
+def score_curve(own: Sequence[Pairs], reference: Sequence[Pairs]) -> ScoreCalibration | None:
+    """Return the curve from a detector's scores to the reference's; None where there is too little to measure it.
+
+    Args:
+        own: all detections of one class, paired with its labels.
+        reference: the same of the reference detector.
+    """
+    samples = [counted_scores(pairs) for pairs in (own, reference)]
+    if min(int(true.sum()) for _, true in samples) < LEAST_TRUE:
+        return None
+    (odds, precision), (known_odds, known) = (_blocks(score, true) for score, true in samples)
+    # Of the knots at or beyond an end of the reference's precisions, the innermost.
+    first = max(int(np.searchsorted(precision, known[0], side="right")) - 1, 0)
+    last = int(np.searchsorted(precision, known[-1], side="left"))
+    within = slice(first, last + 1)
+    meant = np.interp(precision[within], known, known_odds)
+    knots: list[tuple[float, float]] = []
+    for pair in zip(_rounded_scores(odds[within]), _rounded_scores(meant), strict=True):
+        if not knots or (pair[0] > knots[-1][0] and pair[1] > knots[-1][1]):  # equal only by rounding
+            knots.append(pair)
+    if len(knots) <= 1:  # a curve has two
+        return None
+    return ScoreCalibration(detector=tuple(one for one, _ in knots), calibrated=tuple(one for _, one in knots))
+
+
+def _blocks(score: Floats, true: Bools) -> tuple[Floats, Floats]:
+    """Return the mean log odds and the precision of blocks of scores; both ascend strictly."""
+    bounded = np.clip(score, _BOUND, 1.0 - _BOUND)
+    odds = np.log(bounded / (1.0 - bounded))
+    edges = np.unique(np.quantile(odds, np.linspace(0.0, 1.0, GROUPS + 1)[1:-1], method="nearest"))
+    _, group = np.unique(np.searchsorted(edges, odds, side="right"), return_inverse=True)
+    count = np.bincount(group).astype(np.float64)
+    found = isotonic_regression(np.bincount(group, true) / count, weights=count)
+    starts = found.blocks[:-1]
+    weight = np.add.reduceat(count, starts)
+    return np.add.reduceat(np.bincount(group, odds), starts) / weight, np.asarray(found.x[starts], dtype=np.float64)
+
+
+def _rounded_scores(odds: Floats) -> list[float]:
+    """Return the scores of log odds, with as many digits as the smaller of score and rest needs."""
+    scores = 1.0 / (1.0 + np.exp(-odds))
+    places = _DIGITS - 1 - np.floor(np.log10(np.minimum(scores, 1.0 - scores))).astype(np.int64)
+    return [round(score, place) for score, place in zip(scores.tolist(), places.tolist(), strict=True)]

@@ -1,6 +1,6 @@
 """Tuning of one class: estimate, search with folds left out, search on all sequences, report.
 
-The sequences that score a result and those that it was chosen on are never the same: for each fold that is left out
+The sequences that score a result never chose it: for each fold that is left out
 there is a search of its own on the rest, and its result is scored on the fold. The profile comes from one more search,
 on all sequences. Both are kept in one file, from which an interrupted session continues.
 """
@@ -20,8 +20,7 @@ from optipmb_tools.tuning.calibrate import Ranking, calibrate, cross_calibration
 from optipmb_tools.tuning.clips import Clip, Degradation, degrade
 from optipmb_tools.tuning.display import TrialDisplay
 from optipmb_tools.tuning.estimate import estimate
-from optipmb_tools.tuning.objective import MARGIN, Objective, folds_of
-from optipmb_tools.tuning.scoring import Figures, Measured, Scorer, plain_figures
+from optipmb_tools.tuning.scoring import MARGIN, Figures, Gain, Measured, Objective, Scorer, folds_of, plain_figures
 from optipmb_tools.tuning.search import Dimension, Search, Values, dimensions, penalty, repaired
 from optipmb_tools.tuning.values import Value, only, value_of, with_calibration, with_heading_sign, with_values
 
@@ -32,9 +31,6 @@ WORTH = 0.0002
 _EVIDENCE_WEIGHTS = (0.0, 0.5, 1.0)
 _SETTLED = ("metric", "copies", "seed", "everything")
 """Settings of a plan on which the trials depend; their number is not among them, so there can be more later."""
-
-Made = Callable[[Values], Parameters]
-"""From changed values to the parameters of the candidate."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +44,7 @@ class Plan:
     """Of each search with a fold left out."""
     folds: int = 3
     copies: int = 1
-    """Degraded copies of the detections beside the plain ones."""
+    """Degraded copies of the detections, in addition to the plain ones."""
     seed: int = 0
     everything: bool = False
     """Search the values of the paper's table too."""
@@ -71,16 +67,27 @@ class ChangedValue:
 
 
 @dataclass(frozen=True)
+class Scored:
+    """Figures of some sequences with the parameters of one candidate."""
+
+    figures: tuple[Figures, ...]
+    """Of each variant of the detections."""
+    value: float
+    """Of the objective."""
+
+
+@dataclass(frozen=True)
 class FoldResult:
-    """Figures of a fold that was left out, with the parameters found without it."""
+    """Scores of a fold that was left out, with the parameters before and those found without it."""
 
     sequences: tuple[str, ...]
-    parameters: Parameters
-    before: tuple[Figures, ...]
-    """Of each variant of the detections, with the parameters before."""
-    after: tuple[Figures, ...]
-    value_before: float
-    value_after: float
+    before: Scored
+    after: Scored
+
+    @property
+    def gain(self) -> float:
+        """Gain of the objective."""
+        return self.after.value - self.before.value
 
 
 @dataclass(frozen=True)
@@ -93,16 +100,13 @@ class Refined:
     parameters: Parameters
     """With this class only."""
     changes: tuple[ChangedValue, ...]
-    before: tuple[Figures, ...]
-    """All sequences, of each variant of the detections."""
-    after: tuple[Figures, ...]
+    before: Scored
+    """All sequences."""
+    after: Scored
     """The same with the new parameters; these sequences chose them."""
     folds: tuple[FoldResult, ...]
-    crossed: tuple[Figures, ...]
-    """All sequences together, each with the parameters that were found without it; empty without folds."""
-    value_before: float
-    value_after: float
-    value_crossed: float | None
+    crossed: Scored | None
+    """All sequences together, each with the parameters that were found without it; None without folds."""
     calibration: CalibrationResult
     """Of all sequences, each with the calibration that the others give; one alone with its own."""
     ranking: tuple[Ranking, ...]
@@ -112,21 +116,21 @@ class Refined:
     def to_json(self) -> dict[str, Any]:
         """Return everything as plain values."""
         names = ("plain", *(f"degraded {i + 1}" for i in range(self.plan.copies)))
-        held_out = [fold.value_after for fold in self.folds]
-        gains = [fold.value_after - fold.value_before for fold in self.folds]
 
-        def table(figures: tuple[Figures, ...]) -> dict[str, Any]:
+        def table(scored: Scored | None) -> dict[str, Any]:
+            figures = scored.figures if scored else ()
             return {name: plain_figures(one) for name, one in zip(names, figures, strict=False)}
 
+        held_out, gains = [fold.after.value for fold in self.folds], [fold.gain for fold in self.folds]
         return {
             "class": self.name,
             "plan": {**asdict(self.plan), "degradation": asdict(Degradation()), "penalty": PENALTY, "caution": MARGIN},
             "sequences": list(self.sequences),
             "trials": self.trials,
             "objective": {
-                "before": self.value_before,
-                "after": self.value_after,
-                "cross-validated": self.value_crossed,
+                "before": self.before.value,
+                "after": self.after.value,
+                "cross-validated": self.crossed.value if self.crossed else None,
                 "held out, mean": _mean(held_out),
                 "held out, spread": _spread(held_out),
                 "held out, gain": _mean(gains),
@@ -138,7 +142,7 @@ class Refined:
             "folds": [
                 {
                     "sequences": list(fold.sequences),
-                    "objective": {"before": fold.value_before, "after": fold.value_after},
+                    "objective": {"before": fold.before.value, "after": fold.after.value},
                     "before": table(fold.before),
                     "after": table(fold.after),
                 }
@@ -196,25 +200,26 @@ def refine(
     calibration = session.calibrated(base, everyone).classes[name].calibration
     session = replace(session, evidence_weight=calibration.score_of_evidence if calibration else 0.0)
     folds: list[FoldResult] = []
-    crossed: dict[int, list[Measured]] = {}
+    left_out: dict[int, list[Measured]] = {}
     for number, group in enumerate(groups):
         rest = tuple(i for i in everyone if i not in group)
-        choice = session.choose(f"{name} without group {number + 1} of {len(groups)}", rest, plan.fold_trials)
-        (before, value_before), (after, value_after) = (
-            session.figures(one, group) for one in (base, choice.parameters)
+        candidates, values = session.choose(
+            f"{name} without group {number + 1} of {len(groups)}", rest, plan.fold_trials
         )
+        found = session.with_calibration(candidates.parameters(values), rest)
         names = tuple(objective.names[i] for i in group)
-        folds.append(FoldResult(names, choice.parameters, before, after, value_before, value_after))
-        crossed |= session.measured(choice.parameters, group)
-    choice = session.choose(f"{name} all", everyone, plan.trials)
-    changes = weigh(objective, everyone, choice.made, choice.start, choice.values, display.note)
-    found = choice.parameters
-    (before, value_before), (after, value_after) = (session.figures(one, everyone) for one in (base, found))
-    together: tuple[Figures, ...] = ()
-    if crossed:
+        folds.append(FoldResult(names, session.scored(base, group), session.scored(found, group)))
+        left_out |= session.measured(found, group)
+    candidates, values = session.choose(f"{name} all", everyone, plan.trials)
+    found = session.with_calibration(candidates.parameters(values), everyone)
+    changes = candidates.weigh(values)
+    before, after = session.scored(base, everyone), session.scored(found, everyone)
+    crossed = None
+    if left_out:
         # Sequences in no fold have no truth of this class.
-        crossed |= session.measured(base, tuple(i for i in everyone if i not in crossed))
-        together = objective.figures([[crossed[i][k] for i in everyone] for k in range(len(objective.variants))])
+        left_out |= session.measured(base, tuple(i for i in everyone if i not in left_out))
+        figures = objective.figures([[left_out[i][k] for i in everyone] for k in range(len(objective.variants))])
+        crossed = Scored(figures, objective.value(figures, everyone))
     display.note(f"calibrating {name}")
     return Refined(
         name=name,
@@ -225,10 +230,7 @@ def refine(
         before=before,
         after=after,
         folds=tuple(folds),
-        crossed=together,
-        value_before=value_before,
-        value_after=value_after,
-        value_crossed=objective.value(together, everyone) if together else None,
+        crossed=crossed,
         calibration=cross_calibration(clips, scorer, found),
         ranking=rank(clips, scorer, found, plan.metric) if found.classes[name].calibration is not None else (),
         trials=trials,
@@ -236,13 +238,56 @@ def refine(
 
 
 @dataclass(frozen=True)
-class _Choice:
-    """Result of a search."""
+class Candidates:
+    """Parameters that differ from a base in some values, and their gains on some sequences."""
 
-    made: Made
-    start: Values
-    values: Values
-    parameters: Parameters
+    objective: Objective
+    clips: Sequence[int]
+    base: Parameters
+    note: Callable[[str], None] = lambda _: None
+    """Called with each step."""
+
+    def parameters(self, values: Values) -> Parameters:
+        """Return the parameters of a candidate from its changed values."""
+        name = self.objective.scorer.name
+        return with_values(self.base, name, repaired(values, self.base, name))
+
+    def start(self, path: str) -> Value:
+        """Return a value of the base."""
+        return value_of(self.base, self.objective.scorer.name, path)
+
+    def gain(self, values: Values) -> Gain:
+        """Return the gain over the base."""
+        return self.objective.gain(self.parameters(values), self.parameters({}), self.clips)
+
+    def prune(self, values: Values) -> dict[str, Value]:
+        """Return the changed values that pay.
+
+        Values are put back one after the other, the paper's table first, and stay back unless the score and
+        the score less the margin are both lower without.
+        """
+        chosen = {path: value for path, value in values.items() if value != self.start(path)}
+        now = self.gain(chosen)
+        best = now.score
+        for path in reversed(list(chosen)):
+            self.note(f"trying without {path}")
+            rest = {one: value for one, value in chosen.items() if one != path}
+            without = self.gain(rest)
+            if without.score >= best - WORTH:
+                chosen, now, best = rest, without, max(best, without.score)
+            elif without.value >= now.value:  # nearer to the start and no worse, if not as sure
+                chosen, now, best = rest, without, without.score
+        return chosen
+
+    def weigh(self, values: Values) -> tuple[ChangedValue, ...]:
+        """Return the worth of each changed value together with the others, the most worth first."""
+        found = []
+        for path, value in values.items():
+            self.note(f"weighing {path}")
+            rest = {one: other for one, other in values.items() if one != path}
+            one = self.objective.gain(self.parameters(values), self.parameters(rest), self.clips)
+            found.append(ChangedValue(path, self.start(path), value, one.gain, one.error, one.positive, one.groups))
+        return tuple(sorted(found, key=lambda one: -one.gain))
 
 
 @dataclass(frozen=True)
@@ -264,8 +309,8 @@ class _Session:
     def name(self) -> str:
         return self.objective.scorer.name
 
-    def choose(self, title: str, clips: tuple[int, ...], trials: int) -> _Choice:
-        """Return the best candidate on some sequences."""
+    def choose(self, title: str, clips: tuple[int, ...], trials: int) -> tuple[Candidates, dict[str, Value]]:
+        """Return the candidates of a search on some sequences, and the values of the best one."""
         plain = [self.objective.variants[0][i] for i in clips]
         estimated = estimate(plain, self.name, self.base, self.objective.scorer.rules).values
         base = self.calibrated(with_heading_sign(self.base, self.name), clips)
@@ -280,26 +325,22 @@ class _Session:
         starts = _starts(base, self.name, space, estimated)
         search = Search(self.storage, title, settings, space, starts, zlib.crc32(f"{self.plan.seed} {title}".encode()))
         half = folds_of([boxes if i in clips else 0 for i, boxes in enumerate(self.objective.boxes)], 2)[:1]
-
-        def made(values: Values) -> Parameters:
-            return with_values(base, self.name, repaired(values, base, self.name))
+        candidates = Candidates(self.objective, clips, base, self.display.note)
 
         def score(values: Values, guess: Callable[[float], None]) -> float:
-            candidate, cost = made(values), penalty(space, values, PENALTY)
+            candidate, cost = candidates.parameters(values), penalty(space, values, PENALTY)
             for part in (*half, clips):
                 guess(self.objective.plain_value(candidate, part) - cost)
-            return self.objective.gain(candidate, base, clips).score - cost
+            return candidates.gain(values).score - cost
 
         self.display.note(f"searching: {title}")
-        found = repaired(search.run(trials, score, self.display.trial), base, self.name)
-        start = {one.path: value_of(base, self.name, one.path) for one in space}
-        values = prune(self.objective, clips, made, start, found, self.display.note)
-        return _Choice(made, start, values, self._with_calibration(made(values), clips))
+        found = search.run(trials, score, self.display.trial)
+        return candidates, candidates.prune(repaired(found, base, self.name))
 
     def calibrated(self, base: Parameters, clips: tuple[int, ...]) -> Parameters:
         """Return the parameters with a calibration of their own, and with the score that ranks tracks better."""
         self.display.note("calibrating")
-        best = self._with_calibration(with_calibration(base, self.name, None), clips)
+        best = self.with_calibration(with_calibration(base, self.name, None), clips)
         if best.classes[self.name].calibration is None:
             return best
         weights = _EVIDENCE_WEIGHTS if self.evidence_weight is None else (self.evidence_weight,)
@@ -310,7 +351,7 @@ class _Session:
                 first = other
         return first
 
-    def _with_calibration(self, parameters: Parameters, clips: tuple[int, ...]) -> Parameters:
+    def with_calibration(self, parameters: Parameters, clips: tuple[int, ...]) -> Parameters:
         """Return the parameters with the calibration of some sequences; a ranking score that they have stays."""
         before = parameters.classes[self.name].calibration
         plain = [self.objective.variants[0][i] for i in clips]
@@ -319,10 +360,10 @@ class _Session:
             found = found.model_copy(update={"score_of_evidence": before.score_of_evidence})
         return with_calibration(parameters, self.name, found)
 
-    def figures(self, parameters: Parameters, clips: tuple[int, ...]) -> tuple[tuple[Figures, ...], float]:
+    def scored(self, parameters: Parameters, clips: tuple[int, ...]) -> Scored:
         """Return the figures of each variant and the objective."""
         figures = self.objective.figures(self.objective.measure(parameters, clips))
-        return figures, self.objective.value(figures, clips)
+        return Scored(figures, self.objective.value(figures, clips))
 
     def measured(self, parameters: Parameters, clips: tuple[int, ...]) -> dict[int, list[Measured]]:
         """Return the measured tracks of each variant, by sequence."""
@@ -337,58 +378,3 @@ def _starts(base: Parameters, name: str, space: Sequence[Dimension], estimated: 
     noise = {path: guess[path] if path.startswith("measurement_noise") else value for path, value in known.items()}
     between = {one.path: one.moved(one.start, 0.5 * one.offset(float(guess[one.path]))) for one in space}
     return [known, guess, between, noise]
-
-
-def prune(
-    objective: Objective,
-    clips: Sequence[int],
-    made: Made,
-    start: Values,
-    values: Values,
-    note: Callable[[str], None] = lambda _: None,
-) -> dict[str, Value]:
-    """Return those of the changed values that pay.
-
-    Values are put back one after the other, those of the paper's table first, and stay back unless the score and the
-    score less the margin are both lower without.
-
-    Args:
-        objective: of all sequences.
-        clips: the sequences that the values were chosen on.
-        made: gives the parameters of changed values.
-        start: the values before, by path.
-        values: the values that the search chose.
-        note: is called with each step.
-
-    """
-    chosen = {path: value for path, value in values.items() if value != start[path]}
-    base = made({})
-    now = objective.gain(made(chosen), base, clips)
-    best = now.score
-    for path in reversed(list(chosen)):
-        note(f"trying without {path}")
-        rest = {one: value for one, value in chosen.items() if one != path}
-        without = objective.gain(made(rest), base, clips)
-        if without.score >= best - WORTH:
-            chosen, now, best = rest, without, max(best, without.score)
-        elif without.value >= now.value:  # nearer to the start and no worse, if not as sure
-            chosen, now, best = rest, without, without.score
-    return chosen
-
-
-def weigh(
-    objective: Objective,
-    clips: Sequence[int],
-    made: Made,
-    start: Values,
-    values: Values,
-    note: Callable[[str], None] = lambda _: None,
-) -> tuple[ChangedValue, ...]:
-    """Return the worth of each changed value beside the others, the most worth first; arguments as in `prune`."""
-    found = []
-    for path in values:
-        note(f"weighing {path}")
-        rest = {one: value for one, value in values.items() if one != path}
-        one = objective.gain(made(values), made(rest), clips)
-        found.append(ChangedValue(path, start[path], values[path], one.gain, one.error, one.positive, one.groups))
-    return tuple(sorted(found, key=lambda one: -one.gain))

@@ -21,9 +21,8 @@ from optipmb_tools.files import write_whole
 from optipmb_tools.run.bulk import Executor
 from optipmb_tools.tuning.clips import Clip, load, of_class
 from optipmb_tools.tuning.display import TrialDisplay
-from optipmb_tools.tuning.estimate import Estimate, estimate, pair_all
+from optipmb_tools.tuning.estimate import Estimate, estimate, pair_all, score_curve
 from optipmb_tools.tuning.refine import Plan, Refined, refine
-from optipmb_tools.tuning.score_curves import score_curve
 from optipmb_tools.tuning.scoring import rules_of, scorer_of
 from optipmb_tools.tuning.values import only, with_classes, with_score_calibration, with_values, write_profile
 
@@ -51,7 +50,7 @@ class Source:
         parameters: Parameters,
         classes: Sequence[str] | None,
     ) -> "Source":
-        """Read the sequences; the classes are those of the parameters that have labels, or those asked for.
+        """Read the sequences; by default the classes of the parameters that have labels.
 
         Raises:
             DatasetError: a sequence has no truth.
@@ -119,7 +118,7 @@ def calibrate_scores(
     Args:
         data: the dataset with the detector.
         reference: the name of the reference detector.
-        sequences: of the dataset; those that the reference has too are used.
+        sequences: of the dataset; used where the reference has them too.
         parameters: the profile; score calibrations that it has are replaced.
         classes: as of a `Source`.
         out: the folder.

@@ -1,13 +1,13 @@
 """The search for better values: the search space, and trials one after the other in an Optuna study.
 
 By default only the values that the paper's table of parameters lacks are searched: Q, R, P^0, the area and the two
-limits of forgetting. Bounds lie around the values that a search begins from: those of the profile and the estimated
+limits of forgetting. Bounds lie around the values that a search begins from: the profile's and the estimated
 ones.
 
 Most candidates are small moves away from the best one so far, which finds more in many dimensions with few trials;
 every sixth is proposed by Optuna's TPE sampler (Bergstra et al., 2011). Optuna's percentile pruner ends trials that
-fall behind early. Before each trial all chance is seeded anew from the seed and the number of trials done, so a search
-that was interrupted continues as if it had not been.
+fall behind early. Before each trial the random generator is seeded from the seed and the number of trials done, so a
+search that was interrupted continues as if it had not been.
 """
 
 import json
@@ -210,7 +210,7 @@ class Search:
         storage.parent.mkdir(parents=True, exist_ok=True)
         from sqlalchemy.pool import NullPool  # noqa: PLC0415  of Optuna, an extra that only this needs
 
-        # A connection for each access, closed after it: those of a pool would stay open for as long as the process.
+        # A connection for each access, closed after it: a pool would keep them open as long as the process.
         kept = self._optuna.storages.RDBStorage(f"sqlite:///{storage}", engine_kwargs={"poolclass": NullPool})
         self._file = self._optuna.create_study(storage=kept, study_name=name, direction="maximize", load_if_exists=True)
         text = json.dumps(settings, sort_keys=True)
@@ -236,7 +236,7 @@ class Search:
         """Continue until there are `trials` trials; return the best values.
 
         Args:
-            trials: in all, with those of earlier sessions.
+            trials: in all, earlier sessions included.
             score: the score of values.
             on_trial: called after each trial with the best score so far.
 

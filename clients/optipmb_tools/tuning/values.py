@@ -4,6 +4,7 @@ Numbers that tuning chooses have few digits, so that a profile can be read, and 
 gives the same parameters.
 """
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -113,9 +114,6 @@ def write_profile(path: Path, parameters: Parameters) -> None:
     write_whole(path, [profile_text(parameters)])
 
 
-_ESCAPES = {"\\": "\\\\", '"': '\\"', "\t": "\\t", "\r": "\\r", "\n": "\\n"}
-
-
 def _toml(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
@@ -131,4 +129,5 @@ def _toml(value: Any) -> str:
 
 
 def _escaped(text: str) -> str:
-    return "".join(_ESCAPES.get(sign, sign if sign.isprintable() else f"\\u{ord(sign):04X}") for sign in text)
+    # TOML has the escapes of JSON, and needs one for DEL.
+    return json.dumps(text, ensure_ascii=False)[1:-1].replace("\x7f", "\\u007F")

@@ -17,6 +17,7 @@ from optipmb_schemas.installation import install_command
 from optipmb_tools.datasets import DataSequence, DetectionFrame, Truth
 from optipmb_tools.geometry import Floats, Ints, box_corners, rotation_of, stack_poses, to_world
 from optipmb_tools.results import ResultTable
+from optipmb_tools.table_files import is_table, read_table
 from optipmb_tools.views.colours import colour_of
 
 if TYPE_CHECKING:
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 _INK, _TRUTH = "#222222", "#B5B5B5"
 _MARGIN = 6.0
+_MARKERS = "os^vDPX*"  # of classes
 _BREAK = 5  # a path is not drawn across more missing frames than this
 
 # Of moving pictures
@@ -39,6 +41,7 @@ MARGIN_M = 4.0
 NARROWEST_M = 30.0
 SCALE_M = 10.0
 WIDTH_PX = 560
+LEGEND = 0.5  # its height, inches
 COLOURS = 16
 WHITE = 250
 _SHADE, _DETECTION = "#C4C4C4", "#5A5A5A"
@@ -77,7 +80,8 @@ def draw_tracks(path: Path, sequence: DataSequence, panels: Sequence[Panel], tru
         from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  an extra
         from matplotlib.figure import Figure  # noqa: PLC0415  an extra
     _, sensor = stack_poses(sequence.poses)
-    low, high = _extent([sensor, *(panel.tracks.center for panel in panels), truth.center if truth else sensor])
+    boxes = [*(panel.tracks for panel in panels), *([truth] if truth else [])]
+    low, high = _extent([*(one.center for one in boxes), *([sensor] if sensor.any() else [])])
     longest = 11.0 if len(panels) == 1 else 8.0
     width, height = np.maximum(longest / max(high - low) * (high - low), (7.5, 3.0)).tolist()
     # Panels of a long street lie one below the other, others side by side.
@@ -97,7 +101,8 @@ def draw_tracks(path: Path, sequence: DataSequence, panels: Sequence[Panel], tru
         axes.set_axisbelow(True)
         if truth is not None:
             _draw_truth(axes, truth)
-        _draw_sensor(axes, sensor, sequence)
+        if sensor.any():
+            _draw_sensor(axes, sensor, sequence)
         _draw_paths(axes, panel.tracks, last_frame=len(sequence) - 1)
         if truth is not None:
             _draw_failures(axes, truth, panel.results)
@@ -131,11 +136,16 @@ def _draw_sensor(axes: "Axes", sensor: Floats, sequence: DataSequence) -> None:
 
 
 def _draw_paths(axes: "Axes", tracks: ResultTable, last_frame: int) -> None:
-    label, box_label = "track (colour and number: its id)", "last box, a line to its front"
+    label, box_label, named = "track (colour and number: its id)", "last box, a line to its front", set()
     for rows in _rows_by_id(tracks.id):
         identity = int(tracks.id[rows[0]])
         colour = colour_of(identity)
         axes.plot(*_broken(tracks.frame[rows], tracks.center[rows]), color=colour, linewidth=1.2, label=label, zorder=4)
+        kind = int(tracks.label[rows[0]])
+        place = tracks.center[rows[0], :2].tolist()
+        name = "_" if kind in named else f"start of a {tracks.labels[kind]}"
+        axes.plot(*place, _MARKERS[kind % len(_MARKERS)], color=colour, markersize=4, label=name, zorder=6)
+        named.add(kind)
         end = rows[-1:]
         (corners,) = _outlines(tracks, end)
         front, middle = 0.5 * (corners[0] + corners[1]), tracks.center[end[0], :2]
@@ -151,7 +161,7 @@ def _draw_paths(axes: "Axes", tracks: ResultTable, last_frame: int) -> None:
         axes.plot(*np.vstack([middle, front]).T, color=colour, linewidth=1.0 if alive else 0.5, zorder=5)
         axes.annotate(
             str(identity),
-            (float(tracks.center[rows[0], 0]), float(tracks.center[rows[0], 1])),
+            place,
             xytext=(2, 2),
             textcoords="offset points",
             color=colour,
@@ -181,7 +191,7 @@ def _draw_failures(axes: "Axes", truth: Truth, results: "Sequence[ClearResult]")
 
 def _legend(figure: "Figure", grid: "Sequence[Axes]") -> None:
     found = {label: one for axes in grid for one, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    columns = max(1, len(found))
+    columns = max(1, min(4, len(found)))
     figure.legend(found.values(), found, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
 
 
@@ -260,9 +270,9 @@ class _View:
         if self._follows:
             low, high = np.array([-REACH_M, -0.6 * REACH_M]), np.array([REACH_M, 0.6 * REACH_M])
         wide, tall = high - low
-        figure = Figure(figsize=(WIDTH_PX / 100, WIDTH_PX / 100 * tall / wide + 0.3), dpi=100)
+        figure = Figure(figsize=(WIDTH_PX / 100, WIDTH_PX / 100 * tall / wide + LEGEND), dpi=100)
         self._canvas: Any = FigureCanvasAgg(figure)  # two of its methods have no annotations
-        share = 0.3 / figure.get_figheight()
+        share = LEGEND / figure.get_figheight()
         self._axes: Axes = figure.add_axes((0.0, share, 1.0, 1.0 - share))
         self._low, self._high = low, high
         self._legend(figure)
@@ -279,7 +289,8 @@ class _View:
         center, _ = to_world(rotation_of(frame.pose.quaternion), frame.pose.translation, frame.center, frame.yaw)
         axes.plot(*center[:, :2].T, "+", color=_DETECTION, markersize=4, markeredgewidth=0.8, zorder=6)
         self._draw_tracks(frame)
-        axes.plot(*sensor, "^", color=_INK, markersize=7, zorder=7)
+        if self._sensor.any():
+            axes.plot(*sensor, "^", color=_INK, markersize=7, zorder=7)
         seconds = (frame.stamp_ns - self._begin_ns) * 1e-9
         axes.text(0.012, 0.975, f"{seconds:.1f} s", transform=axes.transAxes, fontsize=12, va="top", color=_INK)
         left, bottom = self._low + origin + 0.03 * (self._high - self._low)
@@ -313,6 +324,9 @@ class _View:
             PolyCollection(outlines, facecolors=faces, edgecolors=colours, linewidths=1.2, zorder=5)
         )
         self._axes.add_collection(LineCollection(fronts, colors=colours, linewidths=1.2, zorder=5))
+        for kind in np.unique(tracks.label[rows]).tolist():
+            places = tracks.center[rows[tracks.label[rows] == kind], :2]
+            self._axes.plot(*places.T, _MARKERS[kind % len(_MARKERS)], color=_INK, markersize=2.5, zorder=6)
         for place, identity, colour in zip(tracks.center[rows], tracks.id[rows].tolist(), colours, strict=True):
             self._axes.annotate(
                 str(identity),
@@ -335,9 +349,12 @@ class _View:
             Line2D([], [], label=path, marker="s", color=colour, markerfacecolor=f"{colour}66"),
             Line2D([], [], label="sensor", marker="^", linestyle="", color=_INK, markersize=7),
         ]
-        if self._truth is None:
-            del handles[1]
-        figure.legend(handles=handles, loc="lower center", ncols=len(handles), frameon=False, fontsize=9)
+        drawn = (True, self._truth is not None, True, bool(self._sensor.any()))
+        handles = [handle for handle, one in zip(handles, drawn, strict=True) if one]
+        for kind in np.unique(self._tracks.label).tolist():
+            name, marker = self._tracks.labels[kind], _MARKERS[kind % len(_MARKERS)]
+            handles.append(Line2D([], [], label=name, marker=marker, linestyle="", color=_INK, markersize=4))
+        figure.legend(handles=handles, loc="lower center", ncols=-(-len(handles) // 2), frameon=False, fontsize=8)
 
 
 def _outlines(boxes: "Truth | ResultTable", rows: Ints) -> list[Floats]:
@@ -359,7 +376,8 @@ def draw_results(
         sequence: The tracked sequence.
         folders: Where its result files are, or tables of tracks: one for each tracker.
         results: Figures of the classes of each tracker; their misses and identity changes are marked.
-        score: Least mean score of the tracks that are shown; default: the best threshold of each class, by `results`.
+        score: Least mean score of the tracks that are shown; default: the best threshold of each class by `results`,
+            without results the tracks that were confirmed.
 
     Raises:
         DatasetError: There is no such result file, or it is wrong.
@@ -374,11 +392,23 @@ def draw_results(
     for folder, name, own in zip(folders, names, results, strict=True):
         table = read_tracks(folder, sequence).to_world(sequence.poses)
         best = [result.sweep.results[result.sweep.best] for result in own]
+        if not own and score is None:
+            table = _confirmed(table, folder)
         panels.append(Panel(_from_score(table, own, score), best, name if len(names) > 1 else ""))
     if picture.suffix == ".gif":
         animate_tracks(picture, sequence, panels[0].tracks, sequence.truth())
     else:
         draw_tracks(picture, sequence, panels, sequence.truth())
+
+
+def _confirmed(table: ResultTable, file: Path) -> ResultTable:
+    """Return the tracks that were confirmed in some frame: all, where the file does not tell."""
+    if not (file.is_file() and is_table(file)):
+        return table
+    columns = read_table(file)
+    if not {"id", "confirmed"} <= columns.keys():
+        return table
+    return table.take(np.isin(table.id, columns["id"][columns["confirmed"] == 1]))
 
 
 def _from_score(table: ResultTable, results: "Sequence[ClassResult]", score: float | None) -> ResultTable:

@@ -20,7 +20,7 @@ COUNTED = ("refused", "shed", "late", "gaps", "duplicates", "last frame")
 TEXTS = 3  # columns of texts; the others are of numbers
 LISTED_PROBLEMS = 5
 WORKER = re.compile(r"-w\d+$")  # follows the instance in the name of one of its workers
-NAME = 32  # characters of a member's name in a line
+NAME = 32  # characters of the name of a stream or member in a line
 
 HISTORY = 40  # samples of the curve of frames per second
 GONE_S = 60.0  # how long an instance that vanished stays in the view
@@ -28,6 +28,7 @@ RECENT_S = 30.0  # how long a problem is new
 LATE_MS = 50.0  # latency that is worth a colour
 VERY_LATE_MS = 200.0
 SHOWN_PROBLEMS = 6
+FIGURES = 38  # characters of the columns that even a narrow view has beside the stream
 FRAME_LINES = 6  # lines of the view that are neither services, streams nor problems
 # Columns that a narrow terminal does not show, the first ones first
 SPARE = {
@@ -39,7 +40,7 @@ GOOD, POOR, BAD, QUIET = "green", "yellow", "bold red", "dim"
 STATES = {"ready": GOOD, "running": GOOD, "new": QUIET, "starting": POOR, "degraded": POOR, "stale": POOR}
 
 
-def status_tables(services: Sequence[ServiceStatus]) -> RenderableType:
+def status_tables(services: Sequence[ServiceStatus]) -> Group:
     """Return services with their streams and newest problems, ready to be printed."""
     shown: list[RenderableType] = []
     for service in services:
@@ -47,7 +48,7 @@ def status_tables(services: Sequence[ServiceStatus]) -> RenderableType:
         shown.append(Text(head + f"{service.frames} frames, {service.refused} refused", style="bold"))
         shown.append(_streams(service.sessions) if service.sessions else Text("no streams"))
         for one in service.problems[-LISTED_PROBLEMS:]:
-            text = f"problem: {one.stream or 'no stream'}: {one.message}{_times(one)}"
+            text = f"problem: {one.stream or 'no stream'}: {in_words(one)}{_times(one)}"
             shown.append(Text(text, style="yellow"))
     members = members_of(services)
     return Group(*shown, _members(members)) if len(members) > 1 else Group(*shown)
@@ -82,7 +83,8 @@ def _streams(sessions: Sequence[SessionSummary]) -> Table:
     table = Table(box=None, pad_edge=False)
     for number, name in enumerate(COLUMNS + COUNTED):
         side: JustifyMethod = "right" if number >= TEXTS else "default" if number else "left"
-        table.add_column(name, justify=side, no_wrap=True)  # of a table in parts, each has the columns on the left
+        # Of a table in parts, each has the columns on the left.
+        table.add_column(name, justify=side, no_wrap=number >= TEXTS, overflow="fold", max_width=NAME)
     for one in sessions:
         rates = (f"{value:.1f}" for value in (one.rate_hz, one.latency_p50_ms, one.latency_p99_ms))
         counts = (one.frames, one.tracks, one.queue, one.refused, one.shed, one.late, one.gaps, one.duplicates)
@@ -104,6 +106,21 @@ def duration(seconds: float) -> str:
         if seconds >= 2 * size:
             return f"{seconds / size:.0f} {unit}"
     return f"{seconds:.1f} s"
+
+
+def in_words(problem: Problem) -> str:
+    """Return what happened, for people who do not know the messages."""
+    reason, _, jump = problem.received.rpartition(", ")
+    try:
+        seconds = float(jump.removesuffix(" s"))
+    except ValueError:
+        return problem.message
+    if problem.code == "restarted":
+        gap = f"{seconds:.3g} s gap" if seconds >= 0.0 else f"stamps {-seconds:.3g} s earlier"
+        return f"publisher restarted, {gap}" if reason == "publisher" else f"session restarted ({reason}), {gap}"
+    if problem.code == "late":
+        return f"a frame came too late: {-seconds:.3g} s before the newest one"
+    return problem.message
 
 
 def _times(problem: Problem) -> str:
@@ -167,7 +184,7 @@ class StatusView:
         rows = [(seen, session) for seen in alive for session in seen.status.sessions]
         room = max(1, height - FRAME_LINES - len(self._seen) - (len(problems) + 1 if problems else 0))
         if rows:
-            shown += [Text(), without(self._streams(rows, room), width, SPARE["streams"])]
+            shown += [Text(), without(self._streams(rows, room, width - FIGURES), width, SPARE["streams"])]
         if problems:
             shown += [Text(), *(self._problem(at_s, problem) for at_s, problem in problems)]
         return Group(*shown)
@@ -215,7 +232,7 @@ class StatusView:
             )
         return table
 
-    def _streams(self, rows: list[tuple[_Seen, SessionSummary]], room: int) -> Table:
+    def _streams(self, rows: list[tuple[_Seen, SessionSummary]], room: int, longest: int) -> Table:
         several = len(self._seen) > 1
         names = ("stream", *(("instance",) if several else ()), "profile", "state")
         figures = ("frames/s", "p50 ms", "p99 ms", "tracks", "waiting", "lost/s", "lost", "last frame")
@@ -225,7 +242,7 @@ class StatusView:
         for seen, session in shown:
             instance = seen.status.instance
             table.add_row(
-                session.stream,
+                _short(session.stream, longest),
                 *([instance] if several else []),
                 profile_of(session),
                 _state(session.state),
@@ -250,9 +267,9 @@ class StatusView:
 
     def _problem(self, at_s: float, problem: Problem) -> Text:
         age = self._now_s - at_s
-        text = f"{problem.stream or 'no stream'}: {problem.message}{_times(problem)}"
+        text = f"{_short(problem.stream or 'no stream', NAME)}: {in_words(problem)}{_times(problem)}"
         style = POOR if age < RECENT_S else QUIET
-        line = f"{duration(age):>8} ago  {problem.code:<16} {text}"
+        line = f"{duration(age):>8} ago  {text}"
         return Text(line, style=style, no_wrap=True, overflow="ellipsis")
 
 
@@ -263,6 +280,11 @@ def _table(names: Iterable[str], figures: Iterable[str]) -> Table:
     for name in figures:
         table.add_column(name, justify="right", no_wrap=True)
     return table
+
+
+def _short(name: str, longest: int) -> str:
+    """Cut a name in the middle: streams of one site differ at the end."""
+    return name if len(name) <= longest else f"{name[: longest // 4]}…{name[longest // 4 + 1 - longest :]}"
 
 
 def _counted(number: int, name: str) -> str:
@@ -341,7 +363,13 @@ def _only(table: Table, places: Sequence[int]) -> Table:
     )
     for place in places:
         column = table.columns[place]
-        part.add_column(column.header, justify=column.justify, no_wrap=column.no_wrap, overflow=column.overflow)
+        part.add_column(
+            column.header,
+            justify=column.justify,
+            no_wrap=column.no_wrap,
+            overflow=column.overflow,
+            max_width=column.max_width,
+        )
     for row in zip(*(table.columns[place].cells for place in places), strict=True):
         part.add_row(*row)
     return part

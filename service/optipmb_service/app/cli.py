@@ -35,6 +35,7 @@ from optipmb_service.settings import (
     SettingsInvalidError,
     address,
     load,
+    missing_files,
     state_home,
     without_password,
 )
@@ -144,6 +145,8 @@ def run_command(**given: Unpack[Options]) -> None:
     settings = _begin(_load(given))
     if settings.cluster:
         _needed("optipmb_service.cluster.jetstream", "cluster")
+    if settings.grpc:
+        _needed("grpc", "grpc")
     if settings.workers > 1:
         from optipmb_service.app.workers import supervise  # noqa: PLC0415 - a process that tracks needs none
 
@@ -184,8 +187,10 @@ def config_command(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, with where each value came from.")] = False,
     **given: Unpack[Options],
 ) -> None:
-    """Print the settings in force as TOML. Each comes with its origin; nothing is started."""
+    """Print the settings in force as TOML, each with its origin; nothing is started. A named file must exist."""
     loaded = _load(given)
+    if missing := missing_files(loaded.settings):
+        _wrong("; ".join(missing))
     values = loaded.settings.model_dump(mode="json")
     values |= {"router": loaded.settings.is_router, "listen": list(loaded.settings.endpoints)}
     values["cluster"] = [without_password(server) for server in loaded.settings.cluster]
@@ -194,7 +199,7 @@ def config_command(
         return
     plain = {name: value for name, value in values.items() if not isinstance(value, dict)}
     for name, value in plain.items():
-        # TOML has no null: what is not set is a comment.
+        # TOML has no null: a setting without a value is a comment.
         shown = f"# {name} is not set" if value is None else f"{name} = {_toml(value)}"
         typer.echo(f"{shown}  # {loaded.sources[name]}")
     for name in values.keys() - plain.keys():
@@ -263,7 +268,7 @@ def nats_command(
 
 
 def nats_server() -> str | None:
-    """Return the path of the server, from the package beside this one or else from the system; None without one."""
+    """Return the path of the NATS server of this environment, else of the system; None without one."""
     return shutil.which(NATS, path=sysconfig.get_path("scripts")) or shutil.which(NATS)
 
 
@@ -326,7 +331,7 @@ def _load(given: Mapping[str, Any], **defaults: Any) -> Loaded:
 
 
 def _begin(loaded: Loaded) -> Settings:
-    """Configure the logs, and log what is wrong with the settings but allowed."""
+    """Configure the logs, and warn of settings that are allowed but unsafe or unknown."""
     logs.configure(loaded.settings.log_format, loaded.settings.log_level)
     log = structlog.get_logger("optipmb_service")
     if loaded.unknown:

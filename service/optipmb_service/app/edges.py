@@ -1,7 +1,7 @@
 """Processes that are edges alone: a Zenoh router, and a gRPC gateway.
 
 The router is the same as the one inside the service, with the same tuning; access control, TLS and limits come from
-the Zenoh configuration file. Health and readiness are those of the service.
+the Zenoh configuration file. Health and readiness are reported as by the service.
 """
 
 from __future__ import annotations
@@ -23,23 +23,6 @@ if TYPE_CHECKING:
     from optipmb_service.telemetry.health import ProcessHealth
 
 log = structlog.get_logger("optipmb_service")
-
-
-class ClientReporter(Reporter):
-    """Health of a client of routers."""
-
-    def __init__(self, client: Client) -> None:
-        self._client = client
-
-    @property
-    def state(self) -> str:
-        """Ready while there is a router."""
-        return "unlinked" if self._client.failure else "ready"
-
-    @property
-    def failure(self) -> str:
-        """Why there is no router; empty while there is one."""
-        return self._client.failure
 
 
 async def run_router(settings: Settings) -> int:
@@ -66,7 +49,7 @@ async def run_gateway(settings: Settings) -> int:
         server = Server(settings, client)
         health.metrics.add(GATEWAY_METRICS, lambda: server.metrics)
         await server.start()
-        health.report(ClientReporter(client))
+        health.report(Reporter(lambda: client.failure))
         settle()
         say_ready("grpc", server.address, settings.connect)
         log.info("ready", instance=settings.instance, grpc=server.address, connect=settings.connect)

@@ -28,7 +28,7 @@ def ask(address: str, *, ready: bool) -> tuple[bool, str]:
         ready: ask whether it can be used; otherwise whether it is alive.
 
     Returns:
-        Whether it said yes, and what it said, one line.
+        Whether the answer is yes, and its text, one line.
     """
     host, _, port = address.rpartition(":")
     connection = http.client.HTTPConnection(EVERYWHERE.get(host, host).strip("[]"), int(port), timeout=TIMEOUT_S)

@@ -1,7 +1,7 @@
 """Start and end of every process of the service: signals, monitoring, bounds, exit status.
 
-The end has a bound, for Zenoh's `session.close` may hang, as may any call into a library, and whoever waits for the
-process may have nothing that kills it. The bound runs beside the end, from the moment when that begins:
+The end has a bound, for Zenoh's `session.close` may hang, as may any call into a library, and a supervisor may
+have no time-out of its own. The bound counts from the begin of the end:
 
 - A thread counts most of it, logs where every thread is, and ends the process with status 1.
 - What hangs with the interpreter's lock held lets no other Python run. For that case a thread of `faulthandler`,
@@ -26,15 +26,15 @@ import sys
 import threading
 import time
 import traceback
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeVar
 
 import structlog
+from optipmb_client.errors import ClientError
 from optipmb_schemas.installation import install_command
 
 from optipmb_service import __version__
 from optipmb_service.cluster.store import StoreError
-from optipmb_service.stream.ports import EdgeError, TransportError
 from optipmb_service.telemetry import logs
 from optipmb_service.telemetry.certificates import Certificates
 from optipmb_service.telemetry.health import BEAT_S, ProcessHealth
@@ -63,7 +63,7 @@ SWITCH_S: Final = 0.0005  # by default it is ten times as long, and a frame that
 KEYS_S: Final = 1.0  # period of the check of declared keys
 GAINED: Final = 0.1  # share of the declared keys that a restart gives back at least
 STDERR: Final = 2
-CALLS: Final = 6  # calls that are logged of a thread: the innermost one, and those of these packages
+CALLS: Final = 6  # logged calls of a thread: the innermost one, and calls of these packages
 PACKAGES: Final = ("optipmb_service", "optipmb_client")
 
 log = structlog.get_logger("optipmb_service")
@@ -130,7 +130,7 @@ class EndBound:
             else:
                 self._arm()
             before = now
-        # Not on this thread: nobody may be reading the log.
+        # Not on this thread: the log may block.
         logging = threading.Thread(target=_log_threads, args=(self._seconds,), name="end", daemon=True)
         with contextlib.suppress(RuntimeError):  # no thread can be started
             logging.start()
@@ -142,37 +142,29 @@ class Steps:
     """Steps of an end that may hang, and behind which others must be done."""
 
     def __init__(self) -> None:
-        self._threads: list[threading.Thread] = []
+        self._done: dict[str, Future[object]] = {}
 
     def do(self, name: str, step: Callable[[], object]) -> None:
         """Do a step; one that hangs, or raises, delays the next ones by `STEP_S` at most."""
-
-        def work() -> None:
-            try:
-                step()
-            except Exception:
-                log.exception("internal_error", step=name)
-
-        thread = threading.Thread(target=work, name=name, daemon=True)
-        self._threads.append(thread)
+        self._done[name] = Future()
         with contextlib.suppress(RuntimeError):  # no thread can be started: it remains unfinished
-            thread.start()
-            thread.join(STEP_S)
+            self._done[name] = on_thread(name, step)
+            wait([self._done[name]], STEP_S)
 
     def unfinished(self, seconds: float) -> bool:
         """Return whether a step has not ended after `seconds`, or could not begin, and log it."""
-        deadline = Deadline(seconds)
-        for thread in self._threads:
-            if thread.is_alive():
-                thread.join(deadline.left())
-        names = [thread.name for thread in self._threads if thread.is_alive() or thread.ident is None]
+        done, _ = wait(self._done.values(), seconds)
+        for name, step in self._done.items():
+            if step in done and (error := step.exception()):
+                log.error("internal_error", step=name, exc_info=error)
+        names = [name for name, step in self._done.items() if step not in done]
         if names:
             log.error("step_hangs", steps=names)
         return bool(names)
 
 
 def leave_or_restart(status: int) -> NoReturn:
-    """End the process, or begin it again in its place, with its id and what it was started with."""
+    """End the process, or begin it again in its place, with its id and command line."""
     if status == RESTART:
         sys.stdout.flush()
         logs.finish()
@@ -221,7 +213,7 @@ class StopRequest:
         for number in (signal.SIGINT, signal.SIGTERM):
             self._loop.add_signal_handler(number, self.ask, number.name)
             # The loop hears of it over a descriptor, which stays; in place of a handler that does nothing, the bound
-            # begins, also where the loop hangs. Nothing else may be done there: whatever it interrupts may hold locks.
+            # begins, also where the loop hangs. Nothing else may be done there: the interrupted code may hold locks.
             signal.signal(number, lambda *_: bound.begin())
 
     def restart(self, reason: str) -> None:
@@ -233,7 +225,7 @@ class StopRequest:
     def ask(self, reason: str) -> None:
         """Ask for the end."""
         self.restarts = False
-        if not self.bound.begin():  # before anything that may block, as a log that nobody reads
+        if not self.bound.begin():  # before anything that may block, as a log without a reader
             log.warning("end_unbounded")
         log.info("stop_asked" if not self.is_set() else "stop_asked_again", signal=reason)
         self._event.set()
@@ -254,19 +246,27 @@ class StopRequest:
             await asyncio.wait_for(self._event.wait(), seconds)
 
 
-async def unless(asked: StopRequest, work: Callable[[], _T]) -> _T | None:
-    """Do blocking work on a thread; None when the end was asked for before it was done, the work is then abandoned."""
+def on_thread(name: str, work: Callable[[], _T]) -> Future[_T]:
+    """Do blocking work on a daemon thread: what cannot be interrupted must not keep the process.
+
+    Raises:
+        RuntimeError: no thread can be started.
+    """
     done: Future[_T] = Future()
 
     def call() -> None:
         try:
             done.set_result(work())
-        except BaseException as error:  # noqa: BLE001 - raised where the result is awaited
+        except BaseException as error:  # noqa: BLE001 - raised where the result is read
             done.set_exception(error)
 
-    # A daemon: neither compiling nor waiting for a router can be interrupted, and neither may keep the process.
-    threading.Thread(target=call, name="start", daemon=True).start()
-    result = asyncio.wrap_future(done)
+    threading.Thread(target=call, name=name, daemon=True).start()
+    return done
+
+
+async def unless(asked: StopRequest, work: Callable[[], _T]) -> _T | None:
+    """Do blocking work on a thread; None when the end was asked for before it was done, the work is then abandoned."""
+    result = asyncio.wrap_future(on_thread("start", work))
     result.add_done_callback(lambda one: one.cancelled() or one.exception())  # an abandoned one may fail unseen
     stop = asyncio.create_task(asked.wait())
     waits: set[asyncio.Future[Any]] = {result, stop}
@@ -278,7 +278,7 @@ async def unless(asked: StopRequest, work: Callable[[], _T]) -> _T | None:
 async def watch_keys(asked: StopRequest, used: Callable[[], KeyNumbers], most: int) -> None:
     """Have the process begin again before its network session has no number for keys any more.
 
-    It does not where that would give it few: what is open when it ends needs as many again.
+    It does not where that would free few: keys that are open at the end are declared again.
     """
     while not asked.is_set():
         keys = used()
@@ -289,7 +289,7 @@ async def watch_keys(asked: StopRequest, used: Callable[[], KeyNumbers], most: i
 
 
 def say_ready(what: str, name: str, endpoints: Iterable[str]) -> None:
-    """Print the line that starters wait for, the only one on stdout: what is ready, and the endpoints it uses."""
+    """Print the line that starters wait for, the only one on stdout: name and endpoints."""
     print(f"ready {what}={name} endpoints={','.join(endpoints)}", flush=True)  # noqa: T201 - it is the interface
 
 
@@ -318,7 +318,7 @@ def _monitoring(settings: Settings, health: ProcessHealth) -> Iterator[None]:
     """Answer over HTTP, where that is asked for.
 
     Raises:
-        HttpError: the address cannot be listened on.
+        ClientError: the address cannot be listened on.
     """
     if not settings.http:
         yield
@@ -343,10 +343,10 @@ def _monitoring(settings: Settings, health: ProcessHealth) -> Iterator[None]:
 
 @contextlib.contextmanager
 def grpc_edge(settings: Settings, client: Client, metrics: Metrics) -> Iterator[None]:
-    """Serve gRPC beside a process, where that is asked for, and add its metrics.
+    """Serve gRPC in this process where the settings say so, and add its metrics.
 
     Raises:
-        EdgeError: it cannot be served.
+        ClientError: it cannot be served.
     """
     if not settings.grpc:
         yield
@@ -354,7 +354,7 @@ def grpc_edge(settings: Settings, client: Client, metrics: Metrics) -> Iterator[
     try:
         from optipmb_service.grpc.server import serving  # noqa: PLC0415 - an extra that only this needs
     except ModuleNotFoundError as error:
-        raise EdgeError(f"gRPC needs {error.name}, which is not installed: {install_command('grpc')}") from error
+        raise ClientError(f"gRPC needs {error.name}, which is not installed: {install_command('grpc')}") from error
     with serving(settings, client) as calls:
         metrics.add(GATEWAY_METRICS, lambda: calls)
         yield
@@ -371,10 +371,10 @@ async def run(
     """Work until SIGINT or SIGTERM.
 
     Args:
-        settings: what is in force.
+        settings: of the process.
         serve: does the work until the end is asked for; returns whether it ended in order, None when it never began.
         counts: whether the metrics have the counters of tracking.
-        more_s: how much longer than that of other processes the end may take.
+        more_s: time that the end may take beyond the usual bound.
         about: more for the first line of the log.
 
     Returns:
@@ -397,11 +397,11 @@ async def run(
         tasks.append(asyncio.create_task(certificates.watch()))
         with _monitoring(settings, health):
             ended = await serve(asked, health)
-    except (TransportError, EdgeError, StoreError) as error:
+    except (ClientError, StoreError) as error:
         logs.say(f"optipmb-service: {error}")
         return 1
     finally:
-        asked.bound.begin()  # also where nobody asked
+        asked.bound.begin()  # also after an error
         for task in tasks:
             task.cancel()
     if ended is not None:

@@ -1,8 +1,8 @@
-"""The bridge into the log as a process of its own: what is published as detections and tracks goes to NATS.
+"""The bridge into the log as a process of its own: puts published detections and tracks into NATS.
 
-It keeps nothing, so any number of it may run: the servers drop what another one has put there. It is a process of its
-own, and no part of a member, because what it receives is not for one member, and a member that is killed must not take
-with it what a successor needs.
+It keeps nothing, so any number of it may run: the servers drop what another one has put there. It is no part
+of a member, because it receives the messages of all members, and a killed member must not take messages with it that
+its successor needs.
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ class LogBridge(Reporter):
     """From a network into the log; the client is closed by the caller, after this."""
 
     def __init__(self, settings: Settings, client: Client) -> None:
+        super().__init__(lambda: client.failure)
         self._client = client
         self._instance = settings.instance
         self._limits = settings.limits.limits()
@@ -61,16 +62,17 @@ class LogBridge(Reporter):
     @property
     def state(self) -> str:
         """Ready while it has a router and the servers."""
-        return "unlinked" if not self._client.linked() else "degraded" if self.failure else "ready"
+        state = super().state
+        return "degraded" if state == "ready" and self.failure else state
 
     @property
     def failure(self) -> str:
         """Why nothing can be received or written; empty while it can."""
         why = self.writer.failure
-        return self._client.failure or (f"log: {why}" if why else "")
+        return super().failure or (f"log: {why}" if why else "")
 
     def close(self) -> None:
-        """Write what was received, within the grace, and end."""
+        """Write the waiting messages, within the grace, and end."""
         ends = time.monotonic() + self._grace_s
         for subscription in self._subscriptions:
             subscription.close(CLOSE_S)

@@ -55,6 +55,7 @@ class _Work(Reporter):
     """The queue of the working thread, and what connects the node and the bridge."""
 
     def __init__(self, settings: Settings, node: Ros2Node) -> None:
+        super().__init__(lambda: node.client.failure)
         self._settings = settings
         self._node = node
         self._bridge = Bridge(settings, node)
@@ -68,11 +69,6 @@ class _Work(Reporter):
         self._endpoints = self._ours()
         single = frozenset(stream.detections for stream in settings.ros2.streams.values())
         self._matching = graph.Matching(tuple(self._endpoints), single)
-
-    @property
-    def state(self) -> str:
-        """Ready while it has a router."""
-        return "ready" if self._node.client.linked() else "unlinked"
 
     @property
     def stuck(self) -> bool:

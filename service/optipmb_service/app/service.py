@@ -3,7 +3,7 @@
 Messages go from a thread of the network to a stream's backlog to the tracking thread.
 
 Start: open Zenoh, subscribe, answer queries, say alive. End: withdraw the alive token, let other members take the
-streams over, stop receiving, track what was received as long as the grace lasts, close.
+streams over, stop receiving, track waiting messages as long as the grace lasts, close.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_schemas as schemas
 import structlog
+from optipmb_client.errors import ConnectionFailed as TransportError
 
 import optipmb
 from optipmb_service import __version__
@@ -24,11 +25,9 @@ from optipmb_service.cluster.member import Member
 from optipmb_service.stream.intake import Intake
 from optipmb_service.stream.kept_tracks import TrackQuery
 from optipmb_service.stream.persistence import DAY_S, CheckpointWriter
-from optipmb_service.stream.ports import TransportError
 from optipmb_service.stream.problems import problem_of
 from optipmb_service.stream.queries import ServiceQueries, StreamQueries, members_of
-from optipmb_service.stream.scheduler import Scheduler
-from optipmb_service.stream.streams import Streams
+from optipmb_service.stream.streams import Scheduler, Streams
 from optipmb_service.stream.values import SECOND
 from optipmb_service.telemetry.health import Reporter
 from optipmb_service.telemetry.metrics import (
@@ -57,14 +56,14 @@ DRAIN_POLL_S: Final = 0.01
 JOIN_S: Final = 0.3
 SAVE_S: Final = 0.5  # the last checkpoints have so long even where messages took all the time
 NAME_CHECK_NS: Final = 10_000_000_000  # how often another process of the same name is looked for
-LEASES_S: Final = 1.0  # what is left at the end to say that the leases are free, however long the checkpoints take
+LEASES_S: Final = 1.0  # kept for releasing the leases, however long the checkpoints take
 
 
 class Service(Reporter):
     """A service on the network, without signals or a loop of its own: `run` adds these, tests use it as it is.
 
     Args:
-        settings: what is in force.
+        settings: of the process.
         profiles: the parameters that can be had.
         arm: calls a function at a monotonic time (ns).
         tracker: makes the trackers of sessions; default: trackers bounded as the settings say.
@@ -159,13 +158,12 @@ class Service(Reporter):
         self._reporter.flush(now_ns)
 
     def stop(self, seconds: float = math.inf) -> bool:
-        """Hand the streams over, track what was received, within the grace, and close.
+        """Hand the streams over, track waiting messages within the grace, and close.
 
-        All of it takes a bounded time, so that whoever waits for the end kills nothing that is still being kept; but
-        closing the network, before which all that is to be kept is written.
+        Every step is bounded in time except the last, closing the network; all checkpoints are written before that.
 
         Args:
-            seconds: what is left for it.
+            seconds: time for all steps.
 
         Returns:
             False when a step would not end, or not all checkpoints are written.
@@ -199,7 +197,7 @@ class Service(Reporter):
 
     @property
     def key_numbers(self) -> KeyNumbers:
-        """What is used of the numbers that its network session has for keys."""
+        """Key numbers that its network session has used."""
         return self.client().key_numbers
 
     @property
@@ -253,7 +251,7 @@ class Service(Reporter):
         )
 
     def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None]:
-        """Hand over what comes on a stream to a viewer, until the result is called."""
+        """Hand over the messages of a stream to a viewer, until the result is called."""
         return self._transport.tap(stream, receive, self._streams.fusion.seen_by(stream))
 
     def client(self) -> Client:

@@ -37,7 +37,7 @@ def open_store(settings: Settings, private: Path | None) -> tuple[LeaseStore, st
     Without a folder, or with one that cannot be used, leases are kept for as long as this process lives, or its parent.
 
     Args:
-        settings: what is in force.
+        settings: of the process.
         private: folder that the workers of one parent share; None: this process has no parent.
 
     Raises:
@@ -74,10 +74,10 @@ def nats_access(settings: Settings) -> dict[str, Any]:
 
 
 def copy_folder(settings: Settings) -> tuple[int, int]:
-    """Copy the sessions of the folder `store` into the store of `cluster`, in which nobody tracks yet.
+    """Copy the sessions of the folder `store` into the store of `cluster`, which must have no members yet.
 
     Returns:
-        Sessions that were copied, and those that were not: the cluster has a session of the same stream.
+        Number of copied sessions, and of those left out because the cluster has a session of the same stream.
 
     Raises:
         StoreError: either cannot be used, or a member uses it.
@@ -103,8 +103,8 @@ def copy_folder(settings: Settings) -> tuple[int, int]:
 def _copy(source: SqliteStore, target: LeaseStore) -> tuple[int, int]:
     """Copy the newest checkpoint of each stream that the target has none of; interrupted, it may be begun again.
 
-    Every partition gets a record that says that nobody holds it, and its revision is the fence of what is copied: a
-    member that takes a partition meanwhile makes the copy fail, and not the other way round.
+    Every partition gets a record without a holder, whose revision is the fence of the copies: when a member takes a
+    partition meanwhile, the copy fails, and not the member.
     """
     fences: dict[int, int] = {}
     for partition in range(PARTITIONS):

@@ -3,7 +3,7 @@
 asyncio runs on the main thread and does little: signals, the deadlines of frames that wait for their clouds, and once a
 second the streams that fell silent and the summaries of problems. Messages never pass through it.
 
-Parent and worker talk in lines of JSON. The parent writes to the worker's stdin what it is to run with; when stdin
+Parent and worker talk in lines of JSON. The parent writes settings to the worker's stdin; when stdin
 ends, so does the worker: the parent wants it, or is dead. The worker writes events to its stdout: `ready`, and a beat
 twice a second. Logs go to stderr, which both share.
 """
@@ -120,7 +120,7 @@ async def _serve(
     settle()
     watching = loop.create_task(watch_keys(asked, lambda: service.key_numbers, settings.restart_keys))
     with grpc_edge(settings, service.client(), health.metrics):
-        # In this order: who sees the ready line may send at once, and finds this event before those of a session.
+        # In this order: messages may come as soon as the ready line is out, and this event precedes those of sessions.
         log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
         if parent is None:
             say_ready("instance", settings.instance, (*settings.endpoints, *settings.connect))
@@ -170,7 +170,7 @@ def _release_compiler() -> None:
     advise.argtypes = (ctypes.c_size_t, ctypes.c_size_t, ctypes.c_int)
     for line in MAPS.read_text(encoding="utf-8").splitlines():
         extent, access = line.split(maxsplit=2)[:2]
-        # Code alone: what is only read may hold addresses that were filled in when the library was loaded.
+        # Code alone: read-only data may hold addresses that were filled in when the library was loaded.
         if COMPILER in line and access == "r-xp":
             begin, end = (int(bound, 16) for bound in extent.split("-"))
             advise(begin, end - begin, mmap.MADV_DONTNEED)

@@ -1,4 +1,4 @@
-"""The parent of worker processes: starts them, starts again those that die, speaks for them, and tracks nothing itself.
+"""The parent of worker processes: starts and restarts them, answers for them, and tracks nothing itself.
 
 With a router, the router lives in the parent, and the workers connect to it over a socket in a private folder: no port,
 no password. Else the workers connect where the parent does. To the network the workers are one instance: the parent
@@ -42,9 +42,10 @@ from optipmb_service.zenoh.transport import Transport
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
+    from optipmb_client.zenoh.handles import Query
+
     from optipmb_service.app.lifecycle import StopRequest
     from optipmb_service.settings import Settings
-    from optipmb_service.stream.ports import Request
     from optipmb_service.telemetry.health import ProcessHealth
     from optipmb_service.telemetry.metrics import Metrics
 
@@ -54,8 +55,8 @@ FIRST_PAUSE_S: Final = 0.5
 LONGEST_PAUSE_S: Final = 30.0
 STEADY_S: Final = 10.0  # a worker that has lived for so long is started again at once if it dies
 START_S: Final = 900.0  # longest start of a worker: one compiles the kernels, and the others wait
-WORKERS_S: Final = 2.0  # how much longer the end of a parent may take than that of its workers
-OWN_END_S: Final = 0.5  # how long a parent may take to end without workers: what is left of them before is killed
+WORKERS_S: Final = 2.0  # time of a parent's end beyond the end of its workers
+OWN_END_S: Final = 0.5  # time of a parent's end after its workers; those still running before are killed
 ORDERLY: Final = frozenset({0, RESTART, -signal.SIGINT, -signal.SIGTERM})
 """Statuses of a worker that has ended as it was asked to; by these signals before it could listen to them."""
 
@@ -73,7 +74,7 @@ State = Literal["starting", "ready", "down"]
 
 
 class Worker:
-    """A worker process and those that are started in its place.
+    """A worker process and its replacements.
 
     Each is a fresh interpreter. A fork would copy Zenoh's threads without their life and numba's locks as they were,
     and a worker that is started again after a crash must not inherit what the parent has become by then.
@@ -170,7 +171,7 @@ class Supervisor:
         """Tell the workers to end."""
         for worker in self.workers:
             worker.end()
-        await asyncio.sleep(0.0)  # only the loop's next turn closes what they read from
+        await asyncio.sleep(0.0)  # only the loop's next turn closes their stdin
 
     async def stop(self) -> bool:
         """End the workers; False when one hung in its end, or had to be killed."""
@@ -216,7 +217,7 @@ class Supervisor:
 
     async def _keep(self, worker: Worker) -> None:
         """Run a worker until the end, again whenever it ends."""
-        index, folder = worker.index, self._settings.folder  # one for all, wherever the workers connect
+        index, folder = worker.index, self._settings.folder  # shared by all workers
         settings = self._settings.model_copy(
             update={"instance": f"{self._settings.instance}-w{index}", "store": str(folder) if folder else "none"}
         )
@@ -332,14 +333,14 @@ class AggregateView(Reporter):
         )
 
     def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None] | None:
-        """Hand over what comes on a stream to a viewer, whichever worker tracks it, until the result is called."""
+        """Hand over the messages of a stream of any worker to a viewer, until the result is called."""
         return None if self._ending else self._network.tap(stream, receive, self._fusion.seen_by(stream))
 
-    def answer(self, request: Request) -> None:
-        """Answer a query about the instance, and finish it whatever happens."""
+    def answer(self, request: Query) -> None:
+        """Answer a query about the instance, and finish it in any case."""
         guarded(request, lambda: self._answer(request), instance=self._instance)
 
-    def _answer(self, request: Request) -> None:
+    def _answer(self, request: Query) -> None:
         keys = self._keys
         status, metrics = keys.status(self._instance), keys.metrics(self._instance)
         orders = {keys.move(self._instance): self._move, keys.drain(self._instance): self._drain}
@@ -351,14 +352,14 @@ class AggregateView(Reporter):
         if request.matches(metrics):
             request.answer_text(metrics, self._metrics.text(), TEXT)
 
-    def _move(self, request: Request) -> None:
+    def _move(self, request: Query) -> None:
         asked = move_asked(request, self._limits, len(self._names))
         key = self._keys.move(self._names[asked.worker])
         if self._network.ask(key, MOVE_S, request.payload or b"", request.encoding) is None:
             raise schemas.MessageError("invalid_value", "worker", "a worker to which the stream comes", "none in time")
         request.answer(request.key, asked)
 
-    def _drain(self, request: Request) -> None:
+    def _drain(self, request: Query) -> None:
         asked = drain_asked(request, self._limits)
         answers = [one for one in self._ask(self._keys.status) if one is not None] if asked.drain else []
         members = _newest(schemas.decode(answer, schemas.ServiceStatus) for answer in answers)
@@ -399,7 +400,7 @@ async def supervise(settings: Settings) -> int:
     """Run the service as worker processes until SIGINT or SIGTERM.
 
     Returns:
-        The exit status, as `lifecycle.run` does, or that of a worker which could not start.
+        The exit status, as `lifecycle.run` does, or of a worker which could not start.
     """
     with private_folder() as folder:
         own, workers = divided(settings, f"unixsock-stream/{folder / 'router'}")
@@ -449,7 +450,7 @@ async def serve_workers(
 
 
 def divided(settings: Settings, socket: str) -> tuple[Settings, Settings]:
-    """Return the settings of the parent, whose router listens at `socket`, and those of its workers without names."""
+    """Return the settings of the parent, whose router listens at `socket`, and of its workers, without names."""
     router = settings.is_router
     own = settings.model_copy(update={"listen": (*settings.endpoints, socket) if router else settings.endpoints})
     workers = settings.model_copy(
@@ -459,7 +460,7 @@ def divided(settings: Settings, socket: str) -> tuple[Settings, Settings]:
             "connect": (socket,) if router else settings.connect,
             "http": "",
             "grpc": "",
-            # Its name follows from the endpoints, and those of the workers are the parent's own affair.
+            # Its default name follows from the endpoints, which differ between parent and workers.
             "store": "none" if settings.folder is None else str(settings.folder),
             "zenoh_config": None if router else settings.zenoh_config,
             "standby_mb": max(1, settings.standby_mb // settings.workers),
@@ -473,7 +474,7 @@ def private_folder() -> Iterator[Path]:
     """Make a folder that only this user may enter, and remove it at the end; what killed processes left goes too.
 
     A living process holds a lock on a file in its folder; the kernel lets go of it however the process ends. The file
-    gets its name when it is locked already, so nobody finds one that is not locked yet.
+    gets its name when it is locked already, so every file of this name is locked while its process lives.
     """
     for held in Path(tempfile.gettempdir()).glob(f"{PREFIX}*/{HELD}"):
         with contextlib.suppress(OSError):  # of another user, held by a process that lives, or removed meanwhile

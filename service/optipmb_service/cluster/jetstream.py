@@ -2,9 +2,8 @@
 
 One JetStream stream for each key prefix holds every record and every checkpoint, each kind under subjects of its own.
 The sequence number that the server gives a message is its revision, and the server compares: a write states the
-sequence of the message that it replaces (`Nats-Expected-Last-Subject-Sequence`), a checkpoint that of its partition's
-record (with `…-Subject`, which needs NATS 2.12). A checkpoint that nobody has replaced for so long is forgotten by the
-server.
+sequence of the message that it replaces (`Nats-Expected-Last-Subject-Sequence`), a checkpoint states the sequence of
+its partition's record (with `…-Subject`, which needs NATS 2.12). The server removes old checkpoints by itself.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ class JetStream:
     Args:
         servers: addresses of NATS servers, as `nats://host:4222`; of one cluster, where there are several.
         prefix: first chunks of every key of the service.
-        keep_s: age at which a checkpoint that nobody has replaced is forgotten; 0: never.
+        keep_s: age at which the newest checkpoint of a stream is removed; 0: never.
         options: of NATS' client, as `nats_connection.access` returns them.
     """
 
@@ -75,12 +74,12 @@ class JetStream:
         return self._call(self._publish(self._record(write.key), write.value.encode(), headers))
 
     def gone(self, member: str) -> bool:
-        """Return False: whether a process on another machine has ended nobody knows."""
+        """Return False: the end of a process on another machine cannot be observed."""
         del member
         return False
 
     def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
-        """Write the newest checkpoints of streams; return those that were refused for their fence."""
+        """Write the newest checkpoints of streams; return the streams refused for their fence."""
         refused: frozenset[str] = frozenset()
         left = iter(checkpoints.items())
         while some := dict(islice(left, SAVED_IN_A_CALL)):  # a server that is stuck is waited for once
@@ -156,7 +155,7 @@ class JetStream:
                 return None
             if code != UNDECIDED:
                 raise RefusedError(error)
-            await asyncio.sleep(AGAIN_S)  # whoever called sets the bound
+            await asyncio.sleep(AGAIN_S)  # the caller sets the bound
 
     async def _save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
         turn = asyncio.Semaphore(SAVED_AT_ONCE)

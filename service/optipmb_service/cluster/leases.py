@@ -9,14 +9,14 @@ higher than all before it. No clock is ever compared with another one.
   by its own clock, without a new revision, writes `ended` over that revision; at once where the store knows that the
   member's process is gone. The member's next renewal is refused then, or it has come first and the other's write is
   refused.
-- `partition/<number>`: the member that holds the partition, or nobody. The revision of the record is the *fence* of
+- `partition/<number>`: the member that holds the partition, or none. The revision of the record is the *fence* of
   the lease; the store refuses a checkpoint whose fence is not the newest revision of its partition. A partition
-  whose member has ended, or that nobody holds, is taken by writing over its record.
+  whose member has ended, or without a holder, is taken by writing over its record.
 - A member publishes for half a lease after it has sent a renewal that was accepted, so it has stopped before anybody
   can end it.
 
 Every member computes from the living ones how many partitions each is to have, within one of an equal share, leaves
-what it has beyond that, and takes what is free up to it. `wish/<number>` names the instance that an operator wants to
+the surplus, and takes free ones up to its share. `wish/<number>` names the instance that an operator wants to
 have a partition: while such a member lives, no other takes it, and who holds it leaves it. A member that drains, or
 has no router, says so in its record: its share is nothing, the others have it. Partitions are left a few at a time, so
 that the streams of one wait for nothing but their own restoring.
@@ -83,7 +83,7 @@ class Change(StrEnum):
     RECALLED = "recalled"
     """Another member is to have it as soon as the states of its streams are kept."""
     RENEWED = "renewed"
-    """It is held under another fence: the store had lost its record, and nobody else has taken it."""
+    """It is held under another fence: the store had lost its record, and no other member has taken it."""
     LOST = "lost"
     """Another member may continue its streams already: the states here are not the newest, and are not to be kept."""
 
@@ -126,8 +126,8 @@ class LeaseTable:
         lease_ns: how long a member is watched before it is ended.
         position: the highest revision seen.
         held: partitions that it holds, each with its fence; may be read by any thread.
-        leaving: of these, those that it is about to leave, since when.
-        state: what its record says; unless `alive`, others are to have what it holds.
+        leaving: partitions of `held` that it is about to leave, since when.
+        state: value of its record; unless `alive`, others are to have its partitions.
         moving: whether it has fewer partitions than it is to have, or more.
         changed_ns: when something but a renewal was seen last.
     """
@@ -148,7 +148,7 @@ class LeaseTable:
     def apply(self, records: Iterable[Record], now_ns: int) -> None:
         """Apply new records."""
         if self._looked_ns is None or now_ns - self._looked_ns > self.lease_ns // WATCHED:
-            # Nobody could renew, or it was not seen: the lease of each is counted from now.
+            # Renewals may have been missed: the lease of each member is counted from now.
             for one in self._members.values():
                 one.seen_ns = now_ns
         self._looked_ns = now_ns
@@ -228,7 +228,7 @@ class LeaseTable:
         return known is not None and known.alive and instance in {None, instance_of(holder)}
 
     def due(self, now_ns: int, occupied: Callable[[], Container[int]], gone: Callable[[str], bool]) -> list[Write]:
-        """Return what is to be written now; `written` is to be called with each.
+        """Return the writes that are due; `written` is to be called with each.
 
         Args:
             now_ns: monotonic time.
@@ -241,7 +241,7 @@ class LeaseTable:
             if one.alive and (now_ns - one.seen_ns >= self.lease_ns or gone(name))
         ]
         mine, others = self._wished()
-        # What is wished goes before an equal share.
+        # Wishes go before an equal share.
         room = self._share() - len(mine)
         wished = self.held.keys() & others
         surplus = []
@@ -300,7 +300,7 @@ class LeaseTable:
         return each + (members.index(self.member) < rest)
 
     def _wished(self) -> tuple[set[int], set[int]]:
-        """Return the partitions that this member is to have by a wish, and those that another living one is to have."""
+        """Return the partitions that wishes give to this member, and to other living members."""
         own, living = instance_of(self.member), {instance_of(name) for name in self.takers()}
         mine = {
             partition

@@ -43,7 +43,7 @@ class Missed:
 
     Attributes:
         streams: whose detections.
-        node: `site/node`, of whose other streams in the log those that `belongs` are wanted too; empty: none.
+        node: `site/node`, whose streams in the log are wanted too where `belongs` says so; empty: none.
         belongs: whether a stream of the node feeds the session.
         positions: where streams are; of one without a position the last seconds are wanted.
     """

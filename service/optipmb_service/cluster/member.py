@@ -1,4 +1,4 @@
-"""A member: the thread that renews its record, follows those of others, and takes and leaves partitions.
+"""A member: the thread that renews its record, follows the records of others, and takes and leaves partitions.
 
 It tells what becomes of each partition. One that it leaves it gives up when the state of each of its streams is kept.
 """
@@ -38,14 +38,14 @@ log = structlog.get_logger("optipmb_service")
 SECOND: Final = 1_000_000_000
 LOOKS_PER_LEASE: Final = 8  # each with a renewal: a request to a store elsewhere takes a millisecond of processor
 LONGEST_LOOK_S: Final = 0.1  # of a store on the same machine: how late a killed member may be noticed
-SHORT_LOOK_S: Final = 0.02  # while partitions change hands: each is held by nobody for as long
+SHORT_LOOK_S: Final = 0.02  # while partitions change hands: each is without a holder for as long
 RENEWALS_PER_LEASE: Final = 2 * LOOKS_PER_LEASE  # at most: so each look that is not a short one renews
 STRAINED: Final = 4  # part of a lease without a renewal from which on it is late
 SLOW_LEASES: Final = 2  # leases without a renewal in time: then the store is slow, and waiting does not help
 UNLINKED_PER_LEASE: Final = 4  # part of a lease without a router, before the partitions are given up
 WRITE_LEASES_PER_LEASE: Final = 2
 RETRY_S: Final = 0.1  # at the end, between two tries to say so
-FIRST_TURNS: Final = 3  # turns in which who begins has ended those that are gone, and has all that is free
+FIRST_TURNS: Final = 3  # turns in which a new member ends dead ones, and takes all free partitions
 
 
 class Member:
@@ -88,7 +88,7 @@ class Member:
         self._gone: set[int] = set()
         """Partitions that are held, and whose records the store has lost."""
         self._renewed: set[int] = set()
-        """Those whose records were written again, as long as nobody was told."""
+        """Partitions whose records were written again, until that is reported."""
         self._came = threading.Condition()
         self._changed: Callable[[int, Change], None] = lambda *_: None
         self._resumed: Callable[[], None] = lambda: None
@@ -137,7 +137,7 @@ class Member:
 
     @property
     def partitions(self) -> set[int]:
-        """The partitions that this member holds, also those that it is about to leave."""
+        """The partitions that this member holds, also while it is about to leave them."""
         return set(self._table.held.copy())
 
     def holds(self, stream: str) -> bool:
@@ -192,7 +192,7 @@ class Member:
         self._wake.set()
 
     def drained(self, timeout: float) -> bool:
-        """Wait until nothing is held, or nobody is there to take it, at most so long (s); return whether it is left."""
+        """Wait until nothing is held, or no member can take it, at most so long (s); return whether nothing is held."""
         with self._came:
             self._came.wait_for(lambda: not (self._table.held and self.others), timeout)
             return not self._table.held
@@ -239,7 +239,7 @@ class Member:
                 log.exception("internal_error", thread="member")  # the write lease lapses
 
     def _turn(self) -> None:
-        """Renew, look, write what is due."""
+        """Renew, look, write."""
         self._table.state = self._state()
         if not self._keep():
             return
@@ -335,7 +335,7 @@ class Member:
             revision = self._store.put(Write(key, value, self._revision))
         except StoreError:
             # A full or read-only disk: no member can write, so none is ended, and each goes on while its record stands.
-            # Whoever can write again has not looked meanwhile, and counts every lease anew.
+            # A member that can write again has not looked meanwhile, and counts every lease from then.
             found = None if self._store.remote else self._store.get(key)
             if found is None or found.revision != self._revision:
                 raise
@@ -345,7 +345,7 @@ class Member:
         return revision
 
     def _lose(self) -> None:
-        """Begin anew: another member has ended this one, and holds what it held, or will."""
+        """Begin again as a new member: another one has ended this one, and takes its partitions."""
         self._may_write_until_ns = 0
         if self._table.held:
             log.error("lease_lost", member=self._table.member, partitions=len(self._table.held))

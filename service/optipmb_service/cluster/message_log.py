@@ -1,12 +1,12 @@
-"""The log of messages in NATS JetStream: detections for who goes on with a session, tracks for who asks later.
+"""The log of messages in NATS JetStream: detections for the next member of a session, tracks for later queries.
 
-Each topic has a JetStream stream, with a subject for each stream of the service; its size and the age of what it holds
-are bounded, the oldest messages go. A message has an id, and the server drops what it has under the same id, so it does
-not matter how many write the same. Point clouds are never put here.
+Each topic has a JetStream stream, with a subject for each stream of the service; its size and the age of its messages
+are bounded, the oldest go. The server drops a message whose id it has, so any number of writers may write the same.
+Point clouds are never put here.
 
-A reader looks for the beginning of what it wants from the newest message on, backwards by the server's own times, so
-that neither the clocks of machines nor those of sensors are compared with each other. What cannot be read is as if it
-were not there: the caches of publishers may still have it. A writer holds messages while the servers are away.
+A reader searches its first message backwards from the newest one, by the server's own times, so that clocks of
+machines and sensors are never compared with each other. A message that cannot be read counts as missing: the caches of
+publishers may still have it. A writer holds messages while the servers are away.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from optipmb_service.cluster.nats_connection import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Awaitable, Callable, Mapping, Sequence
 
     from nats.aio.msg import Msg
 
@@ -64,7 +64,7 @@ HEADERS: Final = len(b"NATS/1.0\r\n\r\n")
 
 READ_AT_ONCE: Final = 16  # streams that are read at once
 READ_S: Final = 3.0  # longest time for one stream, from its turn on
-WAIT_S: Final = 30.0  # longest time in all, with what it waits for its turn
+WAIT_S: Final = 30.0  # longest time in all, with the wait for its turn
 OUTAGE_S: Final = 30.0
 """How far a stream is read at most that has a position, by the log's own times, unless one without has it longer.
 
@@ -73,10 +73,10 @@ To track more than that would keep the newest frames waiting for as long as they
 
 MOST_BYTES: Final = 2**25  # bytes of a stream that are given at once at most; the oldest frames go
 MOST_FRAMES: Final = 1024  # frames given at once at most, as many as a session holds while some are missing
-LOOK_AGAIN_S: Final = (0.3, 0.7)  # pauses before the log is read again for what has come since
+LOOK_AGAIN_S: Final = (0.3, 0.7)  # pauses before the log is read again for newer messages
 AT_ONCE: Final = 256  # messages on their way to the servers at once
 HELD_BYTES: Final = 2**28  # bytes that are held at most; the oldest messages go first
-OVERHEAD: Final = 512  # what a message takes beside its payload, nearly
+OVERHEAD: Final = 512  # bytes of a message without its payload, nearly
 RETRY_S: Final = 0.5  # between two tries
 ALONE_TRIES: Final = 5  # how often a message is tried alone that is not written by servers that work
 
@@ -94,7 +94,7 @@ class LogMessage(NamedTuple):
         epoch: of its frame.
         seq: of its frame.
         stamp_ns: of its frame.
-        sensor: whose frame it is, where tracks are those of several sensors; else nothing.
+        sensor: whose frame it is, where several sensors share tracks; else empty.
         order: what tells the tracks of one frame apart: the higher ones hold. (0, 0) for detections.
         payload: its bytes, as they were published.
         encoding: the Zenoh encoding.
@@ -117,7 +117,7 @@ class LogMessage(NamedTuple):
 
     @property
     def headers(self) -> dict[str, str]:
-        """What it carries in the log."""
+        """Its headers in the log."""
         return {ID: self.id, FRAME: self._frame, ENCODING: self.encoding}
 
     @property
@@ -214,7 +214,7 @@ class MessageLog:
         Args:
             topic: which log.
             stream: whose messages.
-            old: whether a message is before those that are wanted; of a stream's messages it is the first ones.
+            old: whether a message precedes the wanted ones; true for the first messages of a stream.
             back_s: how much older than the newest message they are at most.
         """
         newest = await self._one(topic, {"last_by_subj": self._subject(topic, stream)})
@@ -272,7 +272,7 @@ class MessageLog:
             return []
         try:
             messages = await self.connection.read(self._names[topic], request)
-        except NobodyAnswersError:  # nobody has put anything into such a log
+        except NobodyAnswersError:  # the log does not exist yet
             self._missing_until[topic] = time.monotonic() + MISSING_S
             return []
         return [_found(topic, one) for one in messages]
@@ -340,7 +340,7 @@ class LogReader:
         Args:
             wanted: of which streams, from where on.
             take: called, on a thread that must not be kept, with what there is, in the order of the log of each stream;
-                then a few times with what has come since. The first time it is called in any case.
+                then a few times with newer ones. The first time it is called in any case.
             again_s: pauses after which the log is read again.
         """
         self._log.connection.start(self._missed(wanted, take, again_s))
@@ -368,19 +368,30 @@ class LogReader:
         for number, pause_s in enumerate((0.0, *again_s)):
             await asyncio.sleep(pause_s)
             messages: list[LogMessage] = []
-            try:
-                async with asyncio.timeout(WAIT_S), self._turns, asyncio.timeout(READ_S):
-                    streams = set(wanted.streams)
-                    if wanted.node:
-                        streams.update(filter(wanted.belongs, await self._log.streams("detections", wanted.node)))
-                    for stream in sorted(streams):
-                        await self._read(stream, wanted.positions.get(stream), following, messages)
-            except ERRORS as error:
-                log.warning("log_unread", streams=sorted(wanted.streams), error=self._log.connection.described(error))
-            except Exception:
-                log.exception("internal_error", streams=sorted(wanted.streams))  # the session waits for what there is
+
+            async def read(messages: list[LogMessage] = messages) -> None:
+                streams = set(wanted.streams)
+                if wanted.node:
+                    streams.update(filter(wanted.belongs, await self._log.streams("detections", wanted.node)))
+                for stream in sorted(streams):
+                    await self._read(stream, wanted.positions.get(stream), following, messages)
+
+            if failure := await self._bounded(read):
+                log.warning("log_unread", streams=sorted(wanted.streams), error=failure)
             if messages or number == 0:
                 take(messages)
+
+    async def _bounded(self, read: Callable[[], Awaitable[None]]) -> str:
+        """Read in turn, for a bounded time; return the failure, empty without one."""
+        try:
+            async with asyncio.timeout(WAIT_S), self._turns, asyncio.timeout(READ_S):
+                await read()
+        except ERRORS as error:
+            return self._log.connection.described(error)
+        except Exception as error:
+            log.exception("internal_error", thread="nats")  # the session waits for an answer
+            return f"{type(error).__name__}: {error}"
+        return ""
 
     async def _read(
         self, stream: str, position: Position | None, following: dict[str, int | None], messages: list[LogMessage]
@@ -404,7 +415,7 @@ class LogReader:
                     while len(kept) > MOST_FRAMES or size > MOST_BYTES:
                         size -= len(kept.popleft().payload)
                         cut += 1
-        finally:  # what was read before a failure is not read again
+        finally:  # after a failure reading continues here
             following[stream] = number
             messages.extend(kept)
         if cut:
@@ -413,20 +424,14 @@ class LogReader:
     async def _tracks(
         self, stream: str, from_ns: int, take: Callable[[list[LogMessage]], bool], end: Callable[[str], None]
     ) -> None:
-        failure = ""
-        try:
-            async with asyncio.timeout(WAIT_S), self._turns, asyncio.timeout(READ_S):
-                number = await self._log.since("tracks", stream, lambda one: one.stamp_ns < from_ns)
-                while number is not None and (found := await self._log.read("tracks", stream, number)):
-                    number = found[-1][0] + 1
-                    if not take([message for _, message in found]):
-                        break
-        except ERRORS as error:
-            failure = self._log.connection.described(error)
-        except Exception as error:
-            log.exception("internal_error", stream=stream)
-            failure = f"{type(error).__name__}: {error}"
-        end(failure)
+        async def read() -> None:
+            number = await self._log.since("tracks", stream, lambda one: one.stamp_ns < from_ns)
+            while number is not None and (found := await self._log.read("tracks", stream, number)):
+                number = found[-1][0] + 1
+                if not take([message for _, message in found]):
+                    break
+
+        end(await self._bounded(read))
 
 
 class LogWriter:
@@ -434,7 +439,7 @@ class LogWriter:
 
     Args:
         log: where messages go; closed by the caller, after this.
-        keep: what is kept of which topics.
+        keep: retention by topic.
         lost: called, on any thread, with the stream of a message that is not in the log, and why.
         held_bytes: bytes that are held at most.
     """
@@ -509,7 +514,7 @@ class LogWriter:
     # On the loop of the log
 
     async def _run(self) -> None:
-        while not await self._ready():  # noqa: ASYNC110 - the servers are asked again, nobody else says anything
+        while not await self._ready():  # noqa: ASYNC110 - there is no event to wait for
             await asyncio.sleep(RETRY_S)
         self._works()
         while True:
@@ -542,9 +547,9 @@ class LogWriter:
             return [self._waiting.popleft() for _ in range(min(self._at_once, len(self._waiting)))]
 
     async def _write(self, batch: list[LogMessage]) -> list[LogMessage]:
-        """Write messages; return those that have to be tried again.
+        """Write messages; return the ones to try again.
 
-        One message can keep all beside it from being written, by having the connection closed. So after a failure they
+        One message can keep all others from being written, by having the connection closed. So after a failure they
         are tried alone, and the tries of the first one count while the servers say that its log is there.
         """
         if not await self._ready():

@@ -1,6 +1,6 @@
 """One connection to the NATS servers, for any thread, and what opens it: certificates, and a user's credentials.
 
-The client of NATS is asyncio's; it has a loop on a thread of its own, and whoever calls waits for it a bounded time.
+The client of NATS is asyncio's; it has a loop on a thread of its own, and callers wait for it a bounded time.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class NobodyAnswersError(NatsError):
 class SecuredClient(Client):
     """NATS' client, but one that says nothing to a server without TLS where the address wants it.
 
-    A server tells in the clear whether it wants TLS, and whoever stands in between could leave that out: the client
+    A server tells in the clear whether it wants TLS, and an attacker in between could leave that out: the client
     would go on without, and send the password.
 
     It also closes a connection that a server ended before it had greeted the client, before it tries the next one.
@@ -190,7 +190,7 @@ class NatsConnection:
         """
         client = self._client
         if not client.is_connected:
-            # Nothing is put into the client's buffer: it would be sent when nobody waits for it any more.
+            # Nothing is put into the client's buffer: it would be sent after its caller has given up.
             raise NatsError(self._why)
         version = client.connected_server_version
         if (version.major, version.minor) < LEAST:
@@ -198,7 +198,7 @@ class NatsConnection:
         return client
 
     async def create(self, name: str, bounds: Mapping[str, Any]) -> None:
-        """Create a JetStream stream of what is published below its name, unless there is one."""
+        """Create a JetStream stream of the subjects below its name, unless there is one."""
         config = {
             "name": name,
             "subjects": [f"{name}.>"],

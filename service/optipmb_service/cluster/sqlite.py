@@ -2,7 +2,7 @@
 
 A renewal must not wait for a disk: a member that cannot renew for a lease loses its partitions. So the records have a
 file of their own, which is never synced, and a connection that nothing else uses. What a power cut may do to that file
-costs nothing: no member survives it. A damaged one is replaced when nobody uses it.
+costs nothing: no member survives it. A damaged one is replaced when it is not in use.
 
 The other file has the checkpoints. Its journal is a write-ahead log, so that readers never wait for the writer, and
 `synchronous = NORMAL` suffices: what a killed process has committed is in the log and stays, the file is whole after a
@@ -10,7 +10,7 @@ power cut too, which may only cost the last transactions; the publishers' caches
 transaction would cost several milliseconds of disk time each second for nothing else. Much is written in transactions
 of a bounded size, so that other processes have their turn.
 
-Beside the two is a folder with a file for each member, which it holds a lock on as long as it lives. The kernel gives
+A folder has a file for each member, which it holds a lock on as long as it lives. The kernel gives
 up the lock of a member whose process has ended, however it ended: then it publishes nothing more for certain.
 """
 
@@ -37,10 +37,10 @@ if TYPE_CHECKING:
 log = structlog.get_logger("optipmb_service")
 
 MEMBERS: Final = "members"  # folder of the files whose locks say that members live
-BUSY_S: Final = 5.0  # how long a transaction waits for those of other processes; each takes milliseconds
+BUSY_S: Final = 5.0  # longest wait for transactions of other processes; each takes milliseconds
 BUSY_PAUSE_S: Final = 0.01
 
-LOG_BYTES: Final = 4 * 2**20  # size of the write-ahead log from which its pages go into the file, and it begins anew
+LOG_BYTES: Final = 4 * 2**20  # size of the write-ahead log from which its pages go into the file
 ASIDE: Final = 64  # torn checkpoints kept in all; beyond it the oldest go
 LEASES: Final = "leases.db"  # file of the records
 ENDED_KEPT: Final = 64  # records of ended members; who has followed none of the later ones was ended itself
@@ -70,7 +70,7 @@ _SILENT: Final = "SELECT stream FROM written WHERE at < ? LIMIT ?"
 
 
 class MemberLocks:
-    """The lock of the member of this process, and those of others, in a folder; None: there are no others."""
+    """Locks of members in a folder, one held by this process; None: there are no other processes."""
 
     def __init__(self, folder: Path | None) -> None:
         self._folder = folder
@@ -155,8 +155,8 @@ def _locked(path: Path) -> bool:
 class Database:
     """One file that processes share and a connection to it; any thread may use it, one at a time.
 
-    SQLite itself goes on writing into a file that was deleted, where nobody finds it again. So before each use it is
-    seen whether the file is still the one that was opened; else it is made again, with all that the deleted one holds.
+    SQLite itself goes on writing into a file that was deleted, and so loses it. So before each use it is
+    checked that the file is still the one that was opened; else it is made again, with all that the deleted one holds.
 
     Args:
         path: the file; made when it is not there. None: in memory.
@@ -273,7 +273,7 @@ class Database:
         """Use the connection exclusively.
 
         Raises:
-            StoreError: whatever is wrong with it.
+            StoreError: it cannot be used.
         """
         with self._lock:
             connection = self._connected()
@@ -319,8 +319,7 @@ class SqliteStore:
     """The leases and checkpoints of the processes of one machine.
 
     Args:
-        path: the file of the checkpoints; the other one and the folder are beside it, and all are made when they are
-            not there. None: in memory, for one process alone.
+        path: the file of the checkpoints, in whose folder all else is made. None: in memory, for one process alone.
         clock: seconds since 1970.
 
     Raises:
@@ -357,7 +356,7 @@ class SqliteStore:
     def put(self, write: Write) -> int | None:
         """Write a record; return its revision, None when the one to be replaced is not the newest.
 
-        With its first record a member takes its lock, and with its last one it, or whoever ends it, removes that.
+        With its first record a member takes its lock, and the last one, its own or that of another member, removes it.
         """
         kind, _, name = write.key.partition("/")
         begins = kind == "member" and write.over == 0 and write.value != ENDED
@@ -380,10 +379,10 @@ class SqliteStore:
         return self._locks.is_free(member)
 
     def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
-        """Write the newest checkpoints of streams, some in a transaction; return those that were refused.
+        """Write the newest checkpoints of streams, some in a transaction; return the refused ones.
 
-        The fence is read when nobody else can write a checkpoint, and a successor reads one only so (`load`): either it
-        reads what is written here, or its fence is found here.
+        The fence is read with the write lock, and so is a checkpoint by a successor (`load`): either it reads the
+        checkpoints of this call, or its fence is found here.
         """
         refused: set[str] = set()
         left = iter(checkpoints.items())
@@ -443,7 +442,7 @@ class SqliteStore:
             connection.execute("DELETE FROM aside WHERE number <= (SELECT max(number) FROM aside) - ?", (ASIDE,))
 
     def aside(self) -> list[tuple[str, str, bytes]]:
-        """Return stream, reason and bytes of what was set aside, the oldest first."""
+        """Return stream, reason and bytes of the checkpoints set aside, the oldest first."""
         with self._checkpoints.use() as connection:
             rows = connection.execute("SELECT stream, reason, data FROM aside ORDER BY number").fetchall()
         return [(stream, reason, bytes(data)) for stream, reason, data in rows]
@@ -468,7 +467,7 @@ def _some(left: Iterator[tuple[str, Fenced]]) -> list[tuple[str, Fenced]]:
 
 
 def _leases_beside(path: Path, restored: Callable[[], None]) -> Database:
-    """Open the file of the records; one that is damaged is made anew when no member uses it.
+    """Open the file of the records; a damaged one is replaced when no member uses it.
 
     Raises:
         StoreError: it cannot be opened or written.

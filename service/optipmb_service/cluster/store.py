@@ -1,7 +1,7 @@
 """Store of leases and checkpoints: the port `LeaseStore`; its adapters are `sqlite` and `jetstream`.
 
-A store holds records and bytes and knows nothing of what they mean. Of every stream it keeps the newest two
-checkpoints: when the newest turns out to be torn, it is set aside (kept for whoever wants to know why, never deleted by
+A store holds records and bytes without interpreting them. Of every stream it keeps the newest two
+checkpoints: when the newest turns out to be torn, it is set aside (kept for diagnosis, never deleted by
 the way) and the one before it is the newest again. A checkpoint is saved under the fence of a lease: a process that was
 frozen and wakes up cannot write over what its successor has saved since.
 """
@@ -18,11 +18,11 @@ ENDED: Final = "ended"  # what the record of a member says at last
 
 
 class StoreError(Exception):
-    """The store cannot do what was asked: full, read-only, locked, not there. Tracking goes on without it."""
+    """Failure of the store: full, read-only, locked, not there. Tracking goes on without it."""
 
 
 class Record(NamedTuple):
-    """A record as the store has it: its key, what it says, and its revision."""
+    """A record of the store."""
 
     key: str
     value: str
@@ -69,7 +69,7 @@ class LeaseStore(Protocol):
         """Return whether the process of a member that has written its record has ended for certain."""
 
     def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
-        """Write the newest checkpoints of streams; return those that were refused for their fence."""
+        """Write the newest checkpoints of streams; return the streams refused for their fence."""
 
     def load(self, stream: str) -> bytes | None:
         """Return the newest checkpoint of a stream, None without one."""

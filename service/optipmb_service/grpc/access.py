@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import grpc
 import structlog
+from optipmb_client.errors import ClientError
 
 from optipmb_service.grpc.calls import EndCall
-from optipmb_service.stream.ports import EdgeError
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
@@ -90,7 +90,7 @@ class Access:
             nothing); it returns the name that holds, or None to refuse. It may be a coroutine.
 
     Raises:
-        EdgeError: the file or the function cannot be used.
+        ClientError: the file or the function cannot be used.
     """
 
     def __init__(self, *, certificates: bool, names: Path | None = None, tokens: str = "") -> None:
@@ -125,9 +125,9 @@ def _names(file: Path) -> frozenset[str]:
     try:
         names = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise EdgeError(f"setting grpc_names: {file}: {error}") from error
+        raise ClientError(f"setting grpc_names: {file}: {error}") from error
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise EdgeError(f"setting grpc_names: {file}: expected a JSON list of names")
+        raise ClientError(f"setting grpc_names: {file}: expected a JSON list of names")
     return frozenset(names)
 
 
@@ -136,7 +136,7 @@ def _function(path: str) -> Tokens:
     try:
         function: Tokens = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError, ValueError) as error:
-        raise EdgeError(f"setting grpc_tokens: {path}: {error}") from error
+        raise ClientError(f"setting grpc_tokens: {path}: {error}") from error
     return function
 
 
@@ -147,13 +147,13 @@ def credentials(folder: Path) -> grpc.ServerCredentials:
         folder: with `key.pem`, `cert.pem` and `ca.pem`, as `docker/security/make.py` makes it.
 
     Raises:
-        EdgeError: a file cannot be read.
+        ClientError: a file cannot be read.
     """
     try:
         state = [_changed(folder)]
         first = _configuration(folder)
     except OSError as error:
-        raise EdgeError(f"setting grpc_tls: {error.filename}: {error.strerror}") from error
+        raise ClientError(f"setting grpc_tls: {error.filename}: {error.strerror}") from error
 
     def renewed() -> Any:  # the stubs do not know that it may be None
         try:

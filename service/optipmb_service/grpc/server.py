@@ -16,13 +16,14 @@ import optipmb_schemas as schemas
 import structlog
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
+from optipmb_client.errors import ClientError
+from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
 from optipmb_service.grpc import inputs, outputs
 from optipmb_service.grpc.access import Access, credentials
 from optipmb_service.grpc.calls import Call, CallerGoneError, EndCall, ending_with_caller
 from optipmb_service.grpc.network import Network
-from optipmb_service.stream.ports import EdgeError, TransportError
 from optipmb_service.telemetry.problem_reporter import ProblemReporter, log_problem
 
 if TYPE_CHECKING:
@@ -103,7 +104,7 @@ class Server:
         client: of the network.
 
     Raises:
-        EdgeError: the address, the certificates or the access cannot be used.
+        ClientError: the address, the certificates or the access cannot be used.
     """
 
     def __init__(self, settings: Settings, client: Client) -> None:
@@ -169,7 +170,7 @@ class Server:
             else:
                 port = self._server.add_secure_port(settings.grpc, credentials(settings.grpc_tls))
         except RuntimeError as error:
-            raise EdgeError(f"cannot listen on {settings.grpc} for gRPC: is the address in use?") from error
+            raise ClientError(f"cannot listen on {settings.grpc} for gRPC: is the address in use?") from error
         return f"{settings.grpc.rpartition(':')[0]}:{port}"
 
     async def _watch(self) -> None:
@@ -258,7 +259,7 @@ def serving(settings: Settings, client: Client) -> Iterator[CallMetrics]:
     """Serve meanwhile, on a thread with a loop of its own: neither side waits for the other.
 
     Raises:
-        EdgeError: the address, the certificates or the access cannot be used.
+        ClientError: the address, the certificates or the access cannot be used.
     """
     loop = asyncio.new_event_loop()
     thread = threading.Thread(target=loop.run_forever, name="grpc", daemon=True)

@@ -19,10 +19,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import optipmb_schemas as schemas
+from optipmb_client.errors import ConnectionFailed as TransportError
 from starlette.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
-
-from optipmb_service.stream.ports import TransportError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Mapping, Sequence
@@ -34,7 +33,7 @@ if TYPE_CHECKING:
     from optipmb_service.telemetry.health import ProcessHealth
 
 PERIOD_S: Final = 0.1  # a viewer gets no more than one frame in this time
-KEEP_ALIVE_S: Final = 5.0  # period of signs of life of a silent stream, for what is in between
+KEEP_ALIVE_S: Final = 5.0  # period of signs of life of a silent stream, for proxies in between
 RETRY_MS: Final = 15_000  # a viewer whose stream cannot be subscribed to comes back after so long
 VIEWERS: Final = 16  # those who look at the same time; more are asked to come back
 POLICY: Final = (
@@ -88,7 +87,7 @@ def _status(health: ProcessHealth) -> Callable[[Request], Response]:
 
 
 class _Counted(StreamingResponse):
-    """Events for one viewer, and what is called when they end, however they do."""
+    """Events for one viewer; calls `leave` when they end, however they do."""
 
     def __init__(self, events: AsyncIterator[str], leave: Callable[[], None]) -> None:
         super().__init__(events, media_type="text/event-stream", headers=HEADERS)
@@ -158,7 +157,7 @@ class _Viewers:
 
 
 def _undo(tapped: asyncio.Future[Callable[[], None] | None]) -> None:
-    """Release a tap that nobody waits for any more."""
+    """Release a tap whose viewer has gone."""
     if tapped.cancelled() or tapped.exception() is not None or (release := tapped.result()) is None:
         return
     with contextlib.suppress(RuntimeError):  # the server ends, and so do its threads
@@ -166,7 +165,7 @@ def _undo(tapped: asyncio.Future[Callable[[], None] | None]) -> None:
 
 
 class Newest:
-    """The newest message of each topic for one reader on an event loop; what nobody took is replaced."""
+    """The newest message of each topic for one reader on an event loop; one that was not taken is replaced."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
@@ -205,9 +204,9 @@ class Newest:
 
 
 def live_frame(tracks: Sample | None, *detections: Sample, georeference: Georeference | None = None) -> str | None:
-    """Return what the page draws, as JSON; None for what is no valid message.
+    """Return the drawing of the page, as JSON; None without a valid message.
 
-    Of detections, the latest first, those of each stream are drawn that come before another of the same stream.
+    Of the detections, the latest first, the latest of each stream are drawn, up to the first repeated stream.
     """
     if tracks is None:
         return None
@@ -273,7 +272,7 @@ def _placed(message: schemas.Detections) -> tuple[list[float] | None, list[list[
     center, sensor = message.center[:_MOST], None
     if message.pose is not None:
         w, x, y, z = message.pose.quaternion
-        rows = np.array(  # the first two rows of the rotation: what is seen from above
+        rows = np.array(  # the first two rows of the rotation: the view from above
             [
                 [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
                 [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],

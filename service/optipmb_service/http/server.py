@@ -16,6 +16,7 @@ import time
 from typing import TYPE_CHECKING, Any, Final
 
 import uvicorn
+from optipmb_client.errors import ClientError
 from optipmb_schemas.asyncapi import document
 from starlette.applications import Starlette
 from starlette.datastructures import Headers
@@ -24,7 +25,6 @@ from starlette.routing import Route
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from optipmb_service.http.page import page
-from optipmb_service.stream.ports import HttpError
 from optipmb_service.telemetry.metrics import CONTENT_TYPE
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 GRACE_S: Final = 1  # how long an answer under way may take at the end
 CONNECTIONS: Final = 256  # open connections; a further one closes an idle one
-REQUESTS: Final = 64  # requests answered at once, beside those of probes; more than the viewers of the page
+REQUESTS: Final = 64  # requests answered at once, without probes; more than the viewers of the page
 HEAD_S: Final = 5.0  # longest time from the begin of a connection until its first request is complete
 KEEP_ALIVE_S: Final = 5
 HEAD_BYTES: Final = 16 * 1024
@@ -49,7 +49,7 @@ MISDIRECTED: Final = 421
 ANY: Final = "*"
 
 PROBES: Final = frozenset({"/healthz", "/readyz"})  # paths that are answered however many other requests are
-MONITORING: Final = PROBES | {"/metrics"}  # paths that programs ask for, by whatever name the service has for them
+MONITORING: Final = PROBES | {"/metrics"}  # paths for programs, answered under any host name
 
 
 def application(
@@ -96,7 +96,7 @@ def _answer(body: dict[str, object], *, well: bool) -> Response:
 
 
 class _Guarded:
-    """An application that answers known host names, and a bounded number of requests at once beside those of probes."""
+    """An application that answers known host names, and a bounded number of requests at once, without probes."""
 
     def __init__(self, application: ASGIApp, names: Collection[str]) -> None:
         self._application = application
@@ -137,11 +137,11 @@ class Server:
     """A running HTTP server; it listens when the constructor returns.
 
     Args:
-        application: what it serves.
+        application: the application that it serves.
         address: `host:port` or `[v6]:port`; port 0 takes any free one.
 
     Raises:
-        HttpError: the address cannot be listened on.
+        ClientError: the address cannot be listened on.
     """
 
     def __init__(self, application: ASGIApp, address: str) -> None:
@@ -151,7 +151,7 @@ class Server:
             family = socket.getaddrinfo(host, int(port), type=socket.SOCK_STREAM)[0][0]
             self._socket = socket.create_server((host, int(port)), family=family, backlog=CONNECTIONS)
         except OSError as error:
-            raise HttpError(f"cannot listen on {address} for HTTP: {error.strerror or error}") from error
+            raise ClientError(f"cannot listen on {address} for HTTP: {error.strerror or error}") from error
         bound = self._socket.getsockname()
         self.address = f"[{bound[0]}]:{bound[1]}" if family == socket.AF_INET6 else f"{bound[0]}:{bound[1]}"
         self._server = uvicorn.Server(
@@ -182,7 +182,7 @@ class _Connection(H11Protocol):
     """A connection that ends when its first request does not come, or when others need its place.
 
     Where all places are taken, the connection that has been idle for the longest time is closed; where all are busy,
-    the one that has been busy for the longest time. So nobody keeps a probe out.
+    the one that has been busy for the longest time. So probes are always answered.
     """
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as the base class has it

@@ -1,1 +1,1 @@
-"""Streams: their backlogs, turns, opening and recovery, and what they need of the network and the store."""
+"""Streams: their backlogs, turns, opening and recovery, with their network inputs and their checkpoints."""

@@ -126,7 +126,7 @@ class Admission:
     Args:
         settings: the limits.
         tracked: returns the streams with a session, when each was last used, and whether it is silent.
-        evict: closes the session of a stream for that of another.
+        evict: closes the session of a stream to make room.
     """
 
     def __init__(
@@ -196,9 +196,9 @@ class Admission:
 def victim_of(stream: str, tracked: Iterable[tuple[str, int, bool]]) -> str | None:
     """Return the stream whose session makes room for another one; None when none has to.
 
-    The least recently used of those that are silent: they go on from the store. Else, of the site that has the most,
+    The least recently used silent stream: it goes on from the store. Else, of the site that has the most,
     its least recently used, if that site has at least two more than the one that asks. So no site keeps the others
-    out, and streams of one frame keep out nobody.
+    out, nor do streams of one frame.
 
     Args:
         stream: the one that asks.

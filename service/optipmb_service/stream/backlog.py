@@ -1,6 +1,6 @@
 """Backlog of a session: its messages that have arrived, or were recovered, and are not processed yet.
 
-A backlog is made for whatever arrives on the keys of a session. It is in one of three states:
+A backlog is made for any message on the keys of a session. It is in one of three states:
 
 | state | meaning | an arriving message is | bounded by | next state by |
 | --- | --- | --- | --- | --- |
@@ -8,12 +8,12 @@ A backlog is made for whatever arrives on the keys of a session. It is in one of
 | opening | a checkpoint is being read or written | held in order | bytes of all | `go_live`, `leave` |
 | live | messages are processed as they come | queued, clouds before frames | numbers, bytes | `open`, `leave` |
 
-What is foreign is given to the member that asks for it (`recent`). While missed packets wait in a live backlog, those
-that arrive are held, too.
+Foreign messages are given to the member that asks for them (`recent`). While missed packets wait in a live backlog,
+arriving ones are held, too.
 
-A stream takes packets that the session has missed first (`recover`), then those that are held, then those in the
-queues. A change of the state moves all that waits; no message is copied between waiting places. Whatever is dropped
-although it was to be tracked here is counted: `shed` of the queues, `Bounds.lost` of what is held.
+A stream takes packets that the session has missed first (`recover`), then the held ones, then queued ones. A change of
+the state moves all waiting messages; none is copied between waiting places. A dropped message that was to be tracked
+here is counted: `shed` of the queues, `Bounds.lost` of held ones.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import structlog
 
-from optipmb_service.stream.ports import Packet
 from optipmb_service.stream.values import SECOND
+from optipmb_service.zenoh.inputs import Packet
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -227,7 +227,7 @@ class Backlog:
             self._schedule()
 
     def cache_answered(self, stream: str, then: Command) -> bool:
-        """Note that a publisher's cache was received completely; `then` runs after what came of it, if that is queued.
+        """Note that a publisher's cache was received completely; `then` runs after its messages, if they are queued.
 
         False when the backlog is closed.
         """
@@ -278,7 +278,7 @@ class Backlog:
         self._lose(lost)
 
     def bring(self, packets: Iterable[Packet]) -> None:
-        """Put what others have received of a session that has come here before what is held; none is held twice."""
+        """Put messages that other members received before the held ones; none is held twice."""
         with self._lock:
             held = [(packet, True) for packet in packets]
             known = {(packet.key, packet.payload) for packet, _ in held}
@@ -299,14 +299,14 @@ class Backlog:
     # What other members ask for
 
     def recent(self) -> list[Packet]:
-        """Return what is held for the member that goes on with the session; nothing is lost that is dropped later."""
+        """Return the messages held for the session's next member; they no longer count as lost when dropped."""
         with self._lock:
             self.unasked = False
             self._held = deque((packet, False) for packet, _ in self._held)
             return [packet for packet, _ in self._held if packet.payload is not None]
 
     def trim(self, now_ns: int) -> bool:
-        """Drop what has been held for another member for too long; return whether nothing is left."""
+        """Drop messages held for another member for too long; return whether none is left."""
         lost: list[Packet] = []
         with self._lock:
             if self.state != "foreign":
@@ -314,7 +314,7 @@ class Backlog:
             keep_ns = max(self._bounds.keep_ns, UNASKED_NS) if self.unasked else self._bounds.keep_ns
             while self._held and now_ns - self._held[0][0].now_ns > keep_ns:
                 self._drop_held(0, lost)
-            if lost:  # nobody has asked for so long; what comes from others is kept as long as usual
+            if lost:  # no member asked in time; messages from others are kept as long as usual
                 self.unasked = any(own for _, own in self._held)
             empty = not self._held and self._schedule is None
         self._lose(lost)
@@ -323,7 +323,7 @@ class Backlog:
     # Taking, on the tracking thread
 
     def take(self, *, urgent: bool = False) -> Packet | Command | None:
-        """Take what is next, None when there is nothing; with `urgent` only commands that go before everything."""
+        """Take the next item, None when there is none; with `urgent` only commands that go before everything."""
         with self._lock:
             self._rung = False
             if self._urgent:

@@ -82,7 +82,7 @@ class Checkpoint:
     """State of a session between two frames. Nothing in it changes any more.
 
     Attributes:
-        stream: `site/node/sensor`; that of the tracks, where several sensors feed the session.
+        stream: `site/node/sensor`, or the name of a fused session.
         parameters: the profile.
         fused: whether several sensors feed it.
         cloud_wait_ns: the wait for clouds that was asked for, None where the service's own holds.
@@ -93,7 +93,7 @@ class Checkpoint:
         head: the present state.
         deliveries: counts of frames that were not tracked, and of corrections.
         newest_cloud_ns: stamp of the cloud that arrived last, by sensor.
-        run: see `Session.run`: the sum of the fences under which the session began and was taken up again.
+        run: see `Session.run`: the sum of the fences under which the session began and was restored.
         software: version of the service that wrote it.
     """
 
@@ -118,7 +118,7 @@ class Checkpoint:
 
 
 def forgotten(checkpoint: Checkpoint) -> Checkpoint:
-    """Return the checkpoint of a stream that is closed: that of its session after a reset, without its counts."""
+    """Return the checkpoint of a closed stream: its session after a reset, without its counts."""
     state = replace(checkpoint.head, counts=FrameCounts())
     seen = checkpoint.seen
     if checkpoint.fused:  # the next frames may have any clock

@@ -20,8 +20,6 @@ from optipmb.frame import frame_of_checked
 from optipmb_service.stream.values import Tracked
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from optipmb_service.stream.timeline import FrameId
 
 IDENTITY = optipmb.Pose(translation=np.zeros(3), quaternion=np.array([1.0, 0.0, 0.0, 0.0]))
@@ -130,48 +128,34 @@ def density_of(
     )
 
 
-def tracks_of(  # noqa: PLR0913 - all keywords, each a field of the message
-    tracks: optipmb.Tracks,
-    paths: optipmb.PredictedPaths | None,
-    class_probability: NDArray[np.float64] | None = None,
-    *,
-    stream: str,
-    frame_id: FrameId,
-    session: str,
-    revision: int,
-    parameters: optipmb.Parameters,
-    cloud_used: bool,
-    gap: int,
-    ignored: int,
-) -> Tracked:
+def tracks_of(result: optipmb.StepResult, stream: str, frame_id: FrameId, **fields: Any) -> Tracked:
     """Return the tracks of a frame, with paths and classes if there are any.
 
     What the tracker made of checked detections needs one look, not the checks of a message from elsewhere; where that
     look finds something odd, those checks say what it is.
 
+    Args:
+        result: of the step.
+        stream: of the tracks.
+        frame_id: of the frame.
+        fields: the fields of the message from `session` to `labels`, in its order.
+
     Raises:
         schemas.MessageError: the tracks hold numbers that no message may.
     """
+    tracks = result.tracks
     header: dict[str, Any] = {
         "stream": stream,
         "epoch": frame_id.epoch,
         "seq": frame_id.seq,
         "stamp_ns": frame_id.stamp_ns,
-        "sensor": frame_id.sensor,
-        "session": session,
-        "revision": revision,
-        "profile": parameters.name,
-        "cloud_used": cloud_used,
-        "gap": gap,
-        "ignored": ignored,
-        "labels": parameters.labels,
+        **({"sensor": frame_id.sensor} if frame_id.sensor else {}),
+        **fields,
     }
-    if not frame_id.sensor:
-        del header["sensor"]
     others: dict[str, Any] = {}
-    if class_probability is not None:
-        others |= schemas.class_fields(class_probability)
-    if paths is not None:
+    if result.class_probability is not None:
+        others |= schemas.class_fields(result.class_probability)
+    if (paths := result.paths) is not None:
         others |= schemas.path_fields(paths.horizons, paths.mean, paths.covariance)
     if not optipmb.sound(tracks):
         columns: dict[str, Any] = dict(tracks.columns()) | {"confirmed": tracks.confirmed.astype(np.int64)}

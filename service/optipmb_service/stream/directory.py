@@ -83,7 +83,7 @@ class StreamDirectory:
         self._awaited: dict[str, int] = {}
 
     def published(self, stream: str, token: str, now_ns: int, *, present: bool) -> bool:
-        """Note the token of a publisher; True: that changes what is known."""
+        """Note the token of a publisher; True: the known streams change."""
         with self._lock:
             known = self._found(stream) if present else self._streams.get(stream)
             if known is None or (token in known.tokens) is present:
@@ -93,7 +93,7 @@ class StreamDirectory:
             return self._settled(known, now_ns)
 
     def discovered(self, stream: str, token: str, now_ns: int, *, present: bool) -> bool:
-        """Note that a token announces a stream, or no longer does; True: that changes what is known."""
+        """Note that a token announces a stream, or no longer does; True: the known streams change."""
         with self._lock:
             known = self._found(stream) if present else self._streams.get(stream)
             if known is None or (token in known.announcements) is present:
@@ -165,8 +165,8 @@ class StreamDirectory:
 
         Args:
             node: `site/node`.
-            belongs: whether a stream of the node is among those that are asked about.
-            sensors: those of them that were there before.
+            belongs: whether a stream of the node is in question.
+            sensors: the streams of earlier publishers.
             now_ns: monotonic time.
         """
         with self._lock:
@@ -201,27 +201,24 @@ class StreamDirectory:
         return True
 
     def admit(self, now_ns: int) -> None:
-        """Announce the next streams in place of those that have got a session, or have waited too long for one."""
+        """Announce the next streams in place of streams that got a session or waited too long for one."""
         with self._lock:
-            self._admit(now_ns)
-
-    def _admit(self, now_ns: int) -> None:
-        for stream, since_ns in tuple(self._unproven.items()):
-            known = self._streams.get(stream)
-            if known is None or not known.announced or self._has_session(stream):
-                del self._unproven[stream]
-            elif now_ns - since_ns > UNPROVEN_NS:
-                del self._unproven[stream]
-                known.announced = False
-                self._settled(known, now_ns)
-                if len(self._queued) < MAX_STREAMS:
-                    self._queued.setdefault(stream, known.seen_ns)
-        while self._queued and len(self._unproven) < MAX_UNPROVEN_ANNOUNCED:
-            stream = next(iter(self._queued))
-            seen_ns = self._queued.pop(stream)
-            if now_ns - seen_ns <= QUEUED_NS and (known := self._found(stream)) is not None and not known.tokens:
-                self._unproven[stream] = now_ns
-                known.announced, known.left_ns, known.seen_ns = True, None, seen_ns
+            for stream, since_ns in tuple(self._unproven.items()):
+                known = self._streams.get(stream)
+                if known is None or not known.announced or self._has_session(stream):
+                    del self._unproven[stream]
+                elif now_ns - since_ns > UNPROVEN_NS:
+                    del self._unproven[stream]
+                    known.announced = False
+                    self._settled(known, now_ns)
+                    if len(self._queued) < MAX_STREAMS:
+                        self._queued.setdefault(stream, known.seen_ns)
+            while self._queued and len(self._unproven) < MAX_UNPROVEN_ANNOUNCED:
+                stream = next(iter(self._queued))
+                seen_ns = self._queued.pop(stream)
+                if now_ns - seen_ns <= QUEUED_NS and (known := self._found(stream)) is not None and not known.tokens:
+                    self._unproven[stream] = now_ns
+                    known.announced, known.left_ns, known.seen_ns = True, None, seen_ns
 
     def _found(self, stream: str) -> _Known | None:
         known = self._streams.get(stream)

@@ -1,17 +1,17 @@
 """Intake: the subscriptions of a member.
 
-They follow from the partitions that it holds and the streams that are known, whatever came before:
+They follow from the held partitions and the known streams alone:
 
 - all detections and all clouds, where this member holds all partitions;
-- else detections and clouds of each stream of its partitions, and of those that it left just now, for who has them
-  then asks for what came in between (`recent`);
-- detections of streams whose publishers have no cache, where nothing else would know what was sent when their member
+- else detections and clouds of each stream of its partitions, and of partitions left just now, for their holder
+  then asks for the messages in between (`recent`);
+- detections of streams whose publishers have no cache, which nothing else would have when their member
   is killed (`standby`);
 - detections of all streams, where it is the discoverer: the member that holds partition 0. Those whose publishers have
   tokens are dropped unread. It alone watches who tracks which stream.
 
 New subscriptions are declared before old ones are withdrawn. A stream that comes here from another member is held until
-the others have answered what they have received of it lately; then its session goes on with that. The member that has a
+the others have answered with their recent messages of it; then its session goes on with them. The member that has a
 partition asks once for each session, and the end of a process waits, for a moment, until all was asked for.
 """
 
@@ -20,7 +20,7 @@ from __future__ import annotations
 import threading
 import time
 from itertools import islice
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Final
 
 import optipmb_schemas as schemas
 import structlog
@@ -28,21 +28,20 @@ import structlog
 from optipmb_service.cluster.leases import PARTITIONS, Change, partition_of
 from optipmb_service.stream.directory import StreamDirectory, node_of
 from optipmb_service.stream.values import SECOND
+from optipmb_service.zenoh.inputs import Input
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from optipmb_service.cluster.member import Member
-    from optipmb_service.stream.ports import Packet
     from optipmb_service.stream.streams import Streams
+    from optipmb_service.zenoh.inputs import Kind, Packet
+    from optipmb_service.zenoh.transport import Transport
 
 log = structlog.get_logger("optipmb_service")
 
 DISCOVERY: Final = 0
 """The partition whose holder is the discoverer."""
-
-ALL: Final = ""
-"""Instead of a stream: all of them."""
 
 EXPIRY_S: Final = 1.0
 NEW_STREAMS: Final = 128
@@ -61,16 +60,6 @@ DRAIN_S: Final = 0.5
 
 DRAIN_POLL_S: Final = 0.005
 
-Kind = Literal["detections", "points", "discovery"]
-
-
-class Input(NamedTuple):
-    """A subscription to a stream, or to all of them; `cached`: lost messages are recovered from a cache."""
-
-    kind: Kind
-    stream: str = ALL
-    cached: bool = True
-
 
 def _inputs(streams: Iterable[str]) -> set[Input]:
     """Return all possible subscriptions to these streams, and those to all streams."""
@@ -79,48 +68,8 @@ def _inputs(streams: Iterable[str]) -> set[Input]:
     return of_all | {Input(kind, stream, cached) for stream in streams for kind in kinds for cached in (False, True)}
 
 
-class Inputs(Protocol):
-    """Subscriptions, tokens and questions to other members, on the network."""
-
-    def receive(
-        self,
-        on_frame: Callable[[Packet], None],
-        on_cloud: Callable[[Packet], None],
-        noticed: Callable[[str, bool], bool],
-        passed_by: Callable[[str, int], None],
-        answered: Callable[[str], None],
-    ) -> None:
-        """Register the receivers of messages, of discovered keys, of those that are dropped, and of complete caches."""
-
-    def subscribe(self, kind: Kind, stream: str, *, cached: bool) -> None:
-        """Receive a stream, or all of them; what was lost comes from the cache of the publisher where it has one."""
-
-    def unsubscribe(self, inputs: Iterable[tuple[Kind, str, bool]]) -> None:
-        """Receive streams no longer."""
-
-    def watch_streams(
-        self, published: Callable[[str, str, bool], None], discovered: Callable[[str, bool], None]
-    ) -> None:
-        """Report tokens of publishers, and streams that others announce; True: it is there, False: it has gone."""
-
-    def watch_owners(self, on_owner: Callable[[str, str, bool], None] | None) -> None:
-        """Report from now on which instance tracks which stream (False: no longer); None: stop."""
-
-    def discover(self, streams: set[str]) -> None:
-        """Announce these streams, and no others."""
-
-    def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]], bool], None]) -> None:
-        """Call `then` soon with what the caches of a stream hold, all frames, and with whether all have answered."""
-
-    def ask_recent(self, sessions: Sequence[str]) -> list[tuple[Packet, bool]]:
-        """Return what other instances have received lately of sessions, each packet with whether it is a frame."""
-
-    def pass_through(self, then: Callable[[], None]) -> None:
-        """Call `then` when all that has come until now is handed over."""
-
-
 class Intake:
-    """Decides what is received, on a thread of its own.
+    """Subscriptions of the process, on a thread of their own.
 
     Args:
         streams: take the messages.
@@ -132,7 +81,7 @@ class Intake:
     """
 
     def __init__(
-        self, streams: Streams, member: Member, inputs: Inputs, *, standby: bool, linger_s: float, idle_s: float
+        self, streams: Streams, member: Member, inputs: Transport, *, standby: bool, linger_s: float, idle_s: float
     ) -> None:
         self._streams = streams
         self._member = member
@@ -166,9 +115,9 @@ class Intake:
         self._thread = threading.Thread(target=self._run, name="intake", daemon=True)
 
     def start(self) -> None:
-        """Receive from now on what is to be received."""
+        """Begin to receive."""
         streams = self._streams
-        self._inputs.receive(streams.receive, streams.receive, self._noticed, streams.passed_by, streams.cache_answered)
+        self._inputs.receive(streams.receive, self._noticed, streams.passed_by, streams.cache_answered)
         self._directory.began_ns = time.monotonic_ns()  # a start may take long before
         self._inputs.watch_streams(self._published, self._discovered)
         self._step()
@@ -205,7 +154,7 @@ class Intake:
         return sum(not self._member.holds(session_of(stream)) for stream in self._directory.streams())
 
     def hand_over(self, sessions: Iterable[str], give: Callable[[Packet], None]) -> None:
-        """Give what was received lately of sessions that are tracked elsewhere now, the oldest first."""
+        """Give recent messages of sessions that are tracked elsewhere now, the oldest first."""
         sessions = list(sessions)
         if asked := [session for session in sessions if self._may_have(session)]:
             self._drain(asked)
@@ -242,7 +191,7 @@ class Intake:
 
         It is called on a thread that it must not keep.
         """
-        self._inputs.ask_cache(stream, lambda found, complete: then([packet for packet, _ in found], complete))
+        self._inputs.ask_cache(stream, then)
 
     # From the network
 
@@ -294,15 +243,15 @@ class Intake:
                 if self._ending.is_set():
                     return  # the session is closed
                 log.exception("internal_error", thread="intake")
-            # A step looks at all streams: where thousands begin, what comes meanwhile is seen to in one.
+            # A step looks at all streams: where thousands begin, one step serves all that came meanwhile.
             self._hurry.wait(min(MOST_REST_S, REST * (time.thread_time() - began_s)))
 
     def _step(self) -> None:
-        """Bring the subscriptions in line with what is held and known; what fails is done again in the next step."""
+        """Align the subscriptions with held partitions and known streams; the next step retries failures."""
         now_ns = time.monotonic_ns()
         with self._lock:
             came, self._came = self._came, set()
-        held = self._member.partitions  # afterwards: what came is held, or lost again
+        held = self._member.partitions  # afterwards: a partition that came is held, or lost again
         with self._lock:
             self._left = {partition: until for partition, until in self._left.items() if until > now_ns}
             received = self._received = held | self._left.keys()
@@ -316,7 +265,7 @@ class Intake:
             raise
 
     def _align(self, came: set[int], held: set[int], received: set[int], now_ns: int) -> None:
-        """Declare and withdraw subscriptions, and take up sessions that came here."""
+        """Declare and withdraw subscriptions, and open sessions that came here."""
         everything = len(held) == PARTITIONS
         discovering = DISCOVERY in held
         if now_ns >= self._expires_ns:
@@ -330,7 +279,7 @@ class Intake:
         streams = self._directory.streams()
         aligned = (held, received, everything, discovering)
         anew, self._aligned = bool(came) or aligned != self._aligned, aligned
-        # Where thousands begin, each step is to look at those that have changed.
+        # Where thousands begin, each step is to look at changed ones.
         looked = streams if anew else dict(streams.items() - self._known.items())
         gone = self._known.keys() - streams.keys()
         strained = self._member.strained
@@ -346,7 +295,7 @@ class Intake:
             self._inputs.subscribe(one.kind, one.stream, cached=one.cached)
             self._subscribed.add(one)
         left = before - wanted
-        self._inputs.unsubscribe((one.kind, one.stream, one.cached) for one in sorted(left))
+        self._inputs.unsubscribe(sorted(left))
         self._subscribed -= left
         if not everything and any(one.kind == "detections" for one in left):
             self._streams.forget_caches({one.stream for one in self._subscribed if one.kind == "detections"})
@@ -361,7 +310,7 @@ class Intake:
         """Go on with sessions that came here, each with what others have received of it lately."""
         packets: dict[str, list[Packet]] = {session: [] for session in sessions}
         try:
-            for packet, _ in self._inputs.ask_recent(sessions):
+            for packet in self._inputs.ask_recent(sessions):
                 _, session = self._streams.parsed(packet.key)
                 if session in packets:
                     packets[session].append(packet)
@@ -377,7 +326,7 @@ class Intake:
         return received or self._streams.keeps(session)
 
     def _drain(self, sessions: list[str]) -> None:
-        """Wait for what is on its way through this process, for a moment at most."""
+        """Wait for messages on their way through this process, for a moment at most."""
         ends = time.monotonic() + DRAIN_S
         passed = threading.Event()
         self._inputs.pass_through(passed.set)
@@ -424,13 +373,13 @@ class Intake:
             own = partition_of(self._streams.fusion.session_of(stream)) in received
             if own:
                 wanted.add(Input("points", stream, cached))
-            # What has no cache the discoverer has by its subscription to all.
+            # The discoverer's subscription to all includes streams without a cache.
             if (own and cached) or (not cached and not discovering and (own or self._standby)):
                 wanted.add(Input("detections", stream, cached))
         return wanted
 
     def _coming(self, streams: dict[str, bool], came: set[int], held: set[int]) -> list[str]:
-        """Return the sessions that others may have received something of: those that came here, and new streams."""
+        """Return the sessions of which others may have messages: newly held ones, and new streams."""
         session_of = self._streams.fusion.session_of
         coming = {session_of(stream) for stream in streams if came and partition_of(session_of(stream)) in came}
         coming |= {

@@ -7,18 +7,20 @@ from __future__ import annotations
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import optipmb_schemas as schemas
 import structlog
+from optipmb_client.errors import ConnectionFailed as TransportError
 
-from optipmb_service.stream.ports import TransportError
 from optipmb_service.stream.problems import problem_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from optipmb_service.stream.ports import Request
+    from optipmb_client.zenoh.handles import Query
+
+    from optipmb_service.cluster.message_log import LogMessage
     from optipmb_service.stream.recovery import Log
 
 log = structlog.get_logger("optipmb_service")
@@ -36,23 +38,18 @@ LATE_NS: Final = 5_000_000_000
 """Longest distance, by stamps, of a correction from the tracks of a frame. Frames are inserted for a second."""
 
 
-class _Published(Protocol):
-    """Tracks as they were published; the higher `order` of a frame holds."""
+class _Recent(NamedTuple):
+    epoch: bytes
+    seq: int
+    sensor: str
+    stamp_ns: int
+    order: tuple[int, int]
+    payload: bytes
+    encoding: str
 
-    @property
-    def epoch(self) -> bytes: ...
-    @property
-    def seq(self) -> int: ...
-    @property
-    def sensor(self) -> str: ...
-    @property
-    def stamp_ns(self) -> int: ...
-    @property
-    def order(self) -> tuple[int, int]: ...
-    @property
-    def payload(self) -> bytes: ...
-    @property
-    def encoding(self) -> str: ...
+
+_Published: TypeAlias = "LogMessage | _Recent"
+"""Tracks as they were published; the higher `order` of a frame holds."""
 
 
 class TracksRange:
@@ -108,16 +105,6 @@ class TracksRange:
                 return
 
 
-class _Recent(NamedTuple):
-    epoch: bytes
-    seq: int
-    sensor: str
-    stamp_ns: int
-    order: tuple[int, int]
-    payload: bytes
-    encoding: str
-
-
 def order_of(tracks: schemas.Tracks) -> tuple[int, int]:
     """Return the order among the tracks of one frame: the highest hold."""
     return tracks.delivery.run if tracks.delivery else 0, tracks.revision
@@ -147,7 +134,7 @@ class TrackQuery:
         self._pool = ThreadPoolExecutor(1, "tracks")
         self._room = threading.BoundedSemaphore(AT_ONCE)
 
-    def answer(self, request: Request, stream: str) -> None:
+    def answer(self, request: Query, stream: str) -> None:
         """Take a query; it is finished later."""
         try:
             asked = self._asked(request)
@@ -165,7 +152,7 @@ class TrackQuery:
             from_ns = max(0, wanted.from_ns - LATE_NS)
             self._pool.submit(self._guarded, stream, answer, self._logged.tracks, stream, from_ns, wanted.add, answer)
 
-    def _asked(self, request: Request) -> schemas.TracksRequest:
+    def _asked(self, request: Query) -> schemas.TracksRequest:
         """Return what a query asks for, and take the room for its answer."""
         asked, payload = schemas.TracksRequest(), request.payload
         if payload:
@@ -185,7 +172,7 @@ class TrackQuery:
             failed(f"{type(error).__name__}: {error}")
 
     def _answer(
-        self, request: Request, stream: str, asked: schemas.TracksRequest, wanted: TracksRange, failure: str
+        self, request: Query, stream: str, asked: schemas.TracksRequest, wanted: TracksRange, failure: str
     ) -> None:
         """Answer with what the log has, or caches where it knows nothing of the stream."""
         failures = [failure] if failure else []
@@ -223,7 +210,7 @@ class TrackQuery:
         frame = tracks.epoch, tracks.seq, tracks.sensor or "", tracks.stamp_ns
         return _Recent(*frame, order_of(tracks), payload, encoding)
 
-    def _finish(self, request: Request, problem: schemas.Problem | None) -> None:
+    def _finish(self, request: Query, problem: schemas.Problem | None) -> None:
         try:
             if problem is not None:
                 request.refuse(problem)
@@ -235,13 +222,5 @@ class TrackQuery:
     def _problem(
         self, code: str, stream: str, path: str, expected: str, received: str, stamp_ns: int | None = None
     ) -> schemas.Problem:
-        return problem_of(
-            code,
-            stream=stream,
-            instance=self._instance,
-            path=path,
-            expected=expected,
-            received=received,
-            message=f"Query: {path or 'tracks'}: expected {expected}, received {received}.",
-            stamp_ns=stamp_ns,
-        )
+        texts = {"path": path, "expected": expected, "received": received, "subject": f"Query: {path or 'tracks'}"}
+        return problem_of(code, stream=stream, instance=self._instance, stamp_ns=stamp_ns, **texts)

@@ -86,7 +86,7 @@ class PendingFrame:
 
     @property
     def size(self) -> int:
-        """Bytes that it takes, nearly: those of its detections, and as many once more for what was decoded of them."""
+        """Bytes that it takes, nearly: its detections, and as many once more decoded."""
         return size_of(self.detections) + len(self.detections)
 
 
@@ -166,7 +166,7 @@ class SensorQueue:
             same = self.checksums.same(frame_id.epoch, frame_id.seq, detections)
             if same is not None:
                 return not same
-        # What was sent earlier has no stamp beyond the newest one.
+        # An earlier frame has no stamp beyond the newest one.
         return decision.verdict in {Verdict.DUPLICATE, Verdict.LATE} and decision.place.jump_ns > 0
 
     def add(self, frame: PendingFrame) -> None:
@@ -245,7 +245,7 @@ class CloudBuffer:
     """Bounded buffer of the clouds of a sensor: one per epoch and stamp, the newest arrival holds; the oldest goes.
 
     A publisher sends its clouds under the epoch of its detections. Clouds of an epoch in which the sensor has no
-    detections come from a program of their own and belong to whatever frame has their stamp.
+    detections come from a program of their own and belong to the frame with their stamp.
 
     Args:
         most: number of clouds kept.
@@ -315,7 +315,7 @@ class StampCheck:
     """Check that the stamps of a sensor advance as a clock in nanoseconds does; it decides about nothing but a report.
 
     Frames of a detector are more than a millisecond apart. Stamps that advance by less are constant or have another
-    unit, at whatever speed a recording is replayed; the times of arrival tell which unit, where the ratio is certain.
+    unit, at any speed of a replayed recording; the times of arrival tell which unit, where the ratio is certain.
     """
 
     def __init__(self) -> None:
@@ -324,7 +324,7 @@ class StampCheck:
         self._constant = True
 
     def add(self, stamp_ns: int, arrived_ns: int) -> str:
-        """Return what is wrong with the stamps up to a frame; empty when nothing is, or too few came.
+        """Return the fault of the stamps up to a frame; empty without one, or when too few came.
 
         Args:
             stamp_ns: stamp of the frame.
@@ -352,7 +352,7 @@ class StampCheck:
 
 
 class Checksums:
-    """Checksums of the newest frames of a publisher, by which a repeated frame is told from another with its number."""
+    """Checksums of the newest frames of a publisher, by which a repeated frame differs from another with its number."""
 
     def __init__(self) -> None:
         self._epoch = b""
@@ -380,7 +380,7 @@ class Claim:
         self._since_ns = 0
 
     def clear(self) -> None:
-        """Begin anew: the successor has sent a frame."""
+        """Begin again: the successor has sent a frame."""
         self._epoch = b""
 
     def add(self, frame_id: FrameId, *, frames: int, span_ns: int) -> bool:

@@ -2,7 +2,7 @@
 
 The tracking thread gives references to values that never change, which costs it microseconds. The checkpoint writer
 waits before it writes: what a checkpoint contains must have left this process as tracks, or a kill between the
-two would swallow them (what is tracked again after a restore is published again, what the checkpoint holds is not).
+two would swallow them (frames tracked again after a restore are published again, frames in the checkpoint are not).
 Then it writes all sessions that changed in one transaction.
 
 A store that fails (disk full, read-only, gone) costs durability and nothing else: tracking goes on, the status of the
@@ -170,7 +170,7 @@ class CheckpointWriter:
             try:
                 restored = self._recalled(stream, restore, refused)
             except Exception:
-                log.exception("internal_error", stream=stream)  # the stream begins anew
+                log.exception("internal_error", stream=stream)  # the stream begins without it
             try:
                 then(restored)
             except Exception:
@@ -180,7 +180,7 @@ class CheckpointWriter:
             self._reading.submit(read)
 
     def forget(self, stream: str) -> None:
-        """Drop what is still to be written for a stream."""
+        """Drop the pending checkpoint of a stream."""
         with self._lock:
             self._pending.pop(stream, None)
 
@@ -189,8 +189,8 @@ class CheckpointWriter:
     ) -> _T | None:
         """Return what `restore` makes of the newest whole checkpoint of a stream; None when there is none.
 
-        None also when the store fails: then the stream begins anew. A store that cannot be reached is waited for while
-        the stream is to be tracked here: to begin anew would use track ids a second time.
+        None also when the store fails: then the session begins empty. A store that cannot be reached is awaited while
+        the stream is to be tracked here: an empty session would use track ids a second time.
         """
 
         def torn(error: CheckpointError) -> None:
@@ -217,7 +217,7 @@ class CheckpointWriter:
                     return None
 
     def close(self, timeout: float) -> bool:
-        """Write what is pending and end, within so long (s); to be called when nothing is tracked any more.
+        """Write the pending checkpoints and end, within so long (s); to be called when nothing is tracked any more.
 
         Returns:
             Whether all is written that is still this member's.
@@ -258,7 +258,7 @@ class CheckpointWriter:
         return False
 
     def _expire(self) -> None:
-        """Forget what has been silent for too long, now and then."""
+        """Forget streams that have been silent for too long, now and then."""
         now_ns = time.monotonic_ns()
         if not self._keep_s or now_ns < self._expires_ns:
             return
@@ -333,7 +333,7 @@ class CheckpointWriter:
         for stream, one in checkpoints.items():
             try:
                 data = encode_checkpoint(one)
-            except Exception as error:  # noqa: BLE001 - whatever is wrong with one stream, the others are written
+            except Exception as error:  # noqa: BLE001 - an error of one stream must not keep the others
                 self._fail(stream, f"{type(error).__name__}: {error}")
             else:
                 if len(data) > (most := self._store.max_bytes):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 import optipmb_schemas as schemas
 
@@ -16,6 +16,14 @@ CODES: Final = {
     "unknown_class": (
         "Objects of a class that the profile lacks are left out; reported once per session.",
         "Choose another profile, or send the names of its classes.",
+    ),
+    "score_filter": (
+        "Most detections of a class have scores below the profile's `score_filter`; reported once per session.",
+        "Choose the profile `generic`, or lower the filter of the class.",
+    ),
+    "no_pose": (
+        "The sensor moves, and its frames have no pose: the motion is estimated; reported once per session.",
+        "Send poses where they are known: tracks are in the axes of the sensor without them.",
     ),
     "late": (
         "The frame came later than the window in which tracks are corrected.",
@@ -101,32 +109,18 @@ MAX_TEXT: Final = 500
 """Characters of a text in a problem."""
 
 
-def problem_of(  # noqa: PLR0913 - all keywords, each a field of the message
-    code: str,
-    *,
-    stream: str,
-    instance: str,
-    message: str,
-    path: str = "",
-    expected: str = "",
-    received: str = "",
-    seq: int | None = None,
-    stamp_ns: int | None = None,
-    count: int = 1,
-) -> schemas.Problem:
-    """Return a problem, its texts printable and cut to what the message allows."""
-    return schemas.Problem(
-        stream=stream,
-        instance=instance,
-        code=code,
-        path=_fit(path),
-        expected=_fit(expected),
-        received=_fit(received),
-        message=_fit(message),
-        seq=seq,
-        stamp_ns=stamp_ns,
-        count=count,
-    )
+def problem_of(code: str, *, subject: str = "", **fields: Any) -> schemas.Problem:
+    """Return a problem, its texts printable and cut to what the message allows.
+
+    Args:
+        code: one of `CODES`.
+        subject: begins the message, unless that is among the fields.
+        fields: further fields of the message.
+    """
+    fields = {"path": "", "expected": "", "received": ""} | fields
+    fields.setdefault("message", f"{subject}: expected {fields['expected']}, received {fields['received']}.")
+    texts = {name: _fit(fields[name]) for name in ("path", "expected", "received", "message")}
+    return schemas.Problem(code=code, **fields | texts)
 
 
 def _fit(text: str) -> str:

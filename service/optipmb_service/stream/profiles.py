@@ -20,8 +20,6 @@ import optipmb
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from optipmb_service.stream.values import Steps
-
 
 @dataclass(frozen=True)
 class Profiles:
@@ -39,7 +37,7 @@ class Profiles:
 
     @classmethod
     def read(cls, default: str, patterns: Mapping[str, str]) -> Profiles:
-        """Load every profile named, and those that come with the tracker.
+        """Load every profile named, and the tracker's own.
 
         Raises:
             optipmb.ParameterError: one of them cannot be read or is not valid.
@@ -63,7 +61,9 @@ class Profiles:
         """Return a profile by its name, None when there is none."""
         return self.known.get(name)
 
-    def trackers(self, make: Callable[[optipmb.Parameters], optipmb.Tracker]) -> Callable[[optipmb.Parameters], Steps]:
+    def trackers(
+        self, make: Callable[[optipmb.Parameters], optipmb.Tracker]
+    ) -> Callable[[optipmb.Parameters], optipmb.Tracker]:
         """Return what gives all streams of a profile one tracker, for it keeps nothing of them (0.6 ms each)."""
         made = {parameters.name: make(parameters) for parameters in self.known.values()}
 
@@ -108,7 +108,7 @@ class Fusion:
     patterns: Sequence[str] = ()
 
     def session_of(self, stream: str) -> str:
-        """Return the name of the session that a stream feeds: its own, or that of its node."""
+        """Return the name of the session that a stream feeds: its own, or its node's."""
         if not self.patterns:
             return stream
         parts = tuple(stream.split("/"))
@@ -116,7 +116,7 @@ class Fusion:
         return f"{parts[0]}/{parts[1]}/{FUSED}" if matched else stream
 
     def is_session(self, name: str) -> bool:
-        """Whether a name is that of a session of several streams; no sensor may have it."""
+        """Return whether a name is of a fused session; no sensor may have it."""
         site, node, sensor = name.split("/")
         return sensor == FUSED and any(_matches((site, node), pattern) for pattern in self.patterns)
 

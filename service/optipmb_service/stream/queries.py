@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Final, Literal, TypeAlias, TypeVar
 import numpy as np
 import optipmb_schemas as schemas
 import structlog
+from optipmb_client.errors import ConnectionFailed as TransportError
 
 import optipmb
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.stream.checkpoint import digest_of
 from optipmb_service.stream.convert import density_of
-from optipmb_service.stream.ports import TransportError
 from optipmb_service.stream.problems import problem_of
 from optipmb_service.stream.values import SECOND, RefusedError
 
@@ -29,12 +29,14 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
     from concurrent.futures import Future
 
+    from optipmb_client.zenoh.handles import Query
+
     from optipmb_service.cluster.leases import MemberLease
     from optipmb_service.stream.checkpoint import Checkpoint
     from optipmb_service.stream.kept_tracks import TrackQuery
-    from optipmb_service.stream.ports import Packet, Request
     from optipmb_service.stream.stream import Stream
     from optipmb_service.stream.streams import Streams
+    from optipmb_service.zenoh.inputs import Packet
 
 log = structlog.get_logger("optipmb_service")
 
@@ -59,14 +61,12 @@ NO_SESSION = "0" * 32
 _T = TypeVar("_T", bound=schemas.Message)
 _State: TypeAlias = "tuple[schemas.SessionState, Checkpoint | None]"
 """The state of a session, and what its digest is made of."""
-_Command: TypeAlias = "Callable[[Stream, Request], _State | None]"
+_Command: TypeAlias = "Callable[[Stream, Query], _State | None]"
 """Answers a request, or returns the state that is to be answered."""
 
 
-def guarded(
-    request: Request, answer: Callable[[], Future[None] | None], *, instance: str = "", stream: str = ""
-) -> None:
-    """Answer, and finish the request whatever happens: an asker must not wait for its timeout.
+def guarded(request: Query, answer: Callable[[], Future[None] | None], *, instance: str = "", stream: str = "") -> None:
+    """Answer, and finish the request in any case: an asker must not wait for its timeout.
 
     Args:
         request: the query.
@@ -94,19 +94,13 @@ def guarded(
 
 def problem_with(error: schemas.MessageError, *, instance: str, stream: str = "", code: str = "") -> schemas.Problem:
     """Return the answer to a query that is refused, by default with the code of its error."""
-    return problem_of(
-        code or error.code,
-        stream=stream,
-        instance=instance,
-        path=error.path,
-        expected=error.expected,
-        received=error.received,
-        message=f"Query: {error.path or 'payload'}: expected {error.expected}, received {error.received}.",
-    )
+    texts = {"path": error.path, "expected": error.expected, "received": error.received}
+    subject = f"Query: {error.path or 'payload'}"
+    return problem_of(code or error.code, stream=stream, instance=instance, subject=subject, **texts)
 
 
 class StreamQueries:
-    """Answers every request about streams, and finishes it whatever happens.
+    """Answers and finishes every request about streams.
 
     Args:
         streams: the streams.
@@ -127,7 +121,7 @@ class StreamQueries:
         }
         """Commands by name, each with whether it goes before the frames that wait."""
 
-    def answer(self, request: Request) -> None:
+    def answer(self, request: Query) -> None:
         """Answer what concerns sessions, here or by the stream."""
         name = request.key.rpartition("/")[2]
         stream = request.key.removeprefix(f"{self._keys.prefix}/").removesuffix(f"/q/{name}")
@@ -150,10 +144,10 @@ class StreamQueries:
         except schemas.MessageError as error:
             self._refuse(request, error, stream)
 
-    def _refuse(self, request: Request, error: Exception, stream: str = "") -> None:
+    def _refuse(self, request: Query, error: Exception, stream: str = "") -> None:
         guarded(request, partial(_raise, error), instance=self._streams.instance, stream=stream)
 
-    def _command(self, request: Request, name: str, stream: str, session: str) -> None:
+    def _command(self, request: Query, name: str, stream: str, session: str) -> None:
         """Have a stream answer.
 
         Raises:
@@ -174,7 +168,7 @@ class StreamQueries:
         if not self._streams.command(stream, lambda one: one.ask(answer, create=creates), urgent=urgent):
             raise schemas.MessageError("too_large", "key", "fewer new streams at once", "another one")
 
-    def _sets(self, request: Request) -> bool:
+    def _sets(self, request: Query) -> bool:
         """Whether a request for parameters is valid and changes any."""
         try:
             asked = self._payload(request, schemas.SessionParameters())
@@ -183,7 +177,7 @@ class StreamQueries:
         known = asked.profile is None or self._streams.profiles.named(asked.profile) is not None
         return known and asked != schemas.SessionParameters()
 
-    def _answer_many(self, request: Request) -> None:
+    def _answer_many(self, request: Query) -> None:
         """Answer a question about the state of all streams that a key expression includes; many answer nothing else."""
         streams = [one for one in self._streams.tracking() if request.matches(self._keys.query(one.name, "state"))]
         if not streams:
@@ -205,7 +199,7 @@ class StreamQueries:
             if not self._streams.command(stream.name, self._one_of_many(request, left), urgent=True):
                 left.one()
 
-    def _one_of_many(self, request: Request, left: _Countdown) -> Callable[[Stream], None]:
+    def _one_of_many(self, request: Query, left: _Countdown) -> Callable[[Stream], None]:
         def tell(state: _State) -> None:
             try:
                 self._tell(request, state, self._keys.query(state[0].stream, "state"))
@@ -224,7 +218,7 @@ class StreamQueries:
 
         return command
 
-    def _tell(self, request: Request, state: _State, key: str) -> None:
+    def _tell(self, request: Query, state: _State, key: str) -> None:
         """Answer with a state and its digest, on the thread that makes digests: it encodes a whole checkpoint."""
         said, checkpoint = state
         if checkpoint is not None:
@@ -237,7 +231,7 @@ class StreamQueries:
 
     # Run by the tracking thread
 
-    def _run(self, command: _Command, stream: Stream, request: Request) -> Future[None] | None:
+    def _run(self, command: _Command, stream: Stream, request: Query) -> Future[None] | None:
         """Carry out a command; a state is answered by another thread, which makes its digest first."""
         # Where several instances run, the one that tracks the stream answers.
         state = None if stream.elsewhere else command(stream, request)
@@ -251,7 +245,7 @@ class StreamQueries:
             return self._nothing(stream.name, "new"), None
         return state, stream.session.snapshot()
 
-    def _density(self, stream: Stream, request: Request) -> None:
+    def _density(self, stream: Stream, request: Query) -> None:
         session = stream.session
         parameters = session.parameters if session else self._streams.profiles.of(stream.name)
         message = density_of(
@@ -262,7 +256,7 @@ class StreamQueries:
         )
         request.answer(self._keys.query(stream.name, "density"), message)
 
-    def _reset(self, stream: Stream, request: Request) -> _State:
+    def _reset(self, stream: Stream, request: Query) -> _State:
         asked = self._payload(request, schemas.ResetRequest())
         session = stream.session
         if session is None:
@@ -273,7 +267,7 @@ class StreamQueries:
         stream.deliver(session.reset())
         return self._state(stream)
 
-    def _parameters(self, stream: Stream, request: Request) -> None:
+    def _parameters(self, stream: Stream, request: Query) -> None:
         empty = schemas.SessionParameters()
         asked = self._payload(request, empty)
         parameters = None if asked.profile is None else self._streams.profiles.named(asked.profile)
@@ -303,7 +297,7 @@ class StreamQueries:
         profile = self._streams.profiles.of(stream).name
         return schemas.SessionState(stream=stream, session=NO_SESSION, state=state, profile=profile)
 
-    def _payload(self, request: Request, empty: _T) -> _T:
+    def _payload(self, request: Query, empty: _T) -> _T:
         """Return the payload of a request, `empty` without one.
 
         Raises:
@@ -335,13 +329,13 @@ class _Countdown:
 
 
 class ServiceQueries:
-    """Answers every request about the service, and finishes it whatever happens.
+    """Answers and finishes every request about the service.
 
     Args:
         streams: the streams.
         status: returns the status of the service.
         metrics: returns its metrics, in Prometheus' text format.
-        hand_over: gives what was received lately of sessions that are tracked elsewhere now.
+        hand_over: gives recent messages of sessions that are tracked elsewhere now.
         workers: number of processes of the service.
     """
 
@@ -365,7 +359,7 @@ class ServiceQueries:
         self._moving = threading.BoundedSemaphore(MOVES)
         self._handovers = ThreadPoolExecutor(1, "recent")
 
-    def answer(self, request: Request) -> None:
+    def answer(self, request: Query) -> None:
         """Answer with the status of the service, its metrics, or both when the key has a `*`; or have streams moved."""
         instance = self._streams.instance
         orders = {self._keys.move(instance): self._move, self._keys.drain(instance): self._drain}
@@ -379,7 +373,7 @@ class ServiceQueries:
             many = schemas.MessageError("invalid_value", "worker", f"at most {MOVES} moves at a time", "more")
             guarded(request, partial(_raise, many), instance=instance)
 
-    def _report(self, request: Request) -> None:
+    def _report(self, request: Query) -> None:
         instance = self._streams.instance
         status, metrics = self._keys.status(instance), self._keys.metrics(instance)
         if request.matches(status):
@@ -387,8 +381,8 @@ class ServiceQueries:
         if request.matches(metrics):
             request.answer_text(metrics, self._metrics(), TEXT)
 
-    def _hand_over(self, request: Request) -> None:
-        """Answer with what was received lately of sessions, whose names are lines, to who tracks them now."""
+    def _hand_over(self, request: Query) -> None:
+        """Answer with recent messages of sessions, whose names are lines, to the member that tracks them."""
         key = self._keys.recent(self._streams.instance)
 
         def give(packet: Packet) -> None:
@@ -396,13 +390,13 @@ class ServiceQueries:
 
         self._handed_over((request.payload or b"").decode("ascii", "replace").splitlines(), give)
 
-    def _order(self, request: Request, order: Callable[[Request], None]) -> None:
+    def _order(self, request: Query, order: Callable[[Query], None]) -> None:
         try:
             guarded(request, lambda: order(request), instance=self._streams.instance)
         finally:
             self._moving.release()
 
-    def _move(self, request: Request) -> None:
+    def _move(self, request: Query) -> None:
         """Have a stream brought here, and say so."""
         asked = move_asked(request, self._streams.limits, self._workers)
         try:
@@ -416,7 +410,7 @@ class ServiceQueries:
         else:
             request.answer(request.key, asked)
 
-    def _drain(self, request: Request) -> None:
+    def _drain(self, request: Query) -> None:
         """Have all streams taken by others, and say so."""
         asked = drain_asked(request, self._streams.limits)
         received = "none" if asked.drain and not self._member.others else ""
@@ -429,7 +423,7 @@ class ServiceQueries:
         request.answer(request.key, asked)
 
 
-def move_asked(request: Request, limits: schemas.Limits, workers: int) -> schemas.MoveRequest:
+def move_asked(request: Query, limits: schemas.Limits, workers: int) -> schemas.MoveRequest:
     """Return what a request to move a stream says.
 
     Raises:
@@ -441,7 +435,7 @@ def move_asked(request: Request, limits: schemas.Limits, workers: int) -> schema
     return asked
 
 
-def drain_asked(request: Request, limits: schemas.Limits) -> schemas.DrainRequest:
+def drain_asked(request: Query, limits: schemas.Limits) -> schemas.DrainRequest:
     """Return what a request to leave all streams says.
 
     Raises:

@@ -1,6 +1,6 @@
 """Recovery of frames that a session has missed: from the log of messages, and from the caches of publishers.
 
-What they give goes into the backlog before all that waits. The session drops what it has tracked already, or has from
+Their frames go into the backlog before all others. The session drops frames that it has tracked, or has from
 another source. The log is read when a session is opened, and when it is silent: its frames may be there and not arrive,
 as behind a cut between two routers.
 """
@@ -13,12 +13,13 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import structlog
+from optipmb_client.errors import ConnectionFailed as TransportError
 
 from optipmb_service.cluster.log_position import Missed, Position
 from optipmb_service.stream.directory import BACK_NS
-from optipmb_service.stream.ports import Packet, TransportError
 from optipmb_service.stream.timeline import number_of
 from optipmb_service.stream.values import MAX_SENSORS
+from optipmb_service.zenoh.inputs import Packet
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -57,13 +58,13 @@ class Log:
         self._fusion = fusion
 
     def fetch(self, session: str, checkpoint: Checkpoint | None, first: Take, later: Take) -> None:
-        """Call `first` soon, once in any case, with what came after a checkpoint, and `later` with what follows.
+        """Call `first` soon, once in any case, with the frames after a checkpoint, and `later` with further ones.
 
         They are called on a thread that they must not keep.
         """
         fused = self._fusion.is_session(session)
         if checkpoint is not None and checkpoint.fused and not checkpoint.seen:
-            first([])  # it was closed by a query, and knows no longer what it has tracked
+            first([])  # it was closed by a query, and has forgotten its frames
             return
         takes = iter((first,))
         try:
@@ -79,7 +80,7 @@ class Log:
             first([])
 
     def look(self, checkpoint: Checkpoint, then: Take) -> None:
-        """Call `then` soon, once, with what came after the newest frames of a checkpoint."""
+        """Call `then` soon, once, with the frames after the newest ones of a checkpoint."""
         positions = newest_of(checkpoint)
         wanted = Missed(tuple(positions), node="", belongs=lambda _: False, positions=positions)
         self._reader.missed(wanted, lambda messages: then(self._packets(messages)), again_s=())
@@ -194,7 +195,7 @@ class CacheRecovery:
             there = self._streams.caches.awaited(self._session, self._answered).keys()
             self._answered &= there
             self._asked &= there
-            self._most = max(MOST, 2 * len(self._answered))  # publishers that are there are not gone over each time
+            self._most = max(MOST, 2 * len(self._answered))  # present publishers are not looked at each time
 
     def ask_again(self, stream: str) -> None:
         """Note that the cache of a stream has not answered in full."""
@@ -207,7 +208,7 @@ class CacheRecovery:
         self._most = MOST
 
     def awaited(self, session: Session, take: Callable[[str, list[Packet], bool], None]) -> bool:
-        """Return whether caches may hold what has not come; ask those that were not.
+        """Return whether caches may hold missing frames; ask the caches that were not asked.
 
         Args:
             session: has the sensors.

@@ -4,7 +4,7 @@ No I/O, no threads, no clock of its own.
 
 Conventions: `now_ns` is the local monotonic clock, given by the caller and used only for waiting, for point clouds and,
 during recovery, for frames that were missed; everything else follows from the messages. So the same messages give the
-same tracks, byte for byte, and those of the window give the same state in whatever order they come.
+same tracks, byte for byte, and frames of the window give the same state in any order.
 
 A frame that arrives is judged by the timeline (`on_detections`) and waits in the queue of its sensor (`pending`) until
 it is ready (`_advance`). Then it goes into the window (`window`), which takes it, and the frames behind it, through the
@@ -15,10 +15,12 @@ publisher.
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
+import numpy as np
 import optipmb_schemas as schemas
 
 import optipmb
@@ -52,22 +54,28 @@ if TYPE_CHECKING:
     from optipmb_service.stream.state import Inputs
     from optipmb_service.stream.timeline import Decision, Timeline
     from optipmb_service.stream.transition import Outcome
-    from optipmb_service.stream.values import Reason, Steps
+    from optipmb_service.stream.values import Reason
 
     Condition = Literal["new", "running", "recovering", "quarantined", "closed"]
 
 FLUSH_NS: Final = SECOND
 """Longest time for all pending frames at a reset, a change of parameters or the end: others wait for them."""
 
+SCORED: Final = 100
+"""Detections of a class after which its share below the score filter is reported."""
+
+SCORED_EVERY: Final = 8
+"""Frames of which one is looked at for that: in each it would take a tenth of the session's time."""
+
 
 class Session:
     """The state of one stream, or of several that share a density.
 
     Args:
-        stream: `site/node/sensor`; that of the tracks, where several sensors feed the session.
+        stream: `site/node/sensor`, or the name of a fused session.
         parameters: the profile to track with.
         policy: waiting, restarting, going back.
-        fused: whether frames are those of several sensors, by the streams of the messages.
+        fused: whether several sensors feed it, told apart by the streams of the messages.
         instance: name of the service, for problems.
         incarnation: ids that an earlier session of the stream used.
         tracker: makes the tracker; tests put their own here.
@@ -83,7 +91,7 @@ class Session:
         fused: bool = False,
         instance: str = "session",
         incarnation: Incarnation | None = None,
-        tracker: Callable[[optipmb.Parameters], Steps] = optipmb.Tracker,
+        tracker: Callable[[optipmb.Parameters], optipmb.Tracker] = optipmb.Tracker,
         clock: Callable[[], int] = time.perf_counter_ns,
     ) -> None:
         incarnation = incarnation or Incarnation()
@@ -100,6 +108,8 @@ class Session:
         self._clock = clock
         self._sensors: dict[str, SensorQueue] = {}
         self._quarantine: dict[str, str] = {}
+        self._estimated = ""
+        """Incarnation in which the motion of a sensor was reported as estimated."""
         self._deliveries = Deliveries()
         self._has_ready = False
         self._cloud_wait_ns: int | None = None
@@ -135,7 +145,7 @@ class Session:
             message: the frame.
             now_ns: monotonic time.
             arrived_ns: when the frame arrived, if before now: its wait for a cloud began then.
-            ticket: comes back with the tracks of the frame, and with those that it corrects.
+            ticket: comes back with the tracks of the frame and the tracks that it corrects.
         """
         frame_id = self._frame_id(message)
         since_ns = now_ns if arrived_ns is None else arrived_ns
@@ -161,7 +171,7 @@ class Session:
         return [*outputs, *self._not_admitted(queue, frame_id, judged, message)]
 
     def on_points(self, message: schemas.Points, now_ns: int, *, ticket: Any = None) -> list[Output]:
-        """Take a cloud; return the outputs of frames that waited for it and, by setting, those that it corrects.
+        """Take a cloud; return the outputs of frames that waited for it and, by setting, corrected ones.
 
         Args:
             message: the cloud.
@@ -229,7 +239,7 @@ class Session:
         Args:
             parameters: the profile; None: as before.
             cloud_wait_s: the longest wait for a cloud; None: as before.
-            horizons: those of predicted paths, valid ones; None: those of the profile that is set, else as before.
+            horizons: valid horizons of predicted paths; None: from the profile that is set, else as before.
             restart: whether the density may be discarded.
 
         Raises:
@@ -296,13 +306,13 @@ class Session:
         *,
         fence: int = 1,
         instance: str = "session",
-        tracker: Callable[[optipmb.Parameters], Steps] = optipmb.Tracker,
+        tracker: Callable[[optipmb.Parameters], optipmb.Tracker] = optipmb.Tracker,
         clock: Callable[[], int] = time.perf_counter_ns,
     ) -> Self:
         """Return the session that a checkpoint was taken of. It is `recovering` for a while.
 
-        Its tracks belong to another `run`, whose number is that of the checkpoint and the fence together: of two
-        sessions that go on from one checkpoint the later one has the higher fence, whatever the other has written down.
+        Its tracks belong to another `run`, whose number is the sum of the checkpoint's and the fence: of two
+        sessions that go on from one checkpoint the later one has the higher fence, whichever wrote last.
 
         Args:
             checkpoint: its state; its profile goes on too.
@@ -398,7 +408,7 @@ class Session:
 
     @property
     def counters(self) -> Counters:
-        """Counts of the messages so far: by delivery, and those that follow from the frames alone."""
+        """Counts of the messages so far: by delivery, and by the frames alone."""
         counts, deliveries = self._window.head.counts, self._deliveries
         return Counters(
             frames=counts.frames,
@@ -483,6 +493,9 @@ class Session:
     # Settings
 
     def _transition(self, parameters: optipmb.Parameters) -> Transition:
+        self._filters = np.array([one.score_filter for one in parameters.classes.values()])
+        self._scores = np.zeros((2, len(self._filters)), np.int64)
+        """Detections of each class of the profile, and of these the ones below its score filter."""
         return Transition(self.stream, parameters, self._make(parameters), self._policy)
 
     def _limit_wait(self, cloud_wait_ns: int) -> None:
@@ -531,7 +544,7 @@ class Session:
         self._recovery_ns, self._began, self._from_cache, self._young_ns = None, None, False, None
 
     def _is_behind_gap(self, frame_id: FrameId) -> bool:
-        """Return whether a frame waits for others that caches may hold: of its sensor, and of those that were live.
+        """Return whether a frame waits for others that caches may hold: of its sensor, and of live ones.
 
         After a restore the frames between the checkpoint and the crash come from the caches. When a fused session
         begins, the caches come one after the other: until it is known which sensors there are, none goes ahead of the
@@ -583,6 +596,10 @@ class Session:
         if found := queue.stamps.add(frame_id.stamp_ns, since_ns):
             expected = "stamps in nanoseconds that advance with time"
             outputs.append(self._problem("clock", frame_id, "stamp_ns", expected, found))
+        if (
+            frame_id.seq % SCORED_EVERY == 0 and not self.parameters.self_calibration
+        ):  # which never filters the upper half of a class
+            outputs += self._low_scores(frame_id, frame)
         deadline_ns, inputs = queue.cloud_deadline_ns(message, since_ns), (message, frame, ignored)
         pending = PendingFrame(frame_id, detections, inputs, deadline_ns, ticket, judged)
         waits = queue.held or deadline_ns is not None or queue.clouds.newest_ns is not None
@@ -611,7 +628,7 @@ class Session:
         """Go on with the publisher of a frame, which another one has succeeded."""
         outputs = self.flush()
         if not self._fused:
-            self._begin(self._window.head)  # in the window the order of publishers is that of their first frames
+            self._begin(self._window.head)  # in the window publishers follow each other by their first frames
         self._timeline = self._timeline.reinstated(frame_id)
         self._follow()
         return outputs
@@ -690,7 +707,7 @@ class Session:
             frame_id: the frame that is new.
             ticket: its ticket.
             began_ns: when this began.
-            inputs: what was decoded of the new frame; None: frames are inserted or changed.
+            inputs: the new frame, decoded; None: frames are inserted or changed.
         """
         window = self._window
         before = window.head.session
@@ -703,6 +720,11 @@ class Session:
         self._follow(gone)
         self._deliveries.inserted += inputs is None
         outputs = [] if self.session == before else self._restarted(outcomes)
+        if self.parameters.sensor_motion and self._estimated != self.session and self.density.sensor_motion is not None:
+            self._estimated = self.session
+            x, y, _ = self.density.sensor_motion.tolist()
+            received = f"none, and what stands moves by {math.hypot(x, y):.1f} m/s: the motion is estimated"
+            outputs.append(self._problem("no_pose", frame_id, "pose", "the pose of a sensor that moves", received))
         step_ns = (self._clock() - began_ns) // max(1, len(outcomes))
         for one in outcomes:
             if (one.unknown or one.tracks is None) and not one.frame.revision:
@@ -759,6 +781,23 @@ class Session:
                 return [begun, self._problem("restarted", one.frame.frame_id, "", "a stream that goes on", received)]
         return []
 
+    def _low_scores(self, frame_id: FrameId, frame: optipmb.Frame) -> list[Output]:
+        """Count the detections below the score filter; report each class that loses most of them, once."""
+        labels, size = self.parameters.labels, len(self._filters)
+        self._scores[0] += np.bincount(frame.label, minlength=size)
+        low = frame.score < self._filters[frame.label]
+        if not low.any():
+            return []
+        self._scores[1] += np.bincount(frame.label[low], minlength=size)
+        given, removed = self._scores
+        problems: list[Output] = []
+        for index in np.flatnonzero((given >= SCORED) & (2 * removed > given)).tolist():
+            received = f"{removed[index]} of {given[index]} below {self._filters[index]:g}"
+            expected = f"most scores of {labels[index]} above the filter of the profile {self.parameters.name}"
+            problems.append(self._problem("score_filter", frame_id, f"{labels[index]}.score", expected, received))
+            self._filters[index] = 0.0  # reported
+        return problems
+
     def _left_out(self, outcome: Outcome) -> list[Output]:
         """Report objects of unknown classes, and a frame that was refused when its turn came."""
         frame, parameters = outcome.frame, self.parameters
@@ -804,18 +843,10 @@ class Session:
         self, code: str, frame_id: FrameId, path: str, expected: str, received: str, count: int = 1
     ) -> schemas.Problem:
         """Return a problem of a frame, on the stream of its sensor."""
-        return problem_of(
-            code,
-            stream=frame_id.sensor or self.stream,
-            instance=self._instance,
-            path=path,
-            expected=expected,
-            received=received,
-            message=f"Frame {frame_id.seq}: {path or 'tracker'}: expected {expected}, received {received}.",
-            seq=frame_id.seq,
-            stamp_ns=frame_id.stamp_ns,
-            count=count,
-        )
+        texts = {"path": path, "expected": expected, "received": received}
+        frame = {"seq": frame_id.seq, "stamp_ns": frame_id.stamp_ns, "count": count}
+        stream, subject = frame_id.sensor or self.stream, f"Frame {frame_id.seq}: {path or 'tracker'}"
+        return problem_of(code, stream=stream, instance=self._instance, subject=subject, **texts, **frame)
 
 
 def _seconds(jump_ns: int) -> str:

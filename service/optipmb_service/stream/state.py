@@ -1,7 +1,7 @@
 """The state of a session between two frames, and the frames themselves, as values that never change.
 
 A `FilterState` holds all that a frame's tracks follow from, and nothing that depends on how messages were delivered. So
-two sessions that took the same frames have equal states, whatever came twice, late or before a crash.
+two sessions that took the same frames have equal states, with any repeats, delays or crashes.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class FrameCounts:
     Attributes:
         frames: tracked.
         gaps: missing between those tracked.
-        new_epochs: how often the publisher started anew or its stamps jumped.
+        new_epochs: how often the publisher restarted or its stamps jumped.
         clouds_used: tracked with their cloud.
         clouds_missed: that waited for a cloud in vain.
         astray: refused because the sensor cannot have been there.
@@ -56,7 +56,7 @@ class FrameCounts:
 
 @record
 class PoseHistory:
-    """Last pose of a sensor, and those that were refused since.
+    """Last pose of a sensor, and the poses refused since.
 
     Attributes:
         stamp_ns: when; None before the first frame with a pose.
@@ -120,7 +120,7 @@ class FilterState:
     zones: ZoneState | None = None
 
     def sensor(self, name: str) -> SensorState:
-        """Return what is known of a sensor, nothing before its first frame."""
+        """Return the state of a sensor, the initial one before its first frame."""
         return self.sensors.get(name, _UNKNOWN)
 
     @property

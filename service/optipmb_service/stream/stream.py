@@ -3,7 +3,7 @@
 A stream opens its session, gives it what waits in the backlog, delivers its outputs, and ends it. All is on the
 tracking thread, so nothing is locked. Where several sensors share a session, the stream has the session's name.
 
-A stream is made for whatever arrives on a key whose partition this member holds, its session only for a valid message:
+A stream is made for any message on a key whose partition this member holds, its session only for a valid message:
 garbage costs a stream that is gone when its backlog is empty. Clocks: `now_ns` is monotonic and decides; the wall clock
 is only reported.
 """
@@ -17,16 +17,16 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import optipmb_schemas as schemas
 import structlog
+from optipmb_client.errors import ConnectionFailed as TransportError
 
 from optipmb_service.stream.checkpoint import CheckpointError, forgotten
 from optipmb_service.stream.persistence import save_dump
-from optipmb_service.stream.ports import Packet
 from optipmb_service.stream.problems import problem_of
 from optipmb_service.stream.recovery import CacheRecovery, LogCheck
 from optipmb_service.stream.session import Session
-from optipmb_service.stream.track_publisher import Arrival, TrackPublisher
-from optipmb_service.stream.values import MAX_SENSORS, Begun, Incarnation, Quarantined, Tracked
+from optipmb_service.stream.values import MAX_SENSORS, SECOND, Begun, Incarnation, Quarantined, Tracked
 from optipmb_service.telemetry.stream_meter import Counters, MessageCounters, StreamMeter, total
+from optipmb_service.zenoh.inputs import Packet
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from optipmb_service.stream.checkpoint import Checkpoint
     from optipmb_service.stream.streams import Streams
     from optipmb_service.stream.values import Output
+    from optipmb_service.zenoh.transport import StreamPublisher
 
 log = structlog.get_logger("optipmb_service")
 
@@ -47,12 +48,22 @@ TURN_NS: Final = 5_000_000
 REST: Final = 9
 """Rest of a sensor after a message beyond the limit, in times of what it took: it has a tenth of the time at most."""
 
+MILLISECOND: Final = 1e6
+
 CLOUD_REFUSED: Final = {"invalid_value", "refused"}
 """Problems by which a session refuses a cloud: not valid, or of one sensor too many."""
 
 
+class Arrival(NamedTuple):
+    """Times of a frame's arrival, and of its decoding."""
+
+    wall_ns: int
+    now_ns: int
+    decode_ns: int
+
+
 class Stream:
-    """One session: that of a sensor, or of several.
+    """Session of a sensor, or of several.
 
     Args:
         name: of the session, `site/node/sensor`.
@@ -72,9 +83,11 @@ class Stream:
         self._member = streams.member
         self._prefix = f"{streams.keys.prefix}/"
         self._step_limit_ns = streams.step_limit_ns
-        self._tracks = TrackPublisher(
-            name, streams.instance, streams.open_publisher, self.meter, streams.metrics, streams.member
-        )
+        self._publisher: StreamPublisher | None = None
+        self._unpublished: list[tuple[bytes, Tracked, int]] = []
+        """Encoded tracks that wait for the write lease, each with the time that its frame waited, ns."""
+        self._ids = b""
+        """Ids of the newest tracks, as the bytes of int64."""
         self._caches = CacheRecovery(name, streams)
         self._resting: dict[str, int] = {}
         """Monotonic time until when messages of a sensor are refused that took too long."""
@@ -110,8 +123,8 @@ class Stream:
         if not paused:
             if backlog.answered and (answered := backlog.take_answered()):
                 self._guard(self.on_caches_answered, *answered)
-            if self._tracks.waiting:
-                self._guard(self._tracks.flush)
+            if self._unpublished:
+                self._guard(self._publish)
             self._guard(self._settle)
         turn = backlog.end_turn(close=not self.occupied, urgent=paused)
         if turn is None:
@@ -172,7 +185,7 @@ class Stream:
             self.report("internal", "", "a message handled without an error", f"{type(error).__name__}: {error}")
 
     def _settle(self) -> None:
-        """Process what has waited long enough, and ask for a turn for what has not."""
+        """Process frames whose wait is over, and ask for a turn for the others."""
         for origin, shed in self.backlog.shed_since().items():
             expected, received = f"at most {self._streams.queue_frames} frames waiting", "more; the oldest were dropped"
             self.report("shed", "", expected, f"{shed} {received}", count=shed, stream=self._stream_of(origin))
@@ -268,7 +281,7 @@ class Stream:
         session = self.session
         for output in outputs:
             if isinstance(output, Tracked):
-                self._tracks.send(output)
+                self._send(output)
             elif isinstance(output, Begun):
                 epoch = session.state().epoch if session else None
                 log.info(
@@ -286,6 +299,58 @@ class Stream:
             else:
                 self._streams.reporter.report(output, time.monotonic_ns())
 
+    def _open_publisher(self) -> None:
+        try:
+            self._publisher = self._streams.open_publisher(self.name)
+        except TransportError as error:
+            log.warning("publisher_failed", stream=self.name, error=str(error))
+
+    def _send(self, tracked: Tracked) -> None:
+        """Publish the tracks of a frame, now or when the write lease holds again."""
+        ticket: Arrival = tracked.ticket
+        passed_ns = time.monotonic_ns() - ticket.now_ns
+        waited_ns = max(0, passed_ns - ticket.decode_ns - tracked.step_ns)
+        delivery = {
+            "instance": self._streams.instance,
+            "received_ns": ticket.wall_ns,
+            "published_ns": time.time_ns(),
+            "queue_ms": waited_ns / MILLISECOND,
+            "decode_ms": ticket.decode_ns / MILLISECOND,
+            "step_ms": tracked.step_ns / MILLISECOND,
+            "run": tracked.run,
+        }
+        self._count_tracks(tracked.estimates.id.tobytes())
+        self._unpublished.append((tracked.encoded(delivery), tracked, waited_ns))
+        self._publish()
+
+    def _publish(self) -> None:
+        """Publish what waits, if the write lease holds."""
+        if not self._unpublished or not self._member.may_write(self.name, self._fence):
+            return
+        waiting, self._unpublished = self._unpublished, []
+        for payload, tracked, waited_ns in waiting:
+            try:
+                if self._publisher is not None:
+                    self._publisher.publish(payload)
+            except TransportError as error:
+                log.warning("publish_failed", stream=self.name, error=str(error))
+            else:
+                latency_ns = time.monotonic_ns() - tracked.ticket.now_ns
+                self.meter.published(latency_ns)
+                self._streams.metrics.published(
+                    latency_s=latency_ns / SECOND,
+                    queue_s=waited_ns / SECOND,
+                    decode_s=tracked.ticket.decode_ns / SECOND,
+                    step_s=tracked.step_ns / SECOND,
+                )
+
+    def _count_tracks(self, ids: bytes) -> None:
+        """Count new and ended tracks."""
+        if ids != self._ids:
+            after, before = (set(memoryview(one).cast("q")) for one in (ids, self._ids))
+            self._streams.metrics.tracks(started=len(after - before), ended=len(before - after))
+            self._ids = ids
+
     def report(
         self, code: str, path: str, expected: str, received: str, *, what: str = "", count: int = 1, stream: str = ""
     ) -> None:
@@ -295,22 +360,14 @@ class Stream:
             code: one of the codes of `Problem`.
             path: field of the message.
             expected: what would have been accepted.
-            received: what came.
+            received: the value received.
             what: its subject; a stream.
             count: number of messages that it concerns.
-            stream: the one it is reported on; that of the session.
+            stream: the stream it is reported on; by default the session's.
         """
-        message = f"{what or 'Stream'}: {path or 'message'}: expected {expected}, received {received}."
-        problem = problem_of(
-            code,
-            stream=stream or self.name,
-            instance=self._streams.instance,
-            path=path,
-            expected=expected,
-            received=received,
-            message=message,
-            count=count,
-        )
+        texts = {"path": path, "expected": expected, "received": received}
+        about = {"stream": stream or self.name, "subject": f"{what or 'Stream'}: {path or 'message'}"}
+        problem = problem_of(code, instance=self._streams.instance, count=count, **about, **texts)
         self._streams.reporter.report(problem, time.monotonic_ns())
 
     def _report_overload(self, stream: str, received: str) -> None:
@@ -355,7 +412,7 @@ class Stream:
     def take_up(self) -> None:
         """Go on with a session that has come here. One that is kept, and was not closed, goes on at once.
 
-        Else the first valid packet of those that wait begins one.
+        Else the first valid packet begins one.
         """
         if not self._member.holds(self.name):
             return
@@ -380,7 +437,7 @@ class Stream:
         return True
 
     def _load(self) -> None:
-        """Have the session restored on the thread of the store, and what it has missed read from the log."""
+        """Have the session restored on the thread of the store, and missed frames read from the log."""
         streams, fence = self._streams, self._member.fence(self.name)
         taken: list[Checkpoint] = []
 
@@ -426,7 +483,7 @@ class Stream:
         closed = restored is None or not restored.counters.frames
         if holds and not (closed and self._restore_only):
             self._fence = fence
-            self._tracks.open(fence)
+            self._open_publisher()
             session = self._restored(restored) if restored else self._new(incarnation, fence)
             self._counts.open(session)
             self._changed, self.session = False, session
@@ -469,7 +526,7 @@ class Stream:
         return None if same else wanted.name
 
     def _proceed(self) -> None:
-        """Go on with what came while a session was about to begin or end."""
+        """Go on with messages that came while a session was about to begin or end."""
         if self.backlog.state == "opening":
             if self._member.holds(self.name):
                 self.backlog.go_live()
@@ -482,7 +539,7 @@ class Stream:
     # Leaving
 
     def on_lost(self) -> None:
-        """Another instance has the stream: what is here is no longer the newest state."""
+        """Leave the stream: another instance has it, and the newest state."""
         if not self._member.holds(self.name):
             self.backlog.leave()
         if self._fence == self._member.fence(self.name):
@@ -495,7 +552,6 @@ class Stream:
     def on_renewed(self) -> None:
         """Go on under another fence: the store has lost the lease, and all checkpoints with it."""
         self._fence = self._member.fence(self.name)
-        self._tracks.renew(self._fence)
         self._changed = True
 
     def on_recalled(self) -> None:
@@ -512,10 +568,10 @@ class Stream:
             self.close_session("moved")
 
     def close_session(self, reason: str) -> None:
-        """End the session and free what it holds; the next valid message of the stream begins another, or goes on.
+        """End the session and free its memory; the next valid message of the stream begins another, or goes on.
 
         A session that is idle or moved is kept as it is; one that is closed by a query forgets its density and its
-        counters. Pending messages are processed, in a session that is moved by whoever goes on with it.
+        counters. Pending messages are processed, in a session that is moved by the next member.
         """
         session = self.session
         if session is None:
@@ -524,7 +580,7 @@ class Stream:
             self._hand_over(session)
         else:
             self.deliver(session.flush())
-        self._tracks.flush()  # what waited for the write lease is in the state that is kept
+        self._publish()  # what waited for the write lease is in the state that is kept
         state = session.snapshot()
         if reason == "query":
             session.reset()
@@ -571,7 +627,11 @@ class Stream:
             return
         self.session, self._armed_ns = None, None
         self._caches.forget()
-        self._tracks.close()
+        self._unpublished.clear()  # another owner publishes it
+        self._count_tracks(b"")
+        if self._publisher is not None:
+            self._publisher.release()
+            self._publisher = None
         self._counts.close()
         self._streams.admission.release(self.name, session.incarnation)
         log.info(
@@ -634,7 +694,7 @@ class StreamCounters:
     Written by the tracking thread, for any reader.
 
     Args:
-        backlog: counts what it sheds.
+        backlog: counts shed messages.
     """
 
     def __init__(self, backlog: Backlog) -> None:
@@ -676,7 +736,7 @@ class StreamCounters:
         return counted + MessageCounters(received=frames, shed=frames, clouds_shed=self._shed.clouds)
 
     def state(self, session: Session) -> schemas.SessionState:
-        """Return the state of a session with what was received and shed since it was opened."""
+        """Return the state of a session with the messages received and shed since it was opened."""
         waiting, shed, _ = self._backlog.counts()
         _, base, opened, traffic = self._accounts
         before = base.frames + base.duplicates + base.late + base.refused
@@ -694,7 +754,7 @@ class StreamCounters:
 class Sensors:
     """Sensors of one session: when each sent last, and which fell silent.
 
-    Written by the tracking thread; the control loop looks for those that are silent.
+    Written by the tracking thread; the control loop looks for silent ones.
 
     Args:
         session: its name.

@@ -6,6 +6,7 @@ guards the table of backlogs; nothing slow is done under it.
 
 from __future__ import annotations
 
+import queue
 import threading
 import time
 from functools import lru_cache, partial
@@ -13,6 +14,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import optipmb_schemas as schemas
+import structlog
 
 import optipmb
 from optipmb_service.cluster.leases import Change, partition_of
@@ -31,13 +33,15 @@ if TYPE_CHECKING:
     from optipmb_service.settings import Settings
     from optipmb_service.stream.intake import Intake
     from optipmb_service.stream.persistence import CheckpointWriter
-    from optipmb_service.stream.ports import Packet, Publisher
     from optipmb_service.stream.profiles import Profiles
     from optipmb_service.stream.recovery import Log
-    from optipmb_service.stream.scheduler import Scheduler
     from optipmb_service.stream.values import Incarnation
     from optipmb_service.telemetry.metrics import Metrics
     from optipmb_service.telemetry.problem_reporter import ProblemReporter
+    from optipmb_service.zenoh.inputs import Packet
+    from optipmb_service.zenoh.transport import StreamPublisher
+
+log = structlog.get_logger("optipmb_service")
 
 MAX_UNPROVEN: Final = 256
 """Streams at once that have not sent a valid message yet."""
@@ -79,10 +83,10 @@ It would free next to nothing. All such sessions keep less than a tenth of the m
 
 
 class Streams:
-    """The streams of one process, and what they share.
+    """The streams of one process, and their common parts.
 
     Args:
-        settings: what is in force.
+        settings: in force.
         profiles: the parameters that can be had.
         open_publisher: opens the publisher of a stream's tracks.
         reporter: takes problems.
@@ -103,7 +107,7 @@ class Streams:
         settings: Settings,
         profiles: Profiles,
         *,
-        open_publisher: Callable[[str], Publisher],
+        open_publisher: Callable[[str], StreamPublisher],
         reporter: ProblemReporter,
         scheduler: Scheduler,
         member: Member,
@@ -167,7 +171,7 @@ class Streams:
         try:
             stream, session = self.parsed(packet.key)
         except schemas.MessageError as error:
-            # Whoever receives it receives the detections of all: it is one of all members.
+            # Only members that receive the detections of all streams receive it.
             self._refuse("invalid_value", packet, "", error.expected, error.received)
             return
         topic: Literal["detections", "points"] = "detections" if packet.frame else "points"
@@ -267,7 +271,7 @@ class Streams:
                 if stream.backlog.detach():
                     del self._backlogs[stream.name]
 
-    # What is there
+    # Present streams
 
     def tracking(self) -> list[Stream]:
         """Return the streams that have a session, by name."""
@@ -320,7 +324,7 @@ class Streams:
                     self._backlog(session, time.monotonic_ns()).unasked = True
 
     def hold(self, session: str) -> None:
-        """Hold messages of a session until it is taken up."""
+        """Hold messages of a session until it is opened."""
         now_ns = time.monotonic_ns()
         with self._lock:
             self._newcomers.pop(session, None)
@@ -330,7 +334,7 @@ class Streams:
         backlog.leave()
 
     def take_up(self, session: str, packets: list[Packet]) -> None:
-        """Go on with a session that has come here: with what others received of it, then with what is held here."""
+        """Open a session that has come here: first with messages that others received, then with the held ones."""
         with self._lock:
             self._newcomers.pop(session, None)
             self._coming.discard(session)
@@ -348,7 +352,7 @@ class Streams:
                 self._push(session, packet, own=False)
 
     def held(self, partitions: Container[int]) -> set[str]:
-        """Return the sessions of partitions of which messages are held for another member, or to be taken up."""
+        """Return the sessions of partitions of which messages are held for another member, or until it is opened."""
         with self._lock:
             return {
                 name
@@ -357,12 +361,12 @@ class Streams:
             }
 
     def keeps(self, session: str) -> bool:
-        """Whether messages of a session are held for another member, or to be taken up."""
+        """Whether messages of a session are held for another member, or until it is opened."""
         backlog = self._backlogs.get(session)
         return backlog is not None and backlog.state == "foreign"
 
     def recent(self, sessions: Iterable[str]) -> list[Packet]:
-        """Return what is held of sessions, the oldest first, for the member that goes on with them."""
+        """Return the held messages of sessions, the oldest first, for their next member."""
         held = [backlog.recent() for one in sessions if (backlog := self._backlogs.get(one)) is not None]
         return sorted((packet for packets in held for packet in packets), key=lambda one: one.now_ns)
 
@@ -373,13 +377,13 @@ class Streams:
                 backlog.answered &= received
 
     def changed(self, partition: int, change: Change) -> None:
-        """Have streams follow a change of their partition; those that came here are taken up later."""
+        """Have streams follow a change of their partition; sessions that came here are opened later."""
         commands = {Change.RECALLED: Stream.on_recalled, Change.RENEWED: Stream.on_renewed, Change.LOST: Stream.on_lost}
         if (command := commands.get(change)) is None:
             return
         for stream in [one for one in self._all() if partition_of(one.name) == partition]:
             if change is not Change.RENEWED and not self.member.holds(stream.name):
-                # Before its session ends: what comes from then on is held for who asks.
+                # Before its session ends: later messages are held for the next member.
                 stream.backlog.leave(asked_for=change is Change.RECALLED and stream.session is not None)
             stream.tell(command)
 
@@ -392,7 +396,7 @@ class Streams:
 
     @property
     def doubts_owners(self) -> bool:
-        """Whether who tracks what is to be asked for again."""
+        """Whether the owners are to be asked for again."""
         return bool(self._rivals.doubted)
 
     # Checkpoints and the end
@@ -486,7 +490,7 @@ class Streams:
             self.command(stream.name, lambda one: one.close_session("memory"), urgent=False)
 
     def _trim(self, now_ns: int, idle_ns: int) -> None:
-        """Drop what has been held for too long, and backlogs of which nothing was heard for `idle_ns`."""
+        """Drop messages held for too long, and backlogs of which nothing was heard for `idle_ns`."""
         with self._lock:
             backlogs = list(self._backlogs.items())
         for session, backlog in backlogs:
@@ -516,7 +520,7 @@ class Streams:
         return incarnation
 
     def _let_in(self) -> None:
-        """Take up sessions that have waited for room, as far as there is some."""
+        """Open sessions that have waited for room, as far as there is some."""
         while self._newcomers:
             with self._lock:
                 session = None if self._crowded() else next(iter(self._newcomers), None)
@@ -553,16 +557,8 @@ class Streams:
         self._report(code, stream, expected, received)
 
     def _report(self, code: str, stream: str, expected: str, received: str, count: int = 1) -> None:
-        problem = problem_of(
-            code,
-            stream=stream,
-            instance=self.instance,
-            path="key",
-            expected=expected,
-            received=received,
-            message=f"Key: expected {expected}, received {received}.",
-            count=count,
-        )
+        texts = {"path": "key", "expected": expected, "received": received}
+        problem = problem_of(code, stream=stream, instance=self.instance, subject="Key", count=count, **texts)
         self.reporter.report(problem, time.monotonic_ns())
 
     # The table
@@ -593,6 +589,46 @@ class Streams:
             known = self._streams.get
             self._unproven = {one for one in self._unproven if not one.occupied and known(one.name) is one}
         return len(self._unproven) >= most
+
+
+class Scheduler:
+    """A thread that does the work that was submitted, first come first served.
+
+    One is enough: most of a frame is under the interpreter's lock. It is a daemon: a step that does not end must not
+    keep the process.
+    """
+
+    def __init__(self) -> None:
+        self._queue: queue.SimpleQueue[Callable[[], bool] | None] = queue.SimpleQueue()
+        self._began_ns: int | None = None
+        self._thread = threading.Thread(target=self._run, name="tracking", daemon=True)
+        self._thread.start()
+
+    def submit(self, work: Callable[[], bool]) -> None:
+        """Have the thread call `work`, which does a bounded piece and returns whether there is more."""
+        self._queue.put(work)
+
+    @property
+    def busy_s(self) -> float:
+        """Seconds that the present piece of work has taken; 0 while the thread waits."""
+        began_ns = self._began_ns
+        return 0.0 if began_ns is None else (time.monotonic_ns() - began_ns) / 1e9
+
+    def close(self, timeout: float) -> bool:
+        """End the thread after the submitted work; False when it did not end in time (s)."""
+        self._queue.put(None)
+        self._thread.join(timeout)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        while (work := self._queue.get()) is not None:
+            self._began_ns = time.monotonic_ns()
+            try:
+                if work():
+                    self._queue.put(work)
+            except Exception:
+                log.exception("internal_error", thread="tracking")  # one stream must not end the thread of all
+            self._began_ns = None
 
 
 class Rivals:

@@ -17,7 +17,7 @@ the others differs, because a single publisher says in which order its frames we
 
 Both are functions of which frames there are, not of when each came. So a late frame is put where it belongs, also
 before a cut, and the cuts move as they must: `places` says where every frame of the window belongs now. Behind the
-window nothing moves any more. What is later than that is `Verdict.LATE`.
+window nothing moves any more. A later frame is `Verdict.LATE`.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class FrameId(NamedTuple):
         epoch: 16 bytes, new at every start of the publisher.
         seq: counts the publisher's frames in the epoch.
         stamp_ns: sensor time, nanoseconds.
-        sensor: its stream, where several sensors feed one session; empty where the session is that of one stream.
+        sensor: its stream, where several sensors feed one session; empty in a session of one stream.
     """
 
     epoch: Epoch
@@ -113,7 +113,7 @@ class Placement:
 
     Attributes:
         era: the era that it belongs to.
-        generation: counts restarts; a frame of a higher generation than the one before it starts the session anew.
+        generation: counts restarts; a frame of a higher generation than the one before it restarts the session.
         floor_ns: in an era that continues another, the stamp that the other one reached; None elsewhere.
         opens: whether it begins its era, and how: first, new_epoch, restart; next where it does not, unconfirmed where
             its stamp jumped and nothing follows from it yet.
@@ -316,12 +316,12 @@ class Timeline:
         return {name: stamp_ns for name, stamp_ns in self.clock.items() if newest_ns - stamp_ns <= self.limits.ahead_ns}
 
     def silent(self, names: Iterable[str]) -> list[str]:
-        """Return those of several sensors that did not feed the session lately, the longest silent first."""
+        """Return the sensors, of several, that did not feed the session lately, the longest silent first."""
         live = self.live()
         return sorted([name for name in names if name not in live], key=lambda one: (self.clock.get(one, -1), one))
 
     def _place(self, frame_id: FrameId, number: int) -> tuple[Decision, Timeline]:
-        """Decide on a frame that was not seen; `number` is that of its epoch, -1 for a new one."""
+        """Decide on a frame that was not seen; `number` is its epoch's, -1 for a new one."""
         raise NotImplementedError
 
     def _jump_ns(self, frame_id: FrameId) -> int:
@@ -414,7 +414,7 @@ class StreamTimeline(Timeline):
         if not all(map(self._free, frame_ids, places)):
             return self._refuse(frame_id, refusal)
         if frame_id.epoch == before.epoch and frame_id.seq < before.seq and place.opens is not Verdict.NEXT:
-            # What was sent before the window cannot be what opens an era behind it: it merely took long.
+            # A frame from before the window cannot open an era behind it: it merely took long.
             return self._refuse(frame_id, refusal)
         if succeeded and (place.opens is Verdict.UNCONFIRMED or not self._before_successor(at, places)):
             return self._refuse(frame_id, refusal)
@@ -468,13 +468,13 @@ class JumpedFrames:
 class FusedTimeline(Timeline):
     """Timeline of several sensors, in the order of their stamps.
 
-    Each sensor has its own epochs and sequence numbers. A sensor whose publisher starts anew goes on where its stamps
-    are beyond those of the publisher before; that concerns nobody else.
+    Each sensor has its own epochs and sequence numbers. A sensor whose publisher restarts goes on where its stamps
+    are beyond the publisher's before; other sensors are not concerned.
 
     The session's clock is the highest stamp. A frame further from it than the gap limit, ahead or back, is refused, so
-    one sensor's wrong clock costs the others nothing. The jump is believed, and the density begins anew, when
+    one sensor's wrong clock costs the others nothing. The jump is believed, and the density restarts, when
     `JUMP_FRAMES` frames of the sensor agree and the others do too: each sensor that fed the session lately is on the
-    new clock as well, or for as long as the gap limit nobody has moved the old one.
+    new clock as well, or for as long as the gap limit none has moved the old one.
 
     Attributes:
         generation: number of jumps that were believed; all frames of the window are of this one.
@@ -566,7 +566,7 @@ class FusedTimeline(Timeline):
         return Decision(opens if last else Verdict.INSERTED, _placed(frame_id, self.generation), last), timeline
 
     def _other_clock(self, frame_id: FrameId, refusal: Verdict = Verdict.JUMPED) -> tuple[Decision, Timeline]:
-        """Refuse a frame whose stamp is far from the session's clock, or begin anew on its own."""
+        """Refuse a frame whose stamp is far from the session's clock, or restart on its own."""
         sensor, stamp_ns = frame_id.sensor, frame_id.stamp_ns
         before = self.jumped.get(sensor)
         one = JumpedFrames(1, stamp_ns, stamp_ns)
@@ -602,7 +602,7 @@ def _placed(frame_id: FrameId, generation: int) -> Placement:
 
 
 def _latest(jumped: Mapping[str, JumpedFrames], most: int) -> dict[str, JumpedFrames]:
-    """Return those of the sensors that have come last."""
+    """Return the newest ones."""
     return dict(tuple(jumped.items())[-most:])
 
 
@@ -616,7 +616,7 @@ def _agrees(other: JumpedFrames | None, stamp_ns: int, gap_limit_ns: int) -> boo
 
 
 def number_of(epochs: Sequence[SeenNumbers], epoch: bytes | None) -> int:
-    """Return the place of an epoch among those of a publisher, -1 when it is none of them."""
+    """Return the index of an epoch among a publisher's, -1 when it is not there."""
     for number in range(len(epochs) - 1, -1, -1):
         if epochs[number].epoch == epoch:
             return number

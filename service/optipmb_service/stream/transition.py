@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
     from optipmb.zones import Event
     from optipmb_service.stream.state import Inputs, Position, ProcessedFrame
-    from optipmb_service.stream.values import Policy, Reason, Steps, Tracked
+    from optipmb_service.stream.values import Policy, Reason, Tracked
 
 GIVE_UP_NS: Final = SECOND
 """Sensor time after which a density that makes every frame too much is given up."""
@@ -80,7 +80,7 @@ class Transition:
         policy: where a sensor can be.
     """
 
-    def __init__(self, stream: str, parameters: optipmb.Parameters, tracker: Steps, policy: Policy) -> None:
+    def __init__(self, stream: str, parameters: optipmb.Parameters, tracker: optipmb.Tracker, policy: Policy) -> None:
         self.stream = stream
         self.parameters = parameters
         self._tracker = tracker
@@ -113,11 +113,11 @@ class Transition:
             inputs: its detections as the tracker reads them; None: they are decoded here.
 
         Raises:
-            Exception: whatever the tracker raises.
+            Exception: any error of the tracker.
         """
         frame_id, place = frame.frame_id, frame.place
         if place.opens is Verdict.UNCONFIRMED:
-            # What comes after is judged, and put in order, as if it had not been there.
+            # Later frames are judged and ordered as if it had not been there.
             refused = _refused(before, frame, before.sensor(frame_id.sensor).pose_history, "unconfirmed")
             return replace(refused, last=before.last), Outcome(frame)
         if inputs is None:
@@ -179,8 +179,8 @@ class Transition:
 
         Args:
             base: the state before the window.
-            frames: those of the window with the one that failed, in the order of processing.
-            error: what was raised.
+            frames: the window's and the failed one, in the order of processing.
+            error: the exception.
         """
         dumped: list[schemas.DumpedFrame] = []
         state = base
@@ -259,17 +259,16 @@ class Transition:
         highest = sensor.tracked[1] if sensor.tracked is not None and same else frame_id.seq - 1
         gap = max(0, frame_id.seq - highest - 1)
         tracks = convert.tracks_of(
-            result.tracks,
-            result.paths,
-            result.class_probability,
-            stream=self.stream,
-            frame_id=frame_id,
+            result,
+            self.stream,
+            frame_id,
             session=before.session,
             revision=frame.revision,
-            parameters=self.parameters,
+            profile=self.parameters.name,
             cloud_used=used,
             gap=gap,
             ignored=ignored,
+            labels=self.parameters.labels,
         )
         zones, tracks.events = self._zones(before, result.tracks, frame_id.stamp_ns)
         unknown = self._unknown(message, sensor.reported) if ignored else {}
@@ -322,7 +321,7 @@ def check_pose(
 
     A pose that jumps by a hundred metres (a lost localisation, poses of another vehicle) would leave every track behind
     and give birth to as many: the frame is refused. When several frames in a row agree with each other about the new
-    place, the sensor is there, whatever brought it: the next of them starts a new incarnation of the session.
+    place, the sensor is there: the next of them starts a new incarnation of the session.
 
     Args:
         before: poses of the frames before it.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, Literal, NamedTuple, Protocol
+from typing import Annotated, Any, Final, Literal, NamedTuple
 
 import numpy as np
 import optipmb_schemas as schemas
@@ -60,19 +60,12 @@ MAX_LABELS: Final = 256
 """Unknown class names remembered as reported."""
 
 
-class Steps(Protocol):
-    """Tracker of a session; `optipmb.Tracker` is one."""
-
-    def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
-        """Return the density after the frame, and its tracks."""
-
-
 @dataclass(frozen=True, slots=True)
 class Policy:
     """The settings that a session follows; lengths in metres, speeds in metres per second.
 
     Attributes:
-        gap_limit_ns: a larger step of the stamps starts the session anew.
+        gap_limit_ns: a larger step of the stamps restarts the session.
         cloud_wait_ns: longest wait of a frame for its cloud.
         cloud_memory_ns: how lately a cloud must have come for a frame that does not say whether it has one.
         clouds: number of clouds kept.
@@ -87,7 +80,7 @@ class Policy:
         recovery_wait_ns: longest time after a restore that frames behind a gap are held for those missing.
         max_speed: fastest that a sensor moves; 0: any pose is taken.
         pose_margin: how far a pose may lie from where that speed allows.
-        astray_frames: frames in a row that agree on another place until the session begins anew there.
+        astray_frames: frames in a row that agree on another place until the session restarts there.
         zones: those whose events the session finds.
         at_once: frames that are ready which one call takes through the tracker; the next calls take the others. More
             are taken only while more than `held_bytes` are held.
@@ -124,7 +117,7 @@ class Incarnation:
     Attributes:
         starts: incarnations of the density so far.
         next_id: the next track id.
-        run: see `Session.run`; of the next session, higher than that of any which may have published before.
+        run: see `Session.run`; of the next session, higher than any that may have published before.
     """
 
     starts: int = 0
@@ -198,7 +191,7 @@ class Quarantined:
     """A step raised: the session takes no more frames until it is reset or another publisher begins.
 
     Attributes:
-        error: type and text of what was raised.
+        error: type and text of the exception.
         dump: what `optipmb track --dump` replays to the same error.
     """
 
@@ -218,7 +211,7 @@ class Deliveries:
         late: frames that came too late.
         refused: messages that were not valid, or not wanted.
         inserted: late frames and clouds that were put in their place.
-        corrected: tracks that were published anew because of these.
+        corrected: tracks that were published again because of these.
     """
 
     duplicates: Count = 0
@@ -234,7 +227,7 @@ class RefusedError(ValueError):
     Attributes:
         path: the field of the request.
         expected: what would have been accepted.
-        received: what was asked for.
+        received: the value asked for.
     """
 
     def __init__(self, path: str, expected: str, received: str) -> None:

@@ -86,7 +86,7 @@ class ReorderWindow:
         return sorted([*placed, frame], key=lambda one: one.order)
 
     def amended(self, points: schemas.Points, frame_id: FrameId, *, published: bool) -> list[ProcessedFrame]:
-        """Return the frames of the window, a late cloud given to those of its sensor and stamp that lack one.
+        """Return the frames of the window, a late cloud given to the frame of its sensor and stamp that lacks one.
 
         Args:
             points: the cloud.
@@ -152,7 +152,7 @@ class ReorderWindow:
         """Return how many of the newest frames fit."""
         frames = self._frames
         if span_ns != 0 and frames and len(frames) <= most and self._weight <= most_bytes:
-            # Mostly all but the oldest few fit, and they are of one generation: their span is that of the two ends.
+            # Mostly all but the oldest few fit, and they are of one generation: the two ends give their span.
             last, first = frames[-1], 0
             if span_ns is not None and frames[0].place.generation == last.place.generation:
                 since_ns = last.place.time_ns - span_ns

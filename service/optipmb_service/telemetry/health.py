@@ -1,6 +1,6 @@
 """State of the process, for those who ask from outside: from before the service exists until after its end.
 
-The control loop beats; whoever asks sees for how long it has not. States: `starting`, then what the service says
+The age of the control loop's last beat is reported. States: `starting`, then that of the service
 (`ready`, `degraded` when it works with a part missing, `paused` when it may not publish, `unlinked` without a router,
 or `draining` when others track its streams), then `stopping`.
 """
@@ -27,17 +27,24 @@ USABLE: Final = frozenset({"ready", "degraded"})
 
 
 class Reporter:
-    """Part of a process that does its work, and reports how it is; by default one without streams that always works."""
+    """Part of a process that does its work, and reports its state; by default one without streams.
+
+    Args:
+        unlinked: returns why there is no router; empty while there is one.
+    """
+
+    def __init__(self, unlinked: Callable[[], str] = str) -> None:
+        self._unlinked = unlinked
 
     @property
     def state(self) -> str:
         """State of the process while this works."""
-        return "ready"
+        return "unlinked" if self._unlinked() else "ready"
 
     @property
     def failure(self) -> str:
         """Why it cannot be used, or works with a part missing; empty while it works."""
-        return ""
+        return self._unlinked()
 
     @property
     def stuck(self) -> bool:
@@ -121,5 +128,5 @@ class ProcessHealth:
         return None if self._service is None else self._service.status()
 
     def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None] | None:
-        """Hand over what comes on a stream to a viewer (`Reporter.tap`); None while the service starts."""
+        """Hand over the messages of a stream to a viewer (`Reporter.tap`); None while the service starts."""
         return None if self._service is None else self._service.tap(stream, receive)

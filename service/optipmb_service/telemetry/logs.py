@@ -1,6 +1,6 @@
 """Logs: one line per event that an operator can act on, on stderr; stdout holds nothing but the ready line.
 
-A thread of its own writes the lines: whoever logs does not wait for the reader of stderr, which may have stopped
+A thread of its own writes the lines: logging never waits for the reader of stderr, which may have stopped
 reading. Lines beyond the bound of the queue are dropped and counted.
 """
 
@@ -193,7 +193,7 @@ class LineWriter:
                 line = self._lines.popleft()
             try:
                 self._write(line)
-            except OSError:  # nobody reads any more
+            except OSError:  # the reader has gone
                 with self._changed:
                     self.dropped += 1
             with self._changed:
@@ -220,7 +220,7 @@ _writer: LineWriter | None = None
 
 
 def say(line: str) -> None:
-    """Write a line to stderr as it is, after those of the log."""
+    """Write a line to stderr as it is, after the lines of the log."""
     if _writer is None or _writer.file is not sys.stderr:
         print(line, file=sys.stderr)  # noqa: T201 - the one line of a failed start
     else:

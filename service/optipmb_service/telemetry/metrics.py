@@ -1,8 +1,8 @@
 """Metrics of a process, in the form that Prometheus reads.
 
 The tables are the whole list, one row for each metric: its kind, its meaning, how it is read, and its labels. A metric
-is read when somebody asks, from what counts it: `Metrics` for what is noted as things happen, as plain numbers with one
-writer each, else the streams, the network, or an edge. Everything stands in a registry of its own, nothing is global.
+is read on request: from `Metrics`, which counts events as plain numbers with one writer each, else from the streams,
+the network, or an edge. Everything stands in a registry of its own, nothing is global.
 All histograms and counters are totals of the process; series with the name of a stream start with `optipmb_stream_`,
 and only so many streams have them.
 """
@@ -41,7 +41,7 @@ CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 NAMESPACE: Final = "optipmb_"
 
 SECONDS: Final = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
-"""Upper bounds of the histograms' buckets: from a tenth of a usual step to what nobody would call real time."""
+"""Upper bounds of the histograms' buckets: from a tenth of a usual step to far beyond real time."""
 
 STATES: Final = ("starting", "ready", "degraded", "paused", "unlinked", "draining", "stopping")
 SESSION_STATES: Final = ("new", "running", "stale")
@@ -54,7 +54,7 @@ class MetricFamily:
 
     Attributes:
         kind: as Prometheus has it.
-        meaning: what it says.
+        meaning: its help text.
         read: returns its value, or the values by labels; None: there is none. Takes what the table is read from.
         labels: their names.
     """
@@ -103,7 +103,7 @@ PROCESS_METRICS: Final = {
     "info": _gauge("Always 1; says who reports.", lambda p: {(p.instance, __version__): 1}, "instance", "version"),
     "state": _gauge("1 for the state the process is in.", lambda p: _states(STATES, {p.state(): 1}), "state"),
 }
-"""Those of every process, by their names without the prefix `optipmb_`; read from `ProcessHealth`."""
+"""Metrics of every process, by their names without the prefix `optipmb_`; read from `ProcessHealth`."""
 
 NETWORK_METRICS: Final = {
     "declared_keys_total": _counter(
@@ -111,7 +111,7 @@ NETWORK_METRICS: Final = {
     ),
     "linked": _gauge("1 while the process has a router, or is one.", lambda c: c.linked()),
 }
-"""Those of a process with a client of the network."""
+"""Metrics of a process with a client of the network."""
 
 COUNTED_METRICS: Final = {
     "received_total": _counter("Messages received, before any check.", lambda m: m.messages, "topic"),
@@ -131,12 +131,12 @@ COUNTED_METRICS: Final = {
         "Log lines not written: nobody read stderr in time.", lambda _: lines_dropped()
     ),
 }
-"""Those that `Metrics` counts."""
+"""Metrics that `Metrics` counts."""
 
 PROBLEM_METRICS: Final = {
     "problems_total": _counter("Problems, each with its `count`.", lambda s: s.reporter.counts(), "code"),
 }
-"""Those of a process that reports problems."""
+"""Metrics of a process that reports problems."""
 
 STREAM_METRICS: Final = {
     "frames_total": _counter("Frames tracked.", lambda s: s.totals.frames),
@@ -206,7 +206,7 @@ STREAM_METRICS: Final = {
         "Streams beyond `http_streams`, without series of their own.", lambda s: len(s.sessions) - len(s.listed)
     ),
 }
-"""Those of the streams; read from `StreamFigures`."""
+"""Metrics of the streams; read from `StreamFigures`."""
 
 GATEWAY_METRICS: Final = {
     "grpc_open_calls": _gauge("Calls under way.", lambda c: dict(c.open), "method"),
@@ -219,7 +219,7 @@ GATEWAY_METRICS: Final = {
     "grpc_refused_total": _counter("Messages of callers that were not valid.", lambda c: dict(c.refused), "code"),
     "grpc_invalid_total": _counter("Messages of the network that were not valid, so not sent on.", lambda c: c.invalid),
 }
-"""Those of a process that serves gRPC, by itself or beside tracking."""
+"""Metrics of a process that serves gRPC, whether or not it tracks."""
 
 LOG_METRICS: Final = {
     "log_written_total": _counter("Messages put into the log.", lambda b: b.writer.written),
@@ -230,15 +230,15 @@ LOG_METRICS: Final = {
     "log_invalid_total": _counter("Messages that were not valid, so not put there.", lambda b: b.invalid),
     "log_waiting_bytes": _gauge("Bytes waiting for NATS.", lambda b: b.writer.held_bytes),
 }
-"""Those of a bridge into the log."""
+"""Metrics of a bridge into the log."""
 
 TLS_METRICS: Final = {
     "certificate_days": _gauge("Days until a certificate ends; below 0: it has ended.", lambda c: c.days(), "use"),
 }
-"""Those of a process with certificates."""
+"""Metrics of a process with certificates."""
 
 SERVICE_METRICS: Final = PROCESS_METRICS | NETWORK_METRICS | COUNTED_METRICS | PROBLEM_METRICS | STREAM_METRICS
-"""Those of a process that tracks."""
+"""Metrics of a process that tracks."""
 
 METRICS: Final = SERVICE_METRICS | GATEWAY_METRICS | LOG_METRICS | TLS_METRICS
 """Every metric. The figures of the process itself start with `process_`."""
@@ -252,7 +252,7 @@ class StreamFigures:
         reporter: of problems.
         totals: what happened to the messages of all streams since the start.
         sessions: a line for each session.
-        listed: those that have series of their own.
+        listed: sessions with series of their own.
         densities: of the sessions.
         standing_by: streams that are ready to be taken over.
         checkpoints: written since the start.
@@ -297,7 +297,7 @@ class Metrics:
 
     def __init__(self, *, counts: bool = True) -> None:
         self.workers: Callable[[], Iterable[tuple[int, bytes]]] = tuple
-        """Returns the `text` of worker processes, each with its number; that of this process has them too."""
+        """Returns the `text` of worker processes, each with its number; `text` includes them."""
         self.latency, self.queue, self.decode, self.step = Durations(), Durations(), Durations(), Durations()
         self.messages, self.bytes, self.foreign_messages, self.foreign_bytes = (
             {"detections": 0, "points": 0} for _ in range(4)
@@ -344,7 +344,7 @@ class Metrics:
         self._registry.register(Collected(collect))
 
     def text(self) -> bytes:
-        """Return all metrics in Prometheus' text format, those of workers with a label."""
+        """Return all metrics in Prometheus' text format, series of workers with a label."""
         registry = CollectorRegistry()
         registry.register(Collected(self._merged))
         return generate_latest(registry)

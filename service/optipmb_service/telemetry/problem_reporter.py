@@ -1,4 +1,4 @@
-"""Reports problems to people and programs, at a bounded rate whatever arrives.
+"""Reports problems to people and programs, at a bounded rate.
 
 The first problem of a kind is published and logged at once; what follows becomes one summary a second that counts them
 all. Kinds that come and go without end (garbage on ever new keys) share a total rate. Nothing here sends anything.
@@ -33,7 +33,7 @@ LOGGED_PER_SECOND: Final = 20
 
 @dataclass(slots=True)
 class _Kind:
-    """What is known of one kind: when it was last reported, and what has gathered since."""
+    """One kind: times of its last reports, and the counts since."""
 
     published_ns: int
     logged_ns: int

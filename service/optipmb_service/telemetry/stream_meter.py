@@ -12,7 +12,7 @@ import optipmb_schemas as schemas
 
 LATENCIES: Final = 512
 ARRIVALS: Final = 1024
-RATE_NS: Final = 5_000_000_000  # the rate is that of the frames of this time, or of the last two frames
+RATE_NS: Final = 5_000_000_000  # the rate is averaged over this time, or over the last two frames
 SILENT_PERIODS: Final = 3  # after so many periods without a frame the rate falls, and the stream is silent
 LAST: Final = 5  # frames whose largest distance is the period by which silence is judged
 
@@ -21,7 +21,7 @@ MAX_COUNT: Final = 2**61
 
 
 class StreamMeter:
-    """Written by the tracking thread, read by whoever asks: the interpreter copies a queue of integers in one step."""
+    """Written by the tracking thread, read by any: the interpreter copies a queue of integers in one step."""
 
     def __init__(self, now_ns: int) -> None:
         self._latencies: deque[int] = deque(maxlen=LATENCIES)

@@ -15,11 +15,10 @@ from typing import TYPE_CHECKING, Final, Generic, Protocol, TypeVar
 
 import optipmb_schemas as schemas
 import structlog
+from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_client.zenoh.configuration import BUSY, certificates, configured, loaded
 from optipmb_client.zenoh.session import Session
 from optipmb_client.zenoh.session import opened as open_session
-
-from optipmb_service.stream.ports import TransportError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable

@@ -14,14 +14,13 @@ import contextlib
 import threading
 import time
 from collections import deque
+from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 import structlog
 from optipmb_client.zenoh.late_join import CacheQueries, LateJoin
 from optipmb_client.zenoh.session import NEWEST
-
-from optipmb_service.stream.intake import ALL
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -40,6 +39,55 @@ LAST_PAUSE_NS: Final = 16_000_000_000
 
 MOST: Final = 256
 """Messages of a topic that may wait while another thread hands over those before them."""
+
+ALL: Final = ""
+"""Instead of a stream: all of them."""
+
+Kind = Literal["detections", "points", "discovery"]
+
+
+class Input(NamedTuple):
+    """A subscription to a stream, or to all of them; `cached`: lost messages are recovered from a cache."""
+
+    kind: Kind
+    stream: str = ALL
+    cached: bool = True
+
+
+PACKET_BYTES: Final = 512
+"""Bytes of a message beside its payload, nearly."""
+
+
+@dataclass(slots=True)
+class Packet:
+    """A message as it arrived, not decoded.
+
+    Attributes:
+        key: where it was published.
+        payload: its bytes; None when they are more than the limit and were not taken over.
+        size: number of bytes.
+        encoding: the Zenoh encoding, as a text.
+        wall_ns: arrival by the wall clock, ns since 1970; only reported, never decided by.
+        now_ns: arrival by the monotonic clock, ns.
+        origin: what tells the stream: the key without its topic.
+        frame: whether it holds detections.
+        held: bytes that it takes while it waits.
+    """
+
+    key: str
+    payload: bytes | None
+    size: int
+    encoding: str
+    wall_ns: int
+    now_ns: int
+    origin: str = field(init=False)
+    frame: bool = field(init=False)
+    held: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.origin, _, topic = self.key.rpartition("/")
+        self.frame = topic == "detections"
+        self.held = PACKET_BYTES + (0 if self.payload is None else self.size)
 
 
 class Topic:

@@ -11,7 +11,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from optipmb_service.stream.ports import TransportError
+from optipmb_client.errors import ConnectionFailed as TransportError
+
 from optipmb_service.zenoh.client import IdlePool, Turns
 
 if TYPE_CHECKING:

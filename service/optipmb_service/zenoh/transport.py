@@ -9,23 +9,21 @@ from typing import TYPE_CHECKING, Final
 
 import optipmb_schemas as schemas
 import structlog
+from optipmb_client.errors import ConnectionFailed as TransportError
 
-from optipmb_service.stream.ports import Packet, TransportError
-from optipmb_service.stream.queries import problem_with
 from optipmb_service.zenoh.client import Client
-from optipmb_service.zenoh.inputs import ReturnedPublishers, Topic
+from optipmb_service.zenoh.inputs import Packet, ReturnedPublishers, Topic
 from optipmb_service.zenoh.taps import Taps
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
     from collections.abc import Set as AbstractSet
 
-    from optipmb_client.zenoh.handles import Declared, Reading, Sender
+    from optipmb_client.zenoh.handles import Declared, Query, Reading, Sender
     from optipmb_client.zenoh.session import Sample, Session
 
     from optipmb_service.settings import Settings
-    from optipmb_service.stream.intake import Kind
-    from optipmb_service.stream.ports import Request
+    from optipmb_service.zenoh.inputs import Kind
 
 MOST_OPEN: Final = 256
 """Queries of one key expression that may be open; those beyond are refused."""
@@ -125,8 +123,7 @@ class Transport:
 
     def receive(
         self,
-        on_frame: Callable[[Packet], None],
-        on_cloud: Callable[[Packet], None],
+        take: Callable[[Packet], None],
         noticed: Callable[[str, bool], bool],
         passed_by: Callable[[str, int], None],
         answered: Callable[[str], None],
@@ -134,8 +131,7 @@ class Transport:
         """Hand over the detections and point clouds that are subscribed to, on threads of the network.
 
         Args:
-            on_frame: takes detections.
-            on_cloud: takes clouds.
+            take: takes detections and clouds.
             noticed: called for detections that come by a subscription to all, by key and whether they can be recovered;
                 where that is `discovery`, those alone are handed over for which it returns True.
             passed_by: called with the keys and sizes of the others.
@@ -145,7 +141,7 @@ class Transport:
         def discover(sample: Sample) -> None:
             key = str(sample.key_expr)
             if noticed(key, sample.source_info is not None):
-                self._receive(sample, key, on_frame)
+                self._receive(sample, key, take)
             else:
                 passed_by(key, len(sample.payload))
 
@@ -153,12 +149,12 @@ class Transport:
             key = str(sample.key_expr)
             if self._all:
                 noticed(key, sample.source_info is not None)
-            self._receive(sample, key, on_frame)
+            self._receive(sample, key, take)
 
         self._discover = discover
         self._topics = {
             "detections": Topic("detections", self._client, detected, answered),
-            "points": Topic("points", self._client, lambda one: self._receive(one, str(one.key_expr), on_cloud)),
+            "points": Topic("points", self._client, lambda one: self._receive(one, str(one.key_expr), take)),
         }
         self._returned = ReturnedPublishers(self._client, self._topics["detections"].due)
         # A name with a part too few or too many matches no other subscription: it is received to be refused.
@@ -217,8 +213,8 @@ class Transport:
         """Announce these streams, and no others."""
         self._announcements.announce(streams)
 
-    def ask_recent(self, sessions: Sequence[str]) -> list[tuple[Packet, bool]]:
-        """Return what other instances have received lately of sessions, each packet with whether it is a frame.
+    def ask_recent(self, sessions: Sequence[str]) -> list[Packet]:
+        """Return what other instances have received lately of sessions, as packets.
 
         The question has the lowest priority: it overtakes no message on the way to who is asked.
         """
@@ -227,19 +223,18 @@ class Transport:
         for answer in self._client.query(self._keys.recent(), payload, timeout=RECENT_S, background=True):
             if answer.ok and answer.about:
                 now = time.time_ns(), time.monotonic_ns()
-                packet = Packet(answer.about, answer.payload, len(answer.payload), answer.encoding, *now)
-                found.append((packet, answer.about.endswith("/detections")))
+                found.append(Packet(answer.about, answer.payload, len(answer.payload), answer.encoding, *now))
         return found
 
-    def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]], bool], None]) -> None:
+    def ask_cache(self, stream: str, then: Callable[[list[Packet], bool], None]) -> None:
         """Call `then`, on a thread of its own, with what the caches of a stream hold of its detections, all frames.
 
         It is called, too, with whether all caches have answered in time.
         """
-        found: list[tuple[Packet, bool]] = []
+        found: list[Packet] = []
 
         def reply(sample: Sample) -> None:
-            self._receive(sample, str(sample.key_expr), lambda packet: found.append((packet, True)))
+            self._receive(sample, str(sample.key_expr), found.append)
 
         self._client.ask(f"{self._keys.detections(stream)}/@adv/pub/**", reply, partial(then, found))
 
@@ -254,12 +249,12 @@ class Transport:
         """
         self._returned.look(report)
 
-    def serve(self, about_streams: Callable[[Request], None], about_service: Callable[[Request], None]) -> None:
+    def serve(self, about_streams: Callable[[Query], None], about_service: Callable[[Query], None]) -> None:
         """Hand over the queries about streams and those about this instance, each on a thread of its own."""
         self._serve(f"{self._prefix}/*/*/*/q/*", about_streams)
         self.serve_service(about_service)
 
-    def serve_service(self, about_service: Callable[[Request], None], names: Sequence[str] = ("*",)) -> None:
+    def serve_service(self, about_service: Callable[[Query], None], names: Sequence[str] = ("*",)) -> None:
         """Hand over the queries about this instance alone, each name on a thread of its own.
 
         Who asks all instances waits for each that declares the name, so one that takes no such query must not.
@@ -275,9 +270,17 @@ class Transport:
             return None
         return next((answer.payload for answer in answers if answer.ok), None)
 
-    def _serve(self, key: str, answer: Callable[[Request], None]) -> None:
-        full = schemas.MessageError("too_large", "key", f"at most {MOST_OPEN} queries open at once", "another one")
-        refusal = problem_with(full, instance=self._instance, code="refused")
+    def _serve(self, key: str, answer: Callable[[Query], None]) -> None:
+        expected, received = f"at most {MOST_OPEN} queries open at once", "another one"
+        refusal = schemas.Problem(
+            stream="",
+            instance=self._instance,
+            code="refused",
+            path="key",
+            expected=expected,
+            received=received,
+            message=f"Query: key: expected {expected}, received {received}.",
+        )
         self._client.serve(key, answer, most=MOST_OPEN, refusal=refusal)
 
     def tap(self, stream: str, receive: Callable[[str, bytes, str], None], detections: str = "") -> Callable[[], None]:

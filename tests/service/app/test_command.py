@@ -183,6 +183,14 @@ def test_wrong_use_is_one_clear_line(
     refused(capsys, monkeypatch, *options, says=says)
 
 
+def test_grpc_without_its_extra_is_one_clear_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before the tracker is loaded, one line says how to install it."""
+    monkeypatch.setitem(sys.modules, "grpc", None)
+    refused(capsys, monkeypatch, "--grpc", "127.0.0.1:0", says=install_command("grpc"))
+
+
 def test_a_cluster_without_its_extra_is_one_clear_line(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -262,6 +270,26 @@ def test_settings_have_an_order(
         "file",
         "default",
     ]
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        ("rewind = 1", "unknown setting; did you mean rewind_s?"),
+        ("limits.max_byte = 2000", "unknown setting; did you mean max_bytes?"),
+        ('profiles = {"a/*/*" = "there-is-none.toml"}', "there-is-none.toml: no such file"),
+        ('zenoh_config = "there-is-none.json5"', "there-is-none.json5: no such file"),
+    ],
+)
+def test_config_names_what_is_wrong(
+    content: str, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An unknown setting with the one that it may be meant to be, and a file that is missing."""
+    file = tmp_path / "settings.toml"
+    file.write_text(content)
+    with pytest.raises(SystemExit):
+        cli.main(("config", "--settings", str(file)))
+    assert text in capsys.readouterr().err
 
 
 def test_config_prints_no_password(capsys: pytest.CaptureFixture[str]) -> None:

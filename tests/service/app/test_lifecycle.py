@@ -10,10 +10,10 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from optipmb_schemas import Keys, SessionState
-from optipmb_service.app.lifecycle import LAST_S, EndBound, Steps, StopRequest, _calls, longest_end_s
+from optipmb_service.app.lifecycle import LAST_S, EndBound, Steps, StopRequest, longest_end_s
 from optipmb_service.app.workers import WORKERS_S
 from processes import descendants, wait_until_ended
 from router import Node, Sensor
@@ -22,8 +22,6 @@ from service_process import ServiceProcess
 from structlog.testing import capture_logs
 
 if TYPE_CHECKING:
-    from types import FrameType
-
     import pytest
 
 HANGING = Path(__file__).parents[2] / "support" / "hanging"
@@ -172,17 +170,3 @@ async def test_where_no_thread_can_be_started_the_end_is_asked_for(monkeypatch: 
         assert steps.unfinished(1.0)
     assert asked.is_set()
     assert [one["event"] for one in logs] == ["end_unbounded", "stop_asked", "step_hangs"]
-
-
-def test_a_thread_is_listed_whose_innermost_call_is_the_only_one_of_the_package() -> None:
-    """As one that waits for a lock of C; a thread without a call of the package is not."""
-
-    def frame(module: str) -> FrameType:
-        names: dict[str, Any] = {"__name__": module}
-        exec("import sys\ndef call(): return sys._getframe()", names)  # noqa: S102 - a function of another module
-        with ThreadPoolExecutor(1) as thread:
-            found: FrameType = thread.submit(names["call"]).result()
-        return found
-
-    assert _calls(frame("optipmb_service.some")) == "optipmb_service.some.call:2"
-    assert _calls(frame("zenoh")) == ""

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
-    from optipmb_service.stream.ports import Packet
+    from optipmb_service.zenoh.inputs import Packet
 
 STREAM = "a/b/c"
 EPOCH = bytes(16)

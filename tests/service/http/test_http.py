@@ -19,11 +19,11 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from optipmb_client.errors import ClientError
 from optipmb_schemas import Keys, ServiceStatus
 from optipmb_service.app.health_command import ask
 from optipmb_service.http import Server, application
 from optipmb_service.http.server import CONNECTIONS, REQUESTS
-from optipmb_service.stream.ports import HttpError
 from optipmb_service.telemetry.metrics import NAMESPACE, SERVICE_METRICS
 from optipmb_service.zenoh.taps import BURST
 from prometheus_client.parser import text_string_to_metric_families
@@ -236,7 +236,7 @@ def test_an_address_in_use_is_one_error() -> None:
     served_here = application(source)
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"127.0.0.1:{taken.getsockname()[1]}"
-        with pytest.raises(HttpError, match=f"cannot listen on {address} for HTTP: Address already in use"):
+        with pytest.raises(ClientError, match=f"cannot listen on {address} for HTTP: Address already in use"):
             Server(served_here, address)
         with ServiceProcess("--http", address) as service:
             assert service.wait_end() == 1

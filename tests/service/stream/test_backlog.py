@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_service.stream.backlog import UNASKED_NS, UNLIMITED, Backlog, Bounds, ByteBudget
-from optipmb_service.stream.ports import PACKET_BYTES, Packet
 from optipmb_service.stream.values import SECOND
+from optipmb_service.zenoh.inputs import PACKET_BYTES, Packet
 
 TOPICS = {True: "detections", False: "points"}
 

@@ -15,7 +15,7 @@ import optipmb
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from optipmb_service.stream.ports import Packet
+    from optipmb_service.zenoh.inputs import Packet
 
 
 class Publishers:

@@ -13,7 +13,9 @@ from optipmb_service.stream.timeline import FrameId
 from optipmb_service.stream.values import COLUMNS, Tracked
 
 import optipmb
+from optipmb import StepResult
 
+FRAME = FrameId(b"0" * 16, 1, 2)
 PARAMETERS = optipmb.load_profile("generic")
 
 
@@ -27,11 +29,12 @@ def sound_tracks(count: int) -> optipmb.Tracks:
     return optipmb.Tracks(**columns | {"id": np.arange(count) * 3})
 
 
-def made(tracks: optipmb.Tracks, paths: optipmb.PredictedPaths | None = None, **fields: Any) -> Tracked:
-    """Tracks of a frame."""
-    header: dict[str, Any] = {"stream": "a/b/c", "session": "0" * 32, "revision": 0, "cloud_used": False}
-    header |= {"gap": 0, "ignored": 0, "parameters": PARAMETERS, "frame_id": FrameId(b"0" * 16, 1, 2)}
-    return tracks_of(tracks, paths, **header | fields)
+def made(tracks: optipmb.Tracks, *parts: Any, frame_id: FrameId = FRAME, **fields: Any) -> Tracked:
+    """Tracks of a frame, with parts of the tracker's result that few profiles have."""
+    header: dict[str, Any] = {"session": "0" * 32, "revision": 0, "profile": PARAMETERS.name, "cloud_used": False}
+    header |= {"gap": 0, "ignored": 0, "labels": PARAMETERS.labels}
+    result = StepResult(None, tracks, None, *parts)  # type: ignore[arg-type]  # of the tracks alone
+    return tracks_of(result, fields.pop("stream", "a/b/c"), frame_id, **header | fields)
 
 
 def delivery(run: int) -> dict[str, Any]:
@@ -80,7 +83,7 @@ def test_paths_and_classes_are_in_the_bytes() -> None:
     mean, covariance = np.zeros((3, 2, 6)), np.broadcast_to(np.eye(6), (3, 2, 6, 6))
     paths = optipmb.PredictedPaths(one.id, one.label, np.array([0.5, 1.0]), mean, covariance)
     probability = np.full((3, len(PARAMETERS.labels)), 1 / len(PARAMETERS.labels))
-    tracks = made(one, paths, class_probability=probability)
+    tracks = made(one, paths, probability)
     message = schemas.decode(tracks.encoded(delivery(0)), schemas.Tracks)
     assert message.path_position is not None
     assert message.class_probability is not None

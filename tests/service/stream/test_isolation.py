@@ -30,11 +30,11 @@ from optipmb_service.settings import LimitSettings
 from optipmb_service.stream import persistence, queries
 from optipmb_service.stream.backlog import Backlog
 from optipmb_service.stream.persistence import CheckpointWriter
-from optipmb_service.stream.ports import Packet
 from optipmb_service.stream.session import Session
 from optipmb_service.telemetry.health import ProcessHealth
 from optipmb_service.telemetry.metrics import Metrics
 from optipmb_service.telemetry.stream_meter import MAX_COUNT
+from optipmb_service.zenoh.inputs import Packet
 from router import Node, Sensor, until
 
 import optipmb

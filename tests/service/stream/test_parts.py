@@ -14,7 +14,7 @@ from optipmb_service.settings import SettingsInvalidError, load
 from optipmb_service.stream.pending import CloudBuffer
 from optipmb_service.stream.problems import problem_of
 from optipmb_service.stream.profiles import Profiles
-from optipmb_service.stream.scheduler import Scheduler
+from optipmb_service.stream.streams import Scheduler
 from optipmb_service.telemetry.problem_reporter import LOGGED_PER_SECOND, PUBLISHED_PER_SECOND, ProblemReporter
 from optipmb_service.telemetry.stream_meter import StreamMeter
 from router import SECOND, Sensor

@@ -341,6 +341,37 @@ def test_unknown_classes_are_left_out_and_told_once() -> None:
     assert len(problems(one.reset() and feed(one, [3], labels=labels, label=np.array([0, 1, 2])))) == 2
 
 
+def test_a_score_filter_that_removes_most_of_a_class_is_reported_once() -> None:
+    """The class whose scores lie below the filter of the profile is reported with its share, and no other class."""
+    one, scores = session(), np.array([0.001, 0.9, 0.001])
+    outputs = feed(one, range(600), labels=("car", "pedestrian"), label=np.array([0, 1, 0]), score=scores)
+    (problem,) = [one for one in problems(outputs) if one.code == "score_filter"]
+    assert problem.path == "car.score"
+    assert problem.received == "100 of 100 below 0.246"
+    assert not problems(feed(session(), range(500), score=np.full(3, 0.9)))
+
+
+def test_an_estimated_motion_of_the_sensor_is_reported_once() -> None:
+    """A sensor that drives past parked cars and sends no poses is reported, one that stands is not."""
+    rng = np.random.default_rng(5)
+    cars, yaw = rng.uniform((0.0, -25.0), (300.0, 25.0), (60, 2)), np.resize([0.0, np.pi, 0.5 * np.pi], 60)
+
+    def reported(speed: float) -> list[tuple[str, str]]:
+        one, outputs, noise = Session(SENSOR.stream, optipmb.load_profile("generic")), [], np.random.default_rng(0)
+        for seq in range(60):
+            places = cars - np.array([speed * 0.1 * seq, 0.0])
+            seen = np.flatnonzero(np.hypot(*places.T) < 50.0)
+            count = len(seen)
+            center = np.column_stack((places[seen] + noise.normal(0.0, 0.1, (count, 2)), np.zeros(count)))
+            size, score = np.tile([4.5, 1.9, 1.6], (count, 1)), np.full(count, 0.9)
+            boxes = {"center": center, "size": size, "yaw": yaw[seen], "score": score, "label": np.zeros(count, int)}
+            outputs += feed(one, [seq], stamp_ns=SECOND + seq * SECOND // 10, labels=("car",), velocity=None, **boxes)
+        return [(problem.code, problem.path) for problem in problems(outputs)]
+
+    assert reported(10.0) == [("no_pose", "pose")]
+    assert reported(0.0) == []
+
+
 def test_other_names_of_a_class_are_tracked() -> None:
     """A stream that says `vehicle.car` has the tracks of one that says `car`, and no problem."""
     said, alike = (

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from optipmb_service.stream import backlog, stream
 from optipmb_service.stream import streams as table
-from optipmb_service.stream.ports import Packet
 from optipmb_service.stream.values import MAX_SENSORS
 from optipmb_service.telemetry.stream_meter import MessageCounters
+from optipmb_service.zenoh.inputs import Packet
 from registries import Around, packet_of, streams_of
 from router import Sensor
 

@@ -13,8 +13,7 @@ import pytest
 import zenoh
 from optipmb_client.zenoh.session import Session
 from optipmb_schemas import Keys
-from optipmb_service.stream.intake import ALL
-from optipmb_service.zenoh.inputs import Topic
+from optipmb_service.zenoh.inputs import ALL, Topic
 from router import Collected
 from routers import free_endpoint, open_router
 

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 import zenoh
+from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_client.zenoh.session import CACHED, MOST_KEYS, PLAIN, Session
-from optipmb_service.stream.ports import TransportError
 from optipmb_service.zenoh.inputs import Topic
 
 if TYPE_CHECKING:

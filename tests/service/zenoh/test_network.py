@@ -15,6 +15,7 @@ import pytest
 import zenoh
 import zenoh.ext
 from optipmb_client import Connection
+from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_client.zenoh.session import HEARTBEAT_S
 from optipmb_schemas import (
     Density,
@@ -34,7 +35,6 @@ from optipmb_schemas import (
 )
 from optipmb_service.app.workers import QUERIES
 from optipmb_service.settings import load
-from optipmb_service.stream.ports import TransportError
 from optipmb_service.stream.session import Session
 from optipmb_service.stream.values import Tracked
 from optipmb_service.zenoh.transport import Transport
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from optipmb_service.stream.ports import Request
+    from optipmb_client.zenoh.handles import Query
 
 KEYS = Keys()
 SENSOR = Sensor()
@@ -77,7 +77,7 @@ def test_a_parent_that_is_busy_keeps_no_member_waiting() -> None:
     """While it carries out an order, no query to all members waits for it, and it answers with its status."""
     endpoint, began, gate = free_endpoint(), threading.Event(), threading.Event()
 
-    def answer(request: Request) -> None:
+    def answer(request: Query) -> None:
         if request.key == KEYS.drain("test"):
             began.set()
             gate.wait(120)

@@ -2,7 +2,7 @@
 
 Conventions: the sensor is a LiDAR on the roof of a car that drives along; its frame is x forward, y left, z up, level,
 1.75 m above the ground. The world has its origin in the middle of the block and the ground at z = 0. The same options
-give the same bytes, whatever was asked for before and in whichever order.
+give the same bytes, independent of the order of calls.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -31,7 +31,7 @@ MIN_POINTS = 5
 
 HIDDEN_S = 2.0
 """An object that no ray has met for longer is a new one when it is seen again, as is one that was out of range: without
-its looks nobody could know it again."""
+its looks it cannot be recognised."""
 
 _NAME_DIGITS = 4
 
@@ -108,7 +108,7 @@ class SceneSequence(DataSequence):
         return to_sensor(rotation_of(pose.quaternion), pose.translation, center, yaw)
 
     def _scan(self, frame: int) -> Scan:
-        """Return the scan of a frame; its first boxes are the objects, the others what only hides them."""
+        """Return the scan of a frame; its first boxes are the objects, the others only hide them."""
         world = self._world
         place, extent = fixed_boxes()
         center, yaw = self._local(
@@ -126,7 +126,7 @@ class SceneSequence(DataSequence):
         return np.flatnonzero(np.linalg.norm(offset, axis=1) <= RADIUS)
 
     def observe(self, frame: int) -> tuple[Scan, Found]:
-        """Return the scan of a frame and what was detected in it, with the source of every detection."""
+        """Return the scan of a frame and its detections, with the source of each."""
         world = self._world
         view = self._scan(frame)
         rows = self._in_range(frame)

@@ -41,7 +41,7 @@ _CYCLE_S = 36.0
 _GREEN_S, _WALK_S = (0.0, 15.0), (20.0, 22.5)
 """Parts of the cycle of the lights in which vehicles and pedestrians may pass; then the crosswalk is cleared."""
 _BRAKING = 3.5
-"""Whoever would have to brake harder passes the lights."""
+"""A road user that would have to brake harder passes the lights."""
 _HARDEST = 6.0
 _AT_LINE = 0.5
 _PAUSE_EVERY_S, _PAUSE_S = 40.0, 6.0

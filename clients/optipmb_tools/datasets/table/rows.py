@@ -8,7 +8,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from optipmb_tools.camera import sensor_from_kitti
 from optipmb_tools.datasets.motion import SAME_DIRECTION, Moves, find_moves, overlapping
 from optipmb_tools.datasets.table.names import Column, find_columns
 from optipmb_tools.datasets.table.values import (
@@ -199,7 +198,7 @@ class _Table:
         camera = read_axes(reading, center)
         if camera:
             yaw = yaw if yaw_unit in {"quaternion", "none"} else read_angle(reading, "yaw", yaw, yaw_unit)
-            center, size, yaw = sensor_from_kitti(center, np.ascontiguousarray(size[:, ::-1]), yaw)
+            center, size, yaw = _from_camera(center, size, yaw)
             yaw_unit = "rad"
         read_digits(reading, center)
         plane, sides = center[:, :2], size
@@ -565,6 +564,12 @@ _FORWARD: Final = 0.8
 """Share of forward moves from which a common motion is that of traffic, not of the sensor."""
 _LEAST_TURN: Final = 1e-6
 _INVERSE: Final = np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def _from_camera(center: Floats, size: Floats, yaw: Floats) -> tuple[Floats, Floats, Floats]:
+    from optipmb_tools.camera import sensor_from_kitti  # noqa: PLC0415  of few tables
+
+    return sensor_from_kitti(center, np.ascontiguousarray(size[:, ::-1]), yaw)
 
 
 def _rotated(quaternion: Floats, vector: Floats) -> Floats:

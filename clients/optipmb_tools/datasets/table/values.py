@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from optipmb_tools.class_names import class_like
+from optipmb_tools.datasets.interface import class_like
 from optipmb_tools.datasets.motion import LEAST_ALONG, SAME_DIRECTION, SURE_MOVES, Moves
 from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Floats, Ints, wrap_angle

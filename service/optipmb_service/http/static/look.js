@@ -3,7 +3,7 @@
 "use strict";
 
 const COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#8C6D1F"]; // Okabe and Ito
-const TRAIL_S = 5, ASK_MS = 2000, AGAIN_MS = 1000, SILENT_MS = 3000, EDGE = 44, SLOW = 0.3, KNOWN = 0.95;
+const TRAIL_S = 5, ASK_MS = 2000, AGAIN_MS = 1000, SILENT_MS = 3000, EDGE = 44, SLOW = 0.3, KNOWN = 0.95, NAMED = 4; // NAMED: pixels per metre from which classes are written
 const ID = 0, LABEL = 1, X = 2, Y = 3, LENGTH = 4, WIDTH = 5, YAW = 6, VX = 7, VY = 8, EXISTENCE = 9, SCORE = 10, AGE = 11, MISSED = 12, FACING = 13;
 
 const at = (id) => document.getElementById(id);
@@ -45,12 +45,21 @@ function list(status) {
   at("problems-title").hidden = !status.problems || status.problems.length === 0;
   at("problems").replaceChildren(...(status.problems || []).slice(-5).reverse().map((problem) => {
     const often = problem.count > 1 ? ` (${problem.count} times)` : "";
-    const item = made("li", ` ${problem.stream} ${problem.message}${often}`);
+    const item = made("li", ` ${problem.stream} ${inWords(problem)}${often}`);
     if (problem.reported_ns) item.prepend(made("time", ago(Date.now() / 1e3 - problem.reported_ns / 1e9)), " ");
     item.prepend(made("code", problem.code), " ");
     return item;
   }));
   if (!chosen && status.sessions.length > 0) choose(status.sessions[0].stream);
+}
+
+function inWords(problem) { // as `optipmb status` has it
+  const [, reason, jump] = /(?:(.*), )?([+-][\d.]+) s$/.exec(problem.received || "") || [];
+  const seconds = Math.abs(jump).toPrecision(3);
+  if (problem.code === "late" && jump) return `a frame came too late: ${seconds} s before the newest one`;
+  if (problem.code !== "restarted" || !jump) return problem.message;
+  const gap = jump >= 0 ? `${seconds} s gap` : `stamps ${seconds} s earlier`;
+  return reason === "publisher" ? `publisher restarted, ${gap}` : `session restarted (${reason}), ${gap}`;
 }
 
 function ago(seconds) {
@@ -97,8 +106,9 @@ function receive(next) {
     while (trail.length > 0 && frame.time - trail[0][2] > TRAIL_S) trail.shift();
     if (trail.length === 0) trails.delete(id);
   }
-  if (!fitted) fit();
-  if (view.follow) [view.x, view.y] = middle();
+  const first = !fitted;
+  if (first) fit();
+  if (view.follow || (first && fitted)) [view.x, view.y] = middle();
   dirty = true;
 }
 
@@ -217,9 +227,10 @@ function box(track) {
   pen.lineWidth = 3;
   pen.setLineDash([]);
   pen.strokeStyle = "#ffffffd0";
-  pen.strokeText(track[ID], px, py - 4);
+  const name = bold || view.scale > NAMED ? `${track[ID]} ${frame.labels[track[LABEL]]}` : track[ID];
+  pen.strokeText(name, px, py - 4);
   pen.fillStyle = "#222";
-  pen.fillText(track[ID], px, py - 4);
+  pen.fillText(name, px, py - 4);
   pen.globalAlpha = 1;
 }
 
