@@ -7,10 +7,12 @@ tracks leave the tracker, so that the recursion stays the paper's:
 
     evidence    e_k = lambda e_{k-1} + (1 - lambda) l_k,     l_k = ln[z_s / (1 - z_s)], or -l_miss where missed
     existence   f(e_k)
-    covariance  P + U diag(along(e_k), across(e_k))^2 U'     on x and y, U turned by the heading
+    covariance  F P F + U diag(along(e_k), across(e_k))^2 U' on x and y, U turned by the heading
     score       (1 - w) x_s + w (1 + e_k / e_max) / 2        e_max the bound of l_k
+    velocity    v v^2 / (v^2 + P_vv)                         of least mean square error: parked cars hardly move
 
-f, along and across are piecewise linear and were measured on training data. lambda holds for one nominal period.
+f, along and across are piecewise linear and were measured on training data, as were the factors F of speed and turn
+rate: process noise that lets a braking car stay one track is more than most objects show. lambda holds for one period.
 Without a calibration in the profile, existence is r, the covariance is P, and the evidence stays zero.
 
 The state rests on measurement noise R that is larger than a detector's usual error, so that a half-hidden car whose box
@@ -30,7 +32,7 @@ import math
 from typing import TYPE_CHECKING, Final
 
 from optipmb.compiled import kernel
-from optipmb.density import PHI, STATE, X, Y
+from optipmb.density import OMEGA, PHI, STATE, V, X, Y
 from optipmb.predict import wrap
 
 if TYPE_CHECKING:
@@ -60,15 +62,17 @@ def calibrate_rows(
     classes: Sequence[ClassRow],
     existence: Array,
     score: Array,
+    velocity: Array,
     covariance: Array,
 ) -> None:
-    """Overwrite existence, score and covariance of the rows whose class has a calibration.
+    """Overwrite existence, score, velocity and covariance of the rows whose class has a calibration.
 
     Arguments of its own:
         evidence: (K,) e_k.
         existence: (K,) in: r, out: f(e_k).
         score: (K,) in: x_s, out: the published score.
-        covariance: (K, 6, 6) in: P, out: with the lasting error.
+        velocity: (K, 2) in: of the state, out: the published one.
+        covariance: (K, 6, 6) in: P, out: with the factors and the lasting error.
     """
     for row in range(existence.shape[0]):
         own = classes[label[row]]
@@ -86,6 +90,14 @@ def calibrate_rows(
         existence[row] = own.knot_existence[low] + share * (own.knot_existence[high] - own.knot_existence[low])
         along = own.knot_along[low] + share * (own.knot_along[high] - own.knot_along[low])
         across = own.knot_across[low] + share * (own.knot_across[high] - own.knot_across[low])
+        for s, factor in ((V, own.factor_speed), (OMEGA, own.factor_turn_rate)):
+            for t in range(STATE):
+                covariance[row, s, t] *= factor
+                covariance[row, t, s] *= factor
+        squared = velocity[row, 0] ** 2 + velocity[row, 1] ** 2
+        weight = squared / (squared + covariance[row, V, V]) if squared > 0.0 else 0.0
+        velocity[row, 0] *= weight
+        velocity[row, 1] *= weight
         cos, sin = math.cos(yaw[row]), math.sin(yaw[row])
         covariance[row, 0, 0] += along * along * cos * cos + across * across * sin * sin
         covariance[row, 1, 1] += along * along * sin * sin + across * across * cos * cos

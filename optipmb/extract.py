@@ -52,7 +52,7 @@ class Tracks(Rows):
         yaw: (N,) heading, rad, in (-pi, pi].
         heading_confidence: (N,) probability that the object faces along `yaw` and not the other way; one where the
             profile does not follow it (`optipmb.lightweight`).
-        velocity: (N, 2) over ground, m/s.
+        velocity: (N, 2) over ground, m/s; with a calibration near zero where the speed is not certain.
         yaw_rate: (N,) rad/s.
         acceleration: (N,) along the heading, m/s^2.
         existence: (N,) existence probability: calibrated (`optipmb.calibration`), or r without a calibration.
@@ -187,7 +187,8 @@ def extract_tracks(
         tracks.yaw_rate[k], tracks.acceleration[k] = state[k, OMEGA], state[k, A]
         tracks.existence[k], tracks.score[k] = objects.existence[n], objects.score[n]
     label, existence = tracks.label, tracks.existence
-    calibrate_rows(label, objects.evidence[rows], tracks.yaw, classes, existence, tracks.score, covariance)
+    evidence = objects.evidence[rows]
+    calibrate_rows(label, evidence, tracks.yaw, classes, existence, tracks.score, velocity, covariance)
     confirm(rows, label, existence, classes, objects.confirmed, tracks.confirmed)
     return words
 

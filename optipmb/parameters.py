@@ -129,8 +129,8 @@ class HeadingSign(_Table):
 class Calibration(_Table):
     """How the tracks of a class turned out on training data, by their evidence (`optipmb.calibration`).
 
-    The last four fields are columns of one table, a row for each knot; between the knots the curves are straight, and
-    beyond the first and the last they are level.
+    From evidence to across, the fields are columns of one table, a row for each knot; between the knots the curves are
+    straight, and beyond the first and the last they are level.
     """
 
     memory: OpenProbability = Field(description="lambda: weight that the evidence keeps over one nominal period")
@@ -147,6 +147,10 @@ class Calibration(_Table):
         description="lasting error of their position along the heading, standard deviation, m"
     )
     across: tuple[NonNegative, ...] = Field(description="across the heading, m")
+    speed: Positive = Field(
+        default=1.0, exclude_if=(1.0).__eq__, description="factor on the standard deviation of their speed"
+    )
+    turn_rate: Positive = Field(default=1.0, exclude_if=(1.0).__eq__, description="factor on that of their turn rate")
 
     @model_validator(mode="after")
     def _columns(self) -> Calibration:

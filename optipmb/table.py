@@ -49,6 +49,8 @@ class ClassRow(Protocol):
         memory: lambda; one without a calibration, and so the evidence stays zero.
         missed_evidence: l_miss.
         score_of_evidence: weight of the evidence in the score.
+        factor_speed: on the standard deviation of the published speed.
+        factor_turn_rate: on that of the published turn rate.
         knots: number of knots of the calibration, zero without one.
         knot_evidence: (`MAX_KNOTS`,) where its curves bend, ascending; this and the next are zero from `knots` on.
         knot_existence: (`MAX_KNOTS`,) existence probability there.
@@ -104,6 +106,8 @@ class ClassRow(Protocol):
     memory: float
     missed_evidence: float
     score_of_evidence: float
+    factor_speed: float
+    factor_turn_rate: float
     knots: int
     knot_evidence: Curve
     knot_existence: Curve
@@ -206,8 +210,10 @@ def _values(p: ClassParameters) -> dict[str, Any]:
             "memory": calibration.memory,
             "missed_evidence": calibration.missed,
             "knots": len(calibration.evidence),
+            "score_of_evidence": calibration.score_of_evidence,
+            "factor_speed": calibration.speed,
+            "factor_turn_rate": calibration.turn_rate,
         }
-        values["score_of_evidence"] = calibration.score_of_evidence
         for name in ("evidence", "existence", "along", "across"):
             curve = getattr(calibration, name)
             values[f"knot_{name}"] = (*curve, *(0.0,) * (MAX_KNOTS - len(curve)))

@@ -6,15 +6,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from accuracy import figures, material
+from accuracy import figures, material, sequences_of, tracked
 from greedy import greedy_tracks
 from kalman import kalman_tracks
 from optipmb_tools.cli import run
-from optipmb_tools.datasets import Regions, Truth, open_dataset
+from optipmb_tools.datasets import Regions, Truth
 from optipmb_tools.evaluation.calibration import CalibrationResult
 from optipmb_tools.evaluation.errors import evaluate_errors
 from optipmb_tools.tuning.calibrate import cross_calibration
-from optipmb_tools.tuning.clips import Clip, track_clip, track_fully
+from optipmb_tools.tuning.clips import Clip, track_clip
 from optipmb_tools.tuning.values import only
 from real_data import kitti_root
 
@@ -109,13 +109,10 @@ def test_boxes_of_cars_lie_nearer_than_those_of_their_detector(detections: str, 
     Headings are backward at most 1.2 times as often as the detector's, and 90 to 98 % of their errors lie within the
     interval of 95 %.
     """
-    parameters = only(optipmb.load_profile("kitti"), "Car")
-    sequences = open_dataset("kitti", kitti_root(), detections, clouds=False).sequences(["all"])
     scorers, clips = material("kitti", detections)
     near = scorers["Car"].near
-    parts = [
-        (one, clip.world, *track_fully(clip, parameters)) for one, clip in zip(sequences, clips["Car"], strict=True)
-    ]
+    columns = (sequences_of("kitti", detections), clips["Car"], tracked("kitti", detections, "Car"))
+    parts = [(one, clip.world, *both) for one, clip, both in zip(*columns, strict=True)]
     found = evaluate_errors(parts, "Car", near)
     figures_of: Any = found.figures(found.detected)
     for direction in ("along", "across", "height", "heading"):

@@ -8,13 +8,14 @@ from typing import TypeAlias
 
 import numpy as np
 import pytest
+from boxes import points_in_box
 from optipmb_tools.datasets import DatasetError, Truth, open_dataset
 from optipmb_tools.datasets.scene.dataset import MIN_POINTS, RADIUS, SceneSequence, visits
 from optipmb_tools.datasets.scene.detector import CLASSES, FALSE, MIN_SCORE, Found
 from optipmb_tools.datasets.scene.lidar import GROUND, cast
 from optipmb_tools.datasets.scene.traffic import HALF_WIDTH, fixed_boxes
 from optipmb_tools.evaluation import Rules, evaluate_clear, iou_bev
-from optipmb_tools.geometry import points_in_box, rotation_of, wrap_angle
+from optipmb_tools.geometry import rotation_of, wrap_angle
 from optipmb_tools.results import ResultTable
 
 import optipmb

@@ -82,11 +82,3 @@ def test_objects_stay_with_their_tracks(seed: int) -> None:
     hit = np.flatnonzero(match >= 0)
     assert dict(zip(hit.tolist(), match[hit].tolist(), strict=True)) == naive(case)
     assert len(set(match[hit].tolist())) == len(hit)
-
-
-def test_of_two_claims_on_a_track_the_later_holds() -> None:
-    """Object 1, then object 2 was with the track; when both may be, object 2 keeps it although object 1 is nearer."""
-    truth = truth_of([(0, 1, 0.0, 0.0), (1, 2, 0.0, 0.0), (2, 1, 0.1, 0.0), (2, 2, 0.5, 0.0)])
-    tracks = tracks_of([(f, 7, 0.0, 0.0, 0.9) for f in range(3)])
-    case = prepare(truth, tracks, "Car", Rules("distance", 2.0))
-    assert match_frames(case, continuity="latest").tolist() == [0, 1, -1, 2]

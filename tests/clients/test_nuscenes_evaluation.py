@@ -264,30 +264,6 @@ def pairing(truth: Sequence[Row], tracks: Sequence[Row], score: Sequence[float] 
     return pair(boxes(truth), boxes(tracks, score), CAR, 2.0)
 
 
-def test_an_object_keeps_its_track_while_it_is_near_enough() -> None:
-    """A track that matched before goes on, although another one has come nearer."""
-    tracks = [(0, 7, 0.0, 0.0), (1, 7, 1.5, 0.0), (1, 8, 0.1, 0.0)]
-    found = Matching.of(pairing(still(1, 0.0, range(2)), tracks))
-    assert found.event.tolist() == [Event.MATCH, Event.MATCH]
-    assert found.distance.tolist() == [0.0, 1.5]
-    assert found.false_positives == 1
-
-
-def test_the_first_of_two_that_claim_a_track_has_it() -> None:
-    """When a track went from one object to another and both are near it, the first object has it."""
-    truth = [(0, 1, 0.0, 0.0), (1, 2, 0.5, 0.0), (2, 1, 0.4, 0.0), (2, 2, 0.1, 0.0)]
-    tracks = [(0, 7, 0.0, 0.0), (1, 7, 0.5, 0.0), (2, 7, 0.0, 0.0)]
-    found = Matching.of(pairing(truth, tracks))
-    assert found.event.tolist() == [Event.MATCH, Event.MATCH, Event.MATCH, Event.MISS]
-
-
-def test_more_matches_go_before_shorter_ones() -> None:
-    """Two long matches are taken rather than one short one."""
-    found = Matching.of(pairing([(0, 1, 0.0, 0.0), (0, 2, 1.0, 0.0)], [(0, 7, 0.9, 0.0), (0, 8, 2.8, 0.0)]))
-    assert found.event.tolist() == [Event.MATCH, Event.MATCH]
-    assert found.distance == pytest.approx([0.9, 1.8])
-
-
 def naive_match(truth: Sequence[Row], tracks: Sequence[tuple[Row, float]], threshold: float) -> list[tuple[int, float]]:
     """Match as the definition says, by trying all assignments; give event and distance of each truth row."""
     last: dict[int, int] = {}

@@ -3,14 +3,17 @@
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from commands import run_here
 from optipmb_client.errors import ClientError
+from optipmb_tools.cli import run
 from optipmb_tools.datasets import DataSequence, Truth, open_dataset
 from optipmb_tools.evaluation import ClearResult, Rules, evaluate_clear
 from optipmb_tools.results import ResultTable, empty_table
+from optipmb_tools.views import pictures
 from optipmb_tools.views.pictures import WIDTH_PX, Panel, animate_tracks, draw_tracks
 from PIL import Image
 
@@ -141,3 +144,22 @@ def test_several_trackers_are_drawn_on_the_same_axes(
     done = run_here(capsys, "plot", *data, *words, "--out", tmp_path / "a.gif")
     assert done.returncode == 2
     assert "received 3" in done.stderr
+
+
+def test_a_picture_of_own_data_shows_confirmed_tracks_and_no_sensor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without truth and poses there are neither tracks of nothing nor a place of a sensor."""
+    head, row = "t,x,y,z,l,w,h,yaw,score,class", "0.{},{},0,1,4.5,1.9,1.6,0,0.9,car"
+    rows = [row.format(k, 10 * k) for k in range(3)]
+    boxes, tracks = tmp_path / "boxes.csv", tmp_path / "tracks.csv"
+    boxes.write_text("\n".join([head, *rows]))
+    marked = [f"{one},{identity},{confirmed}" for one in rows for identity, confirmed in ((1, 1), (901, 0))]
+    tracks.write_text("\n".join([f"{head},id,confirmed", *marked]))
+    seen: list[Any] = []
+    monkeypatch.setattr(pictures, "draw_tracks", lambda _path, *given: seen.extend(given))
+    out = tmp_path / "own.png"
+    assert run(["plot", str(boxes), "--tracks", str(tracks), "--out", str(out)]) == 0
+    texts = text_of(out, monkeypatch, *seen)
+    assert {"1", "start of a car"} <= set(texts)
+    assert not {"901", "sensor"} & set(texts)

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 KEYS = Keys()
-NUMBERS = 100
-"""Keys of about 25 streams of one process."""
-TOGETHER, MOST = 10, 15
+NUMBERS = 200
+"""Keys of about 50 streams of one process."""
+TOGETHER, MOST = 20, 15
 """Streams that are open at once, and how often others follow them."""
 FRAMES = 8
 END_S = 60.0

@@ -2,8 +2,9 @@
 
 from functools import cache
 
-from optipmb_tools.datasets import open_dataset
-from optipmb_tools.tuning.clips import Clip, load, of_class, track_clip
+from optipmb_tools.datasets import DataSequence, open_dataset
+from optipmb_tools.results import FullTable, ResultTable
+from optipmb_tools.tuning.clips import Clip, load, of_class, track_fully
 from optipmb_tools.tuning.scoring import Figures, Scorer, rules_of, scorer_of
 from optipmb_tools.tuning.values import only
 from real_data import kitti_root, nuscenes_root
@@ -12,11 +13,17 @@ import optipmb
 
 
 @cache
-def material(dataset: str, detections: str) -> tuple[dict[str, Scorer], dict[str, list[Clip]]]:
-    """Scorers and clips of each class that is labelled."""
+def sequences_of(dataset: str, detections: str) -> list[DataSequence]:
+    """All sequences with the detections of one detector."""
     root = kitti_root() if dataset == "kitti" else nuscenes_root()
     options = {"z_bottom": True} if detections == "pointpillars" else {}
-    sequences = open_dataset(dataset, root, detections, clouds=False, **options).sequences(["all"])
+    return list(open_dataset(dataset, root, detections, clouds=False, **options).sequences(["all"]))
+
+
+@cache
+def material(dataset: str, detections: str) -> tuple[dict[str, Scorer], dict[str, list[Clip]]]:
+    """Scorers and clips of each class that is labelled."""
+    sequences = sequences_of(dataset, detections)
     rules = rules_of(dataset)
     clips = [load(one, optipmb.load_profile(dataset), rules) for one in sequences]
     labelled = {str(name) for clip in clips for name in clip.truth.names[~clip.truth.ignored]}
@@ -28,8 +35,16 @@ def material(dataset: str, detections: str) -> tuple[dict[str, Scorer], dict[str
 
 
 @cache
+def tracked(profile: str, detections: str, name: str) -> list[tuple[ResultTable, FullTable]]:
+    """The tracks of one class by one profile, sequence by sequence."""
+    _, clips = material(profile.removesuffix("-paper"), detections)
+    parameters = only(optipmb.load_profile(profile), name)
+    return [track_fully(clip, parameters) for clip in clips[name]]
+
+
+@cache
 def figures(profile: str, detections: str, name: str) -> Figures:
     """The figures of one class by one profile."""
     scorers, clips = material(profile.removesuffix("-paper"), detections)
-    parameters = only(optipmb.load_profile(profile), name)
-    return scorers[name].figures([scorers[name].measure(clip, track_clip(clip, parameters)) for clip in clips[name]])
+    tracks = zip(clips[name], tracked(profile, detections, name), strict=True)
+    return scorers[name].figures([scorers[name].measure(clip, table) for clip, (table, _) in tracks])

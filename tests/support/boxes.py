@@ -41,11 +41,11 @@ def table_of(clip: Clip, name: str, rows: list[Row]) -> ResultTable:
     )
 
 
-def points_in_box(xyz: Floats, center: Floats, size: Floats, yaw: float) -> Bools:
-    """Return which points (P, 3) lie in one box."""
+def points_in_box(xyz: Floats, center: Floats, size: Floats, yaw: float, margin: float = 0.0) -> Bools:
+    """Return which points (P, 3) lie in one box, widened by a margin on every side."""
     offset = xyz - center
     cos, sin = np.cos(yaw), np.sin(yaw)
     along = np.abs(cos * offset[:, 0] + sin * offset[:, 1])
     across = np.abs(cos * offset[:, 1] - sin * offset[:, 0])
-    half = 0.5 * size
+    half = 0.5 * size + margin
     return np.asarray((along <= half[0]) & (across <= half[1]) & (np.abs(offset[:, 2]) <= half[2]), dtype=np.bool_)

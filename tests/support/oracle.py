@@ -384,6 +384,7 @@ class Oracle:
             mean, covariance = report(c, b.measurement, b.mean, b.covariance)
             x, y, v, phi, omega, a = mean
             existence, score, covariance = calibrate(c, b, mean, covariance)
+            told = v if c.calibration is None or v == 0.0 else v**3 / (v**2 + covariance[2, 2])
             sign, doubt = confidence(c, b.heading_odds)
             covariance = covariance + np.diag([0.0, 0.0, 0.0, doubt, 0.0, 0.0])
             b.confirmed = existence >= (c.confirm_until if b.confirmed else c.confirm_from)
@@ -391,7 +392,7 @@ class Oracle:
                 {
                     "id": b.id, "label": b.label, "center": [x, y, b.auxiliary[3]], "size": b.auxiliary[:3], "yaw": phi,
                     "heading_confidence": sign,
-                    "velocity": [v * math.cos(phi), v * math.sin(phi)], "yaw_rate": omega, "acceleration": a,
+                    "velocity": [told * math.cos(phi), told * math.sin(phi)], "yaw_rate": omega, "acceleration": a,
                     "existence": existence, "score": score, "covariance": covariance,
                     "age": (now - b.born_ns) * 1e-9, "time_since_detection": (now - b.seen_ns) * 1e-9,
                     "detection": b.detection, "confirmed": b.confirmed,

@@ -296,7 +296,8 @@ def calibrate(c: Any, b: Any, m: Array, P: Array) -> tuple[float, float, Array]:
         float(np.interp(b.evidence, known.evidence, column)) for column in (known.existence, known.along, known.across)
     )
     turn = np.array([[math.cos(m[3]), -math.sin(m[3])], [math.sin(m[3]), math.cos(m[3])]])
-    covariance = P.copy()
+    factors = np.array([1.0, 1.0, known.speed, 1.0, known.turn_rate, 1.0])
+    covariance = P * np.outer(factors, factors)
     covariance[:2, :2] += turn @ np.diag([along**2, across**2]) @ turn.T
     w = known.score_of_evidence
     return existence, (1 - w) * b.score + w * (b.evidence + 14.0) / 28.0, covariance

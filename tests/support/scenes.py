@@ -304,6 +304,8 @@ def _calibration(rng: np.random.Generator) -> dict[str, Any]:
         "memory": rng.uniform(0.1, 0.95),
         "missed": rng.uniform(0, 4),
         "score_of_evidence": float(rng.choice([0.0, 0.5, 1.0])),
+        "speed": 0.5,
+        "turn_rate": 2.0,
         "evidence": (np.cumsum(rng.uniform(0.1, 2, knots)) - 3).tolist(),
         "existence": np.sort(rng.uniform(0, 1, knots)).tolist(),
         "along": rng.uniform(0, 1, knots).tolist(),

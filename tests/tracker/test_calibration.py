@@ -72,9 +72,11 @@ def test_beyond_the_knots_the_curves_are_level() -> None:
 
 
 def test_the_lasting_error_lies_along_and_across_the_heading() -> None:
-    """The position's covariance is the filter's and, turned with the heading, the lasting error; the rest is as is."""
-    plain, told = follow(PAPER, [1.0] * 6)[-1], follow(with_calibration(), [1.0] * 6)[-1]
-    added = told.covariance[0] - plain.covariance[0]
+    """Covariances are the filter's with factors on speed and turn rate, and the lasting error turned with the box."""
+    plain = follow(PAPER, [1.0] * 6)[-1]
+    told = follow(with_calibration(speed=0.5, turn_rate=2.0), [1.0] * 6)[-1]
+    factors = np.array([1.0, 1.0, 0.5, 1.0, 2.0, 1.0])
+    added = told.covariance[0] - plain.covariance[0] * np.outer(factors, factors)
     ahead = np.array([math.cos(plain.yaw[0]), math.sin(plain.yaw[0])])
     left = np.array([-ahead[1], ahead[0]])
     wanted = 0.2**2 * np.outer(ahead, ahead) + 0.1**2 * np.outer(left, left)
@@ -83,12 +85,30 @@ def test_the_lasting_error_lies_along_and_across_the_heading() -> None:
     assert not added[:, 2:].any()
 
 
+def test_a_parked_car_hardly_moves() -> None:
+    """Velocities are weighted by v^2 / (v^2 + P_vv): hardly any where the speed is not certain."""
+    told, plain = (followed(one) for one in (with_calibration(speed=0.5), PAPER))
+    v = math.hypot(*plain.velocity[0])
+    assert 0.0 < v < 0.3
+    np.testing.assert_allclose(told.velocity, plain.velocity * v**2 / (v**2 + told.covariance[0, 2, 2]), rtol=1e-12)
+
+
+def followed(parameters: optipmb.Parameters) -> optipmb.Tracks:
+    """Tracks of a standing car whose detections are 0.1 m off in turn."""
+    tracker = optipmb.Tracker(parameters)
+    density = tracker.initial()
+    for k in range(6):
+        result = tracker.step(density, boxes(parameters, 0.1 * k, [(5.0 + 0.1 * (k % 2), 1.0)]))
+        density = result.density
+    return result.tracks
+
+
 def test_a_calibration_leaves_the_recursion_alone() -> None:
     """Positions, ids, scores and what is extracted are those without it; the score takes the weight of the evidence."""
     scores = [0.4, 0.9, None, 0.8, None, None, 0.7]
     plain, told = follow(PAPER, scores), follow(with_calibration(), scores)
     for one, other in zip(plain, told, strict=True):
-        for name in ("id", "center", "size", "yaw", "velocity", "score", "detection"):
+        for name in ("id", "center", "size", "yaw", "yaw_rate", "score", "detection"):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
     paper, half, evidence = (
         [float(one.score[0]) for one in follow(with_calibration(score_of_evidence=weight), scores) if len(one)]

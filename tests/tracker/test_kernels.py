@@ -409,22 +409,22 @@ def test_tracks_are_read_off_the_states(*, calibrated: bool) -> None:
         c = SimpleNamespace(reported_noise=less if left[0][label[n]] else None, measurement_noise=noise)
         x[k], spread[k] = textbook.report(c, z, mean[n], covariance[n])
     x[:, 3] = [textbook.wrap(angle) for angle in x[:, 3]]
-    wanted_told = [r[rows], score[rows], spread]
+    heading = np.column_stack([np.cos(x[:, 3]), np.sin(x[:, 3])])
+    wanted_told = [r[rows], score[rows], x[:, 2:3] * heading, spread]
     calibrate_rows(label[rows], evidence[rows], x[:, 3].copy(), classes, *wanted_told)
     facing = np.where(followed[label[rows]], 1 / (1 + np.exp(-odds[rows])), 1.0)
-    wanted_told[2][:, 3, 3] += np.maximum(facing * (1 - facing) - 0.025 * 0.975, 0) * np.pi**2
+    spread[:, 3, 3] += np.maximum(facing * (1 - facing) - 0.025 * 0.975, 0) * np.pi**2
     assert np.array_equal(wanted_told[0], r[rows]) != calibrated
-    np.testing.assert_allclose(told[2], wanted_told[2], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(told[2], spread, rtol=1e-9, atol=1e-12)
     copies = zip((ids, labels, *told[:2]), (identity[rows], label[rows], *wanted_told[:2]), strict=True)
     for copy, column in copies:
         np.testing.assert_array_equal(copy, column)
-    heading = np.column_stack([np.cos(x[:, 3]), np.sin(x[:, 3])])
     wanted = [
         np.column_stack([x[:, :2], auxiliary[rows, 3]]),
         auxiliary[rows, :3],
         x[:, 3],
         facing,
-        x[:, 2:3] * heading,
+        wanted_told[2],
     ]
     wanted += [x[:, 4], x[:, 5], (NOW - born[rows]) * 1e-9, (NOW - seen[rows]) * 1e-9]
     for found, expected in zip(out, wanted, strict=True):

@@ -208,7 +208,7 @@ def test_values_are_allowed_as_numpy_says(data: st.DataObject, count: int, worst
 
 @pytest.mark.parametrize("seed", range(5))
 def test_rows_are_calibrated_as_numpy_interpolates(seed: int) -> None:
-    """`numpy.interp` over the knots of each class, a turned diagonal on x and y; other classes stay as they are."""
+    """`numpy.interp` over knots, a turned diagonal, factors, weighted velocities; other classes stay as they are."""
     rng = np.random.default_rng(seed)
     knots = np.array([4, 0, 1])
     bends = np.sort(rng.normal(0, 2, (3, 4)), axis=1)
@@ -217,12 +217,18 @@ def test_rows_are_calibrated_as_numpy_interpolates(seed: int) -> None:
     evidence[:4], label[:4] = bends[0], 0  # at the knots themselves
     rows = np.arange(30)
     existence, score, covariance = (rng.normal(0, 1, (rows.size, *shape)) for shape in ((), (), (6, 6)))
-    told, ranked, widened = existence.copy(), score.copy(), covariance.copy()
+    velocity = rng.normal(0, 1, (30, 2))
+    covariance[:, 2, 2] = rng.uniform(0.1, 1.0, 30)
+    told, ranked, moving, widened = existence.copy(), score.copy(), velocity.copy(), covariance.copy()
     weight = np.array([0.3, 1.0, 0.0])
-    classes = class_rows(3, knots=knots, score_of_evidence=weight)
+    factors = np.ones((3, 6))
+    factors[:, [2, 4]] = rng.uniform(0.2, 2.0, (3, 2))
+    classes = class_rows(
+        3, knots=knots, score_of_evidence=weight, factor_speed=factors[:, 2], factor_turn_rate=factors[:, 4]
+    )
     for name, curve in (("evidence", bends), ("existence", existence_at), ("along", along_at), ("across", across_at)):
         classes[f"knot_{name}"][:, :4] = curve
-    calibrate_rows(label, evidence, yaw, classes, told, ranked, widened)
+    calibrate_rows(label, evidence, yaw, classes, told, ranked, moving, widened)
     for k, n in enumerate(rows):
         c = label[n]
         used = slice(0, knots[c])
@@ -232,10 +238,14 @@ def test_rows_are_calibrated_as_numpy_interpolates(seed: int) -> None:
             )
             cos, sin = np.cos(yaw[n]), np.sin(yaw[n])
             turn = np.array([[cos, -sin], [sin, cos]])
+            covariance[k] *= np.outer(factors[c], factors[c])
+            squared = velocity[k] @ velocity[k]
+            velocity[k] *= squared / (squared + covariance[k, 2, 2])
             covariance[k, :2, :2] += turn @ np.diag([along**2, across**2]) @ turn.T
             score[k] = np.average([score[k], 0.5 + 0.5 * evidence[n] / SURE], weights=[1 - weight[c], weight[c]])
     np.testing.assert_allclose(told, existence, rtol=1e-12)
     np.testing.assert_allclose(ranked, score, rtol=1e-15)
+    np.testing.assert_allclose(moving, velocity, rtol=1e-12)
     np.testing.assert_allclose(widened, covariance, rtol=1e-12, atol=1e-15)
 
 

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -74,21 +75,29 @@ def _watch(connection: Connection, prefix: str, interval_s: float) -> None:
             time.sleep(max(0.05, interval_s - (time.monotonic() - began)))
 
 
-def tracks(
-    stream: Annotated[str, STREAM],
-    from_ns: Annotated[int, typer.Option("--from", min=0, metavar="STAMP", help="First stamp, nanoseconds.")] = 0,
+@dataclass(frozen=True, kw_only=True)
+class TimeOptions:
+    """Options of a time of a stream."""
+
+    from_ns: Annotated[int, typer.Option("--from", min=0, metavar="STAMP", help="First stamp, nanoseconds.")] = 0
     to_ns: Annotated[
         int | None, typer.Option("--to", min=0, metavar="STAMP", help="Last stamp. Default: up to the newest.")
-    ] = None,
-    last: Annotated[float | None, typer.Option(min=0.0, help="Instead: seconds up to the newest frame.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Write a table: .csv, .parquet, .jsonl or .feather.")] = None,
+    ] = None
+    last: Annotated[float | None, typer.Option(min=0.0, help="Instead: seconds up to the newest frame.")] = None
+
+
+def tracks(
+    stream: Annotated[str, STREAM],
     *,
+    when: TimeOptions,
+    out: Annotated[Path | None, typer.Option(help="Write a table: .csv, .parquet, .jsonl or .feather.")] = None,
     origin: Origin = None,
     service: ServiceOptions,
     as_json: AsJson = False,
 ) -> None:
     """Get the tracks of a stream that the service still has: some seconds, or an hour where there is a log."""
-    if last is not None and (from_ns or to_ns is not None):
+    from_ns, last = when.from_ns, when.last
+    if last is not None and (from_ns or when.to_ns is not None):
         raise UsageError("--last: not together with --from and --to")
     if out is not None and out.suffix.lower() not in SUFFIXES:
         raise UsageError(f"--out: a table such as tracks.csv or tracks.parquet, not {out}")
@@ -103,7 +112,7 @@ def tracks(
             if state is None or state.stamp_ns is None:
                 raise ServiceUnavailable(f"no session of {stream} is there, so --last says nothing: give --from")
             from_ns = max(0, state.stamp_ns - round(last * SECOND))
-        found = list(kept_tracks(connection, stream, from_ns, to_ns, prefix=service.prefix))
+        found = list(kept_tracks(connection, stream, from_ns, when.to_ns, prefix=service.prefix))
     if out is not None:
         from optipmb_tools.results.output import track_columns  # noqa: PLC0415  only with --out
 

@@ -298,7 +298,6 @@ class Preloaded(DataSequence):
         self.poses: Sequence[Pose] = sequence.poses
         self._frames = list(sequence.frames())
         self._truth = sequence.truth()
-        self.points = sum(len(frame.cloud.xyz) for frame in self._frames if frame.cloud is not None)
 
     def __len__(self) -> int:
         return len(self._frames)

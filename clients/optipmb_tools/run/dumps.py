@@ -7,17 +7,13 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 from optipmb_client.errors import UsageError
 from optipmb_schemas import Detections, Dump, DumpedFrame, MessageError, Points, Pose, Tracks, decode_dump
 
 import optipmb
 from optipmb_tools.run.tracking import track_fields
-
-
-class _Steps(Protocol):
-    def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult: ...
 
 
 @dataclass(frozen=True)
@@ -51,7 +47,7 @@ def read(file: Path) -> Dump:
         raise UsageError(f"--dump {file}: {error}") from error
 
 
-def replay(dump: Dump, tracker: Callable[[optipmb.Parameters], _Steps] = optipmb.Tracker) -> Replayed:
+def replay(dump: Dump, tracker: Callable[[optipmb.Parameters], Any] = optipmb.Tracker) -> Replayed:
     """Track the frames of a dump as the service did, until one raises.
 
     Raises:
@@ -64,7 +60,7 @@ def replay(dump: Dump, tracker: Callable[[optipmb.Parameters], _Steps] = optipmb
         density = optipmb.density_of(dump.stamp_ns, dump.next_id, columns, labels)
     except optipmb.OptipmbError as error:
         raise UsageError(f"dump of {dump.stream}: {error}") from error
-    steps = tracker(parameters)
+    steps: optipmb.Tracker = tracker(parameters)
     result = Replayed(dump.stream, len(dump.frames), dump.error)
     for frame in dump.frames:
         if frame.anew:
@@ -80,7 +76,7 @@ def replay(dump: Dump, tracker: Callable[[optipmb.Parameters], _Steps] = optipmb
 
 
 def _step(
-    steps: _Steps, parameters: optipmb.Parameters, density: optipmb.Density, given: DumpedFrame
+    steps: optipmb.Tracker, parameters: optipmb.Parameters, density: optipmb.Density, given: DumpedFrame
 ) -> optipmb.Density:
     """Step by one frame, and make its tracks a message: a value that no message may have is an error too."""
     message = given.detections

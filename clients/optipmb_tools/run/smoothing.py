@@ -68,8 +68,10 @@ class Smoother:
         label = np.concatenate([one.label for one in objects])
         mean = np.concatenate([one.mean for one in objects])
         covariance = np.concatenate([one.covariance for one in objects])
-        mean[shown] = _states(extracted)
-        covariance[shown] = extracted.covariance - self._lasting(extracted.label, evidence, extracted.yaw)
+        mean[shown, :2], mean[shown, PHI] = extracted.center[:, :2], extracted.yaw  # speeds are those of the filter
+        factors = self._factors(extracted.label)
+        lasting = self._lasting(extracted.label, evidence, extracted.yaw)
+        covariance[shown] = (extracted.covariance - lasting) / factors
         covariance[shown, PHI, PHI] -= [doubt(p) for p in extracted.heading_confidence.tolist()]
         odds = smooth(
             np.concatenate([one.id for one in objects]),
@@ -82,6 +84,7 @@ class Smoother:
         )
         confidence = np.array([sign_probability(h) for h in odds[shown].tolist()])
         confidence[self._table["sign_memory"][extracted.label] == 0.0] = 1.0
+        covariance[shown] *= factors
         covariance[shown] += self._lasting(extracted.label, evidence, mean[shown, PHI])
         covariance[shown, PHI, PHI] += [doubt(p) for p in confidence.tolist()]
         start = 0
@@ -93,8 +96,17 @@ class Smoother:
     def _lasting(self, label: Ints, evidence: Floats, yaw: Floats) -> Floats:
         """Return what the calibration adds to the covariances (N, 6, 6) of tracks with these headings (N,)."""
         lasting, unused = np.zeros((len(label), STATE, STATE)), np.empty((2, len(label)))
-        calibrate_rows(label, evidence, yaw, self._table.classes, unused[0], unused[1], lasting)
+        still = np.zeros((len(label), 2))
+        calibrate_rows(label, evidence, yaw, self._table.classes, unused[0], unused[1], still, lasting)
         return lasting
+
+    def _factors(self, label: Ints) -> Floats:
+        """Return the factors of the calibration on the covariances (N, 6, 6) of tracks."""
+        factors = np.ones((len(label), STATE))
+        known = self._table["knots"][label] > 0
+        for s, name in ((V, "factor_speed"), (OMEGA, "factor_turn_rate")):
+            factors[known, s] = self._table[name][label[known]]
+        return np.asarray(factors[:, :, None] * factors[:, None, :])
 
 
 def smooth(
@@ -185,11 +197,6 @@ def _turned(mean: Floats, covariance: Floats, turn: Bools) -> tuple[Floats, Floa
     mean[turn, PHI] += np.pi
     covariance[turn] *= _TURN[:, None] * _TURN
     return mean, covariance
-
-
-def _states(tracks: Tracks) -> Floats:
-    speed = tracks.velocity[:, 0] * np.cos(tracks.yaw) + tracks.velocity[:, 1] * np.sin(tracks.yaw)
-    return np.column_stack((tracks.center[:, :2], speed, tracks.yaw, tracks.yaw_rate, tracks.acceleration))
 
 
 def _joined(parts: list[Tracks]) -> Tracks:

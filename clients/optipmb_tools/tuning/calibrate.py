@@ -8,6 +8,9 @@ Everything is tracked once for each memory that is tried. Then, of the tracks by
 - along, across: in each fifth of the matched tracks, the standard deviation that has to be added to the filter's for
   the mean squared error to be the expected one, NEES = 2; then both times one factor, so that NEES = 2 in sequences
   that are left out in turn, too, where errors are always a little larger than where they were measured.
+- speed, turn_rate: the factor on the filter's standard deviation with which 95 % of the errors lie in the interval of
+  95 %. Braking and turning make few errors many times as large as all others; a mean would be theirs alone. The truth
+  is the motion of the label from half a second before to half a second after.
 
 Centres within two metres match, as in `optipmb_tools.evaluation.calibration`.
 
@@ -26,8 +29,8 @@ import numpy as np
 from scipy.optimize import brentq, isotonic_regression
 
 from optipmb import Calibration, Parameters
-from optipmb_tools.evaluation.calibration import CalibrationResult, calibration, sample
-from optipmb_tools.geometry import Bools, Floats
+from optipmb_tools.evaluation.calibration import NORMAL_95, CalibrationResult, calibration, rows_of, sample
+from optipmb_tools.geometry import Bools, Floats, Ints, wrap_angle
 from optipmb_tools.results import FullTable, ResultTable
 from optipmb_tools.tuning.clips import Clip, track_fully
 from optipmb_tools.tuning.scoring import Figures, Scorer, folds_of, metric, standard_error, without_folds
@@ -46,6 +49,8 @@ _FIFTHS = 5
 _CERTAIN = (0.001, 0.999)
 """Beyond these no share that was measured is known."""
 _WIDEST, _MOST = 10.0, 1.5
+_HALF_WINDOW_S = 0.5
+_LEVEL, _FACTORS = 0.95, (0.1, 1.0)
 _NEES = 2.0
 _SCALE = 28.0
 """Width of the evidence, from one surest to the other, as the score tells it."""
@@ -65,6 +70,8 @@ class _Rows:
     """(H, 2) that the filter expects, m^2"""
     mixed: Floats
     """(H,) covariance of the two"""
+    motion: Floats
+    """(H, 2) errors of speed and turn rate in standard deviations of the filter; NaN where the truth is not known"""
 
     def __add__(self, other: "_Rows") -> "_Rows":
         return _Rows(*(np.concatenate([value, getattr(other, key)]) for key, value in vars(self).items()))
@@ -142,18 +149,37 @@ def _rows(clip: Clip, scorer: Scorer, parameters: Parameters, memory: float) -> 
     )
     tracks, full = _tracked(clip, scorer, with_calibration(parameters, scorer.name, probe))
     found = sample(clip.world, tracks, full, scorer.name, scorer.near)
-    matched = found.row[found.true]
+    matched, owner = found.row[found.true], found.owner[found.true]
     turn, offset = full.yaw[matched], found.offset[found.true]
     ahead = np.column_stack([np.cos(turn), np.sin(turn)])
     aside = np.column_stack([-np.sin(turn), np.cos(turn)])
     covariance = full.covariance[matched, :2, :2]
+    velocity, turn_rate = _true_motion(clip, rows_of(clip.world.frame, clip.world.id, full.frame[matched], owner))
+    motion = [((full.velocity[matched] - velocity) * ahead).sum(axis=1), full.yaw_rate[matched] - turn_rate]
     return _Rows(
         evidence=(full.score[found.row] - 0.5) * _SCALE,
         true=found.true,
         error=np.column_stack([(offset * ahead).sum(axis=1), (offset * aside).sum(axis=1)]),
         variance=np.column_stack([np.einsum("ni,nij,nj->n", axis, covariance, axis) for axis in (ahead, aside)]),
         mixed=np.asarray(np.einsum("ni,nij,nj->n", ahead, covariance, aside)),
+        motion=np.column_stack(motion) / np.sqrt(full.covariance[matched][:, [2, 4], [2, 4]]),
     )
+
+
+def _true_motion(clip: Clip, label: Ints) -> tuple[Floats, Floats]:
+    """Return velocity (N, 2) and turn rate (N,) of some labels, by the labels half a second before and after."""
+    truth, stamps = clip.world, clip.stamps * 1e-9
+    apart = max(1, round(_HALF_WINDOW_S / float(np.median(np.diff(stamps))))) if len(stamps) > 1 else 1
+    before, after = (
+        rows_of(truth.frame, truth.id, truth.frame[label] + shift, truth.id[label]) for shift in (-apart, apart)
+    )
+    known = (before >= 0) & (after >= 0)
+    velocity, turn_rate = np.full((len(label), 2), np.nan), np.full(len(label), np.nan)
+    one, other = before[known], after[known]
+    elapsed = stamps[truth.frame[other]] - stamps[truth.frame[one]]
+    velocity[known] = (truth.center[other, :2] - truth.center[one, :2]) / elapsed[:, None]
+    turn_rate[known] = wrap_angle(truth.yaw[other] - truth.yaw[one]) / elapsed
+    return velocity, turn_rate
 
 
 def _log_loss(rows: Sequence[_Rows]) -> float:
@@ -212,7 +238,17 @@ def _fitted(rows: _Rows, memory: float, widening: float) -> Calibration:
         existence=tuple(np.clip(column(existence, 1), *_CERTAIN).tolist()),
         along=tuple(column(lasting, 1)),
         across=tuple(column(lasting, 2)),
+        speed=_factor(rows.motion[:, 0]),
+        turn_rate=_factor(rows.motion[:, 1]),
     )
+
+
+def _factor(deviations: Floats) -> float:
+    """Return the factor, one at most, with which 95 % of the errors lie in the interval of 95 %."""
+    known = np.abs(deviations[np.isfinite(deviations)])
+    if len(known) < LEAST_MATCHED:
+        return 1.0
+    return rounded(float(np.clip(np.quantile(known, _LEVEL) / NORMAL_95, *_FACTORS)))
 
 
 def _existence(rows: _Rows) -> Floats:

@@ -26,7 +26,7 @@ import sys
 import threading
 import time
 import traceback
-from concurrent.futures import Future, wait
+from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeVar
 
 import structlog
@@ -142,22 +142,30 @@ class Steps:
     """Steps of an end that may hang, and behind which others must be done."""
 
     def __init__(self) -> None:
-        self._done: dict[str, Future[object]] = {}
+        self._threads: list[threading.Thread] = []
 
     def do(self, name: str, step: Callable[[], object]) -> None:
         """Do a step; one that hangs, or raises, delays the next ones by `STEP_S` at most."""
-        self._done[name] = Future()
+
+        def work() -> None:
+            try:
+                step()
+            except Exception:
+                log.exception("internal_error", step=name)
+
+        thread = threading.Thread(target=work, name=name, daemon=True)
+        self._threads.append(thread)
         with contextlib.suppress(RuntimeError):  # no thread can be started: it remains unfinished
-            self._done[name] = on_thread(name, step)
-            wait([self._done[name]], STEP_S)
+            thread.start()
+            thread.join(STEP_S)
 
     def unfinished(self, seconds: float) -> bool:
         """Return whether a step has not ended after `seconds`, or could not begin, and log it."""
-        done, _ = wait(self._done.values(), seconds)
-        for name, step in self._done.items():
-            if step in done and (error := step.exception()):
-                log.error("internal_error", step=name, exc_info=error)
-        names = [name for name, step in self._done.items() if step not in done]
+        deadline = Deadline(seconds)
+        for thread in self._threads:
+            if thread.is_alive():
+                thread.join(deadline.left())
+        names = [thread.name for thread in self._threads if thread.is_alive() or thread.ident is None]
         if names:
             log.error("step_hangs", steps=names)
         return bool(names)
@@ -246,27 +254,19 @@ class StopRequest:
             await asyncio.wait_for(self._event.wait(), seconds)
 
 
-def on_thread(name: str, work: Callable[[], _T]) -> Future[_T]:
-    """Do blocking work on a daemon thread: what cannot be interrupted must not keep the process.
-
-    Raises:
-        RuntimeError: no thread can be started.
-    """
+async def unless(asked: StopRequest, work: Callable[[], _T]) -> _T | None:
+    """Do blocking work on a thread; None when the end was asked for before it was done, the work is then abandoned."""
     done: Future[_T] = Future()
 
     def call() -> None:
         try:
             done.set_result(work())
-        except BaseException as error:  # noqa: BLE001 - raised where the result is read
+        except BaseException as error:  # noqa: BLE001 - raised where the result is awaited
             done.set_exception(error)
 
-    threading.Thread(target=call, name=name, daemon=True).start()
-    return done
-
-
-async def unless(asked: StopRequest, work: Callable[[], _T]) -> _T | None:
-    """Do blocking work on a thread; None when the end was asked for before it was done, the work is then abandoned."""
-    result = asyncio.wrap_future(on_thread("start", work))
+    # A daemon: neither compiling nor waiting for a router can be interrupted, and neither may keep the process.
+    threading.Thread(target=call, name="start", daemon=True).start()
+    result = asyncio.wrap_future(done)
     result.add_done_callback(lambda one: one.cancelled() or one.exception())  # an abandoned one may fail unseen
     stop = asyncio.create_task(asked.wait())
     waits: set[asyncio.Future[Any]] = {result, stop}

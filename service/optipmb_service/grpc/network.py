@@ -18,13 +18,12 @@ from optipmb_schemas.protobuf import tracking_pb2 as pb
 
 from optipmb_service.grpc.calls import varint
 from optipmb_service.grpc.selection import EVERYTHING
-from optipmb_service.zenoh.client import IdlePool
+from optipmb_service.zenoh.client import IdlePool, SharedSubscriptions
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterable
 
     from optipmb_client.incoming import Answer, Arrival
-    from optipmb_client.zenoh.handles import Reading
     from optipmb_schemas.protobuf.convert import EncodedTracks
 
     from optipmb_service.grpc.selection import Selection
@@ -116,19 +115,6 @@ def _publication(tracks: EncodedTracks) -> tuple[object, ...]:
     return tracks.stream, tracks.sensor, tracks.epoch, tracks.seq, tracks.run, tracks.revision
 
 
-class _Feed:
-    """A subscription and its listeners."""
-
-    def __init__(self) -> None:
-        self.listeners: tuple[Listener, ...] = ()
-        self.subscription: Reading | None = None
-
-    def close(self) -> None:
-        """Withdraw the subscription."""
-        if self.subscription is not None:
-            self.subscription.close()
-
-
 class Network:
     """Subscriptions and publishers of a gateway; to be used on its loop.
 
@@ -141,15 +127,15 @@ class Network:
         self._client = client
         self._loop = asyncio.get_running_loop()
         self._invalid = invalid
-        self._feeds: dict[str, _Feed] = {}
-        self._idle_feeds: IdlePool[_Feed] = IdlePool(IDLE_SUBSCRIPTIONS)
+        self._shared: SharedSubscriptions[Listener, Arrival]
+        self._shared = SharedSubscriptions(client.subscribe, self._receive, IDLE_SUBSCRIPTIONS)
         self._idle_publishers: IdlePool[Outgoing] = IdlePool(IDLE_PUBLISHERS)
         self._arrived: collections.deque[tuple[Listener, Item]] = collections.deque()
         self._waking = False
 
     def close(self) -> None:
         """Withdraw what no call has any more; may wait."""
-        self._idle_feeds.close()
+        self._shared.close()
         self._idle_publishers.close()
 
     @contextlib.asynccontextmanager
@@ -159,20 +145,11 @@ class Network:
         Raises:
             TransportError: the network cannot be used.
         """
-        feed = self._feeds.get(key)
-        if feed is None:
-            feed = self._feeds[key] = self._idle_feeds.take(key) or _Feed()
-        feed.listeners = (*feed.listeners, listener)
+        leave = self._shared.join(key, listener)
         try:
-            if feed.subscription is None:
-                feed.subscription = self._client.subscribe(key, lambda message: self._receive(feed, message))
             yield
         finally:
-            feed.listeners = tuple(one for one in feed.listeners if one is not listener)
-            if not feed.listeners:
-                del self._feeds[key]
-                if feed.subscription is not None:
-                    self._idle_feeds.keep(key, feed)
+            leave()
 
     @contextlib.asynccontextmanager
     async def publishing(self, key: PublisherKey, wanted: Callable[[], None]) -> AsyncIterator[Outgoing]:
@@ -206,9 +183,9 @@ class Network:
 
         return await asyncio.to_thread(read)
 
-    def _receive(self, feed: _Feed, message: Arrival) -> None:
+    def _receive(self, listeners: tuple[Listener, ...], message: Arrival) -> None:
         """Take a message on the thread of its subscription."""
-        if not (listeners := feed.listeners):
+        if not listeners:
             return
         arrived: list[tuple[Listener, Item]] = []
         if message.key.endswith("/problems"):

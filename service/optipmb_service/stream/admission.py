@@ -67,20 +67,33 @@ class _Bucket:
         return taken
 
 
-class Quotas:
-    """Quotas of all nodes and sites.
+class Admission:
+    """Room for messages and sessions: quotas of nodes and sites, and the sessions of the process.
 
     Args:
-        node: of each node, `site/node`.
-        site: of each site.
+        settings: the limits.
+        tracked: returns the streams with a session, when each was last used, and whether it is silent.
+        evict: closes the session of a stream to make room.
     """
 
-    def __init__(self, node: Quota, site: Quota) -> None:
+    def __init__(
+        self, settings: Settings, tracked: Callable[[], Sequence[tuple[str, int, bool]]], evict: Callable[[str], None]
+    ) -> None:
+        self._most = settings.max_sessions
+        self._tracked = tracked
+        self._evict = evict
+        node = Quota(settings.node_sessions, settings.node_rate, settings.node_mb_s * MEGABYTE)
+        site = Quota(settings.site_sessions, settings.site_rate, settings.site_mb_s * MEGABYTE)
         self._quotas = {"node": node, "site": site}
         self._rated = [(at, quota) for at, quota in enumerate((node, site)) if quota.messages or quota.bytes]
         self._lock = threading.Lock()
         self._buckets: OrderedDict[str, _Bucket] = OrderedDict()
-        self._sessions: Counter[tuple[str, str]] = Counter()
+        self._owned: Counter[tuple[str, str]] = Counter()
+        """Sessions of each node and site."""
+        self._sessions = 0
+        self._ended: OrderedDict[str, Incarnation] = OrderedDict()
+        self._refused: dict[str, tuple[int, str]] = {}
+        self._evicted: tuple[str, int] = "", 0
 
     def exceeded(self, stream: str, size: int, now_ns: int) -> str:
         """Take a message of a stream from its quotas; return the one that is used up, empty when none is."""
@@ -95,56 +108,6 @@ class Quotas:
                 if not bucket.take(quota, size, now_ns):
                     return f"{kind} {owner}: at most {_text(quota)} a second"
         return ""
-
-    def count(self, stream: str, sessions: int) -> None:
-        """Count a session of a stream that begins (1) or ends (-1)."""
-        with self._lock:
-            for owner in _owners(stream):
-                self._sessions[owner] += sessions
-                if not self._sessions[owner]:
-                    del self._sessions[owner]
-
-    def full(self, stream: str) -> str:
-        """Return the quota of sessions that a further stream would exceed; empty when none."""
-        with self._lock:
-            for kind, owner in _owners(stream):
-                most = self._quotas[kind].sessions
-                if most and self._sessions[kind, owner] >= most:
-                    return f"{kind} {owner}: at most {most} streams at once"
-        return ""
-
-    def _added(self, owner: str, quota: Quota, now_ns: int) -> _Bucket:
-        bucket = self._buckets[owner] = _Bucket(quota.messages, quota.bytes, now_ns)
-        if len(self._buckets) > MAX_OWNERS:
-            self._buckets.popitem(last=False)
-        return bucket
-
-
-class Admission:
-    """Sessions that there are, and room for further ones.
-
-    Args:
-        settings: the limits.
-        tracked: returns the streams with a session, when each was last used, and whether it is silent.
-        evict: closes the session of a stream to make room.
-    """
-
-    def __init__(
-        self, settings: Settings, tracked: Callable[[], Sequence[tuple[str, int, bool]]], evict: Callable[[str], None]
-    ) -> None:
-        self._most = settings.max_sessions
-        self._tracked = tracked
-        self._evict = evict
-        self._quotas = Quotas(
-            Quota(settings.node_sessions, settings.node_rate, settings.node_mb_s * MEGABYTE),
-            Quota(settings.site_sessions, settings.site_rate, settings.site_mb_s * MEGABYTE),
-        )
-        self.exceeded = self._quotas.exceeded
-        self._lock = threading.Lock()
-        self._sessions = 0
-        self._ended: OrderedDict[str, Incarnation] = OrderedDict()
-        self._refused: dict[str, tuple[int, str]] = {}
-        self._evicted: tuple[str, int] = "", 0
 
     def room(self, stream: str) -> str:
         """Return why a further stream has no room; empty when it has. A refusal is remembered for a moment."""
@@ -164,9 +127,8 @@ class Admission:
             if self._sessions >= self._most:
                 return None
             self._sessions += 1
-            incarnation = self._ended.pop(stream, Incarnation())
-        self._quotas.count(stream, 1)
-        return incarnation
+            self._owned.update(_owners(stream))
+            return self._ended.pop(stream, Incarnation())
 
     def release(self, stream: str, incarnation: Incarnation) -> None:
         """Count a session that has ended, or was not begun, and remember its incarnation."""
@@ -176,10 +138,10 @@ class Admission:
             self._ended[stream] = incarnation
             if len(self._ended) > MAX_ENDED:
                 self._ended.popitem(last=False)
-        self._quotas.count(stream, -1)
+            self._owned -= Counter(_owners(stream))  # keeps no zeros
 
     def _look_for_room(self, stream: str, now_ns: int) -> str:
-        if full := self._quotas.full(stream):
+        if full := self._full(stream):
             return full
         if self._sessions < self._most:
             return ""
@@ -191,6 +153,21 @@ class Admission:
             self._evicted = victim, now_ns + EVICT_EVERY_NS
             self._evict(victim)
         return "room for another session: one is being closed"
+
+    def _full(self, stream: str) -> str:
+        """Return the quota of sessions that a further stream would exceed; empty when none."""
+        with self._lock:
+            for kind, owner in _owners(stream):
+                most = self._quotas[kind].sessions
+                if most and self._owned[kind, owner] >= most:
+                    return f"{kind} {owner}: at most {most} streams at once"
+        return ""
+
+    def _added(self, owner: str, quota: Quota, now_ns: int) -> _Bucket:
+        bucket = self._buckets[owner] = _Bucket(quota.messages, quota.bytes, now_ns)
+        if len(self._buckets) > MAX_OWNERS:
+            self._buckets.popitem(last=False)
+        return bucket
 
 
 def victim_of(stream: str, tracked: Iterable[tuple[str, int, bool]]) -> str | None:

@@ -107,8 +107,11 @@ class SensorQueue:
         self._behind = False
         self.clouds = CloudBuffer(policy.clouds, policy.cloud_bytes)
         self.stamps = StampCheck()
-        self.checksums = Checksums()
-        self._claim = Claim()
+        self._checksums = b"", array("I")
+        """Epoch of the newest publisher, and the checksums of its newest frames, by number."""
+        self._claim = b"", -1, 0, 0
+        """Epoch and number of the last frame of a publisher that another one has succeeded, how many came in a row, and
+        the stamp of the first of them."""
         self.held: list[PendingFrame] = []
         """The frames, in order."""
         self.held_bytes = 0
@@ -154,20 +157,30 @@ class SensorQueue:
         """
         if decision.verdict is not Verdict.RETIRED:
             if decision.verdict.admitted:
-                self._claim.clear()
+                self._claim = b"", -1, 0, 0
             return False
         strayed = self.timeline.seen[frame_id.sensor][-1].mask.bit_count() < JUMP_FRAMES
         span_ns = self.policy.rewind_ns if strayed else self.policy.gap_limit_ns
-        return self._claim.add(frame_id, frames=JUMP_FRAMES, span_ns=span_ns)
+        epoch, seq, count, since_ns = self._claim
+        if frame_id.epoch != epoch or frame_id.seq <= seq:
+            count, since_ns = 0, frame_id.stamp_ns
+        self._claim = frame_id.epoch, frame_id.seq, count + 1, since_ns
+        return count + 1 >= JUMP_FRAMES and frame_id.stamp_ns - since_ns >= span_ns
 
     def reuses_number(self, frame_id: FrameId, detections: bytes, decision: Decision) -> bool:
         """Return whether a frame that is refused has the number of another frame."""
-        if decision.verdict is Verdict.DUPLICATE:
-            same = self.checksums.same(frame_id.epoch, frame_id.seq, detections)
-            if same is not None:
-                return not same
+        epoch, checksums = self._checksums
+        known = checksums[frame_id.seq % WINDOW] if frame_id.epoch == epoch else 0
+        if decision.verdict is Verdict.DUPLICATE and known:
+            return known != zlib.crc32(detections)
         # An earlier frame has no stamp beyond the newest one.
         return decision.verdict in {Verdict.DUPLICATE, Verdict.LATE} and decision.place.jump_ns > 0
+
+    def remember(self, frame_id: FrameId, detections: bytes) -> None:
+        """Remember the bytes of a frame that came, to tell its repetition from another frame with its number."""
+        if frame_id.epoch != self._checksums[0]:
+            self._checksums = frame_id.epoch, array("I", bytes(array("I").itemsize * WINDOW))
+        self._checksums[1][frame_id.seq % WINDOW] = zlib.crc32(detections)
 
     def add(self, frame: PendingFrame) -> None:
         """Hold a frame, where it belongs."""
@@ -349,44 +362,3 @@ class StampCheck:
                     f"{CHECKED_FRAMES} frames in {took_ns / SECOND:.1f} s, {advance_ns} apart: stamps look like {unit}"
                 )
         return ""
-
-
-class Checksums:
-    """Checksums of the newest frames of a publisher, by which a repeated frame differs from another with its number."""
-
-    def __init__(self) -> None:
-        self._epoch = b""
-        self._values = array("I")
-
-    def add(self, epoch: bytes, seq: int, detections: bytes) -> None:
-        """Remember a frame that came, by the bytes of its detections."""
-        if epoch != self._epoch:
-            self._epoch, self._values = epoch, array("I", bytes(array("I").itemsize * WINDOW))
-        self._values[seq % WINDOW] = zlib.crc32(detections)
-
-    def same(self, epoch: bytes, seq: int, detections: bytes) -> bool | None:
-        """Return whether the frame that came with a number had these bytes; None: it is not known any more."""
-        known = self._values[seq % WINDOW] if epoch == self._epoch else 0
-        return known == zlib.crc32(detections) if known else None
-
-
-class Claim:
-    """Frames in a row of a publisher that another one has succeeded, while that one sends nothing."""
-
-    def __init__(self) -> None:
-        self._epoch = b""
-        self._seq = -1
-        self._count = 0
-        self._since_ns = 0
-
-    def clear(self) -> None:
-        """Begin again: the successor has sent a frame."""
-        self._epoch = b""
-
-    def add(self, frame_id: FrameId, *, frames: int, span_ns: int) -> bool:
-        """Count a frame; return whether they are so many, over so long a time by their stamps."""
-        if frame_id.epoch != self._epoch or frame_id.seq <= self._seq:
-            self._epoch, self._count, self._since_ns = frame_id.epoch, 0, frame_id.stamp_ns
-        self._seq = frame_id.seq
-        self._count += 1
-        return self._count >= frames and frame_id.stamp_ns - self._since_ns >= span_ns

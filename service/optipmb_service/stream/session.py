@@ -354,7 +354,7 @@ class Session:
                 queue.clouds.newest_ns = checkpoint.newest_cloud_ns.get(name)
         for frame in checkpoint.window:
             if (queue := one._sensors.get(frame.frame_id.sensor)) is not None:
-                queue.checksums.add(frame.frame_id.epoch, frame.frame_id.seq, frame.detections)
+                queue.remember(frame.frame_id, frame.detections)
         return one
 
     @property
@@ -584,7 +584,7 @@ class Session:
         """Process a frame that has a place, or hold it; return the outputs of all frames that it made ready."""
         outputs: list[Output] = []
         detections = schemas.encoded(message)
-        queue.checksums.add(frame_id.epoch, frame_id.seq, detections)
+        queue.remember(frame_id, detections)
         try:
             frame, ignored = convert.frame_of(self.parameters, message)
         except optipmb.FrameError as error:

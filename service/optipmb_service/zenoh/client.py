@@ -11,6 +11,7 @@ import json
 import os
 import threading
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Final, Generic, Protocol, TypeVar
 
 import optipmb_schemas as schemas
@@ -129,6 +130,64 @@ class IdlePool(Generic[R]):
                     self._end_in(IDLE_S)
         for resource in resources:
             resource.close()
+
+
+L = TypeVar("L")
+M = TypeVar("M")
+
+
+class _Feed(Generic[L]):
+    def __init__(self) -> None:
+        self.listeners: tuple[L, ...] = ()
+        self.subscription: Reading | None = None
+
+    def close(self) -> None:
+        if self.subscription is not None:
+            self.subscription.close()
+
+
+class SharedSubscriptions(Generic[L, M]):
+    """Subscriptions that listeners share, by key expression; kept for a while without any. For any threads.
+
+    Args:
+        subscribe: opens a subscription, which calls its second argument with each message.
+        receive: called for each message with the listeners, on a thread of the subscription.
+        most: subscriptions that are kept without listeners.
+    """
+
+    def __init__(
+        self,
+        subscribe: Callable[[str, Callable[[M], None]], Reading],
+        receive: Callable[[tuple[L, ...], M], None],
+        most: int,
+    ) -> None:
+        self._subscribe = subscribe
+        self._receive = receive
+        self._lock = threading.Lock()
+        self._feeds: dict[str, _Feed[L]] = {}
+        self._idle: IdlePool[_Feed[L]] = IdlePool(most)
+
+    def join(self, key: str, listener: L) -> Callable[[], None]:
+        """Add a listener until the result is called, which may be twice. Raises as `subscribe` does."""
+        with self._lock:
+            feed = self._feeds.get(key) or self._idle.take(key) or _Feed()
+            feed.listeners = (*feed.listeners, listener)
+            if feed.subscription is None:
+                feed.subscription = self._subscribe(key, lambda message: self._receive(feed.listeners, message))
+            self._feeds[key] = feed
+        return partial(self._leave, key, feed, listener)
+
+    def _leave(self, key: str, feed: _Feed[L], listener: L) -> None:
+        with self._lock:
+            left = tuple(one for one in feed.listeners if one is not listener)
+            if len(left) < len(feed.listeners):
+                feed.listeners = left
+                if not left:
+                    self._idle.keep(key, self._feeds.pop(key))
+
+    def close(self) -> None:
+        """Withdraw the subscriptions without listeners; may wait."""
+        self._idle.close()
 
 
 class Turns:

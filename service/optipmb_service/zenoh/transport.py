@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import secrets
 import time
 from functools import partial
@@ -11,9 +12,8 @@ import optipmb_schemas as schemas
 import structlog
 from optipmb_client.errors import ConnectionFailed as TransportError
 
-from optipmb_service.zenoh.client import Client
+from optipmb_service.zenoh.client import Client, SharedSubscriptions, Turns
 from optipmb_service.zenoh.inputs import Packet, ReturnedPublishers, Topic
-from optipmb_service.zenoh.taps import Taps
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -42,6 +42,15 @@ ANNOUNCED: Final = 32
 
 CACHES_S: Final = 1.0
 """How long the caches may take to answer."""
+
+KEPT: Final = 32
+"""Subscriptions of viewers that are kept without any: two of each stream."""
+
+BURST: Final = 200
+"""Subscriptions of viewers that are opened at once."""
+
+PERIOD_S: Final = 7.5
+"""Time after which a further one is, in the long run: 11,520 a day, each with a number that Zenoh never gives back."""
 
 
 log = structlog.get_logger("optipmb_service")
@@ -117,7 +126,9 @@ class Transport:
         self._returned = ReturnedPublishers(self._client, lambda *_: 0)
         self._alive: Declared | None = None
         self._owners: Reading | None = None
-        self._taps = Taps(self._client, self._prefix)
+        self._turns = Turns(BURST, PERIOD_S)
+        self._newest: SharedSubscriptions[Callable[[bytes, str], None], Sample]
+        self._newest = SharedSubscriptions(self._read_newest, _to_viewers, KEPT)
 
     # Receiving
 
@@ -292,7 +303,14 @@ class Transport:
         Raises:
             TransportError: the session is closed, or too many other streams were looked at.
         """
-        return self._taps.join((stream, detections or stream), receive)
+        with contextlib.ExitStack() as joined:
+            for topic, names in (("tracks", stream), ("detections", detections or stream)):
+                joined.callback(self._newest.join(f"{self._prefix}/{names}/{topic}", partial(receive, topic)))
+            return joined.pop_all().close
+
+    def _read_newest(self, key: str, receive: Callable[[Sample], None]) -> Reading:
+        self._turns.take()
+        return self._client.read_newest(key, receive)
 
     def recent_tracks(self, stream: str) -> list[tuple[bytes, str]]:
         """Return what those who track a stream keep of its tracks for subscribers, each message with its encoding."""
@@ -375,6 +393,12 @@ class Transport:
 def _name(stream: str, *, cached: bool) -> str:
     """Return the name of a subscription; for a moment there may be one with recovery and one without."""
     return stream if cached else f"{stream} plain"
+
+
+def _to_viewers(listeners: tuple[Callable[[bytes, str], None], ...], sample: Sample) -> None:
+    payload, encoding = sample.payload.to_bytes(), str(sample.encoding)
+    for receive in listeners:
+        receive(payload, encoding)
 
 
 def _log_link(peer: str, kind: str, came: bool) -> None:  # noqa: FBT001 - the signature of a watcher

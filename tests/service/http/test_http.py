@@ -25,7 +25,7 @@ from optipmb_service.app.health_command import ask
 from optipmb_service.http import Server, application
 from optipmb_service.http.server import CONNECTIONS, REQUESTS
 from optipmb_service.telemetry.metrics import NAMESPACE, SERVICE_METRICS
-from optipmb_service.zenoh.taps import BURST
+from optipmb_service.zenoh.transport import BURST
 from prometheus_client.parser import text_string_to_metric_families
 from router import Node, Sensor, until
 from routers import free_endpoint, open_router
@@ -335,7 +335,7 @@ def test_viewers_use_up_no_keys() -> None:
             until(lambda: look("a/b/c") == b": hello\n", "a viewer is let in")
         assert declared() == before + 2
         until(lambda: look(f"a/b/stream-{next(NUMBERS)}") == b"retry: 15000\n", "no more streams are subscribed to")
-        assert declared() <= before + 2 * (BURST + 10)
+        assert declared() <= before + BURST + 20
         assert look("a/b/c") in {b": hello\n", b"retry: 15000\n"}
         assert get(address, "/healthz")[0] == 200
 

@@ -75,16 +75,16 @@ def test_a_covariance_that_no_message_can_carry_is_not_published() -> None:
 def told(found: optipmb.Tracks, paths: optipmb.PredictedPaths | None = None) -> schemas.Tracks:
     """The message for tracks."""
     return convert.tracks_of(
-        found,
-        paths,
-        stream=SENSOR.stream,
-        frame_id=FrameId(SENSOR.epoch, 1, 2),
+        optipmb.StepResult(None, found, None, paths),  # type: ignore[arg-type]  # of the tracks alone
+        SENSOR.stream,
+        FrameId(SENSOR.epoch, 1, 2),
         session="0" * 32,
         revision=0,
-        parameters=NUSCENES,
+        profile=NUSCENES.name,
         cloud_used=False,
         gap=0,
         ignored=0,
+        labels=NUSCENES.labels,
     ).tracks
 
 

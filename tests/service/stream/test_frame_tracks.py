@@ -13,7 +13,6 @@ from optipmb_service.stream.timeline import FrameId
 from optipmb_service.stream.values import COLUMNS, Tracked
 
 import optipmb
-from optipmb import StepResult
 
 FRAME = FrameId(b"0" * 16, 1, 2)
 PARAMETERS = optipmb.load_profile("generic")
@@ -33,7 +32,7 @@ def made(tracks: optipmb.Tracks, *parts: Any, frame_id: FrameId = FRAME, **field
     """Tracks of a frame, with parts of the tracker's result that few profiles have."""
     header: dict[str, Any] = {"session": "0" * 32, "revision": 0, "profile": PARAMETERS.name, "cloud_used": False}
     header |= {"gap": 0, "ignored": 0, "labels": PARAMETERS.labels}
-    result = StepResult(None, tracks, None, *parts)  # type: ignore[arg-type]  # of the tracks alone
+    result = optipmb.StepResult(None, tracks, None, *parts)  # type: ignore[arg-type]  # of the tracks alone
     return tracks_of(result, fields.pop("stream", "a/b/c"), frame_id, **header | fields)
 
 

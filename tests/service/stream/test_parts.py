@@ -201,22 +201,6 @@ def test_the_rate_is_of_the_last_seconds() -> None:
     assert meter.rate_hz(810 * SECOND) == pytest.approx(1000, rel=0.01)
 
 
-def test_clouds_are_found_by_stamp_and_bounded() -> None:
-    """The newest clouds stay; those before a stamp go, those of a jump away stay."""
-    clouds = CloudBuffer(3)
-
-    def found(seq: int, publishers: bytes = b"") -> bool:
-        return clouds.get(SENSOR.epoch, SENSOR.stamp_ns(seq), lambda epoch: epoch == publishers) is not None
-
-    for seq in range(5):
-        clouds.add(SENSOR.points(seq))
-    assert [found(seq) for seq in range(5)] == [False, False, True, True, True]
-    clouds.forget_before(SENSOR.stamp_ns(4), SECOND)
-    assert len(clouds) == 1
-    clouds.forget_before(SENSOR.stamp_ns(4) + 2 * SECOND, SECOND)
-    assert len(clouds) == 1
-
-
 def test_clouds_of_other_publishers() -> None:
     """A cloud of an epoch with detections belongs to them alone; one of a program of its own to any frame."""
     clouds = CloudBuffer(3)

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any
 from hypothesis import given
 from hypothesis import strategies as st
 from optipmb_schemas import Keys
-from optipmb_service.stream.admission import Quota, Quotas, victim_of
+from optipmb_service.settings import Settings
+from optipmb_service.stream.admission import Admission, victim_of
+from optipmb_service.stream.values import Incarnation
 from optipmb_service.telemetry.stream_meter import StreamMeter
 from router import SECOND, Node, Sensor, until
 
@@ -18,9 +20,15 @@ if TYPE_CHECKING:
 KEYS = Keys()
 
 
+def admission(**settings: Any) -> Admission:
+    """The admission of a process without a session, with these quotas alone."""
+    none = dict.fromkeys(("node_rate", "node_mb_s", "site_rate", "site_mb_s"), 0)
+    return Admission(Settings(**none | settings), list, lambda _: None)
+
+
 def test_a_rate_is_a_bucket_of_a_second() -> None:
     """A burst of a second's worth passes, then what the rate lets through; other nodes of the site have their own."""
-    quotas = Quotas(Quota(messages=10), Quota())
+    quotas = admission(node_rate=10)
     taken = [quotas.exceeded("site/node/lidar", 100, 0) for _ in range(12)]
     assert taken == [""] * 10 + ["node site/node: at most 10 messages a second"] * 2
     assert quotas.exceeded("site/node/camera", 100, 0)
@@ -30,24 +38,25 @@ def test_a_rate_is_a_bucket_of_a_second() -> None:
 
 def test_bytes_are_counted_over_a_site() -> None:
     """Nodes of one site share its bytes; a large message is paid for afterwards."""
-    quotas = Quotas(Quota(), Quota(bytes=1000))
-    assert not quotas.exceeded("site/a/lidar", 3000, 0)
-    assert quotas.exceeded("site/b/lidar", 1, SECOND) == "site site: at most 1000 bytes a second"
+    quotas = admission(site_mb_s=1)
+    assert not quotas.exceeded("site/a/lidar", 3 * 2**20, 0)
+    assert quotas.exceeded("site/b/lidar", 1, SECOND) == "site site: at most 1048576 bytes a second"
     assert not quotas.exceeded("site/b/lidar", 1, 4 * SECOND)
     assert not quotas.exceeded("yard/b/lidar", 1, 0)
 
 
 def test_sessions_are_counted_per_node_and_site() -> None:
     """A node with its share of streams gets no further one, and a site likewise."""
-    quotas = Quotas(Quota(sessions=2), Quota(sessions=3))
-    quotas.count("site/a/1", 1)
-    quotas.count("site/a/2", 1)
-    assert quotas.full("site/a/3") == "node site/a: at most 2 streams at once"
-    assert quotas.full("site/b/1") == ""
-    quotas.count("site/b/1", 1)
-    assert quotas.full("site/c/1") == "site site: at most 3 streams at once"
-    quotas.count("site/a/2", -1)
-    assert quotas.full("site/a/3") == quotas.full("site/c/1") == ""
+    quotas = admission(node_sessions=2, site_sessions=3)
+    for stream in ("site/a/1", "site/a/2"):
+        assert quotas.room(stream) == ""
+        quotas.admit(stream)
+    assert quotas.room("site/a/3") == "node site/a: at most 2 streams at once"
+    assert quotas.room("site/b/1") == ""
+    quotas.admit("site/b/1")
+    assert quotas.room("site/c/1") == "site site: at most 3 streams at once"
+    quotas.release("site/a/2", Incarnation())
+    assert quotas.room("site/a/3") == quotas.room("site/c/1") == ""
 
 
 def test_the_least_recently_used_makes_room() -> None:

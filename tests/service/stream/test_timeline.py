@@ -133,29 +133,6 @@ def test_repeats_change_nothing(seqs: set[int], data: st.DataObject) -> None:
     assert [d for d in decisions if d.verdict is not Verdict.DUPLICATE] == judge_all(stream)[0]
 
 
-def test_what_is_missing_is_known() -> None:
-    """A frame is complete when all between it and the last processed came, processed or refused."""
-    _, timeline = judge_all([mark(0, 0), mark(1, 0.1), mark(3, 0.3)])
-    assert timeline.complete_until(mark(2, 0.2), (A, 1))
-    assert not timeline.complete_until(mark(3, 0.3), (A, 1))
-    assert timeline.note(mark(2, 0.2)).complete_until(mark(4, 0.4), (A, 1))
-    assert not timeline.complete_until(mark(2**60, 9), (A, 3))
-    assert timeline.complete_until(mark(0, 1, B), (A, 3))
-    assert not timeline.complete_until(mark(1, 1, B), (A, 3))
-
-
-def test_equal_stamps_are_ordered_by_sequence() -> None:
-    """Of two frames of one stamp the one with the lower number goes first; after the other it is late."""
-    assert verdicts([mark(5, 1), mark(6, 1)]) == [Verdict.FIRST, Verdict.NEXT]
-    assert verdicts([mark(4, 0.9), mark(6, 1), mark(5, 1)]) == [Verdict.FIRST, Verdict.NEXT, Verdict.LATE]
-
-
-def test_a_frame_behind_a_processed_one_is_late() -> None:
-    """A frame that was overtaken is refused, once and again, and does not disturb the stream."""
-    arrived = [mark(0, 0), mark(2, 0.2), mark(1, 0.1), mark(1, 0.1), mark(3, 0.3)]
-    assert verdicts(arrived) == [Verdict.FIRST, Verdict.NEXT, Verdict.LATE, Verdict.LATE, Verdict.NEXT]
-
-
 def test_a_jump_restarts_the_session() -> None:
     """A clock set by an hour, ahead or back, begins a new generation once three frames agree; one behind is late."""
     for to in (3600, -3600):
@@ -222,13 +199,6 @@ def test_what_was_sent_before_a_jump_goes_before_it() -> None:
     after = [mark(5, 60), mark(6, 60.1), mark(7, 60.2)]
     _, timeline = judge_all([mark(0, 0), *after, mark(4, 1.5)], window=True)
     assert [place.era for place in timeline.places().values()] == [1, 1, 1, 1, 2]
-
-
-def test_a_restarted_publisher_continues_the_density() -> None:
-    """A new epoch whose stamps go on keeps the generation and begins its numbers anew."""
-    decisions, _ = judge_all([mark(0, 0), mark(7, 0.7), mark(0, 2, B), mark(1, 2.1, B)])
-    assert [d.verdict for d in decisions][2:] == [Verdict.NEW_EPOCH, Verdict.NEXT]
-    assert {d.place.generation for d in decisions} == {0}
 
 
 def test_a_replay_restarts_the_session() -> None:
