@@ -6,13 +6,10 @@ From the outside in:
 
     app             the command, processes, the parts of a service put together, start and end
     http, grpc, ros2    edges: health, metrics, page; gateway; bridge
-    zenoh           the network, behind the protocols of `runtime.ports`
+    stream          sessions, which know the filter, and around them backlogs, tracking, recovery, checkpoints, queries
+    zenoh           the network
     cluster         leases, checkpoints and the log: SQLite or NATS
-    runtime         streams and queries, found and sorted; one actor for each stream
-    session         one density and all decisions about it
     telemetry       metrics, health, problems, logs
-
-Only `zenoh` knows Zenoh, only `session` knows the filter.
 """
 
 from importlib.metadata import version

@@ -24,8 +24,8 @@ ARROWS = {
     "stream": {"cluster", "telemetry", "zenoh", "settings"},
     "ros2": {"settings", "zenoh"},
     "zenoh": {"settings"},
-    "http": {"stream", "telemetry"},
-    "grpc": {"stream", "telemetry", "settings", "zenoh"},
+    "http": {"telemetry"},
+    "grpc": {"telemetry", "settings", "zenoh"},
     "app": {
         "cluster",
         "telemetry",
