@@ -293,13 +293,16 @@ def observe(
             speed, yaw = math.hypot(*tracks.velocity[row].tolist()), float(tracks.yaw[row])
             now = Event("", "entered", 0, identity, labels[tracks.label[row]], stamp_ns, (x, y, z), speed, yaw)
             seen, more = _moved(zones, old, seen, now, where[at].tolist(), net[at].tolist())
-            seen = seen._replace(held=(*seen.held, *more))
+            if seen.confirmed:  # once is enough
+                events += more
+            else:
+                seen = seen._replace(held=(*seen.held, *more))
         else:
             seen = seen._replace(known=everywhere)
         known[identity] = seen
     for row in np.flatnonzero(confirmed).tolist():
         seen_now = known.get(identities[row])
-        if seen_now is not None and (seen_now.held or not seen_now.confirmed):
+        if seen_now is not None and not seen_now.confirmed:
             events += seen_now.held
             known[identities[row]] = seen_now._replace(confirmed=True, held=())
     times = [_ns(one.lost_s) for one in zones if one.polygon] or [_ns(Zone.lost_s)]

@@ -78,7 +78,7 @@ def walks(seed: int, count: int = 12, steps: int = 300) -> list[Frame]:
         missed = rng.random(count) < 0.1
         frames.append(frame({i + 1: None if missed[i] else tuple(place[i]) for i in here}))
         frames[-1].label = np.array([i % 2 for i in here], np.int64)
-        frames[-1].confirmed = np.array([step >= first[i] + 5 for i in here], np.bool_)
+        frames[-1].confirmed = np.array([step >= first[i] + 5 and rng.random() < 0.8 for i in here], np.bool_)
     return frames
 
 
