@@ -2,7 +2,7 @@
 
     zones = (Zone("crossing", polygon=[(0, 0), (20, 0), (20, 12), (0, 12)]), Zone("gate", line=[(0, -5), (0, 5)]))
     state = ZoneState()
-    state, events = observe(zones, state, stamp_ns, tracks, labels)
+    state, events = observe(zones, state, stamp_ns, tracks, labels, tracks.confirmed)
 
 `observe` is pure, as the step of the tracker is. Only frames in which a track was detected move it. Events of a track
 come when it is confirmed.
