@@ -14,7 +14,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args, get_origin
 
-from optipmb_service.settings import LimitSettings, Ros2Settings, Ros2Stream, Settings, SiteSettings
+from optipmb_service.settings import LimitSettings, Ros2Settings, Ros2Stream, Settings, SiteSettings, ZoneSettings
 from optipmb_service.stream.problems import CODES
 from optipmb_service.telemetry.logs import EVENTS
 from optipmb_service.telemetry.metrics import METRICS, NAMESPACE
@@ -41,6 +41,7 @@ def settings() -> str:
     """Return the table of all settings."""
     tables: tuple[tuple[str, type[BaseModel]], ...] = (
         *(("", Settings), ("limits.", LimitSettings), ("sites.NAME.", SiteSettings)),
+        ("zones.NAME.", ZoneSettings),
         *(("ros2.", Ros2Settings), ("ros2.streams.NAME.", Ros2Stream)),
     )
     rows = []

@@ -53,6 +53,9 @@ class Role:
     receives: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...]
 
 
+OUTPUTS = ("tracks", "events", "problems")
+
+
 def recoverable(*keys: str) -> tuple[str, ...]:
     """Give keys with those below them that recovery uses: caches, heartbeats, tokens of publishers."""
     return tuple(key for one in keys for key in (one, f"{one}/@adv/**"))
@@ -61,7 +64,7 @@ def recoverable(*keys: str) -> tuple[str, ...]:
 def node(prefix: str, name: str) -> Role:
     """Give a perception node `site/node`: it publishes for its own sensors, and reads what comes of that."""
     inputs = recoverable(f"{prefix}/{name}/*/detections", f"{prefix}/{name}/*/points")
-    outputs = recoverable(f"{prefix}/{name}/*/tracks", f"{prefix}/{name}/*/problems")
+    outputs = recoverable(*(f"{prefix}/{name}/*/{topic}" for topic in OUTPUTS))
     questions = (f"{prefix}/{name}/*/q/*",)
     presence = (f"{prefix}/service/*/alive", f"{prefix}/owner/{name}/*/*")
     everywhere = recoverable(f"{prefix}/**")
@@ -85,7 +88,7 @@ def node(prefix: str, name: str) -> Role:
 def service(prefix: str, name: str) -> Role:
     """Give a tracking service: it reads all inputs, writes all outputs, answers, and owns streams."""
     inputs = recoverable(f"{prefix}/*/*/*/detections", f"{prefix}/*/*/*/points")
-    outputs = recoverable(f"{prefix}/*/*/*/tracks", f"{prefix}/*/*/*/problems")
+    outputs = recoverable(*(f"{prefix}/*/*/*/{topic}" for topic in OUTPUTS))
     questions = (f"{prefix}/*/*/*/q/*", f"{prefix}/service/*/q/*")
     presence = (f"{prefix}/service/**", f"{prefix}/owner/**")
     return Role(
@@ -107,7 +110,7 @@ def service(prefix: str, name: str) -> Role:
 
 def viewer(prefix: str, name: str) -> Role:
     """Give a person or program that looks: it reads everything, asks about it, and writes nothing."""
-    everything = recoverable(*(f"{prefix}/*/*/*/{topic}" for topic in ("detections", "points", "tracks", "problems")))
+    everything = recoverable(*(f"{prefix}/*/*/*/{topic}" for topic in ("detections", "points", *OUTPUTS)))
     questions = tuple(f"{prefix}/*/*/*/q/{what}" for what in ("state", "density", "tracks"))
     questions += (f"{prefix}/service/*/q/status", f"{prefix}/service/*/q/metrics")
     presence = (f"{prefix}/service/**", f"{prefix}/owner/**")
@@ -122,7 +125,7 @@ def viewer(prefix: str, name: str) -> Role:
 def gateway(prefix: str, name: str) -> Role:
     """Give a gRPC gateway: it does for its callers what they may do, and looks at their certificates itself."""
     inputs = recoverable(f"{prefix}/*/*/*/detections", f"{prefix}/*/*/*/points")
-    outputs = recoverable(f"{prefix}/*/*/*/tracks", f"{prefix}/*/*/*/problems")
+    outputs = recoverable(*(f"{prefix}/*/*/*/{topic}" for topic in OUTPUTS))
     questions = (f"{prefix}/*/*/*/q/*", f"{prefix}/service/*/q/status")
     presence = (f"{prefix}/service/*/alive",)
     return Role(

@@ -52,6 +52,7 @@ CHANNELS: Final = {
     "detections": Channel("detections", (_STREAM,), ("Detections",), about=f"Put by the publisher. {_CACHED}"),
     "points": Channel("points", (_STREAM,), ("Points",), about="Put by the publisher; dropped under congestion."),
     "tracks": Channel("tracks", (_STREAM,), ("Tracks",), (), f"Put by the service. {_CACHED}", "send"),
+    "events": Channel("events", (_STREAM,), ("Events",), (), f"Put by the service. {_CACHED}", "send"),
     "problems": Channel("problems", (_STREAM,), ("Problem",), (), "Put by the service.", "send"),
     "state": _query("state", (QUERY,), "SessionState"),
     "density": _query("density", (QUERY,), "Density"),

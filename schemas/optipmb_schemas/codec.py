@@ -46,7 +46,7 @@ from optipmb_schemas.control import (
 )
 from optipmb_schemas.errors import MessageError, invalid, show
 from optipmb_schemas.limits import DEFAULT, Limits
-from optipmb_schemas.messages import Density, Detections, FieldOfView, Points, Pose, Tracks
+from optipmb_schemas.messages import Density, Detections, Events, FieldOfView, Points, Pose, Tracks
 from optipmb_schemas.model import Message
 
 try:
@@ -60,6 +60,7 @@ MESSAGES: Final[tuple[type[Message], ...]] = (
     Detections,
     Points,
     Tracks,
+    Events,
     SessionState,
     Density,
     SessionParameters,

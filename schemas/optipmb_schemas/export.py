@@ -23,14 +23,23 @@ from optipmb_schemas.codec import MAJOR, MESSAGES, encoding_of
 from optipmb_schemas.control import MemberSummary, SessionState, SessionSummary
 from optipmb_schemas.errors import CODES
 from optipmb_schemas.limits import DEFAULT
-from optipmb_schemas.messages import Delivery, Detections, FieldOfView, Pose, Tracks
+from optipmb_schemas.messages import Delivery, Detections, FieldOfView, Pose, Tracks, ZoneCount, ZoneEvent
 from optipmb_schemas.model import Message
 
 SUFFIX = ".schema.json"
 
 _TABLE: Final = re.compile(r"(<!-- table: ([A-Za-z]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
-_KINDS: Final[tuple[type[Message], ...]] = (*MESSAGES, Pose, FieldOfView, Delivery, MemberSummary, SessionSummary)
+_KINDS: Final[tuple[type[Message], ...]] = (
+    *MESSAGES,
+    Pose,
+    FieldOfView,
+    Delivery,
+    ZoneEvent,
+    ZoneCount,
+    MemberSummary,
+    SessionSummary,
+)
 _KIND: Final = {kind.__name__: kind for kind in _KINDS}
 
 

@@ -27,8 +27,11 @@ from optipmb_schemas.model import (
     SessionId,
     Stamp,
     Stream,
+    Word,
 )
 
+Real = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Counts = Annotated[tuple[Count, ...], Field(max_length=256)]
 FAR = 1e8
 """Largest coordinate in metres: beyond every map projection, small enough that no square overflows."""
 INT64 = 2**63 - 1
@@ -325,6 +328,85 @@ def _validated(values: Mapping[str, Numeric]) -> dict[str, Numeric]:
         except MessageError as error:
             raise error.under(name) from None
     return fields
+
+
+class ZoneEvent(Message):
+    """What a track did in a zone or at a line."""
+
+    zone: Word = Field(description="Name of the zone or line in the settings.")
+    kind: Literal["entered", "left", "stayed", "crossed"] = Field(description="What happened.")
+    n: Count = Field(description="Counts the events of this zone and kind from 1, through restarts and takeovers.")
+    id: Count = Field(description="The track.")
+    label: Count = Field(description="Its class when it entered, for `crossed` now; an index into `labels`.")
+    at_ns: Stamp = Field(
+        description="When: interpolated at a border or line; for `lost` and `ended` the last time inside."
+    )
+    position: Annotated[tuple[Real, ...], Field(min_length=3, max_length=3)] = Field(
+        description="Where: x, y, z in metres, world frame."
+    )
+    speed: Real = Field(description="Speed in m/s.")
+    yaw: Real = Field(description="Heading in radians, as in `Tracks`.")
+    how: Literal["crossed", "appeared", "lost", "ended"] | None = Field(
+        default=None,
+        description="Of `entered`: `crossed` the border or `appeared` inside. Of `left`: `crossed` the border, `lost`: "
+        "no longer detected, or `ended` with the session.",
+    )
+    dwell_s: NonNegative | None = Field(default=None, description="Of `left` and `stayed`: seconds inside.")
+    direction: Literal["left", "right"] | None = Field(
+        default=None, description="Of `crossed`: to which side of the line, seen from its first point to its last."
+    )
+
+
+class ZoneCount(Message):
+    """Counts of a zone or line, each a list with a number for every class of `labels`."""
+
+    zone: Word = Field(description="Name of the zone or line in the settings.")
+    inside: Counts = Field(description="Inside now: `entered` less `left`.")
+    entered: Counts = Field(description="Have entered.")
+    left: Counts = Field(description="Have left.")
+    appeared: Counts = Field(description="Of those that entered, appeared inside.")
+    lost: Counts = Field(description="Of those that left, were no longer detected.")
+    to_left: Counts = Field(description="Crossings of the line to its left.")
+    to_right: Counts = Field(description="Crossings of the line to its right.")
+
+
+class Events(Header):
+    """Events of the zones and lines of a stream at one frame, and their counts."""
+
+    sensor: Stream | None = Field(
+        default=None,
+        description="Stream of the detections, and of `epoch` and `seq`. Absent: it is `stream`.",
+    )
+    session: SessionId = Field(
+        description="32 hexadecimal digits. When it changes, earlier tracks have ended, except those whose ids return."
+    )
+    revision: Count = Field(
+        default=0,
+        description="Higher than 0: replaces, after a late frame, the events published for the same `session`, `epoch` "
+        "and `seq`.",
+    )
+    labels: Labels = Field(description="Names of the classes that `label` counts.")
+    events: tuple[ZoneEvent, ...] = Field(
+        default=(), max_length=100_000, fail_fast=True, description="In order of `at_ns`, `zone` and `id`."
+    )
+    zones: tuple[ZoneCount, ...] | None = Field(
+        default=None,
+        max_length=256,
+        description="Counts after this frame: at the first of each second of stamps, and with every revision.",
+    )
+    delivery: Delivery | None = Field(default=None, description="How this publication came about.")
+
+    def check(self) -> None:
+        """Labels must be in the list, and every count have one number for each."""
+        super().check()
+        classes = len(self.labels)
+        for at, event in enumerate(self.events):
+            if event.label >= classes:
+                raise invalid(f"events[{at}].label", f"an index into the {classes} labels", event.label)
+        for at, zone in enumerate(self.zones or ()):
+            for name, value in zone.present():
+                if name != "zone" and len(value) != classes:
+                    raise invalid(f"zones[{at}].{name}", f"{classes} numbers, as many as `labels`", len(value))
 
 
 class Density(Message):

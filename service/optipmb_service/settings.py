@@ -22,7 +22,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from optipmb_schemas import DEFAULT, Keys, Limits, MessageError
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+)
 from pydantic_settings import (
     BaseSettings,
     EnvSettingsSource,
@@ -34,6 +43,8 @@ from pydantic_settings import (
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from optipmb.zones import Zone
 
 PREFIX: Final = "OPTIPMB_"  # of environment variables
 RUN: Final = secrets.token_hex(3)  # tells this process from one with its number in a container of the same host name
@@ -197,6 +208,57 @@ class SiteSettings(BaseModel):
     """direction of the world's x axis, degrees clockwise from true north; 90: x is east, y is north"""
 
 
+Shape = tuple[tuple[float, float], ...]
+
+
+class ZoneSettings(BaseModel):
+    """A polygon or a line in the world frame, whose events are published for the streams that it names."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    streams: Patterns
+    """patterns of streams (as `garage/*/fused`); each session that matches counts for itself"""
+    polygon: Shape = ()
+    """3 to 1000 corners, m; closed by itself, without crossing itself"""
+    line: Shape = Field(default=(), validate_default=True)
+    """2 to 100 points, m, in place of a polygon"""
+    z: tuple[float, float] | None = None
+    """heights of centres inside, m; default: all"""
+    classes: tuple[str, ...] = ()
+    """classes that count; default: all"""
+    margin: float = Field(default=0.3, ge=0, le=100)
+    """m; an object leaves when it is farther outside, and crosses a line from farther on one side to farther on the
+    other"""
+    min_s: float = Field(default=0.5, ge=0, le=86_400)
+    """shorter visits give no events"""
+    lost_s: float = Field(default=2.0, ge=0, le=86_400)
+    """an object that was not detected for longer has left"""
+    dwell_s: tuple[Annotated[float, Field(gt=0, le=1e8)], ...] = ()
+    """times inside after which there is an event"""
+
+    @field_validator("polygon", "line")
+    @classmethod
+    def _check_shape(cls, value: Shape, info: ValidationInfo) -> Shape:
+        if info.field_name == "line" and bool(value) is bool(info.data.get("polygon", not value)):
+            raise ValueError(f"a polygon or a line, received {'both' if value else 'neither'}")
+        if value:
+            from optipmb.zones import Zone  # noqa: PLC0415 - compiles kernels
+
+            shape: dict[str, Any] = {str(info.field_name): value}
+            try:
+                Zone("zone", **shape)
+            except ValueError as error:
+                raise ValueError(str(error).partition(": ")[2]) from None
+        return value
+
+    def zone(self, name: str) -> Zone:
+        """Return the zone that these settings describe."""
+        from optipmb.zones import Zone  # noqa: PLC0415 - compiles kernels
+
+        values: dict[str, Any] = self.model_dump(exclude={"streams"}, exclude_none=True)
+        return Zone(name, **values | {"dwell_s": tuple(sorted(self.dwell_s))})
+
+
 def _default_instance() -> str:
     """Return a name that two services do not share."""
     host = re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname()[:HOST_CHARACTERS]) or "host"
@@ -328,7 +390,7 @@ class Settings(BaseSettings):
     is replaced"""
     restart_keys: int = Field(default=50_000, ge=100, le=60_000)
     """keys declared on the network after which a process restarts, its sessions continue from the store: Zenoh has
-    65,535 for the life of a process, and each stream that opens takes up to 5"""
+    65,535 for the life of a process, and each stream that opens takes up to 5, with zones 7"""
     grace_s: float = Field(default=1.0, ge=0, le=60)
     """at shutdown, time for frames already received"""
     http: Address = ""
@@ -356,6 +418,10 @@ class Settings(BaseSettings):
     """lowest level that is logged"""
     sites: dict[str, SiteSettings] = Field(default_factory=dict)
     """place of each site's world frame, by which the live page shows latitude, longitude and true heading"""
+    zones: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")], ZoneSettings] = Field(
+        default_factory=dict, max_length=256
+    )
+    """polygons and lines whose events are published, by name; equal on all members of a cluster"""
     ros2: Ros2Settings = Ros2Settings()
     """topics of ROS 2, for `optipmb-service ros2`"""
     limits: LimitSettings = LimitSettings()

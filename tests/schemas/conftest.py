@@ -1,6 +1,7 @@
 """One valid message of every type, small and complete: every field is present."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from optipmb_schemas import (
     Density,
     Detections,
     DrainRequest,
+    Events,
     FieldOfView,
     Message,
     MoveRequest,
@@ -22,6 +24,8 @@ from optipmb_schemas import (
     SessionSummary,
     Tracks,
     TracksRequest,
+    ZoneCount,
+    ZoneEvent,
 )
 
 EPOCH = bytes(range(16))
@@ -77,6 +81,27 @@ def _examples() -> list[Message]:
         path_yaw=np.array([[0.1, 0.2, -3.0], [0.0, -0.0, 1e-9]], dtype="f4"),
         path_covariance=np.broadcast_to(np.eye(2), (2, 3, 2, 2)),
         delivery=Delivery(instance="host-1", received_ns=5, published_ns=6, queue_ms=0.5, decode_ms=0.125, step_ms=3.0),
+    )
+    where: dict[str, Any] = {
+        "n": 3,
+        "id": 8,
+        "label": 1,
+        "at_ns": 5,
+        "position": (1.0, 2.0, 0.5),
+        "speed": 1.5,
+        "yaw": -3.0,
+    }
+    left = ZoneEvent(zone="crossing", kind="left", how="lost", dwell_s=2.5, **where)
+    crossed = ZoneEvent(zone="gate", kind="crossed", direction="left", **where)
+    names = ("inside", "entered", "left", "appeared", "lost", "to_left", "to_right")
+    events = Events(
+        **HEADER,
+        session="0123456789abcdef" * 2,
+        revision=1,
+        labels=("car", "pedestrian"),
+        events=(left, crossed),
+        zones=(ZoneCount(zone="crossing", **dict.fromkeys(names, (0, 3))),),
+        delivery=tracks.delivery,
     )
     state = SessionState(
         stream=HEADER["stream"],
@@ -136,6 +161,7 @@ def _examples() -> list[Message]:
         detections,
         points,
         tracks,
+        events,
         state,
         density,
         parameters,

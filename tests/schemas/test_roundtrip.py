@@ -14,6 +14,7 @@ from optipmb_schemas import (
     Density,
     Detections,
     DrainRequest,
+    Events,
     Message,
     MoveRequest,
     Points,
@@ -26,6 +27,8 @@ from optipmb_schemas import (
     SessionSummary,
     Tracks,
     TracksRequest,
+    ZoneCount,
+    ZoneEvent,
     decode,
     encode,
     encode_json,
@@ -200,6 +203,37 @@ def densities(draw: st.DrawFn) -> Density:
     )
 
 
+@st.composite
+def zone_events(draw: st.DrawFn) -> Events:
+    """Return events of zones."""
+    names, number = draw(labels), st.floats(allow_nan=False, allow_infinity=False)
+    event = st.builds(
+        ZoneEvent,
+        zone=word,
+        kind=st.sampled_from(["entered", "left", "stayed", "crossed"]),
+        n=count,
+        id=count,
+        label=st.integers(0, len(names) - 1),
+        at_ns=count,
+        position=st.tuples(number, number, number),
+        speed=number,
+        yaw=number,
+        how=st.sampled_from([None, "crossed", "appeared", "lost", "ended"]),
+        dwell_s=st.none() | duration,
+        direction=st.sampled_from([None, "left", "right"]),
+    )
+    columns = set(ZoneCount.names) - {"zone"}
+    counts = st.builds(ZoneCount, zone=word, **dict.fromkeys(columns, st.tuples(*[count] * len(names))))
+    return Events(
+        **draw(headers()),
+        session=draw(session),
+        revision=draw(count),
+        labels=tuple(names),
+        events=tuple(draw(st.lists(event, max_size=3))),
+        zones=draw(st.none() | st.lists(counts, max_size=3).map(tuple)),
+    )
+
+
 problems = st.builds(
     Problem,
     stream=text,
@@ -226,6 +260,7 @@ messages: dict[type[Message], st.SearchStrategy[Message]] = {
     Detections: detections(),
     Points: points(),
     Tracks: tracks(),
+    Events: zone_events(),
     SessionState: st.builds(
         SessionState,
         stream=stream,

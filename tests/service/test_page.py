@@ -107,3 +107,13 @@ def test_the_examples_are_a_settings_file(tmp_path: Path) -> None:
     assert (settings.instance, settings.limits.max_points) == ("edge-1", 300_000)
     assert list(settings.profiles) == ["garage/*/lidar*", "yard/crane/*"]
     assert settings.sites["garage"].x_heading == 90.0
+
+
+def test_the_zones_of_the_example_are_valid(tmp_path: Path) -> None:
+    """The settings on the page of zones are accepted as they stand."""
+    (example,) = re.findall(
+        r"```toml\n(.*?)```", OPERATION.with_name("zones.md").read_text(encoding="utf-8"), re.DOTALL
+    )
+    file = tmp_path / "zones.toml"
+    file.write_text(example, encoding="utf-8")
+    assert [one.zone(name).name for name, one in load(file).settings.zones.items()] == ["yard", "gate"]

@@ -9,6 +9,9 @@ NAN = float("nan")
 INF = float("inf")
 HUGE = 10**30
 SPREAD = [[0.5, 0.1, 0], [0.1, 0.25, 0], [0, 0, 1]]
+COUNTS = ("inside", "entered", "left", "appeared", "lost", "to_left", "to_right")
+EVENT = {"zone": "a", "kind": "left", "n": 1, "id": 1, "label": 0, "at_ns": 0}
+EVENT |= {"position": [0.0, 0.0, 0.0], "speed": 0.0, "yaw": 0.0}
 
 # type, field, value, path of the error
 RULES: list[tuple[str, str, Any, str]] = [
@@ -169,6 +172,12 @@ RULES: list[tuple[str, str, Any, str]] = [
     ("Tracks", "path_yaw", None, "path_yaw"),
     ("Tracks", "path_covariance", [[[[1, 0], [0, 1e31]]] * 3] * 2, "path_covariance[0][0][1][1]"),
     ("Tracks", "delivery", {"instance": "a"}, "delivery.received_ns"),
+    # events
+    ("Events", "events", [{}], "events[0].zone"),
+    ("Events", "events", [EVENT | {"label": 2}], "events[0].label"),
+    ("Events", "events", [EVENT, EVENT | {"kind": "came"}], "events[1].kind"),
+    ("Events", "events", [EVENT | {"position": [0.0, 1.0]}], "events[0].position"),
+    ("Events", "zones", [{name: [0, 0] for name in COUNTS} | {"zone": "a", "lost": [0]}], "zones[0].lost"),
     # control
     ("SessionParameters", "cloud_wait_s", -1, "cloud_wait_s"),
     ("SessionParameters", "cloud_wait_s", "0.1", "cloud_wait_s"),

@@ -78,7 +78,7 @@ class Around:
         """All may be published."""
         return True
 
-    def open_publisher(self, _: str) -> Around:
+    def open_publisher(self, _: str, events: bool = False) -> Around:  # noqa: ARG002, FBT001, FBT002 - as the service calls it
         """Be the publisher of a stream."""
         return self
 
@@ -89,6 +89,8 @@ class Around:
 
     def publish(self, _: bytes) -> None:
         """Tracks go nowhere."""
+
+    publish_events = publish
 
 
 def streams_of(

@@ -24,6 +24,7 @@ from optipmb_schemas.model import first_error
 from pydantic import BaseModel, Field, ValidationError
 
 import optipmb
+from optipmb.zones import MOST, Seen, ZoneState
 from optipmb_service.stream import convert
 from optipmb_service.stream.state import UNPLACED, FilterState, FrameCounts, ProcessedFrame, SensorState
 from optipmb_service.stream.timeline import EPOCHS, WINDOW, FrameId, SeenNumbers
@@ -56,6 +57,7 @@ MAX_BYTES: Final = 2**28
 MAX_PROFILES: Final = 64
 """Profiles whose form in checkpoints is remembered."""
 
+ZONE_BYTES: Final = MOST // 8
 _msgpack: Any = msgpack  # its type information is partial
 _profiles: dict[int, tuple[optipmb.Parameters, bytes]] = {}
 """The profiles that were written last, by their ids."""
@@ -218,9 +220,19 @@ def _packed(value: Any) -> Any:
         points = value.packed[0] if value.packed else None
         return {"detections": value.detections, "points": points, "missed": value.missed, "revision": value.revision}
     table = {name: getattr(value, name) for name in value.__match_args__}
+    if isinstance(value, ZoneState):
+        tracks = sorted(value.tracks.items())
+        packed = [(number, one.known.to_bytes(ZONE_BYTES, "big"), one._replace(known=0)) for number, one in tracks]
+        counts = {
+            zone: {name: sorted(one.items()) for name, one in sorted(names.items())}
+            for zone, names in sorted(value.counts.items())
+        }
+        return table | {"tracks": packed, "counts": counts, "numbers": dict(sorted(value.numbers.items()))}
     if isinstance(value, FilterState):
         density, sensors = value.density, dict(sorted(value.sensors.items()))
         clock = {"stamp_ns": density.stamp_ns, "next_id": density.next_id}
+        if table["zones"] is None:
+            del table["zones"]
         return clock | table | {"density": optipmb.bytes_of(density), "sensors": sensors}
     return table
 
@@ -241,6 +253,20 @@ Flag = Annotated[bool, Field(strict=True)]
 Text = Annotated[str, Field(strict=True, max_length=MAX_ERROR)]
 
 
+class _Zones(BaseModel):
+    tracks: tuple[tuple[Count, Annotated[bytes, Field(strict=True, max_length=ZONE_BYTES)], Seen], ...]
+    counts: dict[str, dict[str, tuple[tuple[str, int], ...]]]
+    numbers: dict[str, Count]
+    zones: tuple[str, ...]
+    session: str
+
+    def state(self) -> ZoneState:
+        """Return what is known of the zones."""
+        tracks = {number: one._replace(known=int.from_bytes(known, "big")) for number, known, one in self.tracks}
+        counts = {zone: {name: dict(one) for name, one in by_name.items()} for zone, by_name in self.counts.items()}
+        return ZoneState(tracks, counts, self.numbers, self.zones, self.session)
+
+
 class _State(BaseModel):
     stamp_ns: Annotated[int, Field(strict=True, ge=-1, lt=2**63)]
     next_id: Count
@@ -252,6 +278,7 @@ class _State(BaseModel):
     tracks: Whole
     counts: FrameCounts
     sensors: Annotated[dict[SensorName, SensorState], Field(max_length=MAX_SENSORS)]
+    zones: _Zones | None = None
 
 
 class _Frame(BaseModel):
@@ -356,5 +383,5 @@ def _state_of(one: _State, stream: str, parameters: optipmb.Parameters) -> Filte
     labels = parameters.labels
     density = optipmb.density_of(one.stamp_ns, one.next_id, optipmb.columns_in(one.density, len(labels)), labels)
     convert.density_of(density, stream=stream, session=one.session, parameters=parameters)  # it can be asked for
-    others = {name: getattr(one, name) for name in FilterState.__match_args__ if name != "density"}
-    return FilterState(density=density, **others)
+    others = {name: getattr(one, name) for name in FilterState.__match_args__ if name not in {"density", "zones"}}
+    return FilterState(density=density, **others, zones=None if one.zones is None else one.zones.state())

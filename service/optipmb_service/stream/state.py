@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     import optipmb
+    from optipmb.zones import ZoneState
 
 ClassName = Annotated[str, Field(strict=True, max_length=64)]
 _Metres = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -105,6 +106,7 @@ class FilterState:
         tracks: number of tracks at the last frame tracked.
         counts: of the frames.
         sensors: each sensor by its stream; the only one of a stream's own session by an empty name.
+        zones: what is known of the zones; None: it has none.
     """
 
     density: optipmb.Density
@@ -115,6 +117,7 @@ class FilterState:
     tracks: int = 0
     counts: FrameCounts = field(default_factory=FrameCounts)
     sensors: Mapping[str, SensorState] = field(default_factory=dict)
+    zones: ZoneState | None = None
 
     def sensor(self, name: str) -> SensorState:
         """Return the state of a sensor, the initial one before its first frame."""

@@ -80,12 +80,13 @@ class Stream:
         self.sensors = Sensors(name, self.meter, fused=self.fused)
         self.log_check = LogCheck(streams.silent_ns)
         self._streams = streams
+        self._policy = streams.policy_for(name)
         self._member = streams.member
         self._prefix = f"{streams.keys.prefix}/"
         self._step_limit_ns = streams.step_limit_ns
         self._publisher: StreamPublisher | None = None
-        self._unpublished: list[tuple[bytes, Tracked, int]] = []
-        """Encoded tracks that wait for the write lease, each with the time that its frame waited, ns."""
+        self._unpublished: list[tuple[bytes, bytes | None, Tracked, int]] = []
+        """Encoded tracks and events that wait for the write lease, each with the time that its frame waited, ns."""
         self._ids = b""
         """Ids of the newest tracks, as the bytes of int64."""
         self._caches = CacheRecovery(name, streams)
@@ -301,7 +302,7 @@ class Stream:
 
     def _open_publisher(self) -> None:
         try:
-            self._publisher = self._streams.open_publisher(self.name)
+            self._publisher = self._streams.open_publisher(self.name, bool(self._policy.zones))
         except TransportError as error:
             log.warning("publisher_failed", stream=self.name, error=str(error))
 
@@ -320,7 +321,7 @@ class Stream:
             "run": tracked.run,
         }
         self._count_tracks(tracked.estimates.id.tobytes())
-        self._unpublished.append((tracked.encoded(delivery), tracked, waited_ns))
+        self._unpublished.append((tracked.encoded(delivery), tracked.encoded_events(delivery), tracked, waited_ns))
         self._publish()
 
     def _publish(self) -> None:
@@ -328,10 +329,12 @@ class Stream:
         if not self._unpublished or not self._member.may_write(self.name, self._fence):
             return
         waiting, self._unpublished = self._unpublished, []
-        for payload, tracked, waited_ns in waiting:
+        for payload, events, tracked, waited_ns in waiting:
             try:
                 if self._publisher is not None:
                     self._publisher.publish(payload)
+                    if events is not None:
+                        self._publisher.publish_events(events)
             except TransportError as error:
                 log.warning("publish_failed", stream=self.name, error=str(error))
             else:
@@ -449,7 +452,7 @@ class Stream:
             if checkpoint.fused is not self.fused:
                 raise CheckpointError(f"of {'several streams' if checkpoint.fused else 'one stream'}, by `fuse` then")
             return Session.restore(
-                checkpoint, now_ns, streams.policy, fence=fence or 1, instance=streams.instance, tracker=streams.tracker
+                checkpoint, now_ns, self._policy, fence=fence or 1, instance=streams.instance, tracker=streams.tracker
             )
 
         def refused(error: CheckpointError) -> None:
@@ -506,7 +509,7 @@ class Stream:
         session = Session(
             self.name,
             self._streams.profiles.of(self.name),
-            self._streams.policy,
+            self._policy,
             fused=self.fused,
             instance=self._streams.instance,
             incarnation=Incarnation(

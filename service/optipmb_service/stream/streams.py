@@ -9,6 +9,8 @@ from __future__ import annotations
 import queue
 import threading
 import time
+from dataclasses import replace
+from fnmatch import fnmatchcase
 from functools import lru_cache, partial
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, Literal
@@ -88,7 +90,7 @@ class Streams:
     Args:
         settings: in force.
         profiles: the parameters that can be had.
-        open_publisher: opens the publisher of a stream's tracks.
+        open_publisher: opens the publisher of a stream's tracks, and of its events.
         reporter: takes problems.
         scheduler: runs the streams.
         member: knows which streams are tracked here.
@@ -107,7 +109,7 @@ class Streams:
         settings: Settings,
         profiles: Profiles,
         *,
-        open_publisher: Callable[[str], StreamPublisher],
+        open_publisher: Callable[[str, bool], StreamPublisher],
         reporter: ProblemReporter,
         scheduler: Scheduler,
         member: Member,
@@ -132,6 +134,7 @@ class Streams:
         self.fusion = Fusion(settings.fuse)
         self.limits = settings.limits.limits()
         self.policy = policy_of(settings)
+        self._zones = [(one.streams, one.zone(name)) for name, one in sorted(settings.zones.items())]
         self.queue_frames = settings.queue_frames
         self.step_limit_ns = round(settings.step_limit_s * SECOND)
         self.silent_ns = round(settings.lease_s * SECOND)
@@ -272,6 +275,11 @@ class Streams:
                     del self._backlogs[stream.name]
 
     # Present streams
+
+    def policy_for(self, session: str) -> Policy:
+        """Return the policy of a session, with its zones."""
+        zones = (zone for patterns, zone in self._zones if any(fnmatchcase(session, one) for one in patterns))
+        return replace(self.policy, zones=tuple(zones))
 
     def tracking(self) -> list[Stream]:
         """Return the streams that have a session, by name."""

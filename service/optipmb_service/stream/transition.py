@@ -27,6 +27,7 @@ import optipmb_schemas as schemas
 
 import optipmb
 from optipmb.rows import record
+from optipmb.zones import Shapes, ZoneState, adapted, end, observe
 from optipmb_service.stream import convert
 from optipmb_service.stream.state import FilterState, FrameCounts, PoseHistory, SensorState
 from optipmb_service.stream.timeline import JUMP_FRAMES, FrameId, Verdict
@@ -36,6 +37,7 @@ from optipmb_service.telemetry.stream_meter import total
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from optipmb.zones import Event
     from optipmb_service.stream.state import Inputs, Position, ProcessedFrame
     from optipmb_service.stream.values import Policy, Reason, Tracked
 
@@ -83,6 +85,7 @@ class Transition:
         self.parameters = parameters
         self._tracker = tracker
         self._policy = policy
+        self._shapes = Shapes.of(policy.zones)
         values = json.dumps(parameters.model_dump(mode="json", exclude={"horizons"}))  # no track depends on them
         self._digest = hashlib.blake2b(values.encode(), digest_size=16).digest()
 
@@ -267,6 +270,10 @@ class Transition:
             ignored=ignored,
             labels=self.parameters.labels,
         )
+        zones, tracks.events = self._zones(before, result.tracks, frame_id.stamp_ns)
+        second = None if before.last is None else before.last.stamp_ns // SECOND
+        if zones is not None and (frame.revision or second != frame_id.stamp_ns // SECOND):
+            tracks.counts = {one.name: zones.counts.get(one.name, {}) for one in self._policy.zones}
         unknown = self._unknown(message, sensor.reported) if ignored else {}
         repaired = int(result.diagnostics.repaired)
         known = SensorState(
@@ -284,8 +291,25 @@ class Transition:
             tracks=len(result.tracks),
             counts=_counted(before, frame, frames=1, gaps=gap, clouds_used=used, repaired=repaired),
             sensors=_sensors(before, frame_id.sensor, known),
+            zones=zones,
         )
         return after, Outcome(frame, tracks, begun, unknown)
+
+    def _zones(
+        self, before: FilterState, tracks: optipmb.Tracks, stamp_ns: int
+    ) -> tuple[ZoneState | None, tuple[Event, ...]]:
+        """Return what is known of the zones after a frame, and its events."""
+        zones = self._policy.zones
+        ended: tuple[Event, ...] = ()
+        if not zones:
+            return None, ()
+        state = adapted(zones, before.zones or ZoneState())
+        if state.session != before.session:
+            state, ended = end(zones, state)
+            state = replace(state, session=before.session)
+        labels = self.parameters.labels
+        state, events = observe(zones, state, stamp_ns, tracks, labels, tracks.confirmed, self._shapes)
+        return state, (*ended, *events)
 
     def _unknown(self, message: schemas.Detections, reported: frozenset[str]) -> dict[str, int]:
         found = convert.unknown_labels(self.parameters, message)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping  # noqa: TC003 - at run time as the others
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
@@ -10,6 +11,7 @@ import optipmb_schemas as schemas
 from pydantic import AfterValidator, Field
 
 import optipmb
+from optipmb.zones import COUNTS, Event, Zone
 from optipmb_service.telemetry.stream_meter import MAX_COUNT
 
 SECOND: Final = 1_000_000_000
@@ -80,6 +82,7 @@ class Policy:
         max_speed: fastest that a sensor moves; 0: any pose is taken.
         pose_margin: how far a pose may lie from where that speed allows.
         astray_frames: frames in a row that agree on another place until the session restarts there.
+        zones: those whose events the session finds.
         at_once: frames that are ready which one call takes through the tracker; the next calls take the others. More
             are taken only while more than `held_bytes` are held.
     """
@@ -100,6 +103,7 @@ class Policy:
     pose_margin: float = 10.0
     astray_frames: int = 5
     at_once: int = 2**62
+    zones: tuple[Zone, ...] = ()
 
     @property
     def jump_limits(self) -> JumpLimits:
@@ -136,6 +140,8 @@ class Tracked:
         ticket: value that the caller gave with the detections.
         step_ns: time that conversion and tracking took.
         run: see `Session.run`.
+        events: those of the zones.
+        counts: of all zones after the frame, by zone, name of `COUNTS` and class; None: not to be published.
     """
 
     estimates: optipmb.Tracks
@@ -144,6 +150,8 @@ class Tracked:
     ticket: Any = None
     step_ns: int = 0
     run: int = 0
+    events: tuple[Event, ...] = ()
+    counts: Mapping[str, Mapping[str, Mapping[str, int]]] | None = None
 
     @property
     def tracks(self) -> schemas.Tracks:
@@ -160,6 +168,36 @@ class Tracked:
             return schemas.encode(self.tracks, delivery=schemas.Delivery.trusted(delivery))
         words = self.estimates.words
         return schemas.encode_columns(schemas.Tracks, self.header, COLUMNS, words, {"delivery": delivery})
+
+    def encoded_events(self, delivery: dict[str, Any]) -> bytes | None:
+        """Return the bytes of the message with the events and counts of zones, None where there are none."""
+        if not self.events and self.counts is None:
+            return None
+        counts = self.counts or {}
+        named = (label for zone in counts.values() for by_class in zone.values() for label in by_class)
+        # Of a profile that was in force before there may be classes that this one lacks.
+        labels = tuple(dict.fromkeys((*self.header["labels"], *(one.label for one in self.events), *sorted(named))))
+        message = schemas.Events(
+            **self.header | {"labels": labels},
+            events=tuple(
+                schemas.ZoneEvent(
+                    **one._asdict()
+                    | {"label": labels.index(one.label), "how": one.how or None, "direction": one.direction or None}
+                    | {"dwell_s": one.dwell_s if one.kind in {"left", "stayed"} else None}
+                )
+                for one in self.events
+            ),
+            zones=None
+            if self.counts is None
+            else tuple(_zone_count(name, one, labels) for name, one in counts.items()),
+            delivery=schemas.Delivery.trusted(delivery),
+        )
+        return schemas.encode(message)
+
+
+def _zone_count(name: str, counts: Mapping[str, Mapping[str, int]], labels: tuple[str, ...]) -> schemas.ZoneCount:
+    columns = {one: tuple(counts.get(one, {}).get(label, 0) for label in labels) for one in COUNTS}
+    return schemas.ZoneCount(zone=name, **columns)
 
 
 Reason = Literal["first", "jump", "clock", "publisher", "pose", "effort", "reset", "parameters", "quarantine"]

@@ -57,16 +57,16 @@ log = structlog.get_logger("optipmb_service")
 
 
 class StreamPublisher:
-    """The publisher of a stream's tracks, and what else is declared while it is there."""
+    """The publishers of a stream's tracks and events, and what else is declared while it is there."""
 
-    def __init__(self, sender: Sender, others: Sequence[Declared]) -> None:
-        self._sender = sender
-        self._others = others
+    def __init__(self, sender: Sender, events: Sender | None, others: Sequence[Declared]) -> None:
+        self._declared = (*others, *([events] if events else []), sender)
         self.publish = sender.put
+        self.publish_events = (events or sender).put
 
     def release(self) -> None:
         """Withdraw all of it."""
-        for one in (*self._others, self._sender):
+        for one in self._declared:
             one.close()
 
 
@@ -337,15 +337,22 @@ class Transport:
         """Say that this instance is alive; to be called when it is ready."""
         self._alive = self._client.token(self._keys.alive(self._instance))
 
-    def open_publisher(self, stream: str) -> StreamPublisher:
-        """Open the publisher of a stream's tracks, say that this instance tracks it, and declare its inputs' keys."""
+    def open_publisher(self, stream: str, events: bool = False) -> StreamPublisher:  # noqa: FBT001, FBT002
+        """Open the publishers of a stream: of its tracks, and with `events` of those.
+
+        Say that this instance tracks it, and declare its inputs' keys.
+        """
+
         # Who subscribes asks the caches, and hears by heartbeats of missed messages: no token is needed for that, and
         # each costs the router more the more there are.
-        key, encoding = self._keys.tracks(stream), schemas.encoding_of(schemas.Tracks)
-        sender = self._client.cached_sender(key, encoding, cache=TRACKS_CACHE, detected=False)
+        def sender(key: str, kind: type[schemas.Message]) -> Sender:
+            return self._client.cached_sender(key, schemas.encoding_of(kind), cache=TRACKS_CACHE, detected=False)
+
+        tracks = sender(self._keys.tracks(stream), schemas.Tracks)
+        other = sender(self._keys.events(stream), schemas.Events) if events else None
         token = self._client.token(self._keys.owner(stream, self._instance))
         inputs = (self._keys.detections(stream), self._keys.points(stream)) if self._all else ()
-        return StreamPublisher(sender, (token, *map(self._client.declare_key, inputs)))
+        return StreamPublisher(tracks, other, (token, *map(self._client.declare_key, inputs)))
 
     def publish_problem(self, problem: schemas.Problem) -> None:
         """Send a problem on its stream's key; one without a stream has no key and is not sent."""
