@@ -1,6 +1,8 @@
 """What profiles that ship reach on real data: figures of each class, computed once in a process."""
 
+import re
 from functools import cache
+from pathlib import Path
 
 from optipmb_tools.datasets import DataSequence, open_dataset
 from optipmb_tools.results import FullTable, ResultTable
@@ -48,3 +50,8 @@ def figures(profile: str, detections: str, name: str) -> Figures:
     scorers, clips = material(profile.removesuffix("-paper"), detections)
     tracks = zip(clips[name], tracked(profile, detections, name), strict=True)
     return scorers[name].figures([scorers[name].measure(clip, table) for clip, (table, _) in tracks])
+
+
+def without_motion(profile: Path) -> bytes:
+    """Return a profile without the factors of speed and turn rate, which were set for each detector by hand."""
+    return re.sub(rb"(?m)^(calibration = .*?)(, (?:speed|turn_rate) = [0-9.]+)+ }$", rb"\1 }", profile.read_bytes())
