@@ -19,6 +19,7 @@ from optipmb.parameters import load_profile, parse_parameters
 from optipmb.paths import predict_tracks
 from optipmb.sensor_motion import Pairs, common_motion, sideways
 from optipmb.tracker import Modules, Tracker
+from optipmb.zones import Shapes, Zone, crossings, locate
 
 
 def kernels() -> dict[str, Any]:
@@ -58,6 +59,9 @@ def warm_up() -> int:
         pairs = Pairs(place, label, place, label)
         common_motion(pairs, np.zeros(3), 0.0, 0.0, 0.0)
         sideways(pairs, place, np.zeros(1), np.zeros(1, np.bool_))
+        line = Zone("line", line=((0.0, 0.0), (1.0, 0.0)))
+        locate(np.zeros((1, 3)), np.zeros((1, 2)), *Shapes.of([line]))
+        crossings(np.array(line.line), 0.0, 0.0, 0.0, 0.0)
     finally:
         gc.set_threshold(*thresholds)
     return compilations() - before

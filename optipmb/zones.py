@@ -360,7 +360,11 @@ def _moved(
             if where[k]:
                 beside[zone.name] = began or last
                 continue
-            crossed = net[k] if began is None else crossings(np.array(zone.line), *began[1][:2], *now.position[:2])
+            crossed = (
+                net[k]
+                if began is None
+                else crossings(np.array(zone.line, np.float64), *began[1][:2], *now.position[:2])
+            )
             if crossed and counts and (began or last)[0] >= 0:
                 at_ns, place = _border(zone.line, began or last, now)
                 event = now._replace(zone=zone.name, kind="crossed", at_ns=at_ns, position=place)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 SUPPORT = Path(__file__).resolve().parents[1] / "support"
 
 # Everything that a stream may bring, after the warm-up: with and without clouds, velocities, poses, calibration and
-# modules; arrays from messages, which are read-only; a density that was stored.
+# modules; zones; arrays from messages, which are read-only; a density that was stored.
 FRESH = """
 import json, sys
 from dataclasses import replace
@@ -30,6 +30,7 @@ sys.path.insert(0, sys.argv[1])
 import numpy as np
 import optipmb
 from optipmb.warm import compilations, kernels
+from optipmb.zones import Zone, ZoneState, observe
 from scenes import Options, random_parameters, scene
 
 compiled = optipmb.warm_up()
@@ -39,11 +40,12 @@ def read_only(array):
     return None if array is None else np.frombuffer(array.tobytes(), array.dtype).reshape(array.shape)
 
 here = optipmb.Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+zones = (Zone("a", polygon=((-30, -30), (30, -30), (0.0, 30.0))), Zone("b", line=((-50, 0), (50, 0)), margin=2.0))
 baselines = (optipmb.Modules(**{name: False}) for name in ("adp", "habm", "rpp", "ote"))
 for seed, modules in enumerate([optipmb.Modules(), optipmb.Modules(), *baselines]):
     parameters = optipmb.parse_parameters(random_parameters(seed, calibrated=seed % 2 == 0))
     tracker = optipmb.Tracker(parameters, modules)
-    density = tracker.initial()
+    density, state = tracker.initial(), ZoneState()
     for given in scene(seed, Options(frames=25, objects=25)):
         columns = given.columns()
         for name in ("label", "center", "size", "yaw", "score", "velocity"):
@@ -55,7 +57,9 @@ for seed, modules in enumerate([optipmb.Modules(), optipmb.Modules(), *baselines
         view = optipmb.FieldOfView(pose=here if seed > 4 else None) if seed > 3 else None
         frame, _ = optipmb.make_frame(parameters, pose=here if seed else None, field_of_view=view, **columns)
         frame = replace(frame, cloud=cloud)  # as where a cloud comes after its frame
-        density = tracker.step(density, frame).density
+        result = tracker.step(density, frame)
+        density, tracks = result.density, result.tracks
+        state, _ = observe(zones, state, frame.stamp_ns, tracks, parameters.labels, tracks.confirmed)
     stored = {name: read_only(column) for name, column in optipmb.columns_of(density).items()}
     density = optipmb.density_of(density.stamp_ns, density.next_id, stored, parameters.labels)
     tracker.step(density, frame)
