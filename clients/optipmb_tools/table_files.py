@@ -361,7 +361,9 @@ def write_table(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
             mark in text for name in texts for text in np.unique(columns[name]) for mark in (separator, '"', "\n")
         )
         style = "needed" if special else "none"  # "needed" quotes every text
-        csv.write_csv(table, content, csv.WriteOptions(delimiter=separator, quoting_style=style, quoting_header=style))
+        head = [f'"{name}"' for name in columns] if special else columns  # releases of pyarrow differ in it
+        content.write((separator.join(head) + "\n").encode())
+        csv.write_csv(table, content, csv.WriteOptions(include_header=False, delimiter=separator, quoting_style=style))
     elif kind in {".jsonl", ".ndjson"}:
         content.write("".join(json.dumps(row) + "\n" for row in table.to_pylist()).encode())
     elif kind == ".parquet":
