@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.density import ENOUGH, LEAST_MOVED_S, NO_FRAME, PHI, V
+from optipmb.density import ENOUGH, LEAST_MOVED_S, NO_FRAME, OMEGA, PHI, V
 from optipmb.rows import read_only
 
 if TYPE_CHECKING:
@@ -207,6 +207,11 @@ def _over_ground(density: Density, motion: Array, dt: float, frame: Frame) -> De
     apparent = (taken(mean[:, :2], motion) - mean[:, :2]) / dt
     along = apparent[:, 0] * np.cos(mean[:, PHI]) + apparent[:, 1] * np.sin(mean[:, PHI])
     mean[:, V] -= np.where(objects.seen_ns > objects.born_ns, along, 0.0)
+    free = (objects.covariance[:, OMEGA, OMEGA] == 0.0) & (objects.seen_ns > objects.born_ns)
+    if free.any():  # those of unknown heading: their whole velocity
+        v, phi = objects.mean[free, V, None], objects.mean[free, PHI]
+        over = v * np.column_stack((np.cos(phi), np.sin(phi))) - apparent[free]
+        mean[free, V], mean[free, PHI] = np.hypot(*over.T), np.arctan2(over[:, 1], over[:, 0])
     return replace(density, bernoulli=objects.replaced(mean=mean))
 
 
