@@ -1,7 +1,7 @@
 """States of objects whose heading nobody measured and whose motion has not shown it yet (not in the paper).
 
 Radars, people counters and cameras on a ground plane give points. Such an object moves at constant velocity in any
-direction, so its state is linear. It stays in the six entries of the motion state, in axes that face along its velocity:
+direction, so its state is linear. It is kept in the six entries of the motion state, in axes along its velocity:
 
     m = [x, y, v, phi, 0, 0]      velocity v along phi, none across
     P                             row and column phi hold the velocity ACROSS phi, m/s; those of omega and a are zero
@@ -137,4 +137,5 @@ def measured_bits(objects: Bernoullis, identity: Index) -> NDArray[np.uint8]:
     rows = np.searchsorted(objects.id, identity)
     known = ~np.isnan(objects.auxiliary[rows])
     heading = objects.covariance[rows, OMEGA, OMEGA] != 0.0
-    return (1 * heading + 2 * known[:, :3].all(axis=1) + 4 * known[:, 3]).astype(np.uint8)
+    bits: NDArray[np.uint8] = np.uint8(1) * heading + np.uint8(2) * known[:, :3].all(axis=1) + np.uint8(4) * known[:, 3]
+    return bits
