@@ -35,8 +35,8 @@ from optipmb_schemas.messages import (
     Tracks,
     ZoneCount,
     ZoneEvent,
-    class_fields,
     path_fields,
+    track_fields,
 )
 from optipmb_schemas.model import Message
 
@@ -77,7 +77,6 @@ __all__ = [
     "TracksRequest",
     "ZoneCount",
     "ZoneEvent",
-    "class_fields",
     "decode",
     "decode_dump",
     "encode",
@@ -87,4 +86,5 @@ __all__ = [
     "encoded",
     "encoding_of",
     "path_fields",
+    "track_fields",
 ]

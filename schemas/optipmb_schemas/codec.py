@@ -736,7 +736,7 @@ _Read = Callable[[tuple[memoryview, ...], dict[str, Any]], None]
 
 def _columns(dtype: str, arrays: list[tuple[int, str, Array, tuple[int, ...]]]) -> _Read:
     """Return the reader of columns of one number type: one behind the other, those with unknown rows last."""
-    arrays = sorted(arrays, key=lambda one: one[2].unknown)
+    arrays = sorted(arrays, key=lambda one: bool(one[2].unknown))
     sizes = [prod(shape) for *_, shape in arrays]
     places = [slice(begin, end) for begin, end in pairwise(accumulate(sizes, initial=0))]
     low = np.concatenate([np.full(size, _least(one[2]), dtype) for one, size in zip(arrays, sizes, strict=True)])
@@ -746,8 +746,8 @@ def _columns(dtype: str, arrays: list[tuple[int, str, Array, tuple[int, ...]]]) 
         (name, place, shape if len(shape) > 1 else None)
         for (_, name, _, shape), place in zip(arrays, places, strict=True)
     ]
-    unknown = [(name, place) for (_, name, one, _), place in zip(arrays, places, strict=True) if one.unknown]
-    known = unknown[0][1].start if unknown else len(low)
+    unknown = [(name, one, place) for (_, name, one, _), place in zip(arrays, places, strict=True) if one.unknown]
+    known = unknown[0][2].start if unknown else len(low)
 
     def read(data: tuple[memoryview, ...], values: dict[str, Any]) -> None:
         numbers = np.frombuffer(b"".join([data[at] for at in order]), dtype)
@@ -756,9 +756,9 @@ def _columns(dtype: str, arrays: list[tuple[int, str, Array, tuple[int, ...]]]) 
             values[name] = numbers[place] if shape is None else numbers[place].reshape(shape)
         if not good[good.argmin()]:
             _need(bool(good[:known].all()))
-            for name, place in unknown:
-                unknown_rows = np.isnan(array := values[name]).all(axis=-1, keepdims=True)
-                _need(bool((good[place].reshape(array.shape) | unknown_rows).all()))
+            for name, one, place in unknown:
+                absent = numeric.unknown(array := values[name], one)
+                _need(bool((good[place].reshape(array.shape) | absent).all()))
 
     return read
 
@@ -775,7 +775,7 @@ def _column(at: int, name: str, described: Array, shape: tuple[int, ...]) -> _Re
         values[name] = array = numbers.reshape(shape)
         # Both are NaN where there is one, and comparisons with NaN are false.
         if not (numbers[numbers.argmin()] >= low and numbers[numbers.argmax()] <= high):
-            _need(described.unknown and numeric.first_outside(array, described) is None)
+            _need(bool(described.unknown) and numeric.first_outside(array, described) is None)
 
     return read
 

@@ -120,20 +120,24 @@ class Detections(SensorMessage):
     label: Annotated[Integers, Array("i8", ("M",), 0, 255)] = Field(
         description="Class of each object as an index into `labels`, from 0."
     )
-    center: Annotated[Reals, Array("f8", ("M", 3), -FAR, FAR)] = Field(
-        description="Geometric centres of the boxes: x, y, z in metres, in `frame`."
+    center: Annotated[Reals, Array("f8", ("M", 3), -FAR, FAR, unknown="last")] = Field(
+        description="Geometric centres of the boxes: x, y, z in metres, in `frame`. A z of NaN (JSON: null) is unknown."
     )
-    size: Annotated[Reals, Array("f8", ("M", 3), 0, 1e4, above=True)] = Field(
-        description="Length (along the heading), width, height in metres."
+    size: Annotated[Reals, Array("f8", ("M", 3), 0, 1e4, above=True, unknown="number")] | None = Field(
+        default=None,
+        description="Length (along the heading), width, height in metres. A number of NaN (JSON: null) is unknown. "
+        "Absent: all are.",
     )
-    yaw: Annotated[Reals, Array("f8", ("M",), -1e4, 1e4)] = Field(
-        description="Heading in radians, counter-clockwise about z from the x axis of `frame`."
+    yaw: Annotated[Reals, Array("f8", ("M",), -1e4, 1e4, unknown="number")] | None = Field(
+        default=None,
+        description="Heading in radians, counter-clockwise about z from the x axis of `frame`. NaN (JSON: null): "
+        "unknown for this object. Absent: for all.",
     )
     score: Annotated[Reals, Array("f8", ("M",), 0, 1)] = Field(
         description="Confidence of the detector; not a logit. An object of score 0 is left out and counted in "
         "`Tracks.ignored`."
     )
-    velocity: Annotated[Reals, Array("f8", ("M", 2), -1e3, 1e3, unknown=True)] | None = Field(
+    velocity: Annotated[Reals, Array("f8", ("M", 2), -1e3, 1e3, unknown="row")] | None = Field(
         default=None,
         description="Velocity over ground in m/s along the x and y axes of `frame`. A row of two NaN (JSON: null): "
         "unknown for this object. Absent: for all.",
@@ -149,7 +153,7 @@ class Detections(SensorMessage):
         "Absent: everywhere.",
     )
 
-    position_covariance: Annotated[Reals, Array("f8", ("M", 3, 3), -1e8, 1e8, unknown=True)] | None = Field(
+    position_covariance: Annotated[Reals, Array("f8", ("M", 3, 3), -1e8, 1e8, unknown="row")] | None = Field(
         default=None,
         description="Covariance of the errors of each centre's x, y and z in m^2, along the axes of `frame`: "
         "symmetric, the variance along every axis from 1e-8 to 1e8. A matrix of NaN (JSON: null) is an object for "
@@ -251,6 +255,12 @@ class Tracks(Header):
         description="1: the existence reached a threshold of the profile and has not fallen below a lower one since; "
         "0: the track may be of nothing.",
     )
+    measured: Annotated[Integers, Array("i8", ("N",), 0, 7)] | None = Field(
+        default=None,
+        description="What is known of the object, from detections or, the heading, from its motion: 1 the heading, 2 "
+        "the size, 4 the height, added up. The rest of `yaw`, `size` and z stand in for it: size by the profile. "
+        "Absent: everything of all.",
+    )
     class_probability: Annotated[Singles, Array("f4", ("N", "C"), 0, 1)] | None = Field(
         default=None,
         description="Probability of each class of `labels`; `label` changes with it. Absent: the profile has no groups "
@@ -311,13 +321,13 @@ def path_fields(horizons: Reals, mean: Reals, covariance: Reals) -> dict[str, Nu
     return _validated(dict(zip(PATHS, values, strict=True)))
 
 
-def class_fields(class_probability: Reals) -> dict[str, Numeric]:
-    """Return the field of `Tracks` with the probabilities (N, C) of the classes.
+def track_fields(**columns: Numeric | None) -> dict[str, Numeric]:
+    """Return further columns of `Tracks`, but for those that are None, as fields.
 
     Raises:
-        MessageError: they are none.
+        MessageError: they hold numbers that no message may.
     """
-    return _validated({"class_probability": class_probability})
+    return _validated({name: one for name, one in columns.items() if one is not None})
 
 
 def _validated(values: Mapping[str, Numeric]) -> dict[str, Numeric]:

@@ -13,7 +13,7 @@ from optipmb_client.errors import UsageError
 from optipmb_schemas import Detections, Dump, DumpedFrame, MessageError, Points, Pose, Tracks, decode_dump
 
 import optipmb
-from optipmb_tools.run.tracking import track_fields
+from optipmb_tools.run.tracking import fields_of
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def _step(
         profile=parameters.name,
         cloud_used=given.points is not None,
         labels=tuple(parameters.classes),
-        **track_fields(found.tracks, found.paths, found.class_probability),
+        **fields_of(found.tracks, found.paths, class_probability=found.class_probability, measured=found.measured),
     )
     return found.density
 

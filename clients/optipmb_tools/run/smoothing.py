@@ -134,7 +134,8 @@ def smooth(
     """
     order = np.argsort(identity, kind="stable")
     before, after = order[:-1], order[1:]
-    follows = identity[before] == identity[after]
+    known = covariance[:, OMEGA, OMEGA] != 0.0  # those of unknown heading stay (`optipmb.unknown_heading`)
+    follows = (identity[before] == identity[after]) & known[before] & known[after]
     before, after = before[follows], after[follows]
     predicted, spread, gain = _predictions(
         mean[before], covariance[before], (stamp_ns[after] - stamp_ns[before]) * 1e-9, label[before], table

@@ -144,7 +144,7 @@ class Delivery(_message.Message):
     def __init__(self, instance: _Optional[str] = ..., received_ns: _Optional[int] = ..., published_ns: _Optional[int] = ..., queue_ms: _Optional[float] = ..., decode_ms: _Optional[float] = ..., step_ms: _Optional[float] = ..., run: _Optional[int] = ...) -> None: ...
 
 class Tracks(_message.Message):
-    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "sensor", "session", "revision", "profile", "cloud_used", "gap", "ignored", "labels", "id", "label", "center", "size", "yaw", "heading_confidence", "velocity", "yaw_rate", "acceleration", "existence", "score", "covariance", "age", "time_since_detection", "detection", "confirmed", "class_probability", "horizons", "path_position", "path_yaw", "path_covariance", "delivery")
+    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "sensor", "session", "revision", "profile", "cloud_used", "gap", "ignored", "labels", "id", "label", "center", "size", "yaw", "heading_confidence", "velocity", "yaw_rate", "acceleration", "existence", "score", "covariance", "age", "time_since_detection", "detection", "confirmed", "measured", "class_probability", "horizons", "path_position", "path_yaw", "path_covariance", "delivery")
     STREAM_FIELD_NUMBER: _ClassVar[int]
     EPOCH_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
@@ -173,6 +173,7 @@ class Tracks(_message.Message):
     TIME_SINCE_DETECTION_FIELD_NUMBER: _ClassVar[int]
     DETECTION_FIELD_NUMBER: _ClassVar[int]
     CONFIRMED_FIELD_NUMBER: _ClassVar[int]
+    MEASURED_FIELD_NUMBER: _ClassVar[int]
     CLASS_PROBABILITY_FIELD_NUMBER: _ClassVar[int]
     HORIZONS_FIELD_NUMBER: _ClassVar[int]
     PATH_POSITION_FIELD_NUMBER: _ClassVar[int]
@@ -207,13 +208,14 @@ class Tracks(_message.Message):
     time_since_detection: Array
     detection: Array
     confirmed: Array
+    measured: Array
     class_probability: Array
     horizons: Array
     path_position: Array
     path_yaw: Array
     path_covariance: Array
     delivery: Delivery
-    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., sensor: _Optional[str] = ..., session: _Optional[str] = ..., revision: _Optional[int] = ..., profile: _Optional[str] = ..., cloud_used: _Optional[bool] = ..., gap: _Optional[int] = ..., ignored: _Optional[int] = ..., labels: _Optional[_Iterable[str]] = ..., id: _Optional[_Union[Array, _Mapping]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., heading_confidence: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., yaw_rate: _Optional[_Union[Array, _Mapping]] = ..., acceleration: _Optional[_Union[Array, _Mapping]] = ..., existence: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., covariance: _Optional[_Union[Array, _Mapping]] = ..., age: _Optional[_Union[Array, _Mapping]] = ..., time_since_detection: _Optional[_Union[Array, _Mapping]] = ..., detection: _Optional[_Union[Array, _Mapping]] = ..., confirmed: _Optional[_Union[Array, _Mapping]] = ..., class_probability: _Optional[_Union[Array, _Mapping]] = ..., horizons: _Optional[_Union[Array, _Mapping]] = ..., path_position: _Optional[_Union[Array, _Mapping]] = ..., path_yaw: _Optional[_Union[Array, _Mapping]] = ..., path_covariance: _Optional[_Union[Array, _Mapping]] = ..., delivery: _Optional[_Union[Delivery, _Mapping]] = ...) -> None: ...
+    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., sensor: _Optional[str] = ..., session: _Optional[str] = ..., revision: _Optional[int] = ..., profile: _Optional[str] = ..., cloud_used: _Optional[bool] = ..., gap: _Optional[int] = ..., ignored: _Optional[int] = ..., labels: _Optional[_Iterable[str]] = ..., id: _Optional[_Union[Array, _Mapping]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., heading_confidence: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., yaw_rate: _Optional[_Union[Array, _Mapping]] = ..., acceleration: _Optional[_Union[Array, _Mapping]] = ..., existence: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., covariance: _Optional[_Union[Array, _Mapping]] = ..., age: _Optional[_Union[Array, _Mapping]] = ..., time_since_detection: _Optional[_Union[Array, _Mapping]] = ..., detection: _Optional[_Union[Array, _Mapping]] = ..., confirmed: _Optional[_Union[Array, _Mapping]] = ..., measured: _Optional[_Union[Array, _Mapping]] = ..., class_probability: _Optional[_Union[Array, _Mapping]] = ..., horizons: _Optional[_Union[Array, _Mapping]] = ..., path_position: _Optional[_Union[Array, _Mapping]] = ..., path_yaw: _Optional[_Union[Array, _Mapping]] = ..., path_covariance: _Optional[_Union[Array, _Mapping]] = ..., delivery: _Optional[_Union[Delivery, _Mapping]] = ...) -> None: ...
 
 class Problem(_message.Message):
     __slots__ = ("stream", "instance", "code", "path", "expected", "received", "message", "seq", "stamp_ns", "count", "reported_ns")
