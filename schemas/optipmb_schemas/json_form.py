@@ -6,7 +6,6 @@ messages, rounded; stamps are texts, because 2^63 does not fit a number of JavaS
 
 from __future__ import annotations
 
-import json
 from datetime import UTC, datetime
 from itertools import repeat
 from math import isnan
@@ -185,7 +184,7 @@ def event_json(events: Events, place: Place | None = None) -> list[bytes]:
     about = _about(events)
     position = np.array([one.position for one in events.events], np.float64).reshape(-1, 3)
     placed = _placed(position, np.zeros(len(position)), place)
-    rows = zip(events.events, np.round(position, DIGITS).tolist(), *placed, strict=True)
+    rows = zip(events.events, *placed, strict=True)
     return [
         msgspec.json.encode(
             EdgeEvent(
@@ -197,7 +196,7 @@ def event_json(events: Events, place: Place | None = None) -> list[bytes]:
                 name=events.labels[one.label],
                 at=_time(one.at_ns),
                 at_ns=str(one.at_ns),
-                position=where,
+                position=tuple(round(value, DIGITS) for value in one.position),
                 speed=round(one.speed, DIGITS),
                 yaw=round(one.yaw, DIGITS),
                 how=one.how or UNSET,
@@ -208,7 +207,7 @@ def event_json(events: Events, place: Place | None = None) -> list[bytes]:
                 alt=alt,
             )
         )
-        for one, where, lat, lon, alt, _ in rows
+        for one, lat, lon, alt, _ in rows
     ]
 
 
@@ -240,12 +239,16 @@ def schemas() -> dict[str, dict[str, Any]]:
     """Return the JSON Schemas (draft 2020-12) of all texts, by name."""
     found = {}
     for kind in FRAMES:
-        schema = json.loads(msgspec.json.encode(msgspec.json.schema(kind)))
-        definitions = schema["$defs"]
+        definitions = msgspec.json.schema(kind)["$defs"]
         found[kind.__name__] = definitions.pop(kind.__name__) | ({"$defs": definitions} if definitions else {})
     problem = Problem.model_json_schema()
-    problem["properties"] = {"type": {"enum": ["problem"]}} | problem["properties"]
-    return found | {"EdgeProblem": problem | {"title": "EdgeProblem", "required": ["type", *problem["required"]]}}
+    fields = {"type": {"enum": ["problem"]}} | problem["properties"] | {"skipped": {"type": "integer"}}
+    found["EdgeProblem"] = problem | {
+        "title": "EdgeProblem",
+        "properties": fields,
+        "required": ["type", *problem["required"]],
+    }
+    return found
 
 
 def _about(message: Tracks | Events) -> dict[str, Any]:

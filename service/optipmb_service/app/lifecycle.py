@@ -334,7 +334,8 @@ def _monitoring(settings: Settings, health: ProcessHealth) -> Iterator[None]:
         places = {
             name: Georeference(site.origin, site.x_heading).to_geographic for name, site in settings.sites.items()
         }
-    interface = functools.partial(document, settings.prefix, (*settings.connect, *settings.endpoints)[0])
+    endpoint = (*settings.connect, *settings.endpoints)[0]
+    interface = functools.partial(document, settings.prefix, endpoint, settings.http)
     server = Server(application(health, settings, places, interface), settings.http)
     log.info("http", address=server.address)
     try:

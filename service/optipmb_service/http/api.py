@@ -100,7 +100,7 @@ class Readers:
         self._places = places
         self._most = settings.http_clients
         self._names = token_names("http_tokens", settings.http_tokens) if settings.http_tokens else None
-        self._count = 0
+        self.count = 0
         self._feeds: Feeds | None = None
 
     def feeds(self) -> Feeds:
@@ -140,12 +140,12 @@ class Readers:
         Raises:
             NoRoomError: there are too many.
         """
-        if self._count >= self._most:
+        if self.count >= self._most:
             raise NoRoomError(f"{self._most} readers are here already")
-        self._count += 1  # before anything is awaited: those who come together are counted one by one
+        self.count += 1  # before anything is awaited: those who come together are counted one by one
 
         def leave() -> None:
-            self._count -= 1
+            self.count -= 1
 
         return leave
 

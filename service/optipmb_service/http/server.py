@@ -103,7 +103,7 @@ def application(
     answers: ASGIApp = Starlette(routes=routes, exception_handlers=refusals)
     if settings.http_origins:
         answers = CORSMiddleware(answers, allow_origins=settings.http_origins, allow_headers=["authorization"])
-    return _Guarded(answers, settings)
+    return _Guarded(answers, settings, readers)
 
 
 def _answer(body: dict[str, object], *, well: bool) -> Response:
@@ -111,17 +111,17 @@ def _answer(body: dict[str, object], *, well: bool) -> Response:
 
 
 class _Guarded:
-    """An application that answers known host names, and a bounded number of requests at once, without probes.
+    """An application that answers known host names, and a bounded number of requests beside probes and readers.
 
     A WebSocket is opened for programs, for pages of this service, and for those of the settings: a browser asks nobody
     before it opens one for a page of a stranger.
     """
 
-    def __init__(self, application: ASGIApp, settings: Settings) -> None:
+    def __init__(self, application: ASGIApp, settings: Settings, readers: Readers) -> None:
         self._application = application
+        self._readers = readers
         self._names = {name.lower().rstrip(".") for name in settings.http_hosts}
         self._origins = settings.http_origins
-        self._most = REQUESTS + settings.http_clients
         self._requests = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -132,8 +132,8 @@ class _Guarded:
             await answer(scope, receive, send)
             return
         headers = Headers(scope=scope)
-        if self._requests >= self._most:
-            answer = PlainTextResponse(f"{self._most} requests are being answered; ask again", UNAVAILABLE)
+        if self._requests - self._readers.count >= REQUESTS:
+            answer = PlainTextResponse(f"{REQUESTS} requests are being answered; ask again", UNAVAILABLE)
         elif (path not in MONITORING or is_socket) and not self._knows(headers.get("host", "")):
             answer = PlainTextResponse("unknown host; see the setting http_hosts", MISDIRECTED)
         elif is_socket and not self._welcomes(headers):
