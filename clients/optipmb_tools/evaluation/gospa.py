@@ -34,12 +34,9 @@ class GospaResult:
 
     frames: int = 0
     gospa: float = 0.0
-    localisation: float = 0.0
-    """Part of GOSPA: inaccurate places."""
-    missed: float = 0.0
-    """Part of GOSPA: missed objects."""
-    false: float = 0.0
-    """Part of GOSPA: false tracks."""
+    localisation: float = 0.0  # part of GOSPA: inaccurate places
+    missed: float = 0.0  # part of GOSPA: missed objects
+    false: float = 0.0  # part of GOSPA: false tracks
     ospa: float = 0.0
 
     def __add__(self, other: "GospaResult") -> "GospaResult":
@@ -64,7 +61,6 @@ def evaluate_gospa(parts: Iterable[tuple[Case, int]], rules: Rules, order: float
         parts: the class in each sequence and the number of frames of the sequence that are compared.
         rules: those by which the cases were prepared; centres, and their limit is the cut-off c.
         order: p, at least 1.
-
     """
     return sum((_gospa(counted(case, rules), frames, rules.limit, order) for case, frames in parts), GospaResult())
 

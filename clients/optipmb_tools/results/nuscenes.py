@@ -34,8 +34,7 @@ from optipmb_tools.results import ResultTable, stacked
 
 NUSCENES_CLASSES = ("bicycle", "bus", "car", "motorcycle", "pedestrian", "trailer", "truck")
 """The classes of the tracking benchmark; others that a file holds are left out."""
-NUSCENES_META = ("use_camera", "use_lidar", "use_radar", "use_map", "use_external")
-"""Inputs that a submission declares."""
+NUSCENES_META = ("use_camera", "use_lidar", "use_radar", "use_map", "use_external")  # inputs that a submission declares
 
 Kind: TypeAlias = Literal["detection", "tracking"]
 _Row: TypeAlias = "array[float]"

@@ -28,20 +28,13 @@ class Clip:
     """One sequence with its detections of some classes."""
 
     name: str
-    labels: tuple[str, ...]
-    """The classes, as the parameters that will be used have them."""
-    frames: tuple[Frame, ...]
-    """(F,) world frame."""
-    rotation: Floats
-    """(F, 3, 3) world from sensor."""
-    translation: Floats
-    """(F, 3)"""
-    camera: Camera | None
-    """In whose image the benchmark counts; None where it does not."""
-    truth: Truth
-    """Of these classes and those alike, in the sensor frame of each row's frame."""
-    world: Truth
-    """The same in the world frame."""
+    labels: tuple[str, ...]  # the classes, as the parameters that will be used have them
+    frames: tuple[Frame, ...]  # (F,) world frame
+    rotation: Floats  # (F, 3, 3) world from sensor
+    translation: Floats  # (F, 3)
+    camera: Camera | None  # in whose image the benchmark counts; None where it does not
+    truth: Truth  # of these classes and those alike, in the sensor frame of each row's frame
+    world: Truth  # the same in the world frame
 
     @property
     def stamps(self) -> Ints:
@@ -55,7 +48,6 @@ def load(sequence: DataSequence, parameters: Parameters, rules: Rules) -> Clip:
     Raises:
         DatasetError: it has no truth, or one of some frames only, by which clutter cannot be counted.
         UsageError: it has values that the tracker refuses.
-
     """
     frames = list(sequence.frames())  # first: a generated scene takes its truth from the scans that its frames needed
     truth = sequence.truth()
@@ -97,16 +89,11 @@ def of_class(clip: Clip, name: str, rules: Rules) -> Clip:
 class Degradation:
     """How much worse the detections of a degraded copy are."""
 
-    drop: float = 0.1
-    """Share of the detections that are lost."""
-    position: float = 0.1
-    """Standard deviation of the noise added to x and to y, m."""
-    heading: float = 0.05
-    """Of the noise added to the heading, rad."""
-    velocity: float = 0.2
-    """Of the noise added to each component of a known velocity, m/s."""
-    score: float = 0.5
-    """Of the noise added to the logit of the score."""
+    drop: float = 0.1  # share of the detections that are lost
+    position: float = 0.1  # standard deviation of the noise added to x and to y, m
+    heading: float = 0.05  # of the noise added to the heading, rad
+    velocity: float = 0.2  # of the noise added to each component of a known velocity, m/s
+    score: float = 0.5  # of the noise added to the logit of the score
 
 
 def degrade(clip: Clip, degradation: Degradation, seed: int, copy: int = 0) -> Clip:
@@ -156,7 +143,6 @@ def track_clip(
         parameters: with the classes of the clip.
         modules: of the tracker.
         every_frame: also step through frames in which nothing can happen; the tracks are the same.
-
     """
     return _table(clip, parameters, list(_steps(clip, parameters, modules, every_frame=every_frame)))
 

@@ -26,8 +26,7 @@ from optipmb_tools.tuning.refine import Plan, Refined, refine
 from optipmb_tools.tuning.scoring import rules_of, scorer_of
 from optipmb_tools.tuning.values import only, with_classes, with_score_calibration, with_values, write_profile
 
-Curves = dict[str, ScoreCalibration | None]
-"""By class; None where there was too little to measure one."""
+Curves = dict[str, ScoreCalibration | None]  # by class; None where there was too little to measure one
 
 
 @dataclass(frozen=True)
@@ -35,8 +34,7 @@ class Source:
     """The data."""
 
     dataset: str
-    detections: str
-    """Name of the detector."""
+    detections: str  # name of the detector
     sequences: Sequence[DataSequence]
     clips: Sequence[Clip]
     classes: tuple[str, ...]
@@ -55,7 +53,6 @@ class Source:
         Raises:
             DatasetError: a sequence has no truth.
             UsageError: a class is not in the parameters, or has no labels.
-
         """
         clips = [load(sequence, parameters, rules_of(dataset)) for sequence in sequences]
         labelled = {name for clip in clips for name in set(clip.truth.names[~clip.truth.ignored].tolist())}
@@ -130,7 +127,6 @@ def calibrate_scores(
     Raises:
         DatasetError: there is no such detector, or a sequence has no truth.
         UsageError: the reference has none of the sequences, or a class is not there.
-
     """
     names = {one.name for one in sequences}
     known = [one for one in replace(data, detections=reference).open().sequences(["all"]) if one.name in names]
@@ -172,7 +168,6 @@ def tune_all(
 
     Raises:
         UsageError: the folder has trials of other data or options.
-
     """
     out.mkdir(parents=True, exist_ok=True)
     results = {}

@@ -75,12 +75,9 @@ _CLOUD = ("expected_points", "detection_floor")
 
 _TPE_EVERY = 6
 _TPE_WARMUP = 4
-_SPREAD = 0.15
-"""Standard deviation of a small move, as a share of the range."""
-_MOVED = (0.5, 0.3, 0.2)
-"""Probabilities that a move changes one value, two, three."""
-_KEPT_PERCENT = 25.0
-"""A trial continues while its score is among the best so many percent."""
+_SPREAD = 0.15  # standard deviation of a small move, as a share of the range
+_MOVED = (0.5, 0.3, 0.2)  # probabilities that a move changes one value, two, three
+_KEPT_PERCENT = 25.0  # a trial continues while its score is among the best so many percent
 
 
 @dataclass(frozen=True)
@@ -131,7 +128,6 @@ def dimensions(
         estimated: other values to begin with, by path.
         clips: values that have no effect on them, such as those about velocities without any, are left out.
         everything: also the values of the paper's table.
-
     """
     known = [np.isfinite(frame.velocity).all(axis=1) for clip in clips for frame in clip.frames]
     velocities = any(row.any() for row in known)
@@ -239,7 +235,6 @@ class Search:
             trials: in all, earlier sessions included.
             score: the score of values.
             on_trial: called after each trial with the best score so far.
-
         """
         for number in range(len(self.trials), trials):
             rng = np.random.Generator(np.random.PCG64([self._seed, number]))

@@ -22,12 +22,9 @@ from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Bools, Floats, Ints, Pose, planar_pose, rotation_of, to_sensor, wrap_angle
 from optipmb_tools.results.kitti import write_kitti_results
 
-HEIGHT = 1.75
-"""Of the sensor above the ground."""
-RADIUS = 60.0
-"""Objects farther away are neither detected nor part of the truth."""
-MIN_POINTS = 5
-"""An object with fewer points cannot be expected to be found: its truth is ignored."""
+HEIGHT = 1.75  # of the sensor above the ground
+RADIUS = 60.0  # objects farther away are neither detected nor part of the truth
+MIN_POINTS = 5  # an object with fewer points cannot be expected to be found: its truth is ignored
 
 HIDDEN_S = 2.0
 """An object that no ray has met for longer is a new one when it is seen again, as is one that was out of range: without
@@ -42,16 +39,12 @@ class SceneOptions:
 
     seed: int = 0
     frames: int = 200
-    rate: float = 10.0
-    """Frames per second."""
-    vehicles: int = 20
-    """Cars, a good third of them parked."""
+    rate: float = 10.0  # frames per second
+    vehicles: int = 20  # Cars, a good third of them parked
     pedestrians: int = 12
     cyclists: int = 5
-    clouds: bool = True
-    """Frames carry their point cloud."""
-    velocity: bool = False
-    """Detections carry a velocity."""
+    clouds: bool = True  # frames carry their point cloud
+    velocity: bool = False  # detections carry a velocity
 
     def __post_init__(self) -> None:
         for name, low, high in _BOUNDS:
@@ -232,7 +225,6 @@ class SceneDataset(Dataset):
 
         Raises:
             DatasetError: a name is not of four digits, or there is none.
-
         """
         wanted = dict.fromkeys("0000" if name == "all" else name for name in names)
         for name in wanted:
@@ -254,7 +246,6 @@ def scene_options(options: dict[str, float | bool]) -> SceneOptions:
 
     Raises:
         DatasetError: an option is not known or out of its bounds.
-
     """
     known = {field.name: field.type for field in fields(SceneOptions)}
     for name in options:
