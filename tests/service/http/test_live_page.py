@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from optipmb_schemas import Detections, Pose, ServiceStatus, Tracks, encode, encode_json, encoding_of
+from optipmb_schemas import Detections, Pose, ServiceStatus, encode, encode_json, encoding_of
 from optipmb_service.http import Server
 from optipmb_service.http.page import VIEWERS, Newest, live_frame, page
 from starlette.applications import Starlette
+from tracks_message import tracks_message
 
 from optipmb import Georeference
 
@@ -29,32 +30,22 @@ DEADLINE_S = 60.0
 
 def tracks(seq: int) -> bytes:
     """One track, a long way from the origin, and one that is not confirmed, in msgpack."""
-    both = np.ones(2)
     return encode(
-        Tracks(
-            stream=STREAM,
-            epoch=bytes(16),
-            seq=seq,
+        tracks_message(
+            STREAM,
+            seq,
+            [5, 6],
             stamp_ns=seq * 100_000_000,
-            session="0" * 32,
-            profile="kitti",
-            cloud_used=False,
-            labels=["Car"],
-            id=[5, 6],
-            label=[0, 0],
-            center=np.array([[100.12345, -7.0, 1.0], [0.0, 0.0, 0.0]]),
-            size=[[4.0, 2.0, 1.5]] * 2,
-            yaw=both / 3,
-            heading_confidence=both * 0.875,
-            velocity=[[1.0, 2.0]] * 2,
-            yaw_rate=both,
-            acceleration=both,
+            center=[[100.12345, -7.0, 1.0], [0.0, 0.0, 0.0]],
+            size=[4.0, 2.0, 1.5],
+            yaw=1 / 3,
+            heading_confidence=0.875,
+            velocity=[1.0, 2.0],
             existence=[0.75, 0.25],
-            score=both * 0.5,
-            covariance=np.stack([np.eye(6)] * 2),
-            age=both * 2,
-            time_since_detection=both * 0.2,
-            detection=[-1, -1],
+            score=0.5,
+            age=2,
+            time_since_detection=0.2,
+            detection=-1,
             confirmed=[1, 0],
         )
     )
