@@ -1,4 +1,4 @@
-"""What a frame costs the service, part by part, beside another version of the code, in one run.
+"""Cost of a frame in the service, part by part, compared with another version of the code in one run.
 
 python benchmarks/frame_cost.py [--beside DIR] [--objects N] [--points N] [--rounds N]
 
@@ -51,7 +51,7 @@ CHECKPOINT_EVERY = 10
 
 
 class Parts:
-    """Processor time of the parts of a frame: of calls of functions, less that of timed calls inside them."""
+    """Processor time of the parts of a frame: of calls of functions, less the timed calls inside them."""
 
     def __init__(self) -> None:
         self.spent_ns: dict[str, int] = {}
@@ -81,7 +81,7 @@ class Parts:
 
 
 class Network:
-    """Everything around the streams: it grants them all, takes what they publish, and gives them their turns."""
+    """Everything around the streams: it grants them all, takes their tracks, and gives them their turns."""
 
     strained = False
 

@@ -33,7 +33,7 @@ SECONDS = float(os.environ.get("OPTIPMB_BENCHMARK_SECONDS", "8"))
 WINDOW = 8
 ROUNDS = 5
 ROUND = 100
-SETTLED = 10  # frames before those that count
+SETTLED = 10  # frames that do not count
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def service() -> Iterator[ServiceProcess]:
 
 @pytest.fixture
 def node(service: ServiceProcess) -> Iterator[Node]:
-    """A node beside it."""
+    """A node that is connected to it."""
     with Node(service.endpoint) as one:
         yield one
 
@@ -62,7 +62,7 @@ def test_latency(benchmark: BenchmarkFixture, service: ServiceProcess, streams: 
     figures |= {f"{stage}_p50_ms": round(value, 3) for stage, value in run.stages_p50_ms.items()}
     figures |= {"streams": streams, "points": points, "lost": run.lost}
     benchmark.extra_info.update(figures)
-    print(figures)  # noqa: T201 - the table of pytest-benchmark does not show what is wanted here
+    print(figures)  # noqa: T201 - the table of pytest-benchmark does not show these
     assert run.received > 0
 
 

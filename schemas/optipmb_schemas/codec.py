@@ -850,7 +850,7 @@ def read_columns(payload: bytes, kind: type[T], limits: Limits) -> T | None:
 
     Memory is bounded: msgspec builds what the types allow, tuples of a few elements and views of the payload. Of a map
     with a field twice it takes the last one, and it skips unknown fields. So the fields are encoded again. That gives
-    as many bytes only if every field is there once, whatever their order: no other form of these types is shorter, but
+    as many bytes only if every field is there once, in any order: no other form of these types is shorter, but
     of floats. Where it would copy a large payload, `_is_encoding` compares the payload without them.
     """
     builder: Any = _BUILDERS.get(kind)

@@ -190,7 +190,7 @@ class Delivery(Message):
 
 
 class ResultMessage(Header):
-    """Header of what the service publishes of a frame; `epoch`, `seq` and `stamp_ns` are those of the detections."""
+    """Header of the service's results for a frame; `epoch`, `seq` and `stamp_ns` repeat the detections."""
 
     sensor: Stream | None = Field(
         default=None,
@@ -207,7 +207,7 @@ class ResultMessage(Header):
 
 
 class Tracks(ResultMessage):
-    """The tracks of one frame, N of them, ordered by id. `epoch`, `seq` and `stamp_ns` are those of the detections."""
+    """The tracks of one frame, N of them, ordered by id. `epoch`, `seq` and `stamp_ns` repeat the detections."""
 
     profile: Name = Field(description="Name of the parameters in force.")
     cloud_used: Flag = Field(description="Whether the frame was tracked with a cloud.")
@@ -403,7 +403,7 @@ class Events(ResultMessage):
 
 
 class Density(Message):
-    """Reply of `q/density`: where the tracker expects objects that nobody has detected yet, one row per component.
+    """Reply of `q/density`: where the tracker expects objects that are not detected yet, one row per component.
 
     These are the Poisson components after the newest frame, N of them, with the values that the tracker holds.
     """

@@ -1,4 +1,4 @@
-"""Who calls, and what they may do: by the name in the certificate, as the routers of a protected network decide.
+"""Callers and their rights: by the name in the certificate, as the routers of a protected network decide.
 
 | name | may |
 | --- | --- |
@@ -42,7 +42,7 @@ log = structlog.get_logger("optipmb_service")
 
 @dataclass(frozen=True)
 class Caller:
-    """Who calls, and what they may do.
+    """A caller and its rights.
 
     Attributes:
         name: in the certificate, or of the token; empty: anybody.

@@ -201,7 +201,7 @@ class Server:
                 except EndCall as raised:
                     end = raised
                 if end is not None:
-                    # A request may be 32 MB, and the frames of what it has raised hold it until the next collection.
+                    # A request may be 32 MB, and the frames of its exceptions hold it until the next collection.
                     end.__traceback__ = end.__context__ = end.__cause__ = None
                     code = end.code.name
                     status = end.status()

@@ -62,7 +62,7 @@ def application(
 
     Args:
         health: of the process.
-        names: names of this service beside addresses and names without a dot; `*`: any.
+        names: names of this service in addition to addresses and names without a dot; `*`: any.
         sites: place of the world frame of each site that has one.
         interface: returns the AsyncAPI document.
     """
