@@ -174,7 +174,7 @@ def measured(objects: int, points: int) -> dict[str, float]:
         Settings(instance="cost", store="none"),
         Profiles.read("nuscenes", {}),
         open_publisher=network.open_publisher,
-        reporter=ProblemReporter(network.publish_problem, lambda *_: None),
+        reporter=ProblemReporter(network.publish_problem),
         scheduler=network,
         member=network,
         checkpoints=CheckpointWriter(nothing, 1.0, network, off=""),

@@ -24,7 +24,7 @@ from optipmb_service.grpc import inputs, outputs
 from optipmb_service.grpc.access import Access, credentials
 from optipmb_service.grpc.calls import Call, CallerGoneError, EndCall, ending_with_caller
 from optipmb_service.grpc.network import Network
-from optipmb_service.telemetry.problem_reporter import ProblemReporter, log_problem
+from optipmb_service.telemetry.problem_reporter import ProblemReporter
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
@@ -114,7 +114,7 @@ class Server:
         self.limits = settings.limits.limits()
         self.network = Network(client, self._invalid)
         self._calls: set[Call] = set()
-        self._reporter = ProblemReporter(client.publish_problem, log_problem)
+        self._reporter = ProblemReporter(client.publish_problem)
         self._most = settings.grpc_calls
         self._access = Access(
             certificates=settings.grpc_tls is not None, names=settings.grpc_names, tokens=settings.grpc_tokens
