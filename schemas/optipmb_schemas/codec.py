@@ -52,7 +52,7 @@ from optipmb_schemas.model import Message
 try:
     import numpy as np
 except ModuleNotFoundError:  # the models read every form then
-    np = None  # type: ignore[assignment]
+    np = None  # type: ignore[assignment]  # numpy is an extra
 
 T = TypeVar("T", bound=Message)
 
@@ -594,7 +594,7 @@ REFUSED: Final = (msgspec.MsgspecError, ValueError, TypeError, LookupError, Recu
 @cache
 def _block_of(dtype: str, dimensions: int) -> Any:
     """Return the type of array blocks of a number type."""
-    shape: Any = tuple[(int,) * dimensions]  # type: ignore[misc]
+    shape: Any = tuple[(int,) * dimensions]  # type: ignore[misc]  # made at run time
     fields = [("dtype", Literal[dtype]), ("shape", shape), ("data", memoryview)]
     return msgspec.defstruct("Block", fields, frozen=True, gc=False)
 
