@@ -218,7 +218,7 @@ def _with_nulls(value: Any) -> Any:
     """Return nested lists with None in place of NaN."""
     if isinstance(value, list):
         return [_with_nulls(item) for item in value]
-    return None if value != value else value  # noqa: PLR0124 - NaN
+    return None if value != value else value  # noqa: PLR0124 - NaN differs from itself
 
 
 def unit_quaternion(array: Reals) -> Reals:

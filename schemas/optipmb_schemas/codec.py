@@ -52,7 +52,7 @@ from optipmb_schemas.model import Message
 try:
     import numpy as np
 except ModuleNotFoundError:  # the models read every form then
-    np = None  # type: ignore[assignment]
+    np = None  # type: ignore[assignment]  # numpy is an extra
 
 T = TypeVar("T", bound=Message)
 
@@ -594,7 +594,7 @@ REFUSED: Final = (msgspec.MsgspecError, ValueError, TypeError, LookupError, Recu
 @cache
 def _block_of(dtype: str, dimensions: int) -> Any:
     """Return the type of array blocks of a number type."""
-    shape: Any = tuple[(int,) * dimensions]  # type: ignore[misc]
+    shape: Any = tuple[(int,) * dimensions]  # type: ignore[misc]  # made at run time
     fields = [("dtype", Literal[dtype]), ("shape", shape), ("data", memoryview)]
     return msgspec.defstruct("Block", fields, frozen=True, gc=False)
 
@@ -850,7 +850,7 @@ def read_columns(payload: bytes, kind: type[T], limits: Limits) -> T | None:
 
     Memory is bounded: msgspec builds what the types allow, tuples of a few elements and views of the payload. Of a map
     with a field twice it takes the last one, and it skips unknown fields. So the fields are encoded again. That gives
-    as many bytes only if every field is there once, whatever their order: no other form of these types is shorter, but
+    as many bytes only if every field is there once, in any order: no other form of these types is shorter, but
     of floats. Where it would copy a large payload, `_is_encoding` compares the payload without them.
     """
     builder: Any = _BUILDERS.get(kind)

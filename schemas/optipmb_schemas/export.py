@@ -87,7 +87,7 @@ def table(name: str) -> str:
 
 
 def _rows(kind: type[Message]) -> Iterable[tuple[str, ...]]:
-    """Yield a row per field; those that are as in a message described before share one."""
+    """Yield a row per field; fields that repeat a message described before share one."""
     rows = list(_field_rows(kind))
     for first in (Detections, Tracks, SessionState):
         if kind is first:

@@ -193,8 +193,8 @@ class Delivery(Message):
     )
 
 
-class Tracks(Header):
-    """The tracks of one frame, N of them, ordered by id. `epoch`, `seq` and `stamp_ns` are those of the detections."""
+class ResultMessage(Header):
+    """Header of the service's results for a frame; `epoch`, `seq` and `stamp_ns` repeat the detections."""
 
     sensor: Stream | None = Field(
         default=None,
@@ -205,9 +205,14 @@ class Tracks(Header):
     )
     revision: Count = Field(
         default=0,
-        description="Higher than 0: corrects, after a late frame, what was published for the same `session`, `epoch` "
+        description="Higher than 0: replaces, after a late frame, what was published for the same `session`, `epoch` "
         "and `seq`.",
     )
+
+
+class Tracks(ResultMessage):
+    """The tracks of one frame, N of them, ordered by id. `epoch`, `seq` and `stamp_ns` repeat the detections."""
+
     profile: Name = Field(description="Name of the parameters in force.")
     cloud_used: Flag = Field(description="Whether the frame was tracked with a cloud.")
     gap: Count = Field(default=0, description="Frames known to be missing directly before this one.")
@@ -380,21 +385,9 @@ class ZoneCount(Message):
     to_right: Counts = Field(description="Crossings of the line to its right.")
 
 
-class Events(Header):
+class Events(ResultMessage):
     """Events of the zones and lines of a stream at one frame, and their counts."""
 
-    sensor: Stream | None = Field(
-        default=None,
-        description="Stream of the detections, and of `epoch` and `seq`. Absent: it is `stream`.",
-    )
-    session: SessionId = Field(
-        description="32 hexadecimal digits. When it changes, earlier tracks have ended, except those whose ids return."
-    )
-    revision: Count = Field(
-        default=0,
-        description="Higher than 0: replaces, after a late frame, the events published for the same `session`, `epoch` "
-        "and `seq`.",
-    )
     labels: Labels = Field(description="Names of the classes that `label` counts.")
     events: tuple[ZoneEvent, ...] = Field(
         default=(), max_length=100_000, fail_fast=True, description="In order of `at_ns`, `zone` and `id`."
@@ -420,7 +413,7 @@ class Events(Header):
 
 
 class Density(Message):
-    """Reply of `q/density`: where the tracker expects objects that nobody has detected yet, one row per component.
+    """Reply of `q/density`: where the tracker expects objects that are not detected yet, one row per component.
 
     These are the Poisson components after the newest frame, N of them, with the values that the tracker holds.
     """

@@ -14,7 +14,8 @@ from fleet import Fleet
 from optipmb_client import Connection
 from optipmb_client.incoming import Inbox
 from real_data import kitti_root
-from recorded import KEYS, Replay, kitti, undisturbed
+from recorded import KEYS, Replay, kitti
+from sessions import undisturbed
 
 import optipmb
 
@@ -68,7 +69,7 @@ def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[
             replay.finish(RESTART_S)
             outages.append(_outage(replay, killed))
             for recording in recordings:
-                tracks, digest = undisturbed(recording, "kitti")
+                tracks, digest = undisturbed(recording.messages, "kitti")
                 result = replay.results[recording.stream]
                 assert [result.tracks[seq] for seq in range(FRAMES)] == [{one} for one in tracks], (round_, SEED)
                 state = replay.state(recording.stream)

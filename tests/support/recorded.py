@@ -1,4 +1,4 @@
-"""Recorded sequences as the messages that a sensor would send, and what an undisturbed session makes of them."""
+"""Recorded sequences as the messages that a sensor would send, and a replay of them through a service."""
 
 from __future__ import annotations
 
@@ -10,13 +10,8 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 from optipmb_schemas import Detections, Keys, Points, Pose, SessionState, Tracks, decode, encode, encoding_of
-from optipmb_service.stream.checkpoint import digest_of
-from optipmb_service.stream.session import Session
-from optipmb_service.stream.values import Policy, Tracked
 from optipmb_tools.datasets import open_dataset
 from router import plain
-
-import optipmb
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,6 +29,11 @@ class Recording:
 
     stream: str
     frames: list[tuple[Detections, Points | None]]
+
+    @property
+    def messages(self) -> list[Detections | Points]:
+        """The clouds and frames in order, each cloud before its frame."""
+        return [one for detections, points in self.frames for one in (points, detections) if one is not None]
 
 
 def kitti(root: Path, name: str, stream: str, frames: int) -> Recording:
@@ -80,18 +80,6 @@ def recording(kind: str, root: Path, detector: str, name: str, stream: str, fram
             clouds += 1
         made.append((detections, points))
     return Recording(stream, made)
-
-
-def undisturbed(recording: Recording, profile: str, policy: Policy | None = None) -> tuple[list[bytes], str]:
-    """The tracks of every frame, and the digest of the state after the last, of a session that nothing happens to."""
-    session = Session(recording.stream, optipmb.load_profile(profile), policy)
-    outputs = []
-    for detections, points in recording.frames:
-        if points is not None:
-            outputs += session.on_points(points, 0)
-        outputs += session.on_detections(detections, 0)
-    tracks = [plain(output.tracks) for output in outputs if isinstance(output, Tracked)]
-    return tracks, digest_of(session.snapshot())
 
 
 @dataclass

@@ -108,7 +108,7 @@ def streams_of(
         Settings(instance="test", store="none", step_limit_s=60, **settings),  # kernels may have to be compiled
         profiles or Profiles.read("nuscenes", {}),
         open_publisher=parts.open_publisher,
-        reporter=reporter or ProblemReporter(lambda _: None, lambda *_: None),
+        reporter=reporter or ProblemReporter(lambda _: None),
         scheduler=parts,
         member=parts,
         checkpoints=parts,

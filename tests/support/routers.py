@@ -42,7 +42,9 @@ def free_endpoint() -> str:
 def open_router(endpoint: str, *others: str, adminspace: bool = False) -> zenoh.Session:
     """A router that listens at `endpoint`, linked to others; close it (it is a context manager)."""
     values: dict[str, object] = {"mode": "router", "listen/endpoints": [endpoint], "connect/endpoints": list(others)}
-    return _open(values | {"adminspace/enabled": adminspace})
+    # Half a second, in which routers find others; with nobody to link to there is nothing to wait for.
+    delay: dict[str, object] = {} if others else {"scouting/delay": 0}
+    return _open(values | delay | {"adminspace/enabled": adminspace})
 
 
 def open_client(endpoint: str) -> zenoh.Session:

@@ -7,15 +7,18 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from optipmb_schemas import Problem, Tracks, encode
+from optipmb_schemas import Detections, Problem, Tracks, encode
+from optipmb_service.stream.checkpoint import digest_of
+from optipmb_service.stream.session import Session
 from optipmb_service.stream.values import Begun, Output, Quarantined, Tracked
 
 import optipmb
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
-    from optipmb_service.stream.session import Session
+    from optipmb_schemas import Points
+    from optipmb_service.stream.values import Policy
     from router import Sensor
 
 
@@ -74,6 +77,17 @@ class Merged:
 def plain(message: Tracks) -> bytes:
     """The bytes of tracks that must be those of the run in order."""
     return encode(message.model_copy(update={"delivery": None, "revision": 0}))
+
+
+def undisturbed(
+    messages: Sequence[Detections | Points], profile: str, policy: Policy | None = None
+) -> tuple[list[bytes], str]:
+    """The tracks of every frame, and the digest of the state after the last, of a session that nothing happens to."""
+    session = Session(messages[0].stream, optipmb.load_profile(profile), policy)
+    outputs: list[Output] = []
+    for one in messages:
+        outputs += session.on_detections(one, 0) if isinstance(one, Detections) else session.on_points(one, 0)
+    return [plain(one) for one in tracks(outputs)], digest_of(session.snapshot())
 
 
 class Failing:

@@ -9,12 +9,8 @@ from typing import TYPE_CHECKING
 
 from fleet import PROFILE
 from optipmb_schemas import Keys, SessionState, Tracks, decode
-from optipmb_service.stream.checkpoint import digest_of
-from optipmb_service.stream.session import Session
-from optipmb_service.stream.values import Tracked
 from router import Sensor, plain, until
-
-import optipmb
+from sessions import undisturbed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,11 +21,9 @@ KEYS = Keys()
 SENSOR = Sensor()
 
 
-def expected(frames: int, sensor: Sensor = SENSOR) -> tuple[list[bytes], str]:
+def expected(frames: int, sensor: Sensor = SENSOR, profile: str = PROFILE) -> tuple[list[bytes], str]:
     """Tracks and the digest of the state of a session that nothing happens to."""
-    session = Session(sensor.stream, optipmb.load_profile(PROFILE))
-    outputs = [output for seq in range(frames) for output in session.on_detections(sensor.detections(seq), 0)]
-    return [plain(one.tracks) for one in outputs if isinstance(one, Tracked)], digest_of(session.snapshot())
+    return undisturbed([sensor.detections(seq) for seq in range(frames)], profile)
 
 
 def distinct(node: Node, sensor: Sensor = SENSOR) -> dict[int, set[bytes]]:

@@ -207,7 +207,7 @@ def plot(
     score: Annotated[float | None, typer.Option(help="Least mean score of a track; default: the best one.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Draw the tracks of one sequence from above, with what was missed and confused where the truth is known."""
+    """Draw the tracks of one sequence from above, with misses and confusions where the truth is known."""
     tables = ("table", "pyarrow") if any(one and one.suffix in SUFFIXES for one in (data.data, *tracks)) else ()
     needed("optipmb plot", ",".join(("plot", *tables[:1])), "matplotlib", "scipy", *tables[1:])
     from optipmb_tools.evaluation import default_rules, evaluate_files  # noqa: PLC0415  loads the solvers of scipy

@@ -4,7 +4,7 @@ Each figure comes from one place: R from detections minus labels, Q from the lab
 detection of each object, p_d0 and mu_c / A from the found labels and the false detections. Standard deviations are
 winsorised (`spread`), for detections and labels are wrong in a few places by much. Estimates are where a search begins,
 not where it must end: a detector's errors last over frames, labels have errors of their own, and a motion model has to
-cover what it leaves out.
+cover the rest.
 
 Detections and labels belong together in the world frame: in each frame as many pairs as possible are made within a
 distance, and of those ways the one of least total distance is taken.

@@ -77,7 +77,7 @@ class Shown(NamedTuple):
 
 
 class FoxgloveMessages:
-    """Converts messages; remembers which tracks of each stream are shown, to delete those that end."""
+    """Converts messages; remembers which tracks of each stream are shown, to delete ended ones."""
 
     def __init__(self) -> None:
         self._shown: dict[str, set[int]] = {}

@@ -83,7 +83,7 @@ def messages(types: Types, tracks: Tracks, stamp_ns: int, frame: str, stream: st
     """
     header = header_of(stamp_ns, frame)
     key = hashlib.blake2b(stream.encode(), digest_size=8).digest()
-    at = np.flatnonzero(np.isin(tracks.horizons, HORIZONS)) if has_paths(tracks) else None  # type: ignore[arg-type]
+    at = np.flatnonzero(np.isin(tracks.horizons, HORIZONS)) if has_paths(tracks) else None  # type: ignore[arg-type]  # then it has horizons
     found: dict[str, list[Fields]] = {end: [] for end in TOPICS}
     stamped = {"header": header, "texture": {"header": header}}
     clear = {"action": _DELETE_ALL, "pose": _pose([0.0, 0.0, 0.0], 0.0), "color": {"a": 1.0}}
