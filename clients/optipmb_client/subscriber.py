@@ -7,6 +7,7 @@ import collections
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Self
 
@@ -78,22 +79,20 @@ class Statistics:
 
 
 class _Subscription:
-    """Inbox of a subscription, on a connection of its own or a shared one; arguments as for `Subscriber`."""
+    """Topics of a pattern, on a connection of its own, which `opened` gives, or a shared one."""
 
     def __init__(
         self,
         pattern: str,
         topics: Sequence[Topic],
-        connect: str | Sequence[str] | None,
         queue: int,
-        config: str | Path | None,
-        connection: "Link | None",
-        connect_timeout: float,
         prefix: str,
+        connection: "Link | None",
+        opened: Callable[[], Link],
     ) -> None:
         Keys(prefix).matching(pattern, "tracks")  # checks both
         self._inbox = Inbox(queue)
-        self._own = linked(connect, config=config, timeout=connect_timeout) if connection is None else None
+        self._own = opened() if connection is None else None
         link = connection or self._own
         assert link is not None  # noqa: S101  one of the two is there: said for the type checker
         self._subscription = link.subscribe_streams(pattern, self._inbox, *topics, prefix=prefix)
@@ -143,7 +142,8 @@ class EventSubscriber(_Subscription):
         self.timeout = timeout
         self._final = final
         self._streams: dict[str, FinalEvents] = collections.defaultdict(FinalEvents)
-        super().__init__(pattern, ("events",), connect, queue, config, connection, connect_timeout, prefix)
+        opened = partial(linked, connect, config=config, timeout=connect_timeout)
+        super().__init__(pattern, ("events",), queue, prefix, connection, opened)
 
     def __iter__(self) -> Iterator[Events]:
         """Iterate over the messages until `timeout` or `close`."""
@@ -212,7 +212,8 @@ class Subscriber(_Subscription):
         self._missed: collections.deque[Missed] = collections.deque(maxlen=MISSED)
         self._missed_count = 0
         topics: tuple[Topic, ...] = ("tracks",) if on_problem is None else ("tracks", "problems")
-        super().__init__(pattern, topics, connect, queue, config, connection, connect_timeout, prefix)
+        opened = partial(linked, connect, config=config, timeout=connect_timeout)
+        super().__init__(pattern, topics, queue, prefix, connection, opened)
 
     def __iter__(self) -> Iterator[Tracks]:
         """Iterate over the messages until `timeout` or `close`."""

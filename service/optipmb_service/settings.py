@@ -268,7 +268,8 @@ class ZoneSettings(BaseModel):
 
         values: dict[str, Any] = self.model_dump(exclude={"streams", "geo"}, exclude_none=True)
         if self.geo and site is not None:
-            world = Georeference(site.origin, site.x_heading).to_world(*zip(*(self.polygon or self.line), strict=True))
+            lat, lon = zip(*(self.polygon or self.line), strict=True)
+            world = Georeference(site.origin, site.x_heading).to_world(lat, lon)
             if max(abs(world[:, :2]).ravel()) > FARTHEST:
                 raise ParameterError(name, f"points within {FARTHEST / 1e3:g} km of the origin of the site", "others")
             values["polygon" if self.polygon else "line"] = tuple(map(tuple, world[:, :2].tolist()))

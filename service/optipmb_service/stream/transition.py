@@ -308,7 +308,7 @@ class Transition:
             state, ended = end(zones, state)
             state = replace(state, session=before.session)
         labels = self.parameters.labels
-        state, events = observe(zones, state, stamp_ns, tracks, labels, tracks.confirmed, self._shapes)
+        state, events = observe(zones, state, stamp_ns, tracks, labels, self._shapes)
         return state, (*ended, *events)
 
     def _unknown(self, message: schemas.Detections, reported: frozenset[str]) -> dict[str, int]:
