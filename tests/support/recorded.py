@@ -9,9 +9,11 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from optipmb_schemas import Detections, Keys, Points, Pose, SessionState, Tracks, decode, encode, encoding_of
+from optipmb_client.merging import FinalEvents
+from optipmb_schemas import Detections, Events, Keys, Points, Pose, SessionState, Tracks, decode, encode, encoding_of
 from optipmb_tools.datasets import open_dataset
 from router import plain
+from sessions import bare_events
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -89,6 +91,15 @@ class Replayed:
     tracks: dict[int, set[bytes]] = field(default_factory=dict)
     repeated: int = 0
     times_ns: list[int] = field(default_factory=list)
+    merged: FinalEvents = field(default_factory=FinalEvents)
+    final: list[bytes] = field(default_factory=list)
+    """Events of frames as they became final."""
+
+    @property
+    def events(self) -> list[bytes]:
+        """Events of all frames, final or not."""
+        rest = sorted(self.merged.held.values(), key=lambda one: one.seq)
+        return self.final + [bare_events(one) for one in rest if one.events]
 
 
 class Replay:
@@ -128,6 +139,19 @@ class Replay:
                 result.times_ns.append(time.monotonic_ns())
             seen.add(plain(tracks))
             self.changed.notify_all()
+
+    def take_events(self, payload: bytes) -> None:
+        """Take in a message of events."""
+        events = decode(payload, Events)
+        if (result := self.results.get(events.stream)) is not None:
+            with self.changed:
+                result.final += [bare_events(one) for one in result.merged.take(events) if one.events]
+                self.changed.notify_all()
+
+    def wait_events(self, stream: str, expected: list[bytes], deadline_s: float) -> bool:
+        """Wait until the events of a stream are those expected."""
+        with self.changed:
+            return self.changed.wait_for(lambda: self.results[stream].events == expected, deadline_s)
 
     def start(self) -> None:
         """Begin to send."""

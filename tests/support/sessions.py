@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from optipmb_schemas import Detections, Problem, Tracks, encode
+from optipmb_schemas import Detections, Events, Problem, Tracks, encode
 from optipmb_service.stream.checkpoint import digest_of
 from optipmb_service.stream.session import Session
-from optipmb_service.stream.values import Begun, Output, Quarantined, Tracked
+from optipmb_service.stream.values import Begun, Output, Quarantined, Tracked, events_of
 
 import optipmb
 
@@ -81,13 +81,20 @@ def plain(message: Tracks) -> bytes:
 
 def undisturbed(
     messages: Sequence[Detections | Points], profile: str, policy: Policy | None = None
-) -> tuple[list[bytes], str]:
-    """The tracks of every frame, and the digest of the state after the last, of a session that nothing happens to."""
+) -> tuple[list[bytes], str, list[bytes]]:
+    """The tracks of every frame, the digest of the last state, and the events of a session that nothing happens to."""
     session = Session(messages[0].stream, optipmb.load_profile(profile), policy)
     outputs: list[Output] = []
     for one in messages:
         outputs += session.on_detections(one, 0) if isinstance(one, Detections) else session.on_points(one, 0)
-    return [plain(one) for one in tracks(outputs)], digest_of(session.snapshot())
+    tracked = [one for one in outputs if isinstance(one, Tracked)]
+    events = [bare_events(events_of(one.header, one.events, None)) for one in tracked if one.events]
+    return [plain(one) for one in tracks(outputs)], digest_of(session.snapshot()), events
+
+
+def bare_events(message: Events) -> bytes:
+    """The bytes of the events of a frame that must be the same in every run."""
+    return encode(message.model_copy(update={"delivery": None, "revision": 0, "zones": None}))
 
 
 class Failing:
