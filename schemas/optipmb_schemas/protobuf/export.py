@@ -16,12 +16,13 @@ from typing import Final
 
 from optipmb_schemas.control import Problem, SessionParameters, SessionState, SessionSummary
 from optipmb_schemas.export import bring_up_to_date, read
-from optipmb_schemas.messages import Delivery, Detections, FieldOfView, Points, Pose, Tracks
+from optipmb_schemas.messages import Delivery, Detections, FieldOfView, Points, Pose, Relocation, Tracks
 from optipmb_schemas.model import Message
 
 SOURCE: Final = "optipmb/v1/tracking.proto"
 MODELS: Final[tuple[type[Message], ...]] = (
     Pose,
+    Relocation,
     FieldOfView,
     Detections,
     Points,

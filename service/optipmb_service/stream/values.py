@@ -200,7 +200,7 @@ def _zone_count(name: str, counts: Mapping[str, Mapping[str, int]], labels: tupl
     return schemas.ZoneCount(zone=name, **columns)
 
 
-Reason = Literal["first", "jump", "clock", "publisher", "pose", "effort", "reset", "parameters", "quarantine"]
+Reason = Literal["first", "jump", "clock", "publisher", "pose", "world", "effort", "reset", "parameters", "quarantine"]
 """Why the density started again; `clock`: after a step back, with its objects."""
 
 
