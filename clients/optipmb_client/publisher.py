@@ -164,7 +164,7 @@ class Publisher:
             if relocation is not None:
                 world = _relocation(relocation, 1 if world is None else world.world + 1)
             if points is not None and (has_points or self.points_wanted):
-                cloud = self._encode_points(stamp_ns, points, pose if points_pose is None else points_pose, world)
+                cloud = self._encode_points(stamp_ns, points, pose if points_pose is None else points_pose)
                 has_points = True
             elif has_points is None and self._points_seq > 0:
                 has_points = False
@@ -213,13 +213,11 @@ class Publisher:
         with self._order:
             if not self.points_wanted:
                 return None
-            self._points.put(self._encode_points(stamp_ns, points, pose, None))
+            self._points.put(self._encode_points(stamp_ns, points, pose))
             self._points_seq += 1
             return self._points_seq - 1
 
-    def _encode_points(
-        self, stamp_ns: int, points: ArrayLike, pose: PoseLike | None, world: Relocation | None
-    ) -> bytes:
+    def _encode_points(self, stamp_ns: int, points: ArrayLike, pose: PoseLike | None) -> bytes:
         return self._points.pack(
             Points(
                 stream=self.stream,
@@ -228,7 +226,6 @@ class Publisher:
                 stamp_ns=_stamp(stamp_ns),
                 frame=self.frame,
                 pose=_pose(pose),
-                relocation=world,
                 xyz=numeric.finite(_array("xyz", points, 3)),
             )
         )
