@@ -27,12 +27,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from optipmb.compiled import kernel
 from optipmb.density import ENOUGH, LEAST_MOVED_S, NO_FRAME, OMEGA, PHI, V
+from optipmb.relocation import Relocation
 from optipmb.rows import read_only
 
 if TYPE_CHECKING:
@@ -220,25 +221,18 @@ def _over_ground(density: Density, motion: Array, dt: float, frame: Frame) -> De
 
 def _carried(density: Density, motion: Array, dt: float) -> Density:
     """Return a density in the axes of a sensor that made a motion."""
-    parts: dict[str, Any] = {"sensor": read_only(np.array([*motion / dt, ENOUGH, LEAST_MOVED_S]))}
-    cos, sin = math.cos(motion[2]), math.sin(motion[2])
-    turn = np.eye(6)
-    turn[:2, :2] = (cos, -sin), (sin, cos)
-    for name in ("bernoulli", "poisson"):
-        rows = getattr(density, name)
-        mean = rows.mean.copy()
-        mean[:, :2] = taken(mean[:, :2], motion)
-        heading = mean[:, PHI] + motion[2]
-        mean[:, PHI] = heading - 2.0 * math.pi * np.ceil((heading - math.pi) / (2.0 * math.pi))
-        parts[name] = rows.replaced(mean=mean, covariance=turn @ rows.covariance @ turn.T)
-    return replace(density, **parts)
+    moved = _relocation(motion).density(density)
+    return replace(moved, sensor=read_only(np.array([*motion / dt, ENOUGH, LEAST_MOVED_S])))
 
 
 def taken(points: Array, motion: Array) -> Array:
     """Return points (N, 2) where a motion (3,), t and theta, takes them."""
-    cos, sin = math.cos(motion[2]), math.sin(motion[2])
-    x, y = points[:, 0], points[:, 1]
-    return np.column_stack((cos * x - sin * y + motion[0], sin * x + cos * y + motion[1]))
+    return _relocation(motion).points(points)
+
+
+def _relocation(motion: Array) -> Relocation:
+    x, y, theta = motion.tolist()
+    return Relocation(x, y, 0.0, theta)
 
 
 @kernel

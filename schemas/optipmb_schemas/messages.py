@@ -39,6 +39,8 @@ FULL = 2.0 * math.pi
 TURN = FULL + 1e-6
 QUARTER = 0.25 * FULL + 1e-6
 """Limits of angles; float32 rounds them up."""
+UPRIGHT = 1e-3
+"""Largest tilt of a relocation, rad."""
 NARROWEST = 1e-3
 """Least width of a field of view, rad."""
 LEAST_VARIANCE = 1e-8
@@ -83,6 +85,24 @@ class FieldOfView(Message):
                 raise invalid(name, "an end above the beginning", [begin, end])
 
 
+class Relocation(Message):
+    """Motion of the world frame: from the world before, what was at p is at R p + `translation`, R a turn about z."""
+
+    world: Annotated[int, Field(strict=True, ge=1, le=2**31 - 1)] = Field(
+        description="Number of the world frame of this message: 1 after the first motion, then 2, 3, without gaps."
+    )
+    translation: Annotated[Reals, Array("f8", (3,), -FAR, FAR)] = Field(description="Translation x, y, z in metres.")
+    quaternion: Annotated[Reals, Array("f8", (4,), -1.001, 1.001), AfterValidator(unit_quaternion)] = Field(
+        description="The turn R: w, x, y, z; its norm within 0.001 of one, tilted by at most 0.001 rad."
+    )
+
+    def check(self) -> None:
+        """The world stays upright."""
+        _, x, y, _ = self.quaternion.tolist()
+        if (tilt := 2.0 * math.hypot(x, y)) > UPRIGHT:
+            raise invalid("quaternion", f"a turn about z, tilted by at most {UPRIGHT:g} rad", tilt)
+
+
 class Header(Message):
     """What every message of a stream starts with."""
 
@@ -103,6 +123,11 @@ class SensorMessage(Header):
     pose: Pose | None = Field(
         default=None,
         description="World from sensor at `stamp_ns`. Required when `frame` is `sensor`.",
+    )
+    relocation: Relocation | None = Field(
+        default=None,
+        description="The last motion of the world frame, in every message after it. Absent: the world is that of the "
+        "message before; of `Points`: that of their detections.",
     )
 
     def check(self) -> None:
@@ -223,6 +248,9 @@ class Tracks(ResultMessage):
     cloud_used: Flag = Field(description="Whether the frame was tracked with a cloud.")
     gap: Count = Field(default=0, description="Frames known to be missing directly before this one.")
     ignored: Count = Field(default=0, description="Detections left out: class not in the profile, or score 0.")
+    world: Count | None = Field(
+        default=None, description="Number of the world frame, which grows with each `relocation`. Absent: 0."
+    )
     labels: Labels = Field(description="Names of the classes that `label` counts.")
     id: Annotated[Integers, Array("i8", ("N",), 0, INT64)] = Field(
         description="Identity: unique in the stream, never used again. Ascending."
@@ -290,6 +318,9 @@ class Tracks(ResultMessage):
     )
     path_covariance: Annotated[Singles, Array("f4", ("N", "H", 2, 2), -1e30, 1e30)] | None = Field(
         default=None, description="Covariance of the predicted x and y, m^2."
+    )
+    relocation: Relocation | None = Field(
+        default=None, description="Motion of the world frame between the frame before and this one."
     )
     delivery: Delivery | None = Field(default=None, description="How this publication came about.")
 

@@ -23,6 +23,7 @@ from optipmb_schemas.messages import (
     FieldOfView,
     Points,
     Pose,
+    Relocation,
     Tracks,
     ZoneCount,
     ZoneEvent,
@@ -32,6 +33,7 @@ from optipmb_schemas.model import Message
 SOURCE: Final = "optipmb/v1/tracking.proto"
 MODELS: Final[tuple[type[Message], ...]] = (
     Pose,
+    Relocation,
     FieldOfView,
     Detections,
     Points,

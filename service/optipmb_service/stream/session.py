@@ -750,7 +750,7 @@ class Session:
             outputs.append(self._problem("no_pose", frame_id, "pose", "the pose of a sensor that moves", received))
         step_ns = (self._clock() - began_ns) // max(1, len(outcomes))
         for one in outcomes:
-            if (one.unknown or one.tracks is None) and not one.frame.revision:
+            if (one.unknown or one.fault or one.tracks is None) and not one.frame.revision:
                 outputs += self._left_out(one)
             if (tracks := one.tracks) is not None:
                 self._deliveries.corrected += one.frame.revision > 0
@@ -829,7 +829,9 @@ class Session:
             self._problem("unknown_class", frame.frame_id, "labels", expected, repr(label), count)
             for label, count in (outcome.unknown or {}).items()
         ]
-        if outcome.tracks is not None:
+        if (fault := outcome.fault) is not None:
+            problems.append(self._problem("invalid_value", frame.frame_id, fault.path, fault.expected, fault.received))
+        if outcome.tracks is not None or fault is not None:
             return problems
         if frame.place.opens is Verdict.UNCONFIRMED:
             expected = f"a stamp near the one before, or {JUMP_FRAMES} frames in a row that agree on the jump"

@@ -218,7 +218,7 @@ def events_of(header: dict[str, Any], events: Sequence[Event], counts: ZoneCount
     )
 
 
-Reason = Literal["first", "jump", "clock", "publisher", "pose", "effort", "reset", "parameters", "quarantine"]
+Reason = Literal["first", "jump", "clock", "publisher", "pose", "world", "effort", "reset", "parameters", "quarantine"]
 """Why the density started again; `clock`: after a step back, with its objects."""
 
 
