@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 KEYS = Keys()
-NUMBERS = 200
-"""Keys of about 50 streams of one process."""
+NUMBERS = 100
+"""Keys of about 25 streams of one process."""
 TOGETHER, MOST = 20, 15
 """Streams that are open at once, and how often others follow them."""
 FRAMES = 8
