@@ -16,7 +16,7 @@ from pathlib import Path
 from optipmb_schemas import Detections, Points, Tracks, decode
 
 from optipmb_tools.camera import synthetic_camera
-from optipmb_tools.datasets.interface import IDENTITY, Cloud, DataSequence, Dataset, DetectionFrame, relabelled
+from optipmb_tools.datasets.interface import IDENTITY, Cloud, DataSequence, Dataset, DetectionFrame
 from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Floats, Pose, box_columns, rotation_of, to_sensor
 from optipmb_tools.recordings.files import Recorded, RecordingFile
@@ -64,8 +64,8 @@ class RecordedSequence(DataSequence):
                 index=index,
                 stamp_ns=message.stamp_ns,
                 pose=pose,
-                labels=self.labels,
-                label=relabelled(message.label, message.labels, self.labels),
+                labels=message.labels,
+                label=message.label,
                 center=center,
                 size=box_columns(message)[0],
                 yaw=yaw,

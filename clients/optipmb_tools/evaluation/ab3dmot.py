@@ -54,7 +54,7 @@ class Point:
 
     @property
     def smota(self) -> float:
-        """MOTA scaled to its maximum at the recall, in [0, 1]; NaN where no truth counts."""
+        """MOTA scaled to its largest value at the recall, in [0, 1]; NaN where no truth counts."""
         counts, recall = self.counts, self.recall
         scaled = 1.0 - ratio(counts.errors - (1.0 - recall) * counts.truth, recall * counts.truth)
         return float(np.clip(scaled, 0.0, 1.0))

@@ -1,7 +1,7 @@
 """Errors of boxes in every direction, of tracks and of the detections that they are made of.
 
 Conventions: world frame, metres and radians, box minus label. `along` and `across` are offsets of the centre along and
-across the heading of the label, `height` is the error of the centre upwards. Headings are compared modulo pi; a box is
+across the heading of the label, `height` is the offset upwards. Headings are compared modulo pi; a box is
 backward when its heading is off by more than half of pi. Tracks count from an existence probability of a half on; only
 boxes with a detection of their own in the frame are compared, so that both columns are of the same objects at the same
 times. Labels and tracks belong together as in `optipmb_tools.evaluation.calibration`. Where the dataset was opened

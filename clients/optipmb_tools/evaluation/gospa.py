@@ -70,7 +70,7 @@ def _gospa(case: Case, frames: int, cutoff: float, order: float) -> GospaResult:
     near = case.pairs(case.cost < cutoff)
     power = near.cost**order
     limit = cutoff**order
-    # A pair is worth its saving: either of the two metrics charges c^p for two that are left alone or far apart.
+    # A pair is worth its saving: either of the two metrics charges c^p for two boxes that are alone or far apart.
     taken = assign_frames(near.pair_frame, near.truth_row, near.track_row, limit - power, best_pairs)
     when = near.pair_frame[taken]
     stop = 1 + max(case.truth_frame.max(initial=-1), case.track_frame.max(initial=-1))

@@ -68,7 +68,7 @@ class Smoother:
         label = np.concatenate([one.label for one in objects])
         mean = np.concatenate([one.mean for one in objects])
         covariance = np.concatenate([one.covariance for one in objects])
-        mean[shown, :2], mean[shown, PHI] = extracted.center[:, :2], extracted.yaw  # speeds are the filter's
+        mean[shown, :2], mean[shown, PHI] = extracted.center[:, :2], extracted.yaw  # speeds stay the filter's
         factors = self._factors(extracted.label)
         lasting = self._lasting(extracted.label, evidence, extracted.yaw)
         covariance[shown] = (extracted.covariance - lasting) / factors

@@ -31,8 +31,8 @@ from scipy.optimize import brentq, isotonic_regression
 from optipmb import Calibration, Parameters
 from optipmb_tools.evaluation.calibration import NORMAL_95, CalibrationResult, calibration, rows_of, sample
 from optipmb_tools.geometry import Bools, Floats, Ints, wrap_angle
-from optipmb_tools.results import FullTable, ResultTable
-from optipmb_tools.tuning.clips import Clip, track_fully
+from optipmb_tools.results import FullTable
+from optipmb_tools.tuning.clips import Clip, track_clip
 from optipmb_tools.tuning.scoring import Figures, Scorer, folds_of, metric, standard_error, without_folds
 from optipmb_tools.tuning.values import rounded, with_calibration, with_values
 
@@ -94,8 +94,9 @@ def measured_calibration(clips: Sequence[Clip], scorer: Scorer, parameters: Para
     """Return the calibration figures of the tracks of some sequences."""
     parts = []
     for clip in clips:
-        tracks, full = _tracked(clip, scorer, parameters)
-        parts.append(calibration(clip.world, tracks, full, scorer.name, scorer.near))
+        tracks = track_clip(clip, parameters)
+        counted = tracks.take(scorer.counts(clip, tracks))
+        parts.append(calibration(clip.world, counted, tracks, scorer.name, scorer.near))
     return reduce(add, parts)
 
 
@@ -119,11 +120,6 @@ def cross_calibration(clips: Sequence[Clip], scorer: Scorer, parameters: Paramet
     return reduce(add, parts)
 
 
-def _tracked(clip: Clip, scorer: Scorer, parameters: Parameters) -> tuple[ResultTable, FullTable]:
-    tracks, full = track_fully(clip, parameters)
-    return tracks.take(scorer.counts(clip, tracks)), full
-
-
 def _rows(clip: Clip, scorer: Scorer, parameters: Parameters, memory: float) -> _Rows:
     """Track a sequence; the score carries the evidence."""
     probe = Calibration(
@@ -135,8 +131,8 @@ def _rows(clip: Clip, scorer: Scorer, parameters: Parameters, memory: float) -> 
         along=(0.0,),
         across=(0.0,),
     )
-    tracks, full = _tracked(clip, scorer, with_calibration(parameters, scorer.name, probe))
-    found = sample(clip.world, tracks, full, scorer.name, scorer.near)
+    full = track_clip(clip, with_calibration(parameters, scorer.name, probe))
+    found = sample(clip.world, full.take(scorer.counts(clip, full)), full, scorer.name, scorer.near)
     matched, owner = found.row[found.true], found.owner[found.true]
     turn, offset = full.yaw[matched], found.offset[found.true]
     ahead = np.column_stack([np.cos(turn), np.sin(turn)])
@@ -305,10 +301,10 @@ def rank(clips: Sequence[Clip], scorer: Scorer, parameters: Parameters, objectiv
         objective: one of `optipmb_tools.tuning.scoring.METRICS`.
     """
     probe = with_values(parameters, scorer.name, {"calibration.score_of_evidence": 1.0})
-    tracked = [track_fully(clip, probe) for clip in clips]
-    scores_of = [_scores(clip, full, parameters.nominal_period) for clip, (_, full) in zip(clips, tracked, strict=True)]
+    tracked = [track_clip(clip, probe) for clip in clips]
+    scores_of = [_scores(clip, full, parameters.nominal_period) for clip, full in zip(clips, tracked, strict=True)]
     scores = {
-        name: [replace(tracks, score=one[name]) for (tracks, _), one in zip(tracked, scores_of, strict=True)]
+        name: [replace(tracks, score=one[name]) for tracks, one in zip(tracked, scores_of, strict=True)]
         for name in scores_of[0]
     }
     objects = [len(set(clip.truth.id[~clip.truth.ignored].tolist())) for clip in clips]

@@ -15,12 +15,11 @@ import numpy as np
 
 from optipmb import Parameters
 from optipmb_tools.evaluation.calibration import CalibrationResult
-from optipmb_tools.run.bulk import Executor
 from optipmb_tools.tuning.calibrate import Ranking, calibrate, cross_calibration, rank
-from optipmb_tools.tuning.clips import Clip, Degradation, degrade
+from optipmb_tools.tuning.clips import Degradation
 from optipmb_tools.tuning.display import TrialDisplay
 from optipmb_tools.tuning.estimate import estimate
-from optipmb_tools.tuning.scoring import MARGIN, Figures, Gain, Measured, Objective, Scorer, folds_of, plain_figures
+from optipmb_tools.tuning.scoring import MARGIN, Figures, Gain, Measured, Objective, folds_of, plain_figures
 from optipmb_tools.tuning.search import Dimension, Search, Values, dimensions, penalty, repaired
 from optipmb_tools.tuning.values import Value, only, value_of, with_calibration, with_heading_sign, with_values
 
@@ -148,33 +147,28 @@ def _spread(values: Sequence[float]) -> float | None:
 
 
 def refine(
-    clips: Sequence[Clip],
-    scorer: Scorer,
+    objective: Objective,
     parameters: Parameters,
     plan: Plan,
     storage: Path,
     context: Mapping[str, Any],
     display: TrialDisplay,
-    executor: Executor | None = None,
 ) -> Refined:
     """Tune one class.
 
     Args:
-        clips: with this class only.
-        scorer: of this class.
+        objective: of this class, with clips that have it only.
         parameters: where the search begins; other classes in them do not matter.
         plan: options.
         storage: the file that keeps the trials.
         context: other settings that the trials depend on, such as the names of the data.
         display: shows the progress.
-        executor: where sequences are tracked; by default in this process.
 
     Raises:
         UsageError: the storage holds trials of another session.
     """
-    name, base, everyone = scorer.name, only(parameters, scorer.name), tuple(range(len(clips)))
-    copies = [[degrade(clip, Degradation(), plan.seed, i) for clip in clips] for i in range(plan.copies)]
-    objective = Objective([clips, *copies], scorer, plan.metric, executor, display.note)
+    clips, scorer, name = objective.variants[0], objective.scorer, objective.scorer.name
+    base, everyone = only(parameters, name), tuple(range(len(clips)))
     groups = folds_of(objective.boxes, plan.folds)
     trials = len(groups) * plan.fold_trials + plan.trials
     display.begin(name, trials)

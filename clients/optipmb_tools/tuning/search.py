@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from optipmb_client.errors import ClientError, UsageError
-from optipmb_schemas.installation import install_command
+from optipmb_client.errors import UsageError
 
 from optipmb import Parameters
+from optipmb_tools.extras import needed
 from optipmb_tools.tuning.clips import Clip
 from optipmb_tools.tuning.values import Value, rounded, value_of
 
@@ -284,11 +284,10 @@ class Search:
 
 
 def _load_optuna() -> Any:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            import optuna  # noqa: PLC0415  an extra that only this needs
-    except ImportError as error:
-        raise ClientError(f"tuning needs optuna, which is not installed: {install_command('tune')}") from error
+    needed("tuning", "tune", "optuna")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import optuna  # noqa: PLC0415  an extra that only this needs
+
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     return optuna

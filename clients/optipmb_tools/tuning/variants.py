@@ -114,8 +114,8 @@ def write_sweep(folder: Path, result: Mapping[str, Any], *, picture: bool) -> No
 
     Args:
         folder: is made where it is not there.
-        result: `sweeps` has for each parameter its `values`, those of the `profile` by class, and `figures`: by class
-            a mapping for each value.
+        result: `sweeps` has for each parameter its `values`, the profile's own by class (`profile`), and `figures`: by
+            class a mapping for each value.
         picture: whether to draw.
     """
     folder.mkdir(parents=True, exist_ok=True)

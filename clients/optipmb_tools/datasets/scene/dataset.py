@@ -14,7 +14,7 @@ import numpy as np
 from optipmb_schemas import Tracks
 
 from optipmb_tools.camera import synthetic_camera
-from optipmb_tools.datasets.interface import Cloud, DataSequence, Dataset, DetectionFrame, Regions, Truth
+from optipmb_tools.datasets.interface import Cloud, DataSequence, Dataset, DetectionFrame, Truth
 from optipmb_tools.datasets.scene.detector import CLASSES, Found, Seen, detect
 from optipmb_tools.datasets.scene.lidar import Scan, scan
 from optipmb_tools.datasets.scene.traffic import World, build_world, fixed_boxes
@@ -171,10 +171,9 @@ class SceneSequence(DataSequence):
         points = returns[when, which]
         covered = np.stack([self._scanned[i][1] for i in range(len(self))])[when, which]
         level = np.digitize(np.nan_to_num(covered, nan=0.0), [0.1, 0.5])
-        count = len(when)
-        return Truth(
-            labels=CLASSES,
-            frame=when.astype(np.int64),
+        return Truth.of(
+            CLASSES,
+            when.astype(np.int64),
             id=identity[when, which],
             label=world.label[which],
             center=world.center[when, which],
@@ -182,12 +181,9 @@ class SceneSequence(DataSequence):
             yaw=wrap_angle(world.yaw[when, which]),
             velocity=world.velocity[when, which],
             occlusion=level.astype(np.int64),
-            truncation=np.zeros(count, dtype=np.int64),
             covered=covered,
             points=points,
-            box2d=np.full((count, 4), np.nan),
             ignored=points < MIN_POINTS,
-            regions=Regions(np.empty(0, dtype=np.int64), np.empty((0, 4))),
         )
 
 

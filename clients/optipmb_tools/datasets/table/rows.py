@@ -566,7 +566,7 @@ class _Motion:
         return np.asarray(np.arctan2(turned[:, 1], turned[:, 0]), dtype=np.float64)
 
 
-_FORWARD: Final = 0.8  # share of forward moves from which a common motion is that of traffic, not of the sensor
+_FORWARD: Final = 0.8  # share of forward moves from which traffic shares a motion, not the sensor
 _LEAST_TURN: Final = 1e-6
 _INVERSE: Final = np.array([1.0, -1.0, -1.0, -1.0])
 
