@@ -397,6 +397,13 @@ class Settings(BaseSettings):
     """address of health, metrics and live page, as `127.0.0.1:8080`"""
     http_hosts: Names = ()
     """host names with a dot by which the page may be asked for, besides addresses and names without; `*`: any"""
+    http_origins: Names = ()
+    """origins of other pages that may read over HTTP, as `https://map.example`; `*`: any"""
+    http_tokens: str = ""
+    """JSON file of names by the SHA-256 of their tokens, or `module:function`, as `grpc_tokens`; default: all may
+    read"""
+    http_clients: int = Field(default=32, ge=1, le=128)
+    """readers of streams over HTTP at once, viewers of the page among them; further ones are refused"""
     http_streams: int = Field(default=100, ge=0, le=10_000)
     """streams with series of their own in the metrics, by name"""
     grpc: Address = ""

@@ -327,13 +327,16 @@ def _monitoring(settings: Settings, health: ProcessHealth) -> Iterator[None]:
 
     from optipmb_service.http import Server, application  # noqa: PLC0415 - a third of a second that only this needs
 
-    sites = {}
+    places = {}
     if settings.sites:
         from optipmb import Georeference  # noqa: PLC0415 - the tracker, which a router does not load
 
-        sites = {name: Georeference(site.origin, site.x_heading) for name, site in settings.sites.items()}
-    interface = functools.partial(document, settings.prefix, (*settings.connect, *settings.endpoints)[0])
-    server = Server(application(health, settings.http_hosts, sites, interface), settings.http)
+        places = {
+            name: Georeference(site.origin, site.x_heading).to_geographic for name, site in settings.sites.items()
+        }
+    endpoint = (*settings.connect, *settings.endpoints)[0]
+    interface = functools.partial(document, settings.prefix, endpoint, settings.http)
+    server = Server(application(health, settings, places, interface), settings.http)
     log.info("http", address=server.address)
     try:
         yield

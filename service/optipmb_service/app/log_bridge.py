@@ -45,7 +45,7 @@ class LogBridge(Reporter):
     """From a network into the log; the client is closed by the caller, after this."""
 
     def __init__(self, settings: Settings, client: Client) -> None:
-        super().__init__(lambda: client.failure)
+        super().__init__(client)
         self._client = client
         self._instance = settings.instance
         self._limits = settings.limits.limits()
@@ -62,8 +62,7 @@ class LogBridge(Reporter):
     @property
     def state(self) -> str:
         """Ready while it has a router and the servers."""
-        state = super().state
-        return "degraded" if state == "ready" and self.failure else state
+        return "unlinked" if super().failure else "degraded" if self.failure else "ready"
 
     @property
     def failure(self) -> str:

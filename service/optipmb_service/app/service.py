@@ -250,9 +250,13 @@ class Service(Reporter):
             problems=self._reporter.newest(),
         )
 
-    def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None]:
-        """Hand over the messages of a stream to a viewer, until the result is called."""
-        return self._transport.tap(stream, receive, self._streams.fusion.seen_by(stream))
+    def session(self) -> Client:
+        """Return the session for readers."""
+        return self.client()
+
+    def detections_of(self, stream: str) -> str:
+        """Return the pattern of the streams whose detections belong to the tracks of a stream."""
+        return self._streams.fusion.seen_by(stream)
 
     def client(self) -> Client:
         """Return what an edge in this process uses of the network."""

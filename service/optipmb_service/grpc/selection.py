@@ -1,26 +1,21 @@
-"""What a subscriber wants of the tracks: which of them, which columns, and how often."""
+"""What a subscriber wants of the tracks: which of them, and which columns."""
 
 from __future__ import annotations
 
-import collections
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import optipmb_schemas as schemas
+from optipmb_schemas.json_form import CONFIRMED_EXISTENCE
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf.convert import column, select
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-    from optipmb_schemas.protobuf.convert import EncodedTracks
 
 MAX_CORNERS: Final = 1000
 MAX_NAMES: Final = 256
 CORNERS: Final = 3
-CONFIRMED_EXISTENCE: Final = 0.5
-TOLERANCE: Final = 0.999
-"""Part of a period that counts as a whole one: stamps of real sensors jitter."""
-REMEMBERED: Final = 64
 
 
 class Selection:
@@ -83,38 +78,6 @@ class Selection:
 
 
 EVERYTHING: Final = Selection(pb.TrackFilter())
-
-
-class Pace:
-    """Leaves out frames that come sooner than a period after the one before, in sensor time, in each stream.
-
-    What corrects a frame that was let through is let through too.
-
-    Args:
-        max_rate_hz: highest rate; 0: all frames.
-
-    Raises:
-        MessageError: it is no rate.
-    """
-
-    def __init__(self, max_rate_hz: float) -> None:
-        if not 0 <= max_rate_hz < float("inf"):
-            raise schemas.MessageError("invalid_value", "max_rate_hz", "a rate in Hz, or 0", f"{max_rate_hz:g}")
-        self._period_ns = TOLERANCE * 1e9 / max_rate_hz if max_rate_hz else 0.0
-        self._passed: dict[str, collections.deque[int]] = {}
-
-    def passes(self, tracks: EncodedTracks) -> bool:
-        """Tell whether the tracks of a frame are sent."""
-        if not self._period_ns:
-            return True
-        stamp_ns = tracks.stamp_ns
-        passed = self._passed.setdefault(tracks.stream, collections.deque(maxlen=REMEMBERED))
-        if stamp_ns in passed:
-            return True
-        if passed and abs(stamp_ns - passed[-1]) < self._period_ns:
-            return False
-        passed.append(stamp_ns)
-        return True
 
 
 def _inside(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray[np.bool_]:

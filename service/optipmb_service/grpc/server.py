@@ -20,6 +20,7 @@ from optipmb_client.errors import ClientError
 from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
+from optipmb_service.edge.access import NotAllowedError
 from optipmb_service.grpc import inputs, outputs
 from optipmb_service.grpc.access import Access, credentials
 from optipmb_service.grpc.calls import Call, CallerGoneError, EndCall, ending_with_caller
@@ -238,6 +239,8 @@ class Server:
         except schemas.MessageError as error:
             self.metrics.refused[error.code] += 1
             raise EndCall.invalid(error) from None
+        except NotAllowedError as error:
+            raise EndCall(grpc.StatusCode.PERMISSION_DENIED, str(error)) from None
         except TransportError as error:
             raise EndCall(grpc.StatusCode.UNAVAILABLE, f"the network cannot be used: {error}") from error
         except (EndCall, CallerGoneError, asyncio.CancelledError):
