@@ -73,7 +73,9 @@ FIELDS: Final = frozenset(msgspec.structs.asdict(EdgeTrack(0))) - {"id", "kind"}
 class _Frame(Struct, frozen=True, tag_field="type", kw_only=True):
     stream: Annotated[str, Meta(description="Name of the stream.")]
     sensor: Annotated[str, Meta(description="Stream of the detections.")]
-    time: Annotated[str, Meta(description="Time of the frame in UTC; absent if not in 2000 to 2100.")] | UnsetType
+    time: Annotated[str, Meta(description="Time of the frame in UTC; absent if not in 2000 to 2100.")] | UnsetType = (
+        UNSET
+    )
     stamp_ns: Annotated[str, Meta(description="The same in nanoseconds of the sensor's clock, as text.")]
     session: Annotated[str, Meta(description="32 hexadecimal digits. When it changes, earlier tracks have ended.")]
     epoch: Annotated[str, Meta(description="Start of the publisher, 32 hexadecimal digits.")]
@@ -99,14 +101,14 @@ class EdgeEvent(_Frame, frozen=True, tag="event", kw_only=True, rename={"name": 
     n: Annotated[int, Meta(description="Counts the events of this zone and kind from 1, through restarts.")]
     id: Annotated[int, Meta(description="The track.")]
     name: Class
-    at: Annotated[str, Meta(description="When, in UTC; absent if not in 2000 to 2100.")] | UnsetType
+    at: Annotated[str, Meta(description="When, in UTC; absent if not in 2000 to 2100.")] | UnsetType = UNSET
     at_ns: Annotated[str, Meta(description="When, in nanoseconds of the sensor's clock, as text.")]
     position: Position
     speed: Speed
     yaw: Yaw
-    how: Annotated[str, Meta(description="`crossed` the border, `appeared`, `lost` or `ended`.")] | UnsetType
-    dwell_s: Annotated[float, Meta(description="Seconds inside.")] | UnsetType
-    direction: Annotated[str, Meta(description="To the `left` or `right` of the line.")] | UnsetType
+    how: Annotated[str, Meta(description="`crossed` the border, `appeared`, `lost` or `ended`.")] | UnsetType = UNSET
+    dwell_s: Annotated[float, Meta(description="Seconds inside.")] | UnsetType = UNSET
+    direction: Annotated[str, Meta(description="To the `left` or `right` of the line.")] | UnsetType = UNSET
     lat: Lat | UnsetType = UNSET
     lon: Lon | UnsetType = UNSET
     alt: Alt | UnsetType = UNSET

@@ -56,6 +56,7 @@ PURE = {
     "transition",
     "values",
     "window",
+    "worlds",
 }
 """Modules of `stream/` that make up a session."""
 

@@ -14,7 +14,7 @@ from optipmb_schemas import Detections, Dump, DumpedFrame, MessageError, Points,
 
 import optipmb
 from optipmb_tools.datasets.interface import DETECTION_COLUMNS
-from optipmb_tools.run.tracking import track_fields
+from optipmb_tools.run.tracking import fields_of
 
 
 @dataclass(frozen=True)
