@@ -54,6 +54,7 @@ PURE = {
     "transition",
     "values",
     "window",
+    "worlds",
 }
 """Modules of `stream/` that make up a session."""
 
