@@ -15,7 +15,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_client import Connection, ConnectionFailed, Publisher, Subscriber
 from optipmb_client.incoming import Inbox
-from optipmb_schemas import Detections, Message, MessageError, Points, Problem, Tracks, decode, encode, encoding_of
+from optipmb_schemas import (
+    Detections,
+    Message,
+    MessageError,
+    Points,
+    Pose,
+    Problem,
+    Tracks,
+    decode,
+    encode,
+    encoding_of,
+)
 from routers import free_endpoint, open_client
 from tracks_message import SESSION, tracks_message
 from without_numpy import command, publish_everything
@@ -185,6 +196,9 @@ BAD = [
     ({"velocity": [[np.inf, 0]]}, "velocity[0][0]"),
     ({"points": np.zeros((4, 2), np.float32)}, "xyz"),
     ({"points": "nonsense"}, "xyz"),
+    ({"relocation": 5}, "relocation"),
+    ({"relocation": ([0, 0, 0], [0.8, 0.6, 0, 0])}, "relocation.quaternion"),
+    ({"relocation": ([0, 0], [1.0, 0, 0, 0])}, "relocation.translation"),
     ({"points_pose": ([0, 0], [1.0, 0, 0, 0]), "points": np.zeros((4, 3), np.float32)}, "translation"),
 ]
 
@@ -234,6 +248,26 @@ def test_a_cloud_is_sent_before_its_detections() -> None:
     assert cloud.xyz.tolist() == points[:, :3].tolist()
     assert cloud.pose is not None
     assert cloud.pose.translation.tolist() == [9.0, 9.0, 9.0]
+
+
+def test_a_motion_of_the_world_is_counted_and_repeated() -> None:
+    """Given once, it is in all later messages; a message that is refused does not count."""
+    sent: list[bytes] = []
+    turn = [0.8, 0.0, 0.0, 0.6]
+    with offline_publisher(sent) as publisher:
+        publisher.publish(stamp_ns=0, pose=POSE, **ONE)
+        publisher.publish(stamp_ns=1, pose=POSE, relocation=([5, 6, 7], turn), **ONE)
+        publisher.publish(stamp_ns=2, pose=POSE, **ONE)
+        with pytest.raises(MessageError, match="score"):
+            publisher.publish(stamp_ns=3, pose=POSE, relocation=([0, 0, 1], turn), **(ONE | {"score": [2.0]}))
+        publisher.publish(stamp_ns=3, pose=POSE, relocation=Pose(translation=[0, 0, 1], quaternion=turn), **ONE)
+    said = [decode(payload, Detections).relocation for payload in sent]
+    assert [one and (one.world, one.translation.tolist()) for one in said] == [
+        None,
+        (1, [5.0, 6.0, 7.0]),
+        (1, [5.0, 6.0, 7.0]),
+        (2, [0.0, 0.0, 1.0]),
+    ]
 
 
 def test_points_without_a_return_are_left_out() -> None:

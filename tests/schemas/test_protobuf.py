@@ -10,7 +10,7 @@ import msgpack
 import numpy as np
 import pytest
 from optipmb_schemas import MessageError, SessionParameters, decode, encode, encode_json, encoding_of
-from optipmb_schemas.messages import Detections, Message, Points, Tracks
+from optipmb_schemas.messages import Detections, Message, Points, Relocation, Tracks
 from optipmb_schemas.protobuf import convert, export
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf.convert import transcode
@@ -178,6 +178,14 @@ def test_tracks_of_any_number_are_transcoded(rows: int, example_of: Any) -> None
     known = (many.stream, many.epoch, many.seq, many.stamp_ns, many.revision, many.delivery.run)
     assert (transcoded.stream, transcoded.epoch, transcoded.seq, transcoded.stamp_ns) == known[:4]
     assert (transcoded.revision, transcoded.run) == known[4:]
+
+
+def test_tracks_after_a_motion_of_the_world_are_transcoded(example_of: Any) -> None:
+    """They say which motion, in both forms."""
+    tracks = example_of(Tracks).model_copy(update={"relocation": example_of(Relocation)})
+    transcoded = transcode(encode(tracks), encoding=encoding_of(Tracks)).message()
+    assert transcoded == convert.to_proto(tracks)
+    assert transcoded.relocation.world == transcoded.world == 3
 
 
 def without_rows(fields: dict[str, Any]) -> None:

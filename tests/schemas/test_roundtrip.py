@@ -23,6 +23,7 @@ from optipmb_schemas import (
     Points,
     Pose,
     Problem,
+    Relocation,
     ResetRequest,
     ServiceStatus,
     SessionParameters,
@@ -98,7 +99,17 @@ def placed(draw: st.DrawFn) -> dict[str, Any]:
     """Return the fields that all messages of a publisher have."""
     frame = draw(st.sampled_from(["world", "sensor"]))
     pose = draw(poses()) if frame == "sensor" else draw(st.none() | poses())
-    return {**draw(headers()), "frame": frame, "pose": pose}
+    return {**draw(headers()), "frame": frame, "pose": pose, "relocation": draw(st.none() | relocations())}
+
+
+@st.composite
+def relocations(draw: st.DrawFn) -> Relocation:
+    """Return motions of the world."""
+    turn = draw(st.floats(-7.0, 7.0))
+    quaternion = np.array([np.cos(turn), 0.0, 0.0, np.sin(turn)])
+    return Relocation(
+        world=draw(st.integers(1, 2**31 - 1)), translation=draw(rows((3,), -FAR, FAR)), quaternion=quaternion
+    )
 
 
 @st.composite
@@ -164,6 +175,8 @@ def tracks(draw: st.DrawFn) -> Tracks:
         cloud_used=draw(st.booleans()),
         gap=draw(count),
         ignored=draw(count),
+        world=draw(st.none() | count),
+        relocation=draw(st.none() | relocations()),
         labels=tuple(names),
         id=np.sort(np.array(draw(st.lists(count, min_size=n, max_size=n, unique=True)), dtype="i8")),
         label=draw(whole(n, 0, len(names) - 1)),

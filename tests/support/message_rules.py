@@ -45,6 +45,18 @@ RULES: list[tuple[str, str, Any, str]] = [
     ("Detections", "pose", {"translation": [0, 0, 0], "quaternion": [1, 0, 0, 0.1]}, "pose.quaternion"),
     ("Detections", "pose", {"translation": [0, 0, 0], "quaternion": [0, 0, 0, 0]}, "pose.quaternion"),
     ("Detections", "pose", {"translation": [0, 0, 0], "quaternion": [1, 0, 0]}, "pose.quaternion"),
+    *(
+        ("Detections", "relocation", {"world": 1, "translation": [0, 0, 0], "quaternion": [1, 0, 0, 0]} | wrong, path)
+        for wrong, path in (
+            ({"world": 0}, "relocation.world"),
+            ({"world": 2**31}, "relocation.world"),
+            ({"translation": [0, 0]}, "relocation.translation"),
+            ({"quaternion": [0.999, 0.03, 0.0, 0.0]}, "relocation.quaternion"),
+            ({"quaternion": [1, 0, -0.001, 0.01]}, "relocation.quaternion"),
+            ({"quaternion": [0.9, 0, 0, 0]}, "relocation.quaternion"),
+        )
+    ),
+    ("Tracks", "world", -1, "world"),
     ("Detections", "field_of_view", [-1, 1], "field_of_view"),
     ("Detections", "field_of_view", {"azimuth": [-1, 1]}, "field_of_view.elevation"),
     *(

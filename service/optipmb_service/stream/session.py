@@ -619,6 +619,9 @@ class Session:
         if found := queue.stamps.add(frame_id.stamp_ns, since_ns):
             expected = "stamps in nanoseconds that advance with time"
             outputs.append(self._problem("clock", frame_id, "stamp_ns", expected, found))
+        if self._policy.jumps == "report" and (found := queue.poses.add(message, self._policy)):
+            expected = "a pose where the motion of the sensor leads, or a `relocation`"
+            outputs.append(self._problem("world_jump", frame_id, "pose", expected, found))
         if (
             frame_id.seq % SCORED_EVERY == 0 and not self.parameters.self_calibration
         ):  # which never filters the upper half of a class
