@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping  # noqa: TC003 - checkpoints read the records by their annotations
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 import numpy as np
@@ -81,7 +82,7 @@ class Zone:
         if self.polygon and _crosses_itself(self.polygon):
             raise ParameterError(f"{self.name}.polygon", "edges that do not cross", "others")
 
-    @property
+    @cached_property
     def digest(self) -> str:
         """All that its events follow from."""
         return repr(self)
@@ -265,13 +266,11 @@ def observe(
     where, net = locate(center, before, *(shapes or Shapes.of(zones)))
     marked = ((where != 0) | (net != 0)).any(axis=1).tolist()
     everywhere = (1 << len(zones)) - 1
-    for at, row in enumerate(rows.tolist()):
+    for at, (row, (x, y, z)) in enumerate(zip(rows.tolist(), center.tolist(), strict=True)):
         identity = identities[row]
-        x, y, z = center[at].tolist()
         old = known.get(identity)
-        seen = old or Seen(stamp_ns, (x, y, z), everywhere, {}, {})
-        seen = seen._replace(stamp_ns=stamp_ns, place=(x, y, z))
-        if marked[at] or seen.visits or seen.beside:
+        seen = Seen(stamp_ns, (x, y, z), everywhere, {}, {}, *(old[5:] if old else ()))
+        if marked[at] or (old and (old.visits or old.beside)):
             speed, yaw = math.hypot(*tracks.velocity[row].tolist()), float(tracks.yaw[row])
             now = Event("", "entered", 0, identity, labels[tracks.label[row]], stamp_ns, (x, y, z), speed, yaw)
             seen, more = _moved(zones, old, seen, now, where[at].tolist(), net[at].tolist())
@@ -279,8 +278,6 @@ def observe(
                 events += more
             else:
                 seen = seen._replace(held=(*seen.held, *more))
-        else:
-            seen = seen._replace(known=everywhere)
         known[identity] = seen
     for row in np.flatnonzero(tracks.confirmed).tolist():
         seen_now = known.get(identities[row])
@@ -359,9 +356,11 @@ def _moved(
 ) -> tuple[Seen, list[Event]]:
     """Return a track after a detection, and its events."""
     events: list[Event] = []
-    visits, beside, known = dict(seen.visits), dict(seen.beside), seen.known
-    last = (-1, now.position) if old is None else (old.stamp_ns, old.place)
+    visits, beside = (dict(old.visits), dict(old.beside)) if old else ({}, {})
+    known, last = seen.known, (old.stamp_ns, old.place) if old else (-1, now.position)
     for k, zone in enumerate(zones):
+        if not (where[k] or net[k] or zone.name in visits or zone.name in beside):
+            continue
         counts, bit = not zone.classes or now.label in zone.classes, 1 << k
         if zone.line:
             began = beside.pop(zone.name, None)
@@ -377,7 +376,7 @@ def _moved(
         visit = visits.get(zone.name)
         if where[k] == _INSIDE and (visit or counts):
             if visit is None:
-                comes = last[0] >= 0 and known & bit
+                comes = old is not None and old.known & bit
                 _, at_ns, place = _crossing(ring, last, now) if comes else (0, now.at_ns, now.position)
                 entry = now._replace(
                     zone=zone.name, at_ns=at_ns, position=place, how="crossed" if comes else "appeared"
@@ -387,8 +386,8 @@ def _moved(
         elif visit is not None and (visit.last_ns, visit.place) == last:
             _, at_ns, place = _crossing(ring, last, now)
             visit = visit._replace(last_ns=at_ns, place=place)
-        known = known & ~bit if where[k] == _INSIDE and visit is None else known | bit
         if visit is None:
+            known &= ~bit if where[k] == _INSIDE else -1
             continue
         stayed_ns = visit.last_ns - visit.since_ns
         if visit.entered is not None and stayed_ns >= _ns(zone.min_s):

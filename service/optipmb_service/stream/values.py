@@ -202,22 +202,19 @@ def events_of(header: dict[str, Any], events: Sequence[Event], counts: ZoneCount
     named = (label for zone in (counts or {}).values() for by_class in zone.values() for label in by_class)
     # Of a profile that was in force before there may be classes that this one lacks.
     labels = tuple(dict.fromkeys((*header["labels"], *(one.label for one in events), *sorted(named))))
-    told = []
+    told: list[schemas.ZoneEvent] = []
     for one in events:
         values: dict[str, Any] = {name: None if value == "" else value for name, value in one._asdict().items()}
         dwell_s = one.dwell_s if one.kind in {"left", "stayed"} else None
-        told.append(schemas.ZoneEvent(**values | {"label": labels.index(one.label), "dwell_s": dwell_s}))
-    zones = [
-        schemas.ZoneCount(
-            zone=name, **{one: tuple(by.get(one, {}).get(label, 0) for label in labels) for one in COUNTS}
+        told.append(schemas.ZoneEvent.trusted(values | {"label": labels.index(one.label), "dwell_s": dwell_s}))
+    zones = tuple(
+        schemas.ZoneCount.trusted(
+            {"zone": name} | {one: tuple(by.get(one, {}).get(label, 0) for label in labels) for one in COUNTS}
         )
         for name, by in (counts or {}).items()
-    ]
-    return schemas.Events(
-        **header | {"labels": labels},
-        events=tuple(told),
-        zones=None if counts is None else tuple(zones),
     )
+    fields = header | {"labels": labels, "events": tuple(told), "zones": None if counts is None else zones}
+    return schemas.Events(**fields)
 
 
 Reason = Literal["first", "jump", "clock", "publisher", "pose", "world", "effort", "reset", "parameters", "quarantine"]
