@@ -215,6 +215,10 @@ class Oracle:
             return False
         distance, c = math.hypot(*(component.mean[:2] - z.xy)), self.classes[component.label]
         spread = math.sqrt(component.covariance[2, 2])
+        if distance > c.gate and isinstance(component, Bernoulli):
+            turn = (z.yaw - component.mean[3] + math.pi / 2) % math.pi - math.pi / 2
+            if turn**2 > 1.5**2 * (component.covariance[3, 3] + c.measurement_noise.heading**2):
+                return False
         return distance <= max(c.gate, c.gate_deviations * spread * self.dt)
 
     def _log_likelihood(self, component: Bernoulli | Poisson, z: Measurement) -> float:

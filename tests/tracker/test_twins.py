@@ -75,6 +75,7 @@ TWINS = {
     "hypotheses._grown": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
     "hypotheses.close_gates": "test_field_of_view.test_gates_are_closed_for_what_cannot_be_detected",
     "hypotheses.detection_costs": "test_hypotheses.test_costs_and_association_probabilities_are_the_formulas",
+    "hypotheses.exclude_turned": "test_twins.test_hypotheses_are_those_of_their_parts",
     "hypotheses.first_detections": "test_hypotheses.test_each_kind_of_first_detection_has_its_formula",
     "hypotheses.gate": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
     "hypotheses.gate_widening": "test_hypotheses.test_a_gate_widens_by_what_r_is_above_that_of_the_class",
@@ -279,7 +280,7 @@ def test_measurements_are_the_chosen_rows(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_hypotheses_are_those_of_their_parts(seed: int) -> None:
-    """Gates, costs, ln e = ln(mu p_d) + ln N and first-time detections, in the order of the columns."""
+    """Gates, headings beyond eta_dist, costs, ln e = ln(mu p_d) + ln N and first-time detections, column by column."""
     rng = np.random.default_rng(seed)
     root = rng.normal(0, 0.5, (20, 6, 6))
     mean, covariance = rng.normal(0, 4, (20, 6)), root @ np.swapaxes(root, 1, 2) + 0.01 * np.eye(6)
@@ -290,15 +291,19 @@ def test_hypotheses_are_those_of_their_parts(seed: int) -> None:
     old, new = slice(0, 12), slice(12, 20)
     classes = class_rows(2, noise_position=noise, clutter_intensity=clutter, birth_intensity=birth)
     classes["birth_score"], classes["birth_over_clutter"] = threshold, [True, False]
-    classes["gate"], classes["gate_deviations"] = distance, [0.0, 3.0]
+    classes["gate"], classes["gate_deviations"], classes["noise_heading"] = distance, [0.0, 30.0], 0.15
     parts = [{"mean": mean[rows], "covariance": covariance[rows], "label": label[rows]} for rows in (old, new)]
     objects = BernoulliArrays(**dict(Bernoullis.empty().columns()) | parts[0] | {"existence": weight[old]})
     components = PoissonArrays(**dict(Poissons.empty().columns()) | parts[1] | {"weight": weight[new]})
-    empty = np.empty(15)
-    measurements = Measurements(position, empty, np.empty((15, 2)), np.empty((15, 4)), score, measured, measured)
+    yaw = rng.uniform(-np.pi, np.pi, 15)
+    measurements = Measurements(position, yaw, np.empty((15, 2)), np.empty((15, 4)), score, measured, measured)
     found = local_hypotheses(objects, components, p_d, measurements, Groups(UNGROUPED, UNGROUPED), 0.15, classes)
     radius = gate_radii(covariance, label, 0.15, classes)
     row, measurement, likelihood = gate(*parts[0].values(), radius[old], position, measured, classes, False)
+    apart = np.linalg.norm(position[measurement] - mean[row, :2], axis=1)
+    turn = (yaw[measurement] - mean[row, 3] + np.pi / 2) % np.pi - np.pi / 2
+    turned = turn**2 > 1.5**2 * (covariance[row, 3, 3] + 0.15**2)
+    likelihood[(apart > distance[label[row]]) & turned] = -np.inf
     association = np.empty(15)
     cost = detection_costs(row, measurement, likelihood, weight[old], p_d[old], association)
     component, announced, log_e = gate(*parts[1].values(), radius[new], position, measured, classes, False)
