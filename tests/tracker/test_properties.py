@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from compare import TRACKS, density_bytes, digest, tracks_bytes
 from oracle_formulas import Measurement, confidence, report
-from scenes import Options, SceneCloud, SceneFrame, SensorPose, frame_of, random_parameters, scene
+from scenes import Options, SceneCloud, SceneFrame, SensorPose, frame_of, partial, random_parameters, scene
 
 import optipmb
 from optipmb.parameters import parse_parameters
@@ -131,14 +131,6 @@ def test_a_density_may_start_with_a_later_id() -> None:
     assert later.next_id == first.next_id + 99
 
 
-def partial(given: SceneFrame, headings: np.ndarray, sizes: np.ndarray, heights: np.ndarray) -> SceneFrame:
-    """The frame without the headings, sizes and heights of some detections."""
-    center = given.center.copy()
-    center[heights, 2] = np.nan
-    size = np.where(sizes[:, None], np.nan, given.size)
-    return replace(given, yaw=np.where(headings, np.nan, given.yaw), size=size, center=center)
-
-
 def assert_same_known(one: optipmb.StepResult, other: optipmb.StepResult) -> None:
     """What is known of the tracks is the same."""
     assert (one.measured is None) == (other.measured is None)
@@ -168,11 +160,13 @@ def test_the_world_frame_does_not_matter(seed: int, unknown: float) -> None:
     rng = np.random.default_rng(seed)
     angle, shift = rng.uniform(-3, 3), rng.uniform(-500, 500, 3)
     frames = list(scene(seed, Options(frames=60, ties=False)))  # ties are broken by coordinates, which turn too
+    turned_frames = [moved(given, angle, shift) for given in frames]
     if unknown:
         absent = [rng.random((3, len(given.score))) < unknown for given in frames]
         frames = [partial(given, *rows) for given, rows in zip(frames, absent, strict=True)]
+        turned_frames = [partial(given, *rows) for given, rows in zip(turned_frames, absent, strict=True)]
     parameters = parse_parameters(random_parameters(seed + 20))
-    turned = run(parameters, [moved(given, angle, shift) for given in frames])
+    turned = run(parameters, turned_frames)
     c, s = np.cos(angle), np.sin(angle)
     rotation = np.array([[c, -s], [s, c]])
     full = np.eye(6)

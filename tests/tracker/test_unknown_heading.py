@@ -11,8 +11,7 @@ import pytest
 from class_rows import class_row, class_rows
 from compare import density_bytes, tracks_bytes
 from numpy.typing import NDArray
-from scenes import Options, frame_of, random_parameters, scene
-from test_properties import assert_valid, partial, run
+from scenes import Options, SceneFrame, frame_of, partial, random_parameters, scene
 
 import optipmb
 from optipmb.geometry import boxes_overlap, iou_exceeds
@@ -174,6 +173,16 @@ def test_boxes_of_unknown_heading_overlap_alike_in_all_axes(seed: int) -> None:
     assert math.isnan(blind[4])
 
 
+def run(parameters: optipmb.Parameters, frames: list[SceneFrame]) -> list[optipmb.StepResult]:
+    """The results of all frames of a scene."""
+    tracker = optipmb.Tracker(parameters)
+    density, results = tracker.initial(), []
+    for given in frames:
+        results.append(tracker.step(density, frame_of(parameters, given)))
+        density = results[-1].density
+    return results
+
+
 def points(tracker: optipmb.OnlineTracker, k: int, **more: Any) -> optipmb.OnlineTracks:
     """A car at 8 m/s along y and a pedestrian that stands, seen as points."""
     return tracker.update({"x": [5.0, 9.0], "y": [0.8 * k, -4.0], "class": ["car", "person"]}, t=0.1 * k, **more)
@@ -261,12 +270,6 @@ def test_partial_detections_leave_a_valid_density_that_can_be_stored(seed: int) 
         columns = optipmb.columns_in(optipmb.bytes_of(density), len(parameters.labels))
         again = optipmb.density_of(density.stamp_ns, density.next_id, columns, parameters.labels)
         assert density_bytes(again) == density_bytes(density)
-    boxes = np.nan_to_num(density.bernoulli.auxiliary, nan=1.0)
-    straight = density.bernoulli.covariance[:, 4, 4] == 0.0
-    covariance = density.bernoulli.covariance.copy()
-    covariance[straight, 4, 4] = covariance[straight, 5, 5] = 1.0
-    whole = density.bernoulli.replaced(auxiliary=boxes, covariance=covariance)
-    assert_valid(replace(density, bernoulli=whole, poisson=density.poisson.take(np.zeros(0, np.int64))))
     assert {0, 7} < known
 
 
