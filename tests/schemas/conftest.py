@@ -71,6 +71,7 @@ def _examples() -> list[Message]:
         yaw=np.array([0.1, -0.2]),
         heading_confidence=np.array([0.9, 0.5]),
         confirmed=np.array([1, 0]),
+        measured=np.array([7, 4]),
         class_probability=np.array([[0.25, 0.75], [1.0, 0.0]], dtype="f4"),
         velocity=np.array([[1.0, 2.0], [0.0, 0.5]]),
         yaw_rate=np.array([0.01, 0.0]),

@@ -119,13 +119,22 @@ def detections(draw: st.DrawFn) -> Detections:
     velocity = draw(st.none() | rows((m, 2), -1e3, 1e3))
     if velocity is not None:
         velocity[draw(arrays(np.bool_, m))] = np.nan
+    center, size, yaw = (
+        draw(rows((m, 3), -FAR, FAR)),
+        draw(rows((m, 3), 0, 1e4, above=True)),
+        draw(rows((m,), -1e4, 1e4)),
+    )
+    if draw(st.booleans()):
+        center[draw(arrays(np.bool_, m)), 2] = np.nan
+        size[draw(arrays(np.bool_, (m, 3)))] = np.nan
+        yaw[draw(arrays(np.bool_, m))] = np.nan
     return Detections(
         **draw(placed()),
         labels=tuple(names),
         label=draw(whole(m, 0, len(names) - 1)),
-        center=draw(rows((m, 3), -FAR, FAR)),
-        size=draw(rows((m, 3), 0, 1e4, above=True)),
-        yaw=draw(rows((m,), -1e4, 1e4)),
+        center=center,
+        size=draw(st.sampled_from([None, size])),
+        yaw=draw(st.sampled_from([None, yaw])),
         score=draw(rows((m,), 0, 1, above=True)),
         velocity=velocity,
         has_points=draw(st.none() | st.booleans()),

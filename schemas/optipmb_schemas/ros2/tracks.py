@@ -97,9 +97,10 @@ def messages(types: Types, tracks: Tracks, stamp_ns: int, frame: str, stream: st
         found["/predicted"].append(objects | {"kinematics": predicted | {"predicted_paths": _paths(tracks, row, at)}})
         confidence = getattr(tracks, "heading_confidence", None)
         faces = confidence is None or confidence[row] >= FACES
-        headless = tracks.measured is not None and not int(tracks.measured[row]) & 1
+        known = getattr(tracks, "measured", None)
+        unavailable = known is not None and not int(known[row]) & 1
         tracked |= {
-            "orientation_availability": _UNAVAILABLE if headless else _SIGN_KNOWN if faces else _SIGN_UNKNOWN,
+            "orientation_availability": _UNAVAILABLE if unavailable else _SIGN_KNOWN if faces else _SIGN_UNKNOWN,
             "is_stationary": math.hypot(*tracks.velocity[row].tolist()) < STANDING,
         }
         found[""].append(objects | {"kinematics": tracked})
