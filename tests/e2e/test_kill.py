@@ -1,4 +1,4 @@
-"""SIGKILL at random moments while recorded sequences are replayed: nobody can tell afterwards, but for the outage."""
+"""SIGKILL at random moments while recorded sequences are replayed: no trace is left but the outage."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def _compiled() -> None:
 
 
 def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Fault 1: four recorded streams, SIGKILL in the middle, a new process: state and tracks are those of no kill.
+    """Fault 1: four recorded streams, SIGKILL in the middle, a new process: state and tracks as without it.
 
     The tracks of every frame, repetitions set aside, and the digest of the state are byte-equal to those of a session
     that nothing happened to; every round has a moment of its own.
