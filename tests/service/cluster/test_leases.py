@@ -145,7 +145,7 @@ def test_what_changed_is_followed(make: Make) -> None:
 
 
 def test_a_checkpoint_is_refused_for_its_fence(make: Make) -> None:
-    """A former holder of a partition saves nothing; the newest checkpoint comes back to the byte, also the one before it."""
+    """A former holder of a partition saves nothing; the newest checkpoint and the one before come back to the byte."""
     one, other = make(), make()
     data = [random.Random(number).randbytes(200_000) for number in range(3)]
     key = partition_key(partition_of(STREAM))
