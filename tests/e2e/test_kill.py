@@ -1,4 +1,4 @@
-"""SIGKILL at random moments while recorded sequences are replayed: nobody can tell afterwards, but for the outage."""
+"""SIGKILL at random moments while recorded sequences are replayed: no trace is left but the outage."""
 
 from __future__ import annotations
 

@@ -119,7 +119,7 @@ def one_each(node: Node, site: str) -> dict[int, Sensor]:
 
 
 def goes_on(node: Node, sensor: Sensor, seq: int) -> None:
-    """Send a frame and wait for its tracks: the newest are those of a session that nothing happened to."""
+    """Send a frame and wait for its tracks: the newest equal an undisturbed session."""
     node.send(sensor.detections(seq))
     arrived(node, sensor.stream, seq)
     newest = [plain(message) for message in node.tracks(sensor.stream, seq + 1) if message.seq == seq]

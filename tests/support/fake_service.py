@@ -41,7 +41,7 @@ class Behaviour:
 
 @dataclass
 class Seen:
-    """What has come in: everything by stream."""
+    """Messages received, in their order."""
 
     detections: list[Detections] = field(default_factory=list)
     points: list[Points] = field(default_factory=list)

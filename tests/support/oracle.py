@@ -1,7 +1,7 @@
 """The slow twin of the tracker: Algorithm 1 of the paper with one Python object per component and no shortcuts.
 
 Conventions as in `oracle_formulas`. Nothing here imports the tracker: `Oracle` reads parameters, modules and frames
-by attribute. Where the paper is silent the decisions are those of the tracker's docstrings.
+by attribute. Where the paper is silent the tracker's docstrings decide.
 """
 # ruff: noqa: N806 - Q and W are the names that the paper uses
 
@@ -80,7 +80,7 @@ class NewObject:
 
 @dataclass
 class OracleTracks:
-    """The extracted tracks in columns of the same names as those of the tracker."""
+    """The extracted tracks in columns with the tracker's names."""
 
     columns: dict[str, Array] = field(default_factory=dict)
 

@@ -86,7 +86,7 @@ def recording(kind: str, root: Path, detector: str, name: str, stream: str, fram
 
 @dataclass
 class Replayed:
-    """What came back of a recording: by frame the distinct tracks, in the order of their revisions."""
+    """Results of a recording: by frame the distinct tracks, in the order of their revisions."""
 
     tracks: dict[int, set[bytes]] = field(default_factory=dict)
     repeated: int = 0
@@ -117,7 +117,7 @@ class Replay:
             detections = connection.cached_sender(
                 KEYS.detections(recording.stream), encoding_of(Detections), cache=len(recording.frames)
             )
-            # Clouds too are kept: what was tracked with its cloud before a kill must be tracked with it again.
+            # Clouds too are kept: a frame tracked with its cloud before a kill must be tracked with it again.
             points = connection.plain_sender(
                 KEYS.points(recording.stream), encoding_of(Points), cache=len(recording.frames)
             )

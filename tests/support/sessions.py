@@ -33,12 +33,12 @@ def problems(outputs: Iterable[Output]) -> list[Problem]:
 
 
 def begun(outputs: Iterable[Output]) -> list[str]:
-    """Why sessions began anew."""
+    """Reasons of the restarts of sessions."""
     return [output.reason for output in outputs if isinstance(output, Begun)]
 
 
 def dumps(outputs: Iterable[Output]) -> list[Quarantined]:
-    """What was saved of failures."""
+    """Dumps of failures."""
     return [output for output in outputs if isinstance(output, Quarantined)]
 
 
@@ -75,7 +75,7 @@ class Merged:
 
 
 def plain(message: Tracks) -> bytes:
-    """The bytes of tracks that must be those of the run in order."""
+    """The bytes of tracks that must equal the run in order."""
     return encode(message.model_copy(update={"delivery": None, "revision": 0}))
 
 
@@ -146,7 +146,7 @@ class Chained:
         numbers = np.frombuffer(digest.digest(), np.uint8).astype(np.float64)
         born = not len(density.bernoulli)
         known = density.bernoulli
-        # Whatever else a Bernoulli has is one.
+        # All other columns of a Bernoulli are one.
         ones = {name: np.ones((1, *column.shape[1:]), column.dtype) for name, column in known.columns()}
         rows = optipmb.Bernoullis(**ones).replaced(
             mean=numbers.reshape(8, 6)[:1] / 100.0,

@@ -1,4 +1,4 @@
-"""A stream that several services take over from each other: what comes of it is that of a session left alone."""
+"""A stream that several services take over from each other: the result equals an undisturbed session."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def expected(frames: int, sensor: Sensor = SENSOR, profile: str = PROFILE) -> tu
 
 
 def distinct(node: Node, sensor: Sensor = SENSOR) -> dict[int, set[bytes]]:
-    """What was published for each frame, repetitions set aside."""
+    """The distinct tracks published for each frame."""
     found: dict[int, set[bytes]] = {}
     key = KEYS.tracks(sensor.stream)
     for payload in [payload for at, payload, _ in node.tracks_seen.items if at == key]:
