@@ -54,6 +54,7 @@ HOST_CHARACTERS: Final = 40
 DEFAULT_LISTEN: Final = "tcp/127.0.0.1:7447"
 DEFAULT_GRPC: Final = "127.0.0.1:50051"
 DEFAULT_NATS: Final = "127.0.0.1:4222"
+DEFAULT_MQTT: Final = "mqtt://127.0.0.1:1883"
 MOST_ZONES: Final = 256  # as `optipmb.zones.MOST`, which the settings do not import
 
 
@@ -197,6 +198,36 @@ class Ros2Settings(BaseModel):
     """topic of `diagnostic_msgs/DiagnosticArray`"""
     streams: Annotated[dict[str, Ros2Stream], AfterValidator(_streams)] = Field(default_factory=dict)
     """topics by stream (`site/node/sensor`)"""
+
+
+class MqttSettings(BaseModel):
+    """An MQTT broker and what it gets; used by `optipmb-service mqtt`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    broker: Annotated[str, _form(r"mqtts?://[^\s/@]+", "a broker looks like mqtt://127.0.0.1:1883")] = DEFAULT_MQTT
+    """address of the broker; `mqtts://` with TLS"""
+    credentials: Path | None = None
+    """file with `user:password`"""
+    tls: Path | None = None
+    """folder with `ca.pem`, and `cert.pem` and `key.pem` where the broker asks for a certificate; default: the
+    system's authorities"""
+    streams: Patterns = ("*/*/*",)
+    """patterns of streams, each part a name or `*`, that do not overlap"""
+    topics: tuple[Literal["tracks", "events", "zones", "problems"], ...] = ("tracks", "events", "zones", "problems")
+    """what is published"""
+    tracks_hz: float = Field(default=2.0, ge=0, le=1000)
+    """highest rate of the tracks of a stream, in sensor time; 0: all frames"""
+
+    @field_validator("streams")
+    @classmethod
+    def _check_streams(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        for pattern in value:
+            try:
+                Keys().matching(pattern, "tracks")
+            except MessageError as error:
+                raise ValueError(f"{error.expected}, or * for any of its parts, received {pattern!r}") from None
+        return value
 
 
 class SiteSettings(BaseModel):
@@ -449,6 +480,8 @@ class Settings(BaseSettings):
     cluster"""
     ros2: Ros2Settings = Ros2Settings()
     """topics of ROS 2, for `optipmb-service ros2`"""
+    mqtt: MqttSettings = MqttSettings()
+    """a broker of MQTT, for `optipmb-service mqtt`"""
     limits: LimitSettings = LimitSettings()
     """bounds on what one message may hold"""
 

@@ -9,8 +9,22 @@ from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from optipmb_client.incoming import Answer, Arrival
-from optipmb_schemas import Keys, Message, ServiceStatus, encode, encoding_of
+from optipmb_schemas import (
+    Delivery,
+    Events,
+    Keys,
+    Message,
+    Problem,
+    ServiceStatus,
+    Tracks,
+    ZoneCount,
+    ZoneEvent,
+    encode,
+    encoding_of,
+)
+from optipmb_service.edge.readers import Publication
 from optipmb_service.http import Server, application
 from optipmb_service.settings import Settings
 
@@ -18,11 +32,14 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 KEYS = Keys()
+STREAM = "garage/rig/lidar"
 DEADLINE_S = 60.0
 
 
 class Session:
     """The session of the service: subscriptions by key, and caches."""
+
+    keys = KEYS
 
     def __init__(self) -> None:
         self.subscriptions: list[tuple[str, Callable[[Message], None]]] = []
@@ -83,6 +100,10 @@ class Session:
         assert pattern == KEYS.all_alive()
         assert timeout
         return [KEYS.alive(one) for one in self.instances]
+
+    def linked(self) -> bool:
+        """It is."""
+        return True
 
     def wait(self, count: int) -> None:
         """Wait until there are so many subscriptions."""
@@ -156,3 +177,75 @@ def served(source: Any, places: Any = None, **settings: Any) -> Iterator[str]:
         yield server.address
     finally:
         server.close()
+
+
+def tracks(seq: int, stream: str = STREAM, run: int = 0, count: int = 2) -> Tracks:
+    """Return tracks of a frame; the first is confirmed."""
+    one = np.ones(count)
+    return Tracks(
+        stream=stream,
+        epoch=bytes(16),
+        seq=seq,
+        stamp_ns=1_800_000_000 * 10**9 + seq * 10**8,
+        session="0" * 32,
+        profile="kitti",
+        cloud_used=False,
+        labels=["car", "pedestrian"],
+        id=np.arange(count),
+        label=np.arange(count) % 2,
+        center=np.arange(3 * count).reshape(count, 3) / 7,
+        size=np.ones((count, 3)),
+        yaw=one / 3,
+        velocity=np.ones((count, 2)),
+        yaw_rate=one,
+        acceleration=one,
+        existence=one / 3,
+        score=one,
+        covariance=np.zeros((count, 6, 6)),
+        age=one,
+        time_since_detection=one,
+        detection=np.arange(count),
+        confirmed=(np.arange(count) == 0).astype(int),
+        delivery=delivery(run, seq),
+    )
+
+
+def delivery(run: int, seq: int) -> Delivery:
+    """Return how a message came about."""
+    return Delivery(instance="one", received_ns=0, published_ns=seq, queue_ms=0.0, decode_ms=0.0, step_ms=0.0, run=run)
+
+
+def events(seq: int, count: int = 1, stream: str = STREAM) -> Events:
+    """Return events of a frame, and its counts."""
+    one = ZoneEvent(
+        zone="gate",
+        kind="crossed",
+        n=1,
+        id=7,
+        label=0,
+        at_ns=5,
+        position=(1.0, 2.0, 3.0),
+        speed=1.0,
+        yaw=0.0,
+        direction="left",
+    )
+    counts = {name: [1, 0] for name in ZoneCount.names if name != "zone"}
+    return Events(
+        stream=stream,
+        epoch=bytes(16),
+        seq=seq,
+        stamp_ns=seq,
+        session="0" * 32,
+        labels=["car", "pedestrian"],
+        events=[one.model_copy(update={"n": seq * 1000 + at}) for at in range(count)],
+        zones=[ZoneCount(zone="gate", **counts)],
+        delivery=delivery(0, seq),
+    )
+
+
+PROBLEM = Problem(stream=STREAM, instance="one", code="late", message="Late.")
+
+
+def publication(message: Message) -> Publication:
+    """Return a message as it comes in."""
+    return Publication(key_of(message), encode(message), encoding_of(message), {})

@@ -122,21 +122,29 @@ class Outbox(Generic[T]):
         Raises:
             TimeoutError: none has come in so long.
         """
-        while True:
+        while (taken := self.take_now()) is None:
             with self._lock:
                 if self._waiting:
-                    stream, queue = next(iter(self._waiting.items()))
-                    item, size = queue.popleft()
-                    self._bytes -= size
-                    del self._waiting[stream]
-                    if queue:
-                        self._waiting[stream] = queue  # behind the others
-                    skipped, self._skipped = self._skipped, 0
-                    return item, skipped
+                    continue
                 if self._closed:
                     return None
                 self._changed.clear()
             await asyncio.wait_for(self._changed.wait(), seconds)
+        return taken
+
+    def take_now(self) -> tuple[T, int] | None:
+        """Return the next item, and how many were left out before it; None when none waits."""
+        with self._lock:
+            if not self._waiting:
+                return None
+            stream, queue = next(iter(self._waiting.items()))
+            item, size = queue.popleft()
+            self._bytes -= size
+            del self._waiting[stream]
+            if queue:
+                self._waiting[stream] = queue  # behind the others
+            skipped, self._skipped = self._skipped, 0
+            return item, skipped
 
     def _wake(self) -> None:
         with contextlib.suppress(RuntimeError):  # the loop has ended

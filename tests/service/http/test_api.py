@@ -9,27 +9,18 @@ import json
 from socket import SO_RCVBUF, SOL_SOCKET
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import pytest
 from optipmb_client.errors import ClientError
 from optipmb_schemas import (
-    Delivery,
-    Events,
-    Problem,
     ServiceStatus,
     SessionSummary,
-    Tracks,
-    ZoneCount,
-    ZoneEvent,
-    encode,
-    encoding_of,
 )
 from optipmb_schemas.json_form import event_json, problem_json, tracks_json, with_skipped, zones_json
-from optipmb_service.edge.readers import EVENTS, Publication, Reader, Wish
+from optipmb_service.edge.readers import EVENTS, Reader, Wish
 from optipmb_service.http import application
 from optipmb_service.settings import Settings
 from router import until
-from watched import KEYS, Session, Watched, key_of, served
+from watched import KEYS, PROBLEM, STREAM, Session, Watched, events, key_of, publication, served, tracks
 from websocket import (
     ABNF,
     WebSocket,
@@ -42,79 +33,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-STREAM = "garage/rig/lidar"
 ALL = "garage/*/*"
 DEADLINE_S = 60.0
-SESSION = "0" * 32
 TOKENS = {"secret": "viewer/map", "rig": "garage/rig"}
 OK = http.client.OK
-
-
-def tracks(seq: int, stream: str = STREAM, run: int = 0, count: int = 2) -> Tracks:
-    """Return tracks of a frame; the first is confirmed."""
-    one = np.ones(count)
-    return Tracks(
-        stream=stream,
-        epoch=bytes(16),
-        seq=seq,
-        stamp_ns=1_800_000_000 * 10**9 + seq * 10**8,
-        session=SESSION,
-        profile="kitti",
-        cloud_used=False,
-        labels=["car", "pedestrian"],
-        id=np.arange(count),
-        label=np.arange(count) % 2,
-        center=np.arange(3 * count).reshape(count, 3) / 7,
-        size=np.ones((count, 3)),
-        yaw=one / 3,
-        velocity=np.ones((count, 2)),
-        yaw_rate=one,
-        acceleration=one,
-        existence=one / 3,
-        score=one,
-        covariance=np.zeros((count, 6, 6)),
-        age=one,
-        time_since_detection=one,
-        detection=np.arange(count),
-        confirmed=(np.arange(count) == 0).astype(int),
-        delivery=delivery(run, seq),
-    )
-
-
-def delivery(run: int, seq: int) -> Delivery:
-    """Return how a message came about."""
-    return Delivery(instance="one", received_ns=0, published_ns=seq, queue_ms=0.0, decode_ms=0.0, step_ms=0.0, run=run)
-
-
-def events(seq: int, count: int = 1, stream: str = STREAM) -> Events:
-    """Return events of a frame, and its counts."""
-    one = ZoneEvent(
-        zone="gate",
-        kind="crossed",
-        n=1,
-        id=7,
-        label=0,
-        at_ns=5,
-        position=(1.0, 2.0, 3.0),
-        speed=1.0,
-        yaw=0.0,
-        direction="left",
-    )
-    counts = {name: [1, 0] for name in ZoneCount.names if name != "zone"}
-    return Events(
-        stream=stream,
-        epoch=bytes(16),
-        seq=seq,
-        stamp_ns=seq,
-        session=SESSION,
-        labels=["car", "pedestrian"],
-        events=[one.model_copy(update={"n": seq * 1000 + at}) for at in range(count)],
-        zones=[ZoneCount(zone="gate", **counts)],
-        delivery=delivery(0, seq),
-    )
-
-
-PROBLEM = Problem(stream=STREAM, instance="one", code="late", message="Late.")
 
 
 @pytest.fixture
@@ -415,11 +337,6 @@ async def test_a_reader_that_loses_events_has_to_come_again() -> None:
     assert json.loads(await reader.take() or b"")["n"] == 1001
     reader.receive(publication(events(3, 2)))
     assert await reader.take() is None
-
-
-def publication(message: Tracks | Events) -> Publication:
-    """Return a message as it comes in."""
-    return Publication(key_of(message), encode(message), encoding_of(message), {})
 
 
 def test_a_socket_that_loses_events_is_closed(session: Session, address: str) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
-from optipmb_schemas import Detections, Message, Pose, Tracks, encode, encode_json, encoding_of
+from optipmb_schemas import Detections, Pose, Tracks, encode_json
 from optipmb_service.edge.readers import Publication
 from optipmb_service.http import application
 from optipmb_service.http.page import Live, live_frame
@@ -20,7 +20,7 @@ from optipmb_service.settings import Settings
 from optipmb_service.zenoh import client
 from router import until
 from tracks_message import tracks_message
-from watched import KEYS, Session, Watched, key_of, served
+from watched import KEYS, Session, Watched, key_of, publication, served
 
 from optipmb import Georeference
 
@@ -67,11 +67,6 @@ DETECTIONS = Detections(
     yaw=[0.0],
     score=[0.9],
 )
-
-
-def publication(message: Message) -> Publication:
-    """A message as it comes in."""
-    return Publication(key_of(message), encode(message), encoding_of(message), {})
 
 
 @pytest.fixture
