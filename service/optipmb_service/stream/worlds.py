@@ -11,8 +11,10 @@ from __future__ import annotations
 from collections.abc import Mapping  # noqa: TC003 - checkpoints read the records by their annotations
 from contextlib import suppress
 from dataclasses import replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple
 
+import numpy as np
 from pydantic import Field
 
 import optipmb
@@ -94,7 +96,7 @@ def relocated(before: FilterState, frame_id: FrameId, relocation: schemas.Reloca
     if relocation is None:
         zero = zero if continues else number
     else:
-        motion = optipmb.Relocation.of(optipmb.Pose(relocation.translation, relocation.quaternion))
+        motion = _motion(relocation.translation.tobytes(), relocation.quaternion.tobytes())
         here = zero + relocation.world
         if before.last is None:
             worlds = Worlds(here, (motion,), {})
@@ -102,16 +104,23 @@ def relocated(before: FilterState, frame_id: FrameId, relocation: schemas.Reloca
             here = number if same else number + 1
             zero = here - relocation.world
         follows = number <= here <= number + 1 or before.last is None or motion in worlds.since(here - 1)[:1]
-    known = {other: one for other, one in worlds.sensors.items() if other in before.sensors}
-    worlds = replace(worlds, sensors=known | {name: SensorWorld(here, zero)})
+    if worlds.sensors.get(name) != (here, zero):
+        known = {other: one for other, one in worlds.sensors.items() if other in before.sensors}
+        worlds = replace(worlds, sensors=known | {name: SensorWorld(here, zero)})
     if follows and here <= worlds.number:
-        return _behind(replace(before, worlds=worlds), worlds, here, motion)
+        return _behind(before if worlds is before.worlds else replace(before, worlds=worlds), worlds, here, motion)
     if follows and here == worlds.number + 1 and motion is not None:
         motions = (*worlds.motions, motion)[-KEPT:]
         with suppress(optipmb.DensityError):
             return Relocated(_moved(before, replace(worlds, number=here, motions=motions), motion), change="moves")
     worlds = replace(worlds, number=here, motions=() if motion is None else (motion,))
     return Relocated(replace(before, worlds=worlds), change="restarts")
+
+
+@lru_cache(256)
+def _motion(translation: bytes, quaternion: bytes) -> optipmb.Relocation:
+    """Return a motion, which publishers repeat in every message."""
+    return optipmb.Relocation.of(optipmb.Pose(np.frombuffer(translation), np.frombuffer(quaternion)))
 
 
 def _behind(state: FilterState, worlds: Worlds, here: int, motion: optipmb.Relocation | None) -> Relocated:
