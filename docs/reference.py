@@ -14,7 +14,15 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args, get_origin
 
-from optipmb_service.settings import LimitSettings, Ros2Settings, Ros2Stream, Settings, SiteSettings, ZoneSettings
+from optipmb_service.settings import (
+    LimitSettings,
+    MqttSettings,
+    Ros2Settings,
+    Ros2Stream,
+    Settings,
+    SiteSettings,
+    ZoneSettings,
+)
 from optipmb_service.stream.problems import CODES
 from optipmb_service.telemetry.logs import EVENTS
 from optipmb_service.telemetry.metrics import METRICS, NAMESPACE
@@ -42,7 +50,7 @@ def settings() -> str:
     tables: tuple[tuple[str, type[BaseModel]], ...] = (
         *(("", Settings), ("limits.", LimitSettings), ("sites.NAME.", SiteSettings)),
         ("zones.NAME.", ZoneSettings),
-        *(("ros2.", Ros2Settings), ("ros2.streams.NAME.", Ros2Stream)),
+        *(("ros2.", Ros2Settings), ("ros2.streams.NAME.", Ros2Stream), ("mqtt.", MqttSettings)),
     )
     rows = []
     for prefix, table in tables:
@@ -50,7 +58,7 @@ def settings() -> str:
         rows += [
             _setting(f"{prefix}{name}", field, meanings[name])
             for name, field in table.model_fields.items()
-            if f"{prefix}{name}" not in {"limits", "ros2"}
+            if f"{prefix}{name}" not in {"limits", "mqtt", "ros2"}
         ]
     return _table(("setting", "default", "allowed", "meaning"), rows)
 

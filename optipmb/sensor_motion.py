@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.density import ENOUGH, LEAST_MOVED_S, NO_FRAME, PHI, V
+from optipmb.density import ENOUGH, LEAST_MOVED_S, NO_FRAME, OMEGA, PHI, V
 from optipmb.relocation import Relocation
 from optipmb.rows import read_only
 
@@ -134,6 +134,7 @@ def follow_sensor(density: Density, frame: Frame, table: ClassTable) -> Density:
     start, target = np.ascontiguousarray(objects.mean[rows, :2]), np.ascontiguousarray(frame.center[best, :2])
     pairs = Pairs(start, objects.label[rows], target, frame.label[best])
     ahead = np.column_stack((np.cos(objects.mean[rows, PHI]), np.sin(objects.mean[rows, PHI])))
+    free = objects.covariance[rows, OMEGA, OMEGA] == 0.0  # to move in any direction: their heading is unknown
     before = None if density.sensor_motion is None else density.sensor_motion * dt
     if before is not None:
         found = _continued(pairs, objects.mean[rows, V, None] * dt * ahead, before, dt)
@@ -141,7 +142,7 @@ def follow_sensor(density: Density, frame: Frame, table: ClassTable) -> Density:
             still = math.hypot(found[0], found[1]) < STANDING[0] * dt and abs(found[2]) < STANDING[1] * dt
             return unknown if still else _carried(density, found, dt)
     found = _begun(pairs, dt)
-    after = unknown if found is None else _weighed(density, pairs, ahead, found, dt, table)
+    after = unknown if found is None else _weighed(density, pairs, ahead, free, found, dt, table)
     if found is not None and after.sensor_motion is not None:
         return _carried(after if before is not None else _over_ground(after, found, dt, frame), found, dt)
     if before is not None and together(pairs, np.zeros(3)).sum() < SHARE * len(rows):
@@ -173,12 +174,14 @@ def _begun(pairs: Pairs, dt: float) -> Array | None:
     return found if clear and _drives(found, dt) else None
 
 
-def _weighed(density: Density, pairs: Pairs, ahead: Array, motion: Array, dt: float, table: ClassTable) -> Density:
+def _weighed(
+    density: Density, pairs: Pairs, ahead: Array, free: NDArray[np.bool_], motion: Array, dt: float, table: ClassTable
+) -> Density:
     """Return a density with a motion and the evidence for it, which goes on from one that is alike."""
     cos, sin = math.cos(motion[2]), math.sin(motion[2])
     turned = ahead @ np.array([[cos, sin], [-sin, cos]])
     reach = (UNKNOWN * dt * table["birth_unknown"][:, V])[pairs.label]
-    walks = table["constant_velocity"][pairs.label]
+    walks = table["constant_velocity"][pairs.label] | free
     standing = sideways(pairs, ahead, reach, walks)
     moving = sideways(pairs._replace(start=taken(pairs.start, motion)), turned, reach, walks)
     gained = standing - moving
@@ -208,6 +211,11 @@ def _over_ground(density: Density, motion: Array, dt: float, frame: Frame) -> De
     apparent = (taken(mean[:, :2], motion) - mean[:, :2]) / dt
     along = apparent[:, 0] * np.cos(mean[:, PHI]) + apparent[:, 1] * np.sin(mean[:, PHI])
     mean[:, V] -= np.where(objects.seen_ns > objects.born_ns, along, 0.0)
+    free = (objects.covariance[:, OMEGA, OMEGA] == 0.0) & (objects.seen_ns > objects.born_ns)
+    if free.any():  # those of unknown heading: their whole velocity
+        v, phi = objects.mean[free, V, None], objects.mean[free, PHI]
+        over = v * np.column_stack((np.cos(phi), np.sin(phi))) - apparent[free]
+        mean[free, V], mean[free, PHI] = np.hypot(*over.T), np.arctan2(over[:, 1], over[:, 0])
     return replace(density, bernoulli=objects.replaced(mean=mean))
 
 

@@ -112,9 +112,9 @@ class Publisher:
         stamp_ns: int,
         label: Sequence[str] | ArrayLike,
         center: ArrayLike,
-        size: ArrayLike,
-        yaw: ArrayLike,
         score: ArrayLike,
+        size: ArrayLike | None = None,
+        yaw: ArrayLike | None = None,
         velocity: ArrayLike | None = None,
         labels: Sequence[str] | None = None,
         pose: PoseLike | None = None,
@@ -130,10 +130,10 @@ class Publisher:
         Args:
             stamp_ns: Sensor time of the frame.
             label: Class names of the M objects; or, with `labels`, indices (M,) into it.
-            center: (M, 3), geometric centres of the boxes.
-            size: (M, 3), length, width, height, all positive.
-            yaw: (M,), counter-clockwise from x.
+            center: (M, 3), geometric centres of the boxes; NaN as z where it is unknown.
             score: (M,), in [0, 1]; an object of score 0 is left out and counted.
+            size: (M, 3), length, width, height, all positive; NaN where unknown. None: unknown for all.
+            yaw: (M,), counter-clockwise from x; NaN where unknown. None: unknown for all.
             velocity: (M, 2), over ground; a row of NaN where it is unknown. None: unknown for all.
             labels: The class names that `label` points into.
             pose: Pose of the sensor in the world, (translation (3,), unit quaternion w x y z (4,)); needed with
@@ -179,8 +179,8 @@ class Publisher:
                 labels=names,
                 label=index,
                 center=_array("center", center, 3),
-                size=_array("size", size, 3),
-                yaw=_array("yaw", yaw),
+                size=None if size is None else _array("size", size, 3),
+                yaw=None if yaw is None else _array("yaw", yaw),
                 velocity=None if velocity is None else _array("velocity", velocity, 2),
                 score=_array("score", score),
                 has_points=has_points,

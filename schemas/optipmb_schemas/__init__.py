@@ -36,8 +36,8 @@ from optipmb_schemas.messages import (
     Tracks,
     ZoneCount,
     ZoneEvent,
-    class_fields,
     path_fields,
+    track_fields,
 )
 from optipmb_schemas.model import Message
 
@@ -79,7 +79,6 @@ __all__ = [
     "TracksRequest",
     "ZoneCount",
     "ZoneEvent",
-    "class_fields",
     "decode",
     "decode_dump",
     "encode",
@@ -89,4 +88,5 @@ __all__ = [
     "encoded",
     "encoding_of",
     "path_fields",
+    "track_fields",
 ]

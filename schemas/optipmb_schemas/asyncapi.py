@@ -11,11 +11,14 @@ import json
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
+from optipmb_schemas import json_form
 from optipmb_schemas.codec import MAJOR, MESSAGES, encoding_of
 from optipmb_schemas.export import schema_of
 from optipmb_schemas.keys import PREFIX, Keys
 
 ENDPOINT: Final = "tcp/127.0.0.1:7447"
+HTTP: Final = "127.0.0.1:8080"
+MQTT: Final = "127.0.0.1:1883"
 METRICS: Final = "Metrics"  # a reply that is no message: text in Prometheus' format
 QUERY: Final = "Query"  # a query without a payload
 _PARAMETERS: Final = {
@@ -25,6 +28,7 @@ _PARAMETERS: Final = {
     "instance": "Name of a service instance.",
 }
 _STREAM: Final = "site/node/sensor"
+EDGE: Final = tuple(json_form.schemas())  # texts of WebSocket and MQTT, in JSON alone
 _CACHED: Final = "Zenoh's advanced publisher: reliable, with a cache for subscribers that come late or miss a message."
 
 
@@ -38,10 +42,16 @@ class Channel:
     replies: tuple[str, ...] = ()
     about: str = "Query."
     action: Literal["send", "receive"] | None = "receive"  # None: a liveliness token
+    server: str = "router"
+    address: str = ""  # in place of a key; below the prefix, or a path of HTTP
 
 
 def _query(what: str, messages: tuple[str, ...], *replies: str) -> Channel:
     return Channel("query", (_STREAM, what), messages, replies)
+
+
+def _mqtt(topic: str, *messages: str) -> Channel:
+    return Channel("", (), messages, (), "Put by `optipmb-service mqtt`.", "send", "mqtt", f"{_STREAM}/{topic}")
 
 
 def _instance(key: str, messages: tuple[str, ...], *replies: str) -> Channel:
@@ -57,6 +67,7 @@ CHANNELS: Final = {
     "state": _query("state", (QUERY,), "SessionState"),
     "density": _query("density", (QUERY,), "Density"),
     "keptTracks": _query("tracks", (QUERY, "TracksRequest"), "Tracks", "TracksRequest"),
+    "zones": _query("zones", (QUERY,), "Events"),
     "reset": _query("reset", (QUERY, "ResetRequest"), "SessionState"),
     "parameters": _query("parameters", (QUERY, "SessionParameters"), "SessionParameters"),
     "owner": Channel("owner", (_STREAM, "instance"), about="Liveliness: this instance tracks the stream.", action=None),
@@ -65,12 +76,17 @@ CHANNELS: Final = {
     "metrics": _instance("metrics", (QUERY,), METRICS),
     "move": _instance("move", ("MoveRequest",), "MoveRequest"),
     "drain": _instance("drain", (QUERY, "DrainRequest"), "DrainRequest"),
+    "reader": Channel("", (), EDGE, (), "WebSocket of a reader.", "send", "http", "/api/v1/ws"),
+    "mqttTracks": _mqtt("tracks", "EdgeTracks"),
+    "mqttEvents": _mqtt("events", "EdgeEvent"),
+    "mqttZones": _mqtt("zones", "EdgeZones"),
+    "mqttProblems": _mqtt("problems", "EdgeProblem"),
 }
 """Channels of the document by name."""
 
 
-def document(prefix: str = PREFIX, endpoint: str = ENDPOINT) -> str:
-    """Return the document as JSON, for a prefix of keys and an endpoint of a Zenoh router."""
+def document(prefix: str = PREFIX, endpoint: str = ENDPOINT, http: str = HTTP) -> str:
+    """Return the document as JSON, for a prefix of keys, an endpoint of a Zenoh router and an address of HTTP."""
     schemas: dict[str, Any] = {}
     messages: dict[str, Any] = {
         QUERY: {"title": "Query without a payload", "payload": {"type": "null"}},
@@ -86,6 +102,10 @@ def document(prefix: str = PREFIX, endpoint: str = ENDPOINT) -> str:
                 "contentType": encoding_of(kind, form=form),
                 "payload": {"$ref": f"#/components/schemas/{kind.__name__}"},
             }
+    for name, schema in json_form.schemas().items():
+        lifted = json.loads(json.dumps(schema).replace("#/$defs/", "#/components/schemas/"))
+        schemas |= lifted.pop("$defs", {}) | {name: lifted}
+        messages[name] = {"contentType": "application/json", "payload": {"$ref": f"#/components/schemas/{name}"}}
     whole = {
         "asyncapi": "3.0.0",
         "info": {
@@ -95,7 +115,11 @@ def document(prefix: str = PREFIX, endpoint: str = ENDPOINT) -> str:
             "encoding of a sample. In msgpack, arrays may be blocks and byte strings are binary; schemas are of JSON.",
         },
         "defaultContentType": encoding_of(MESSAGES[0]).partition(";")[0],
-        "servers": {"router": {"host": endpoint.partition("/")[2], "protocol": "zenoh"}},
+        "servers": {
+            "router": {"host": endpoint.partition("/")[2], "protocol": "zenoh"},
+            "http": {"host": http, "protocol": "ws"},
+            "mqtt": {"host": MQTT, "protocol": "mqtt"},
+        },
         "channels": {name: _channel(channel, Keys(prefix)) for name, channel in CHANNELS.items()},
         "operations": {name: _operation(name, channel) for name, channel in CHANNELS.items() if channel.action},
         "components": {"messages": messages, "schemas": schemas},
@@ -105,9 +129,9 @@ def document(prefix: str = PREFIX, endpoint: str = ENDPOINT) -> str:
 
 def _forms(names: tuple[str, ...]) -> list[str]:
     """Return the messages of a document that stand for messages of the product: each in two encodings."""
-    return [
-        one for name in names for one in ([name] if name in {QUERY, METRICS} else [f"{name}.msgpack", f"{name}.json"])
-    ]
+    alone = {QUERY, METRICS, *EDGE}
+    forms = ([name] if name in alone else [f"{name}.msgpack", f"{name}.json"] for name in names)
+    return [one for form in forms for one in form]
 
 
 def _replies(channel: Channel) -> tuple[str, ...]:
@@ -115,13 +139,16 @@ def _replies(channel: Channel) -> tuple[str, ...]:
 
 
 def _channel(channel: Channel, keys: Keys) -> dict[str, Any]:
-    below = getattr(keys, channel.key)(*channel.of).removeprefix(f"{keys.prefix}/").split("/")
+    key = channel.address or getattr(keys, channel.key)(*channel.of).removeprefix(f"{keys.prefix}/")
+    below = key.split("/")
     parameters = {chunk: {"description": _PARAMETERS[chunk]} for chunk in below if chunk in _PARAMETERS}
+    named = (f"{{{chunk}}}" if chunk in parameters else chunk for chunk in below)
     names = _forms((*channel.messages, *_replies(channel)))
     return {
-        "address": "/".join([keys.prefix, *(f"{{{chunk}}}" if chunk in parameters else chunk for chunk in below)]),
+        "address": key if channel.server == "http" else f"{keys.prefix}/{'/'.join(named)}",
         "description": channel.about,
         "parameters": parameters,
+        "servers": [{"$ref": f"#/servers/{channel.server}"}],
         **({"messages": {name: {"$ref": f"#/components/messages/{name}"} for name in names}} if names else {}),
     }
 

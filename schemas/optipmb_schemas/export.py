@@ -19,6 +19,7 @@ from typing import Any, Final
 from pydantic.fields import FieldInfo
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 
+from optipmb_schemas import json_form
 from optipmb_schemas.codec import MAJOR, MESSAGES, encoding_of
 from optipmb_schemas.control import MemberSummary, SessionState, SessionSummary
 from optipmb_schemas.errors import CODES
@@ -64,9 +65,11 @@ def schema_of(kind: type[Message]) -> dict[str, Any]:
 
 def schema_files() -> dict[str, str]:
     """Return the names and texts of all schema files."""
+    about = {"$schema": "https://json-schema.org/draft/2020-12/schema", "x-encoding": "application/json"}
+    edges = {name: about | {"$id": f"urn:optipmb:{name}.v{MAJOR}"} | one for name, one in json_form.schemas().items()}
     return {
-        f"{kind.__name__}.v{MAJOR}{SUFFIX}": json.dumps(schema_of(kind), indent=2, sort_keys=True) + "\n"
-        for kind in MESSAGES
+        f"{name}.v{MAJOR}{SUFFIX}": json.dumps(schema, indent=2, sort_keys=True) + "\n"
+        for name, schema in ({kind.__name__: schema_of(kind) for kind in MESSAGES} | edges).items()
     }
 
 
@@ -85,7 +88,7 @@ def table(name: str) -> str:
 
 
 def _rows(kind: type[Message]) -> Iterable[tuple[str, ...]]:
-    """Yield a row per field; those that are as in a message described before share one."""
+    """Yield a row per field; fields that repeat a message described before share one."""
     rows = list(_field_rows(kind))
     for first in (Detections, Tracks, SessionState):
         if kind is first:

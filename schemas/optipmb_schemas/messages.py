@@ -145,20 +145,24 @@ class Detections(SensorMessage):
     label: Annotated[Integers, Array("i8", ("M",), 0, 255)] = Field(
         description="Class of each object as an index into `labels`, from 0."
     )
-    center: Annotated[Reals, Array("f8", ("M", 3), -FAR, FAR)] = Field(
-        description="Geometric centres of the boxes: x, y, z in metres, in `frame`."
+    center: Annotated[Reals, Array("f8", ("M", 3), -FAR, FAR, unknown="last")] = Field(
+        description="Geometric centres of the boxes: x, y, z in metres, in `frame`. A z of NaN (JSON: null) is unknown."
     )
-    size: Annotated[Reals, Array("f8", ("M", 3), 0, 1e4, above=True)] = Field(
-        description="Length (along the heading), width, height in metres."
+    size: Annotated[Reals, Array("f8", ("M", 3), 0, 1e4, above=True, unknown="number")] | None = Field(
+        default=None,
+        description="Length (along the heading), width, height in metres. A number of NaN (JSON: null) is unknown. "
+        "Absent: all are.",
     )
-    yaw: Annotated[Reals, Array("f8", ("M",), -1e4, 1e4)] = Field(
-        description="Heading in radians, counter-clockwise about z from the x axis of `frame`."
+    yaw: Annotated[Reals, Array("f8", ("M",), -1e4, 1e4, unknown="number")] | None = Field(
+        default=None,
+        description="Heading in radians, counter-clockwise about z from the x axis of `frame`. NaN (JSON: null): "
+        "unknown for this object. Absent: for all.",
     )
     score: Annotated[Reals, Array("f8", ("M",), 0, 1)] = Field(
         description="Confidence of the detector; not a logit. An object of score 0 is left out and counted in "
         "`Tracks.ignored`."
     )
-    velocity: Annotated[Reals, Array("f8", ("M", 2), -1e3, 1e3, unknown=True)] | None = Field(
+    velocity: Annotated[Reals, Array("f8", ("M", 2), -1e3, 1e3, unknown="row")] | None = Field(
         default=None,
         description="Velocity over ground in m/s along the x and y axes of `frame`. A row of two NaN (JSON: null): "
         "unknown for this object. Absent: for all.",
@@ -174,7 +178,7 @@ class Detections(SensorMessage):
         "Absent: everywhere.",
     )
 
-    position_covariance: Annotated[Reals, Array("f8", ("M", 3, 3), -1e8, 1e8, unknown=True)] | None = Field(
+    position_covariance: Annotated[Reals, Array("f8", ("M", 3, 3), -1e8, 1e8, unknown="row")] | None = Field(
         default=None,
         description="Covariance of the errors of each centre's x, y and z in m^2, along the axes of `frame`: "
         "symmetric, the variance along every axis from 1e-8 to 1e8. A matrix of NaN (JSON: null) is an object for "
@@ -212,10 +216,16 @@ class Delivery(Message):
         description="Grows whenever a process begins to track the stream or goes on with it. Tracks of a later run "
         "replace those of an earlier one for the same `epoch` and `seq`, whatever their revisions.",
     )
+    final_session: SessionId | None = Field(
+        default=None,
+        description="In `Events`: messages of this session with a `stamp_ns` below `final_ns`, and of all sessions "
+        "before it, do not change any more.",
+    )
+    final_ns: Stamp | None = Field(default=None, description="In `Events`: see `final_session`.")
 
 
-class Tracks(Header):
-    """The tracks of one frame, N of them, ordered by id. `epoch`, `seq` and `stamp_ns` are those of the detections."""
+class ResultMessage(Header):
+    """Header of the service's results for a frame; `epoch`, `seq` and `stamp_ns` repeat the detections."""
 
     sensor: Stream | None = Field(
         default=None,
@@ -226,9 +236,14 @@ class Tracks(Header):
     )
     revision: Count = Field(
         default=0,
-        description="Higher than 0: corrects, after a late frame, what was published for the same `session`, `epoch` "
+        description="Higher than 0: replaces, after a late frame, what was published for the same `session`, `epoch` "
         "and `seq`.",
     )
+
+
+class Tracks(ResultMessage):
+    """The tracks of one frame, N of them, ordered by id. `epoch`, `seq` and `stamp_ns` repeat the detections."""
+
     profile: Name = Field(description="Name of the parameters in force.")
     cloud_used: Flag = Field(description="Whether the frame was tracked with a cloud.")
     gap: Count = Field(default=0, description="Frames known to be missing directly before this one.")
@@ -278,6 +293,12 @@ class Tracks(Header):
         default=None,
         description="1: the existence reached a threshold of the profile and has not fallen below a lower one since; "
         "0: the track may be of nothing.",
+    )
+    measured: Annotated[Integers, Array("i8", ("N",), 0, 7)] | None = Field(
+        default=None,
+        description="What is known of the object, from detections or, the heading, from its motion: 1 the heading, 2 "
+        "the size, 4 the height, added up. The rest of `yaw`, `size` and z stand in for it: size by the profile. "
+        "Absent: everything of all.",
     )
     class_probability: Annotated[Singles, Array("f4", ("N", "C"), 0, 1)] | None = Field(
         default=None,
@@ -342,13 +363,13 @@ def path_fields(horizons: Reals, mean: Reals, covariance: Reals) -> dict[str, Nu
     return _validated(dict(zip(PATHS, values, strict=True)))
 
 
-def class_fields(class_probability: Reals) -> dict[str, Numeric]:
-    """Return the field of `Tracks` with the probabilities (N, C) of the classes.
+def track_fields(**columns: Numeric | None) -> dict[str, Numeric]:
+    """Return further columns of `Tracks`, but for those that are None, as fields.
 
     Raises:
-        MessageError: they are none.
+        MessageError: they hold numbers that no message may.
     """
-    return _validated({"class_probability": class_probability})
+    return _validated({name: one for name, one in columns.items() if one is not None})
 
 
 def _validated(values: Mapping[str, Numeric]) -> dict[str, Numeric]:
@@ -401,21 +422,9 @@ class ZoneCount(Message):
     to_right: Counts = Field(description="Crossings of the line to its right.")
 
 
-class Events(Header):
+class Events(ResultMessage):
     """Events of the zones and lines of a stream at one frame, and their counts."""
 
-    sensor: Stream | None = Field(
-        default=None,
-        description="Stream of the detections, and of `epoch` and `seq`. Absent: it is `stream`.",
-    )
-    session: SessionId = Field(
-        description="32 hexadecimal digits. When it changes, earlier tracks have ended, except those whose ids return."
-    )
-    revision: Count = Field(
-        default=0,
-        description="Higher than 0: replaces, after a late frame, the events published for the same `session`, `epoch` "
-        "and `seq`.",
-    )
     labels: Labels = Field(description="Names of the classes that `label` counts.")
     events: tuple[ZoneEvent, ...] = Field(
         default=(), max_length=100_000, fail_fast=True, description="In order of `at_ns`, `zone` and `id`."
@@ -423,7 +432,8 @@ class Events(Header):
     zones: tuple[ZoneCount, ...] | None = Field(
         default=None,
         max_length=256,
-        description="Counts after this frame: at the first of each second of stamps, and with every revision.",
+        description="Counts after this frame: at the first of each session and second of stamps, with every revision, "
+        "and in replies to `q/zones`.",
     )
     delivery: Delivery | None = Field(default=None, description="How this publication came about.")
 
@@ -441,7 +451,7 @@ class Events(Header):
 
 
 class Density(Message):
-    """Reply of `q/density`: where the tracker expects objects that nobody has detected yet, one row per component.
+    """Reply of `q/density`: where the tracker expects objects that are not detected yet, one row per component.
 
     These are the Poisson components after the newest frame, N of them, with the values that the tracker holds.
     """

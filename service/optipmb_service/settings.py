@@ -18,6 +18,7 @@ import secrets
 import socket
 import tomllib
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
@@ -53,6 +54,8 @@ HOST_CHARACTERS: Final = 40
 DEFAULT_LISTEN: Final = "tcp/127.0.0.1:7447"
 DEFAULT_GRPC: Final = "127.0.0.1:50051"
 DEFAULT_NATS: Final = "127.0.0.1:4222"
+DEFAULT_MQTT: Final = "mqtt://127.0.0.1:1883"
+MOST_ZONES: Final = 256  # as `optipmb.zones.MOST`, which the settings do not import
 
 
 def _form(pattern: str, expected: str) -> AfterValidator:
@@ -197,6 +200,36 @@ class Ros2Settings(BaseModel):
     """topics by stream (`site/node/sensor`)"""
 
 
+class MqttSettings(BaseModel):
+    """An MQTT broker and what it gets; used by `optipmb-service mqtt`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    broker: Annotated[str, _form(r"mqtts?://[^\s/@]+", "a broker looks like mqtt://127.0.0.1:1883")] = DEFAULT_MQTT
+    """address of the broker; `mqtts://` with TLS"""
+    credentials: Path | None = None
+    """file with `user:password`"""
+    tls: Path | None = None
+    """folder with `ca.pem`, and `cert.pem` and `key.pem` where the broker asks for a certificate; default: the
+    system's authorities"""
+    streams: Patterns = ("*/*/*",)
+    """patterns of streams, each part a name or `*`, that do not overlap"""
+    topics: tuple[Literal["tracks", "events", "zones", "problems"], ...] = ("tracks", "events", "zones", "problems")
+    """what is published"""
+    tracks_hz: float = Field(default=2.0, ge=0, le=1000)
+    """highest rate of the tracks of a stream, in sensor time; 0: all frames"""
+
+    @field_validator("streams")
+    @classmethod
+    def _check_streams(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        for pattern in value:
+            try:
+                Keys().matching(pattern, "tracks")
+            except MessageError as error:
+                raise ValueError(f"{error.expected}, or * for any of its parts, received {pattern!r}") from None
+        return value
+
+
 class SiteSettings(BaseModel):
     """Place of a site's world frame on the globe."""
 
@@ -209,6 +242,8 @@ class SiteSettings(BaseModel):
 
 
 Shape = tuple[tuple[float, float], ...]
+FARTHEST: Final = 100_000.0
+"""Distance of a zone from the origin of its site, m, beyond which latitude and longitude are likely exchanged."""
 
 
 class ZoneSettings(BaseModel):
@@ -235,6 +270,8 @@ class ZoneSettings(BaseModel):
     """an object that was not detected for longer has left"""
     dwell_s: tuple[Annotated[float, Field(gt=0, le=1e8)], ...] = ()
     """times inside after which there is an event"""
+    geo: bool = False
+    """points are latitude and longitude in degrees, by the place of the stream's site in `sites`"""
 
     @field_validator("polygon", "line")
     @classmethod
@@ -251,11 +288,22 @@ class ZoneSettings(BaseModel):
                 raise ValueError(str(error).partition(": ")[2]) from None
         return value
 
-    def zone(self, name: str) -> Zone:
-        """Return the zone that these settings describe."""
+    def zone(self, name: str, site: SiteSettings | None = None) -> Zone:
+        """Return the zone that these settings describe, of a site if its points are geographic.
+
+        Raises:
+            ParameterError: these are too far from the site.
+        """
+        from optipmb import Georeference, ParameterError  # noqa: PLC0415 - compiles kernels
         from optipmb.zones import Zone  # noqa: PLC0415 - compiles kernels
 
-        values: dict[str, Any] = self.model_dump(exclude={"streams"}, exclude_none=True)
+        values: dict[str, Any] = self.model_dump(exclude={"streams", "geo"}, exclude_none=True)
+        if self.geo and site is not None:
+            lat, lon = zip(*(self.polygon or self.line), strict=True)
+            world = Georeference(site.origin, site.x_heading).to_world(lat, lon)
+            if max(abs(world[:, :2]).ravel()) > FARTHEST:
+                raise ParameterError(name, f"points within {FARTHEST / 1e3:g} km of the origin of the site", "others")
+            values["polygon" if self.polygon else "line"] = tuple(map(tuple, world[:, :2].tolist()))
         return Zone(name, **values | {"dwell_s": tuple(sorted(self.dwell_s))})
 
 
@@ -399,6 +447,13 @@ class Settings(BaseSettings):
     """address of health, metrics and live page, as `127.0.0.1:8080`"""
     http_hosts: Names = ()
     """host names with a dot by which the page may be asked for, besides addresses and names without; `*`: any"""
+    http_origins: Names = ()
+    """origins of other pages that may read over HTTP, as `https://map.example`; `*`: any"""
+    http_tokens: str = ""
+    """JSON file of names by the SHA-256 of their tokens, or `module:function`, as `grpc_tokens`; default: all may
+    read"""
+    http_clients: int = Field(default=32, ge=1, le=128)
+    """readers of streams over HTTP at once, viewers of the page among them; further ones are refused"""
     http_streams: int = Field(default=100, ge=0, le=10_000)
     """streams with series of their own in the metrics, by name"""
     grpc: Address = ""
@@ -420,14 +475,28 @@ class Settings(BaseSettings):
     """lowest level that is logged"""
     sites: dict[str, SiteSettings] = Field(default_factory=dict)
     """place of each site's world frame, by which the live page shows latitude, longitude and true heading"""
-    zones: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")], ZoneSettings] = Field(
-        default_factory=dict, max_length=256
-    )
-    """polygons and lines whose events are published, by name; equal on all members of a cluster"""
+    zones: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")], ZoneSettings] = Field(default_factory=dict)
+    """polygons and lines whose events are published, by name, at most 256 for a session; equal on all members of a
+    cluster"""
     ros2: Ros2Settings = Ros2Settings()
     """topics of ROS 2, for `optipmb-service ros2`"""
+    mqtt: MqttSettings = MqttSettings()
+    """a broker of MQTT, for `optipmb-service mqtt`"""
     limits: LimitSettings = LimitSettings()
     """bounds on what one message may hold"""
+
+    def zones_of(self, session: str) -> list[str]:
+        """Return the names of the zones of a session, or of all that a pattern matches."""
+        site = session.partition("/")[0]
+        return [
+            name
+            for name, one in sorted(self.zones.items())
+            if any(fnmatchcase(session, pattern) for pattern in one.streams) and (not one.geo or site in self.sites)
+        ]
+
+    def zone(self, name: str, site: str) -> Zone:
+        """Return a zone as it is in the world of a site."""
+        return self.zones[name].zone(name, self.sites.get(site))
 
     @property
     def is_router(self) -> bool:
@@ -544,6 +613,7 @@ def load(
     if settings.fuse and not settings.rewind_s:
         raise SettingsInvalidError("setting fuse: sensors do not come in order of their stamps: rewind_s must not be 0")
     _check_cluster(settings)
+    _check_zones(settings)
     if settings.workers > 1 and settings.zenoh_config is not None and settings.is_router:
         # Its access control would be deaf to the workers, which come over a socket and without a certificate.
         raise SettingsInvalidError(
@@ -592,6 +662,29 @@ def _check_cluster(settings: Settings) -> None:
             raise SettingsInvalidError(f"setting cluster_tls: {folder}: cert.pem and key.pem belong together")
     if file is not None and not file.is_file():
         raise SettingsInvalidError(f"setting cluster_credentials: {file}: no such file")
+
+
+def _check_zones(settings: Settings) -> None:
+    """Refuse geographic zones whose place is not known or not right, and too many zones of one pattern.
+
+    Raises:
+        SettingsInvalidError: there are such.
+    """
+    for name, zone in settings.zones.items():
+        for pattern in zone.streams if zone.geo else ():
+            sites = [site for site in settings.sites if fnmatchcase(site, pattern.partition("/")[0])]
+            if not sites:
+                raise SettingsInvalidError(f"setting zones.{name}.geo: the site of {pattern} is not in `sites`")
+            try:
+                for site in sites:
+                    settings.zone(name, site)
+            except ValueError as error:
+                shape = "polygon" if zone.polygon else "line"
+                reason = str(error).partition(": ")[2]
+                raise SettingsInvalidError(f"setting zones.{name}.{shape} in sites.{site}: {reason}") from error
+    for pattern in {pattern for one in settings.zones.values() for pattern in one.streams}:
+        if (count := len(settings.zones_of(pattern))) > MOST_ZONES:
+            raise SettingsInvalidError(f"setting zones: at most {MOST_ZONES} for a session, {pattern} has {count}")
 
 
 def _read(file: Path) -> dict[str, Any]:

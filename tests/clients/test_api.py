@@ -28,6 +28,7 @@ from optipmb_schemas import (
     encoding_of,
 )
 from routers import free_endpoint, open_client
+from tracks_message import SESSION, tracks_message
 from without_numpy import command, publish_everything
 
 if TYPE_CHECKING:
@@ -37,7 +38,6 @@ DEADLINE_S = 60.0
 STREAM = "garage/robot-1/lidar"
 POSE = ([1.0, 2.0, 3.0], [1.0, 0.0, 0.0, 0.0])
 ONE = {"label": ["Car"], "center": [[1, 2, 0]], "size": [[4, 2, 1.5]], "yaw": [0.1], "score": [0.9]}
-SESSION = "0123456789abcdef0123456789abcdef"
 
 
 @pytest.fixture
@@ -54,35 +54,9 @@ def listen(connection: Connection, topic: str) -> Inbox:
     return inbox
 
 
-def tracks(seq: int, *, revision: int = 0, session: str = SESSION, epoch: bytes = bytes(16), gap: int = 0) -> Tracks:
+def tracks(seq: int, **changes: Any) -> Tracks:
     """A tracks message without tracks."""
-    none = np.zeros(0)
-    return Tracks(
-        stream=STREAM,
-        epoch=epoch,
-        seq=seq,
-        stamp_ns=seq,
-        session=session,
-        revision=revision,
-        profile="kitti",
-        cloud_used=False,
-        gap=gap,
-        labels=("Car",),
-        id=none.astype(np.int64),
-        label=none.astype(np.int64),
-        center=np.zeros((0, 3)),
-        size=np.zeros((0, 3)),
-        yaw=none,
-        velocity=np.zeros((0, 2)),
-        yaw_rate=none,
-        acceleration=none,
-        existence=none,
-        score=none,
-        covariance=np.zeros((0, 6, 6)),
-        age=none,
-        time_since_detection=none,
-        detection=none.astype(np.int64),
-    )
+    return tracks_message(STREAM, seq, **changes)
 
 
 def problem(message: str) -> Problem:

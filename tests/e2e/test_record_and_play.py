@@ -149,7 +149,7 @@ def play_into_another(path: Path, folder: Path, capsys: pytest.CaptureFixture[st
 def test_four_streams_played_into_a_fresh_service(
     service: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Ids, sessions, numbers, stamps and every byte of the tracks are those of the recording; offline, too."""
+    """Ids, sessions, numbers, stamps and every byte of the tracks equal the recording; offline, too."""
     path = recorded_replay(service, tmp_path, open_dataset("scene", **VALUES), *FOUR)
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()
@@ -232,7 +232,7 @@ def test_a_stream_that_was_tracked_before_is_reported(incident: Path, capsys: py
 def test_a_killed_recording_still_plays(
     service: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """SIGKILL in the middle of a stream: what was written until a second before is there, and plays the same."""
+    """SIGKILL in the middle of a stream: messages until a second before are there, and play the same."""
     path = tmp_path / "cut.mcap"
     with recording(service, path) as process, Subscriber("replay/*/0000", service.endpoint) as tracks:
         replaying = start("replay", *SCENE, "--option", "frames=60", "--speed", 1, "--connect", service.endpoint)
@@ -269,7 +269,7 @@ def test_kitti(service: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFi
 def test_what_cannot_be_is_one_line_with_status_2(
     arguments: tuple[str, ...], words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Wrong files and options are told before anything is connected."""
+    """Wrong files and options are reported before anything is connected."""
     assert run(arguments) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert words in line

@@ -10,8 +10,9 @@ import contextlib
 import optipmb_schemas as schemas
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
-from optipmb_schemas.protobuf.convert import EncodedTracks, transcode
-from optipmb_service.grpc.selection import Pace, Selection
+from optipmb_schemas.protobuf.convert import transcode
+from optipmb_service.edge.readers import Pace
+from optipmb_service.grpc.selection import Selection
 from optipmb_service.stream.checkpoint import CheckpointError, decode_checkpoint, encode_checkpoint, seal
 from optipmb_service.stream.convert import density_of
 from optipmb_service.stream.session import Session
@@ -75,7 +76,7 @@ def protobuf(data: bytes) -> None:
         request = convert.parse(data[1:], kind)
         if isinstance(request, pb.SubscribeRequest):
             Selection(request.filter)
-            Pace(request.max_rate_hz).passes(EncodedTracks("a/b/c", b"", 0, 0, 0, 0, b""))
+            Pace(request.max_rate_hz).passes("a/b/c", 0)
             schemas.Keys().matching(request.pattern, "tracks")
         elif isinstance(request, pb.SetParametersRequest):
             convert.from_proto(request.parameters, schemas.SessionParameters, LIMITS)

@@ -71,6 +71,7 @@ def _examples() -> list[Message]:
         yaw=np.array([0.1, -0.2]),
         heading_confidence=np.array([0.9, 0.5]),
         confirmed=np.array([1, 0]),
+        measured=np.array([7, 4]),
         class_probability=np.array([[0.25, 0.75], [1.0, 0.0]], dtype="f4"),
         velocity=np.array([[1.0, 2.0], [0.0, 0.5]]),
         yaw_rate=np.array([0.01, 0.0]),
@@ -188,16 +189,20 @@ def examples() -> dict[str, Message]:
 @pytest.fixture(scope="session")
 def example_of(examples: dict[str, Message]) -> Callable[[type[Message]], Message]:
     """Gives the valid message of a type, also of nested ones."""
-    tracks, status = examples["Tracks"], examples["ServiceStatus"]
+    tracks, status, events = examples["Tracks"], examples["ServiceStatus"], examples["Events"]
     assert isinstance(tracks, Tracks)
     assert isinstance(status, ServiceStatus)
+    assert isinstance(events, Events)
     assert tracks.delivery is not None
+    assert events.zones is not None
     held = {
         "Pose": POSE,
         "Relocation": MOTION,
         "FieldOfView": VIEW,
         "Delivery": tracks.delivery,
         "SessionSummary": status.sessions[0],
+        "ZoneEvent": events.events[0],
+        "ZoneCount": events.zones[0],
     }
     return lambda kind: {**examples, **held}[kind.__name__]
 

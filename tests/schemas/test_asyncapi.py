@@ -51,7 +51,8 @@ def test_channels_are_the_table_of_keys() -> None:
     """Each row of docs/messages.md is a channel, with its parameters, and no other is one."""
     page = (ROOT / "docs" / "messages.md").read_text()
     keys = re.findall(r"^\| `(optipmb/v1/[^`]*)` \|", page.split("## Keys")[1].split("## Encodings")[0], re.MULTILINE)
-    addresses = [channel["address"] for channel in DOCUMENT["channels"].values()]
+    servers = {name: channel["servers"][0]["$ref"] for name, channel in DOCUMENT["channels"].items()}
+    addresses = [DOCUMENT["channels"][name]["address"] for name, at in servers.items() if at == "#/servers/router"]
     assert sorted(addresses) == sorted(re.sub(r"<(\w+)>", r"{\1}", key) for key in keys)
     for channel in DOCUMENT["channels"].values():
         assert set(channel["parameters"]) == set(re.findall(r"{(\w+)}", channel["address"]))
@@ -81,6 +82,7 @@ def test_messages_fit_the_schemas_of_the_document(examples: dict[str, Message], 
 
 def test_prefix_and_endpoint_are_those_in_force() -> None:
     """As a service with other settings serves it."""
-    other = json.loads(document("site/node/sensor", "tls/tracker.example:7447"))
+    other = json.loads(document("site/node/sensor", "tls/tracker.example:7447", "tracker.example:80"))
     assert other["channels"]["tracks"]["address"] == "site/node/sensor/{site}/{node}/{sensor}/tracks"
-    assert other["servers"] == {"router": {"host": "tracker.example:7447", "protocol": "zenoh"}}
+    assert other["servers"]["router"] == {"host": "tracker.example:7447", "protocol": "zenoh"}
+    assert other["servers"]["http"] == {"host": "tracker.example:80", "protocol": "ws"}

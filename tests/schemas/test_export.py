@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from optipmb_schemas import MESSAGES, Message, encode_json
+from optipmb_schemas import MESSAGES, Message, encode_json, json_form
 from optipmb_schemas.export import main, schema_of
 
 
@@ -32,7 +32,7 @@ def test_the_module_is_a_command(tmp_path: Path) -> None:
     """`python -m optipmb_schemas.export` works; a folder that cannot be is one line and status 2."""
     command = [sys.executable, "-m", "optipmb_schemas.export"]
     assert subprocess.run([*command, tmp_path / "new"], check=False, timeout=60).returncode == 0
-    assert len(list((tmp_path / "new").iterdir())) == len(MESSAGES)
+    assert len(list((tmp_path / "new").iterdir())) == len(MESSAGES) + len(json_form.schemas())
     (tmp_path / "file").touch()
     failed = subprocess.run([*command, tmp_path / "file"], check=False, timeout=60, capture_output=True, text=True)
     assert failed.returncode == 2

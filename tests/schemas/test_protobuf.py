@@ -88,6 +88,17 @@ def test_covariances_survive(example_of: Any) -> None:
         convert.from_proto(proto, Detections)
 
 
+@pytest.mark.parametrize(
+    "unknown",
+    [{"yaw": None, "size": None}, {"yaw": [0.5, np.nan, 1.0], "size": [[4.0, np.nan, 1.5], [np.nan] * 3, [1.0] * 3]}],
+)
+def test_detections_without_headings_and_sizes_survive(unknown: dict[str, Any], example_of: Any) -> None:
+    """Absent columns stay absent, and unknown numbers unknown."""
+    center = np.array([[1.0, 2.0, np.nan], [3.0, 4.0, 0.5], [5.0, 6.0, np.nan]])
+    message = Detections(**(dict(example_of(Detections).present()) | unknown | {"center": center}))
+    assert encode(convert.from_proto(proto_of(message), Detections)) == encode(message)
+
+
 @pytest.mark.parametrize("rows", [0, 1, 5000])
 def test_columns_of_any_length_survive(rows: int) -> None:
     """A frame without objects and the largest one are no exceptions."""

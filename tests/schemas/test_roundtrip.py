@@ -1,6 +1,8 @@
 """Messages survive the wire unchanged, to the bit."""
 
+import json
 import pickle
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from jsonschema import Draft202012Validator
 from optipmb_schemas import (
     MESSAGES,
     Delivery,
@@ -35,7 +38,11 @@ from optipmb_schemas import (
     encode_json,
     encoding_of,
 )
+from optipmb_schemas.json_form import FIELDS, Selection, event_json, tracks_json, zones_json
 
+from optipmb import Georeference
+
+SCHEMAS = Path(__file__).parents[2] / "schemas/json"
 INT64 = 2**63 - 1
 FAR = 1e8
 
@@ -112,13 +119,22 @@ def detections(draw: st.DrawFn) -> Detections:
     velocity = draw(st.none() | rows((m, 2), -1e3, 1e3))
     if velocity is not None:
         velocity[draw(arrays(np.bool_, m))] = np.nan
+    center, size, yaw = (
+        draw(rows((m, 3), -FAR, FAR)),
+        draw(rows((m, 3), 0, 1e4, above=True)),
+        draw(rows((m,), -1e4, 1e4)),
+    )
+    if draw(st.booleans()):
+        center[draw(arrays(np.bool_, m)), 2] = np.nan
+        size[draw(arrays(np.bool_, (m, 3)))] = np.nan
+        yaw[draw(arrays(np.bool_, m))] = np.nan
     return Detections(
         **draw(placed()),
         labels=tuple(names),
         label=draw(whole(m, 0, len(names) - 1)),
-        center=draw(rows((m, 3), -FAR, FAR)),
-        size=draw(rows((m, 3), 0, 1e4, above=True)),
-        yaw=draw(rows((m,), -1e4, 1e4)),
+        center=center,
+        size=draw(st.sampled_from([None, size])),
+        yaw=draw(st.sampled_from([None, yaw])),
         score=draw(rows((m,), 0, 1, above=True)),
         velocity=velocity,
         has_points=draw(st.none() | st.booleans()),
@@ -363,3 +379,69 @@ def test_messages_that_differ_are_not_equal(detections: Detections) -> None:
     assert detections.model_copy(update={"center": moved}) != detections
     assert detections.model_copy(update={"seq": 8}) != detections
     assert ResetRequest() != SessionParameters()
+
+
+def validator(name: str) -> Draft202012Validator:
+    """The published schema of a text."""
+    return Draft202012Validator(json.loads((SCHEMAS / f"{name}.v1.schema.json").read_text()))
+
+
+@given(tracks())
+def test_the_json_of_the_edges_has_the_numbers_of_the_columns(message: Tracks) -> None:
+    """Each object has the values of its row, rounded; the text conforms to its published schema."""
+    text = json.loads(tracks_json(message, place=Georeference((48.0, 11.0, 500.0)).to_geographic))
+    validator("EdgeTracks").validate(text)
+    assert text["type"] == "tracks"
+    assert (text["stamp_ns"], text["epoch"]) == (str(message.stamp_ns), message.epoch.hex())
+    assert [one["id"] for one in text["objects"]] == message.id.tolist()
+    assert [one["class"] for one in text["objects"]] == [message.labels[at] for at in message.label]
+    columns = {
+        "position": message.center,
+        "size": message.size,
+        "yaw": message.yaw,
+        "velocity": message.velocity,
+        "existence": message.existence,
+        "age_s": message.age,
+        "seen_s": message.time_since_detection,
+    }
+    for name, column in columns.items():
+        assert [one[name] for one in text["objects"]] == np.round(column, 3).tolist()
+    near = np.linalg.norm(message.center, axis=1) <= 1e5
+    assert ["lat" in one and 0 <= one["heading"] < 360 for one in text["objects"]] == near.tolist()
+
+
+@given(tracks(), st.frozensets(st.sampled_from(sorted(FIELDS))), st.floats(0, 1), st.integers(0, 1))
+def test_a_selection_leaves_out_rows_and_fields(
+    message: Tracks, fields: frozenset[str], least: float, confirmed: int
+) -> None:
+    """The objects that are left are those of the whole text, with the fields that were asked for and `id`."""
+    selection = Selection(frozenset(message.labels[:1]), bool(confirmed), least, fields)
+    whole = {one["id"]: one for one in json.loads(tracks_json(message))["objects"]}
+    chosen = json.loads(tracks_json(message, selection))["objects"]
+    for one in chosen:
+        all_of_it = whole[one["id"]]
+        assert one == {name: all_of_it[name] for name in all_of_it if name in fields | {"id"} or not fields}
+        assert all_of_it["class"] == message.labels[0]
+    expected = (message.existence >= least) & (message.label == 0)
+    if confirmed:
+        expected &= (message.existence > 0.5) & (message.age > 0)
+    assert [one["id"] for one in chosen] == message.id[expected].tolist()
+
+
+@given(zone_events())
+def test_the_json_of_events_has_one_text_for_each(message: Events) -> None:
+    """Every event and the counts conform to their schemas, with classes by name."""
+    texts = [json.loads(one) for one in event_json(message)]
+    for text, event in zip(texts, message.events, strict=True):
+        validator("EdgeEvent").validate(text)
+        assert (text["zone"], text["n"], text["at_ns"]) == (event.zone, event.n, str(event.at_ns))
+        assert text["class"] == message.labels[event.label]
+    counts = zones_json(message)
+    assert (counts is None) == (message.zones is None)
+    if counts is not None:
+        validator("EdgeZones").validate(json.loads(counts))
+        for zone in message.zones or ():
+            found = json.loads(counts)["zones"][zone.zone]
+            assert {name: one["inside"] for name, one in found.items()} == dict(
+                zip(message.labels, zone.inside, strict=True)
+            ) or [one.zone for one in message.zones or ()].count(zone.zone) > 1

@@ -15,7 +15,7 @@ SOURCES = sorted(ROOT.rglob("*.py"))
 MODULES = {".".join(("optipmb_service", *source.relative_to(ROOT).with_suffix("").parts)): source for source in SOURCES}
 PAGE = (Path(__file__).parents[2] / "docs/architecture.md").read_text()
 
-LINK = ("optipmb_client.zenoh.", "optipmb_client.incoming.", "optipmb_client.errors.")
+LINK = ("optipmb_client.zenoh.", "optipmb_client.incoming.", "optipmb_client.errors.", "optipmb_client.merging.")
 """What the service may import of the client."""
 
 ARROWS = {
@@ -24,13 +24,15 @@ ARROWS = {
     "stream": {"cluster", "telemetry", "zenoh", "settings"},
     "ros2": {"settings", "zenoh"},
     "zenoh": {"settings"},
-    "http": {"telemetry"},
-    "grpc": {"telemetry", "settings", "zenoh"},
+    "edge": {"zenoh"},
+    "http": {"telemetry", "settings", "edge"},
+    "grpc": {"telemetry", "settings", "zenoh", "edge"},
     "app": {
         "cluster",
         "telemetry",
         "stream",
         "zenoh",
+        "edge",
         "http",
         "grpc",
         "ros2",
@@ -60,7 +62,7 @@ PURE = {
 
 
 def place_of(source: Path) -> str:
-    """The folder of a module, or the module itself where it lies beside the folders."""
+    """The folder of a module, or the module itself where it has none."""
     first, *rest = source.relative_to(ROOT).parts
     return first if rest else source.stem
 
@@ -86,7 +88,7 @@ def test_arrows_run_one_way(source: Path) -> None:
 
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: f"{path.parent.name}/{path.stem}")
 def test_libraries_of_an_edge_stay_there(source: Path) -> None:
-    """HTTP, gRPC and NATS are imported by their folders alone, Zenoh by none; of the client, its link to Zenoh."""
+    """HTTP, gRPC and NATS are imported by their folders alone, Zenoh by none; of the client, its link and merging."""
     names = imported(source.read_text())
     first = {name.partition(".")[0] for name in names}
     place = place_of(source)
@@ -108,7 +110,7 @@ def test_a_session_is_pure(name: str) -> None:
 
 
 def test_every_folder_is_listed() -> None:
-    """The arrows name each folder and each module beside the folders."""
+    """The arrows name each folder, and each module without one."""
     assert {place_of(source) for source in SOURCES} == set(ARROWS)
 
 
@@ -124,7 +126,7 @@ def test_the_page_has_the_arrows() -> None:
 
 @cache
 def floors(module: str) -> int:
-    """Modules in the longest chain of imports that begins with one, of those that run when it is imported."""
+    """Modules in the longest chain of imports that begins with one; imports inside functions do not count."""
     names = set()
     for statement in ast.parse(MODULES[module].read_text()).body:
         if isinstance(statement, ast.ImportFrom):

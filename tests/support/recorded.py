@@ -1,4 +1,4 @@
-"""Recorded sequences as the messages that a sensor would send, and what an undisturbed session makes of them."""
+"""Recorded sequences as the messages that a sensor would send, and a replay of them through a service."""
 
 from __future__ import annotations
 
@@ -9,14 +9,11 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from optipmb_schemas import Detections, Keys, Points, Pose, SessionState, Tracks, decode, encode, encoding_of
-from optipmb_service.stream.checkpoint import digest_of
-from optipmb_service.stream.session import Session
-from optipmb_service.stream.values import Policy, Tracked
+from optipmb_client.merging import FinalEvents
+from optipmb_schemas import Detections, Events, Keys, Points, Pose, SessionState, Tracks, decode, encode, encoding_of
 from optipmb_tools.datasets import open_dataset
 from router import plain
-
-import optipmb
+from sessions import bare_events
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,6 +31,11 @@ class Recording:
 
     stream: str
     frames: list[tuple[Detections, Points | None]]
+
+    @property
+    def messages(self) -> list[Detections | Points]:
+        """The clouds and frames in order, each cloud before its frame."""
+        return [one for detections, points in self.frames for one in (points, detections) if one is not None]
 
 
 def kitti(root: Path, name: str, stream: str, frames: int) -> Recording:
@@ -82,25 +84,22 @@ def recording(kind: str, root: Path, detector: str, name: str, stream: str, fram
     return Recording(stream, made)
 
 
-def undisturbed(recording: Recording, profile: str, policy: Policy | None = None) -> tuple[list[bytes], str]:
-    """The tracks of every frame, and the digest of the state after the last, of a session that nothing happens to."""
-    session = Session(recording.stream, optipmb.load_profile(profile), policy)
-    outputs = []
-    for detections, points in recording.frames:
-        if points is not None:
-            outputs += session.on_points(points, 0)
-        outputs += session.on_detections(detections, 0)
-    tracks = [plain(output.tracks) for output in outputs if isinstance(output, Tracked)]
-    return tracks, digest_of(session.snapshot())
-
-
 @dataclass
 class Replayed:
-    """What came back of a recording: by frame the distinct tracks, in the order of their revisions."""
+    """Results of a recording: by frame the distinct tracks, in the order of their revisions."""
 
     tracks: dict[int, set[bytes]] = field(default_factory=dict)
     repeated: int = 0
     times_ns: list[int] = field(default_factory=list)
+    merged: FinalEvents = field(default_factory=FinalEvents)
+    final: list[bytes] = field(default_factory=list)
+    """Events of frames as they became final."""
+
+    @property
+    def events(self) -> list[bytes]:
+        """Events of all frames, final or not."""
+        rest = sorted(self.merged.held.values(), key=lambda one: one.seq)
+        return self.final + [bare_events(one) for one in rest if one.events]
 
 
 class Replay:
@@ -118,7 +117,7 @@ class Replay:
             detections = connection.cached_sender(
                 KEYS.detections(recording.stream), encoding_of(Detections), cache=len(recording.frames)
             )
-            # Clouds too are kept: what was tracked with its cloud before a kill must be tracked with it again.
+            # Clouds too are kept: a frame tracked with its cloud before a kill must be tracked with it again.
             points = connection.plain_sender(
                 KEYS.points(recording.stream), encoding_of(Points), cache=len(recording.frames)
             )
@@ -140,6 +139,19 @@ class Replay:
                 result.times_ns.append(time.monotonic_ns())
             seen.add(plain(tracks))
             self.changed.notify_all()
+
+    def take_events(self, payload: bytes) -> None:
+        """Take in a message of events."""
+        events = decode(payload, Events)
+        if (result := self.results.get(events.stream)) is not None:
+            with self.changed:
+                result.final += [bare_events(one) for one in result.merged.take(events) if one.events]
+                self.changed.notify_all()
+
+    def wait_events(self, stream: str, expected: list[bytes], deadline_s: float) -> bool:
+        """Wait until the events of a stream are those expected."""
+        with self.changed:
+            return self.changed.wait_for(lambda: self.results[stream].events == expected, deadline_s)
 
     def start(self) -> None:
         """Begin to send."""

@@ -234,6 +234,19 @@ def ros2_command(**given: Unpack[RouterOptions]) -> None:
     leave_or_restart(asyncio.run(_needed("optipmb_service.app.ros2", "ros2").run(settings)))
 
 
+@app.command("mqtt")
+@_taking(RouterOptions)
+def mqtt_command(
+    broker: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Broker; as mqtt://127.0.0.1:1883, or mqtts:// with TLS.")
+    ] = None,
+    **given: Unpack[RouterOptions],
+) -> None:
+    """Publish tracks and events as JSON to an MQTT broker, a client of routers. SIGINT and SIGTERM end it."""
+    settings = _client({**given, "mqtt": broker and {"broker": broker}})
+    leave_or_restart(asyncio.run(_needed("optipmb_service.app.mqtt", "mqtt").run(settings)))
+
+
 @app.command("log")
 @_taking(LogOptions)
 def log_command(**given: Unpack[LogOptions]) -> None:

@@ -30,7 +30,7 @@ async def run_router(settings: Settings) -> int:
 
     async def serve(asked: StopRequest, health: ProcessHealth) -> bool:
         router = Client(settings)
-        health.report(Reporter())
+        health.report(Reporter(router))
         say_ready("router", settings.instance, settings.endpoints)
         log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
         await asked.wait()
@@ -49,7 +49,7 @@ async def run_gateway(settings: Settings) -> int:
         server = Server(settings, client)
         health.metrics.add(GATEWAY_METRICS, lambda: server.metrics)
         await server.start()
-        health.report(Reporter(lambda: client.failure))
+        health.report(Reporter(client))
         settle()
         say_ready("grpc", server.address, settings.connect)
         log.info("ready", instance=settings.instance, grpc=server.address, connect=settings.connect)

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from optipmb_client.zenoh.session import KeyNumbers
+    from optipmb_schemas.json_form import Place
 
     from optipmb_service.settings import Settings
 
@@ -313,6 +314,15 @@ def _certificate_files(settings: Settings) -> dict[str, Path]:
     return files
 
 
+def places_of(settings: Settings) -> dict[str, Place]:
+    """Return the places of sites whose world frames have one."""
+    if not settings.sites:
+        return {}
+    from optipmb import Georeference  # noqa: PLC0415 - the tracker, which a router does not load
+
+    return {name: Georeference(site.origin, site.x_heading).to_geographic for name, site in settings.sites.items()}
+
+
 @contextlib.contextmanager
 def _monitoring(settings: Settings, health: ProcessHealth) -> Iterator[None]:
     """Answer over HTTP, where that is asked for.
@@ -327,13 +337,9 @@ def _monitoring(settings: Settings, health: ProcessHealth) -> Iterator[None]:
 
     from optipmb_service.http import Server, application  # noqa: PLC0415 - a third of a second that only this needs
 
-    sites = {}
-    if settings.sites:
-        from optipmb import Georeference  # noqa: PLC0415 - the tracker, which a router does not load
-
-        sites = {name: Georeference(site.origin, site.x_heading) for name, site in settings.sites.items()}
-    interface = functools.partial(document, settings.prefix, (*settings.connect, *settings.endpoints)[0])
-    server = Server(application(health, settings.http_hosts, sites, interface), settings.http)
+    endpoint = (*settings.connect, *settings.endpoints)[0]
+    interface = functools.partial(document, settings.prefix, endpoint, settings.http)
+    server = Server(application(health, settings, places_of(settings), interface), settings.http)
     log.info("http", address=server.address)
     try:
         yield

@@ -22,7 +22,7 @@ from optipmb_service.stream.kept_tracks import order_of
 from optipmb_service.stream.problems import problem_of
 from optipmb_service.telemetry.health import Reporter
 from optipmb_service.telemetry.metrics import LOG_METRICS, PROBLEM_METRICS
-from optipmb_service.telemetry.problem_reporter import ProblemReporter, log_problem
+from optipmb_service.telemetry.problem_reporter import ProblemReporter
 
 if TYPE_CHECKING:
     from optipmb_client.incoming import Arrival
@@ -45,13 +45,13 @@ class LogBridge(Reporter):
     """From a network into the log; the client is closed by the caller, after this."""
 
     def __init__(self, settings: Settings, client: Client) -> None:
-        super().__init__(lambda: client.failure)
+        super().__init__(client)
         self._client = client
         self._instance = settings.instance
         self._limits = settings.limits.limits()
         self._grace_s = settings.grace_s
         self.invalid = 0
-        self.reporter = ProblemReporter(client.publish_problem, log_problem)
+        self.reporter = ProblemReporter(client.publish_problem)
         keep: dict[Topic, Retention] = {"detections": Retention(settings.log_s, settings.log_mb * MEGABYTE)}
         if settings.log_tracks_s:
             keep["tracks"] = Retention(settings.log_tracks_s, settings.log_tracks_mb * MEGABYTE)
@@ -62,8 +62,7 @@ class LogBridge(Reporter):
     @property
     def state(self) -> str:
         """Ready while it has a router and the servers."""
-        state = super().state
-        return "degraded" if state == "ready" and self.failure else state
+        return "unlinked" if super().failure else "degraded" if self.failure else "ready"
 
     @property
     def failure(self) -> str:

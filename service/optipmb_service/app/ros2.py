@@ -55,7 +55,7 @@ class _Work(Reporter):
     """The queue of the working thread, and what connects the node and the bridge."""
 
     def __init__(self, settings: Settings, node: Ros2Node) -> None:
-        super().__init__(lambda: node.client.failure)
+        super().__init__(node.client)
         self._settings = settings
         self._node = node
         self._bridge = Bridge(settings, node)

@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from optipmb_service.settings import Settings
     from optipmb_service.telemetry.health import ProcessHealth
     from optipmb_service.telemetry.metrics import Metrics
+    from optipmb_service.zenoh.client import Client
 
 log = structlog.get_logger("optipmb_service")
 
@@ -332,9 +333,13 @@ class AggregateView(Reporter):
             **sums,
         )
 
-    def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None] | None:
-        """Hand over the messages of a stream of any worker to a viewer, until the result is called."""
-        return None if self._ending else self._network.tap(stream, receive, self._fusion.seen_by(stream))
+    def session(self) -> Client | None:
+        """Return the session for readers; None at the end."""
+        return None if self._ending else self._network.client()
+
+    def detections_of(self, stream: str) -> str:
+        """Return the pattern of the streams whose detections belong to the tracks of a stream."""
+        return self._fusion.seen_by(stream)
 
     def answer(self, request: Query) -> None:
         """Answer a query about the instance, and finish it in any case."""

@@ -1,83 +1,27 @@
-"""Who calls, and what they may do: by the name in the certificate, as the routers of a protected network decide.
+"""Who calls over gRPC: by the name in the certificate, or of a token; `edge.access` tells what they may do.
 
-| name | may |
-| --- | --- |
-| `site/node` | publish and track its own streams, `site/node/*`, read and command them |
-| `service/name` | read and command all streams |
-| `viewer/name` | read all streams |
-
-Without certificates and tokens everybody may do everything, as on a network without access control. The certificates of
-the gateway are read again when their files have changed, so that they can be renewed.
+The certificates of the gateway are read again when their files have changed, so that they can be renewed.
 """
 
 from __future__ import annotations
 
-import importlib
 import inspect
 import json
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import grpc
 import structlog
 from optipmb_client.errors import ClientError
 
+from optipmb_service.edge.access import ANYBODY, Caller, token_names
 from optipmb_service.grpc.calls import EndCall
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping
     from pathlib import Path
-
-    Tokens = Callable[[Mapping[str, str], str], str | Awaitable[str | None] | None]
-
-ANYBODY: Final = ""
-"""Name of a caller where callers have none."""
-
-NODE_CHUNKS: Final = 2
 
 FILES: Final = ("key.pem", "cert.pem", "ca.pem")
 
 log = structlog.get_logger("optipmb_service")
-
-
-@dataclass(frozen=True)
-class Caller:
-    """Who calls, and what they may do.
-
-    Attributes:
-        name: in the certificate, or of the token; empty: anybody.
-    """
-
-    name: str = ANYBODY
-
-    def may_publish(self, stream: str) -> None:
-        """Raise EndCall unless the caller may publish a stream."""
-        self._check(self.name == ANYBODY or self._owns(stream), f"publish {stream}")
-
-    def may_read(self, pattern: str) -> None:
-        """Raise EndCall unless the caller may read all streams of a pattern."""
-        self._check(self.name == ANYBODY or bool(self._role) or self._owns(pattern), f"read {pattern}")
-
-    def may_command(self, stream: str) -> None:
-        """Raise EndCall unless the caller may reset a stream and set its parameters."""
-        self._check(self.name == ANYBODY or self._role == "service" or self._owns(stream), f"command {stream}")
-
-    @property
-    def pattern(self) -> str:
-        """The widest pattern that the caller may read."""
-        return "*/*/*" if self.name == ANYBODY or self._role else f"{self.name}/*"
-
-    @property
-    def _role(self) -> str:
-        head = self.name.partition("/")[0]
-        return head if head in {"viewer", "service"} else ""
-
-    def _owns(self, stream: str) -> bool:
-        return not self._role and self.name.count("/") == NODE_CHUNKS - 1 and stream.startswith(f"{self.name}/")
-
-    def _check(self, allowed: bool, what: str) -> None:  # noqa: FBT001 - the one thing that it is given
-        if not allowed:
-            raise EndCall(grpc.StatusCode.PERMISSION_DENIED, f"{self.name} may not {what}")
 
 
 class Access:
@@ -96,7 +40,7 @@ class Access:
     def __init__(self, *, certificates: bool, names: Path | None = None, tokens: str = "") -> None:
         self._certificates = certificates
         self._names = None if names is None else _names(names)
-        self._tokens = _function(tokens) if tokens else None
+        self._tokens = token_names("grpc_tokens", tokens) if tokens else None
 
     async def caller(self, context: grpc.aio.ServicerContext[Any, Any]) -> Caller:
         """Return who calls.
@@ -129,15 +73,6 @@ def _names(file: Path) -> frozenset[str]:
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ClientError(f"setting grpc_names: {file}: expected a JSON list of names")
     return frozenset(names)
-
-
-def _function(path: str) -> Tokens:
-    module, _, name = path.partition(":")
-    try:
-        function: Tokens = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ClientError(f"setting grpc_tokens: {path}: {error}") from error
-    return function
 
 
 def credentials(folder: Path) -> grpc.ServerCredentials:

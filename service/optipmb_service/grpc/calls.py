@@ -1,9 +1,8 @@
-"""One call: its requests, the responses that wait for its reader, and its end."""
+"""One call: its requests, its responses, and its end."""
 
 from __future__ import annotations
 
 import asyncio
-import collections
 import contextlib
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -19,16 +18,14 @@ if TYPE_CHECKING:
     import optipmb_schemas as schemas
     from google.protobuf.message import Message as ProtoMessage
 
-    from optipmb_service.grpc.access import Caller
+    from optipmb_service.edge.access import Caller
+    from optipmb_service.edge.readers import Outbox
     from optipmb_service.grpc.server import Server
 
     P = TypeVar("P", bound=ProtoMessage)
 
 FIRST_S: Final = 30.0
 """How long a call may be open before its first message."""
-
-BYTES: Final = 32 * 2**20
-"""Bytes that wait at most for one reader."""
 
 CODES: Final[dict[str, grpc.StatusCode]] = {"too_large": grpc.StatusCode.RESOURCE_EXHAUSTED}
 """Codes of messages that are refused for another reason than that they are not valid."""
@@ -86,68 +83,6 @@ def ending_with_caller() -> Iterator[None]:
         raise CallerGoneError from error
 
 
-class Outbox:
-    """Bounded queue of encoded responses to one reader; the newest win. To be used on the loop.
-
-    Streams take turns, so that one of them cannot hide the others.
-
-    Args:
-        per_stream: responses of one stream that may wait.
-    """
-
-    def __init__(self, per_stream: int) -> None:
-        self._per_stream = per_stream
-        self._waiting: dict[str, collections.deque[bytes]] = {}
-        self._bytes = 0
-        self._skipped = 0
-        self._changed = asyncio.Event()
-        self._closed = False
-        self.left_out = 0
-        """Responses left out since the beginning."""
-
-    def put(self, stream: str, response: bytes) -> None:
-        """Add a response."""
-        queue = self._waiting.setdefault(stream, collections.deque())
-        queue.append(response)
-        self._bytes += len(response)
-        while len(queue) > self._per_stream or (self._bytes > BYTES and len(queue) > 1):
-            self._bytes -= len(queue.popleft())
-            self._skipped += 1
-            self.left_out += 1
-        self._changed.set()
-
-    def replace(self, response: bytes) -> None:
-        """Add a response that replaces the waiting ones of its kind."""
-        queue = self._waiting.setdefault("", collections.deque())
-        self._bytes += len(response) - sum(map(len, queue))
-        queue.clear()
-        queue.append(response)
-        self._changed.set()
-
-    def close(self) -> None:
-        """Say that nothing follows."""
-        self._closed = True
-        self._changed.set()
-
-    async def take(self) -> bytes | None:
-        """Return the next response, waiting for it; None when there is none and nothing follows."""
-        while not self._waiting:
-            if self._closed:
-                return None
-            self._changed.clear()
-            await self._changed.wait()
-        stream, queue = next(iter(self._waiting.items()))
-        response = queue.popleft()
-        self._bytes -= len(response)
-        del self._waiting[stream]
-        if queue:
-            self._waiting[stream] = queue  # behind the others
-        if self._skipped:
-            response += _SKIPPED + varint(self._skipped)
-            self._skipped = 0
-        return response
-
-
 class Call:
     """A call under way.
 
@@ -167,7 +102,7 @@ class Call:
         self._method = method
         self._ended = asyncio.Event()
         self._reading: asyncio.Task[Any] | None = None
-        self._outbox: Outbox | None = None
+        self._outbox: Outbox[bytes] | None = None
 
     def end(self) -> None:
         """Read nothing more; a call that only writes ends."""
@@ -237,14 +172,15 @@ class Call:
             await self._context.write(response)
         self.gateway.metrics.responses[self._method] += 1
 
-    async def drain(self, outbox: Outbox) -> None:
+    async def drain(self, outbox: Outbox[bytes]) -> None:
         """Write the responses of an outbox until it is closed."""
         self._outbox = outbox
-        while (response := await outbox.take()) is not None:
-            await self.write(response)
+        while (taken := await outbox.take()) is not None:
+            response, skipped = taken
+            await self.write(response + _SKIPPED + varint(skipped) if skipped else response)
 
     @contextlib.asynccontextmanager
-    async def writing(self, outbox: Outbox) -> AsyncIterator[None]:
+    async def writing(self, outbox: Outbox[bytes]) -> AsyncIterator[None]:
         """Write the responses of an outbox meanwhile, and the rest of them at the end."""
         task = asyncio.create_task(self.drain(outbox))
         try:

@@ -12,7 +12,7 @@ import optipmb_schemas as schemas
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
-from optipmb_service.grpc.calls import Outbox
+from optipmb_service.edge.readers import Outbox
 from optipmb_service.grpc.network import Item, Listener
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ Input = schemas.Detections | schemas.Points | schemas.Problem | pb.PublishOption
 
 async def track(call: Call) -> None:
     """Detections and clouds in, tracks and problems back."""
-    inputs, outbox = _Inputs(call, pb.TrackRequest), Outbox(RESPONSES)
+    inputs, outbox = _Inputs(call, pb.TrackRequest), Outbox[bytes](RESPONSES)
     message = await inputs.next()
     if message is None:
         return
@@ -80,7 +80,7 @@ async def track(call: Call) -> None:
     call.check_ending()
 
 
-def _already_tracked(cached: Iterable[EncodedTracks], first: Input, outbox: Outbox) -> set[tuple[bytes, int]]:
+def _already_tracked(cached: Iterable[EncodedTracks], first: Input, outbox: Outbox[bytes]) -> set[tuple[bytes, int]]:
     """Answer what a caller that comes back sends again: it may have been tracked, and is not tracked twice."""
     known: set[tuple[bytes, int]] = set()
     if not isinstance(first, schemas.Detections | schemas.Points):
@@ -88,13 +88,14 @@ def _already_tracked(cached: Iterable[EncodedTracks], first: Input, outbox: Outb
     for tracks in cached:
         if tracks.epoch == first.epoch and tracks.stamp_ns >= first.stamp_ns:
             known.add((tracks.epoch, tracks.seq))
-            outbox.put(tracks.stream, Item.of_tracks(tracks).response)
+            response = Item.of_tracks(tracks).response
+            outbox.put(tracks.stream, response, len(response))
     return known
 
 
 async def publish(call: Call) -> None:
     """Detections and clouds in, acknowledgements and problems back."""
-    inputs, outbox = _Inputs(call, pb.PublishRequest), Outbox(RESPONSES)
+    inputs, outbox = _Inputs(call, pb.PublishRequest), Outbox[bytes](RESPONSES)
     message = await inputs.next()
     if message is None:
         return
@@ -244,7 +245,7 @@ class _Answers:
         listener: takes tracks and problems.
     """
 
-    def __init__(self, outbox: Outbox) -> None:
+    def __init__(self, outbox: Outbox[bytes]) -> None:
         self._outbox = outbox
         self._reported: collections.deque[tuple[str, str]] = collections.deque(maxlen=RESPONSES)
         self.in_flight = _InFlight()
@@ -253,13 +254,14 @@ class _Answers:
     def report(self, problem: schemas.Problem) -> None:
         """Report a message that was refused here; the problem also comes back from the network."""
         self._reported.append((problem.code, problem.path))
-        self._outbox.put(problem.stream, Item.of_problem(problem).response)
+        response = Item.of_problem(problem).response
+        self._outbox.put(problem.stream, response, len(response))
 
     def _answer(self, item: Item) -> None:
         if item.tracks is not None:
             self.in_flight.remove(item.tracks.epoch, item.tracks.seq)
         if item.problem not in self._reported:
-            self._outbox.put(item.stream, item.response)
+            self._outbox.put(item.stream, item.response, len(item.response))
 
 
 class _InFlight:
@@ -298,7 +300,7 @@ class _InFlight:
 class _Acknowledgements:
     """Acknowledgements of a publisher's messages; the newest stands for those before it."""
 
-    def __init__(self, outbox: Outbox) -> None:
+    def __init__(self, outbox: Outbox[bytes]) -> None:
         self._outbox = outbox
         self._newest = pb.Acknowledgement()
         self._outgoing: Outgoing | None = None
@@ -321,7 +323,8 @@ class _Acknowledgements:
         self.cancel()
         if self._outgoing is not None:
             self._newest.points_wanted = self._outgoing.points_wanted
-            self._outbox.replace(pb.PublishResponse(acknowledgement=self._newest).SerializeToString())
+            response = pb.PublishResponse(acknowledgement=self._newest).SerializeToString()
+            self._outbox.replace(response, len(response))
 
     def cancel(self) -> None:
         """Acknowledge nothing later."""

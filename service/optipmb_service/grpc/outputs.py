@@ -11,9 +11,10 @@ import optipmb_schemas as schemas
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
-from optipmb_service.grpc.calls import EndCall, Outbox
+from optipmb_service.edge.readers import Outbox, Pace, listed
+from optipmb_service.grpc.calls import EndCall
 from optipmb_service.grpc.network import Item, Listener
-from optipmb_service.grpc.selection import Pace, Selection
+from optipmb_service.grpc.selection import EventSelection, Selection
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable
@@ -46,8 +47,15 @@ async def subscribe(call: Call) -> None:
     selection, pace = Selection(asked.filter), Pace(asked.max_rate_hz)
     if asked.queue > MAX_QUEUE:
         raise schemas.MessageError("too_large", "queue", f"at most {MAX_QUEUE}", str(asked.queue))
-    outbox = Outbox(asked.queue or QUEUE)
-    listener = Listener(lambda item: outbox.put(item.stream, item.response), selection, pace.passes)
+    outbox = Outbox[bytes](asked.queue or QUEUE)
+
+    def passes(one: EncodedTracks) -> bool:
+        return pace.passes(one.stream, one.stamp_ns)
+
+    def put(item: Item) -> None:
+        outbox.put(item.stream, item.response, len(item.response))
+
+    listener = Listener(put, selection, passes)
     async with contextlib.AsyncExitStack() as subscriptions:
         await subscriptions.enter_async_context(network.subscribed(tracks, listener))
         if asked.problems:
@@ -55,8 +63,35 @@ async def subscribe(call: Call) -> None:
         await call.begin()
         history = await network.recent(tracks)
         for one in history if asked.history else ():
-            if pace.passes(one):
+            if passes(one):
                 await call.write(Item.of_tracks(one, selection).response)
+        listener.begin(history)
+        try:
+            await call.drain(outbox)
+        finally:
+            call.left_out += outbox.left_out
+    call.check_ending()
+
+
+async def subscribe_events(call: Call) -> None:
+    """Send the events of a pattern, final ones by default, until the caller or the gateway ends it."""
+    asked = await call.request(pb.SubscribeEventsRequest)
+    key, network = call.gateway.client.keys.matching(asked.pattern, "events"), call.gateway.network
+    call.caller.may_read(asked.pattern)
+    chosen = EventSelection(asked)
+    outbox: Outbox[bytes] = Outbox(MAX_QUEUE)
+
+    def take(item: Item) -> None:
+        for response in chosen.responses(item.events):
+            outbox.put(item.stream, response, len(response))
+
+    listener = Listener(take)
+    async with network.subscribed(key, listener):
+        await call.begin()
+        history = await network.recent_events(key)
+        for one in history if asked.history else ():
+            for response in chosen.responses(one):
+                await call.write(response)
         listener.begin(history)
         try:
             await call.drain(outbox)
@@ -118,24 +153,13 @@ async def set_parameters(call: Call) -> None:
 
 
 async def list_streams(call: Call) -> None:
-    """Ask every service for its streams; workers, who answer too, are no services: their parent speaks for them."""
+    """Ask every service for its streams."""
     asked = await call.request(pb.ListStreamsRequest)
     client, pattern = call.gateway.client, asked.pattern or call.caller.pattern
     client.keys.matching(pattern, "tracks")
     call.caller.may_read(pattern)
-    answers, alive = await asyncio.gather(
-        asyncio.to_thread(client.query, client.keys.all_status(), timeout=QUERY_S),
-        asyncio.to_thread(client.alive, client.keys.all_alive(), timeout=QUERY_S),
-    )
-    services = {client.keys.instance_of(key) for key in alive}
-    listed = []
-    for answer in answers:
-        if answer.ok:
-            status = schemas.decode(answer.payload, schemas.ServiceStatus, encoding=answer.encoding)
-            if status.instance in services:
-                listed += [(status.instance, one) for one in status.sessions if _matches(one.stream, pattern)]
-    listed.sort(key=lambda entry: (entry[1].stream, entry[0]))
-    streams = [pb.ListedStream(instance=instance, session=convert.to_proto(one)) for instance, one in listed]
+    found = await listed(client, client.keys, pattern)
+    streams = [pb.ListedStream(instance=instance, session=convert.to_proto(one)) for instance, one in found]
     await _answer(call, pb.ListStreamsResponse(streams=streams))
 
 
@@ -202,7 +226,3 @@ def _refusal(problem: schemas.Problem) -> EndCall:
     if problem.code in schemas.CODES:
         return EndCall.invalid(error)
     return EndCall(grpc.StatusCode.FAILED_PRECONDITION, problem.message, error)
-
-
-def _matches(stream: str, pattern: str) -> bool:
-    return all(want in {"*", part} for part, want in zip(stream.split("/"), pattern.split("/"), strict=True))

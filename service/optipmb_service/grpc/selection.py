@@ -1,26 +1,25 @@
-"""What a subscriber wants of the tracks: which of them, which columns, and how often."""
+"""What a subscriber wants of the tracks: which of them, and which columns."""
 
 from __future__ import annotations
 
 import collections
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, get_args
 
 import numpy as np
 import optipmb_schemas as schemas
+from optipmb_client.merging import FinalEvents
+from optipmb_schemas.json_form import CONFIRMED_EXISTENCE
+from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf.convert import column, select
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-    from optipmb_schemas.protobuf.convert import EncodedTracks
 
 MAX_CORNERS: Final = 1000
 MAX_NAMES: Final = 256
 CORNERS: Final = 3
-CONFIRMED_EXISTENCE: Final = 0.5
-TOLERANCE: Final = 0.999
-"""Part of a period that counts as a whole one: stamps of real sensors jitter."""
-REMEMBERED: Final = 64
+KINDS: Final = get_args(schemas.ZoneEvent.model_fields["kind"].annotation)
 
 
 class Selection:
@@ -85,36 +84,49 @@ class Selection:
 EVERYTHING: Final = Selection(pb.TrackFilter())
 
 
-class Pace:
-    """Leaves out frames that come sooner than a period after the one before, in sensor time, in each stream.
-
-    What corrects a frame that was let through is let through too.
+class EventSelection:
+    """Events as they were asked for.
 
     Args:
-        max_rate_hz: highest rate; 0: all frames.
+        asked: the request.
 
     Raises:
-        MessageError: it is no rate.
+        MessageError: it is not valid, with the path of its field.
     """
 
-    def __init__(self, max_rate_hz: float) -> None:
-        if not 0 <= max_rate_hz < float("inf"):
-            raise schemas.MessageError("invalid_value", "max_rate_hz", "a rate in Hz, or 0", f"{max_rate_hz:g}")
-        self._period_ns = TOLERANCE * 1e9 / max_rate_hz if max_rate_hz else 0.0
-        self._passed: dict[str, collections.deque[int]] = {}
+    def __init__(self, asked: pb.SubscribeEventsRequest) -> None:
+        self._chosen = {name: frozenset(getattr(asked, name)) for name in ("zones", "kinds", "classes")}
+        for name, values in self._chosen.items():
+            if len(values) > MAX_NAMES:
+                raise schemas.MessageError("too_large", name, f"at most {MAX_NAMES}", str(len(values)))
+        if unknown := self._chosen["kinds"] - set(KINDS):
+            expected = f"some of {', '.join(KINDS)}"
+            raise schemas.MessageError("invalid_value", "kinds", expected, ascii(min(unknown))[:80])
+        self._final = asked.final or not asked.HasField("final")
+        self._streams: dict[str, FinalEvents] = collections.defaultdict(FinalEvents)
 
-    def passes(self, tracks: EncodedTracks) -> bool:
-        """Tell whether the tracks of a frame are sent."""
-        if not self._period_ns:
-            return True
-        stamp_ns = tracks.stamp_ns
-        passed = self._passed.setdefault(tracks.stream, collections.deque(maxlen=REMEMBERED))
-        if stamp_ns in passed:
-            return True
-        if passed and abs(stamp_ns - passed[-1]) < self._period_ns:
-            return False
-        passed.append(stamp_ns)
-        return True
+    def responses(self, message: schemas.Events | None) -> list[bytes]:
+        """Return the responses that a message makes due."""
+        if message is None:
+            return []
+        due = self._streams[message.stream].take(message) if self._final else [message]
+        return [
+            pb.SubscribeEventsResponse(events=convert.to_proto(one)).SerializeToString()
+            for one in map(self._of, due)
+            if one.events or one.zones or not self._final
+        ]
+
+    def _of(self, message: schemas.Events) -> schemas.Events:
+        zones, kinds, classes = self._chosen.values()
+        events = tuple(
+            one
+            for one in message.events
+            if (not zones or one.zone in zones)
+            and (not kinds or one.kind in kinds)
+            and (not classes or message.labels[one.label] in classes)
+        )
+        counts = message.zones and tuple(one for one in message.zones if not zones or one.zone in zones)
+        return message.model_copy(update={"events": events, "zones": counts})
 
 
 def _inside(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray[np.bool_]:

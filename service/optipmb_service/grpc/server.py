@@ -20,11 +20,12 @@ from optipmb_client.errors import ClientError
 from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
+from optipmb_service.edge.access import NotAllowedError
 from optipmb_service.grpc import inputs, outputs
 from optipmb_service.grpc.access import Access, credentials
 from optipmb_service.grpc.calls import Call, CallerGoneError, EndCall, ending_with_caller
 from optipmb_service.grpc.network import Network
-from optipmb_service.telemetry.problem_reporter import ProblemReporter, log_problem
+from optipmb_service.telemetry.problem_reporter import ProblemReporter
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
@@ -40,6 +41,7 @@ METHODS: Final[dict[str, Callable[[Call], Awaitable[None]]]] = {
     "Track": inputs.track,
     "Publish": inputs.publish,
     "Subscribe": outputs.subscribe,
+    "SubscribeEvents": outputs.subscribe_events,
     "QueryTracks": outputs.query_tracks,
     "GetState": outputs.get_state,
     "Reset": outputs.reset,
@@ -114,7 +116,7 @@ class Server:
         self.limits = settings.limits.limits()
         self.network = Network(client, self._invalid)
         self._calls: set[Call] = set()
-        self._reporter = ProblemReporter(client.publish_problem, log_problem)
+        self._reporter = ProblemReporter(client.publish_problem)
         self._most = settings.grpc_calls
         self._access = Access(
             certificates=settings.grpc_tls is not None, names=settings.grpc_names, tokens=settings.grpc_tokens
@@ -201,7 +203,7 @@ class Server:
                 except EndCall as raised:
                     end = raised
                 if end is not None:
-                    # A request may be 32 MB, and the frames of what it has raised hold it until the next collection.
+                    # A request may be 32 MB, and the frames of its exceptions hold it until the next collection.
                     end.__traceback__ = end.__context__ = end.__cause__ = None
                     code = end.code.name
                     status = end.status()
@@ -238,6 +240,8 @@ class Server:
         except schemas.MessageError as error:
             self.metrics.refused[error.code] += 1
             raise EndCall.invalid(error) from None
+        except NotAllowedError as error:
+            raise EndCall(grpc.StatusCode.PERMISSION_DENIED, str(error)) from None
         except TransportError as error:
             raise EndCall(grpc.StatusCode.UNAVAILABLE, f"the network cannot be used: {error}") from error
         except (EndCall, CallerGoneError, asyncio.CancelledError):

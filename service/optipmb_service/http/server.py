@@ -20,31 +20,37 @@ from optipmb_client.errors import ClientError
 from optipmb_schemas.asyncapi import document
 from starlette.applications import Starlette
 from starlette.datastructures import Headers
+from starlette.middleware.cors import CORSMiddleware
 from starlette.responses import JSONResponse, PlainTextResponse, Response
-from starlette.routing import Route
+from starlette.routing import BaseRoute, Route
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from optipmb_service.http.api import STATUS, Api, Readers, refuse
 from optipmb_service.http.page import page
 from optipmb_service.telemetry.metrics import CONTENT_TYPE
 
 if TYPE_CHECKING:
     import asyncio
-    from collections.abc import Callable, Collection, Mapping
+    from collections.abc import Callable, Mapping
 
+    from optipmb_schemas.json_form import Place
     from starlette.requests import Request
     from starlette.types import ASGIApp, Receive, Scope, Send
 
-    from optipmb import Georeference
+    from optipmb_service.settings import Settings
     from optipmb_service.telemetry.health import ProcessHealth
 
 GRACE_S: Final = 1  # how long an answer under way may take at the end
 CONNECTIONS: Final = 256  # open connections; a further one closes an idle one
-REQUESTS: Final = 64  # requests answered at once, without probes; more than the viewers of the page
+REQUESTS: Final = 64  # requests answered at once, without probes and readers
 HEAD_S: Final = 5.0  # longest time from the begin of a connection until its first request is complete
 KEEP_ALIVE_S: Final = 5
 HEAD_BYTES: Final = 16 * 1024
+MESSAGE_BYTES: Final = 4096  # largest message of a WebSocket's client
+PING_S: Final = 20.0  # period of pings, and longest wait for their answers
 
 UNAVAILABLE: Final = 503
+FORBIDDEN: Final = 403
 MISDIRECTED: Final = 421
 ANY: Final = "*"
 
@@ -54,17 +60,20 @@ MONITORING: Final = PROBES | {"/metrics"}  # paths for programs, answered under 
 
 def application(
     health: ProcessHealth,
-    names: Collection[str] = (),
-    sites: Mapping[str, Georeference] | None = None,
+    settings: Settings,
+    places: Mapping[str, Place] | None = None,
     interface: Callable[[], str] = document,
 ) -> ASGIApp:
-    """Return the application: health, readiness, metrics, and the page.
+    """Return the application: health, readiness, metrics, the JSON interface, and the page.
 
     Args:
         health: of the process.
-        names: names of this service beside addresses and names without a dot; `*`: any.
-        sites: place of the world frame of each site that has one.
+        settings: of the process.
+        places: of the world frames of sites that have one.
         interface: returns the AsyncAPI document.
+
+    Raises:
+        ClientError: the tokens cannot be used.
     """
 
     # Coroutines: probes wait for no thread.
@@ -86,9 +95,15 @@ def application(
     def asyncapi(_: Request) -> Response:
         return Response(interface(), media_type="application/json", headers={"cache-control": "no-store"})
 
-    routes = [Route("/healthz", alive), Route("/readyz", ready), Route("/metrics", metrics)]
-    routes += [Route("/api/v1/asyncapi.json", asyncapi), *page(health, sites)]
-    return _Guarded(Starlette(routes=routes), names)
+    routes: list[BaseRoute] = [Route("/healthz", alive), Route("/readyz", ready), Route("/metrics", metrics)]
+    places = places or {}
+    readers = Readers(health, settings, places)
+    routes += [Route("/api/v1/asyncapi.json", asyncapi), *Api(readers).routes(), *page(health, readers, places)]
+    refusals: dict[Any, Any] = dict.fromkeys(STATUS, refuse)
+    answers: ASGIApp = Starlette(routes=routes, exception_handlers=refusals)
+    if settings.http_origins:
+        answers = CORSMiddleware(answers, allow_origins=settings.http_origins, allow_headers=["authorization"])
+    return _Guarded(answers, settings, readers)
 
 
 def _answer(body: dict[str, object], *, well: bool) -> Response:
@@ -96,29 +111,43 @@ def _answer(body: dict[str, object], *, well: bool) -> Response:
 
 
 class _Guarded:
-    """An application that answers known host names, and a bounded number of requests at once, without probes."""
+    """An application that answers known host names, and a bounded number of requests beside probes and readers.
 
-    def __init__(self, application: ASGIApp, names: Collection[str]) -> None:
+    A WebSocket is opened for programs, for pages of this service, and for those of the settings: a browser asks nobody
+    before it opens one for a page of a stranger.
+    """
+
+    def __init__(self, application: ASGIApp, settings: Settings, readers: Readers) -> None:
         self._application = application
-        self._names = {name.lower().rstrip(".") for name in names}
+        self._readers = readers
+        self._names = {name.lower().rstrip(".") for name in settings.http_hosts}
+        self._origins = settings.http_origins
         self._requests = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer, or refuse."""
         answer: Any = self._application
-        path = scope["path"] if scope["type"] == "http" else ""
-        if path in PROBES:
+        is_socket, path = scope["type"] == "websocket", scope.get("path", "")
+        if path in PROBES and not is_socket:
             await answer(scope, receive, send)
             return
-        if self._requests >= REQUESTS:
-            answer = PlainTextResponse(f"{REQUESTS} requests are being answered; ask again", status_code=UNAVAILABLE)
-        elif path and path not in MONITORING and not self._knows(Headers(scope=scope).get("host", "")):
-            answer = PlainTextResponse("unknown host; see the setting http_hosts", status_code=MISDIRECTED)
+        headers = Headers(scope=scope)
+        if self._requests - self._readers.count >= REQUESTS:
+            answer = PlainTextResponse(f"{REQUESTS} requests are being answered; ask again", UNAVAILABLE)
+        elif (path not in MONITORING or is_socket) and not self._knows(headers.get("host", "")):
+            answer = PlainTextResponse("unknown host; see the setting http_hosts", MISDIRECTED)
+        elif is_socket and not self._welcomes(headers):
+            answer = PlainTextResponse("page of another origin; see the setting http_origins", FORBIDDEN)
         self._requests += 1
         try:
             await answer(scope, receive, send)
         finally:
             self._requests -= 1
+
+    def _welcomes(self, headers: Headers) -> bool:
+        origin = headers.get("origin")
+        own = origin is None or origin.partition("://")[2] == headers.get("host")
+        return own or origin in self._origins or ANY in self._origins
 
     def _knows(self, host: str) -> bool:
         name = host.lower()
@@ -166,6 +195,11 @@ class Server:
                 timeout_keep_alive=KEEP_ALIVE_S,
                 timeout_graceful_shutdown=GRACE_S,
                 h11_max_incomplete_event_size=HEAD_BYTES,
+                ws="wsproto",
+                ws_max_size=MESSAGE_BYTES,
+                ws_ping_interval=PING_S,
+                ws_ping_timeout=PING_S,
+                ws_per_message_deflate=False,
             )
         )
         self._thread = threading.Thread(target=self._server.run, args=([self._socket],), name="http", daemon=True)
@@ -209,5 +243,5 @@ class _Connection(H11Protocol):
         return self.cycle is not None and not self.cycle.response_complete
 
     def _end_without_request(self) -> None:
-        if self.headers is None:  # its type says that it never is
-            self.transport.abort()  # type: ignore[unreachable]
+        if self.headers is None:
+            self.transport.abort()  # type: ignore[unreachable]  # uvicorn types the headers as always there

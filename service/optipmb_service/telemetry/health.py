@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Final
 from optipmb_service.telemetry.metrics import PROCESS_METRICS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     import optipmb_schemas as schemas
+    from optipmb_client.zenoh.session import Session
 
     from optipmb_service.telemetry.certificates import Certificates
     from optipmb_service.telemetry.metrics import Metrics
@@ -30,21 +29,23 @@ class Reporter:
     """Part of a process that does its work, and reports its state; by default one without streams.
 
     Args:
-        unlinked: returns why there is no router; empty while there is one.
+        session: on the network, if it has one.
     """
 
-    def __init__(self, unlinked: Callable[[], str] = str) -> None:
-        self._unlinked = unlinked
+    _session: Session | None = None
+
+    def __init__(self, session: Session | None = None) -> None:
+        self._session = session
 
     @property
     def state(self) -> str:
         """State of the process while this works."""
-        return "unlinked" if self._unlinked() else "ready"
+        return "unlinked" if self.failure else "ready"
 
     @property
     def failure(self) -> str:
         """Why it cannot be used, or works with a part missing; empty while it works."""
-        return self._unlinked()
+        return "" if self._session is None or self._session.linked() else "network: no router"
 
     @property
     def stuck(self) -> bool:
@@ -60,16 +61,13 @@ class Reporter:
         """Return its report; None when it makes none."""
         return None
 
-    def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None] | None:
-        """Hand over topic, payload and encoding of a stream's detections and tracks until the result is called.
+    def session(self) -> Session | None:
+        """Return the session by which readers of this process subscribe; None: there is none now."""
+        return self._session
 
-        `receive` is called by other threads and must return at once. None: there are no streams.
-
-        Raises:
-            TransportError: the network cannot be used, or too many streams were looked at.
-        """
-        del stream, receive
-        return None
+    def detections_of(self, stream: str) -> str:
+        """Return the pattern of the streams whose detections belong to the tracks of a stream."""
+        return stream
 
 
 class ProcessHealth:
@@ -127,6 +125,10 @@ class ProcessHealth:
         """Return the service's own report; None while it starts."""
         return None if self._service is None else self._service.status()
 
-    def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None] | None:
-        """Hand over the messages of a stream to a viewer (`Reporter.tap`); None while the service starts."""
-        return None if self._service is None else self._service.tap(stream, receive)
+    def session(self) -> Session | None:
+        """Return the session for readers (`Reporter.session`); None while the service starts."""
+        return None if self._service is None else self._service.session()
+
+    def detections_of(self, stream: str) -> str:
+        """Return the pattern of the streams whose detections belong to a stream (`Reporter.detections_of`)."""
+        return stream if self._service is None else self._service.detections_of(stream)

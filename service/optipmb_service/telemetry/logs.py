@@ -81,6 +81,8 @@ EVENTS: Final = {
     "stream_stale": "No frame for `stale_s`: check the publisher.",
     "stream_back": "Frames arrive again.",
     "problem": "`count` messages were refused or lost since the last line: see the table of problems.",
+    "mqtt_connected": "The bridge has a connection to the `broker`, in this version of the `protocol`.",
+    "mqtt_disconnected": "The broker cannot be used, for `reason`: the bridge holds 10,000 events and tries again.",
     "ros2_mismatch": "An endpoint has another type, definition or quality of service; `message` says which.",
     "publisher_failed": "The tracks of a stream cannot be published; the network is closing.",
     "publish_failed": "Tracks cannot be passed to Zenoh; the network is closing.",

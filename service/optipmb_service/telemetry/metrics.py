@@ -240,7 +240,14 @@ TLS_METRICS: Final = {
 SERVICE_METRICS: Final = PROCESS_METRICS | NETWORK_METRICS | COUNTED_METRICS | PROBLEM_METRICS | STREAM_METRICS
 """Metrics of a process that tracks."""
 
-METRICS: Final = SERVICE_METRICS | GATEWAY_METRICS | LOG_METRICS | TLS_METRICS
+MQTT_METRICS: Final = {
+    "mqtt_connected": _gauge("1 while there is a connection to the broker.", lambda b: b.connected),
+    "mqtt_published_total": _counter("Messages that the broker has taken.", lambda b: b.published, "topic"),
+    "mqtt_events_lost_total": _counter("Events lost while the broker was away.", lambda b: b.lost),
+}
+"""Metrics of the bridge to MQTT."""
+
+METRICS: Final = SERVICE_METRICS | GATEWAY_METRICS | LOG_METRICS | MQTT_METRICS | TLS_METRICS
 """Every metric. The figures of the process itself start with `process_`."""
 
 

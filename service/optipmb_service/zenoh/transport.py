@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import secrets
 import time
 from functools import partial
@@ -12,7 +11,7 @@ import optipmb_schemas as schemas
 import structlog
 from optipmb_client.errors import ConnectionFailed as TransportError
 
-from optipmb_service.zenoh.client import Client, SharedSubscriptions, Turns
+from optipmb_service.zenoh.client import Client
 from optipmb_service.zenoh.inputs import Packet, ReturnedPublishers, Topic
 
 if TYPE_CHECKING:
@@ -42,15 +41,6 @@ ANNOUNCED: Final = 32
 
 CACHES_S: Final = 1.0
 """How long the caches may take to answer."""
-
-KEPT: Final = 32
-"""Subscriptions of viewers that are kept without any: two of each stream."""
-
-BURST: Final = 200
-"""Subscriptions of viewers that are opened at once."""
-
-PERIOD_S: Final = 7.5
-"""Time after which a further one is, in the long run: 11,520 a day, each with a number that Zenoh never gives back."""
 
 
 log = structlog.get_logger("optipmb_service")
@@ -126,9 +116,6 @@ class Transport:
         self._returned = ReturnedPublishers(self._client, lambda *_: 0)
         self._alive: Declared | None = None
         self._owners: Reading | None = None
-        self._turns = Turns(BURST, PERIOD_S)
-        self._newest: SharedSubscriptions[Callable[[bytes, str], None], Sample]
-        self._newest = SharedSubscriptions(self._read_newest, _to_viewers, KEPT)
 
     # Receiving
 
@@ -294,24 +281,6 @@ class Transport:
         )
         self._client.serve(key, answer, most=MOST_OPEN, refusal=refusal)
 
-    def tap(self, stream: str, receive: Callable[[str, bytes, str], None], detections: str = "") -> Callable[[], None]:
-        """Hand over topic, payload and encoding of the newest detections and tracks of a stream to a viewer.
-
-        Viewers of a stream share its subscriptions, until the last of them has called the result. Detections of a
-        session of several streams come from `detections`, a pattern of streams.
-
-        Raises:
-            TransportError: the session is closed, or too many other streams were looked at.
-        """
-        with contextlib.ExitStack() as joined:
-            for topic, names in (("tracks", stream), ("detections", detections or stream)):
-                joined.callback(self._newest.join(f"{self._prefix}/{names}/{topic}", partial(receive, topic)))
-            return joined.pop_all().close
-
-    def _read_newest(self, key: str, receive: Callable[[Sample], None]) -> Reading:
-        self._turns.take()
-        return self._client.read_newest(key, receive)
-
     def recent_tracks(self, stream: str) -> list[tuple[bytes, str]]:
         """Return what those who track a stream keep of its tracks for subscribers, each message with its encoding."""
         return [(one.payload, one.encoding) for one in self._client.cached(self._keys.tracks(stream), timeout=CACHES_S)]
@@ -337,7 +306,7 @@ class Transport:
         """Say that this instance is alive; to be called when it is ready."""
         self._alive = self._client.token(self._keys.alive(self._instance))
 
-    def open_publisher(self, stream: str, events: bool = False) -> StreamPublisher:  # noqa: FBT001, FBT002
+    def open_publisher(self, stream: str, events: bool = False) -> StreamPublisher:  # noqa: FBT001, FBT002 - as `Streams` calls it
         """Open the publishers of a stream: of its tracks, and with `events` of those.
 
         Say that this instance tracks it, and declare its inputs' keys.
@@ -393,12 +362,6 @@ class Transport:
 def _name(stream: str, *, cached: bool) -> str:
     """Return the name of a subscription; for a moment there may be one with recovery and one without."""
     return stream if cached else f"{stream} plain"
-
-
-def _to_viewers(listeners: tuple[Callable[[bytes, str], None], ...], sample: Sample) -> None:
-    payload, encoding = sample.payload.to_bytes(), str(sample.encoding)
-    for receive in listeners:
-        receive(payload, encoding)
 
 
 def _log_link(peer: str, kind: str, came: bool) -> None:  # noqa: FBT001 - the signature of a watcher

@@ -13,8 +13,7 @@ import subprocess
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from contextlib import closing
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -22,17 +21,18 @@ import pytest
 from optipmb_client.errors import ClientError
 from optipmb_schemas import Keys, ServiceStatus
 from optipmb_service.app.health_command import ask
+from optipmb_service.edge.readers import BURST
 from optipmb_service.http import Server, application
 from optipmb_service.http.server import CONNECTIONS, REQUESTS
+from optipmb_service.settings import Settings
 from optipmb_service.telemetry.metrics import NAMESPACE, SERVICE_METRICS
-from optipmb_service.zenoh.transport import BURST
 from prometheus_client.parser import text_string_to_metric_families
 from router import Node, Sensor, until
 from routers import free_endpoint, open_router
 from service_process import ServiceProcess
+from watched import Watched, served
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from concurrent.futures import Future
     from pathlib import Path
 
@@ -44,40 +44,6 @@ NUMBERS = itertools.count()
 NOT_MADE = {http.client.NOT_FOUND, http.client.SERVICE_UNAVAILABLE}
 
 Samples = dict[tuple[str, tuple[tuple[str, str], ...]], float]
-
-
-@dataclass
-class Said:
-    """A source that says what a test wants."""
-
-    age_s: float = 0.1
-    now: str = "ready"
-    why: str = ""
-    metrics: Any = field(default_factory=lambda: SimpleNamespace(text=lambda: b"one 1\n"))
-
-    def failure(self) -> str:
-        """As told."""
-        return self.why
-
-    def alive(self) -> bool:
-        """Turns or not."""
-        return self.age_s < 10
-
-    def beat_age_s(self) -> float:
-        """As told."""
-        return self.age_s
-
-    def ready(self) -> bool:
-        """Follows the state."""
-        return self.now == "ready"
-
-    def state(self) -> str:
-        """As told."""
-        return self.now
-
-    def status(self) -> ServiceStatus | None:
-        """Nothing."""
-        return None
 
 
 def get(address: str, path: str) -> tuple[int, str]:
@@ -101,16 +67,6 @@ def status_for(address: str, path: str, host: str) -> int:
         return connection.getresponse().status
 
 
-@contextmanager
-def served(source: Any) -> Iterator[str]:
-    """The application on a free port; gives its address."""
-    server = Server(application(source, ["tracker.example.org"]), "127.0.0.1:0")
-    try:
-        yield server.address
-    finally:
-        server.close()
-
-
 def address_of(service: ServiceProcess) -> str:
     """Where a service said that it answers."""
     service.wait_log('"event": "http"')
@@ -130,7 +86,7 @@ def free_address() -> str:
 
 def test_health_follows_the_heartbeat() -> None:
     """`/healthz` says 200 while the control loop turns and 503 when it has not for ten seconds."""
-    source = Said()
+    source = Watched()
     with served(source) as address:
         assert (get(address, "/healthz")[0], ask(address, ready=False)[0]) == (200, True)
         source.age_s = 11.0
@@ -152,7 +108,7 @@ def test_health_follows_the_heartbeat() -> None:
 )
 def test_a_host_that_is_not_the_service_s_is_refused(host: str, status: int) -> None:
     """A name that a stranger lets point here gets no answer; addresses, plain names and those of the settings do."""
-    with served(Said()) as address:
+    with served(Watched(), http_hosts=["tracker.example.org"]) as address:
         assert status_for(address, "/", host) == status
 
 
@@ -160,14 +116,14 @@ def test_a_host_that_is_not_the_service_s_is_refused(host: str, status: int) -> 
 @pytest.mark.parametrize("host", ["tracker.site.svc.cluster.local:8080", "tracker.plant.example.org."])
 def test_programs_that_monitor_ask_by_any_name(path: str, host: str) -> None:
     """Probes and Prometheus get answers by names with a domain or a trailing dot, without a setting."""
-    with served(Said()) as address:
+    with served(Watched(), http_hosts=["tracker.example.org"]) as address:
         assert status_for(address, path, host) == 200
 
 
 @pytest.mark.parametrize("sent", [b"", b"GET /healthz HTTP/1.1\r\nhost: a\r\n"])
 def test_connections_without_a_request_keep_no_probe_out(sent: bytes) -> None:
     """However many connections send nothing, or half a request, `/healthz` says 200; in the end they are closed."""
-    with served(Said()) as address, contextlib.ExitStack() as stack:
+    with served(Watched(), http_hosts=["tracker.example.org"]) as address, contextlib.ExitStack() as stack:
         host, _, port = address.rpartition(":")
         idle = [stack.enter_context(socket.create_connection((host, int(port)))) for _ in range(2 * CONNECTIONS)]
         for one in idle:
@@ -197,7 +153,9 @@ def test_slow_requests_keep_no_probe_out() -> None:
             status_for(address, "/", "stranger.example.org") == 503
         )  # else 421, which needs no thread, and they all hang
 
-    with served(Said(metrics=SimpleNamespace(text=hang))) as address, ThreadPoolExecutor(REQUESTS) as pool:
+    source = Watched()
+    source.metrics = SimpleNamespace(text=hang)
+    with served(source) as address, ThreadPoolExecutor(REQUESTS) as pool:
         try:
             until(all_busy, "all are busy")
             assert get(address, "/healthz")[0] == get(address, "/readyz")[0] == 200
@@ -210,7 +168,7 @@ def test_slow_requests_keep_no_probe_out() -> None:
 @pytest.mark.parametrize("state", ["starting", "stopping"])
 def test_readiness_follows_the_state(state: str) -> None:
     """`/readyz` says 200 when the service can be used, 503 with the state before and after."""
-    source = Said()
+    source = Watched()
     with served(source) as address:
         assert get(address, "/readyz") == (200, '{"ready":true,"state":"ready"}')
         source.why = "disk full"
@@ -223,7 +181,7 @@ def test_readiness_follows_the_state(state: str) -> None:
 
 def test_what_nobody_serves_is_not_found() -> None:
     """The page and the metrics are served at their paths; any other is 404."""
-    with served(Said()) as address:
+    with served(Watched(), http_hosts=["tracker.example.org"]) as address:
         assert get(address, "/")[1].startswith("<!")
         assert get(address, "/metrics") == (200, "one 1\n")
         assert json.loads(get(address, "/api/v1/asyncapi.json")[1])["asyncapi"] == "3.0.0"
@@ -232,8 +190,8 @@ def test_what_nobody_serves_is_not_found() -> None:
 
 def test_an_address_in_use_is_one_error() -> None:
     """A port that somebody listens on gives one line that names the address."""
-    source: Any = Said()
-    served_here = application(source)
+    source: Any = Watched()
+    served_here = application(source, Settings())
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"127.0.0.1:{taken.getsockname()[1]}"
         with pytest.raises(ClientError, match=f"cannot listen on {address} for HTTP: Address already in use"):
@@ -376,7 +334,8 @@ def test_the_health_command() -> None:
         command = [sys.executable, "-m", "optipmb_service", "health", *options]
         return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
 
-    source = Said(now="starting")
+    source = Watched()
+    source.now = "starting"
     with served(source) as address:
         well = health("--http", address)
         assert (well.returncode, json.loads(well.stdout)) == (0, {"alive": True, "beat_age_s": 0.1})

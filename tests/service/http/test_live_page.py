@@ -7,113 +7,66 @@ import contextlib
 import functools
 import http.client
 import json
-import threading
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
-from optipmb_schemas import Detections, Pose, ServiceStatus, Tracks, encode, encode_json, encoding_of
-from optipmb_service.http import Server
-from optipmb_service.http.page import VIEWERS, Newest, live_frame, page
-from starlette.applications import Starlette
+from optipmb_schemas import Detections, Pose, Tracks, encode_json
+from optipmb_service.edge.readers import Publication
+from optipmb_service.http import application
+from optipmb_service.http.page import Live, live_frame
+from optipmb_service.settings import Settings
+from optipmb_service.zenoh import client
+from router import until
+from tracks_message import tracks_message
+from watched import KEYS, Session, Watched, key_of, publication, served
 
 from optipmb import Georeference
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, MutableMapping
+    from collections.abc import Iterator, MutableMapping
 
+VIEWERS = 6
 STREAM = "yard/gate/lidar"
 DEADLINE_S = 60.0
 
 
-def tracks(seq: int) -> bytes:
-    """One track, a long way from the origin, and one that is not confirmed, in msgpack."""
-    both = np.ones(2)
-    return encode(
-        Tracks(
-            stream=STREAM,
-            epoch=bytes(16),
-            seq=seq,
-            stamp_ns=seq * 100_000_000,
-            session="0" * 32,
-            profile="kitti",
-            cloud_used=False,
-            labels=["Car"],
-            id=[5, 6],
-            label=[0, 0],
-            center=np.array([[100.12345, -7.0, 1.0], [0.0, 0.0, 0.0]]),
-            size=[[4.0, 2.0, 1.5]] * 2,
-            yaw=both / 3,
-            heading_confidence=both * 0.875,
-            velocity=[[1.0, 2.0]] * 2,
-            yaw_rate=both,
-            acceleration=both,
-            existence=[0.75, 0.25],
-            score=both * 0.5,
-            covariance=np.stack([np.eye(6)] * 2),
-            age=both * 2,
-            time_since_detection=both * 0.2,
-            detection=[-1, -1],
-            confirmed=[1, 0],
-        )
+def tracks(seq: int) -> Tracks:
+    """One track, a long way from the origin, and one that is not confirmed."""
+    return tracks_message(
+        STREAM,
+        seq,
+        [5, 6],
+        stamp_ns=seq * 100_000_000,
+        center=[[100.12345, -7.0, 1.0], [0.0, 0.0, 0.0]],
+        size=[4.0, 2.0, 1.5],
+        yaw=1 / 3,
+        heading_confidence=0.875,
+        velocity=[1.0, 2.0],
+        existence=[0.75, 0.25],
+        score=0.5,
+        age=2,
+        time_since_detection=0.2,
+        detection=-1,
+        confirmed=[1, 0],
     )
 
 
-class Watched:
-    """A service that a test speaks for."""
-
-    def __init__(self) -> None:
-        self.taps: dict[int, Callable[[str, bytes, str], None]] = {}
-        self.now = "ready"
-        self.gate = threading.Event()
-        self.gate.set()
-        self.arrived: Callable[[], object] = lambda: None
-        self.released = 0
-        self._changed = threading.Condition()
-
-    def state(self) -> str:
-        """As told."""
-        return self.now
-
-    def status(self) -> ServiceStatus | None:
-        """Nothing while it starts."""
-        if self.now == "starting":
-            return None
-        return ServiceStatus(instance="one", version="1", started_ns=0, uptime_s=1.0, state=self.now)
-
-    def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None] | None:
-        """Keep what is to be called."""
-        assert stream == STREAM
-        self.arrived()
-        assert self.gate.wait(DEADLINE_S)
-        number = id(receive)
-        with self._changed:
-            self.taps[number] = receive
-            self._changed.notify_all()
-
-        def release() -> None:
-            with self._changed:
-                self.taps.pop(number, None)
-                self.released += 1
-                self._changed.notify_all()
-
-        return release
-
-    def wait_taps(self, count: int) -> None:
-        """Wait until so many look."""
-        with self._changed:
-            assert self._changed.wait_for(lambda: len(self.taps) == count, DEADLINE_S), len(self.taps)
-
-    def wait_released(self, count: int) -> None:
-        """Wait until so many taps have been released."""
-        with self._changed:
-            assert self._changed.wait_for(lambda: self.released == count, DEADLINE_S), self.released
-
-    def send(self, payload: bytes, topic: str = "tracks") -> None:
-        """Hand something to everybody who looks."""
-        for receive in tuple(self.taps.values()):
-            receive(topic, payload, "")
+DETECTIONS = Detections(
+    stream=STREAM,
+    epoch=bytes(16),
+    seq=0,
+    stamp_ns=0,
+    frame="sensor",
+    pose=Pose(translation=[10.0, 20.0, 1.0], quaternion=[np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]),
+    labels=["Car"],
+    label=[0],
+    center=[[5.0, 1.0, 0.0]],
+    size=[[4.0, 2.0, 1.5]],
+    yaw=[0.0],
+    score=[0.9],
+)
 
 
 @pytest.fixture
@@ -123,13 +76,17 @@ def watched() -> Watched:
 
 
 @pytest.fixture
+def session(watched: Watched) -> Session:
+    """Its session."""
+    assert watched.network is not None
+    return watched.network
+
+
+@pytest.fixture
 def address(watched: Watched) -> Iterator[str]:
     """Where its page is."""
-    server = Server(Starlette(routes=page(watched)), "127.0.0.1:0")
-    try:
-        yield server.address
-    finally:
-        server.close()
+    with served(watched, http_clients=VIEWERS) as address:
+        yield address
 
 
 @contextlib.contextmanager
@@ -158,6 +115,7 @@ def looking(address: str) -> Iterator[Iterator[dict[str, object]]]:
     with asked(address, f"/live?stream={STREAM}") as response:
         assert response.status == http.client.OK
         assert response.getheader("content-type", "").startswith("text/event-stream")
+        assert response.readline() == b": hello\n", "it is there when it has subscribed"
 
         def frames() -> Iterator[dict[str, object]]:
             while line := response.readline():
@@ -182,28 +140,25 @@ def test_every_answer_forbids_what_is_from_elsewhere(watched: Watched, address: 
             assert b"http" not in response.read()
 
 
-def test_nobody_looks_nothing_is_tapped(watched: Watched, address: str) -> None:
-    """Pages and status open no tap; a viewer opens one, and it is gone when the viewer is."""
+def test_nobody_looks_nothing_is_subscribed(address: str, session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages and status open no subscription; viewers of a stream share two, which go a while after the last viewer."""
+    monkeypatch.setattr(client, "IDLE_S", 0.05)
     get(address, "/")
     get(address, "/status")
-    assert watched.taps == {}
-    with looking(address) as one:
-        watched.wait_taps(1)
-        with looking(address):
-            watched.wait_taps(2)
-        watched.wait_taps(1)
-        watched.send(tracks(3))
-        assert next(one)["time"] == 0.3
-    watched.wait_taps(0)
+    assert session.subscriptions == []
+    with looking(address) as one, looking(address) as other:
+        assert sorted(key for key, _ in session.subscriptions) == [KEYS.detections(STREAM), KEYS.tracks(STREAM)]
+        session.publish(tracks(3))
+        assert next(one)["time"] == next(other)["time"] == 0.3
+    session.wait(0)
 
 
-def test_viewers_get_the_newest_frame_and_not_too_often(watched: Watched, address: str) -> None:
+def test_viewers_get_the_newest_frame_and_not_too_often(session: Session, address: str) -> None:
     """Of frames at 200 Hz a viewer gets about ten a second, each newer than the one before, and the last one."""
     with looking(address) as frames:
-        watched.wait_taps(1)
         began = time.monotonic()
         for seq in range(200):
-            watched.send(tracks(seq))
+            session.publish(tracks(seq))
             time.sleep(0.005)  # the pace is what is tested
         took = time.monotonic() - began
         times = []
@@ -215,11 +170,14 @@ def test_viewers_get_the_newest_frame_and_not_too_often(watched: Watched, addres
     assert len(times) <= took / 0.1 + 3
 
 
-async def test_a_viewer_that_leaves_before_its_tap_is_made_leaves_none(watched: Watched) -> None:
-    """The connection is lost while a thread makes the tap: it is released as soon as it is there."""
-    watched.gate.clear()
+async def test_a_viewer_that_leaves_before_it_has_subscribed_leaves_nothing(
+    watched: Watched, session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The connection is lost while a thread subscribes: the subscriptions go as soon as they are there."""
+    monkeypatch.setattr(client, "IDLE_S", 0.05)
+    session.gate.clear()
     arrived = asyncio.Event()
-    watched.arrived = functools.partial(asyncio.get_running_loop().call_soon_threadsafe, arrived.set)
+    session.arrived = functools.partial(asyncio.get_running_loop().call_soon_threadsafe, arrived.set)
 
     async def receive() -> dict[str, object]:
         await arrived.wait()
@@ -228,47 +186,46 @@ async def test_a_viewer_that_leaves_before_its_tap_is_made_leaves_none(watched: 
     async def send(_message: MutableMapping[str, object]) -> None:
         pass
 
-    query = f"stream={STREAM}".encode()
-    scope = {"type": "http", "method": "GET", "path": "/live", "headers": [], "query_string": query}
-    await Starlette(routes=page(watched))(scope, receive, send)
-    assert watched.taps == {}
-    watched.gate.set()
-    await asyncio.to_thread(watched.wait_released, 1)
-    assert watched.taps == {}
+    query, host = f"stream={STREAM}".encode(), [(b"host", b"localhost")]
+    scope = {"type": "http", "method": "GET", "path": "/live", "headers": host, "query_string": query}
+    await application(cast("Any", watched), Settings())(scope, receive, send)
+    assert session.subscriptions == []
+    session.gate.set()
+    await asyncio.to_thread(session.wait, 2)
+    await asyncio.to_thread(session.wait, 0)
 
 
 def test_the_end_of_the_service_ends_the_viewers(watched: Watched, address: str) -> None:
     """While the service stops, live answers end by themselves, so that nothing keeps the process."""
     with looking(address) as frames:
-        watched.wait_taps(1)
         watched.now = "stopping"
         assert list(frames) == []
-    watched.wait_taps(0)
 
 
-def test_there_is_room_for_so_many_viewers(watched: Watched, address: str) -> None:
+def test_there_is_room_for_so_many_viewers(address: str) -> None:
     """One more is asked to come back, and may when another has gone."""
+
+    def status() -> int:
+        with asked(address, f"/live?stream={STREAM}") as response:
+            return response.status
+
     with contextlib.ExitStack() as stack:
         for _ in range(VIEWERS - 1):
             stack.enter_context(looking(address))
         with looking(address):
-            watched.wait_taps(VIEWERS)
-            assert get(address, f"/live?stream={STREAM}")[0] == http.client.SERVICE_UNAVAILABLE
-        watched.wait_taps(VIEWERS - 1)
-        with looking(address):
-            watched.wait_taps(VIEWERS)
+            assert status() == http.client.SERVICE_UNAVAILABLE
+            assert get(address, "/healthz")[0] == http.client.OK
+        until(lambda: status() == http.client.OK, "there is room again")
 
 
-def test_viewers_that_come_together_are_counted_one_by_one(watched: Watched, address: str) -> None:
-    """More than there is room for, all before the first has its tap: those beyond the limit are asked to come back."""
-    watched.gate.clear()
+def test_viewers_that_come_together_are_counted_one_by_one(session: Session, address: str) -> None:
+    """More than there is room for, all before the first has subscribed: those beyond the limit are to come back."""
+    session.gate.clear()
     with contextlib.ExitStack() as stack:
         path = f"/live?stream={STREAM}"
         answers = [stack.enter_context(asked(address, path)) for _ in range(VIEWERS + 4)]
         assert sorted(one.status for one in answers) == [200] * VIEWERS + [503] * 4
-        watched.gate.set()
-        watched.wait_taps(VIEWERS)
-    watched.wait_taps(0)
+        session.gate.set()
 
 
 def test_wrong_streams_and_a_service_that_starts_are_shown(watched: Watched, address: str) -> None:
@@ -284,29 +241,16 @@ def test_wrong_streams_and_a_service_that_starts_are_shown(watched: Watched, add
 
 def test_a_frame_holds_what_is_drawn() -> None:
     """Tracks by column; detections and the sensor in the world frame, whatever frame they came in."""
-    detections = Detections(
-        stream=STREAM,
-        epoch=bytes(16),
-        seq=0,
-        stamp_ns=0,
-        frame="sensor",
-        pose=Pose(translation=[10.0, 20.0, 1.0], quaternion=[np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]),
-        labels=["Car"],
-        label=[0],
-        center=[[5.0, 1.0, 0.0]],
-        size=[[4.0, 2.0, 1.5]],
-        yaw=[0.0],
-        score=[0.9],
-    )
-    text = live_frame((tracks(1), ""), (encode(detections), encoding_of(detections)))
+    detections = DETECTIONS
+    text = live_frame(publication(tracks(1)), publication(detections))
     assert text is not None
     frame = json.loads(text)
     assert frame["tracks"] == [[5, 0, 100.123, -7.0, 4.0, 2.0, 0.333, 1.0, 2.0, 0.75, 0.5, 2.0, 0.2, 0.875]]
     assert frame["unconfirmed"] == 1
     assert frame["sensor"] == [10.0, 20.0, 1.571]
     assert frame["detections"] == [[9.0, 25.0]]
-    place = Georeference((48.0, 11.0, 500.0), x_heading=0.0)
-    placed = live_frame((tracks(1), ""), georeference=place)
+    place = Georeference((48.0, 11.0, 500.0), x_heading=0.0).to_geographic
+    placed = live_frame(publication(tracks(1)), place=place)
     assert placed is not None
     ((lat, lon, alt, heading),) = json.loads(placed)["geographic"]
     assert lat == pytest.approx(48.0 + 100.123 / 111_200, abs=1e-5)
@@ -316,24 +260,25 @@ def test_a_frame_holds_what_is_drawn() -> None:
     assert "geographic" not in frame
     rear = detections.model_copy(update={"stream": "site/node/rear", "pose": None, "frame": "world"})
     older = detections.model_copy(update={"center": np.zeros((1, 3))})
-    both = live_frame((tracks(1), ""), *((encode(one), encoding_of(one)) for one in (detections, rear, older)))
+    both = live_frame(publication(tracks(1)), *map(publication, (detections, rear, older)))
     assert both is not None
     assert json.loads(both)["detections"] == [[9.0, 25.0], [5.0, 1.0]]
     assert json.loads(both)["sensor"] == [10.0, 20.0, 1.571]
-    assert live_frame((b"\xc1", "")) is None
-    assert live_frame(None) is None
+    assert live_frame(Publication(key_of(tracks(1)), b"\xc1", "", {})) is None
 
 
 async def test_only_the_newest_is_kept() -> None:
-    """What nobody took in time is replaced, and its place is free at once."""
-    newest = Newest(asyncio.get_running_loop())
+    """What nobody took in time is replaced; of detections the newest eight are kept, or one that is large."""
+    live = Live(None)
+    for number in range(10):
+        live.receive(publication(DETECTIONS.model_copy(update={"stream": f"site/node/sensor-{number}"})))
     for seq in range(3):
-        newest.put("tracks", bytes([seq]), "")
-    newest.put("detections", bytes(2**22), "large")
-    for number in range(20):
-        newest.put("detections", bytes([number]), "x")
-    assert await newest.came(1.0)
-    assert newest.take() == ((b"\x02", ""), *((bytes([number]), "x") for number in range(19, 11, -1)))
-    assert not await newest.came(0.01)
-    newest.put("tracks", b"3", "")
-    assert await newest.came(1.0)
+        live.receive(publication(tracks(seq)))
+    text = await live.take(1.0)
+    assert text is not None
+    assert json.loads(text)["time"] == 0.2
+    assert len(json.loads(text)["detections"]) == 8
+    with pytest.raises(TimeoutError):
+        await live.take(0.01)
+    live.receive(publication(tracks(3)))
+    assert await live.take(1.0)

@@ -1,0 +1,284 @@
+"""JSON of the edges: one object per track, event and problem, for browsers, city platforms and Node-RED.
+
+A text is one frame of a WebSocket, one server-sent event, or the payload of one MQTT message. Numbers are those of the
+messages, rounded; stamps are texts, because 2^63 does not fit a number of JavaScript.
+"""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from itertools import repeat
+from math import isnan
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+import msgspec
+import numpy as np
+from msgspec import UNSET, Meta, Struct, UnsetType
+
+from optipmb_schemas.codec import encode_json
+from optipmb_schemas.control import Problem
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from numpy.typing import NDArray
+
+    from optipmb_schemas.messages import Events, Tracks
+
+    Place = Callable[[Any, Any], tuple[NDArray[np.float64], ...]]
+    """Returns latitudes, longitudes, heights and headings of centres (N, 3) and yaws (N,)."""
+
+DIGITS: Final = 3
+"""Decimals of all numbers but latitude and longitude (9: 0.1 mm) and heading (1)."""
+
+PLACE: Final = {"lat": 9, "lon": 9, "alt": 3, "heading": 1}
+"""Fields of a place, and their decimals."""
+
+CONFIRMED_EXISTENCE: Final = 0.5
+YEARS_NS: Final = (946_684_800 * 10**9, 4_102_444_800 * 10**9)  # 2000 and 2100
+
+Lat = Annotated[float, Meta(description="Latitude in degrees (WGS84), 9 decimals. Absent: the site has no place.")]
+Lon = Annotated[float, Meta(description="Longitude in degrees, 9 decimals.")]
+Alt = Annotated[float, Meta(description="Height above the ellipsoid in m.")]
+Position = Annotated[tuple[float, float, float], Meta(description="Centre: x, y, z in m, world frame.")]
+Yaw = Annotated[float, Meta(description="Heading in radians, counter-clockwise from x of the world frame.")]
+Speed = Annotated[float, Meta(description="Speed in m/s.")]
+Class = Annotated[str, Meta(description="Name of the class.")]
+
+
+class EdgeTrack(Struct, frozen=True, rename={"kind": "class"}):
+    """One track. Fields that a reader did not ask for are absent."""
+
+    id: Annotated[int, Meta(description="Identity: unique in the stream, never used again.")]
+    kind: Class | UnsetType = UNSET
+    confirmed: Annotated[bool, Meta(description="Whether the object is taken to exist.")] | UnsetType = UNSET
+    existence: Annotated[float, Meta(description="Probability that the object exists.")] | UnsetType = UNSET
+    position: Position | UnsetType = UNSET
+    size: Annotated[tuple[float, float, float], Meta(description="Length, width, height in m.")] | UnsetType = UNSET
+    yaw: Yaw | UnsetType = UNSET
+    speed: Speed | UnsetType = UNSET
+    velocity: Annotated[tuple[float, float], Meta(description="Velocity in m/s along x and y.")] | UnsetType = UNSET
+    age_s: Annotated[float, Meta(description="Seconds since its first detection.")] | UnsetType = UNSET
+    seen_s: Annotated[float, Meta(description="Seconds since its last detection.")] | UnsetType = UNSET
+    lat: Lat | UnsetType = UNSET
+    lon: Lon | UnsetType = UNSET
+    alt: Alt | UnsetType = UNSET
+    heading: Annotated[float, Meta(description="Degrees clockwise from true north, in [0, 360).")] | UnsetType = UNSET
+
+
+FIELDS: Final = frozenset(msgspec.structs.asdict(EdgeTrack(0))) - {"id", "kind"} | {"class"}
+"""Fields of an object that a reader may choose; `id` is always there."""
+
+
+class _Frame(Struct, frozen=True, tag_field="type", kw_only=True):
+    stream: Annotated[str, Meta(description="Name of the stream.")]
+    sensor: Annotated[str, Meta(description="Stream of the detections.")]
+    time: Annotated[str, Meta(description="Time of the frame in UTC; absent if not in 2000 to 2100.")] | UnsetType = (
+        UNSET
+    )
+    stamp_ns: Annotated[str, Meta(description="The same in nanoseconds of the sensor's clock, as text.")]
+    session: Annotated[str, Meta(description="32 hexadecimal digits. When it changes, earlier tracks have ended.")]
+    epoch: Annotated[str, Meta(description="Start of the publisher, 32 hexadecimal digits.")]
+    seq: Annotated[int, Meta(description="Number of the frame in its epoch.")]
+    revision: Annotated[int, Meta(description="Above 0: replaces what was sent for the same epoch and seq.")]
+    run: Annotated[int, Meta(description="A higher one replaces what was sent for the same epoch and seq.")]
+    skipped: (
+        Annotated[int, Meta(description="Texts left out since the one before: the reader was slow.")] | UnsetType
+    ) = UNSET
+
+
+class EdgeTracks(_Frame, frozen=True, tag="tracks", kw_only=True):
+    """The tracks of one frame, also when there are none."""
+
+    objects: Annotated[list[EdgeTrack], Meta(description="The tracks, ordered by id.")]
+
+
+class EdgeEvent(_Frame, frozen=True, tag="event", kw_only=True, rename={"name": "class"}):
+    """What a track did in a zone or at a line."""
+
+    zone: Annotated[str, Meta(description="Name of the zone or line.")]
+    kind: Literal["entered", "left", "stayed", "crossed"]
+    n: Annotated[int, Meta(description="Counts the events of this zone and kind from 1, through restarts.")]
+    id: Annotated[int, Meta(description="The track.")]
+    name: Class
+    at: Annotated[str, Meta(description="When, in UTC; absent if not in 2000 to 2100.")] | UnsetType = UNSET
+    at_ns: Annotated[str, Meta(description="When, in nanoseconds of the sensor's clock, as text.")]
+    position: Position
+    speed: Speed
+    yaw: Yaw
+    how: Annotated[str, Meta(description="`crossed` the border, `appeared`, `lost` or `ended`.")] | UnsetType = UNSET
+    dwell_s: Annotated[float, Meta(description="Seconds inside.")] | UnsetType = UNSET
+    direction: Annotated[str, Meta(description="To the `left` or `right` of the line.")] | UnsetType = UNSET
+    lat: Lat | UnsetType = UNSET
+    lon: Lon | UnsetType = UNSET
+    alt: Alt | UnsetType = UNSET
+
+
+class EdgeZones(_Frame, frozen=True, tag="zones", kw_only=True):
+    """Counts of the zones and lines after a frame, once a second."""
+
+    zones: Annotated[
+        dict[str, dict[str, dict[str, int]]],
+        Meta(description="By zone and class: `inside`, `entered`, `left`, `appeared`, `lost`, `to_left`, `to_right`."),
+    ]
+
+
+FRAMES: Final = (EdgeTracks, EdgeEvent, EdgeZones)
+
+
+class Selection(Struct, frozen=True):
+    """Which tracks a reader wants, and which of their fields."""
+
+    classes: frozenset[str] = frozenset()
+    confirmed: bool = False
+    min_existence: float = 0.0
+    fields: frozenset[str] = frozenset()
+
+    def rows(self, tracks: Tracks) -> NDArray[np.bool_]:
+        """Return which rows of the tracks (N,) are wanted."""
+        rows: NDArray[np.bool_] = tracks.existence >= self.min_existence
+        if self.confirmed:
+            rows &= is_confirmed(tracks)
+        if self.classes:
+            rows &= np.isin(tracks.label, [at for at, name in enumerate(tracks.labels) if name in self.classes])
+        return rows
+
+
+EVERYTHING: Final = Selection()
+
+
+def is_confirmed(tracks: Tracks) -> NDArray[np.bool_]:
+    """Return which tracks (N,) are confirmed; without such a column, those that probably exist and were seen twice."""
+    if tracks.confirmed is not None:
+        return np.asarray(tracks.confirmed > 0)
+    return np.asarray((tracks.existence > CONFIRMED_EXISTENCE) & (tracks.age > 0.0))
+
+
+def tracks_json(tracks: Tracks, selection: Selection = EVERYTHING, place: Place | None = None) -> bytes:
+    """Return the selected tracks of a frame as one text."""
+    rows = np.flatnonzero(selection.rows(tracks))
+    numbers = {
+        "existence": tracks.existence,
+        "position": tracks.center,
+        "size": tracks.size,
+        "yaw": tracks.yaw,
+        "speed": np.hypot(*tracks.velocity.T),
+        "velocity": tracks.velocity,
+        "age_s": tracks.age,
+        "seen_s": tracks.time_since_detection,
+    }
+    columns: dict[str, Iterable[Any]] = {
+        "id": tracks.id[rows].tolist(),
+        "class": map(tracks.labels.__getitem__, tracks.label[rows].tolist()),
+        "confirmed": is_confirmed(tracks)[rows].tolist(),
+        **{name: np.round(column[rows], DIGITS).tolist() for name, column in numbers.items()},
+        **dict(zip(PLACE, _placed(tracks.center[rows], tracks.yaw[rows], place), strict=True)),
+    }
+    if selection.fields:
+        columns |= dict.fromkeys(columns.keys() - selection.fields - {"id"}, repeat(UNSET))
+    return msgspec.json.encode(
+        EdgeTracks(**_about(tracks), objects=[EdgeTrack(*row) for row in zip(*columns.values(), strict=False)])
+    )
+
+
+def event_json(events: Events, place: Place | None = None) -> list[bytes]:
+    """Return each event of a message as a text."""
+    about = _about(events)
+    position = np.array([one.position for one in events.events], np.float64).reshape(-1, 3)
+    placed = _placed(position, np.zeros(len(position)), place)
+    rows = zip(events.events, *placed, strict=True)
+    return [
+        msgspec.json.encode(
+            EdgeEvent(
+                **about,
+                zone=one.zone,
+                kind=one.kind,
+                n=one.n,
+                id=one.id,
+                name=events.labels[one.label],
+                at=_time(one.at_ns),
+                at_ns=str(one.at_ns),
+                position=tuple(round(value, DIGITS) for value in one.position),
+                speed=round(one.speed, DIGITS),
+                yaw=round(one.yaw, DIGITS),
+                how=one.how or UNSET,
+                dwell_s=UNSET if one.dwell_s is None else round(one.dwell_s, DIGITS),
+                direction=one.direction or UNSET,
+                lat=lat,
+                lon=lon,
+                alt=alt,
+            )
+        )
+        for one, lat, lon, alt, _ in rows
+    ]
+
+
+def zones_json(events: Events) -> bytes | None:
+    """Return the counts of a message as one text; None without any."""
+    if events.zones is None:
+        return None
+    zones = {
+        zone.zone: {
+            name: {count: values[at] for count, values in zone.present() if count != "zone"}
+            for at, name in enumerate(events.labels)
+        }
+        for zone in events.zones
+    }
+    return msgspec.json.encode(EdgeZones(**_about(events), zones=zones))
+
+
+def problem_json(problem: Problem) -> bytes:
+    """Return a problem as one text: the message with its type."""
+    return b'{"type":"problem",' + encode_json(problem)[1:]
+
+
+def with_skipped(text: bytes, skipped: int) -> bytes:
+    """Return a text that says how many others were left out before it."""
+    return text[:-1] + b',"skipped":%d}' % skipped if skipped else text
+
+
+def schemas() -> dict[str, dict[str, Any]]:
+    """Return the JSON Schemas (draft 2020-12) of all texts, by name."""
+    found = {}
+    for kind in FRAMES:
+        definitions = msgspec.json.schema(kind)["$defs"]
+        found[kind.__name__] = definitions.pop(kind.__name__) | ({"$defs": definitions} if definitions else {})
+    problem = Problem.model_json_schema()
+    fields = {"type": {"enum": ["problem"]}} | problem["properties"] | {"skipped": {"type": "integer"}}
+    found["EdgeProblem"] = problem | {
+        "title": "EdgeProblem",
+        "properties": fields,
+        "required": ["type", *problem["required"]],
+    }
+    return found
+
+
+def _about(message: Tracks | Events) -> dict[str, Any]:
+    """Return the fields that all texts about a frame have."""
+    return {
+        "stream": message.stream,
+        "sensor": message.sensor or message.stream,
+        "time": _time(message.stamp_ns),
+        "stamp_ns": str(message.stamp_ns),
+        "session": message.session,
+        "epoch": message.epoch.hex(),
+        "seq": message.seq,
+        "revision": message.revision,
+        "run": 0 if message.delivery is None else message.delivery.run,
+    }
+
+
+def _time(stamp_ns: int) -> str | UnsetType:
+    if not YEARS_NS[0] <= stamp_ns < YEARS_NS[1]:
+        return UNSET
+    seconds, rest = divmod(stamp_ns, 10**9)
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest:09d}Z"
+
+
+def _placed(center: NDArray[np.float64], yaw: NDArray[np.float64], place: Place | None) -> list[Any]:
+    """Return columns of latitude, longitude, height and heading; UNSET where they are not known."""
+    if place is None:
+        return [[UNSET] * len(center)] * len(PLACE)
+    columns = [np.round(one, digits) for one, digits in zip(place(center, yaw), PLACE.values(), strict=True)]
+    columns[3] %= 360.0  # 359.97 was rounded to 360
+    return [[UNSET if isnan(value) else value for value in column.tolist()] for column in columns]

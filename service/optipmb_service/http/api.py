@@ -1,0 +1,385 @@
+"""JSON over HTTP: the newest tracks and counts by GET, all of them as server-sent events and over a WebSocket.
+
+Readers share subscriptions and are counted here, apart from other requests. Each has a bounded queue: one that is too
+slow gets the newest frame of each stream, and of events it may lose none: then it has to come again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import inspect
+import time
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Protocol
+
+import msgspec
+import optipmb_schemas as schemas
+from msgspec import Meta, Struct
+from optipmb_client.errors import ConnectionFailed as TransportError
+from optipmb_schemas.json_form import FIELDS, Selection
+from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.routing import Route, WebSocketRoute
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from optipmb_service.edge.access import ANYBODY, Caller, NotAllowedError, token_names
+from optipmb_service.edge.readers import Feeds, Reader, Wish, listed
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable, Iterable, Mapping
+
+    from optipmb_schemas.json_form import Place
+    from starlette.requests import HTTPConnection, Request
+    from starlette.types import Receive, Scope, Send
+
+    from optipmb_service.edge.readers import Publication
+    from optipmb_service.settings import Settings
+    from optipmb_service.telemetry.health import ProcessHealth
+
+POLL_S: Final = 0.1  # a reader hears so soon that the service ends
+KEEP_ALIVE_S: Final = 5.0  # period of signs of life of a silent stream, for proxies in between
+RETRY_MS: Final = 15_000  # a reader whose stream cannot be subscribed to comes back after so long
+PROTOCOL: Final = "optipmb.v1"  # subprotocol of the WebSocket
+BEARER: Final = "bearer."  # a second subprotocol with the token of a browser, which can set no header
+NAMES: Final = 256
+TRY_AGAIN, MALFORMED = 1013, 1008  # why a WebSocket was closed
+HEADERS: Final = {"cache-control": "no-store", "x-content-type-options": "nosniff", "referrer-policy": "no-referrer"}
+
+
+class NoTokenError(Exception):
+    """The token is missing or not valid."""
+
+
+class NoRoomError(Exception):
+    """There are as many readers as there may be."""
+
+
+STATUS: Final[dict[type[Exception], HTTPStatus]] = {
+    schemas.MessageError: HTTPStatus.BAD_REQUEST,
+    NoTokenError: HTTPStatus.UNAUTHORIZED,
+    NotAllowedError: HTTPStatus.FORBIDDEN,
+    NoRoomError: HTTPStatus.SERVICE_UNAVAILABLE,
+    TransportError: HTTPStatus.SERVICE_UNAVAILABLE,
+}
+
+
+async def refuse(connection: HTTPConnection, error: Exception) -> Response | None:
+    """Answer what cannot be answered otherwise: with the status of the error, its text and its path."""
+    status = next(status for kind, status in STATUS.items() if isinstance(error, kind))
+    body = {"error": str(error), "path": getattr(error, "path", "")}
+    headers = HEADERS | ({"www-authenticate": "Bearer"} if status == HTTPStatus.UNAUTHORIZED else {})
+    response = JSONResponse(body, status, headers)
+    if not isinstance(connection, WebSocket):
+        return response
+    await connection.send_denial_response(response)
+    return None
+
+
+class Source(Protocol):
+    """Queue of a reader."""
+
+    def receive(self, one: Publication) -> None:
+        """Take a message, on any thread."""
+
+    async def take(self, seconds: float | None = None) -> bytes | None:
+        """Return the next text; None at its end. Raises TimeoutError."""
+
+
+class Readers:
+    """Those who read now, by any path: a bounded number, with rights by their tokens.
+
+    Args:
+        health: of the process.
+        settings: of the process.
+        places: of sites.
+    """
+
+    def __init__(self, health: ProcessHealth, settings: Settings, places: Mapping[str, Place]) -> None:
+        self.keys = schemas.Keys(settings.prefix)
+        self._health = health
+        self._places = places
+        self._most = settings.http_clients
+        self._names = token_names("http_tokens", settings.http_tokens) if settings.http_tokens else None
+        self.count = 0
+        self._feeds: Feeds | None = None
+
+    def feeds(self) -> Feeds:
+        """Return the subscriptions.
+
+        Raises:
+            TransportError: there is no session yet.
+        """
+        session = self._health.session()
+        if session is None:
+            raise TransportError(f"the service is {self._health.state()}")
+        if self._feeds is None or self._feeds.session is not session:
+            self._feeds = Feeds(session, self._places)
+        return self._feeds
+
+    async def caller(self, connection: HTTPConnection) -> Caller:
+        """Return who asks.
+
+        Raises:
+            NoTokenError: the token is missing or not valid.
+        """
+        if self._names is None:
+            return Caller(ANYBODY)
+        metadata = dict(connection.headers)
+        for one in connection.scope.get("subprotocols", ()):
+            if one.startswith(BEARER):
+                metadata["authorization"] = f"Bearer {one[len(BEARER) :]}"
+        found = self._names(metadata, "")
+        name = await found if inspect.isawaitable(found) else found
+        if not name:
+            raise NoTokenError("the token is missing or not valid")
+        return Caller(name)
+
+    def enter(self) -> Callable[[], None]:
+        """Count a reader until the result is called.
+
+        Raises:
+            NoRoomError: there are too many.
+        """
+        if self.count >= self._most:
+            raise NoRoomError(f"{self._most} readers are here already")
+        self.count += 1  # before anything is awaited: those who come together are counted one by one
+
+        def leave() -> None:
+            self.count -= 1
+
+        return leave
+
+    @contextlib.asynccontextmanager
+    async def joined(self, keys: Iterable[str], source: Source) -> AsyncIterator[None]:
+        """Hand over the publications of keys meanwhile.
+
+        Raises:
+            TransportError: the network cannot be used.
+        """
+        loop = asyncio.get_running_loop()
+        joining = loop.run_in_executor(None, self.feeds().join, tuple(keys), source.receive)
+        try:
+            leave = await asyncio.shield(joining)
+        except asyncio.CancelledError:
+            joining.add_done_callback(_undo)  # the reader has gone; the thread subscribes all the same
+            raise
+        try:
+            yield
+        finally:
+            loop.run_in_executor(None, leave)  # not awaited: the reader's task may be cancelled
+
+    def stream(
+        self, keys: Iterable[str], source: Callable[[], Source], headers: Mapping[str, str], pause_s: float = 0.0
+    ) -> Response:
+        """Return an answer with the texts of a reader as server-sent events.
+
+        Raises:
+            NoRoomError: there are too many readers.
+        """
+        return _Counted(self._lines(keys, source, pause_s), self.enter(), headers)
+
+    async def _lines(self, keys: Iterable[str], source: Callable[[], Source], pause_s: float) -> AsyncIterator[bytes]:
+        reader = source()
+        try:
+            async with self.joined(keys, reader):
+                heard = time.monotonic()
+                yield b": hello\n\n"  # the headers go with the first piece: the reader knows that it is connected
+                while self._health.state() != "stopping":
+                    try:
+                        text = await reader.take(POLL_S)
+                    except TimeoutError:
+                        if time.monotonic() - heard > KEEP_ALIVE_S:
+                            heard = time.monotonic()
+                            yield b": silent\n\n"
+                        continue
+                    if text is None:
+                        return
+                    heard = time.monotonic()
+                    yield b"data: %b\n\n" % text
+                    await asyncio.sleep(pause_s)
+        except TransportError as error:
+            yield f"retry: {RETRY_MS}\n: {error}\n\n".encode()
+
+
+class _Counted(StreamingResponse):
+    """Events for one reader; calls `leave` when they end, however they do."""
+
+    def __init__(self, lines: AsyncIterator[bytes], leave: Callable[[], None], headers: Mapping[str, str]) -> None:
+        super().__init__(lines, media_type="text/event-stream", headers=headers)
+        self._leave = leave
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer."""
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self._leave()
+
+
+def _undo(joining: asyncio.Future[Callable[[], None]]) -> None:
+    """Withdraw the subscriptions of a reader that has gone."""
+    if not joining.cancelled() and joining.exception() is None:
+        with contextlib.suppress(RuntimeError):  # the server ends, and so do its threads
+            joining.get_loop().run_in_executor(None, joining.result())
+
+
+Names = Annotated[frozenset[str], Meta(max_length=NAMES)]
+
+
+class _Asked(Struct, frozen=True):
+    """Parameters of all paths and of `subscribe`."""
+
+    stream: str
+    topics: frozenset[Literal["tracks", "events", "zones", "problems"]] = frozenset({"tracks"})
+    classes: Names = frozenset()
+    confirmed: bool = True
+    min_existence: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    max_rate_hz: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
+    fields: Names = frozenset()
+
+
+class _Incoming(Struct, forbid_unknown_fields=True):
+    """A message of a WebSocket's client."""
+
+    subscribe: dict[str, Any]
+
+
+def wish_of(parameters: Mapping[str, Any]) -> Wish:
+    """Return what a reader asks for.
+
+    Raises:
+        MessageError: a parameter is wrong; with its name as path.
+    """
+    known = _Asked.__struct_fields__
+    values = {
+        name: value.split(",") if name in {"topics", "classes", "fields"} and isinstance(value, str) else value
+        for name, value in parameters.items()
+    }
+    for name in values.keys() - set(known):
+        raise schemas.MessageError("invalid_value", name, f"one of {', '.join(known)}", "another parameter")
+    if "stream" not in values:
+        raise schemas.MessageError("missing_field", "stream", "a pattern, as garage/*/*", "nothing")
+    try:
+        asked = msgspec.convert(values, _Asked, strict=False)
+    except msgspec.ValidationError as error:
+        expected, _, path = str(error).rpartition(" - at `$.")
+        path = path.rstrip("`")
+        received = ascii(values[path.partition("[")[0]])[:80]
+        raise schemas.MessageError("invalid_value", path, expected.removeprefix("Expected "), received) from None
+    if wrong := asked.fields - FIELDS:
+        raise schemas.MessageError("invalid_value", "fields", f"of {', '.join(sorted(FIELDS))}", ascii(min(wrong))[:80])
+    selection = Selection(asked.classes, asked.confirmed, asked.min_existence, asked.fields)
+    return Wish((asked.stream,), asked.topics, selection, asked.max_rate_hz)
+
+
+class Api:
+    """Routes below `/api/v1`."""
+
+    def __init__(self, readers: Readers) -> None:
+        self._readers = readers
+
+    def routes(self) -> list[Route | WebSocketRoute]:
+        """Return the routes."""
+        answers = {"streams": self.streams, "tracks": self.tracks, "zones": self.zones, "stream": self.stream}
+        gets = [Route(f"/api/v1/{name}", answer) for name, answer in answers.items()]
+        return [*gets, WebSocketRoute("/api/v1/ws", self.socket)]
+
+    async def streams(self, request: Request) -> Response:
+        """Answer with the sessions of a pattern, or of all streams that the caller may read."""
+        caller = await self._readers.caller(request)
+        pattern = request.query_params.get("stream", caller.pattern)
+        self._readers.keys.matching(pattern, "tracks")
+        caller.may_read(pattern)
+        found = await listed(self._readers.feeds().session, self._readers.keys, pattern)
+        texts = [b'{"instance":"%b",%b' % (name.encode(), schemas.encode_json(one)[1:]) for name, one in found]
+        return _array(texts)
+
+    async def tracks(self, request: Request) -> Response:
+        """Answer with the newest frame of each stream."""
+        wish = await self._wish(request)
+        (key,) = wish.keys(self._readers.keys)
+        return _array([one.tracks(wish.selection) for one in await self._newest(key)])
+
+    async def zones(self, request: Request) -> Response:
+        """Answer with the newest counts of the zones of each stream."""
+        wish = await self._wish(request)
+        key = self._readers.keys.matching(wish.streams[0], "events")
+        return _array([text for one in await self._newest(key) if (text := one.zones) is not None])
+
+    async def stream(self, request: Request) -> Response:
+        """Answer with server-sent events."""
+        wish = await self._wish(request)
+        return self._readers.stream(wish.keys(self._readers.keys), lambda: Reader(wish), HEADERS)
+
+    async def socket(self, websocket: WebSocket) -> None:
+        """Serve a WebSocket."""
+        wish, reader = await self._wish(websocket), None
+        leave = self._readers.enter()
+        try:
+            reader = Reader(wish)
+            async with contextlib.AsyncExitStack() as joined:
+                await joined.enter_async_context(self._readers.joined(wish.keys(self._readers.keys), reader))
+                offered = PROTOCOL in websocket.scope["subprotocols"]
+                await websocket.accept(PROTOCOL if offered else None)
+                sending = asyncio.create_task(_send(websocket, reader))
+                try:
+                    await self._listen(websocket, reader, joined)
+                finally:
+                    sending.cancel()
+                    await asyncio.wait((sending,))
+        finally:
+            leave()
+
+    async def _listen(self, websocket: WebSocket, reader: Reader, joined: contextlib.AsyncExitStack) -> None:
+        """Change what a reader wants as often as it says so, until it goes."""
+        caller = await self._readers.caller(websocket)
+        with contextlib.suppress(WebSocketDisconnect):
+            while True:
+                message = await websocket.receive()
+                if message["type"] == "websocket.disconnect":
+                    return
+                try:
+                    asked = msgspec.json.decode(message.get("text") or "", type=_Incoming)
+                    wish = wish_of(asked.subscribe)
+                    keys = wish.keys(self._readers.keys)
+                    caller.may_read(wish.streams[0])
+                except (msgspec.DecodeError, schemas.MessageError, NotAllowedError) as error:
+                    await websocket.close(MALFORMED, str(error)[:100])
+                    return
+                before = joined.pop_all()
+                reader.want(wish)
+                await joined.enter_async_context(self._readers.joined(keys, reader))
+                await before.aclose()
+
+    async def _wish(self, connection: HTTPConnection) -> Wish:
+        """Return what a caller asks for, and may read."""
+        caller = await self._readers.caller(connection)
+        wish = wish_of(connection.query_params)
+        wish.keys(self._readers.keys)
+        caller.may_read(wish.streams[0])
+        return wish
+
+    async def _newest(self, key: str) -> list[Publication]:
+        """Return the newest message of each stream, by stream: that of the newest run."""
+        newest: dict[str, Publication] = {}
+        found = await asyncio.to_thread(self._readers.feeds().newest, key)
+        for one in sorted((one for one in found if one.message is not None), key=_order):
+            newest[one.message.stream] = one
+        return [newest[stream] for stream in sorted(newest)]
+
+
+def _order(one: Publication) -> tuple[int, int]:
+    delivery = one.message.delivery
+    return (0, 0) if delivery is None else (delivery.run, delivery.published_ns)
+
+
+def _array(texts: Iterable[bytes]) -> Response:
+    return Response(b"[%b]" % b",".join(texts), media_type="application/json", headers=HEADERS)
+
+
+async def _send(websocket: WebSocket, reader: Reader) -> None:
+    """Send the texts of a reader, each when the one before has gone."""
+    with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # it has gone
+        while (text := await reader.take()) is not None:
+            await websocket.send_text(text.decode())
+        await websocket.close(TRY_AGAIN, "events were lost: the reader is too slow")

@@ -1,0 +1,163 @@
+"""The bridge to MQTT: topics and payloads, and what waits and what is sent again when the broker goes and comes."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from broker import Broker, mosquitto
+from optipmb_client.errors import ClientError
+from optipmb_schemas.json_form import Selection, event_json, problem_json, tracks_json, zones_json
+from optipmb_service.settings import MqttSettings, Settings
+from watched import PROBLEM, STREAM, Session, events, tracks
+
+aiomqtt = pytest.importorskip("aiomqtt")
+mqtt = pytest.importorskip("optipmb_service.app.mqtt")
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+    from pathlib import Path
+
+TOPIC = f"optipmb/v1/{STREAM}"
+ALIVE = "optipmb/v1/mqtt/one/alive"
+CONFIRMED = Selection(confirmed=True)
+
+
+@contextlib.asynccontextmanager
+async def bridging(session: Session, broker: Broker | str, **settings: Any) -> AsyncIterator[Any]:
+    """Run a bridge meanwhile."""
+    address = broker if isinstance(broker, str) else f"mqtt://127.0.0.1:{broker.port}"
+    network: Any = session
+    bridge = mqtt.Bridge(Settings(instance="one", mqtt=MqttSettings(broker=address, **settings)), network)
+    running = asyncio.create_task(bridge.run())
+    try:
+        yield bridge
+    finally:
+        running.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await running
+
+
+async def until(true: Callable[[], bool]) -> None:
+    """Wait until something is so."""
+    async with asyncio.timeout(8):
+        while not true():  # noqa: ASYNC110 - nothing tells of it
+            await asyncio.sleep(0.01)
+
+
+@pytest.fixture
+def session(monkeypatch: pytest.MonkeyPatch) -> Session:
+    """The session of the bridge, which waits little for its broker."""
+    monkeypatch.setattr(mqtt, "RETRY_S", 0.05)
+    return Session()
+
+
+@pytest.mark.parametrize("versions", [(5,), (4,)])
+async def test_topics_are_keys_and_payloads_the_texts_of_readers(session: Session, versions: tuple[int, ...]) -> None:
+    """Each with its quality of service; in MQTT 3.1.1 where the broker refuses 5."""
+    async with Broker(versions) as broker, bridging(session, broker, tracks_hz=0) as bridge:
+        assert bridge.state == "degraded"
+        await until(lambda: bridge.connected)
+        assert (bridge.state, bridge.failure) == ("ready", "")
+        session.publish(tracks(1), events(1, 2), PROBLEM)
+        await broker.wait(1, "/problems")
+        await broker.wait(1, "/zones")
+        found = {(one.topic, one.qos, one.retain): one.payload for one in broker.messages}
+        assert found == {
+            (ALIVE, 1, True): b"1",
+            (f"{TOPIC}/tracks", 0, False): tracks_json(tracks(1), CONFIRMED),
+            (f"{TOPIC}/events", 1, False): event_json(events(1, 2))[1],
+            (f"{TOPIC}/zones", 1, True): zones_json(events(1)),
+            (f"{TOPIC}/problems", 0, False): problem_json(PROBLEM),
+        }
+        assert broker.of("/events") == event_json(events(1, 2))
+        await until(lambda: bridge.published.total() == 5)
+        assert dict(bridge.published) == {"tracks": 1, "events": 2, "zones": 1, "problems": 1}
+        assert broker.refused == ([] if 5 in versions else [5])
+    assert broker.of("/alive") == [b"1", b"0"]
+
+
+async def test_events_wait_for_the_broker_and_tracks_do_not(session: Session) -> None:
+    """What the broker has not confirmed is sent again, in order; the newest counts are too."""
+    async with Broker(silent=True) as broker, bridging(session, broker, tracks_hz=0) as bridge:
+        broker.silent = False
+        await until(lambda: bridge.connected)
+        broker.silent = True
+        session.publish(events(1, 2))
+        await broker.wait(2, "/events")
+        await broker.__aexit__()
+        await until(lambda: not bridge.connected)
+        session.publish(tracks(1), PROBLEM, *(events(seq, 1) for seq in (2, 3)))
+        assert "degraded" in bridge.state
+        broker.messages.clear()
+        broker.silent = False
+        async with broker:
+            await broker.wait(4, "/events")
+            await broker.wait(2, "/zones")
+            sent = [json.loads(one)["n"] for one in broker.of("/events")]
+            assert sent == [1000, 1001, 2000, 3000]
+            assert json.loads(broker.of("/zones")[-1])["seq"] == 3
+            session.publish(tracks(5))
+            assert [json.loads(one)["seq"] for one in await broker.wait(1, "/tracks")] == [5]
+            assert broker.of("/problems") == []
+
+
+async def test_the_oldest_events_are_lost_where_too_many_wait(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where too many wait they are counted, and the numbers of those that come show the gap."""
+    monkeypatch.setattr(mqtt, "EVENTS", 3)
+    broker = Broker()
+    async with broker:
+        pass
+    async with bridging(session, broker) as bridge:
+        await asyncio.to_thread(session.wait, 3)
+        session.publish(events(1, 5))
+        assert bridge.lost == 2
+        async with broker:
+            assert [json.loads(one)["n"] for one in await broker.wait(3, "/events")] == [1002, 1003, 1004]
+
+
+async def test_settings_choose_streams_topics_and_the_rate(session: Session) -> None:
+    """A frame within half a second of the one before is left out at 2 Hz."""
+    async with Broker() as broker, bridging(session, broker, streams=["garage/*/lidar"], topics=["tracks"]) as bridge:
+        await until(lambda: bridge.connected)
+        assert [key for key, _ in session.subscriptions] == ["optipmb/v1/garage/*/lidar/tracks"]
+        for seq in range(6):
+            session.publish(tracks(seq))
+            await until(lambda: bridge.published["tracks"] == 1 + (seq == 5))  # noqa: B023 - awaited here
+        assert [json.loads(one)["seq"] for one in broker.of("/tracks")] == [0, 5]
+
+
+@pytest.mark.parametrize("name", ["credentials", "tls"])
+async def test_files_that_cannot_be_read_end_the_start(session: Session, tmp_path: Path, name: str) -> None:
+    """One line that names the settings."""
+    with pytest.raises(ClientError, match=r"settings mqtt\.credentials, mqtt\.tls: .*No such file"):
+        async with bridging(session, "mqtts://127.0.0.1:1", **{name: tmp_path / "none"}):
+            pass
+
+
+async def test_a_real_broker_keeps_counts_and_says_who_is_gone(session: Session, tmp_path: Path) -> None:
+    """Mosquitto gives late subscribers the newest counts; when the bridge dies, its last will."""
+    with mosquitto(tmp_path) as address:
+        async with bridging(session, address, tracks_hz=0) as bridge:
+            await until(lambda: bridge.connected)
+            session.publish(tracks(1), events(1, 2))
+            await until(lambda: bridge.published.total() == 4)
+            port = int(address.rpartition(":")[2])
+            async with aiomqtt.Client("127.0.0.1", port, protocol=aiomqtt.ProtocolVersion.V5) as client:
+                await client.subscribe("optipmb/v1/#", qos=1)
+                held = {}
+                async for message in client.messages:
+                    held[str(message.topic)] = message.payload
+                    if len(held) == 2:
+                        break
+                assert held == {ALIVE: b"1", f"{TOPIC}/zones": zones_json(events(1))}
+                session.publish(events(2))
+                async for message in client.messages:
+                    assert (str(message.topic), message.payload) == (f"{TOPIC}/events", event_json(events(2))[0])
+                    assert message.properties.ContentType == "application/json"
+                    break

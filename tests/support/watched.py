@@ -1,0 +1,251 @@
+"""A service that a test speaks for, and its HTTP server: readers of its session get what the test publishes."""
+
+from __future__ import annotations
+
+import fnmatch
+import threading
+import time
+from contextlib import contextmanager
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from optipmb_client.incoming import Answer, Arrival
+from optipmb_schemas import (
+    Delivery,
+    Events,
+    Keys,
+    Message,
+    Problem,
+    ServiceStatus,
+    Tracks,
+    ZoneCount,
+    ZoneEvent,
+    encode,
+    encoding_of,
+)
+from optipmb_service.edge.readers import Publication
+from optipmb_service.http import Server, application
+from optipmb_service.settings import Settings
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+KEYS = Keys()
+STREAM = "garage/rig/lidar"
+DEADLINE_S = 60.0
+
+
+class Session:
+    """The session of the service: subscriptions by key, and caches."""
+
+    keys = KEYS
+
+    def __init__(self) -> None:
+        self.subscriptions: list[tuple[str, Callable[[Message], None]]] = []
+        self.cache: list[tuple[str, Message]] = []
+        self.instances: list[str] = ["one"]
+        self.statuses: list[ServiceStatus] = []
+        self.gate = threading.Event()
+        self.gate.set()
+        self.arrived: Callable[[], object] = lambda: None
+        self._changed = threading.Condition()
+
+    def _add(self, key: str, receive: Callable[[Message], None]) -> Any:
+        self.arrived()
+        assert self.gate.wait(DEADLINE_S)
+        entry = (key, receive)
+        with self._changed:
+            self.subscriptions.append(entry)
+            self._changed.notify_all()
+
+        def close() -> None:
+            with self._changed:
+                self.subscriptions.remove(entry)
+                self._changed.notify_all()
+
+        return SimpleNamespace(close=close)
+
+    def subscribe(self, key: str, receive: Callable[[Any], object], *, history: bool) -> Any:
+        """Keep what is to be called."""
+        assert history
+
+        def put(message: Message) -> None:
+            receive(Arrival(key_of(message), encode(message), encoding_of(message), time.monotonic_ns()))
+
+        return self._add(key, put)
+
+    def read_newest(self, key: str, receive: Callable[[Any], None], *, most: int) -> Any:
+        """Keep what is to be called."""
+        assert most > 0
+
+        def put(message: Message) -> None:
+            payload = SimpleNamespace(to_bytes=lambda: encode(message))
+            receive(SimpleNamespace(key_expr=key_of(message), payload=payload, encoding=encoding_of(message)))
+
+        return self._add(key, put)
+
+    def query(self, selector: str, *, timeout: float) -> list[Answer]:
+        """Answer from the caches, or with the statuses."""
+        assert timeout
+        if selector == KEYS.all_status():
+            return [Answer("status", encode(one), encoding_of(one), ok=True) for one in self.statuses]
+        key, _, parameters = selector.partition("/@adv/**")
+        assert parameters == "?_max=1"
+        found = [(at, one) for at, one in self.cache if fnmatch.fnmatchcase(at, key)]
+        return [Answer(at, encode(one), encoding_of(one), ok=True) for at, one in found]
+
+    def alive(self, pattern: str, *, timeout: float) -> list[str]:
+        """Name the instances."""
+        assert pattern == KEYS.all_alive()
+        assert timeout
+        return [KEYS.alive(one) for one in self.instances]
+
+    def linked(self) -> bool:
+        """It is."""
+        return True
+
+    def wait(self, count: int) -> None:
+        """Wait until there are so many subscriptions."""
+        with self._changed:
+            assert self._changed.wait_for(lambda: len(self.subscriptions) == count, DEADLINE_S), self.subscriptions
+
+    def publish(self, *messages: Message) -> None:
+        """Hand messages to all who subscribe to their keys."""
+        for message in messages:
+            for key, put in tuple(self.subscriptions):
+                if fnmatch.fnmatchcase(key_of(message), key):
+                    put(message)
+
+
+def key_of(message: Any) -> str:
+    """Return the key of a message."""
+    topics = {"Tracks": "tracks", "Events": "events", "Detections": "detections", "Problem": "problems"}
+    return f"{KEYS.prefix}/{message.stream}/{topics[type(message).__name__]}"
+
+
+class Watched:
+    """The health of the service."""
+
+    def __init__(self) -> None:
+        self.network: Session | None = Session()
+        self.now = "ready"
+        self.why = ""
+        self.age_s = 0.1
+        self.metrics: Any = SimpleNamespace(text=lambda: b"one 1\n")
+
+    def state(self) -> str:
+        """As told."""
+        return self.now
+
+    def failure(self) -> str:
+        """As told."""
+        return self.why
+
+    def beat_age_s(self) -> float:
+        """As told."""
+        return self.age_s
+
+    def alive(self) -> bool:
+        """Turns or not."""
+        return self.age_s < 10
+
+    def ready(self) -> bool:
+        """Follows the state."""
+        return self.now == "ready"
+
+    def status(self) -> ServiceStatus | None:
+        """Nothing while it starts."""
+        if self.now == "starting":
+            return None
+        return ServiceStatus(instance="one", version="1", started_ns=0, uptime_s=1.0, state=self.now)
+
+    def session(self) -> Any:
+        """The network; None while it starts."""
+        return self.network
+
+    def detections_of(self, stream: str) -> str:
+        """The stream itself."""
+        return stream
+
+
+@contextmanager
+def served(source: Any, places: Any = None, **settings: Any) -> Iterator[str]:
+    """The application on a free port; gives its address."""
+    server = Server(application(source, Settings(**settings), places), "127.0.0.1:0")
+    try:
+        yield server.address
+    finally:
+        server.close()
+
+
+def tracks(seq: int, stream: str = STREAM, run: int = 0, count: int = 2) -> Tracks:
+    """Return tracks of a frame; the first is confirmed."""
+    one = np.ones(count)
+    return Tracks(
+        stream=stream,
+        epoch=bytes(16),
+        seq=seq,
+        stamp_ns=1_800_000_000 * 10**9 + seq * 10**8,
+        session="0" * 32,
+        profile="kitti",
+        cloud_used=False,
+        labels=["car", "pedestrian"],
+        id=np.arange(count),
+        label=np.arange(count) % 2,
+        center=np.arange(3 * count).reshape(count, 3) / 7,
+        size=np.ones((count, 3)),
+        yaw=one / 3,
+        velocity=np.ones((count, 2)),
+        yaw_rate=one,
+        acceleration=one,
+        existence=one / 3,
+        score=one,
+        covariance=np.zeros((count, 6, 6)),
+        age=one,
+        time_since_detection=one,
+        detection=np.arange(count),
+        confirmed=(np.arange(count) == 0).astype(int),
+        delivery=delivery(run, seq),
+    )
+
+
+def delivery(run: int, seq: int) -> Delivery:
+    """Return how a message came about."""
+    return Delivery(instance="one", received_ns=0, published_ns=seq, queue_ms=0.0, decode_ms=0.0, step_ms=0.0, run=run)
+
+
+def events(seq: int, count: int = 1, stream: str = STREAM) -> Events:
+    """Return events of a frame, and its counts."""
+    one = ZoneEvent(
+        zone="gate",
+        kind="crossed",
+        n=1,
+        id=7,
+        label=0,
+        at_ns=5,
+        position=(1.0, 2.0, 3.0),
+        speed=1.0,
+        yaw=0.0,
+        direction="left",
+    )
+    counts = {name: [1, 0] for name in ZoneCount.names if name != "zone"}
+    return Events(
+        stream=stream,
+        epoch=bytes(16),
+        seq=seq,
+        stamp_ns=seq,
+        session="0" * 32,
+        labels=["car", "pedestrian"],
+        events=[one.model_copy(update={"n": seq * 1000 + at}) for at in range(count)],
+        zones=[ZoneCount(zone="gate", **counts)],
+        delivery=delivery(0, seq),
+    )
+
+
+PROBLEM = Problem(stream=STREAM, instance="one", code="late", message="Late.")
+
+
+def publication(message: Message) -> Publication:
+    """Return a message as it comes in."""
+    return Publication(key_of(message), encode(message), encoding_of(message), {})
