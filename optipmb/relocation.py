@@ -95,7 +95,7 @@ class Relocation(NamedTuple):
         mean[:, PHI] = heading - 2.0 * math.pi * np.ceil((heading - math.pi) / (2.0 * math.pi))
         if self.z:
             auxiliary = auxiliary + np.array([0.0, 0.0, 0.0, self.z])
-        farthest = max(np.abs(mean[:, :2]).max(initial=0.0), np.abs(auxiliary[:, 3]).max(initial=0.0))
+        farthest = max(np.abs(mean[:, :2]).max(initial=0.0), np.nanmax(np.abs(auxiliary[:, 3]), initial=0.0))
         if farthest > MAX_COORDINATE:
             raise DensityError(f"{rows.part}.mean", f"coordinates up to {MAX_COORDINATE:g} m", f"{farthest:g}")
         return rows.replaced(mean=mean, covariance=turn @ rows.covariance @ turn.T, auxiliary=auxiliary)
