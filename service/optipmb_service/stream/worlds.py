@@ -54,7 +54,7 @@ class Worlds:
 
     number: Whole
     motions: Annotated[tuple[_Motion, ...], Field(max_length=KEPT)]
-    sensors: Annotated[Mapping[SensorName, SensorWorld], Field(max_length=MAX_SENSORS)]
+    sensors: Annotated[Mapping[SensorName, SensorWorld], Field(max_length=MAX_SENSORS + 1)]
 
     def since(self, world: int) -> tuple[optipmb.Relocation, ...]:
         """Return the motions from a world to the newest, as far as they are kept."""
@@ -113,7 +113,10 @@ def relocated(before: FilterState, frame_id: FrameId, relocation: schemas.Reloca
         motions = (*worlds.motions, motion)[-KEPT:]
         with suppress(optipmb.DensityError):
             return Relocated(_moved(before, replace(worlds, number=here, motions=motions), motion), change="moves")
-    worlds = replace(worlds, number=here, motions=() if motion is None else (motion,))
+    if relocation is not None:
+        here, zero = relocation.world, 0
+    sensors = {**worlds.sensors, name: SensorWorld(here, zero)}
+    worlds = Worlds(here, () if motion is None else (motion,), sensors)
     return Relocated(replace(before, worlds=worlds), change="restarts")
 
 
