@@ -2,7 +2,7 @@
 
     zones = (Zone("crossing", polygon=[(0, 0), (20, 0), (20, 12), (0, 12)]), Zone("gate", line=[(0, -5), (0, 5)]))
     state = ZoneState()
-    state, events = observe(zones, state, stamp_ns, tracks, labels, tracks.confirmed)
+    state, events = observe(zones, state, stamp_ns, tracks, labels)
 
 `observe` is pure, as the step of the tracker is. Only frames in which a track was detected move it. Events of a track
 come when it is confirmed.
@@ -13,7 +13,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping  # noqa: TC003 - checkpoints read the records by their annotations
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol
+from functools import cached_property
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from optipmb.extract import Tracks
     from optipmb.rows import Array, Index
 
 Point = tuple[float, float]
@@ -39,23 +41,6 @@ MOST: Final = 256
 COUNTS: Final = ("inside", "entered", "left", "appeared", "lost", "to_left", "to_right")
 _SECOND: Final = 1_000_000_000
 _OUTSIDE, _NEAR, _INSIDE = 0, 1, 2
-
-
-class Tracks(Protocol):
-    """The columns of `optipmb.Tracks`, and of the message of this name, that are used."""
-
-    @property
-    def id(self) -> Index: ...  # noqa: D102
-    @property
-    def label(self) -> Index: ...  # noqa: D102
-    @property
-    def center(self) -> Array: ...  # noqa: D102
-    @property
-    def velocity(self) -> Array: ...  # noqa: D102
-    @property
-    def yaw(self) -> Array: ...  # noqa: D102
-    @property
-    def detection(self) -> Index: ...  # noqa: D102
 
 
 @dataclass(frozen=True)
@@ -96,7 +81,7 @@ class Zone:
         if self.polygon and _crosses_itself(self.polygon):
             raise ParameterError(f"{self.name}.polygon", "edges that do not cross", "others")
 
-    @property
+    @cached_property
     def digest(self) -> str:
         """All that its events follow from."""
         return repr(self)
@@ -208,7 +193,7 @@ def locate(
             if not closed[k] and not (
                 max(x, p) < left or min(x, p) > right or max(y, q) < low or min(y, q) > high or p != p  # noqa: PLR0124
             ):
-                net[i, k] = crossings(shape, p, q, x, y)
+                net[i, k] = crossings(shape, p, q, x, y)[0]
             if x < left or x > right or y < low or y > high:
                 continue
             inside, nearest = False, np.inf
@@ -232,25 +217,24 @@ def locate(
 
 
 @kernel
-def crossings(line: Array, ax: float, ay: float, bx: float, by: float) -> int:
-    """Return how often a move from a to b crosses a line to its left, less how often to its right.
+def crossings(line: Array, ax: float, ay: float, bx: float, by: float) -> tuple[int, float]:
+    """Return how often a move from a to b crosses a line to its left, less how often to its right, and the last place.
 
-    A point of the line on the path counts as left of the path, in all pieces that it belongs to. So a line and its
-    parts, and a line and its reverse, are crossed equally.
+    That is a share of the move, -1 without any. A point of the line on the path counts as left of the path, in all
+    pieces that it belongs to. So a line and its parts, and a line and its reverse, are crossed equally.
     """
-    net = 0
+    net, share = 0, -1.0
     for j in range(len(line) - 1):
         x1, y1 = line[j]
         x2, y2 = line[j + 1]
         first = (bx - ax) * (y1 - ay) - (by - ay) * (x1 - ax) >= 0.0
         last = (bx - ax) * (y2 - ay) - (by - ay) * (x2 - ax) >= 0.0
-        if first == last:
-            continue
-        a = (x2 - x1) * (ay - y1) - (y2 - y1) * (ax - x1) > 0.0
-        b = (x2 - x1) * (by - y1) - (y2 - y1) * (bx - x1) > 0.0
-        if a != b:
+        a = (x2 - x1) * (ay - y1) - (y2 - y1) * (ax - x1)
+        b = (x2 - x1) * (by - y1) - (y2 - y1) * (bx - x1)
+        if first != last and (a > 0.0) != (b > 0.0):
             net += 1 if first else -1
-    return net
+            share = max(share, a / (a - b))
+    return net, share
 
 
 def observe(
@@ -259,7 +243,6 @@ def observe(
     stamp_ns: int,
     tracks: Tracks,
     labels: Sequence[str],
-    confirmed: NDArray[np.bool_],
     shapes: Shapes | None = None,
 ) -> tuple[ZoneState, tuple[Event, ...]]:
     """Return the state after a frame, and its events ordered by time, zone and id.
@@ -270,7 +253,6 @@ def observe(
         stamp_ns: of the frame.
         tracks: of the frame.
         labels: the classes.
-        confirmed: (N,) which tracks are confirmed.
         shapes: the zones as arrays, where they are at hand.
     """
     known = dict(state.tracks)
@@ -283,13 +265,11 @@ def observe(
     where, net = locate(center, before, *(shapes or Shapes.of(zones)))
     marked = ((where != 0) | (net != 0)).any(axis=1).tolist()
     everywhere = (1 << len(zones)) - 1
-    for at, row in enumerate(rows.tolist()):
+    for at, (row, (x, y, z)) in enumerate(zip(rows.tolist(), center.tolist(), strict=True)):
         identity = identities[row]
-        x, y, z = center[at].tolist()
         old = known.get(identity)
-        seen = old or Seen(stamp_ns, (x, y, z), everywhere, {}, {})
-        seen = seen._replace(stamp_ns=stamp_ns, place=(x, y, z))
-        if marked[at] or seen.visits or seen.beside:
+        seen = Seen(stamp_ns, (x, y, z), everywhere, {}, {}, *(old[5:] if old else ()))
+        if marked[at] or (old and (old.visits or old.beside)):
             speed, yaw = math.hypot(*tracks.velocity[row].tolist()), float(tracks.yaw[row])
             now = Event("", "entered", 0, identity, labels[tracks.label[row]], stamp_ns, (x, y, z), speed, yaw)
             seen, more = _moved(zones, old, seen, now, where[at].tolist(), net[at].tolist())
@@ -297,10 +277,8 @@ def observe(
                 events += more
             else:
                 seen = seen._replace(held=(*seen.held, *more))
-        else:
-            seen = seen._replace(known=everywhere)
         known[identity] = seen
-    for row in np.flatnonzero(confirmed).tolist():
+    for row in np.flatnonzero(tracks.confirmed).tolist():
         seen_now = known.get(identities[row])
         if seen_now is not None and not seen_now.confirmed:
             events += seen_now.held
@@ -351,40 +329,38 @@ def _moved(
 ) -> tuple[Seen, list[Event]]:
     """Return a track after a detection, and its events."""
     events: list[Event] = []
-    visits, beside, known = dict(seen.visits), dict(seen.beside), seen.known
-    last = (-1, now.position) if old is None else (old.stamp_ns, old.place)
+    visits, beside = (dict(old.visits), dict(old.beside)) if old else ({}, {})
+    known, last = seen.known, (old.stamp_ns, old.place) if old else (-1, now.position)
     for k, zone in enumerate(zones):
+        if not (where[k] or net[k] or zone.name in visits or zone.name in beside):
+            continue
         counts, bit = not zone.classes or now.label in zone.classes, 1 << k
         if zone.line:
             began = beside.pop(zone.name, None)
             if where[k]:
                 beside[zone.name] = began or last
                 continue
-            crossed = (
-                net[k]
-                if began is None
-                else crossings(np.array(zone.line, np.float64), *began[1][:2], *now.position[:2])
-            )
-            if crossed and counts and (began or last)[0] >= 0:
-                at_ns, place = _border(zone.line, began or last, now)
+            if (net[k] or began) and counts and (began or last)[0] >= 0:
+                crossed, at_ns, place = _crossing(zone.line, began or last, now)
                 event = now._replace(zone=zone.name, kind="crossed", at_ns=at_ns, position=place)
-                events.append(event._replace(direction="left" if crossed > 0 else "right"))
+                events += [event._replace(direction="left" if crossed > 0 else "right")] if crossed else []
             continue
+        ring = (*zone.polygon, zone.polygon[0])
         visit = visits.get(zone.name)
         if where[k] == _INSIDE and (visit or counts):
             if visit is None:
-                comes = last[0] >= 0 and known & bit
-                at_ns, place = _border(zone.polygon, last, now) if comes else (now.at_ns, now.position)
+                comes = old is not None and old.known & bit
+                _, at_ns, place = _crossing(ring, last, now) if comes else (0, now.at_ns, now.position)
                 entry = now._replace(
                     zone=zone.name, at_ns=at_ns, position=place, how="crossed" if comes else "appeared"
                 )
                 visit = Visit(now.label, at_ns, now.at_ns, now.position, entry)
             visit = visit._replace(last_ns=now.at_ns, place=now.position)
         elif visit is not None and (visit.last_ns, visit.place) == last:
-            at_ns, place = _border(zone.polygon, last, now)
+            _, at_ns, place = _crossing(ring, last, now)
             visit = visit._replace(last_ns=at_ns, place=place)
-        known = known & ~bit if where[k] == _INSIDE and visit is None else known | bit
         if visit is None:
+            known &= ~bit if where[k] == _INSIDE else -1
             continue
         stayed_ns = visit.last_ns - visit.since_ns
         if visit.entered is not None and stayed_ns >= _ns(zone.min_s):
@@ -451,22 +427,14 @@ def _counted(state: ZoneState, events: Iterable[Event]) -> tuple[ZoneState, tupl
     return replace(state, counts=counts, numbers=numbers), tuple(ordered)
 
 
-def _border(points: tuple[Point, ...], last: Moment, now: Event) -> Moment:
-    """Return when and where a move last crossed a border or line; its end, where it crossed none (but a height)."""
-    since_ns, begin = last
-    (ax, ay), (bx, by) = begin[:2], now.position[:2]
-    share = -1.0
-    for (x1, y1), (x2, y2) in zip(points, (*points[1:], points[0]), strict=True):
-        a = (x2 - x1) * (ay - y1) - (y2 - y1) * (ax - x1)
-        b = (x2 - x1) * (by - y1) - (y2 - y1) * (bx - x1)
-        first = (bx - ax) * (y1 - ay) - (by - ay) * (x1 - ax) >= 0.0
-        second = (bx - ax) * (y2 - ay) - (by - ay) * (x2 - ax) >= 0.0
-        if (a > 0.0) != (b > 0.0) and first != second:
-            share = max(share, a / (a - b))
+def _crossing(points: tuple[Point, ...], start: Moment, now: Event) -> tuple[int, int, Place]:
+    """Return how often a move crossed a line, and when and where it did last; its end, where it did not."""
+    since_ns, begin = start
+    net, share = crossings(np.array(points, np.float64), *begin[:2], *now.position[:2])
     if share < 0.0:
-        return now.at_ns, now.position
-    at = [p + share * (q - p) for p, q in zip(begin, now.position, strict=True)]
-    return since_ns + round(share * (now.at_ns - since_ns)), (at[0], at[1], at[2])
+        return net, now.at_ns, now.position
+    x, y, z = (p + share * (q - p) for p, q in zip(begin, now.position, strict=True))
+    return net, since_ns + round(share * (now.at_ns - since_ns)), (x, y, z)
 
 
 def _crosses_itself(polygon: tuple[Point, ...]) -> bool:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from optipmb_client.errors import ClientError, ConnectionFailed, ServiceRefused, ServiceUnavailable, UsageError
     from optipmb_client.publisher import Publisher
     from optipmb_client.sessions import kept_tracks
-    from optipmb_client.subscriber import Missed, Received, Statistics, Subscriber
+    from optipmb_client.subscriber import EventSubscriber, Missed, Received, Statistics, Subscriber
     from optipmb_client.zenoh import DEFAULT_ENDPOINT, Connection
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "ClientError",
     "Connection",
     "ConnectionFailed",
+    "EventSubscriber",
     "Missed",
     "Publisher",
     "Received",
@@ -36,7 +37,7 @@ _MODULES = {
     "errors": ("ClientError", "ConnectionFailed", "ServiceRefused", "ServiceUnavailable", "UsageError"),
     "publisher": ("Publisher",),
     "sessions": ("kept_tracks",),
-    "subscriber": ("Missed", "Received", "Statistics", "Subscriber"),
+    "subscriber": ("EventSubscriber", "Missed", "Received", "Statistics", "Subscriber"),
     "zenoh": ("DEFAULT_ENDPOINT", "Connection"),
 }
 

@@ -11,7 +11,12 @@ import enum
 import hashlib
 from typing import NamedTuple
 
-from optipmb_schemas import Tracks
+from optipmb_schemas import Events, Tracks
+
+MOST_HELD = 4096
+"""Messages that are held of a stream; beyond, the oldest are lost, as where a service cannot write checkpoints."""
+MOST_SESSIONS = 1024
+"""Sessions of a stream whose order is remembered."""
 
 
 class Novelty(enum.Enum):
@@ -62,3 +67,54 @@ def _digest(tracks: Tracks) -> bytes:
         elif name not in {"delivery", "revision"}:
             digest.update(repr(value).encode())
     return digest.digest()
+
+
+class FinalEvents:
+    """Holds events of a stream until they are final, and gives out each message once, in the order of the frames.
+
+    A run that goes on for another publishes again all that is not final. So a later run voids what is held of earlier
+    ones, but for the last frame that is final.
+    """
+
+    def __init__(self) -> None:
+        self.held: dict[tuple[str | None, bytes, int], Events] = {}
+        """Messages that may still change, the newest of each frame."""
+        self._sessions: dict[str, int] = {}
+        self._count = 0
+        self._run = 0
+        self._final = 0, 0
+
+    def take(self, message: Events) -> list[Events]:
+        """Take a message; return those that are final now."""
+        delivery, run, is_new = message.delivery, _run(message), message.session not in self._sessions
+        if run < self._run and not is_new:
+            return []
+        if is_new:  # without checkpoints its runs count from 0 again
+            self._count += 1
+            self._sessions[message.session] = self._count
+            if len(self._sessions) > MOST_SESSIONS:
+                del self._sessions[next(iter(self._sessions))]
+        if delivery and delivery.final_session in self._sessions:
+            self._final = max(self._final, (self._sessions[delivery.final_session], delivery.final_ns or 0))
+        if run > self._run:
+            self.held = {frame: one for frame, one in self.held.items() if self._place(one) <= self._final}
+        self._run = run
+        frame = message.sensor, message.epoch, message.seq
+        if self._place(message) >= self._final:
+            known = self.held.get(frame, message)
+            self.held[frame] = max(known, message, key=lambda one: (_run(one), one.revision))
+        final = [frame for frame, one in self.held.items() if self._place(one) < self._final]
+        released = [self.held.pop(frame) for frame in final]
+        while len(self.held) > MOST_HELD:
+            del self.held[next(iter(self.held))]
+        return sorted(
+            (one for one in released if one.events or one.zones),
+            key=lambda one: (self._place(one), one.sensor or "", one.seq),
+        )
+
+    def _place(self, message: Events) -> tuple[int, int]:
+        return self._sessions.get(message.session, 0), message.stamp_ns
+
+
+def _run(message: Events) -> int:
+    return message.delivery.run if message.delivery else 0

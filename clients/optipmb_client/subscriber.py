@@ -7,16 +7,17 @@ import collections
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Self
 
-from optipmb_schemas import PREFIX, Keys, MessageError, Problem, Tracks
+from optipmb_schemas import PREFIX, Events, Keys, MessageError, Problem, Topic, Tracks
 
 from optipmb_client.incoming import Arrival, Inbox
 from optipmb_client.links import Link, linked
-from optipmb_client.merging import Merging, Novelty
+from optipmb_client.merging import FinalEvents, Merging, Novelty
 
-__all__ = ["Missed", "Received", "Statistics", "Subscriber"]
+__all__ = ["EventSubscriber", "Missed", "Received", "Statistics", "Subscriber"]
 
 REMEMBERED = 65_536  # frames whose repetition is recognised
 MISSED = 1024  # ranges of lost frames that are kept
@@ -77,7 +78,84 @@ class Statistics:
     missed: int = 0
 
 
-class Subscriber:
+class _Subscription:
+    """Topics of a pattern, on a connection of its own, which `opened` gives, or a shared one."""
+
+    def __init__(
+        self,
+        pattern: str,
+        topics: Sequence[Topic],
+        queue: int,
+        prefix: str,
+        connection: "Link | None",
+        opened: Callable[[], Link],
+    ) -> None:
+        Keys(prefix).matching(pattern, "tracks")  # checks both
+        self._inbox = Inbox(queue)
+        self._own = opened() if connection is None else None
+        link = connection or self._own
+        assert link is not None  # noqa: S101  one of the two is there: said for the type checker
+        self._subscription = link.subscribe_streams(pattern, self._inbox, *topics, prefix=prefix)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the subscription; a loop over it gets what still waits, then ends. May be called twice."""
+        self._subscription.close()
+        self._inbox.close()
+        if self._own is not None:
+            self._own.close()
+
+
+class EventSubscriber(_Subscription):
+    """Iterates over the events of zones and lines of one stream or of many.
+
+    Args:
+        pattern: Name of a stream, `site/node/sensor`, or a pattern with `*` in the place of names: `garage/*/*`.
+        connect: As for `Subscriber`, like all options that are not named here.
+        final: Give out each message once it does not change any more, in order: to count. Else give out all at once,
+            with those that replace earlier ones: to raise alarms.
+        timeout: Iterating ends when nothing has come for so many seconds; None: never.
+
+    Raises:
+        ConnectionFailed: No router, or gateway, within `connect_timeout`, or `connection` is used up.
+        MessageError: `pattern` is neither the name of a stream nor such a pattern.
+    """
+
+    def __init__(  # noqa: PLR0913  each option by its name, all but two seldom used
+        self,
+        pattern: str,
+        connect: str | Sequence[str] | None = None,
+        *,
+        final: bool = True,
+        timeout: float | None = None,
+        queue: int = 1024,
+        config: str | Path | None = None,
+        connection: "Link | None" = None,
+        connect_timeout: float = 5.0,
+        prefix: str = PREFIX,
+    ) -> None:
+        self.timeout = timeout
+        self._final = final
+        self._streams: dict[str, FinalEvents] = collections.defaultdict(FinalEvents)
+        opened = partial(linked, connect, config=config, timeout=connect_timeout)
+        super().__init__(pattern, ("events",), queue, prefix, connection, opened)
+
+    def __iter__(self) -> Iterator[Events]:
+        """Iterate over the messages until `timeout` or `close`."""
+        while (arrival := self._inbox.get(self.timeout)) is not None:
+            try:
+                message = arrival.read(Events)
+            except MessageError:  # of somebody else
+                continue
+            yield from self._streams[message.stream].take(message) if self._final else (message,)
+
+
+class Subscriber(_Subscription):
     """Receives the tracks of one stream or of many.
 
     Iterating gives `Tracks` messages as they come. The service may deliver a message again, after a restart for
@@ -122,7 +200,6 @@ class Subscriber:
         connect_timeout: float = 5.0,
         prefix: str = PREFIX,
     ) -> None:
-        Keys(prefix).matching(pattern, "tracks")  # checks both
         self.timeout = timeout
         self._on_problem = on_problem
         self._merging = Merging(REMEMBERED)
@@ -134,24 +211,9 @@ class Subscriber:
         self._newest: dict[tuple[str, str | None], tuple[bytes, int, int]] = {}
         self._missed: collections.deque[Missed] = collections.deque(maxlen=MISSED)
         self._missed_count = 0
-        self._inbox = Inbox(queue)
-        self._own = linked(connect, config=config, timeout=connect_timeout) if connection is None else None
-        link = connection or self._own
-        assert link is not None  # noqa: S101  one of the two is there: said for the type checker
-        self._subscription = link.subscribe_tracks(pattern, self._inbox, prefix=prefix, problems=on_problem is not None)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """End the subscription; a loop over it gets what still waits, then ends. May be called twice."""
-        self._subscription.close()
-        self._inbox.close()
-        if self._own is not None:
-            self._own.close()
+        topics: tuple[Topic, ...] = ("tracks",) if on_problem is None else ("tracks", "problems")
+        opened = partial(linked, connect, config=config, timeout=connect_timeout)
+        super().__init__(pattern, topics, queue, prefix, connection, opened)
 
     def __iter__(self) -> Iterator[Tracks]:
         """Iterate over the messages until `timeout` or `close`."""

@@ -67,6 +67,7 @@ CHANNELS: Final = {
     "state": _query("state", (QUERY,), "SessionState"),
     "density": _query("density", (QUERY,), "Density"),
     "keptTracks": _query("tracks", (QUERY, "TracksRequest"), "Tracks", "TracksRequest"),
+    "zones": _query("zones", (QUERY,), "Events"),
     "reset": _query("reset", (QUERY, "ResetRequest"), "SessionState"),
     "parameters": _query("parameters", (QUERY, "SessionParameters"), "SessionParameters"),
     "owner": Channel("owner", (_STREAM, "instance"), about="Liveliness: this instance tracks the stream.", action=None),

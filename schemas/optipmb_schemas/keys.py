@@ -1,7 +1,7 @@
 """Zenoh keys: where each message goes. A stream is `site/node/sensor`; chunks are letters, digits and `_ . -`.
 
 <prefix>/<stream>/detections | points | tracks | events | problems     publications
-<prefix>/<stream>/q/state | q/density | q/tracks | q/reset | q/parameters    queries
+<prefix>/<stream>/q/state | q/density | q/tracks | q/zones | q/reset | q/parameters    queries
 <prefix>/owner/<stream>/<instance>                            liveliness: who tracks this stream
 <prefix>/service/<instance>/alive                             liveliness: which services are there
 <prefix>/service/<instance>/discovered/<run>/<streams>        liveliness: streams whose publishers say nothing
@@ -16,7 +16,7 @@ from optipmb_schemas.errors import MessageError, invalid
 from optipmb_schemas.model import check_chunk, check_stream
 
 Topic = Literal["detections", "points", "tracks", "events", "problems"]
-Query = Literal["state", "density", "tracks", "reset", "parameters"]
+Query = Literal["state", "density", "tracks", "zones", "reset", "parameters"]
 
 PREFIX: Final = "optipmb/v1"
 

@@ -187,6 +187,12 @@ class Delivery(Message):
         description="Grows whenever a process begins to track the stream or goes on with it. Tracks of a later run "
         "replace those of an earlier one for the same `epoch` and `seq`, whatever their revisions.",
     )
+    final_session: SessionId | None = Field(
+        default=None,
+        description="In `Events`: messages of this session with a `stamp_ns` below `final_ns`, and of all sessions "
+        "before it, do not change any more.",
+    )
+    final_ns: Stamp | None = Field(default=None, description="In `Events`: see `final_session`.")
 
 
 class Tracks(Header):
@@ -392,7 +398,8 @@ class Events(Header):
     zones: tuple[ZoneCount, ...] | None = Field(
         default=None,
         max_length=256,
-        description="Counts after this frame: at the first of each second of stamps, and with every revision.",
+        description="Counts after this frame: at the first of each session and second of stamps, with every revision, "
+        "and in replies to `q/zones`.",
     )
     delivery: Delivery | None = Field(default=None, description="How this publication came about.")
 

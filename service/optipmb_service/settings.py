@@ -18,6 +18,7 @@ import secrets
 import socket
 import tomllib
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
@@ -54,6 +55,7 @@ DEFAULT_LISTEN: Final = "tcp/127.0.0.1:7447"
 DEFAULT_GRPC: Final = "127.0.0.1:50051"
 DEFAULT_NATS: Final = "127.0.0.1:4222"
 DEFAULT_MQTT: Final = "mqtt://127.0.0.1:1883"
+MOST_ZONES: Final = 256  # as `optipmb.zones.MOST`, which the settings do not import
 
 
 def _form(pattern: str, expected: str) -> AfterValidator:
@@ -240,6 +242,8 @@ class SiteSettings(BaseModel):
 
 
 Shape = tuple[tuple[float, float], ...]
+FARTHEST: Final = 100_000.0
+"""Distance of a zone from the origin of its site, m, beyond which latitude and longitude are likely exchanged."""
 
 
 class ZoneSettings(BaseModel):
@@ -266,6 +270,8 @@ class ZoneSettings(BaseModel):
     """an object that was not detected for longer has left"""
     dwell_s: tuple[Annotated[float, Field(gt=0, le=1e8)], ...] = ()
     """times inside after which there is an event"""
+    geo: bool = False
+    """points are latitude and longitude in degrees, by the place of the stream's site in `sites`"""
 
     @field_validator("polygon", "line")
     @classmethod
@@ -282,11 +288,22 @@ class ZoneSettings(BaseModel):
                 raise ValueError(str(error).partition(": ")[2]) from None
         return value
 
-    def zone(self, name: str) -> Zone:
-        """Return the zone that these settings describe."""
+    def zone(self, name: str, site: SiteSettings | None = None) -> Zone:
+        """Return the zone that these settings describe, of a site if its points are geographic.
+
+        Raises:
+            ParameterError: these are too far from the site.
+        """
+        from optipmb import Georeference, ParameterError  # noqa: PLC0415 - compiles kernels
         from optipmb.zones import Zone  # noqa: PLC0415 - compiles kernels
 
-        values: dict[str, Any] = self.model_dump(exclude={"streams"}, exclude_none=True)
+        values: dict[str, Any] = self.model_dump(exclude={"streams", "geo"}, exclude_none=True)
+        if self.geo and site is not None:
+            lat, lon = zip(*(self.polygon or self.line), strict=True)
+            world = Georeference(site.origin, site.x_heading).to_world(lat, lon)
+            if max(abs(world[:, :2]).ravel()) > FARTHEST:
+                raise ParameterError(name, f"points within {FARTHEST / 1e3:g} km of the origin of the site", "others")
+            values["polygon" if self.polygon else "line"] = tuple(map(tuple, world[:, :2].tolist()))
         return Zone(name, **values | {"dwell_s": tuple(sorted(self.dwell_s))})
 
 
@@ -456,16 +473,28 @@ class Settings(BaseSettings):
     """lowest level that is logged"""
     sites: dict[str, SiteSettings] = Field(default_factory=dict)
     """place of each site's world frame, by which the live page shows latitude, longitude and true heading"""
-    zones: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")], ZoneSettings] = Field(
-        default_factory=dict, max_length=256
-    )
-    """polygons and lines whose events are published, by name; equal on all members of a cluster"""
+    zones: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")], ZoneSettings] = Field(default_factory=dict)
+    """polygons and lines whose events are published, by name, at most 256 for a session; equal on all members of a
+    cluster"""
     ros2: Ros2Settings = Ros2Settings()
     """topics of ROS 2, for `optipmb-service ros2`"""
     mqtt: MqttSettings = MqttSettings()
     """a broker of MQTT, for `optipmb-service mqtt`"""
     limits: LimitSettings = LimitSettings()
     """bounds on what one message may hold"""
+
+    def zones_of(self, session: str) -> list[str]:
+        """Return the names of the zones of a session, or of all that a pattern matches."""
+        site = session.partition("/")[0]
+        return [
+            name
+            for name, one in sorted(self.zones.items())
+            if any(fnmatchcase(session, pattern) for pattern in one.streams) and (not one.geo or site in self.sites)
+        ]
+
+    def zone(self, name: str, site: str) -> Zone:
+        """Return a zone as it is in the world of a site."""
+        return self.zones[name].zone(name, self.sites.get(site))
 
     @property
     def is_router(self) -> bool:
@@ -582,6 +611,7 @@ def load(
     if settings.fuse and not settings.rewind_s:
         raise SettingsInvalidError("setting fuse: sensors do not come in order of their stamps: rewind_s must not be 0")
     _check_cluster(settings)
+    _check_zones(settings)
     if settings.workers > 1 and settings.zenoh_config is not None and settings.is_router:
         # Its access control would be deaf to the workers, which come over a socket and without a certificate.
         raise SettingsInvalidError(
@@ -630,6 +660,29 @@ def _check_cluster(settings: Settings) -> None:
             raise SettingsInvalidError(f"setting cluster_tls: {folder}: cert.pem and key.pem belong together")
     if file is not None and not file.is_file():
         raise SettingsInvalidError(f"setting cluster_credentials: {file}: no such file")
+
+
+def _check_zones(settings: Settings) -> None:
+    """Refuse geographic zones whose place is not known or not right, and too many zones of one pattern.
+
+    Raises:
+        SettingsInvalidError: there are such.
+    """
+    for name, zone in settings.zones.items():
+        for pattern in zone.streams if zone.geo else ():
+            sites = [site for site in settings.sites if fnmatchcase(site, pattern.partition("/")[0])]
+            if not sites:
+                raise SettingsInvalidError(f"setting zones.{name}.geo: the site of {pattern} is not in `sites`")
+            try:
+                for site in sites:
+                    settings.zone(name, site)
+            except ValueError as error:
+                shape = "polygon" if zone.polygon else "line"
+                reason = str(error).partition(": ")[2]
+                raise SettingsInvalidError(f"setting zones.{name}.{shape} in sites.{site}: {reason}") from error
+    for pattern in {pattern for one in settings.zones.values() for pattern in one.streams}:
+        if (count := len(settings.zones_of(pattern))) > MOST_ZONES:
+            raise SettingsInvalidError(f"setting zones: at most {MOST_ZONES} for a session, {pattern} has {count}")
 
 
 def _read(file: Path) -> dict[str, Any]:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import threading
 import time
 from statistics import median
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from fleet import Fleet
 from optipmb_client import Connection
 from optipmb_client.incoming import Inbox
+from optipmb_service.settings import ZoneSettings
+from optipmb_service.stream.values import Policy
 from real_data import kitti_root
 from recorded import KEYS, Replay, kitti, undisturbed
 
@@ -28,7 +31,14 @@ SEED = int(os.environ.get("OPTIPMB_TEST_SEED", "1"))
 LONG_S = 2.0
 """From so long an outage on, the log of the new process is shown."""
 RESTART_S = 200.0  # on a machine that is busy with other things
-SEQUENCES = ("0000", "0002", "0004", "0011")
+SEQUENCES = ("0000", "0002", "0004", "0011", "0003", "0005", "0007", "0009", "0017", "0020")[: 10 if KILLS > FEW else 4]
+EVENTS_S = 30.0
+ZONES: dict[str, dict[str, Any]] = {
+    f"zone-{x}-{y}": {"streams": ["*/kitti/*"], "polygon": [[x, y], [x + 18, y], [x + 18, y + 12], [x, y + 12]]}
+    for x in (0, 20, 40, 60)
+    for y in (-12, 0)
+} | {f"line-{x}": {"streams": ["*/kitti/*"], "line": [[x, -20], [x, 20]]} for x in range(5, 85, 10)}
+"""Eight zones and eight lines where the recorded vehicles start."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -37,24 +47,28 @@ def _compiled() -> None:
 
 
 def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Fault 1: four recorded streams, SIGKILL in the middle, a new process: state and tracks are those of no kill.
+    """Fault 1: four recorded streams, SIGKILL in the middle, a new process: all is as without a kill.
 
-    The tracks of every frame, repetitions set aside, and the digest of the state are byte-equal to those of a session
-    that nothing happened to; every round has a moment of its own.
+    The tracks of every frame, repetitions set aside, the digest of the state and the events of zones are byte-equal to
+    those of a session that nothing happened to; events that were final did not change. Every round has a moment of its
+    own.
     """
     root = kitti_root()
     moments = random.Random(SEED)
     outages: list[float] = []
     repeated = 0
     waits = {"cloud_wait_s": 30, "recovery_wait_s": 10, "checkpoint_s": 0.2}
-    settings = {"profile": "kitti", "queue_clouds": FRAMES, "stream_mb": 1024} | waits
+    zones = tuple(ZoneSettings(**one).zone(name) for name, one in sorted(ZONES.items()))
+    final, number = 0, 0
+    settings = {"zones": json.dumps(ZONES), "profile": "kitti", "queue_clouds": FRAMES, "stream_mb": 1024} | waits
     with Fleet(tmp_path, **settings) as fleet, Connection(fleet.endpoint) as connection:
         service = fleet.service("one")
         for round_ in range(KILLS):
             recordings = [kitti(root, name, f"round{round_}/kitti/{name}", FRAMES) for name in SEQUENCES]
             replay = Replay(connection, recordings, pace_s=0.004)
             inbox = Inbox(100_000)
-            subscriptions = [connection.subscribe(KEYS.tracks(one.stream), inbox) for one in recordings]
+            keys = [key(one.stream) for one in recordings for key in (KEYS.tracks, KEYS.events)]
+            subscriptions = [connection.subscribe(key, inbox) for key in keys]
             reader = threading.Thread(target=_read, args=(inbox, replay), daemon=True)
             reader.start()
             replay.start()
@@ -68,11 +82,13 @@ def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[
             replay.finish(RESTART_S)
             outages.append(_outage(replay, killed))
             for recording in recordings:
-                tracks, digest = undisturbed(recording, "kitti")
+                tracks, digest, events = undisturbed(recording, "kitti", Policy(zones=zones))
                 result = replay.results[recording.stream]
                 assert [result.tracks[seq] for seq in range(FRAMES)] == [{one} for one in tracks], (round_, SEED)
                 state = replay.state(recording.stream)
                 assert (state.digest, state.frames, state.gaps) == (digest, FRAMES, 0), (round_, SEED)
+                assert replay.wait_events(recording.stream, events, EVENTS_S), (round_, SEED)
+                final, number = final + len(result.final), number + len(events)
                 repeated += result.repeated
             if KILLS > FEW:
                 _tell(capsys, f"kill {round_ + 1} of {KILLS}: outage {outages[-1]:.2f} s")
@@ -86,7 +102,8 @@ def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[
         assert service.end()[0] == 0
     _tell(
         capsys,
-        f"{KILLS} of {KILLS} kills: all tracks byte-equal (seed {SEED}); {4 * KILLS * FRAMES} frames, "
+        f"{KILLS} of {KILLS} kills: all tracks and events byte-equal (seed {SEED}); "
+        f"{len(SEQUENCES) * KILLS * FRAMES} frames, {number} of them with events, {final} of these final; "
         f"{repeated} published again, outage median {median(outages):.2f} s, longest {max(outages):.2f} s",
     )
 
@@ -98,7 +115,7 @@ def _tell(capsys: pytest.CaptureFixture[str], text: str) -> None:
 
 def _read(inbox: Inbox, replay: Replay) -> None:
     while (arrival := inbox.get()) is not None:
-        replay.take(arrival.payload)
+        (replay.take_events if arrival.key.endswith("/events") else replay.take)(arrival.payload)
 
 
 def _outage(replay: Replay, killed_ns: int) -> float:

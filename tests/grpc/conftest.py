@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -18,7 +19,9 @@ NUMBERS = itertools.count()
 @pytest.fixture(scope="session")
 def service() -> Iterator[ServiceProcess]:
     """A service with its own router."""
-    with ServiceProcess() as process:
+    yard = {"streams": ["zoned/*/*"], "polygon": [[10, -5], [30, -5], [30, 5], [10, 5]]}
+    zones = {"yard": yard, "gate": {"streams": ["zoned/*/*"], "line": [[20, -5], [20, 5]]}}
+    with ServiceProcess(environment={"OPTIPMB_ZONES": json.dumps(zones)}) as process:
         process.wait_ready()
         yield process
 

@@ -78,6 +78,7 @@ def test_a_node_tracks_its_own_streams_alone(network: Network, secured: GatewayP
     assert denied(own.Track(iter([detections(frame(0, FOREIGN))]))) == no
     assert denied(own.Publish(iter([pb.PublishRequest(options=pb.PublishOptions(stream=FOREIGN))]))) == no
     assert denied(own.Subscribe(pb.SubscribeRequest(pattern="garage/*/lidar"))) == no
+    assert denied(own.SubscribeEvents(pb.SubscribeEventsRequest(pattern=FOREIGN))) == no
     assert denied(own.QueryTracks(pb.QueryTracksRequest(pattern=FOREIGN))) == no
     assert denied(lambda: own.Reset(pb.ResetRequest(stream=FOREIGN))) == no
     assert {one.session.stream for one in own.ListStreams(pb.ListStreamsRequest()).streams} == {LIDAR}

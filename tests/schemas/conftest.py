@@ -183,11 +183,14 @@ def examples() -> dict[str, Message]:
 @pytest.fixture(scope="session")
 def example_of(examples: dict[str, Message]) -> Callable[[type[Message]], Message]:
     """Gives the valid message of a type, also of nested ones."""
-    tracks, status = examples["Tracks"], examples["ServiceStatus"]
+    tracks, status, events = examples["Tracks"], examples["ServiceStatus"], examples["Events"]
     assert isinstance(tracks, Tracks)
     assert isinstance(status, ServiceStatus)
+    assert isinstance(events, Events)
     assert tracks.delivery is not None
+    assert events.zones is not None
     held = {"Pose": POSE, "FieldOfView": VIEW, "Delivery": tracks.delivery, "SessionSummary": status.sessions[0]}
+    held |= {"ZoneEvent": events.events[0], "ZoneCount": events.zones[0]}
     return lambda kind: {**examples, **held}[kind.__name__]
 
 

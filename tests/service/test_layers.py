@@ -15,7 +15,7 @@ SOURCES = sorted(ROOT.rglob("*.py"))
 MODULES = {".".join(("optipmb_service", *source.relative_to(ROOT).with_suffix("").parts)): source for source in SOURCES}
 PAGE = (Path(__file__).parents[2] / "docs/architecture.md").read_text()
 
-LINK = ("optipmb_client.zenoh.", "optipmb_client.incoming.", "optipmb_client.errors.")
+LINK = ("optipmb_client.zenoh.", "optipmb_client.incoming.", "optipmb_client.errors.", "optipmb_client.merging.")
 """What the service may import of the client."""
 
 ARROWS = {
@@ -87,7 +87,7 @@ def test_arrows_run_one_way(source: Path) -> None:
 
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: f"{path.parent.name}/{path.stem}")
 def test_libraries_of_an_edge_stay_there(source: Path) -> None:
-    """HTTP, gRPC and NATS are imported by their folders alone, Zenoh by none; of the client, its link to Zenoh."""
+    """HTTP, gRPC and NATS are imported by their folders alone, Zenoh by none; of the client, its link and merging."""
     names = imported(source.read_text())
     first = {name.partition(".")[0] for name in names}
     place = place_of(source)

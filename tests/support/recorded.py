@@ -9,10 +9,11 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from optipmb_schemas import Detections, Keys, Points, Pose, SessionState, Tracks, decode, encode, encoding_of
+from optipmb_client.merging import FinalEvents
+from optipmb_schemas import Detections, Events, Keys, Points, Pose, SessionState, Tracks, decode, encode, encoding_of
 from optipmb_service.stream.checkpoint import digest_of
 from optipmb_service.stream.session import Session
-from optipmb_service.stream.values import Policy, Tracked
+from optipmb_service.stream.values import Policy, Tracked, events_of
 from optipmb_tools.datasets import open_dataset
 from router import plain
 
@@ -82,16 +83,24 @@ def recording(kind: str, root: Path, detector: str, name: str, stream: str, fram
     return Recording(stream, made)
 
 
-def undisturbed(recording: Recording, profile: str, policy: Policy | None = None) -> tuple[list[bytes], str]:
-    """The tracks of every frame, and the digest of the state after the last, of a session that nothing happens to."""
+def undisturbed(
+    recording: Recording, profile: str, policy: Policy | None = None
+) -> tuple[list[bytes], str, list[bytes]]:
+    """Tracks of every frame, digest of the last state, and events of a session that nothing happens to."""
     session = Session(recording.stream, optipmb.load_profile(profile), policy)
     outputs = []
     for detections, points in recording.frames:
         if points is not None:
             outputs += session.on_points(points, 0)
         outputs += session.on_detections(detections, 0)
-    tracks = [plain(output.tracks) for output in outputs if isinstance(output, Tracked)]
-    return tracks, digest_of(session.snapshot())
+    tracked = [output for output in outputs if isinstance(output, Tracked)]
+    events = [bare_events(events_of(one.header, one.events, None)) for one in tracked if one.events]
+    return [plain(one.tracks) for one in tracked], digest_of(session.snapshot()), events
+
+
+def bare_events(message: Events) -> bytes:
+    """The bytes of the events of a frame that must be the same in every run."""
+    return encode(message.model_copy(update={"delivery": None, "revision": 0, "zones": None}))
 
 
 @dataclass
@@ -101,6 +110,15 @@ class Replayed:
     tracks: dict[int, set[bytes]] = field(default_factory=dict)
     repeated: int = 0
     times_ns: list[int] = field(default_factory=list)
+    merged: FinalEvents = field(default_factory=FinalEvents)
+    final: list[bytes] = field(default_factory=list)
+    """Events of frames as they became final."""
+
+    @property
+    def events(self) -> list[bytes]:
+        """Events of all frames, final or not."""
+        rest = sorted(self.merged.held.values(), key=lambda one: one.seq)
+        return self.final + [bare_events(one) for one in rest if one.events]
 
 
 class Replay:
@@ -140,6 +158,19 @@ class Replay:
                 result.times_ns.append(time.monotonic_ns())
             seen.add(plain(tracks))
             self.changed.notify_all()
+
+    def take_events(self, payload: bytes) -> None:
+        """Take in a message of events."""
+        events = decode(payload, Events)
+        if (result := self.results.get(events.stream)) is not None:
+            with self.changed:
+                result.final += [bare_events(one) for one in result.merged.take(events) if one.events]
+                self.changed.notify_all()
+
+    def wait_events(self, stream: str, expected: list[bytes], deadline_s: float) -> bool:
+        """Wait until the events of a stream are those expected."""
+        with self.changed:
+            return self.changed.wait_for(lambda: self.results[stream].events == expected, deadline_s)
 
     def start(self) -> None:
         """Begin to send."""

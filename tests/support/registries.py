@@ -24,6 +24,7 @@ class Around:
     """Everything around the streams: it grants them all, keeps their states, and gives them turns when told to."""
 
     strained = unlinked = False
+    durable = True
 
     def __init__(self) -> None:
         self._working: list[Callable[[], bool]] = []

@@ -59,7 +59,7 @@ for seed, modules in enumerate([optipmb.Modules(), optipmb.Modules(), *baselines
         frame = replace(frame, cloud=cloud)  # as where a cloud comes after its frame
         result = tracker.step(density, frame)
         density, tracks = result.density, result.tracks
-        state, _ = observe(zones, state, frame.stamp_ns, tracks, parameters.labels, tracks.confirmed)
+        state, _ = observe(zones, state, frame.stamp_ns, tracks, parameters.labels)
     stored = {name: read_only(column) for name, column in optipmb.columns_of(density).items()}
     density = optipmb.density_of(density.stamp_ns, density.next_id, stored, parameters.labels)
     tracker.step(density, frame)

@@ -14,6 +14,7 @@ from optipmb_schemas import (
     ResetRequest,
     SessionParameters,
     SessionState,
+    Topic,
     decode,
     encode,
     encoding_of,
@@ -73,9 +74,9 @@ class GrpcConnection:
         publishing = Publishing(self._channels, stream, cache, cache_clouds, self._timeout)
         return GrpcSender(publishing, "detections"), GrpcSender(publishing, "points")
 
-    def subscribe_tracks(self, pattern: str, inbox: Inbox, *, prefix: str, problems: bool) -> GrpcSubscription:
-        """Move the tracks of a pattern into an inbox, its problems too where that is asked for."""
-        return GrpcSubscription(self._channels, pattern, inbox, Keys(prefix), problems=problems, timeout=self._timeout)
+    def subscribe_streams(self, pattern: str, inbox: Inbox, *topics: Topic, prefix: str) -> GrpcSubscription:
+        """Move topics of a pattern of streams into an inbox: tracks, perhaps with problems, or events."""
+        return GrpcSubscription(self._channels, pattern, inbox, Keys(prefix), topics=topics, timeout=self._timeout)
 
     def query(self, key: str, payload: bytes = b"", encoding: str = "", *, timeout: float = 2.0) -> tuple[Answer, ...]:
         """Ask at the key of a query about a stream: its state, its parameters, a reset.

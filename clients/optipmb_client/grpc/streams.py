@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, TypeVar
 
-from optipmb_schemas import Keys, Message
+from optipmb_schemas import Keys, Message, Topic
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
@@ -213,14 +213,14 @@ class _ProtoArrival(Arrival):
 
 
 class GrpcSubscription(ResumedCall):
-    """A `Subscribe` call, made again when it ends; kept tracks come first each time.
+    """A `Subscribe` or `SubscribeEvents` call, made again when it ends; kept messages come first each time.
 
     Args:
         channels: to gateways.
         pattern: of streams.
         inbox: for the messages.
         keys: of the network, for the names of arrivals.
-        problems: whether problems come too.
+        topics: tracks, perhaps with problems, or events.
         timeout: seconds to wait until it is in force.
 
     Raises:
@@ -229,10 +229,13 @@ class GrpcSubscription(ResumedCall):
     """
 
     def __init__(
-        self, channels: Channels, pattern: str, inbox: Inbox, keys: Keys, *, problems: bool, timeout: float
+        self, channels: Channels, pattern: str, inbox: Inbox, keys: Keys, *, topics: Sequence[Topic], timeout: float
     ) -> None:
-        super().__init__(channels, "Subscribe", f"subscribe {pattern}")
-        request = pb.SubscribeRequest(pattern=pattern, queue=QUEUE, history=True, problems=problems)
+        self._events = "events" in topics
+        super().__init__(channels, "SubscribeEvents" if self._events else "Subscribe", f"subscribe {pattern}")
+        request: Any = pb.SubscribeRequest(pattern=pattern, queue=QUEUE, history=True, problems="problems" in topics)
+        if self._events:
+            request = pb.SubscribeEventsRequest(pattern=pattern, final=False, history=True)
         self._request = request.SerializeToString()
         self._inbox = inbox
         self._keys = keys
@@ -255,9 +258,9 @@ class GrpcSubscription(ResumedCall):
             self._inbox.close()  # nothing will come any more
 
     def _take(self, response: bytes) -> None:
-        said = pb.SubscribeResponse.FromString(response)
+        said = (pb.SubscribeEventsResponse if self._events else pb.SubscribeResponse).FromString(response)
         self._inbox.dropped += said.skipped
-        tracks = said.WhichOneof("response") == "tracks"
-        proto = said.tracks if tracks else said.problem
-        key = self._keys.tracks(proto.stream) if tracks else self._keys.problems(proto.stream)
+        (name,) = {field.name for field, _ in said.ListFields()} - {"skipped"}
+        proto = getattr(said, name)
+        key = getattr(self._keys, "problems" if name == "problem" else name)(proto.stream)
         self._inbox.put(_ProtoArrival(key, b"", "application/protobuf", time.monotonic_ns(), proto=proto))

@@ -107,9 +107,8 @@ class Connection:
         """
         return self._session.subscribe(pattern, inbox.put, history=True)
 
-    def subscribe_tracks(self, pattern: str, inbox: Inbox, *, prefix: str, problems: bool) -> contextlib.ExitStack:
-        """Move the tracks of a pattern into an inbox, its problems too where that is asked for."""
-        topics: tuple[Topic, ...] = ("tracks", "problems") if problems else ("tracks",)
+    def subscribe_streams(self, pattern: str, inbox: Inbox, *topics: Topic, prefix: str) -> contextlib.ExitStack:
+        """Move topics of a pattern of streams into an inbox: tracks, perhaps with problems, or events."""
         self._session.require(CACHED * len(topics))
         subscriptions = contextlib.ExitStack()
         for topic in topics:

@@ -75,6 +75,8 @@ def to_proto(message: Message) -> Any:
             fields[name] = _array(value, described.dtype) if described.rows else value.tolist()
         elif isinstance(value, Message):
             fields[name] = to_proto(value)
+        elif isinstance(value, tuple) and value and isinstance(value[0], Message):
+            fields[name] = [to_proto(one) for one in value]
         elif name == "frame":
             fields[name] = _FRAME_CODES[value]
         else:
@@ -110,11 +112,12 @@ def _array(array: NDArray[Any], dtype: str) -> pb.Array:
 
 
 def _fields(proto: ProtoMessage) -> dict[str, Any]:
-    """Return the fields as `build` takes them. An absent one that can tell so is left out."""
+    """Return the fields as `build` takes them. An absent one that can tell so, or a list of messages, is left out."""
+    present = {field.name for field, _ in proto.ListFields()}
     return {
         name: read(getattr(proto, name))
-        for name, read, has_presence in _readers(proto.DESCRIPTOR.full_name)
-        if not has_presence or proto.HasField(name)
+        for name, read, can_be_absent in _readers(proto.DESCRIPTOR.full_name)
+        if not can_be_absent or name in present
     }
 
 
@@ -122,12 +125,15 @@ def _fields(proto: ProtoMessage) -> dict[str, Any]:
 def _readers(name: str) -> list[tuple[str, Callable[[Any], Any], bool]]:
     """Return of every field of a message type its name, how to read it, and whether it can be absent."""
     fields = pb.DESCRIPTOR.message_types_by_name[name.rpartition(".")[2]].fields
-    return [(field.name, _reader(field), field.has_presence) for field in fields]
+    return [
+        (field.name, _reader(field), field.has_presence or (field.is_repeated and field.message_type is not None))
+        for field in fields
+    ]
 
 
 def _reader(field: FieldDescriptor) -> Callable[[Any], Any]:
     if field.is_repeated:
-        return list
+        return list if field.message_type is None else lambda values: [_fields(one) for one in values]
     if field.enum_type is not None:
         return _frame
     if field.message_type is None:

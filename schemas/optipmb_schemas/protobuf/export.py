@@ -16,7 +16,17 @@ from typing import Final
 
 from optipmb_schemas.control import Problem, SessionParameters, SessionState, SessionSummary
 from optipmb_schemas.export import bring_up_to_date, read
-from optipmb_schemas.messages import Delivery, Detections, FieldOfView, Points, Pose, Tracks
+from optipmb_schemas.messages import (
+    Delivery,
+    Detections,
+    Events,
+    FieldOfView,
+    Points,
+    Pose,
+    Tracks,
+    ZoneCount,
+    ZoneEvent,
+)
 from optipmb_schemas.model import Message
 
 SOURCE: Final = "optipmb/v1/tracking.proto"
@@ -27,6 +37,9 @@ MODELS: Final[tuple[type[Message], ...]] = (
     Points,
     Delivery,
     Tracks,
+    ZoneEvent,
+    ZoneCount,
+    Events,
     Problem,
     SessionState,
     SessionParameters,

@@ -126,7 +126,7 @@ class Points(_message.Message):
     def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., frame: _Optional[_Union[Frame, str]] = ..., pose: _Optional[_Union[Pose, _Mapping]] = ..., xyz: _Optional[_Union[Array, _Mapping]] = ...) -> None: ...
 
 class Delivery(_message.Message):
-    __slots__ = ("instance", "received_ns", "published_ns", "queue_ms", "decode_ms", "step_ms", "run")
+    __slots__ = ("instance", "received_ns", "published_ns", "queue_ms", "decode_ms", "step_ms", "run", "final_session", "final_ns")
     INSTANCE_FIELD_NUMBER: _ClassVar[int]
     RECEIVED_NS_FIELD_NUMBER: _ClassVar[int]
     PUBLISHED_NS_FIELD_NUMBER: _ClassVar[int]
@@ -134,6 +134,8 @@ class Delivery(_message.Message):
     DECODE_MS_FIELD_NUMBER: _ClassVar[int]
     STEP_MS_FIELD_NUMBER: _ClassVar[int]
     RUN_FIELD_NUMBER: _ClassVar[int]
+    FINAL_SESSION_FIELD_NUMBER: _ClassVar[int]
+    FINAL_NS_FIELD_NUMBER: _ClassVar[int]
     instance: str
     received_ns: int
     published_ns: int
@@ -141,7 +143,9 @@ class Delivery(_message.Message):
     decode_ms: float
     step_ms: float
     run: int
-    def __init__(self, instance: _Optional[str] = ..., received_ns: _Optional[int] = ..., published_ns: _Optional[int] = ..., queue_ms: _Optional[float] = ..., decode_ms: _Optional[float] = ..., step_ms: _Optional[float] = ..., run: _Optional[int] = ...) -> None: ...
+    final_session: str
+    final_ns: int
+    def __init__(self, instance: _Optional[str] = ..., received_ns: _Optional[int] = ..., published_ns: _Optional[int] = ..., queue_ms: _Optional[float] = ..., decode_ms: _Optional[float] = ..., step_ms: _Optional[float] = ..., run: _Optional[int] = ..., final_session: _Optional[str] = ..., final_ns: _Optional[int] = ...) -> None: ...
 
 class Tracks(_message.Message):
     __slots__ = ("stream", "epoch", "seq", "stamp_ns", "sensor", "session", "revision", "profile", "cloud_used", "gap", "ignored", "labels", "id", "label", "center", "size", "yaw", "heading_confidence", "velocity", "yaw_rate", "acceleration", "existence", "score", "covariance", "age", "time_since_detection", "detection", "confirmed", "class_probability", "horizons", "path_position", "path_yaw", "path_covariance", "delivery")
@@ -214,6 +218,80 @@ class Tracks(_message.Message):
     path_covariance: Array
     delivery: Delivery
     def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., sensor: _Optional[str] = ..., session: _Optional[str] = ..., revision: _Optional[int] = ..., profile: _Optional[str] = ..., cloud_used: _Optional[bool] = ..., gap: _Optional[int] = ..., ignored: _Optional[int] = ..., labels: _Optional[_Iterable[str]] = ..., id: _Optional[_Union[Array, _Mapping]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., heading_confidence: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., yaw_rate: _Optional[_Union[Array, _Mapping]] = ..., acceleration: _Optional[_Union[Array, _Mapping]] = ..., existence: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., covariance: _Optional[_Union[Array, _Mapping]] = ..., age: _Optional[_Union[Array, _Mapping]] = ..., time_since_detection: _Optional[_Union[Array, _Mapping]] = ..., detection: _Optional[_Union[Array, _Mapping]] = ..., confirmed: _Optional[_Union[Array, _Mapping]] = ..., class_probability: _Optional[_Union[Array, _Mapping]] = ..., horizons: _Optional[_Union[Array, _Mapping]] = ..., path_position: _Optional[_Union[Array, _Mapping]] = ..., path_yaw: _Optional[_Union[Array, _Mapping]] = ..., path_covariance: _Optional[_Union[Array, _Mapping]] = ..., delivery: _Optional[_Union[Delivery, _Mapping]] = ...) -> None: ...
+
+class ZoneEvent(_message.Message):
+    __slots__ = ("zone", "kind", "n", "id", "label", "at_ns", "position", "speed", "yaw", "how", "dwell_s", "direction")
+    ZONE_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    N_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    LABEL_FIELD_NUMBER: _ClassVar[int]
+    AT_NS_FIELD_NUMBER: _ClassVar[int]
+    POSITION_FIELD_NUMBER: _ClassVar[int]
+    SPEED_FIELD_NUMBER: _ClassVar[int]
+    YAW_FIELD_NUMBER: _ClassVar[int]
+    HOW_FIELD_NUMBER: _ClassVar[int]
+    DWELL_S_FIELD_NUMBER: _ClassVar[int]
+    DIRECTION_FIELD_NUMBER: _ClassVar[int]
+    zone: str
+    kind: str
+    n: int
+    id: int
+    label: int
+    at_ns: int
+    position: _containers.RepeatedScalarFieldContainer[float]
+    speed: float
+    yaw: float
+    how: str
+    dwell_s: float
+    direction: str
+    def __init__(self, zone: _Optional[str] = ..., kind: _Optional[str] = ..., n: _Optional[int] = ..., id: _Optional[int] = ..., label: _Optional[int] = ..., at_ns: _Optional[int] = ..., position: _Optional[_Iterable[float]] = ..., speed: _Optional[float] = ..., yaw: _Optional[float] = ..., how: _Optional[str] = ..., dwell_s: _Optional[float] = ..., direction: _Optional[str] = ...) -> None: ...
+
+class ZoneCount(_message.Message):
+    __slots__ = ("zone", "inside", "entered", "left", "appeared", "lost", "to_left", "to_right")
+    ZONE_FIELD_NUMBER: _ClassVar[int]
+    INSIDE_FIELD_NUMBER: _ClassVar[int]
+    ENTERED_FIELD_NUMBER: _ClassVar[int]
+    LEFT_FIELD_NUMBER: _ClassVar[int]
+    APPEARED_FIELD_NUMBER: _ClassVar[int]
+    LOST_FIELD_NUMBER: _ClassVar[int]
+    TO_LEFT_FIELD_NUMBER: _ClassVar[int]
+    TO_RIGHT_FIELD_NUMBER: _ClassVar[int]
+    zone: str
+    inside: _containers.RepeatedScalarFieldContainer[int]
+    entered: _containers.RepeatedScalarFieldContainer[int]
+    left: _containers.RepeatedScalarFieldContainer[int]
+    appeared: _containers.RepeatedScalarFieldContainer[int]
+    lost: _containers.RepeatedScalarFieldContainer[int]
+    to_left: _containers.RepeatedScalarFieldContainer[int]
+    to_right: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, zone: _Optional[str] = ..., inside: _Optional[_Iterable[int]] = ..., entered: _Optional[_Iterable[int]] = ..., left: _Optional[_Iterable[int]] = ..., appeared: _Optional[_Iterable[int]] = ..., lost: _Optional[_Iterable[int]] = ..., to_left: _Optional[_Iterable[int]] = ..., to_right: _Optional[_Iterable[int]] = ...) -> None: ...
+
+class Events(_message.Message):
+    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "sensor", "session", "revision", "labels", "events", "zones", "delivery")
+    STREAM_FIELD_NUMBER: _ClassVar[int]
+    EPOCH_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    STAMP_NS_FIELD_NUMBER: _ClassVar[int]
+    SENSOR_FIELD_NUMBER: _ClassVar[int]
+    SESSION_FIELD_NUMBER: _ClassVar[int]
+    REVISION_FIELD_NUMBER: _ClassVar[int]
+    LABELS_FIELD_NUMBER: _ClassVar[int]
+    EVENTS_FIELD_NUMBER: _ClassVar[int]
+    ZONES_FIELD_NUMBER: _ClassVar[int]
+    DELIVERY_FIELD_NUMBER: _ClassVar[int]
+    stream: str
+    epoch: bytes
+    seq: int
+    stamp_ns: int
+    sensor: str
+    session: str
+    revision: int
+    labels: _containers.RepeatedScalarFieldContainer[str]
+    events: _containers.RepeatedCompositeFieldContainer[ZoneEvent]
+    zones: _containers.RepeatedCompositeFieldContainer[ZoneCount]
+    delivery: Delivery
+    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., sensor: _Optional[str] = ..., session: _Optional[str] = ..., revision: _Optional[int] = ..., labels: _Optional[_Iterable[str]] = ..., events: _Optional[_Iterable[_Union[ZoneEvent, _Mapping]]] = ..., zones: _Optional[_Iterable[_Union[ZoneCount, _Mapping]]] = ..., delivery: _Optional[_Union[Delivery, _Mapping]] = ...) -> None: ...
 
 class Problem(_message.Message):
     __slots__ = ("stream", "instance", "code", "path", "expected", "received", "message", "seq", "stamp_ns", "count", "reported_ns")
@@ -462,6 +540,30 @@ class SubscribeResponse(_message.Message):
     problem: Problem
     skipped: int
     def __init__(self, tracks: _Optional[_Union[Tracks, _Mapping]] = ..., problem: _Optional[_Union[Problem, _Mapping]] = ..., skipped: _Optional[int] = ...) -> None: ...
+
+class SubscribeEventsRequest(_message.Message):
+    __slots__ = ("pattern", "zones", "kinds", "classes", "final", "history")
+    PATTERN_FIELD_NUMBER: _ClassVar[int]
+    ZONES_FIELD_NUMBER: _ClassVar[int]
+    KINDS_FIELD_NUMBER: _ClassVar[int]
+    CLASSES_FIELD_NUMBER: _ClassVar[int]
+    FINAL_FIELD_NUMBER: _ClassVar[int]
+    HISTORY_FIELD_NUMBER: _ClassVar[int]
+    pattern: str
+    zones: _containers.RepeatedScalarFieldContainer[str]
+    kinds: _containers.RepeatedScalarFieldContainer[str]
+    classes: _containers.RepeatedScalarFieldContainer[str]
+    final: bool
+    history: bool
+    def __init__(self, pattern: _Optional[str] = ..., zones: _Optional[_Iterable[str]] = ..., kinds: _Optional[_Iterable[str]] = ..., classes: _Optional[_Iterable[str]] = ..., final: _Optional[bool] = ..., history: _Optional[bool] = ...) -> None: ...
+
+class SubscribeEventsResponse(_message.Message):
+    __slots__ = ("events", "skipped")
+    EVENTS_FIELD_NUMBER: _ClassVar[int]
+    SKIPPED_FIELD_NUMBER: _ClassVar[int]
+    events: Events
+    skipped: int
+    def __init__(self, events: _Optional[_Union[Events, _Mapping]] = ..., skipped: _Optional[int] = ...) -> None: ...
 
 class GetStateRequest(_message.Message):
     __slots__ = ("stream",)

@@ -77,6 +77,11 @@ class TrackingServiceStub:
                 request_serializer=optipmb_dot_v1_dot_tracking__pb2.QueryTracksRequest.SerializeToString,
                 response_deserializer=optipmb_dot_v1_dot_tracking__pb2.QueryTracksResponse.FromString,
                 _registered_method=True)
+        self.SubscribeEvents = channel.unary_stream(
+                '/optipmb.v1.TrackingService/SubscribeEvents',
+                request_serializer=optipmb_dot_v1_dot_tracking__pb2.SubscribeEventsRequest.SerializeToString,
+                response_deserializer=optipmb_dot_v1_dot_tracking__pb2.SubscribeEventsResponse.FromString,
+                _registered_method=True)
 
 
 class TrackingServiceServicer:
@@ -142,6 +147,13 @@ class TrackingServiceServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def SubscribeEvents(self, request, context):
+        """Sends the events of zones and lines of the streams of a pattern.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_TrackingServiceServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -184,6 +196,11 @@ def add_TrackingServiceServicer_to_server(servicer, server):
                     servicer.QueryTracks,
                     request_deserializer=optipmb_dot_v1_dot_tracking__pb2.QueryTracksRequest.FromString,
                     response_serializer=optipmb_dot_v1_dot_tracking__pb2.QueryTracksResponse.SerializeToString,
+            ),
+            'SubscribeEvents': grpc.unary_stream_rpc_method_handler(
+                    servicer.SubscribeEvents,
+                    request_deserializer=optipmb_dot_v1_dot_tracking__pb2.SubscribeEventsRequest.FromString,
+                    response_serializer=optipmb_dot_v1_dot_tracking__pb2.SubscribeEventsResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -404,6 +421,33 @@ class TrackingService:
             '/optipmb.v1.TrackingService/QueryTracks',
             optipmb_dot_v1_dot_tracking__pb2.QueryTracksRequest.SerializeToString,
             optipmb_dot_v1_dot_tracking__pb2.QueryTracksResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def SubscribeEvents(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_stream(
+            request,
+            target,
+            '/optipmb.v1.TrackingService/SubscribeEvents',
+            optipmb_dot_v1_dot_tracking__pb2.SubscribeEventsRequest.SerializeToString,
+            optipmb_dot_v1_dot_tracking__pb2.SubscribeEventsResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -139,7 +139,7 @@ class Service(Reporter):
     def start(self, *, announce: bool = True) -> None:
         """Receive, answer, and say so."""
         self._transport.watch()
-        self._checkpoints.start(self._streams.keep)
+        self._checkpoints.start(self._streams.keep, self._streams.kept)
         self._member.start(self._intake.changed, self._streams.resume, self._streams.occupied, self.client().linked)
         self._intake.start()
         self._transport.serve(self._stream_queries.answer, self._service_queries.answer)

@@ -10,7 +10,8 @@ import asyncio
 import collections
 import contextlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from functools import partial
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import optipmb_schemas as schemas
 from optipmb_schemas.protobuf import convert
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
 
     from optipmb_service.grpc.selection import Selection
     from optipmb_service.zenoh.client import Client, Outgoing
+
+    T = TypeVar("T")
+    M = TypeVar("M", bound=schemas.Message)
 
 IDLE_SUBSCRIPTIONS: Final = 256
 IDLE_PUBLISHERS: Final = 64
@@ -53,12 +57,14 @@ class Item:
     Attributes:
         tracks: of which it is, if it is of any.
         problem: its code and path, if it is one.
+        events: of zones, if it is these; each call makes its own response of them.
     """
 
     stream: str
     response: bytes
     tracks: EncodedTracks | None = None
     problem: tuple[str, str] | None = None
+    events: schemas.Events | None = None
 
     @classmethod
     def of_tracks(cls, tracks: EncodedTracks, selection: Selection = EVERYTHING) -> Item:
@@ -100,19 +106,22 @@ class Listener:
         """Pass on an item, now or when the caches have been asked, or leave it out."""
         if self._early is not None and len(self._early) < MAX_EARLY:
             self._early.append(item)
-        elif item.tracks is None or _publication(item.tracks) not in self._known:
+            return
+        of = item.tracks or item.events
+        if of is None or _publication(of) not in self._known:
             self._take(item)
 
-    def begin(self, held: Iterable[EncodedTracks]) -> None:
+    def begin(self, held: Iterable[EncodedTracks | schemas.Events]) -> None:
         """Leave out the contents of the caches, and pass on the other items that came while they were asked."""
-        self._known = {_publication(tracks) for tracks in held}
+        self._known = {_publication(one) for one in held}
         early, self._early = self._early or [], None
         for item in early:
             self.put(item)
 
 
-def _publication(tracks: EncodedTracks) -> tuple[object, ...]:
-    return tracks.stream, tracks.sensor, tracks.epoch, tracks.seq, tracks.run, tracks.revision
+def _publication(one: EncodedTracks | schemas.Events) -> tuple[object, ...]:
+    delivery = one.delivery if isinstance(one, schemas.Events) else one
+    return one.stream, one.sensor or "", one.epoch, one.seq, delivery and delivery.run, one.revision
 
 
 class Network:
@@ -176,12 +185,15 @@ class Network:
         Raises:
             TransportError: the network cannot be used.
         """
+        return await asyncio.to_thread(self._cached, key, self._tracks)
 
-        def read() -> list[EncodedTracks]:
-            messages = self._client.cached(key, timeout=HISTORY_S)
-            return [tracks for one in messages if (tracks := self._tracks(one)) is not None]
+    async def recent_events(self, key: str) -> list[schemas.Events]:
+        """Do the same for events."""
+        return await asyncio.to_thread(self._cached, key, partial(self._decoded, schemas.Events))
 
-        return await asyncio.to_thread(read)
+    def _cached(self, key: str, read: Callable[[Answer], T | None]) -> list[T]:
+        messages = self._client.cached(key, timeout=HISTORY_S)
+        return [found for one in messages if (found := read(one)) is not None]
 
     def _receive(self, listeners: tuple[Listener, ...], message: Arrival) -> None:
         """Take a message on the thread of its subscription."""
@@ -189,9 +201,14 @@ class Network:
             return
         arrived: list[tuple[Listener, Item]] = []
         if message.key.endswith("/problems"):
-            problem = self._problem(message)
+            problem = self._decoded(schemas.Problem, message)
             if problem is not None:
                 item = Item.of_problem(problem)
+                arrived = [(listener, item) for listener in listeners]
+        elif message.key.endswith("/events"):
+            events = self._decoded(schemas.Events, message)
+            if events is not None:
+                item = Item(events.stream, b"", events=events)
                 arrived = [(listener, item) for listener in listeners]
         else:
             tracks = self._tracks(message)
@@ -220,9 +237,9 @@ class Network:
             self._invalid(str(error))
             return None
 
-    def _problem(self, message: Arrival) -> schemas.Problem | None:
+    def _decoded(self, kind: type[M], message: Answer | Arrival) -> M | None:
         try:
-            return schemas.decode(message.payload, schemas.Problem, encoding=message.encoding)
+            return schemas.decode(message.payload, kind, encoding=message.encoding)
         except schemas.MessageError as error:
             self._invalid(str(error))
             return None

@@ -14,7 +14,7 @@ from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_service.edge.readers import Outbox, Pace, listed
 from optipmb_service.grpc.calls import EndCall
 from optipmb_service.grpc.network import Item, Listener
-from optipmb_service.grpc.selection import Selection
+from optipmb_service.grpc.selection import EventSelection, Selection
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable
@@ -65,6 +65,33 @@ async def subscribe(call: Call) -> None:
         for one in history if asked.history else ():
             if passes(one):
                 await call.write(Item.of_tracks(one, selection).response)
+        listener.begin(history)
+        try:
+            await call.drain(outbox)
+        finally:
+            call.left_out += outbox.left_out
+    call.check_ending()
+
+
+async def subscribe_events(call: Call) -> None:
+    """Send the events of a pattern, final ones by default, until the caller or the gateway ends it."""
+    asked = await call.request(pb.SubscribeEventsRequest)
+    key, network = call.gateway.client.keys.matching(asked.pattern, "events"), call.gateway.network
+    call.caller.may_read(asked.pattern)
+    chosen = EventSelection(asked)
+    outbox: Outbox[bytes] = Outbox(MAX_QUEUE)
+
+    def take(item: Item) -> None:
+        for response in chosen.responses(item.events):
+            outbox.put(item.stream, response, len(response))
+
+    listener = Listener(take)
+    async with network.subscribed(key, listener):
+        await call.begin()
+        history = await network.recent_events(key)
+        for one in history if asked.history else ():
+            for response in chosen.responses(one):
+                await call.write(response)
         listener.begin(history)
         try:
             await call.drain(outbox)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+import collections
+from typing import TYPE_CHECKING, Final, get_args
 
 import numpy as np
 import optipmb_schemas as schemas
+from optipmb_client.merging import FinalEvents
 from optipmb_schemas.json_form import CONFIRMED_EXISTENCE
+from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf.convert import column, select
 
@@ -16,6 +19,7 @@ if TYPE_CHECKING:
 MAX_CORNERS: Final = 1000
 MAX_NAMES: Final = 256
 CORNERS: Final = 3
+KINDS: Final = get_args(schemas.ZoneEvent.model_fields["kind"].annotation)
 
 
 class Selection:
@@ -78,6 +82,51 @@ class Selection:
 
 
 EVERYTHING: Final = Selection(pb.TrackFilter())
+
+
+class EventSelection:
+    """Events as they were asked for.
+
+    Args:
+        asked: the request.
+
+    Raises:
+        MessageError: it is not valid, with the path of its field.
+    """
+
+    def __init__(self, asked: pb.SubscribeEventsRequest) -> None:
+        self._chosen = {name: frozenset(getattr(asked, name)) for name in ("zones", "kinds", "classes")}
+        for name, values in self._chosen.items():
+            if len(values) > MAX_NAMES:
+                raise schemas.MessageError("too_large", name, f"at most {MAX_NAMES}", str(len(values)))
+        if unknown := self._chosen["kinds"] - set(KINDS):
+            expected = f"some of {', '.join(KINDS)}"
+            raise schemas.MessageError("invalid_value", "kinds", expected, ascii(min(unknown))[:80])
+        self._final = asked.final or not asked.HasField("final")
+        self._streams: dict[str, FinalEvents] = collections.defaultdict(FinalEvents)
+
+    def responses(self, message: schemas.Events | None) -> list[bytes]:
+        """Return the responses that a message makes due."""
+        if message is None:
+            return []
+        due = self._streams[message.stream].take(message) if self._final else [message]
+        return [
+            pb.SubscribeEventsResponse(events=convert.to_proto(one)).SerializeToString()
+            for one in map(self._of, due)
+            if one.events or one.zones or not self._final
+        ]
+
+    def _of(self, message: schemas.Events) -> schemas.Events:
+        zones, kinds, classes = self._chosen.values()
+        events = tuple(
+            one
+            for one in message.events
+            if (not zones or one.zone in zones)
+            and (not kinds or one.kind in kinds)
+            and (not classes or message.labels[one.label] in classes)
+        )
+        counts = message.zones and tuple(one for one in message.zones if not zones or one.zone in zones)
+        return message.model_copy(update={"events": events, "zones": counts})
 
 
 def _inside(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -41,6 +41,7 @@ METHODS: Final[dict[str, Callable[[Call], Awaitable[None]]]] = {
     "Track": inputs.track,
     "Publish": inputs.publish,
     "Subscribe": outputs.subscribe,
+    "SubscribeEvents": outputs.subscribe_events,
     "QueryTracks": outputs.query_tracks,
     "GetState": outputs.get_state,
     "Reset": outputs.reset,

@@ -100,6 +100,7 @@ class CheckpointWriter:
         """Whether checkpoints are there after a restart."""
         self._interval_s = interval_s
         self._gather: Callable[[], None] = lambda: None
+        self._kept: Callable[[Checkpoint], None] = lambda _: None
         self._member = member
         self._lock = threading.Lock()
         self._pending: dict[str, tuple[Checkpoint, int | None]] = {}
@@ -117,9 +118,9 @@ class CheckpointWriter:
         self.complete_ns = time.monotonic_ns() if off != "" else None
         """Monotonic time at which the store last had all that it should; None when nothing is to be kept."""
 
-    def start(self, gather: Callable[[], None]) -> None:
-        """Begin the rounds."""
-        self._gather = gather
+    def start(self, gather: Callable[[], None], kept: Callable[[Checkpoint], None] = lambda _: None) -> None:
+        """Begin the rounds: `gather` has changed sessions give their states, `kept` gets each that was written."""
+        self._gather, self._kept = gather, kept
         if self.durable:
             self._thread.start()
 
@@ -307,14 +308,16 @@ class CheckpointWriter:
             self.written += len(encoded) - len(lost)
             for stream in encoded:
                 self._failed_streams.pop(stream, None)
+                if stream in lost:
+                    log.warning("checkpoint_refused", stream=stream)
+                else:
+                    self._kept(mine[stream][0])
             if encoded and self._store_failure:
                 self._store_failure = ""
                 log.info("store_back")
             if not (waited_for or later or self.failure):  # all sessions that changed have given their states
                 self.complete_ns = time.monotonic_ns()
             self._whole = not (lapsed or self._failed_streams)
-            for stream in lost:
-                log.warning("checkpoint_refused", stream=stream)
         with self._lock:
             self._pending, self._writing = later | self._pending, {}
             self._thens += [one for one in thens if one[0] in later]

@@ -20,6 +20,8 @@ import optipmb
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    from optipmb_service.settings import ZoneSettings
+
 
 @dataclass(frozen=True)
 class Profiles:
@@ -49,6 +51,20 @@ class Profiles:
         for parameters in tuple(known.values()):
             known.setdefault(parameters.name, parameters)
         return cls(default, tuple(patterns.items()), known)
+
+    def check_zones(self, zones: Mapping[str, ZoneSettings]) -> None:
+        """Check the classes of zones.
+
+        Raises:
+            optipmb.ParameterError: no profile of the settings has one of them.
+        """
+        profiles = [self.known[name] for name in (self.default, *(name for _, name in self.patterns))]
+        labels = sorted({label for one in profiles for label in one.labels})
+        for name, zone in zones.items():
+            for label in zone.classes:
+                if label not in labels:
+                    expected = f"classes of the profiles in force: {', '.join(labels)}"
+                    raise optipmb.ParameterError(f"setting zones.{name}.classes", expected, repr(label))
 
     def of(self, stream: str) -> optipmb.Parameters:
         """Return the parameters of a stream, `site/node/sensor`."""

@@ -116,6 +116,7 @@ class StreamQueries:
         self._commands: dict[str, tuple[_Command, bool]] = {
             "state": (lambda one, _: self._state(one), True),
             "density": (self._density, True),
+            "zones": (self._zones, True),
             "reset": (self._reset, False),
             "parameters": (self._parameters, False),
         }
@@ -255,6 +256,12 @@ class StreamQueries:
             parameters=parameters,
         )
         request.answer(self._keys.query(stream.name, "density"), message)
+
+    def _zones(self, stream: Stream, request: Query) -> None:
+        counts = stream.session.zone_counts() if stream.session else None
+        if counts is None:
+            raise schemas.MessageError("invalid_value", "key", "a stream with zones and frames", stream.name)
+        request.answer(self._keys.query(stream.name, "zones"), counts)
 
     def _reset(self, stream: Stream, request: Query) -> _State:
         asked = self._payload(request, schemas.ResetRequest())

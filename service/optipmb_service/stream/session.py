@@ -43,6 +43,7 @@ from optipmb_service.stream.values import (
     Policy,
     Quarantined,
     RefusedError,
+    events_of,
 )
 from optipmb_service.stream.window import ReorderWindow
 from optipmb_service.telemetry.stream_meter import Counters, total
@@ -54,7 +55,7 @@ if TYPE_CHECKING:
     from optipmb_service.stream.state import Inputs
     from optipmb_service.stream.timeline import Decision, Timeline
     from optipmb_service.stream.transition import Outcome
-    from optipmb_service.stream.values import Reason
+    from optipmb_service.stream.values import Reached, Reason, Tracked
 
     Condition = Literal["new", "running", "recovering", "quarantined", "closed"]
 
@@ -384,6 +385,13 @@ class Session:
         self._end_recovery()
         return self._advance(now_ns)
 
+    def again(self) -> list[Tracked]:
+        """Return the tracks of the window once more, as of this run."""
+        tracked = [one.tracks for one in self._window.again() if one.tracks is not None]
+        for one in tracked:
+            one.run, one.final = self.run, self._window.base.reached
+        return tracked
+
     def unprocessed(self) -> list[tuple[schemas.Detections | schemas.Points, Any]]:
         """Return the messages that are in no snapshot: clouds without their frame, pending frames with their ticket."""
         used = frozenset(id(frame.points) for frame in self._window.frames)
@@ -400,6 +408,21 @@ class Session:
     def session(self) -> str:
         """Id of the present incarnation of the density."""
         return self._window.head.session
+
+    @property
+    def final(self) -> Reached:
+        """Up to where no frame can be inserted any more."""
+        return self._window.base.reached
+
+    def zone_counts(self) -> schemas.Events | None:
+        """Return the counts of all zones after the newest frame; None: there is none, or no zone."""
+        head = self._window.head
+        if (last := head.last) is None or head.zones is None:
+            return None
+        header: dict[str, Any] = {"stream": self.stream, "session": head.session, "labels": self.parameters.labels}
+        header |= {"epoch": last.epoch, "seq": last.seq, "stamp_ns": last.stamp_ns, "sensor": last.sensor or None}
+        header["revision"] = next((one.revision for one in self._window.frames if one.frame_id == last), 0)
+        return events_of(header, (), {one.name: head.zones.counts.get(one.name, {}) for one in self._policy.zones})
 
     @property
     def density(self) -> optipmb.Density:
@@ -710,7 +733,7 @@ class Session:
             inputs: the new frame, decoded; None: frames are inserted or changed.
         """
         window = self._window
-        before = window.head.session
+        before, final = window.head.session, window.base.reached
         try:
             outcomes = window.redo(placed) if inputs is None else window.append(placed[0], inputs)
         except Exception as error:  # noqa: BLE001 - a fault in one session's step must not end the others
@@ -731,7 +754,7 @@ class Session:
                 outputs += self._left_out(one)
             if (tracks := one.tracks) is not None:
                 self._deliveries.corrected += one.frame.revision > 0
-                tracks.ticket, tracks.step_ns, tracks.run = ticket, step_ns, self.run
+                tracks.ticket, tracks.step_ns, tracks.run, tracks.final = ticket, step_ns, self.run, final
                 outputs.append(tracks)
         return outputs
 

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from optipmb.rows import record
 from optipmb_service.stream.timeline import Cursor, FrameId, Order, Placement, Verdict
-from optipmb_service.stream.values import MAX_LABELS, Count, Epoch, Whole
+from optipmb_service.stream.values import MAX_LABELS, Count, Epoch, Reached, Whole
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -127,6 +127,11 @@ class FilterState:
     def cursors(self) -> dict[str, Cursor]:
         """The courses of the sensors."""
         return {name: one.cursor for name, one in self.sensors.items()}
+
+    @property
+    def reached(self) -> Reached:
+        """How far the stream has come with it."""
+        return self.starts, self.last.stamp_ns if self.last else 0, self.session
 
     def begun_anew(self, density: optipmb.Density, session: str) -> FilterState:
         """Return the state in which the next incarnation of the density begins: no classes were reported yet."""

@@ -25,7 +25,7 @@ from optipmb_service.stream.problems import problem_of
 from optipmb_service.stream.recovery import CacheRecovery, LogCheck
 from optipmb_service.stream.session import Session
 from optipmb_service.stream.values import MAX_SENSORS, SECOND, Begun, Incarnation, Quarantined, Tracked
-from optipmb_service.telemetry.stream_meter import Counters, MessageCounters, StreamMeter, total
+from optipmb_service.telemetry.stream_meter import MAX_COUNT, Counters, MessageCounters, StreamMeter, total
 from optipmb_service.zenoh.inputs import Packet
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from optipmb_service.stream.backlog import Backlog, Shed
     from optipmb_service.stream.checkpoint import Checkpoint
     from optipmb_service.stream.streams import Streams
-    from optipmb_service.stream.values import Output
+    from optipmb_service.stream.values import Output, Reached
     from optipmb_service.zenoh.transport import StreamPublisher
 
 log = structlog.get_logger("optipmb_service")
@@ -81,6 +81,8 @@ class Stream:
         self.log_check = LogCheck(streams.silent_ns)
         self._streams = streams
         self._policy = streams.policy_for(name)
+        self.durable: Reached | None = None if streams.checkpoints.durable else (MAX_COUNT, 0, "")
+        """How far the newest checkpoint is that a process would go on from; None: there is none."""
         self._member = streams.member
         self._prefix = f"{streams.keys.prefix}/"
         self._step_limit_ns = streams.step_limit_ns
@@ -284,6 +286,8 @@ class Stream:
             if isinstance(output, Tracked):
                 self._send(output)
             elif isinstance(output, Begun):
+                if session and output.reason in {"first", "parameters"}:
+                    self._check_zones(session)
                 epoch = session.state().epoch if session else None
                 log.info(
                     "session_begun",
@@ -306,8 +310,15 @@ class Stream:
         except TransportError as error:
             log.warning("publisher_failed", stream=self.name, error=str(error))
 
-    def _send(self, tracked: Tracked) -> None:
-        """Publish the tracks of a frame, now or when the write lease holds again."""
+    def _republish_events(self) -> None:
+        """Publish the events of the window in this run: those that the run before published behind it are void."""
+        now = Arrival(time.time_ns(), time.monotonic_ns(), 0)
+        for tracked in self.session.again() if self.session and self._policy.zones else ():
+            tracked.ticket = now
+            self._send(tracked, again=True)
+
+    def _send(self, tracked: Tracked, *, again: bool = False) -> None:
+        """Publish tracks and events of a frame, `again` events alone, now or when the write lease holds again."""
         ticket: Arrival = tracked.ticket
         passed_ns = time.monotonic_ns() - ticket.now_ns
         waited_ns = max(0, passed_ns - ticket.decode_ns - tracked.step_ns)
@@ -320,8 +331,10 @@ class Stream:
             "step_ms": tracked.step_ns / MILLISECOND,
             "run": tracked.run,
         }
-        self._count_tracks(tracked.estimates.id.tobytes())
-        self._unpublished.append((tracked.encoded(delivery), tracked.encoded_events(delivery), tracked, waited_ns))
+        events = tracked.encoded_events(delivery, self.durable)
+        if not again:
+            self._count_tracks(tracked.estimates.id.tobytes())
+        self._unpublished.append((b"" if again else tracked.encoded(delivery), events, tracked, waited_ns))
         self._publish()
 
     def _publish(self) -> None:
@@ -332,12 +345,14 @@ class Stream:
         for payload, events, tracked, waited_ns in waiting:
             try:
                 if self._publisher is not None:
-                    self._publisher.publish(payload)
+                    if payload:
+                        self._publisher.publish(payload)
                     if events is not None:
                         self._publisher.publish_events(events)
             except TransportError as error:
                 log.warning("publish_failed", stream=self.name, error=str(error))
-            else:
+                continue
+            if payload:
                 latency_ns = time.monotonic_ns() - tracked.ticket.now_ns
                 self.meter.published(latency_ns)
                 self._streams.metrics.published(
@@ -372,6 +387,14 @@ class Stream:
         about = {"stream": stream or self.name, "subject": f"{what or 'Stream'}: {path or 'message'}"}
         problem = problem_of(code, instance=self._streams.instance, count=count, **about, **texts)
         self._streams.reporter.report(problem, time.monotonic_ns())
+
+    def _check_zones(self, session: Session) -> None:
+        """Report the classes of zones that the profile lacks."""
+        for zone in self._policy.zones:
+            for label in zone.classes:
+                if label not in session.parameters.labels:
+                    expected = f"one of {', '.join(session.parameters.labels)} (profile {session.parameters.name})"
+                    self.report("unknown_class", f"zones.{zone.name}.classes", expected, repr(label))
 
     def _report_overload(self, stream: str, received: str) -> None:
         expected = f"at most {self._step_limit_ns / 1e9:g} s of processor time for a message"
@@ -490,6 +513,10 @@ class Stream:
             session = self._restored(restored) if restored else self._new(incarnation, fence)
             self._counts.open(session)
             self._changed, self.session = False, session
+            if restored:
+                self.durable = self.durable or session.final
+                self._check_zones(session)
+                self._guard(self._republish_events)
         else:
             self._streams.admission.release(self.name, incarnation)
             self._member.look()

@@ -10,8 +10,7 @@ import queue
 import threading
 import time
 from dataclasses import replace
-from fnmatch import fnmatchcase
-from functools import lru_cache, partial
+from functools import cache, lru_cache, partial
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -19,6 +18,7 @@ import optipmb_schemas as schemas
 import structlog
 
 import optipmb
+from optipmb.zones import MOST
 from optipmb_service.cluster.leases import Change, partition_of
 from optipmb_service.stream.admission import Admission
 from optipmb_service.stream.backlog import MEGABYTE, Backlog, Bounds, ByteBudget
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
     from optipmb_service.cluster.member import Member
     from optipmb_service.settings import Settings
+    from optipmb_service.stream.checkpoint import Checkpoint
     from optipmb_service.stream.intake import Intake
     from optipmb_service.stream.persistence import CheckpointWriter
     from optipmb_service.stream.profiles import Profiles
@@ -134,7 +135,7 @@ class Streams:
         self.fusion = Fusion(settings.fuse)
         self.limits = settings.limits.limits()
         self.policy = policy_of(settings)
-        self._zones = [(one.streams, one.zone(name)) for name, one in sorted(settings.zones.items())]
+        self._zone = cache(settings.zone)
         self.queue_frames = settings.queue_frames
         self.step_limit_ns = round(settings.step_limit_s * SECOND)
         self.silent_ns = round(settings.lease_s * SECOND)
@@ -278,7 +279,12 @@ class Streams:
 
     def policy_for(self, session: str) -> Policy:
         """Return the policy of a session, with its zones."""
-        zones = (zone for patterns, zone in self._zones if any(fnmatchcase(session, one) for one in patterns))
+        names = self._settings.zones_of(session)
+        if len(names) > MOST:
+            expected, received = f"at most {MOST} zones and lines for a session", f"{len(names)}; the last are left out"
+            self._report("refused", session, expected, received, path="zones")
+        site, known = session.partition("/")[0], self._settings.zones
+        zones = (self._zone(name, site if known[name].geo else "") for name in names[:MOST])
         return replace(self.policy, zones=tuple(zones))
 
     def tracking(self) -> list[Stream]:
@@ -423,6 +429,11 @@ class Streams:
             stream.keep()
         return len(some) == KEPT_AT_ONCE
 
+    def kept(self, checkpoint: Checkpoint) -> None:
+        """Note that a checkpoint is durable."""
+        if (stream := self._streams.get(checkpoint.stream)) is not None:
+            stream.durable = checkpoint.base.reached
+
     def keep_now(self) -> None:
         """Do the same in the calling thread, when the tracking thread has ended."""
         for stream in self.tracking():
@@ -564,9 +575,11 @@ class Streams:
             self._past += MessageCounters(received=frame, refused=frame, clouds_refused=not frame)
         self._report(code, stream, expected, received)
 
-    def _report(self, code: str, stream: str, expected: str, received: str, count: int = 1) -> None:
-        texts = {"path": "key", "expected": expected, "received": received}
-        problem = problem_of(code, stream=stream, instance=self.instance, subject="Key", count=count, **texts)
+    def _report(self, code: str, stream: str, expected: str, received: str, count: int = 1, path: str = "key") -> None:
+        texts = {"path": path, "expected": expected, "received": received}
+        problem = problem_of(
+            code, stream=stream, instance=self.instance, subject=path.capitalize(), count=count, **texts
+        )
         self.reporter.report(problem, time.monotonic_ns())
 
     # The table

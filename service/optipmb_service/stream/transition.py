@@ -272,7 +272,7 @@ class Transition:
         )
         zones, tracks.events = self._zones(before, result.tracks, frame_id.stamp_ns)
         second = None if before.last is None else before.last.stamp_ns // SECOND
-        if zones is not None and (frame.revision or second != frame_id.stamp_ns // SECOND):
+        if zones is not None and (frame.revision or begun or second != frame_id.stamp_ns // SECOND):
             tracks.counts = {one.name: zones.counts.get(one.name, {}) for one in self._policy.zones}
         unknown = self._unknown(message, sensor.reported) if ignored else {}
         repaired = int(result.diagnostics.repaired)
@@ -308,7 +308,7 @@ class Transition:
             state, ended = end(zones, state)
             state = replace(state, session=before.session)
         labels = self.parameters.labels
-        state, events = observe(zones, state, stamp_ns, tracks, labels, tracks.confirmed, self._shapes)
+        state, events = observe(zones, state, stamp_ns, tracks, labels, self._shapes)
         return state, (*ended, *events)
 
     def _unknown(self, message: schemas.Detections, reported: frozenset[str]) -> dict[str, int]:

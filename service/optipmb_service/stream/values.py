@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping  # noqa: TC003 - at run time as the others
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
@@ -34,6 +34,14 @@ def _check_sensor(name: str) -> str:
 
 SensorName = Annotated[str, Field(strict=True), AfterValidator(_check_sensor)]
 """Stream of a sensor; empty for the only one of a stream's own session."""
+
+
+Reached = tuple[int, int, str]
+"""Incarnations so far, stamp of the last frame, and session id: in this order states of a stream follow each other."""
+
+
+ZoneCounts = Mapping[str, Mapping[str, Mapping[str, int]]]
+"""Counts by zone, name of `COUNTS` and class."""
 
 
 class JumpLimits(NamedTuple):
@@ -142,6 +150,7 @@ class Tracked:
         run: see `Session.run`.
         events: those of the zones.
         counts: of all zones after the frame, by zone, name of `COUNTS` and class; None: not to be published.
+        final: up to where the window does not change any more.
     """
 
     estimates: optipmb.Tracks
@@ -151,7 +160,8 @@ class Tracked:
     step_ns: int = 0
     run: int = 0
     events: tuple[Event, ...] = ()
-    counts: Mapping[str, Mapping[str, Mapping[str, int]]] | None = None
+    counts: ZoneCounts | None = None
+    final: Reached = (0, 0, "")
 
     @property
     def tracks(self) -> schemas.Tracks:
@@ -169,35 +179,40 @@ class Tracked:
         words = self.estimates.words
         return schemas.encode_columns(schemas.Tracks, self.header, COLUMNS, words, {"delivery": delivery})
 
-    def encoded_events(self, delivery: dict[str, Any]) -> bytes | None:
-        """Return the bytes of the message with the events and counts of zones, None where there are none."""
+    def encoded_events(self, delivery: dict[str, Any], durable: Reached | None) -> bytes | None:
+        """Return the bytes of the message with the events and counts of zones, None where there are none.
+
+        Args:
+            delivery: the values of its delivery part.
+            durable: how far a process that took over would not go back; None: nothing is final.
+        """
         if not self.events and self.counts is None:
             return None
-        counts = self.counts or {}
-        named = (label for zone in counts.values() for by_class in zone.values() for label in by_class)
-        # Of a profile that was in force before there may be classes that this one lacks.
-        labels = tuple(dict.fromkeys((*self.header["labels"], *(one.label for one in self.events), *sorted(named))))
-        message = schemas.Events(
-            **self.header | {"labels": labels},
-            events=tuple(
-                schemas.ZoneEvent(
-                    **one._asdict()
-                    | {"label": labels.index(one.label), "how": one.how or None, "direction": one.direction or None}
-                    | {"dwell_s": one.dwell_s if one.kind in {"left", "stayed"} else None}
-                )
-                for one in self.events
-            ),
-            zones=None
-            if self.counts is None
-            else tuple(_zone_count(name, one, labels) for name, one in counts.items()),
-            delivery=schemas.Delivery.trusted(delivery),
+        if durable is not None:
+            _, final_ns, session = min(self.final, durable)
+            delivery = delivery | {"final_session": session, "final_ns": final_ns}
+        message = events_of(self.header, self.events, self.counts)
+        return schemas.encode(message, delivery=schemas.Delivery.trusted(delivery))
+
+
+def events_of(header: dict[str, Any], events: Sequence[Event], counts: ZoneCounts | None) -> schemas.Events:
+    """Return the message of a frame whose header, as that of its tracks, has the classes in force."""
+    named = (label for zone in (counts or {}).values() for by_class in zone.values() for label in by_class)
+    # Of a profile that was in force before there may be classes that this one lacks.
+    labels = tuple(dict.fromkeys((*header["labels"], *(one.label for one in events), *sorted(named))))
+    told: list[schemas.ZoneEvent] = []
+    for one in events:
+        values: dict[str, Any] = {name: None if value == "" else value for name, value in one._asdict().items()}
+        dwell_s = one.dwell_s if one.kind in {"left", "stayed"} else None
+        told.append(schemas.ZoneEvent.trusted(values | {"label": labels.index(one.label), "dwell_s": dwell_s}))
+    zones = tuple(
+        schemas.ZoneCount.trusted(
+            {"zone": name} | {one: tuple(by.get(one, {}).get(label, 0) for label in labels) for one in COUNTS}
         )
-        return schemas.encode(message)
-
-
-def _zone_count(name: str, counts: Mapping[str, Mapping[str, int]], labels: tuple[str, ...]) -> schemas.ZoneCount:
-    columns = {one: tuple(counts.get(one, {}).get(label, 0) for label in labels) for one in COUNTS}
-    return schemas.ZoneCount(zone=name, **columns)
+        for name, by in (counts or {}).items()
+    )
+    fields = header | {"labels": labels, "events": tuple(told), "zones": None if counts is None else zones}
+    return schemas.Events(**fields)
 
 
 Reason = Literal["first", "jump", "clock", "publisher", "pose", "effort", "reset", "parameters", "quarantine"]

@@ -69,6 +69,14 @@ class ReorderWindow:
             self._after[at] = state
         return state
 
+    def again(self) -> list[Outcome]:
+        """Return the outcomes of its frames once more."""
+        state, outcomes = self.base, []
+        for frame in self._frames:
+            state, outcome = self.transition.step(state, frame)
+            outcomes.append(outcome)
+        return outcomes
+
     def append(self, frame: ProcessedFrame, inputs: Inputs) -> list[Outcome]:
         """Process a frame that belongs behind all others and moves none."""
         state, outcome = self.transition.step(self.head, frame, inputs)

@@ -6,9 +6,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from optipmb_schemas import Events, decode
+from optipmb_client.merging import FinalEvents
+from optipmb_schemas import Events, Problem, decode
 from optipmb_service.settings import SettingsInvalidError, ZoneSettings, load
 from optipmb_service.stream.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
+from optipmb_service.stream.profiles import Profiles
 from optipmb_service.stream.session import Session
 from optipmb_service.stream.values import Output, Policy, Tracked
 from registries import Around, packet_of, streams_of
@@ -21,6 +23,8 @@ from optipmb.zones import Event, Zone
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
+
+    from optipmb_service.stream.streams import Streams
 
 SENSOR = Sensor()
 PROFILE = optipmb.load_profile("nuscenes")
@@ -43,10 +47,10 @@ def final(outputs: Iterable[Output]) -> list[Event]:
     return [event for seq in sorted(newest) for event in newest[seq][2]]
 
 
-def in_order(policy: Policy = POLICY) -> tuple[list[Event], Session]:
-    """Return the events of forty frames in order."""
+def in_order(policy: Policy = POLICY, frames: int = 40) -> tuple[list[Event], Session]:
+    """Return the events of frames in order."""
     session = Session(SENSOR.stream, PROFILE, policy)
-    return final(feed(session, range(40), SENSOR)), session
+    return final(feed(session, range(frames), SENSOR)), session
 
 
 def test_objects_enter_cross_and_leave() -> None:
@@ -125,56 +129,117 @@ SETTINGS: dict[str, Any] = {
 
 
 class Reader(Around):
-    """A process without network whose events are read."""
+    """A process without network whose events and problems are read."""
 
     def __init__(self) -> None:
         super().__init__()
         self.messages: list[Events] = []
+        self.merged = FinalEvents()
+        self.final: list[Events] = []
+        self.problems: list[Problem] = []
 
     def publish_events(self, payload: bytes) -> None:
         """Read a message."""
-        self.messages.append(decode(payload, Events))
+        message = decode(payload, Events)
+        self.messages.append(message)
+        self.final += self.merged.take(message)
 
-    def serve(self, seqs: Iterable[int], zones: dict[str, Any] | None = None) -> None:
-        """Track frames in a process that begins with what was kept, and is killed after its states were kept."""
-        zones = SETTINGS if zones is None else zones
-        streams = streams_of(self, tracker=optipmb.Tracker, recovery_wait_s=0, zones=zones)
-        for seq in seqs:
-            streams.receive(packet_of(SENSOR.detections(seq)))
+    def report(self, problem: Problem, _: int) -> None:
+        """Note a problem."""
+        self.problems.append(problem)
+
+    def serve(self, seqs: Iterable[int], lost: Iterable[int] = (), sensor: Sensor = SENSOR, **settings: Any) -> None:
+        """Track frames in a process that begins with what was kept, and is killed after its states were kept.
+
+        Every fifth frame the states are written too; those behind `lost` never are.
+        """
+        streams = streams_of(
+            self, reporter=self, tracker=optipmb.Tracker, recovery_wait_s=0, **{"zones": SETTINGS} | settings
+        )
+        for number, seq in enumerate(seqs):
+            streams.receive(packet_of(sensor.detections(seq)))
             self.run()
+            if number % 5 == 4:
+                self.keep(streams)
+        self.keep(streams)
+        for seq in lost:
+            streams.receive(packet_of(sensor.detections(seq)))
+            self.run()
+
+    def keep(self, streams: Streams) -> None:
+        """Write the states."""
         streams.keep()
         self.run()
+        for checkpoint in self.kept.values():
+            streams.kept(checkpoint)
 
-    def final(self) -> list[tuple[object, ...]]:
-        """Return the events as a consumer has them in the end."""
-        newest: dict[int, Events] = {}
-        for one in self.messages:
-            newest[one.seq] = max(one, newest.get(one.seq, one), key=_version)
-        return [
-            (event.zone, event.kind, event.n, event.id, one.labels[event.label], event.at_ns, event.position)
-            for seq in sorted(newest)
-            for one in [newest[seq]]
-            for event in one.events
-        ]
+    @property
+    def events(self) -> list[tuple[object, ...]]:
+        """The events of all frames, final or not."""
+        rest = sorted(self.merged.held.values(), key=lambda one: one.stamp_ns)
+        return told([*self.final, *rest])
 
 
-def _version(one: Events) -> tuple[int, int]:
-    assert one.delivery is not None
-    return one.delivery.run, one.revision
+def told(messages: Iterable[Events]) -> list[tuple[object, ...]]:
+    """Return the events of messages."""
+    return [
+        (event.zone, event.kind, event.n, event.id, one.labels[event.label], event.at_ns, event.position)
+        for one in messages
+        for event in one.events
+    ]
 
 
 @pytest.mark.parametrize(
     "runs",
-    [[range(40)], [[0, 2, 1, *range(3, 20), 22, 21, 20, *range(23, 40)]], [range(17), [19, 18, 17, *range(20, 40)]]],
+    [
+        [(range(40), ())],
+        [([0, 2, 1, *range(3, 20), 22, 21, 20, *range(23, 40)], ())],
+        [(range(17), ()), ([19, 18, 17, *range(20, 40)], ())],
+        [(range(12), range(12, 20)), (range(12, 40), ())],
+        # A frame of the first run that the second never gets, and one that comes late in the second alone.
+        [([*range(6), *range(7, 13)], range(13, 20)), ([6, *range(13, 40)], ())],
+        [(range(22), (23, 22, 24)), (range(22, 30), (31, 30)), (range(30, 40), ())],
+    ],
 )
-def test_a_service_publishes_the_events(runs: list[Iterable[int]]) -> None:
-    """In order, with late frames and through a restart they are those of a session of frames in order."""
+def test_final_events_never_change(runs: list[tuple[Iterable[int], Iterable[int]]]) -> None:
+    """In order, with late frames and through restarts they are those of a session of frames in order."""
     reader = Reader()
-    for seqs in runs:
-        reader.serve(seqs)
-    expected = [(*one[:2], *one[2:7]) for one in in_order()[0]]
-    assert reader.final() == expected
+    for seqs, lost in (*runs, (range(40, 60), ())):
+        reader.serve(seqs, lost)
+    expected = [one[:7] for one in in_order(frames=60)[0]]
+    assert reader.events == expected
+    settled = told(reader.final)
+    assert settled == expected[: len(settled)]
+    assert len(settled) >= len(in_order()[0])
     assert {one.stream for one in reader.messages} == {SENSOR.stream}
+
+
+def test_events_of_frames_that_a_later_run_never_saw_are_void() -> None:
+    """A process tracked frames and was killed before their state was kept; the next one begins behind them."""
+    reader = Reader()
+    reader.serve(range(10), range(10, 22))
+    behind = told(reader.messages)
+    reader.serve(range(22, 40))
+    session = Session(SENSOR.stream, PROFILE, POLICY)
+    expected = [one[:7] for one in final(feed(session, [*range(10), *range(22, 40)], SENSOR))]
+    assert reader.events == expected
+    assert not set(behind) <= set(expected)
+
+
+def test_nothing_is_final_until_its_state_is_durable() -> None:
+    """Neither in the window nor behind the last checkpoint; without a store the window decides."""
+    reader = Reader()
+    reader.serve([], range(40))
+    assert not reader.final
+    reader = Reader()
+    reader.serve(range(20), range(20, 40))
+    (newest,) = [one.delivery for one in reader.messages[-1:]]
+    assert newest is not None
+    assert newest.final_ns == SENSOR.stamp_ns(20 - 12)  # eleven frames are within a second of the last one kept
+    reader = Reader()
+    reader.durable = False
+    reader.serve([], range(40))
+    assert told(reader.final)
 
 
 def test_counts_come_once_a_second_and_with_corrections() -> None:
@@ -196,12 +261,18 @@ def test_counts_come_once_a_second_and_with_corrections() -> None:
         (3, 1, True),
         (4, 1, True),
     ]
+    _, session = in_order()
+    now = session.zone_counts()
+    assert now is not None
+    assert (now.seq, now.session) == (39, session.session)
+    assert {one.zone: sum(one.inside) for one in now.zones or ()} == {"crossing": 0, "gate": 0, "yard": 3}
+    assert Session(SENSOR.stream, PROFILE, POLICY).zone_counts() is None
 
 
 def test_a_stream_without_zones_has_no_events() -> None:
     """Nothing is published for a stream that no zone names."""
     reader = Reader()
-    reader.serve(range(20), {"elsewhere": SETTINGS["elsewhere"]})
+    reader.serve(range(20), zones={"elsewhere": SETTINGS["elsewhere"]})
     assert not reader.messages
 
 
@@ -214,6 +285,8 @@ def test_a_stream_without_zones_has_no_events() -> None:
         ("polygon = [[0, 0], [4, 4], [4, 0], [0, 4]]", r"zones\.gate\.polygon .*edges that do not cross"),
         ("line = [[0, 0], [0, inf]]", r"zones\.gate\.line\.1\.1 "),
         ("line = [[0, 0], [0, 1]]\nmargn = 0.3", r"zones\.gate\.margn .*unknown setting"),
+        ("line = [[0, 0], [0, 1]]\ngeo = true", r"zones\.gate\.geo: the site of a/\*/\* is not in"),
+        ("line = [[11, 48], [11, 49]]\ngeo = true\n[sites.a]\norigin = [48, 11, 0]", r"zones\.gate\.line .*100 km"),
     ],
 )
 def test_a_wrong_zone_is_refused_with_its_path(tmp_path: Path, zone: str, says: str) -> None:
@@ -230,3 +303,55 @@ def test_settings_of_a_zone_become_the_zone() -> None:
     values: dict[str, Any] = {"z": (-1.0, 6.0), "classes": ("car",), "margin": 0.1, "min_s": 1.0, "lost_s": 3.0}
     made = ZoneSettings(streams=("a/*/*",), polygon=shape, dwell_s=(30.0, 2.0), **values).zone("one")
     assert made == Zone("one", polygon=shape, dwell_s=(2.0, 30.0), **values)
+
+
+def test_points_in_latitude_and_longitude_are_those_of_the_site() -> None:
+    """A zone that names places on the globe finds the events of one that names the same places in the world."""
+    site = {"origin": (48.265, 11.671, 489.0), "x_heading": 30.0}
+    place = optipmb.Georeference((48.265, 11.671, 489.0), 30.0)
+    zones = {}
+    for name, one in SETTINGS.items():
+        shape = "polygon" if "polygon" in one else "line"
+        lat, lon, _, _ = place.to_geographic([(x, y, 0) for x, y in one[shape]], 0.0)
+        zones[name] = one | {shape: list(zip(lat, lon, strict=True)), "geo": True}
+    plain, reader = Reader(), Reader()
+    plain.serve(range(40))
+    reader.serve(range(40), zones=zones, sites={"site": site})
+    assert [one[:5] for one in reader.events] == [one[:5] for one in plain.events]
+    for a, b in zip(reader.events, plain.events, strict=True):
+        assert a[6] == pytest.approx(b[6], abs=1e-5)
+    elsewhere = Reader()
+    elsewhere.serve(range(20), sensor=Sensor("other/node/lidar"), zones=zones, sites={"site": site})
+    assert not elsewhere.messages
+
+
+def test_a_session_has_at_most_256_zones(tmp_path: Path) -> None:
+    """A settings file may have more, of several streams; more of one pattern are refused, others are left out."""
+    line = {"line": [(8.2, -30), (8.2, 30)]}
+    zones = {f"{site}-{n}": line | {"streams": [f"{site}/*/*"]} for site in ("site", "other") for n in range(200)}
+    reader = Reader()
+    reader.serve(range(20), zones=zones)
+    assert len(reader.messages[0].zones or ()) == 200
+    zones |= {f"all-{n}": line | {"streams": ["*/*/lidar"]} for n in range(100)}
+    reader = Reader()
+    reader.serve(range(20), zones=zones)
+    assert len(reader.messages[0].zones or ()) == 256
+    assert [(one.code, one.path) for one in reader.problems] == [("refused", "zones")]
+    file = tmp_path / "settings.toml"
+    file.write_text("\n".join(f'[zones.z{n}]\nstreams = ["a/*/*"]\nline = [[0, 0], [0, 1]]' for n in range(257)))
+    with pytest.raises(SettingsInvalidError, match=r"zones: at most 256 for a session, a/\*/\* has 257"):
+        load(file)
+
+
+def test_unknown_classes_of_a_zone_are_reported() -> None:
+    """At the start where no profile has one, else as a problem of each session whose profile lacks it."""
+    profiles = Profiles.read("nuscenes", {"other/*/*": "kitti"})
+    zone = ZoneSettings(streams=("*/*/*",), line=((8.2, -30), (8.2, 30)), classes=("car", "Car"))
+    profiles.check_zones({"gate": zone})
+    with pytest.raises(optipmb.ParameterError, match=r"zones\.gate\.classes.*'tram'"):
+        profiles.check_zones({"gate": zone.model_copy(update={"classes": ("tram",)})})
+    reader = Reader()
+    for run in (range(10), range(10, 20)):
+        reader.serve(run, zones={"gate": zone})
+    said = [(one.code, one.path, one.received) for one in reader.problems]
+    assert said == [("unknown_class", "zones.gate.classes", "'Car'")] * 2
