@@ -12,7 +12,7 @@ KITTI = --dataset kitti --root $(DATA)/kitti --detections pointrcnn
 NUSCENES = --dataset nuscenes --root $(DATA)/nuscenes --detections centerpoint
 
 FUZZ_TARGETS := fuzz-messages fuzz-checkpoints fuzz-protobuf
-.PHONY: help kernels docs release demo test accuracy alone bounds ray bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests check lowest paths pythons repeat schemas wheel clean tune ablate
+.PHONY: help kernels dist docs release demo test accuracy alone bounds ray bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests check lowest paths pythons repeat schemas wheel clean tune ablate
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
 	@echo "make install a virtual environment with everything, and compiled kernels"
@@ -114,23 +114,25 @@ check: $(VENV)/.installed
 	$(BIN)/mypy
 	$(BIN)/python tests/nearest.py $(SINCE)
 
-# The wheel with the oldest packages that pyproject.toml allows; and with the newest Python on this machine.
-lowest: $(VENV)/.installed
+# Both wheels, once for all that install them.
+dist: $(VENV)/.installed
 	mkdir -p out
+	rm -rf out/dist
+	$(BIN)/python -m build --wheel --outdir out/dist . >out/build.log || { cat out/build.log; exit 1; }
+	$(BIN)/python -m build --wheel --outdir out/dist node >>out/build.log || { cat out/build.log; exit 1; }
+
+# The wheel with the oldest packages that pyproject.toml allows; and with the newest Python on this machine.
+lowest: dist
 	$(BIN)/python tests/lowest.py >out/lowest.txt
-	sh tests/elsewhere.sh $(PYTHON) $(BIN) $(CURDIR)/out/lowest.txt
+	sh tests/elsewhere.sh $(PYTHON) out/dist out/lowest.txt
 
 # What stands in the README, from pip install to tracks; PATHS=csv, python, node or kitti walks one of them alone.
 PATHS ?=
-paths: $(VENV)/.installed
-	mkdir -p out
-	rm -rf out/dist
-	$(BIN)/python -m build --wheel --outdir out/dist . >out/build.log
-	$(BIN)/python -m build --wheel --outdir out/dist node >>out/build.log
+paths: dist
 	$(BIN)/python tests/paths.py out/dist $(PATHS)
 
-pythons: $(VENV)/.installed
-	sh tests/pythons.sh $(BIN)
+pythons: dist
+	sh tests/pythons.sh out/dist
 
 # As often as N says, each time in a fresh clone, with LOAD processes computing beside it: tests that pass now and then fail here.
 N ?= 10
@@ -142,8 +144,8 @@ schemas: $(VENV)/.installed
 	$(BIN)/python -m optipmb_schemas.export --check --page docs/messages.md --asyncapi schemas/asyncapi.json schemas/json
 	$(BIN)/python docs/reference.py --check docs/reference.md
 
-wheel: kernels
-	sh tests/wheel.sh $(PYTHON) $(BIN)
+wheel: kernels dist
+	sh tests/wheel.sh $(PYTHON) $(BIN) out/dist
 
 # The baseline is compared with and not obeyed: machines differ, and no test fails by a time. Processor time is counted,
 # so that what else the machine does disturbs little; the service, which waits, has its own line and the clock on the wall.

@@ -20,7 +20,7 @@ from greedy import greedy_tracks
 from kalman import HABITS, kalman_tracks
 from optipmb_tools.datasets import open_dataset
 from optipmb_tools.evaluation.errors import evaluate_errors
-from optipmb_tools.tuning.clips import Clip, Degradation, degrade, load, of_class, track_clip, track_fully
+from optipmb_tools.tuning.clips import Clip, Degradation, degrade, load, of_class, track_clip
 from optipmb_tools.tuning.scoring import plain_figures, rules_of, scorer_of
 from optipmb_tools.tuning.values import only
 
@@ -66,8 +66,8 @@ def backward(
 ) -> tuple[str, str]:
     """Return the shares of boxes that face backwards, of tracks and of their detections, in percent."""
     parameters = only(optipmb.load_profile(profile), name)
-    parts = ((one, clip.world, *track_fully(clip, parameters)) for one, clip in zip(sequences, clips, strict=True))
-    found = evaluate_errors(parts, name, rules)
+    tracked = [(one, clip.world, track_clip(clip, parameters)) for one, clip in zip(sequences, clips, strict=True)]
+    found = evaluate_errors([(*one, one[-1]) for one in tracked], name, rules)
     shares = found.figures(found.detected)["backward"]
     return f"{100 * shares['track']:.2f}", f"{100 * shares['detection']:.2f}"
 

@@ -1,7 +1,7 @@
-"""The step of this checkout beside that of another one: `python benchmarks/beside.py OTHER [--profile FILE]`.
+"""The step of this checkout compared with another one: `python benchmarks/beside.py OTHER [--profile FILE]`.
 
 Each has a process of its own; they measure in turns, a few hundredths of a second each, so that what else the machine
-does meets both. Processor time of the thread; the ratio is the median of those of single turns.
+does meets both. Processor time of the thread; the ratio is the median over single turns.
 """
 
 from __future__ import annotations

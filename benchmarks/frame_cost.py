@@ -1,4 +1,4 @@
-"""What a frame costs the service, part by part, beside another version of the code, in one run.
+"""Cost of a frame in the service, part by part, compared with another version of the code in one run.
 
 python benchmarks/frame_cost.py [--beside DIR] [--objects N] [--points N] [--rounds N]
 
@@ -11,18 +11,31 @@ own, and the medians of the rounds are compared.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import os
 import subprocess
 import sys
 import time
-from importlib import import_module
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import optipmb_schemas as schemas
+from optipmb_service.app.worker import warm_up
+from optipmb_service.settings import Settings
+from optipmb_service.stream import convert
+from optipmb_service.stream import stream as stream_module
+from optipmb_service.stream.checkpoint import encode_checkpoint
+from optipmb_service.stream.persistence import CheckpointWriter
+from optipmb_service.stream.profiles import Profiles
+from optipmb_service.stream.session import Session
+from optipmb_service.stream.stream import Stream
+from optipmb_service.stream.streams import Streams
+from optipmb_service.telemetry.logs import configure
+from optipmb_service.telemetry.metrics import Metrics
+from optipmb_service.telemetry.problem_reporter import ProblemReporter
+from optipmb_service.zenoh.inputs import Packet
+from optipmb_tools.run import load
 
 import optipmb
 
@@ -38,7 +51,7 @@ CHECKPOINT_EVERY = 10
 
 
 class Parts:
-    """Processor time of the parts of a frame: of calls of functions, less that of timed calls inside them."""
+    """Processor time of the parts of a frame: of calls of functions, less the timed calls inside them."""
 
     def __init__(self) -> None:
         self.spent_ns: dict[str, int] = {}
@@ -68,7 +81,7 @@ class Parts:
 
 
 class Network:
-    """Everything around the streams: it grants them all, takes what they publish, and gives them their turns."""
+    """Everything around the streams: it grants them all, takes their tracks, and gives them their turns."""
 
     strained = False
 
@@ -99,7 +112,7 @@ class Network:
         """All may be published."""
         return fence == self.fence(stream)
 
-    def open_publisher(self, stream: str) -> Network:
+    def open_publisher(self, stream: str, _zones: bool) -> Network:  # noqa: FBT001 - the signature of the service
         """Be the publisher of a stream."""
         del stream
         return self
@@ -115,8 +128,7 @@ class Network:
 
 def packets(objects: int, points: int) -> Iterator[list[Any]]:
     """Yield the messages of each frame, its cloud first."""
-    load, keys = module_of("optipmb_tools.run.load", "optipmb_client.load"), schemas.Keys()
-    packet = part_of("Packet", "zenoh.inputs", "runtime.ports")
+    keys = schemas.Keys()
     frames = load.generated(objects, points, RATE_HZ)
     for k in range(WARM + FRAMES):
         begins = load.head(STREAM, bytes(16), load.FIRST + k, 10**18 + round(k * 1e9 / RATE_HZ))
@@ -130,72 +142,45 @@ def packets(objects: int, points: int) -> Iterator[list[Any]]:
             if body is not None:
                 payload = load.message(body, begins)
                 encoding = schemas.encoding_of(kind)
-                made.append(packet(key, payload, len(payload), encoding, time.time_ns(), time.monotonic_ns()))
+                made.append(Packet(key, payload, len(payload), encoding, time.time_ns(), time.monotonic_ns()))
         yield made
-
-
-def module_of(*names: str) -> Any:
-    """Return the first of these modules that the checkout has: another version may have it under another name."""
-    for name in names:
-        with contextlib.suppress(ModuleNotFoundError):
-            return import_module(name)
-    raise ModuleNotFoundError(names[-1])
-
-
-def part_of(name: str, *modules: str) -> Any:
-    """Return what has a name in the first of these modules of the service that has it."""
-    for module in modules:
-        with contextlib.suppress(ModuleNotFoundError, AttributeError):
-            return getattr(import_module(f"optipmb_service.{module}"), name)
-    raise AttributeError(name)
 
 
 def measured(objects: int, points: int) -> dict[str, float]:
     """Return the median microseconds of each part of a frame."""
-    part_of("configure", "telemetry.logs")("console", "error")
-    part_of("warm_up", "app.worker")()
-    metrics, reporter = (
-        part_of("Metrics", "telemetry.metrics"),
-        part_of("ProblemReporter", "telemetry.problem_reporter"),
-    )
-    streams_type = part_of("Streams", "stream.streams", "runtime.streams")
-    stream_type = part_of("Stream", "stream.stream", "runtime.stream")
-    session = part_of("Session", "stream.session", "session.session")
-    publishing = (stream_type, "_send")
-    if not hasattr(*publishing):
-        publishing = (part_of("TrackPublisher", "runtime.track_publisher"), "send")
+    configure("console", "error")
+    warm_up()
     parts = Parts()
     network: Any = Network()  # in the place of several parts
     nothing: Any = None
-    for part, owner, name in (
-        ("handing over", streams_type, "receive"),
-        ("decoding", module_of(stream_type.__module__), "message_of"),
-        ("session", session, "on_detections"),
-        ("session", session, "on_points"),
-        ("conversion", part_of("convert", "stream", "session"), "frame_of"),
-        ("conversion", part_of("convert", "stream", "session"), "cloud_of"),
-        ("conversion", part_of("convert", "stream", "session"), "tracks_of"),
+    timed: tuple[tuple[str, Any, str], ...] = (
+        ("handing over", Streams, "receive"),
+        ("decoding", stream_module, "message_of"),
+        ("session", Session, "on_detections"),
+        ("session", Session, "on_points"),
+        ("conversion", convert, "frame_of"),
+        ("conversion", convert, "cloud_of"),
+        ("conversion", convert, "tracks_of"),
         ("step", optipmb.Tracker, "step"),
-        ("publishing", *publishing),
-        ("metrics", metrics, "received"),
-        ("metrics", metrics, "published"),
-        ("metrics", metrics, "tracks"),
-        ("turn", stream_type, "work"),
-    ):
+        ("publishing", Stream, "_send"),
+        ("metrics", Metrics, "received"),
+        ("metrics", Metrics, "published"),
+        ("metrics", Metrics, "tracks"),
+        ("turn", Stream, "work"),
+    )
+    for part, owner, name in timed:
         setattr(owner, name, parts.time(part, getattr(owner, name)))
-    encode_checkpoint = part_of("encode_checkpoint", "stream.checkpoint", "session.checkpoint")
-    writer_type = part_of("CheckpointWriter", "stream.persistence", "runtime.persistence")
-    streams = streams_type(
-        part_of("Settings", "settings")(instance="cost", store="none"),
-        part_of("Profiles", "stream.profiles", "runtime.profiles").read("nuscenes", {}),
+    streams: Any = Streams(
+        Settings(instance="cost", store="none"),
+        Profiles.read("nuscenes", {}),
         open_publisher=network.open_publisher,
-        reporter=reporter(network.publish_problem, lambda *_: None),
+        reporter=ProblemReporter(network.publish_problem),
         scheduler=network,
         member=network,
-        checkpoints=writer_type(nothing, 1.0, network, off=""),
+        checkpoints=CheckpointWriter(nothing, 1.0, network, off=""),
         log=None,
         arm=lambda *_: None,
-        metrics=metrics(),
+        metrics=Metrics(),
     )
     rows: list[dict[str, float]] = []
     checkpoints: list[float] = []

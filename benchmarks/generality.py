@@ -28,7 +28,7 @@ from optipmb_tools.evaluation import default_rules
 from optipmb_tools.evaluation.calibration import calibration
 from optipmb_tools.evaluation.cases import CENTRE_DISTANCE
 from optipmb_tools.geometry import Pose, to_sensor, to_world
-from optipmb_tools.results import COLUMNS, FullTable, ResultTable, stacked
+from optipmb_tools.results import FullTable, full_table, stacked
 from optipmb_tools.results.kitti import LEAST_SHOWN
 from optipmb_tools.run import profiles
 from optipmb_tools.tuning.clips import Clip, load, of_class
@@ -138,18 +138,19 @@ class Cell:
             scorer = scorer_of(dataset, name, sequences)
             near = default_rules(dataset, "distance", CENTRE_DISTANCE)
             all_of, sure, true, existence, certain, waits = [], [], [], [], [], []
-            for clip, table, full, confirmed in tracked:
+            for clip, table, confirmed in tracked:
                 own, mine = of_class(clip, name, rules), table.names == name
                 all_of.append(scorer.measure(own, table.take(mine)))
                 sure.append(scorer.measure(own, table.take(mine & confirmed)))
-                found = calibration(own.world, table.take(mine), full.take(mine), name, near)
+                found = calibration(own.world, table.take(mine), table.take(mine), name, near)
                 existence.append(found.existence)
                 true.append(found.true)
-                ghosts = calibration(own.world, table.take(mine & confirmed), full.take(mine & confirmed), name, near)
+                shown = table.take(mine & confirmed)
+                ghosts = calibration(own.world, shown, shown, name, near)
                 certain.append((~ghosts.true).sum())
                 waits.extend(_delays(table.id[mine], clip.stamps[table.frame[mine]], confirmed[mine]))
             figures = plain_figures(scorer.figures(all_of))
-            confirmed_share = sum(int((table.names[sure_of] == name).sum()) for _, table, _, sure_of in tracked)
+            confirmed_share = sum(int((table.names[sure_of] == name).sum()) for _, table, sure_of in tracked)
             count = sum(int((table.names == name).sum()) for _, table, _, _ in tracked)
             extra = (
                 plain_figures(scorer.figures(sure))["HOTA, all"],
@@ -163,31 +164,24 @@ class Cell:
         return rows
 
 
-def track(clip: Clip, parameters: Parameters, *, posed: bool) -> tuple[ResultTable, FullTable, Bools]:
-    """Return the tracks of all classes in the world frame, everything known of them, and which are confirmed."""
+def track(clip: Clip, parameters: Parameters, *, posed: bool) -> tuple[FullTable, Bools]:
+    """Return the tracks of all classes in the world frame, and which are confirmed."""
     tracker = optipmb.Tracker(parameters)
-    found: list[tuple[int, Tracks]] = []
+    found: dict[int, Tracks] = {}
     density = tracker.initial()
     for index, frame in enumerate(clip.frames):
         result = tracker.step(density, frame)
-        density = result.density
-        if len(result.tracks.id):
-            found.append((index, result.tracks))
-    parts = [tracks for _, tracks in found]
-    when = np.repeat([index for index, _ in found], [len(one) for one in parts]).astype(np.int64)
-    names = ("id", "label", "center", "size", "yaw", "score")
-    image = np.full((len(when), 4), np.nan)
-    table = ResultTable(parameters.labels, when, *(stacked(parts, name) for name in names), image)
-    full = FullTable(table.labels, when, *(stacked(parts, name) for name in COLUMNS))
-    confirmed = stacked(parts, "confirmed").astype(np.bool_)
+        density, found[index] = result.density, result.tracks
+    table = full_table(parameters.labels, found)
+    confirmed, when = stacked(list(found.values()), "confirmed").astype(np.bool_), table.frame
     rotation, translation = clip.rotation[when], clip.translation[when]
     if not posed and len(when):
         center, yaw = to_world(rotation, translation, table.center, table.yaw)
-        table, full = replace(table, center=center, yaw=yaw), replace(full, center=center, yaw=yaw)
+        table = replace(table, center=center, yaw=yaw)
     if clip.camera is not None and len(when):
         center, yaw = to_sensor(rotation, translation, table.center, table.yaw)
         table = replace(table, box2d=clip.camera.boxes(center, table.size, yaw, LEAST_SHOWN)[0])
-    return table, full, confirmed
+    return table, confirmed
 
 
 def calibration_error(existence: Floats, true: Bools) -> float:

@@ -7,7 +7,7 @@
 Prints one JSON object: tracker, objects, and the milliseconds of processor time of each frame after the first few.
 What a tracker needs as input (its own detection objects) is made before the clock starts. A tracker that needs longer
 than `PATIENCE_S` for a frame is not given larger scenes. Each is set up as its documentation shows, with a gate of 4 m
-and prediction over the period of the scene; none of them is told the classes, most have no oriented boxes.
+and prediction over the period of the scene; none of them receives the classes, most have no oriented boxes.
 """
 
 from __future__ import annotations

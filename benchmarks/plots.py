@@ -19,7 +19,7 @@ STAGES = ("predict", "preprocess", "detection_probability", "update", "extract")
 
 
 def scaling(found: dict[str, Any], path: Path) -> None:
-    """Time of a step against the number of objects, beside the bare arithmetic and other trackers."""
+    """Time of a step against the number of objects, with the bare arithmetic and other trackers."""
     figure = Figure(figsize=(7.5, 5.4), layout="constrained")
     axes = figure.add_subplot()
     step, floor = found["dense"]["step"], found["dense"]["bare"]

@@ -1,4 +1,4 @@
-"""What share of a step is arithmetic, what is the calling of kernels, what is the interpreter and numpy.
+"""Shares of a step: arithmetic, calls of kernels, interpreter and numpy.
 
 Each dispatcher of a kernel that the tracker calls is replaced by a function that reads a clock before and after. A
 kernel's time is that of its call less what calling a kernel with the same arguments costs, measured with one that does

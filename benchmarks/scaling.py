@@ -122,7 +122,7 @@ class Cluster:
         return member
 
     def sample(self) -> Sample:
-        """Return what has been used so far."""
+        """Return the seconds used so far."""
         varz, jsz = (self._ask(page) for page in ("varz", "jsz"))
         alive = [one.process.pid for one in self.members if one.process.poll() is None]
         taken = [used(pid) for pid in alive]

@@ -49,7 +49,7 @@ def test_preprocess(benchmark: BenchmarkFixture, objects: int) -> None:
 
 @pytest.mark.parametrize("apart", [1.0, 6.0], ids=["heap", "street"])
 def test_suppression(benchmark: BenchmarkFixture, apart: float) -> None:
-    """A thousand boxes, heaped upon each other or standing beside each other."""
+    """A thousand boxes, heaped upon each other or side by side."""
     rng = np.random.default_rng(0)
     boxes = rng.uniform([-16, -16, 3, 1.5, -3], [16, 16, 5, 2, 3], (1000, 5))
     boxes[:, :2] *= apart

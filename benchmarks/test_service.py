@@ -9,10 +9,15 @@ Throughput is in frames per second, when a window of 8 is kept full, as a replay
 from __future__ import annotations
 
 import os
+import time
+from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
-from optipmb_client import Connection
+from gateway import GatewayProcess
+from optipmb_client import Connection, Publisher, Subscriber
 from optipmb_tools.run.load import Load, generated, run_load
 from router import Node, Sensor
 from service_process import ServiceProcess
@@ -28,6 +33,7 @@ SECONDS = float(os.environ.get("OPTIPMB_BENCHMARK_SECONDS", "8"))
 WINDOW = 8
 ROUNDS = 5
 ROUND = 100
+SETTLED = 10  # frames that do not count
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +46,7 @@ def service() -> Iterator[ServiceProcess]:
 
 @pytest.fixture
 def node(service: ServiceProcess) -> Iterator[Node]:
-    """A node beside it."""
+    """A node that is connected to it."""
     with Node(service.endpoint) as one:
         yield one
 
@@ -56,7 +62,7 @@ def test_latency(benchmark: BenchmarkFixture, service: ServiceProcess, streams: 
     figures |= {f"{stage}_p50_ms": round(value, 3) for stage, value in run.stages_p50_ms.items()}
     figures |= {"streams": streams, "points": points, "lost": run.lost}
     benchmark.extra_info.update(figures)
-    print(figures)  # noqa: T201 - the table of pytest-benchmark does not show what is wanted here
+    print(figures)  # noqa: T201 - the table of pytest-benchmark does not show these
     assert run.received > 0
 
 
@@ -93,3 +99,41 @@ def test_throughput(benchmark: BenchmarkFixture, node: Node) -> None:
     figures = {"frames_per_second": round(ROUND / benchmark.stats.stats.median)}
     benchmark.extra_info.update(figures)
     print(figures)  # noqa: T201 - as above
+
+
+@pytest.mark.parametrize("rate", [10, 100])
+def test_gateway(service: ServiceProcess, rate: int) -> None:
+    """Median latency over Zenoh and through a gRPC gateway, and the gateway's processor time per frame."""
+    with GatewayProcess(service.endpoint) as gateway:
+        gateway.wait_ready()
+        zenoh_ms = _latency_ms(service.endpoint, f"gateway/zenoh-{rate}/lidar", rate)
+        began_s = _processor_s(gateway.process.pid)
+        grpc_ms = _latency_ms(f"grpc://{gateway.address}", f"gateway/grpc-{rate}/lidar", rate)
+        used_ms = (_processor_s(gateway.process.pid) - began_s) / round(rate * SECONDS) * 1e3
+    figures = {"rate": rate, "zenoh_ms": zenoh_ms, "grpc_ms": grpc_ms, "gateway_processor_ms": used_ms}
+    print({name: round(value, 2) for name, value in figures.items()})  # noqa: T201 - as above
+
+
+def _latency_ms(endpoint: str, stream: str, rate: int) -> float:
+    number = np.arange(float(OBJECTS))
+    took_ms = []
+    with Publisher(stream, endpoint, frame="world") as publisher, Subscriber(stream, endpoint) as subscriber:
+        for k in range(round(rate * SECONDS)):
+            publisher.publish(
+                stamp_ns=10**18 + k * 10**9 // rate,
+                label=["car"] * OBJECTS,
+                center=np.column_stack((k / rate + 0 * number, 10 * number, 0 * number)),
+                size=np.tile((4.5, 1.9, 1.6), (OBJECTS, 1)),
+                yaw=0 * number,
+                score=0 * number + 0.9,
+            )
+            received = subscriber.receive(10.0)
+            assert received is not None
+            took_ms.append((received.monotonic_ns - publisher.last_put_ns) / 1e6)
+            time.sleep(max(0.0, 1 / rate - took_ms[-1] / 1e3))
+    return median(took_ms[SETTLED:])
+
+
+def _processor_s(pid: int) -> float:
+    user, system = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[11:13]
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")

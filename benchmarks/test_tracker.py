@@ -35,7 +35,7 @@ def test_step(benchmark: BenchmarkFixture, objects: int, points: int) -> None:
 
 @pytest.mark.parametrize("objects", OBJECTS)
 def test_bare_arithmetic(benchmark: BenchmarkFixture, objects: int) -> None:
-    """The lower bound of the step; its updates are those of the tracker, bit by bit."""
+    """The lower bound of the step; its updates equal the tracker's bit by bit."""
     tracker, density, frame = settled(objects)
     given = arguments(PARAMETERS, density, frame)
     benchmark(bare, *given)

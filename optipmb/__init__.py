@@ -42,6 +42,7 @@ from optipmb.parameters import (
     profiles,
 )
 from optipmb.paths import PredictedPaths, predict_tracks
+from optipmb.relocation import Relocation
 from optipmb.tracker import Diagnostics, Modules, StepResult, Tracker
 from optipmb.warm import warm_up
 
@@ -71,6 +72,7 @@ __all__ = [
     "Poissons",
     "Pose",
     "PredictedPaths",
+    "Relocation",
     "ScoreCalibration",
     "StepResult",
     "Tracker",

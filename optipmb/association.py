@@ -26,8 +26,10 @@ import numpy as np
 
 from optipmb.compiled import kernel
 from optipmb.density import PHI, X, Y, whole_periods
-from optipmb.geometry import iou_exceeds
+from optipmb.geometry import boxes_overlap
 from optipmb.hypotheses import CLUTTER
+from optipmb.predict import heading_unknown
+from optipmb.table import known_length
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -161,11 +163,14 @@ def forbid_births(
         if not objects.extracted[n] or whole_periods(missed_from_ns[n], moment.stamp_ns, moment.period) > longest:
             continue
         predicted[0], predicted[1], predicted[4] = objects.mean[n, X], objects.mean[n, Y], objects.mean[n, PHI]
+        if heading_unknown(objects.covariance[n]):
+            predicted[4] = np.nan
         detected[0], detected[1] = measurements.position[m, 0], measurements.position[m, 1]
         detected[4] = measurements.yaw[m]
         for s in range(2):
-            predicted[2 + s], detected[2 + s] = objects.auxiliary[n, s], measurements.auxiliary[m, s]
-        if iou_exceeds(predicted, detected, overlap):
+            predicted[2 + s] = known_length(objects.auxiliary[n, s], s, own)
+            detected[2 + s] = known_length(measurements.auxiliary[m, s], s, own)
+        if boxes_overlap(predicted, detected, overlap):
             hypotheses.first_kind[m], hypotheses.first_existence[m] = CLUTTER, 0.0
 
 

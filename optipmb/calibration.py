@@ -119,7 +119,8 @@ def follow_box(box: Box, noise: Box, mean: Array, covariance: Array) -> None:
     The entries of z are taken one after the other, as R_x is diagonal; where its variance is zero the state stays.
     """
     x, y, yaw = box
-    yaw = mean[PHI] + 0.5 * wrap(2.0 * (yaw - mean[PHI]))
+    if noise[2] != 0.0:  # else it may be unknown
+        yaw = mean[PHI] + 0.5 * wrap(2.0 * (yaw - mean[PHI]))
     for s in BOX:
         if s == PHI:
             variance = noise[2]

@@ -5,7 +5,8 @@ compared, hashed and stored as it is. It is never written after it is made.
 
 Motion state x_M = [x, y, v, phi, omega, a]: position on the ground plane (m), speed along the heading (m/s, negative
 when reversing), heading (rad, in (-pi, pi]), turn rate (rad/s), acceleration (m/s^2).
-Auxiliary state x_A = [length, width, height, z]: box size and height of the box's centre, m.
+Auxiliary state x_A = [length, width, height, z]: box size and height of the box's centre, m; NaN where no detection
+gave it. States without a heading are those of `optipmb.unknown_heading`.
 
 It is stored as named arrays (`bernoulli.mean`, `poisson.weight`) or as bytes; what is read back is checked.
 """
@@ -547,6 +548,9 @@ def _rows(kind: type[_Rows], columns: Mapping[str, Any]) -> _Rows:
     rows = kind(**found)
     for name, column in rows.columns():
         if column.dtype.kind == "f" and not np.isfinite(column).all():
-            row = np.argwhere(~np.isfinite(column))[0]
+            good = np.isfinite(column) | (np.isnan(column) if name == "auxiliary" else False)
+            if good.all():
+                continue
+            row = np.argwhere(~good)[0]
             raise DensityError(f"{kind.part}.{name}[{row[0]}]", "finite numbers", str(column[tuple(row)]))
     return rows

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from optipmb.compiled import kernel, long_kernel
-from optipmb.density import PHI, components_in, objects_in
+from optipmb.density import OMEGA, PHI, components_in, objects_in
 from optipmb.errors import FrameError
 
 if TYPE_CHECKING:
@@ -41,7 +41,8 @@ def detection_probability(
 
     ``p_d = p_d0 min[1, (1 - s_d) PTS / PTS_0 + s_d]`` with the points PTS counted in the predicted box: position and
     heading from the motion state, size and height from the auxiliary state; points up to `ground_clearance` above the
-    bottom of the box are returns of the ground and do not count. Without a cloud p_d = p_d0.
+    bottom of the box are returns of the ground and do not count. Without a cloud p_d = p_d0, and so where heading, size
+    or height are unknown.
 
     It holds for the time of the look, and for what is in view.
 
@@ -59,6 +60,9 @@ def detection_probability(
     p_d = table["detection"][label]
     if cloud is not None and label.size:
         auxiliary = np.concatenate((objects.auxiliary, components.auxiliary))
+        turning = np.concatenate((objects.covariance[:, OMEGA, OMEGA], components.covariance[:, OMEGA, OMEGA]))
+        known = (turning != 0.0) & ~np.isnan(auxiliary).any(axis=1)
+        auxiliary = table.known_boxes(label, auxiliary)
         mean = np.concatenate((objects.mean, components.mean))
         cut = np.minimum(table["ground_clearance"][label], auxiliary[:, 2])
         center = np.column_stack((mean[:, :2], auxiliary[:, 3] + 0.5 * cut))
@@ -66,7 +70,8 @@ def detection_probability(
         size[:, 2] -= cut
         points = points_in_boxes(cloud, center, size, mean[:, PHI].copy())
         s_d = table["detection_floor"][label]
-        p_d *= np.minimum(1.0, (1.0 - s_d) * points / table["expected_points"][label] + s_d)
+        share_seen = np.minimum(1.0, (1.0 - s_d) * points / table["expected_points"][label] + s_d)
+        p_d *= np.where(known, share_seen, 1.0)
     if looks is None:
         return over_time(p_d, share)
     shares = np.full(len(p_d), share)

@@ -26,8 +26,11 @@ from optipmb.density import (
 from optipmb.errors import FrameError
 from optipmb.frame import PLAIN
 from optipmb.lightweight import doubt, sign_probability
+from optipmb.predict import heading_unknown
 from optipmb.preprocess import Measurements
 from optipmb.rows import Column, Rows, arrays_of
+from optipmb.table import known_length
+from optipmb.unknown_heading import show_heading
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -163,6 +166,9 @@ def extract_tracks(
         n = rows[k]
         own = classes[objects.label[n]]
         copy_state(objects.mean, objects.covariance, n, state, covariance, k)
+        straight = heading_unknown(covariance[k])
+        if straight:
+            show_heading(state[k, V], covariance[k])
         m = measurement[n]
         tracks.detection[k] = z.source[m] if m >= 0 else -1
         if m >= 0 and own.reported_position + own.reported_heading > 0.0:
@@ -170,14 +176,17 @@ def extract_tracks(
             r_x = r_y = own.reported_position
             if position.shape[0] > PLAIN:
                 r_x, r_y = r_x * position[2], r_y * position[4]
-            box, noise = (position[0], position[1], z.yaw[m]), (r_x, r_y, own.reported_heading)
+            r_phi = 0.0 if straight or math.isnan(z.yaw[m]) else own.reported_heading
+            box, noise = (position[0], position[1], z.yaw[m]), (r_x, r_y, r_phi)
             follow_box(box, noise, state[k], covariance[k])
         v, phi = state[k, V], state[k, PHI]
         center[k, 0], center[k, 1], center[k, 2] = state[k, X], state[k, Y], objects.auxiliary[n, 3]
         for s in range(3):
-            size[k, s] = objects.auxiliary[n, s]
-        tracks.heading_confidence[k] = 1.0
-        if own.sign_known:
+            size[k, s] = known_length(objects.auxiliary[n, s], s, own)
+        if math.isnan(center[k, 2]):
+            center[k, 2] = 0.5 * size[k, 2]
+        tracks.heading_confidence[k] = 0.5 if straight else 1.0
+        if own.sign_known and not straight:
             tracks.heading_confidence[k] = sign_probability(objects.heading_odds[n])
             covariance[k, PHI, PHI] += doubt(tracks.heading_confidence[k])
         velocity[k, 0], velocity[k, 1] = v * math.cos(phi), v * math.sin(phi)

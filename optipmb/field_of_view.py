@@ -221,8 +221,8 @@ def look(view: FieldOfView | None, prior: Density, moment: Moment, table: ClassT
     axes: tuple[Array, Array] = _AXES_OF_WORLD if view.pose is None else (view.pose.rotation, view.pose.translation)
     where = *axes, view.limits
     in_view, poisson_in_view = np.empty(len(bernoulli)), np.empty(len(poisson))
-    shares_in_view(bernoulli.mean, bernoulli.covariance, bernoulli.auxiliary, *where, in_view)
-    shares_in_view(poisson.mean, poisson.covariance, poisson.auxiliary, *where, poisson_in_view)
+    for rows, share in ((bernoulli, in_view), (poisson, poisson_in_view)):
+        shares_in_view(rows.mean, rows.covariance, table.known_boxes(rows.label, rows.auxiliary), *where, share)
     time, missed_from_ns = count_looks(in_view, misses.looked_ns, misses.missed_from_ns, tuple(moment))
     lost = now_ns - bernoulli.seen_ns > LONGEST_UNSEEN_S * 1e9
     missed_from_ns[lost] = misses.missed_from_ns[lost]

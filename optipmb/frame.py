@@ -138,8 +138,8 @@ class Frame:
     Attributes:
         stamp_ns: sensor time, nanoseconds.
         center: (M, 3) m.
-        size: (M, 3) length, width, height, m.
-        yaw: (M,) rad.
+        size: (M, 3) length, width, height, m; NaN where unknown, as is the z of a centre.
+        yaw: (M,) rad; NaN where unknown.
         velocity: (M, 2) over ground, m/s; a row of NaN where the detector gives none.
         score: (M,) in (0, 1]; what the thresholds of the class mean by it (`optipmb.frame`).
         label: (M,) int64, index into the classes of the parameters.
@@ -207,9 +207,9 @@ def make_frame(
     labels: Sequence[str],
     label: ArrayLike,
     center: ArrayLike,
-    size: ArrayLike,
-    yaw: ArrayLike,
     score: ArrayLike,
+    size: ArrayLike | None = None,
+    yaw: ArrayLike | None = None,
     velocity: ArrayLike | None = None,
     pose: Pose | None = None,
     cloud: PointCloud | None = None,
@@ -224,9 +224,10 @@ def make_frame(
         labels: names of the classes that `label` points into. Names that mean the same as one class of the parameters
             are that class: `car`, `Car` and `vehicle.car`.
         label: (M,) integers.
-        center: (M, 3) geometric centres, m, in the world frame, or in the sensor frame when `pose` is given.
-        size: (M, 3) length, width, height, m, all positive.
-        yaw: (M,) rad, in the same frame.
+        center: (M, 3) geometric centres, m, in the world frame, or in the sensor frame when `pose` is given. A z that
+            is NaN is unknown.
+        size: (M, 3) length, width, height, m, all positive; None, or NaN, where unknown.
+        yaw: (M,) rad, in the same frame; None, or NaN, where unknown.
         score: (M,) in [0, 1], as the detector gives it; an object of score 0 is left out, for its detector says that
             there is none. The frame has the calibrated scores where a class has a `score_calibration`.
         velocity: (M, 2) over ground along the axes of the same frame, m/s; None, or rows of NaN, where unknown.
@@ -249,9 +250,10 @@ def make_frame(
     check_view(field_of_view)
     which = _integers("label", label)
     m = which.shape[0]
-    center, size = _shaped("center", center, (m, 3)), _shaped("size", size, (m, 3))
-    yaw, score = _shaped("yaw", yaw, (m,)), _shaped("score", score, (m,))
-    velocity = _unknown(m) if velocity is None else _shaped("velocity", velocity, (m, 2))
+    center, score = _shaped("center", center, (m, 3)), _shaped("score", score, (m,))
+    size = _unknown(m, 3) if size is None else _shaped("size", size, (m, 3))
+    yaw = _unknown(m) if yaw is None else _shaped("yaw", yaw, (m,))
+    velocity = _unknown(m, 2) if velocity is None else _shaped("velocity", velocity, (m, 2))
     scored = read_only(np.where(score == 0.0, 1.0, score))  # those are left out, whatever they are
     given = which, len(labels), center, size, yaw, scored, velocity
     if not allowed(*given):
@@ -276,18 +278,20 @@ def frame_of_checked(
 
     Every value is one that `make_frame` allows, and every array has the type, the shape and the order of one in a
     frame. They are not copied but become read-only, so nobody may change them. `columns` are label, center, size, yaw,
-    score and velocity, the last of which may be None.
+    score and velocity; size, yaw and velocity may be None.
 
     Raises:
         FrameError: a covariance is none, or an object is too far in the world frame.
     """
     label, center, size, yaw, score, velocity = columns
     m = label.shape[0]
-    velocity = _unknown(m) if velocity is None else velocity
+    size = _unknown(m, 3) if size is None else size
+    yaw = _unknown(m) if yaw is None else yaw
+    velocity = _unknown(m, 2) if velocity is None else velocity
     rotation = None
     if pose is not None and not pose.is_identity:
         rotation = pose.rotation
-        center = center @ rotation.T + pose.translation
+        center = _to_world(center, rotation, pose.translation)
         heading = np.empty((m, 2))
         heading[:, 0], heading[:, 1] = np.cos(yaw), np.sin(yaw)
         heading = heading @ rotation[:2, :2].T
@@ -325,9 +329,19 @@ def _every_row(count: int) -> NDArray[np.int64]:
 
 
 @lru_cache(64)
-def _unknown(count: int) -> NDArray[np.float64]:
-    """Return the velocities of so many objects whose detector gives none."""
-    return read_only(np.full((count, 2), np.nan))
+def _unknown(count: int, *shape: int) -> NDArray[np.float64]:
+    """Return a column of so many objects whose detector does not give it."""
+    return read_only(np.full((count, *shape), np.nan))
+
+
+def _to_world(center: NDArray[np.float64], rotation: NDArray[np.float64], translation: Array) -> NDArray[np.float64]:
+    """Return centres in the world; one without z is taken to be at the height of the sensor, and has none there."""
+    moved: NDArray[np.float64] = center @ rotation.T + translation
+    if np.isnan(moved.sum()):
+        flat = np.isnan(center[:, 2])
+        moved[flat] = np.column_stack((center[flat, :2], np.zeros(flat.sum()))) @ rotation.T + translation
+        moved[flat, 2] = np.nan
+    return moved
 
 
 @kernel
@@ -344,11 +358,11 @@ def allowed(
     good = True
     for m in range(label.shape[0]):  # NaN compares as not good
         good &= 0 <= label[m] < n_labels
-        good &= abs(yaw[m]) <= MAX_COORDINATE
+        good &= abs(yaw[m]) <= MAX_COORDINATE or np.isnan(yaw[m])
         good &= 0.0 < score[m] <= 1.0
         for s in range(3):
-            good &= abs(center[m, s]) <= MAX_COORDINATE
-            good &= 0.0 < size[m, s] <= MAX_COORDINATE
+            good &= abs(center[m, s]) <= MAX_COORDINATE or (s == 2 and np.isnan(center[m, s]))  # noqa: PLR2004 - z
+            good &= 0.0 < size[m, s] <= MAX_COORDINATE or np.isnan(size[m, s])
         unknown = np.isnan(velocity[m, 0]) and np.isnan(velocity[m, 1])
         good &= unknown or (abs(velocity[m, 0]) <= MAX_SPEED and abs(velocity[m, 1]) <= MAX_SPEED)
     return good
@@ -365,10 +379,12 @@ def _refuse(
 ) -> None:
     """Raise for the first value that is not allowed."""
     _all("label", (label >= 0) & (label < n_labels), f"an index below {n_labels}", label)
-    bounds = (("center", center, MAX_COORDINATE), ("size", size, MAX_COORDINATE), ("yaw", yaw, MAX_COORDINATE))
-    for path, values, bound in (*bounds, ("score", score, 1.0)):
+    z_known = np.where(np.isnan(center) & (np.arange(3) == 2), 0.0, center)  # noqa: PLR2004 - z may be unknown
+    size_known, yaw_known = np.where(np.isnan(size), 1.0, size), np.where(np.isnan(yaw), 0.0, yaw)
+    bounds = (("center", z_known, MAX_COORDINATE), ("size", size_known, MAX_COORDINATE))
+    for path, values, bound in (*bounds, ("yaw", yaw_known, MAX_COORDINATE), ("score", score, 1.0)):
         _bounded(path, values, bound)
-    _all("size", size > 0, "a positive length", size)
+    _all("size", size_known > 0, "a positive length", size)
     _all("score", score > 0, "a score in (0, 1]", score)
     unknown = np.isnan(velocity).all(axis=1, keepdims=True)
     expected = f"at most {MAX_SPEED:g} m/s, or a whole row of NaN"

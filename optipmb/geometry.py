@@ -122,6 +122,26 @@ def iou_exceeds(first: Array, second: Array, threshold: float) -> bool:
     return box_iou(first, second) > threshold
 
 
+@kernel
+def boxes_overlap(first: Array, second: Array, threshold: float) -> bool:
+    """Tell what `iou_exceeds` does of boxes whose yaw may be NaN, unknown.
+
+    An unknown yaw is taken for that of the other box. Two boxes of unknown yaw are squares of their areas that face
+    each other: nothing depends on the axes of the world.
+    """
+    if not (math.isnan(first[4]) or math.isnan(second[4])):
+        return iou_exceeds(first, second, threshold)
+    first, second = first.copy(), second.copy()
+    if math.isnan(first[4]) and math.isnan(second[4]):
+        first[4] = math.atan2(second[1] - first[1], second[0] - first[0])
+        first[2] = first[3] = math.sqrt(first[2] * first[3])
+        second[2] = second[3] = math.sqrt(second[2] * second[3])
+    if math.isnan(first[4]):
+        first[4] = second[4]
+    second[4] = first[4] if math.isnan(second[4]) else second[4]
+    return iou_exceeds(first, second, threshold)
+
+
 def bev_iou(first: Array, second: Array) -> Array:
     """Rotated intersection over union on the ground plane.
 

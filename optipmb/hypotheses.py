@@ -15,10 +15,11 @@ import numpy as np
 
 from optipmb.class_posterior import weigh_by_class
 from optipmb.compiled import kernel
-from optipmb.density import V
+from optipmb.density import PHI, V, X, Y
 from optipmb.errors import EffortError
 from optipmb.frame import PLAIN
 from optipmb.geometry import NOBODY, block, empty_torus, insert
+from optipmb.predict import wrap
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -90,6 +91,7 @@ def local_hypotheses(
     row, measurement, log_likelihood = gate(
         objects.mean, objects.covariance, objects.label, radius, position, label, classes, grouped
     )
+    exclude_turned(row, measurement, log_likelihood, objects, measurements, classes)
     if grouped:
         weigh_by_class(row, measurement, log_likelihood, measurements, groups, classes)
     association = np.empty(label.shape[0])
@@ -114,6 +116,35 @@ def close_gates(p_d: Array, radius: Array) -> None:
     for n in range(p_d.shape[0]):
         if p_d[n] == 0.0:
             radius[n] = -1.0
+
+
+TURNED: Final = 1.5
+"""Standard deviations of a heading beyond which a detection outside eta_dist is not of the object."""
+
+
+@kernel
+def exclude_turned(
+    row: Index,
+    measurement: Index,
+    log_likelihood: Array,
+    objects: Bernoullis,
+    measurements: Measurements,
+    classes: Sequence[ClassRow],
+) -> None:
+    """Write a likelihood of zero for pairs outside eta_dist whose headings do not agree, modulo pi.
+
+    A gate that is wide for an unknown speed holds the neighbours of a parked car that is missed. An object that went
+    so far in a frame kept to its heading.
+    """
+    widening = gate_widening(measurements.position, measurements.label, classes)
+    for k in range(row.shape[0]):
+        n, m = row[k], measurement[k]
+        own, position = classes[objects.label[n]], measurements.position[m]
+        squared = (position[0] - objects.mean[n, X]) ** 2 + (position[1] - objects.mean[n, Y]) ** 2
+        turn = 0.5 * wrap(2.0 * (measurements.yaw[m] - objects.mean[n, PHI]))
+        variance = objects.covariance[n, PHI, PHI] + own.noise_heading**2
+        if squared > own.gate**2 + widening[m] and turn**2 > TURNED**2 * variance:
+            log_likelihood[k] = -math.inf
 
 
 @kernel

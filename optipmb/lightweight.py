@@ -10,7 +10,8 @@ With lambda the memory over one nominal period,
 where the object is detected. Where h falls below zero the state is turned: phi + pi, -v, -a and -h, and P -> T P T with
 T = diag(1, 1, -1, 1, 1, -1). Both states describe the same motion. A track publishes the probability 1 / (1 + e^-h)
 that its heading is right, and in the variance of the heading what the doubt adds to it. Without `heading_sign` in the
-profile the sign stays that of the birth.
+profile the sign stays that of the birth. A detection without heading has no vote; a heading that motion has shown
+begins with b_v, and h stays while nothing votes.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from optipmb.association import NEW
 from optipmb.calibration import log_odds
 from optipmb.compiled import kernel
 from optipmb.density import PHI, STATE, A, V
-from optipmb.predict import wrap
+from optipmb.predict import heading_unknown, wrap
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -95,12 +96,16 @@ def light_weight_filter(
         if m >= 0:
             z_s = measurements.score[m]
             for s in range(4):
-                auxiliary[k, s] = (1.0 - z_s) * auxiliary[k, s] + z_s * measurements.auxiliary[m, s]
+                z = measurements.auxiliary[m, s]
+                if math.isnan(auxiliary[k, s]):
+                    auxiliary[k, s] = z
+                if not math.isnan(z):
+                    auxiliary[k, s] = (1.0 - z_s) * auxiliary[k, s] + z_s * z
             x_len = 1.0 + (stamp_ns - born_ns[k]) * 1e-9 / moment.period
             score[k] = (1.0 - math.exp(-x_len)) * z_s
             seen_ns[k] = stamp_ns
             latest = log_odds(z_s)
-            if own.sign_memory == 0.0:  # the sign is not followed
+            if own.sign_memory == 0.0 or heading_unknown(covariance[k]):  # the sign is not followed
                 heading_odds[k] = 0.0
             else:
                 kept = own.sign_memory if first else sign_memory_of_frame[label[k]]
@@ -130,9 +135,12 @@ def follow_sign(
         own: parameters of its class: lambda, b_d, b_v and v_0.
         yaw: z_phi.
     """
-    latest = own.sign_detection * score * math.cos(yaw - mean[PHI])
+    blind = math.isnan(yaw)
+    latest = 0.0 if blind else own.sign_detection * score * math.cos(yaw - mean[PHI])
     if abs(mean[V]) >= own.sign_speed + CERTAIN * math.sqrt(covariance[V, V]):
         latest += math.copysign(own.sign_motion, mean[V])
+    elif blind:
+        return odds if odds > 0.0 else own.sign_motion
     odds = kept * odds + (1.0 - kept) / (1.0 - own.sign_memory) * latest
     if odds < 0.0:
         turn_around(mean, covariance)

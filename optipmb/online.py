@@ -50,8 +50,9 @@ ALIASES: Final = MappingProxyType({
 """Other names of columns."""
 WITHOUT: Final = MappingProxyType({"z": 0.0, "h": 1.5, "score": 1.0})
 """Values of the columns that may be missing, as in the tables of `optipmb track`."""
-BOXES: Final = ("center", "size", "yaw", "score", "label")
-KNOWN: Final = (*BOXES, "velocity", "position_covariance", *(part for _, parts in FLAT for part in parts), *ALIASES)
+BOXES: Final = ("center", "score", "label")
+OTHERS: Final = ("size", "yaw", "velocity", "position_covariance")
+KNOWN: Final = (*BOXES, *OTHERS, *(part for _, parts in FLAT for part in parts), *ALIASES)
 SHOWN_ROWS: Final = 10
 """Tracks that the representation of `OnlineTracks` lists."""
 CLASS_COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#8C6D1F")
@@ -74,6 +75,7 @@ class OnlineTracks:
         class_probability: (N, C) probability of each class of the profile; None where it has no groups of classes.
         sensor_motion: (3,) velocity, m/s, and turn rate, rad/s, with which what stands passes the sensor, where the
             motion of the sensor is estimated; None elsewhere.
+        measured: (N,) what is known of each track, as in `optipmb.StepResult`; None: everything of all.
 
     The other attributes are the columns of `optipmb.Tracks`.
     """
@@ -101,6 +103,7 @@ class OnlineTracks:
     paths: PredictedPaths | None = None
     class_probability: Array | None = None
     sensor_motion: Array | None = None
+    measured: NDArray[np.uint8] | None = None
 
     def __len__(self) -> int:
         return len(self.tracks)
@@ -305,8 +308,9 @@ class OnlineTracker:
                 pandas, polars or pyarrow. `center` (M, 3) or `x`, `y`, `z`; `size` (M, 3) or `l`, `w`, `h` or `length`,
                 `width`, `height`; `yaw` or `heading` (M,) rad; `score` or `confidence` (M,) in (0, 1]; `class`,
                 `label`, `name`, `category` or `type` (M,): class names, or their places in the profile; `velocity`
-                (M, 2) or `vx`, `vy`, m/s, NaN where unknown; `position_covariance` (M, 3, 3), m^2, likewise. Without
-                `z` it is 0, without `h` 1.5 m, without `score` 1. None: nothing was detected.
+                (M, 2) or `vx`, `vy`, m/s, NaN where unknown; `position_covariance` (M, 3, 3), m^2, likewise. Sizes,
+                headings and `z` may be NaN or absent, unknown; but beside a size `z` is 0 and `h` 1.5 m where there is
+                no such column. Without `score` it is 1. None: nothing was detected.
             t: time of the frame: seconds, or a date (of pandas too; UTC where it has no zone); or
             stamp_ns: nanoseconds.
             pose: world from sensor, or None when the boxes are in the world frame.
@@ -346,6 +350,7 @@ class OnlineTracker:
             paths=result.paths,
             class_probability=result.class_probability,
             sensor_motion=result.density.sensor_motion,
+            measured=result.measured,
         )
 
     def _classes(self, values: ArrayLike) -> tuple[tuple[str, ...], NDArray[np.int64], int]:
@@ -389,7 +394,7 @@ def _columns(boxes: Any, arrays: Mapping[str, ArrayLike]) -> dict[str, Any]:
     """Return the columns as `make_frame` takes them."""
     given = {**_named(boxes), **arrays}
     if not given:
-        return {"center": [], "size": [], "yaw": [], "score": [], "label": []}
+        return {"center": [], "score": [], "label": []}
     if unknown := [name for name in given if name not in KNOWN]:
         raise FrameError(unknown[0], f"columns among {', '.join(KNOWN)}", f"the columns {', '.join(given)}")
     whole = {part: name for name, parts in FLAT for part in parts}
@@ -405,7 +410,9 @@ def _columns(boxes: Any, arrays: Mapping[str, ArrayLike]) -> dict[str, Any]:
         elif any(part in given for part in parts):
             columns[name] = _stacked(given, parts)
     columns |= {name: given[name] for name in ("yaw", "score", "position_covariance", "label") if name in given}
-    columns.setdefault("score", [WITHOUT["score"]] * len(columns.get("yaw", ())))
+    columns.setdefault("score", [WITHOUT["score"]] * len(columns.get("center", ())))
+    if "size" not in columns and "center" not in given and "z" not in given and "center" in columns:
+        columns["center"][:, 2] = np.nan
     if missing := [name for name in BOXES if name not in columns]:
         raise FrameError(missing[0], f"a column for each of {', '.join(BOXES)}", f"the columns {', '.join(given)}")
     return {name: values if isinstance(values, list) else np.asarray(values) for name, values in columns.items()}

@@ -229,6 +229,12 @@ class ClassParameters(_Table):
         default=None, description="R' of the boxes that tracks report; without it they are those of the state"
     )
     birth: BirthSpread = Field(description="P^0")
+    default_size: tuple[Positive, Positive, Positive] | None = Field(
+        default=None,
+        exclude_if=not_,
+        description="length, width and height, m, of an object of which no detection gave them; none: by the name of "
+        "the class",
+    )
     motion: Literal["ctra", "cv"] = Field(
         default="ctra",
         description="motion model: constant turn rate and acceleration (the paper's), or constant velocity",

@@ -20,9 +20,10 @@ from optipmb.errors import DensityError, FrameError
 from optipmb.extract import sound, unsound
 from optipmb.lightweight import doubt
 from optipmb.parameters import HORIZONS, MAX_HORIZON_S, MAX_HORIZONS
-from optipmb.predict import decay_and_turn, displacement, predict_state, wrap
+from optipmb.predict import decay_and_turn, displacement, heading_unknown, predict_state, wrap
 from optipmb.rows import record
 from optipmb.table import ClassTable
+from optipmb.unknown_heading import scale_across, show_heading
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -178,6 +179,9 @@ def predict_paths(
     for n in range(mean.shape[0]):
         own = classes[label[n]]
         copy_state(mean, covariance, n, state, spread, 0)
+        straight = heading_unknown(spread[0]) and spread[0, PHI, PHI] > 0.0
+        if straight:  # in the units of a track
+            scale_across(spread[0], math.sqrt(spread[0, V, V] / spread[0, PHI, PHI]))
         for s in (OMEGA, A):
             squared = state[0, s] * state[0, s]
             state[0, s] *= 0.0 if own.constant_velocity or squared == 0.0 else squared / (squared + spread[0, s, s])
@@ -190,6 +194,8 @@ def predict_paths(
                 move(state[0], ahead / steps, own.acceleration_time, state[1])
                 copy_state(state, spread, 1, state, spread, 0)
             copy_state(state, spread, 0, mean_out[n], covariance_out[n], h)
+            if straight:
+                show_heading(state[0, V], covariance_out[n, h])
             before = horizons[h]
 
 

@@ -214,6 +214,44 @@ def square_root(covariance: Array, root: Array) -> int:
 
 
 @kernel
+def heading_unknown(covariance: Array) -> bool:
+    """Tell whether a state is one of `optipmb.unknown_heading`."""
+    return bool(covariance[OMEGA, OMEGA] == 0.0)
+
+
+@kernel
+def predict_without_heading(
+    mean: Array, covariance: Array, dt: float, own: ClassRow, mean_out: Array, covariance_out: Array
+) -> None:
+    """Predict a state of `optipmb.unknown_heading`: arguments as in `predict_state`.
+
+    The velocity gains the noise of a speed in both directions, and what an acceleration changes over dt.
+    """
+    cos_phi, sin_phi = math.cos(mean[PHI]), math.sin(mean[PHI])
+    for s in range(STATE):
+        mean_out[s] = mean[s]
+    mean_out[X] += dt * mean[V] * cos_phi
+    mean_out[Y] += dt * mean[V] * sin_phi
+    for s in range(STATE):
+        for t in range(STATE):
+            covariance_out[s, t] = covariance[s, t]
+    for t in range(STATE):
+        along, across = covariance_out[V, t], covariance_out[PHI, t]
+        covariance_out[X, t] += dt * (cos_phi * along - sin_phi * across)
+        covariance_out[Y, t] += dt * (sin_phi * along + cos_phi * across)
+    for s in range(STATE):
+        along, across = covariance_out[s, V], covariance_out[s, PHI]
+        covariance_out[s, X] += dt * (cos_phi * along - sin_phi * across)
+        covariance_out[s, Y] += dt * (sin_phi * along + cos_phi * across)
+    for s in range(STATE):
+        for t in range(s):
+            covariance_out[t, s] = covariance_out[s, t]
+    gained = own.process_noise[V] ** 2 * dt + (own.birth_unknown[A] * dt) ** 2
+    for s in range(4):
+        covariance_out[s, s] += gained if s >= V else own.process_noise[s] ** 2 * dt
+
+
+@kernel
 def predict_state(
     mean: Array,
     covariance: Array,
@@ -237,6 +275,9 @@ def predict_state(
     Returns:
         Number of pivots that had to be repaired.
     """
+    if heading_unknown(covariance):
+        predict_without_heading(mean, covariance, dt, own, mean_out, covariance_out)
+        return 0
     straight, tau, process_noise = own.constant_velocity, own.acceleration_time, own.process_noise
     repaired = square_root(covariance, root)
     v, phi = mean[V], mean[PHI]

@@ -14,8 +14,9 @@ import numpy as np
 from optipmb.compiled import kernel
 from optipmb.errors import EffortError
 from optipmb.frame import PLAIN
-from optipmb.geometry import NOBODY, block, empty_torus, insert, iou_exceeds
+from optipmb.geometry import NOBODY, block, boxes_overlap, empty_torus, insert
 from optipmb.hypotheses import UNLIMITED
+from optipmb.table import known_length
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,9 +34,9 @@ class Measurements(NamedTuple):
     Attributes:
         position: (M, 2) z_xy, m; (M, 5) with rho_xx, rho_xy and rho_yy of `optipmb.frame` behind, where some
             detection of the frame has another R than its class.
-        yaw: (M,) z_phi, rad.
+        yaw: (M,) z_phi, rad, NaN where unknown.
         velocity: (M, 2) z_v, m/s, NaN where unknown.
-        auxiliary: (M, 4) z_A = [length, width, height, z].
+        auxiliary: (M, 4) z_A = [length, width, height, z], NaN where unknown.
         score: (M,) z_s in (0, 1].
         label: (M,) class z_c.
         source: (M,) index in the caller's arrays.
@@ -101,8 +102,9 @@ def select(detections: Columns, width: int, classes: Sequence[ClassRow], most: i
     ordered_label = np.empty(above, np.int64)
     for k in range(above):
         m = order[k]
-        boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3] = center[m, 0], center[m, 1], size[m, 0], size[m, 1]
-        boxes[k, 4] = yaw[m]
+        boxes[k, 0], boxes[k, 1], boxes[k, 4] = center[m, 0], center[m, 1], yaw[m]
+        for s in range(2):
+            boxes[k, 2 + s] = known_length(size[m, s], s, classes[label[m]])
         ordered_label[k] = label[m]
     keep = non_maximum_suppression(boxes, ordered_label, classes, most)
     if keep.shape[0] < above:
@@ -122,14 +124,26 @@ def precedes(m: int, n: int, score: Array, center: Array, size: Array, yaw: Arra
     if score[m] != score[n]:
         return bool(score[m] > score[n])
     for s in range(3):
-        if center[m, s] != center[n, s]:
-            return bool(center[m, s] < center[n, s])
+        if differ(center[m, s], center[n, s]):
+            return below(center[m, s], center[n, s])
     for s in range(3):
-        if size[m, s] != size[n, s]:
-            return bool(size[m, s] < size[n, s])
-    if yaw[m] != yaw[n]:
-        return bool(yaw[m] < yaw[n])
+        if differ(size[m, s], size[n, s]):
+            return below(size[m, s], size[n, s])
+    if differ(yaw[m], yaw[n]):
+        return below(yaw[m], yaw[n])
     return bool(source[m] < source[n])
+
+
+@kernel
+def differ(one: float, other: float) -> bool:
+    """Tell whether two numbers differ, where NaN equals NaN."""
+    return one != other and not (math.isnan(one) and math.isnan(other))
+
+
+@kernel
+def below(one: float, other: float) -> bool:
+    """Tell whether a number is below another one, NaN above all."""
+    return one < other or math.isnan(other)
 
 
 @kernel
@@ -190,7 +204,7 @@ def non_maximum_suppression(boxes: Array, label: Index, classes: Sequence[ClassR
                             left -= 1
                             if left < 0:
                                 return keep[:0]
-                            keep[m] = not iou_exceeds(boxes[k], boxes[m], threshold)
+                            keep[m] = not boxes_overlap(boxes[k], boxes[m], threshold)
                     k = following[k]
         if keep[m]:
             insert(head, following, side, m, boxes[m, 0], boxes[m, 1], cell_size)

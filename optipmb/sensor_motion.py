@@ -27,12 +27,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.density import ENOUGH, LEAST_MOVED_S, NO_FRAME, PHI, V
+from optipmb.density import ENOUGH, LEAST_MOVED_S, NO_FRAME, OMEGA, PHI, V
+from optipmb.relocation import Relocation
 from optipmb.rows import read_only
 
 if TYPE_CHECKING:
@@ -133,6 +134,7 @@ def follow_sensor(density: Density, frame: Frame, table: ClassTable) -> Density:
     start, target = np.ascontiguousarray(objects.mean[rows, :2]), np.ascontiguousarray(frame.center[best, :2])
     pairs = Pairs(start, objects.label[rows], target, frame.label[best])
     ahead = np.column_stack((np.cos(objects.mean[rows, PHI]), np.sin(objects.mean[rows, PHI])))
+    free = objects.covariance[rows, OMEGA, OMEGA] == 0.0  # to move in any direction: their heading is unknown
     before = None if density.sensor_motion is None else density.sensor_motion * dt
     if before is not None:
         found = _continued(pairs, objects.mean[rows, V, None] * dt * ahead, before, dt)
@@ -140,7 +142,7 @@ def follow_sensor(density: Density, frame: Frame, table: ClassTable) -> Density:
             still = math.hypot(found[0], found[1]) < STANDING[0] * dt and abs(found[2]) < STANDING[1] * dt
             return unknown if still else _carried(density, found, dt)
     found = _begun(pairs, dt)
-    after = unknown if found is None else _weighed(density, pairs, ahead, found, dt, table)
+    after = unknown if found is None else _weighed(density, pairs, ahead, free, found, dt, table)
     if found is not None and after.sensor_motion is not None:
         return _carried(after if before is not None else _over_ground(after, found, dt, frame), found, dt)
     if before is not None and together(pairs, np.zeros(3)).sum() < SHARE * len(rows):
@@ -172,12 +174,14 @@ def _begun(pairs: Pairs, dt: float) -> Array | None:
     return found if clear and _drives(found, dt) else None
 
 
-def _weighed(density: Density, pairs: Pairs, ahead: Array, motion: Array, dt: float, table: ClassTable) -> Density:
+def _weighed(
+    density: Density, pairs: Pairs, ahead: Array, free: NDArray[np.bool_], motion: Array, dt: float, table: ClassTable
+) -> Density:
     """Return a density with a motion and the evidence for it, which goes on from one that is alike."""
     cos, sin = math.cos(motion[2]), math.sin(motion[2])
     turned = ahead @ np.array([[cos, sin], [-sin, cos]])
     reach = (UNKNOWN * dt * table["birth_unknown"][:, V])[pairs.label]
-    walks = table["constant_velocity"][pairs.label]
+    walks = table["constant_velocity"][pairs.label] | free
     standing = sideways(pairs, ahead, reach, walks)
     moving = sideways(pairs._replace(start=taken(pairs.start, motion)), turned, reach, walks)
     gained = standing - moving
@@ -207,30 +211,28 @@ def _over_ground(density: Density, motion: Array, dt: float, frame: Frame) -> De
     apparent = (taken(mean[:, :2], motion) - mean[:, :2]) / dt
     along = apparent[:, 0] * np.cos(mean[:, PHI]) + apparent[:, 1] * np.sin(mean[:, PHI])
     mean[:, V] -= np.where(objects.seen_ns > objects.born_ns, along, 0.0)
+    free = (objects.covariance[:, OMEGA, OMEGA] == 0.0) & (objects.seen_ns > objects.born_ns)
+    if free.any():  # those of unknown heading: their whole velocity
+        v, phi = objects.mean[free, V, None], objects.mean[free, PHI]
+        over = v * np.column_stack((np.cos(phi), np.sin(phi))) - apparent[free]
+        mean[free, V], mean[free, PHI] = np.hypot(*over.T), np.arctan2(over[:, 1], over[:, 0])
     return replace(density, bernoulli=objects.replaced(mean=mean))
 
 
 def _carried(density: Density, motion: Array, dt: float) -> Density:
     """Return a density in the axes of a sensor that made a motion."""
-    parts: dict[str, Any] = {"sensor": read_only(np.array([*motion / dt, ENOUGH, LEAST_MOVED_S]))}
-    cos, sin = math.cos(motion[2]), math.sin(motion[2])
-    turn = np.eye(6)
-    turn[:2, :2] = (cos, -sin), (sin, cos)
-    for name in ("bernoulli", "poisson"):
-        rows = getattr(density, name)
-        mean = rows.mean.copy()
-        mean[:, :2] = taken(mean[:, :2], motion)
-        heading = mean[:, PHI] + motion[2]
-        mean[:, PHI] = heading - 2.0 * math.pi * np.ceil((heading - math.pi) / (2.0 * math.pi))
-        parts[name] = rows.replaced(mean=mean, covariance=turn @ rows.covariance @ turn.T)
-    return replace(density, **parts)
+    moved = _relocation(motion).density(density)
+    return replace(moved, sensor=read_only(np.array([*motion / dt, ENOUGH, LEAST_MOVED_S])))
 
 
 def taken(points: Array, motion: Array) -> Array:
     """Return points (N, 2) where a motion (3,), t and theta, takes them."""
-    cos, sin = math.cos(motion[2]), math.sin(motion[2])
-    x, y = points[:, 0], points[:, 1]
-    return np.column_stack((cos * x - sin * y + motion[0], sin * x + cos * y + motion[1]))
+    return _relocation(motion).points(points)
+
+
+def _relocation(motion: Array) -> Relocation:
+    x, y, theta = motion.tolist()
+    return Relocation(x, y, 0.0, theta)
 
 
 @kernel

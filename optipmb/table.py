@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 
+from optipmb.class_names import common_name
+from optipmb.compiled import kernel
 from optipmb.parameters import MAX_KNOTS
 
 if TYPE_CHECKING:
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
 
     from optipmb.parameters import ClassParameters, Parameters
 
+    Size = NDArray[np.float64]
     Spread = NDArray[np.float64]
     Curve = NDArray[np.float64]
 
@@ -33,6 +36,7 @@ class ClassRow(Protocol):
         birth_intensity: mu_b0 / A, 1/m^2.
         acceleration_time: time constant of the acceleration, s, infinite where it is constant.
         constant_velocity: whether the motion model is that of constant velocity.
+        default_size: (3,) length, width and height of an object of which they are unknown, m.
         process_noise: (6,) standard deviations in state order, per square root of a second.
         noise_position: standard deviation of z_x and z_y.
         noise_velocity: of z_vx and z_vy.
@@ -90,6 +94,7 @@ class ClassRow(Protocol):
     birth_intensity: float
     acceleration_time: float
     constant_velocity: bool
+    default_size: Size
     process_noise: Spread
     noise_position: float
     noise_velocity: float
@@ -120,6 +125,7 @@ _TYPES: Final = MappingProxyType(
         "float": np.float64,
         "int": np.int64,
         "bool": np.bool_,
+        "Size": (np.float64, (3,)),
         "Spread": (np.float64, (6,)),
         "Curve": (np.float64, (MAX_KNOTS,)),
     }
@@ -149,6 +155,15 @@ class ClassTable:
         column: NDArray[Any] = np.asarray(self.classes)[name]
         return column
 
+    def known_boxes(self, label: NDArray[np.int64], auxiliary: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return x_A of objects (N, 4), with what is usual in their classes in place of what is unknown."""
+        unknown = np.isnan(auxiliary)
+        if not unknown.any():
+            return auxiliary
+        usual = self["default_size"][label]
+        size: NDArray[np.float64] = np.where(unknown[:, :3], usual, auxiliary[:, :3])
+        return np.column_stack((size, np.where(unknown[:, 3], 0.5 * size[:, 2], auxiliary[:, 3])))
+
     def copy(self) -> ClassTable:
         """Return a table whose classes may be written."""
         classes: Any = np.array(self.classes)
@@ -163,13 +178,31 @@ class ClassTable:
             group if p.suppress_in_group else row for row, (p, group) in enumerate(zip(rows, groups, strict=True))
         ]
         classes: Any = np.zeros(len(rows), CLASS)
+        sizes = [p.default_size or usual_size(name) for name, p in parameters.classes.items()]
         for c, (p, group) in enumerate(zip(rows, groups, strict=True)):
-            shared = {"group": groups.index(group), "group_size": groups.count(group)}
-            shared["suppressed_with"] = suppressed.index(suppressed[c])
+            shared: dict[str, Any] = {"group": groups.index(group), "group_size": groups.count(group)}
+            shared |= {"suppressed_with": suppressed.index(suppressed[c]), "default_size": sizes[c]}
             for name, value in (_values(p) | shared).items():
                 classes[name][c] = value
         confusion = _confusion(classes, np.array([p.class_confusion for p in rows]))
         return cls(classes, parameters.nominal_period, parameters.detection_time, confusion)
+
+
+@kernel
+def known_length(length: float, s: int, own: ClassRow) -> float:
+    """Return entry `s` of a size, m, or that of the class where it is unknown, NaN."""
+    return own.default_size[s] if math.isnan(length) else length
+
+
+_USUAL: Final = MappingProxyType({
+    "car": (4.5, 1.9, 1.6), "truck": (8.0, 2.6, 3.2), "bus": (11.0, 2.8, 3.3), "trailer": (11.0, 2.8, 3.8),
+    "pedestrian": (0.7, 0.7, 1.75), "bicycle": (1.8, 0.6, 1.7), "motorcycle": (2.1, 0.8, 1.6),
+})  # fmt: skip
+
+
+def usual_size(name: str) -> tuple[float, float, float]:
+    """Return length, width and height of an object, m, by what the name of its class means."""
+    return _USUAL.get(common_name(name) or "", (1.5, 1.5, 1.5))
 
 
 def _confusion(classes: Any, kappa: NDArray[np.float64]) -> NDArray[np.float64]:

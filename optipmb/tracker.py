@@ -36,10 +36,13 @@ from optipmb.self_calibration import calibrated, followed
 from optipmb.sensor_motion import follow_sensor
 from optipmb.table import ClassTable
 from optipmb.undetected import update_undetected, with_measurement_births
+from optipmb.unknown_heading import all_measured, measured_bits
 from optipmb.update import first_detected_states, ukf_updates
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from numpy.typing import NDArray
 
     from optipmb.extract import Tracks
     from optipmb.frame import Frame
@@ -190,6 +193,8 @@ class StepResult:
         diagnostics: what happened.
         paths: predicted paths of the tracks, where the profile has horizons.
         class_probability: (N, C) of each track and class, where classes have a group in common.
+        measured: (N,) uint8, what of each track is known: 1 the heading, by a detection or by its motion, 2 the size,
+            4 the height, added up; the rest are stand-ins. None: everything of all.
     """
 
     density: Density
@@ -197,6 +202,7 @@ class StepResult:
     diagnostics: Diagnostics
     paths: PredictedPaths | None = None
     class_probability: Array | None = None
+    measured: NDArray[np.uint8] | None = None
 
 
 class Tracker:
@@ -313,7 +319,8 @@ class Tracker:
         pi = None if pi is None else pi[np.searchsorted(objects.id, tracks.id)]
         removed, repaired = (frame.score.shape[0], below_score, suppressed), repaired + after.repaired
         diagnostics = Diagnostics(cloud is not None, *removed, after.detected, born, repaired)
-        return StepResult(posterior, tracks, diagnostics, paths, pi)
+        measured = None if all_measured(objects.words) else measured_bits(objects, tracks.id)
+        return StepResult(posterior, tracks, diagnostics, paths, pi, measured)
 
     def _moment(self, density: Density, frame: Frame) -> Moment:
         """Return the time of a frame; refuse the past, and other classes, for which kernels read out of bounds."""

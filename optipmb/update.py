@@ -9,6 +9,9 @@ A birth starts at the measurement: m^0 = [z_x, z_y, speed, heading, 0, 0] under 
 of the measured velocity. Two cases that the paper leaves open: without a velocity the object starts with the detected
 heading and v = 0 under a wide prior; and the direction of a velocity slower than `birth_heading_speed` is mostly noise,
 so the heading is that of the box and the speed is the velocity along it.
+
+A detection without heading (NaN) leaves the last row out. Its birth, and what follows until the heading is known, is
+that of `optipmb.unknown_heading`.
 """
 
 from __future__ import annotations
@@ -20,10 +23,11 @@ import numpy as np
 
 from optipmb.association import NEW
 from optipmb.compiled import kernel
-from optipmb.density import PHI, STATE, V, X, Y, copy_state
+from optipmb.density import OMEGA, PHI, STATE, A, V, X, Y, copy_state
 from optipmb.frame import PLAIN
 from optipmb.hypotheses import FROM_POISSON
-from optipmb.predict import ORDER, SPREAD, WEIGHT, square_root, wrap
+from optipmb.predict import ORDER, SPREAD, WEIGHT, heading_unknown, square_root, wrap
+from optipmb.unknown_heading import LOST, face_along, find_heading, lose_heading, take_heading
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -37,7 +41,7 @@ if TYPE_CHECKING:
     Buffers = tuple[Array, Array, Array, Array, Array, Array]
 
 MEASURED = 5
-"""Rows of z_M with a velocity; three without."""
+"""Rows of z_M with a velocity and a heading."""
 
 
 @kernel
@@ -101,6 +105,13 @@ def ukf_updates(
         sigma[4] = own.noise_heading
         if ukf_update(mean[n], covariance[n], z, sigma, buffers, mean_out[k], covariance_out[k]) > 0:
             repaired += 1
+        if heading_unknown(covariance_out[k]):
+            if math.isnan(z[4]):
+                find_heading(mean_out[k], covariance_out[k], own)
+            else:
+                take_heading(mean_out[k], covariance_out[k], z[4], own)
+        elif math.isnan(z[4]) and covariance_out[k, PHI, PHI] > LOST * LOST:
+            lose_heading(mean_out[k], covariance_out[k])
     return repaired
 
 
@@ -115,7 +126,7 @@ def ukf_update(
 
     Arguments of its own:
         covariance: (6, 6) P_+.
-        z: (5,) z_M; NaN at 2 and 3 where the velocity is unknown.
+        z: (5,) z_M; NaN at 2 and 3 where the velocity is unknown, at 4 where the heading is.
         sigma: (6,) standard deviations of the measurement noise, ``R = diag(sigma^2)``, and last the covariance of z_x
             and z_y in R.
         buffers: of `workspace`; what they hold does not matter.
@@ -126,7 +137,9 @@ def ukf_update(
         Number of pivots that had to be repaired.
     """
     with_velocity = not (math.isnan(z[2]) or math.isnan(z[3]))
-    size = MEASURED if with_velocity else 3
+    straight = heading_unknown(covariance)  # and takes no heading here
+    with_heading = not (straight or math.isnan(z[4]))
+    size = (MEASURED if with_velocity else 3) - (not with_heading)
     root, chi, psi, innovation, factor, weighted = buffers
     repaired = square_root(covariance, root)
     v, phi = mean[V], mean[PHI]
@@ -142,13 +155,16 @@ def ukf_update(
         for row in range(STATE):
             chi[i, ORDER[row]] = step * root[row, i // 2]
         psi[i, 0], psi[i, 1] = chi[i, X], chi[i, Y]
-        if with_velocity:
+        if straight and with_velocity:
+            psi[i, 2], psi[i, 3] = chi[i, V], chi[i, PHI]
+        elif with_velocity:
             cos_point, sin_point = cos_phi, sin_phi
             if chi[i, PHI] != 0.0:  # only the columns of v and phi turn the heading
                 cos_point, sin_point = math.cos(phi + chi[i, PHI]), math.sin(phi + chi[i, PHI])
             psi[i, 2] = (v + chi[i, V]) * cos_point - vx0
             psi[i, 3] = (v + chi[i, V]) * sin_point - vy0
-        psi[i, size - 1] = chi[i, PHI]
+        if with_heading:
+            psi[i, size - 1] = chi[i, PHI]
         for r in range(size):
             innovation[r] -= WEIGHT * psi[i, r]
     for i in range(2 * STATE):
@@ -156,11 +172,15 @@ def ukf_update(
             psi[i, r] += innovation[r]  # the mean of psi is minus the innovation so far
     innovation[0] += z[0] - mean[X]
     innovation[1] += z[1] - mean[Y]
-    if with_velocity:
+    if straight and with_velocity:
+        innovation[2] += cos_phi * z[2] + sin_phi * z[3] - v
+        innovation[3] += cos_phi * z[3] - sin_phi * z[2]
+    elif with_velocity:
         innovation[2] += z[2] - vx0
         innovation[3] += z[3] - vy0
-    turn = innovation[size - 1] + z[4] - phi
-    innovation[size - 1] = 0.5 * wrap(2.0 * turn)
+    if with_heading:
+        turn = innovation[size - 1] + z[4] - phi
+        innovation[size - 1] = 0.5 * wrap(2.0 * turn)
 
     # S = Psi' W Psi + R, factored in place; then W = C L^-T and u = L^-1 nu.
     for r in range(size):
@@ -170,7 +190,7 @@ def ukf_update(
                 value += psi[i, r] * psi[i, s]
             value *= WEIGHT
             if r == s:
-                deviation = sigma[r] if r < size - 1 else sigma[4]
+                deviation = sigma[4] if with_heading and r == size - 1 else sigma[r]
                 value += deviation * deviation
             elif r == 1 and sigma[MEASURED] != 0.0:
                 value += sigma[MEASURED]
@@ -201,6 +221,10 @@ def ukf_update(
                 value -= weighted[s, r] * weighted[t, r]
             covariance_out[s, t] = value
             covariance_out[t, s] = value
+    if straight:
+        across, mean_out[PHI] = mean_out[PHI] - phi, phi
+        face_along(mean_out, covariance_out, across)
+        return 0
     mean_out[PHI] = wrap(mean_out[PHI])
     return repaired
 
@@ -224,10 +248,13 @@ def birth_states(
         own = classes[measurements.label[m]]
         speed, heading = 0.0, yaw[m]
         spread = own.birth_unknown
+        straight = math.isnan(heading)
+        if straight:
+            heading = math.atan2(position[m, 1], position[m, 0])
         if not (math.isnan(velocity[m, 0]) or math.isnan(velocity[m, 1])):
             spread = own.birth_known
             speed = math.hypot(velocity[m, 0], velocity[m, 1])
-            if speed >= own.birth_heading_speed and speed > 0.0:
+            if (speed >= own.birth_heading_speed or straight) and speed > 0.0:
                 heading = math.atan2(velocity[m, 1], velocity[m, 0])
             else:
                 speed = velocity[m, 0] * math.cos(heading) + velocity[m, 1] * math.sin(heading)
@@ -245,6 +272,10 @@ def birth_states(
             covariance_out[k, 0, 0] *= position[m, 2]
             covariance_out[k, 1, 1] *= position[m, 4]
             covariance_out[k, 0, 1] = covariance_out[k, 1, 0] = spread[0] * spread[1] * position[m, 3]
+        if straight:
+            covariance_out[k, PHI, PHI] = spread[V] * spread[V]
+            covariance_out[k, OMEGA, OMEGA] = covariance_out[k, A, A] = 0.0
+            find_heading(mean_out[k], covariance_out[k], own)
 
 
 @kernel
@@ -331,7 +362,8 @@ def moment_match(
 ) -> None:
     """Replace Gaussian mixtures by single Gaussians of the same mean and covariance.
 
-    Headings are averaged as differences from the heading of the heaviest component, taken in (-pi, pi].
+    Headings are averaged as differences from the heading of the heaviest component, taken in (-pi, pi]. Where one of
+    them is unknown, the heaviest component stands for all.
 
     Arguments of its own:
         start: (K + 1,) where the components of each mixture start.
@@ -345,6 +377,12 @@ def moment_match(
         for j in range(first, last):
             if weight[j] > weight[heaviest]:
                 heaviest = j
+        straight = False
+        for j in range(first, last):
+            straight |= heading_unknown(covariance[j])
+        if straight:
+            copy_state(mean, covariance, heaviest, mean_out, covariance_out, k)
+            continue
         deviation = np.empty((last - first, STATE))
         shift = np.zeros(STATE)
         for j in range(first, last):

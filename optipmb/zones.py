@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from optipmb.extract import Tracks
+    from optipmb.relocation import Relocation
     from optipmb.rows import Array, Index
 
 Point = tuple[float, float]
@@ -316,6 +317,32 @@ def adapted(zones: Sequence[Zone], state: ZoneState) -> ZoneState:
     }
     counts = {name: one for name, one in state.counts.items() if name in kept}
     return replace(state, tracks=tracks, counts=counts, zones=digests)
+
+
+def relocated(state: ZoneState, relocation: Relocation) -> ZoneState:
+    """Return the state in a world that has moved, in which zones stay where they are: no move crosses a border by it.
+
+    An object that is inside a zone then, and was not before, has appeared there.
+    """
+
+    def event(one: Event) -> Event:
+        return one._replace(position=relocation.place(one.position), yaw=one.yaw + relocation.theta)
+
+    def visit(one: Visit) -> Visit:
+        entered = None if one.entered is None else event(one.entered)
+        return one._replace(place=relocation.place(one.place), entered=entered)
+
+    tracks = {
+        identity: seen._replace(
+            place=relocation.place(seen.place),
+            known=0,
+            visits={name: visit(one) for name, one in seen.visits.items()},
+            beside={name: (at_ns, relocation.place(place)) for name, (at_ns, place) in seen.beside.items()},
+            held=tuple(event(one) for one in seen.held),
+        )
+        for identity, seen in state.tracks.items()
+    }
+    return replace(state, tracks=tracks)
 
 
 def end(zones: Sequence[Zone], state: ZoneState) -> tuple[ZoneState, tuple[Event, ...]]:

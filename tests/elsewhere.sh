@@ -1,21 +1,20 @@
 #!/bin/sh
 # Installs the wheel into a fresh environment, other than the one it was developed in, and runs tests against it there.
-# Called as: sh tests/elsewhere.sh PYTHON BIN [CONSTRAINTS]
+# Called as: sh tests/elsewhere.sh PYTHON DIST [CONSTRAINTS]
 #   PYTHON       interpreter that makes the fresh environment
-#   BIN          folder of an environment with `build`
+#   DIST         folder with the wheel
 #   CONSTRAINTS  versions to install; the newest that pyproject.toml allows by default
 set -eu
 python=$1
-case $2 in /*) bin=$2 ;; *) bin=$PWD/$2 ;; esac
+wheel=$(ls "$2"/optipmb-*.whl)
 root=$(cd "$(dirname "$0")/.." && pwd)
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT INT TERM
 constraints=${3:-/dev/null}
 
-"$bin/python" -m build --wheel --outdir "$work/dist" "$root" >"$work/build.log" 2>&1 || { cat "$work/build.log"; exit 1; }
 "$python" -m venv "$work/venv"
 "$work/venv/bin/python" -m pip install --quiet --disable-pip-version-check --constraint "$constraints" \
-  "$(ls "$work"/dist/optipmb-*.whl)[grpc,plot,record,service,table,tune]" hypothesis pytest pytest-asyncio pytest-xdist \
+  "$wheel[grpc,plot,record,service,table,tune]" hypothesis pytest pytest-asyncio pytest-xdist \
   foxglove-schemas-protobuf mcap-protobuf-support mcap-ros2-support websocket-client
 "$work/venv/bin/python" -m pip check --disable-pip-version-check
 mkdir "$work/away" && cd "$work/away" # nothing of the source tree is importable from here, but for what tests share

@@ -1,6 +1,6 @@
 #!/bin/sh
 # Tests the wheel with the newest Python beyond 3.11 on this machine: on the path, or kept by pyenv.
-# Called as: sh tests/pythons.sh BIN
+# Called as: sh tests/pythons.sh DIST
 set -eu
 here=$(dirname "$0")
 for minor in 13 12; do

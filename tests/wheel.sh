@@ -1,19 +1,20 @@
 #!/bin/sh
-# Builds the wheel, installs it alone into a fresh environment, and uses it from there: what the source tree adds is not
-# there, so that a file missing from the wheel shows. Called as: sh tests/wheel.sh PYTHON BIN
+# Installs the wheel alone into a fresh environment, and uses it from there: what the source tree adds is not there, so
+# that a file missing from the wheel shows. Called as: sh tests/wheel.sh PYTHON BIN DIST
 #   PYTHON  interpreter that makes the fresh environment
-#   BIN     folder of an environment with `build`
+#   BIN     folder of an environment with pip
+#   DIST    folder with the wheel
 set -eu
 python=$1
 case $2 in /*) bin=$2 ;; *) bin=$PWD/$2 ;; esac
 root=$(cd "$(dirname "$0")/.." && pwd)
+wheel=$(ls "$3"/optipmb-*.whl)
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT INT TERM
 
-"$bin/python" -m build --wheel --outdir "$work/dist" "$root" >"$work/build.log" 2>&1 || { cat "$work/build.log"; exit 1; }
 "$python" -m venv --without-pip "$work/venv"
 "$bin/python" -m pip --python "$work/venv/bin/python" install --quiet --no-compile --disable-pip-version-check \
-  --constraint "$root/requirements.lock" "$(echo "$work"/dist/optipmb-*.whl)[service]"
+  --constraint "$root/requirements.lock" "$wheel[service]"
 
 # Machine code is kept by the digest of the package's sources. These are the same, so what was compiled from the source
 # tree serves here too, which spares a minute; whatever is missing is compiled.
@@ -45,4 +46,4 @@ PYTHON
 "$work/venv/bin/optipmb" track --dataset scene --option frames=5 --out "$work/out" >/dev/null
 test -s "$work/out/0000.txt"
 "$bin/python" -m pip --python "$work/venv/bin/python" check --disable-pip-version-check
-echo "the wheel $(basename "$work"/dist/optipmb-*.whl) works by itself"
+echo "the wheel $(basename "$wheel") works by itself"

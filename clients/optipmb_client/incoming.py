@@ -92,7 +92,7 @@ class Inbox:
 
     @property
     def closed(self) -> bool:
-        """Whether no further entries will come; those that wait can still be read."""
+        """Whether no further entries will come; waiting ones can still be read."""
         return self._closed
 
     def close(self) -> None:

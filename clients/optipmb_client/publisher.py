@@ -17,7 +17,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
-from optipmb_schemas import PREFIX, Detections, FieldOfView, Keys, MessageError, Points, Pose
+from optipmb_schemas import PREFIX, Detections, FieldOfView, Keys, MessageError, Points, Pose, Relocation
 from optipmb_schemas.arrays import ArrayLike, numeric
 
 from optipmb_client.links import Link, linked
@@ -79,6 +79,7 @@ class Publisher:
         self.last_put_ns = 0  # monotonic time just before the newest detections were handed to the network
         self._seq = 0
         self._points_seq = 0
+        self._relocation: Relocation | None = None  # of the present world
         self._order = threading.Lock()  # sequence numbers go out in order
         self._own = linked(connect, config=config, timeout=timeout) if connection is None else None
         link = connection or self._own
@@ -111,9 +112,9 @@ class Publisher:
         stamp_ns: int,
         label: Sequence[str] | ArrayLike,
         center: ArrayLike,
-        size: ArrayLike,
-        yaw: ArrayLike,
         score: ArrayLike,
+        size: ArrayLike | None = None,
+        yaw: ArrayLike | None = None,
         velocity: ArrayLike | None = None,
         labels: Sequence[str] | None = None,
         pose: PoseLike | None = None,
@@ -122,16 +123,17 @@ class Publisher:
         has_points: bool | None = None,
         field_of_view: FieldOfView | None = None,
         position_covariance: ArrayLike | None = None,
+        relocation: PoseLike | None = None,
     ) -> int:
         """Publish the detections of one sensor frame, and its point cloud where there is one.
 
         Args:
             stamp_ns: Sensor time of the frame.
             label: Class names of the M objects; or, with `labels`, indices (M,) into it.
-            center: (M, 3), geometric centres of the boxes.
-            size: (M, 3), length, width, height, all positive.
-            yaw: (M,), counter-clockwise from x.
+            center: (M, 3), geometric centres of the boxes; NaN as z where it is unknown.
             score: (M,), in [0, 1]; an object of score 0 is left out and counted.
+            size: (M, 3), length, width, height, all positive; NaN where unknown. None: unknown for all.
+            yaw: (M,), counter-clockwise from x; NaN where unknown. None: unknown for all.
             velocity: (M, 2), over ground; a row of NaN where it is unknown. None: unknown for all.
             labels: The class names that `label` points into.
             pose: Pose of the sensor in the world, (translation (3,), unit quaternion w x y z (4,)); needed with
@@ -146,6 +148,9 @@ class Publisher:
                 nor missed. None: it sees everything.
             position_covariance: (M, 3, 3), of the errors of the centres; NaN for an object for which the noise of the
                 profile holds. None: it holds for all.
+            relocation: With the first frame after a loop closure or a change of map: the motion (translation (3,),
+                quaternion of a turn about z) from the world frame before to that of this message and of all later ones.
+                The service moves its tracks so, and they keep their ids.
 
         Returns:
             The sequence number of the frame.
@@ -155,7 +160,9 @@ class Publisher:
         """
         names, index = _labelled(label, labels)
         with self._order:  # sequence numbers go out in their order
-            cloud = None
+            cloud, world = None, self._relocation
+            if relocation is not None:
+                world = _relocation(relocation, 1 if world is None else world.world + 1)
             if points is not None and (has_points or self.points_wanted):
                 cloud = self._encode_points(stamp_ns, points, pose if points_pose is None else points_pose)
                 has_points = True
@@ -168,11 +175,12 @@ class Publisher:
                 stamp_ns=_stamp(stamp_ns),
                 frame=self.frame,
                 pose=_pose(pose),
+                relocation=world,
                 labels=names,
                 label=index,
                 center=_array("center", center, 3),
-                size=_array("size", size, 3),
-                yaw=_array("yaw", yaw),
+                size=None if size is None else _array("size", size, 3),
+                yaw=None if yaw is None else _array("yaw", yaw),
                 velocity=None if velocity is None else _array("velocity", velocity, 2),
                 score=_array("score", score),
                 has_points=has_points,
@@ -188,6 +196,7 @@ class Publisher:
             self.last_put_ns = time.monotonic_ns()
             self._detections.put(payload)
             self._seq += 1
+            self._relocation = world
             return message.seq
 
     def publish_points(self, *, stamp_ns: int, points: ArrayLike, pose: PoseLike | None = None) -> int | None:
@@ -265,3 +274,17 @@ def _pose(pose: PoseLike | None) -> Pose | None:
     except (TypeError, ValueError):
         raise MessageError("invalid_value", "pose", "a pair: translation, quaternion", type(pose).__name__) from None
     return Pose(translation=_array("pose.translation", translation), quaternion=_array("pose.quaternion", quaternion))
+
+
+def _relocation(motion: PoseLike, world: int) -> Relocation:
+    """Return the motion into a world of this number."""
+    try:
+        translation, quaternion = (motion.translation, motion.quaternion) if isinstance(motion, Pose) else motion
+        return Relocation(
+            world=world, translation=_array("translation", translation), quaternion=_array("quaternion", quaternion)
+        )
+    except MessageError as error:
+        raise error.under("relocation") from None
+    except (TypeError, ValueError):
+        expected = "a pair: translation, quaternion"
+        raise MessageError("invalid_value", "relocation", expected, type(motion).__name__) from None

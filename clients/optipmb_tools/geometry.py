@@ -10,10 +10,13 @@ gives the same yaw again for any tilt.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from optipmb_schemas import Detections
 
 Floats: TypeAlias = NDArray[np.float64]
 Ints: TypeAlias = NDArray[np.int64]
@@ -116,13 +119,31 @@ def to_world(rotation: Floats, translation: Floats, center: Floats, yaw: Floats)
     """
     heading = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=-1)
     forward = np.einsum("...ij,...j->...i", rotation, heading)
-    moved = np.einsum("...ij,...j->...i", rotation, center) + translation
+    flat = np.isnan(center[..., 2])  # of unknown height: at that of the sensor
+    moved = np.einsum("...ij,...j->...i", rotation, np.nan_to_num(center) if flat.any() else center) + translation
+    moved[flat, 2] = np.nan
     return moved, wrap_angle(np.arctan2(forward[..., 1], forward[..., 0]))
+
+
+def box_columns(detections: "Detections") -> tuple[Floats, Floats]:
+    """Return sizes (M, 3) and yaws (M,) of detections, of NaN where the message has none."""
+    count = len(detections.label)
+    size = np.full((count, 3), np.nan) if detections.size is None else detections.size
+    return size, np.full(count, np.nan) if detections.yaw is None else detections.yaw
+
+
+def shown_boxes(detections: "Detections") -> tuple[Floats, Floats]:
+    """Return sizes and yaws as pictures have them: half a metre where a length is unknown, 0 where a heading is."""
+    size, yaw = box_columns(detections)
+    return np.nan_to_num(size, nan=0.5), np.nan_to_num(yaw)
 
 
 def to_sensor(rotation: Floats, translation: Floats, center: Floats, yaw: Floats) -> tuple[Floats, Floats]:
     """Carry boxes from the world to the sensor frame: the inverse of `to_world`, with the same shapes."""
-    moved = np.einsum("...ji,...j->...i", rotation, center - translation)
+    flat = np.isnan(center[..., 2])
+    away = center - translation
+    moved = np.einsum("...ji,...j->...i", rotation, np.nan_to_num(away) if flat.any() else away)
+    moved[flat, 2] = np.nan
     # The heading (c, s, 0) of the sensor frame is seen from above along A (c, s) with A the upper left block of R. The
     # adjugate of A gives the direction of its inverse; its sign is the sign of det A, positive while the sensor stands
     # upright.

@@ -32,11 +32,12 @@ from optipmb_schemas.messages import (
     FieldOfView,
     Points,
     Pose,
+    Relocation,
     Tracks,
     ZoneCount,
     ZoneEvent,
-    class_fields,
     path_fields,
+    track_fields,
 )
 from optipmb_schemas.model import Message
 
@@ -67,6 +68,7 @@ __all__ = [
     "Pose",
     "Problem",
     "Query",
+    "Relocation",
     "ResetRequest",
     "ServiceStatus",
     "SessionParameters",
@@ -77,7 +79,6 @@ __all__ = [
     "TracksRequest",
     "ZoneCount",
     "ZoneEvent",
-    "class_fields",
     "decode",
     "decode_dump",
     "encode",
@@ -87,4 +88,5 @@ __all__ = [
     "encoded",
     "encoding_of",
     "path_fields",
+    "track_fields",
 ]

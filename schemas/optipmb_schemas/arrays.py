@@ -14,7 +14,7 @@ from functools import cached_property
 from itertools import chain
 from math import hypot, nan
 from operator import le
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic.json_schema import JsonSchemaValue
@@ -72,7 +72,8 @@ class Array:
         shape: numbers, or letters for symbolic dimensions, the first of which is a number of rows.
         low, high: range of every value, both ends included. NaN and infinity are in no range.
         above: the values must be greater than `low`, not equal.
-        unknown: a row may be all NaN (null in JSON), which means that it is not known for this object.
+        unknown: what may be NaN (null in JSON), not known for this object: a whole `row`, any `number`, or the `last`
+            one of a row; empty: nothing.
         wider: the last dimension may be larger than described; further columns are dropped.
     """
 
@@ -81,7 +82,7 @@ class Array:
     low: float
     high: float
     above: bool = False
-    unknown: bool = False
+    unknown: Literal["", "row", "number", "last"] = ""
     wider: bool = False
 
     @cached_property
@@ -217,7 +218,7 @@ def _with_nulls(value: Any) -> Any:
     """Return nested lists with None in place of NaN."""
     if isinstance(value, list):
         return [_with_nulls(item) for item in value]
-    return None if value != value else value  # noqa: PLR0124 - NaN
+    return None if value != value else value  # noqa: PLR0124 - NaN differs from itself
 
 
 def unit_quaternion(array: Reals) -> Reals:

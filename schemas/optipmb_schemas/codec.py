@@ -52,7 +52,7 @@ from optipmb_schemas.model import Message
 try:
     import numpy as np
 except ModuleNotFoundError:  # the models read every form then
-    np = None  # type: ignore[assignment]
+    np = None  # type: ignore[assignment]  # numpy is an extra
 
 T = TypeVar("T", bound=Message)
 
@@ -594,7 +594,7 @@ REFUSED: Final = (msgspec.MsgspecError, ValueError, TypeError, LookupError, Recu
 @cache
 def _block_of(dtype: str, dimensions: int) -> Any:
     """Return the type of array blocks of a number type."""
-    shape: Any = tuple[(int,) * dimensions]  # type: ignore[misc]
+    shape: Any = tuple[(int,) * dimensions]  # type: ignore[misc]  # made at run time
     fields = [("dtype", Literal[dtype]), ("shape", shape), ("data", memoryview)]
     return msgspec.defstruct("Block", fields, frozen=True, gc=False)
 
@@ -736,7 +736,7 @@ _Read = Callable[[tuple[memoryview, ...], dict[str, Any]], None]
 
 def _columns(dtype: str, arrays: list[tuple[int, str, Array, tuple[int, ...]]]) -> _Read:
     """Return the reader of columns of one number type: one behind the other, those with unknown rows last."""
-    arrays = sorted(arrays, key=lambda one: one[2].unknown)
+    arrays = sorted(arrays, key=lambda one: bool(one[2].unknown))
     sizes = [prod(shape) for *_, shape in arrays]
     places = [slice(begin, end) for begin, end in pairwise(accumulate(sizes, initial=0))]
     low = np.concatenate([np.full(size, _least(one[2]), dtype) for one, size in zip(arrays, sizes, strict=True)])
@@ -746,8 +746,8 @@ def _columns(dtype: str, arrays: list[tuple[int, str, Array, tuple[int, ...]]]) 
         (name, place, shape if len(shape) > 1 else None)
         for (_, name, _, shape), place in zip(arrays, places, strict=True)
     ]
-    unknown = [(name, place) for (_, name, one, _), place in zip(arrays, places, strict=True) if one.unknown]
-    known = unknown[0][1].start if unknown else len(low)
+    unknown = [(name, one, place) for (_, name, one, _), place in zip(arrays, places, strict=True) if one.unknown]
+    known = unknown[0][2].start if unknown else len(low)
 
     def read(data: tuple[memoryview, ...], values: dict[str, Any]) -> None:
         numbers = np.frombuffer(b"".join([data[at] for at in order]), dtype)
@@ -756,9 +756,9 @@ def _columns(dtype: str, arrays: list[tuple[int, str, Array, tuple[int, ...]]]) 
             values[name] = numbers[place] if shape is None else numbers[place].reshape(shape)
         if not good[good.argmin()]:
             _need(bool(good[:known].all()))
-            for name, place in unknown:
-                unknown_rows = np.isnan(array := values[name]).all(axis=-1, keepdims=True)
-                _need(bool((good[place].reshape(array.shape) | unknown_rows).all()))
+            for name, one, place in unknown:
+                absent = numeric.unknown(array := values[name], one)
+                _need(bool((good[place].reshape(array.shape) | absent).all()))
 
     return read
 
@@ -775,7 +775,7 @@ def _column(at: int, name: str, described: Array, shape: tuple[int, ...]) -> _Re
         values[name] = array = numbers.reshape(shape)
         # Both are NaN where there is one, and comparisons with NaN are false.
         if not (numbers[numbers.argmin()] >= low and numbers[numbers.argmax()] <= high):
-            _need(described.unknown and numeric.first_outside(array, described) is None)
+            _need(bool(described.unknown) and numeric.first_outside(array, described) is None)
 
     return read
 
@@ -850,7 +850,7 @@ def read_columns(payload: bytes, kind: type[T], limits: Limits) -> T | None:
 
     Memory is bounded: msgspec builds what the types allow, tuples of a few elements and views of the payload. Of a map
     with a field twice it takes the last one, and it skips unknown fields. So the fields are encoded again. That gives
-    as many bytes only if every field is there once, whatever their order: no other form of these types is shorter, but
+    as many bytes only if every field is there once, in any order: no other form of these types is shorter, but
     of floats. Where it would copy a large payload, `_is_encoding` compares the payload without them.
     """
     builder: Any = _BUILDERS.get(kind)

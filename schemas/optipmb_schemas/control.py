@@ -24,7 +24,7 @@ from optipmb_schemas.model import (
 
 
 class SessionParameters(Message):
-    """Query `q/parameters`. Without a payload it asks; with one it sets what is present. The reply has all fields."""
+    """Query `q/parameters`. Without a payload it asks; with one it sets the fields given. The reply has all fields."""
 
     profile: Name | None = Field(default=None, description="Name of a profile of the service, such as `nuscenes`.")
     cloud_wait_s: NonNegative | None = Field(default=None, description="Longest wait of detections for their cloud, s.")
@@ -46,7 +46,7 @@ class SessionParameters(Message):
 
 
 class ResetRequest(Message):
-    """Query `q/reset`, with or without a payload. The session starts anew without tracks. No track id is used again."""
+    """Query `q/reset`, with or without a payload. The session restarts without tracks. No track id is used again."""
 
     close: Flag = Field(default=False, description="Free the session instead of restarting it.")
 
@@ -64,7 +64,7 @@ class TracksRequest(Message):
 
 
 class MoveRequest(Message):
-    """Query `service/<instance>/q/move`: move a stream to a worker of this instance, from wherever it is.
+    """Query `service/<instance>/q/move`: move a stream to a worker of this instance, from any member.
 
     The reply repeats it when it is done. All streams of its partition go with it, and stay until they are moved again.
     A stream may be moved before its first message.
@@ -128,7 +128,7 @@ class SessionState(Message):
 
 
 class Problem(Message):
-    """What was refused or lost, why, and where. Texts are cut to their limits."""
+    """A message refused or lost, the reason and the place. Texts are cut to their limits."""
 
     stream: Text = Field(description="Name of the stream; empty: none.")
     instance: Name = Field(description="Instance that reports.")

@@ -60,7 +60,7 @@ class Dump:
 
     Attributes:
         stream: `site/node/sensor`.
-        error: type and text of what was raised.
+        error: type and text of the exception.
         trace: where it was raised, for people.
         versions: of the software, by name.
         parameters: the profile, as nested maps.

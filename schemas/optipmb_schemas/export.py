@@ -24,7 +24,7 @@ from optipmb_schemas.codec import MAJOR, MESSAGES, encoding_of
 from optipmb_schemas.control import MemberSummary, SessionState, SessionSummary
 from optipmb_schemas.errors import CODES
 from optipmb_schemas.limits import DEFAULT
-from optipmb_schemas.messages import Delivery, Detections, FieldOfView, Pose, Tracks, ZoneCount, ZoneEvent
+from optipmb_schemas.messages import Delivery, Detections, FieldOfView, Pose, Relocation, Tracks, ZoneCount, ZoneEvent
 from optipmb_schemas.model import Message
 
 SUFFIX = ".schema.json"
@@ -34,6 +34,7 @@ _TABLE: Final = re.compile(r"(<!-- table: ([A-Za-z]+) -->\n).*?(<!-- end -->)", 
 _KINDS: Final[tuple[type[Message], ...]] = (
     *MESSAGES,
     Pose,
+    Relocation,
     FieldOfView,
     Delivery,
     ZoneEvent,
@@ -87,7 +88,7 @@ def table(name: str) -> str:
 
 
 def _rows(kind: type[Message]) -> Iterable[tuple[str, ...]]:
-    """Yield a row per field; those that are as in a message described before share one."""
+    """Yield a row per field; fields that repeat a message described before share one."""
     rows = list(_field_rows(kind))
     for first in (Detections, Tracks, SessionState):
         if kind is first:

@@ -103,7 +103,7 @@ class Keys:
         raise invalid("key", f"a key of discovered streams under {self.prefix}", key)
 
     def discovered_by(self, key: str, run: str) -> bool:
-        """Whether a key of `discovered` is that of a process."""
+        """Return whether a key of `discovered` belongs to a process."""
         match self._chunks(key):
             case ["service", _, "discovered", of, _]:
                 return of == run

@@ -39,6 +39,8 @@ FULL = 2.0 * math.pi
 TURN = FULL + 1e-6
 QUARTER = 0.25 * FULL + 1e-6
 """Limits of angles; float32 rounds them up."""
+UPRIGHT = 1e-3
+"""Largest tilt of a relocation, rad."""
 NARROWEST = 1e-3
 """Least width of a field of view, rad."""
 LEAST_VARIANCE = 1e-8
@@ -83,6 +85,24 @@ class FieldOfView(Message):
                 raise invalid(name, "an end above the beginning", [begin, end])
 
 
+class Relocation(Message):
+    """Motion of the world frame: from the world before, what was at p is at R p + `translation`, R a turn about z."""
+
+    world: Annotated[int, Field(strict=True, ge=1, le=2**31 - 1)] = Field(
+        description="Number of the world frame of this message: 1 after the first motion, then 2, 3, without gaps."
+    )
+    translation: Annotated[Reals, Array("f8", (3,), -FAR, FAR)] = Field(description="Translation x, y, z in metres.")
+    quaternion: Annotated[Reals, Array("f8", (4,), -1.001, 1.001), AfterValidator(unit_quaternion)] = Field(
+        description="The turn R: w, x, y, z; its norm within 0.001 of one, tilted by at most 0.001 rad."
+    )
+
+    def check(self) -> None:
+        """The world stays upright."""
+        _, x, y, _ = self.quaternion.tolist()
+        if (tilt := 2.0 * math.hypot(x, y)) > UPRIGHT:
+            raise invalid("quaternion", f"a turn about z, tilted by at most {UPRIGHT:g} rad", tilt)
+
+
 class Header(Message):
     """What every message of a stream starts with."""
 
@@ -104,6 +124,11 @@ class SensorMessage(Header):
         default=None,
         description="World from sensor at `stamp_ns`. Required when `frame` is `sensor`.",
     )
+    relocation: Relocation | None = Field(
+        default=None,
+        description="The last motion of the world frame, in every message after it. Absent: the world is that of the "
+        "message before; of `Points`: that of their detections.",
+    )
 
     def check(self) -> None:
         """A sensor frame needs its pose."""
@@ -120,20 +145,24 @@ class Detections(SensorMessage):
     label: Annotated[Integers, Array("i8", ("M",), 0, 255)] = Field(
         description="Class of each object as an index into `labels`, from 0."
     )
-    center: Annotated[Reals, Array("f8", ("M", 3), -FAR, FAR)] = Field(
-        description="Geometric centres of the boxes: x, y, z in metres, in `frame`."
+    center: Annotated[Reals, Array("f8", ("M", 3), -FAR, FAR, unknown="last")] = Field(
+        description="Geometric centres of the boxes: x, y, z in metres, in `frame`. A z of NaN (JSON: null) is unknown."
     )
-    size: Annotated[Reals, Array("f8", ("M", 3), 0, 1e4, above=True)] = Field(
-        description="Length (along the heading), width, height in metres."
+    size: Annotated[Reals, Array("f8", ("M", 3), 0, 1e4, above=True, unknown="number")] | None = Field(
+        default=None,
+        description="Length (along the heading), width, height in metres. A number of NaN (JSON: null) is unknown. "
+        "Absent: all are.",
     )
-    yaw: Annotated[Reals, Array("f8", ("M",), -1e4, 1e4)] = Field(
-        description="Heading in radians, counter-clockwise about z from the x axis of `frame`."
+    yaw: Annotated[Reals, Array("f8", ("M",), -1e4, 1e4, unknown="number")] | None = Field(
+        default=None,
+        description="Heading in radians, counter-clockwise about z from the x axis of `frame`. NaN (JSON: null): "
+        "unknown for this object. Absent: for all.",
     )
     score: Annotated[Reals, Array("f8", ("M",), 0, 1)] = Field(
         description="Confidence of the detector; not a logit. An object of score 0 is left out and counted in "
         "`Tracks.ignored`."
     )
-    velocity: Annotated[Reals, Array("f8", ("M", 2), -1e3, 1e3, unknown=True)] | None = Field(
+    velocity: Annotated[Reals, Array("f8", ("M", 2), -1e3, 1e3, unknown="row")] | None = Field(
         default=None,
         description="Velocity over ground in m/s along the x and y axes of `frame`. A row of two NaN (JSON: null): "
         "unknown for this object. Absent: for all.",
@@ -149,7 +178,7 @@ class Detections(SensorMessage):
         "Absent: everywhere.",
     )
 
-    position_covariance: Annotated[Reals, Array("f8", ("M", 3, 3), -1e8, 1e8, unknown=True)] | None = Field(
+    position_covariance: Annotated[Reals, Array("f8", ("M", 3, 3), -1e8, 1e8, unknown="row")] | None = Field(
         default=None,
         description="Covariance of the errors of each centre's x, y and z in m^2, along the axes of `frame`: "
         "symmetric, the variance along every axis from 1e-8 to 1e8. A matrix of NaN (JSON: null) is an object for "
@@ -195,8 +224,8 @@ class Delivery(Message):
     final_ns: Stamp | None = Field(default=None, description="In `Events`: see `final_session`.")
 
 
-class Tracks(Header):
-    """The tracks of one frame, N of them, ordered by id. `epoch`, `seq` and `stamp_ns` are those of the detections."""
+class ResultMessage(Header):
+    """Header of the service's results for a frame; `epoch`, `seq` and `stamp_ns` repeat the detections."""
 
     sensor: Stream | None = Field(
         default=None,
@@ -207,13 +236,21 @@ class Tracks(Header):
     )
     revision: Count = Field(
         default=0,
-        description="Higher than 0: corrects, after a late frame, what was published for the same `session`, `epoch` "
+        description="Higher than 0: replaces, after a late frame, what was published for the same `session`, `epoch` "
         "and `seq`.",
     )
+
+
+class Tracks(ResultMessage):
+    """The tracks of one frame, N of them, ordered by id. `epoch`, `seq` and `stamp_ns` repeat the detections."""
+
     profile: Name = Field(description="Name of the parameters in force.")
     cloud_used: Flag = Field(description="Whether the frame was tracked with a cloud.")
     gap: Count = Field(default=0, description="Frames known to be missing directly before this one.")
     ignored: Count = Field(default=0, description="Detections left out: class not in the profile, or score 0.")
+    world: Count | None = Field(
+        default=None, description="Number of the world frame, which grows with each `relocation`. Absent: 0."
+    )
     labels: Labels = Field(description="Names of the classes that `label` counts.")
     id: Annotated[Integers, Array("i8", ("N",), 0, INT64)] = Field(
         description="Identity: unique in the stream, never used again. Ascending."
@@ -257,6 +294,12 @@ class Tracks(Header):
         description="1: the existence reached a threshold of the profile and has not fallen below a lower one since; "
         "0: the track may be of nothing.",
     )
+    measured: Annotated[Integers, Array("i8", ("N",), 0, 7)] | None = Field(
+        default=None,
+        description="What is known of the object, from detections or, the heading, from its motion: 1 the heading, 2 "
+        "the size, 4 the height, added up. The rest of `yaw`, `size` and z stand in for it: size by the profile. "
+        "Absent: everything of all.",
+    )
     class_probability: Annotated[Singles, Array("f4", ("N", "C"), 0, 1)] | None = Field(
         default=None,
         description="Probability of each class of `labels`; `label` changes with it. Absent: the profile has no groups "
@@ -275,6 +318,9 @@ class Tracks(Header):
     )
     path_covariance: Annotated[Singles, Array("f4", ("N", "H", 2, 2), -1e30, 1e30)] | None = Field(
         default=None, description="Covariance of the predicted x and y, m^2."
+    )
+    relocation: Relocation | None = Field(
+        default=None, description="Motion of the world frame between the frame before and this one."
     )
     delivery: Delivery | None = Field(default=None, description="How this publication came about.")
 
@@ -317,13 +363,13 @@ def path_fields(horizons: Reals, mean: Reals, covariance: Reals) -> dict[str, Nu
     return _validated(dict(zip(PATHS, values, strict=True)))
 
 
-def class_fields(class_probability: Reals) -> dict[str, Numeric]:
-    """Return the field of `Tracks` with the probabilities (N, C) of the classes.
+def track_fields(**columns: Numeric | None) -> dict[str, Numeric]:
+    """Return further columns of `Tracks`, but for those that are None, as fields.
 
     Raises:
-        MessageError: they are none.
+        MessageError: they hold numbers that no message may.
     """
-    return _validated({"class_probability": class_probability})
+    return _validated({name: one for name, one in columns.items() if one is not None})
 
 
 def _validated(values: Mapping[str, Numeric]) -> dict[str, Numeric]:
@@ -376,21 +422,9 @@ class ZoneCount(Message):
     to_right: Counts = Field(description="Crossings of the line to its right.")
 
 
-class Events(Header):
+class Events(ResultMessage):
     """Events of the zones and lines of a stream at one frame, and their counts."""
 
-    sensor: Stream | None = Field(
-        default=None,
-        description="Stream of the detections, and of `epoch` and `seq`. Absent: it is `stream`.",
-    )
-    session: SessionId = Field(
-        description="32 hexadecimal digits. When it changes, earlier tracks have ended, except those whose ids return."
-    )
-    revision: Count = Field(
-        default=0,
-        description="Higher than 0: replaces, after a late frame, the events published for the same `session`, `epoch` "
-        "and `seq`.",
-    )
     labels: Labels = Field(description="Names of the classes that `label` counts.")
     events: tuple[ZoneEvent, ...] = Field(
         default=(), max_length=100_000, fail_fast=True, description="In order of `at_ns`, `zone` and `id`."
@@ -417,7 +451,7 @@ class Events(Header):
 
 
 class Density(Message):
-    """Reply of `q/density`: where the tracker expects objects that nobody has detected yet, one row per component.
+    """Reply of `q/density`: where the tracker expects objects that are not detected yet, one row per component.
 
     These are the Poisson components after the newest frame, N of them, with the values that the tracker holds.
     """

@@ -93,8 +93,18 @@ def first_outside(array: NDArray[Any], description: "Array") -> int | None:
         return None
     good = ((array > low) if above else (array >= low)) & (array <= high)
     if description.unknown:
-        good |= np.isnan(array).all(axis=-1, keepdims=True)
+        good |= unknown(array, description)
     return None if good.all() else int(np.argmin(good))
+
+
+def unknown(array: NDArray[Any], description: "Array") -> NDArray[np.bool_]:
+    """Return which numbers of an array, or rows with a last axis of length one, are NaN where that is allowed."""
+    nan: NDArray[np.bool_] = np.isnan(array)
+    if description.unknown == "row":
+        nan = np.all(nan, axis=-1, keepdims=True)
+    elif description.unknown == "last":
+        nan[..., :-1] = False
+    return nan
 
 
 def finite(points: Any) -> Any:

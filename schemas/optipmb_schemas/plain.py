@@ -165,9 +165,11 @@ def first_outside(numbers: Numbers, description: "Array") -> int | None:
         outside = [at for at, value in enumerate(flat) if not low < value <= high]  # a NaN is never within
     else:
         outside = [at for at, value in enumerate(flat) if not low <= value <= high]
-    if outside and description.unknown:
-        width = numbers.shape[-1]
+    width, kind = numbers.shape[-1], description.unknown
+    if outside and kind == "row":
         outside = [at for at in outside if not all(map(math.isnan, flat[at - at % width :][:width]))]
+    elif outside and kind:
+        outside = [at for at in outside if not (math.isnan(flat[at]) and (kind == "number" or (at + 1) % width == 0))]
     return outside[0] if outside else None
 
 

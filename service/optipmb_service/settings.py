@@ -369,6 +369,8 @@ class Settings(BaseSettings):
     """longest wait for the publisher's cache after a restart"""
     max_speed: float = Field(default=100.0, ge=0, le=1e6)
     """highest speed of a sensor, m/s; poses beyond it are refused; 0: no check"""
+    jumps: Literal["off", "report"] = "report"
+    """report poses that jump within reach of `max_speed`, unless a relocation announces it"""
     queue_frames: int = Field(default=1024, ge=1, le=65536)
     """frames waiting per stream, as many as a publisher's cache may send at once after an outage; then the oldest is
     dropped"""

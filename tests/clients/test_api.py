@@ -15,8 +15,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_client import Connection, ConnectionFailed, Publisher, Subscriber
 from optipmb_client.incoming import Inbox
-from optipmb_schemas import Detections, Message, MessageError, Points, Problem, Tracks, decode, encode, encoding_of
+from optipmb_schemas import (
+    Detections,
+    Message,
+    MessageError,
+    Points,
+    Pose,
+    Problem,
+    Tracks,
+    decode,
+    encode,
+    encoding_of,
+)
 from routers import free_endpoint, open_client
+from tracks_message import SESSION, tracks_message
 from without_numpy import command, publish_everything
 
 if TYPE_CHECKING:
@@ -26,7 +38,6 @@ DEADLINE_S = 60.0
 STREAM = "garage/robot-1/lidar"
 POSE = ([1.0, 2.0, 3.0], [1.0, 0.0, 0.0, 0.0])
 ONE = {"label": ["Car"], "center": [[1, 2, 0]], "size": [[4, 2, 1.5]], "yaw": [0.1], "score": [0.9]}
-SESSION = "0123456789abcdef0123456789abcdef"
 
 
 @pytest.fixture
@@ -43,35 +54,9 @@ def listen(connection: Connection, topic: str) -> Inbox:
     return inbox
 
 
-def tracks(seq: int, *, revision: int = 0, session: str = SESSION, epoch: bytes = bytes(16), gap: int = 0) -> Tracks:
+def tracks(seq: int, **changes: Any) -> Tracks:
     """A tracks message without tracks."""
-    none = np.zeros(0)
-    return Tracks(
-        stream=STREAM,
-        epoch=epoch,
-        seq=seq,
-        stamp_ns=seq,
-        session=session,
-        revision=revision,
-        profile="kitti",
-        cloud_used=False,
-        gap=gap,
-        labels=("Car",),
-        id=none.astype(np.int64),
-        label=none.astype(np.int64),
-        center=np.zeros((0, 3)),
-        size=np.zeros((0, 3)),
-        yaw=none,
-        velocity=np.zeros((0, 2)),
-        yaw_rate=none,
-        acceleration=none,
-        existence=none,
-        score=none,
-        covariance=np.zeros((0, 6, 6)),
-        age=none,
-        time_since_detection=none,
-        detection=none.astype(np.int64),
-    )
+    return tracks_message(STREAM, seq, **changes)
 
 
 def problem(message: str) -> Problem:
@@ -211,6 +196,9 @@ BAD = [
     ({"velocity": [[np.inf, 0]]}, "velocity[0][0]"),
     ({"points": np.zeros((4, 2), np.float32)}, "xyz"),
     ({"points": "nonsense"}, "xyz"),
+    ({"relocation": 5}, "relocation"),
+    ({"relocation": ([0, 0, 0], [0.8, 0.6, 0, 0])}, "relocation.quaternion"),
+    ({"relocation": ([0, 0], [1.0, 0, 0, 0])}, "relocation.translation"),
     ({"points_pose": ([0, 0], [1.0, 0, 0, 0]), "points": np.zeros((4, 3), np.float32)}, "translation"),
 ]
 
@@ -260,6 +248,26 @@ def test_a_cloud_is_sent_before_its_detections() -> None:
     assert cloud.xyz.tolist() == points[:, :3].tolist()
     assert cloud.pose is not None
     assert cloud.pose.translation.tolist() == [9.0, 9.0, 9.0]
+
+
+def test_a_motion_of_the_world_is_counted_and_repeated() -> None:
+    """Given once, it is in all later messages; a message that is refused does not count."""
+    sent: list[bytes] = []
+    turn = [0.8, 0.0, 0.0, 0.6]
+    with offline_publisher(sent) as publisher:
+        publisher.publish(stamp_ns=0, pose=POSE, **ONE)
+        publisher.publish(stamp_ns=1, pose=POSE, relocation=([5, 6, 7], turn), **ONE)
+        publisher.publish(stamp_ns=2, pose=POSE, **ONE)
+        with pytest.raises(MessageError, match="score"):
+            publisher.publish(stamp_ns=3, pose=POSE, relocation=([0, 0, 1], turn), **(ONE | {"score": [2.0]}))
+        publisher.publish(stamp_ns=3, pose=POSE, relocation=Pose(translation=[0, 0, 1], quaternion=turn), **ONE)
+    said = [decode(payload, Detections).relocation for payload in sent]
+    assert [one and (one.world, one.translation.tolist()) for one in said] == [
+        None,
+        (1, [5.0, 6.0, 7.0]),
+        (1, [5.0, 6.0, 7.0]),
+        (2, [0.0, 0.0, 1.0]),
+    ]
 
 
 def test_points_without_a_return_are_left_out() -> None:

@@ -344,10 +344,10 @@ def test_projected_real_detections_are_where_the_detector_saw_them(real: KittiDa
     (sequence,) = real.sequences(["0011"])
     path = kitti_root() / "detections/pointrcnn/Car/0011.txt"
     file = read_detections(path, len(sequence), 2)
-    boxes, seen = sequence.camera.boxes(*sensor_from_kitti(file.bottom, file.hwl, file.rotation_y))
-    low, high = np.maximum(boxes[:, :2], file.box2d[:, :2]), np.minimum(boxes[:, 2:], file.box2d[:, 2:])
+    boxes, seen = sequence.camera.boxes(*sensor_from_kitti(file["bottom"], file["hwl"], file["ry"]))
+    low, high = np.maximum(boxes[:, :2], file["box2d"][:, :2]), np.minimum(boxes[:, 2:], file["box2d"][:, 2:])
     common = np.prod(np.maximum(high - low, 0.0), axis=1)
-    areas = [np.prod(b[:, 2:] - b[:, :2], axis=1) for b in (boxes, file.box2d)]
+    areas = [np.prod(b[:, 2:] - b[:, :2], axis=1) for b in (boxes, file["box2d"])]
     overlap = common / (areas[0] + areas[1] - common)
     assert seen.mean() > 0.99
     assert (overlap > 0.7).mean() > 0.99

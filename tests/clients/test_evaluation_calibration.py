@@ -43,6 +43,7 @@ def full_of(center: Floats, existence: Floats, covariance: Floats, frames: int, 
         age=zero,
         time_since_detection=zero,
         detection=np.zeros(count, dtype=np.int64),
+        box2d=np.full((count, 4), np.nan),
     )
 
 

@@ -36,6 +36,7 @@ from optipmb_tools.datasets import DatasetError, dataset_at, open_dataset
 from optipmb_tools.recordings.files import Recorded, RecordingFile, RecordingWriter
 from optipmb_tools.recordings.plan import plan, steps
 from optipmb_tools.views.foxglove import FoxgloveServer
+from tracks_message import tracks_message
 
 KEYS = Keys()
 STREAM = "garage/robot-1/lidar"
@@ -68,32 +69,22 @@ def points(seq: int, stamp: int) -> Points:
 
 def tracks(seq: int, ids: list[int], *, cloud_used: bool = False, revision: int = 0) -> Tracks:
     """Tracks of these ids at frame `seq`, going along x at 2 m/s."""
-    n = len(ids)
-    column = [0.5] * n
-    return Tracks(
-        stream=STREAM,
+    return tracks_message(
+        STREAM,
+        seq,
+        ids,
         epoch=EPOCH,
-        seq=seq,
         stamp_ns=1_500_000_000 + seq,
         session=SESSION,
         revision=revision,
-        profile="kitti",
         cloud_used=cloud_used,
-        labels=["Car"],
-        id=ids,
-        label=[0] * n,
-        center=np.arange(3.0 * n).reshape(n, 3),
-        size=np.full((n, 3), 2.0),
-        yaw=column,
-        velocity=np.tile([2.0, 0.0], (n, 1)),
-        yaw_rate=column,
-        acceleration=column,
-        existence=column,
-        score=column,
-        covariance=np.tile(np.eye(6), (n, 1, 1)),
-        age=column,
-        time_since_detection=column,
-        detection=[-1] * n,
+        center=np.arange(3.0 * len(ids)).reshape(-1, 3),
+        size=2.0,
+        yaw=0.5,
+        velocity=[2.0, 0.0],
+        existence=0.5,
+        age=0.5,
+        detection=-1,
     )
 
 

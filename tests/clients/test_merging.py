@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from optipmb_client.merging import Merging, Novelty
-from optipmb_schemas import PATHS, Delivery, Tracks
-
-LABELS = ("car",)
+from optipmb_schemas import Delivery, Tracks
+from tracks_message import tracks_message
 
 
 def message(seq: int, *, content: int, revision: int = 0, run: int = 0, session: str = "0" * 32) -> Tracks:
@@ -18,25 +16,7 @@ def message(seq: int, *, content: int, revision: int = 0, run: int = 0, session:
     delivery = Delivery(
         instance="test", received_ns=revision, published_ns=run, queue_ms=0, decode_ms=0, step_ms=0, run=run
     )
-    columns = {
-        name: np.zeros((1, *array.shape[1:]), {"f8": np.float64, "i8": np.int64}[array.dtype])
-        for name, array in Tracks.arrays.items()
-        if name not in {*PATHS, "class_probability"}
-    }
-    columns |= {"id": np.array([content]), "size": np.ones((1, 3))}
-    return Tracks(
-        stream="a/b/c",
-        epoch=bytes(16),
-        seq=seq,
-        stamp_ns=seq,
-        session=session,
-        revision=revision,
-        profile="kitti",
-        cloud_used=False,
-        labels=LABELS,
-        delivery=delivery,
-        **columns,
-    )
+    return tracks_message("a/b/c", seq, [content], revision=revision, session=session, delivery=delivery)
 
 
 def test_a_repetition_brings_nothing() -> None:

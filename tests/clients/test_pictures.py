@@ -12,7 +12,7 @@ from optipmb_client.errors import ClientError
 from optipmb_tools.cli import run
 from optipmb_tools.datasets import DataSequence, Truth, open_dataset
 from optipmb_tools.evaluation import ClearResult, Rules, evaluate_clear
-from optipmb_tools.results import ResultTable, empty_table
+from optipmb_tools.results import ResultTable, full_table
 from optipmb_tools.views import pictures
 from optipmb_tools.views.pictures import WIDTH_PX, Panel, animate_tracks, draw_tracks
 from PIL import Image
@@ -75,8 +75,8 @@ def test_the_same_tracks_give_the_same_bytes(tmp_path: Path) -> None:
 def test_a_sequence_without_tracks_or_truth_is_drawn_too(tmp_path: Path) -> None:
     """Only the sensor's path, and also when there is a single track far away."""
     sequence, truth, tracks = scene()
-    draw_tracks(tmp_path / "none.png", sequence, [Panel(empty_table())])
-    draw_tracks(tmp_path / "truth.png", sequence, [Panel(empty_table())], truth)
+    draw_tracks(tmp_path / "none.png", sequence, [Panel(full_table((), {}))])
+    draw_tracks(tmp_path / "truth.png", sequence, [Panel(full_table((), {}))], truth)
     far = tracks.take(np.arange(1))
     far = replace(far, center=far.center + np.array([900.0, 0.0, 0.0]))
     draw_tracks(tmp_path / "far.png", sequence, [Panel(far)])
@@ -112,7 +112,7 @@ def test_a_gif_follows_a_sensor_that_drives_far(tmp_path: Path) -> None:
     sequence, truth, tracks = scene()
     far = np.concatenate([tracks.center[:-20], tracks.center[-20:] + np.array([900.0, 0.0, 0.0])])
     animate_tracks(tmp_path / "far.gif", sequence, replace(tracks, center=far), truth)
-    animate_tracks(tmp_path / "none.gif", sequence, empty_table())
+    animate_tracks(tmp_path / "none.gif", sequence, full_table((), {}))
     with Image.open(tmp_path / "far.gif") as wide, Image.open(tmp_path / "none.gif") as empty:
         assert wide.height < wide.width == empty.width
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from optipmb_tools.camera import synthetic_camera
 from optipmb_tools.datasets import DatasetError, open_dataset
 from optipmb_tools.geometry import Floats, Ints, Pose, planar_pose, wrap_angle
-from optipmb_tools.results import empty_table
+from optipmb_tools.results import full_table
 from optipmb_tools.results.kitti import SUBMISSION_SCORES, read_kitti_results, write_kitti_results
 from optipmb_tools.run.profiles import read_profile
 from optipmb_tools.run.tracking import track_whole
@@ -115,7 +115,7 @@ def test_a_sequence_without_tracks_is_an_empty_file(tmp_path: Path) -> None:
     """The file is there, and reading it gives a table without rows."""
     path = write(tmp_path / "out" / "0000.txt", [])
     assert path.read_bytes() == b""
-    assert len(read_kitti_results(path)) == len(empty_table()) == 0
+    assert len(read_kitti_results(path)) == len(full_table((), {})) == 0
 
 
 def test_the_same_tracks_give_the_same_bytes(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from optipmb_tools.views.colours import COLOURS, colour_of, rgb_of
 from optipmb_tools.views.density_queries import DensityQueries
 from optipmb_tools.views.viewer import LEGEND, View
 from routers import free_endpoint
+from tracks_message import tracks_message
 
 STREAM = "garage/robot-1/lidar"
 POSE = Pose(translation=[100.0, 50.0, 2.0], quaternion=[np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])  # looks along y
@@ -55,32 +56,18 @@ class Log:
 
 def tracks(seq: int, ids: list[int], covariance: np.ndarray | None = None) -> Tracks:
     """Tracks of these ids side by side, going along x."""
-    n = len(ids)
-    one = np.ones(n)
-    each = np.tile(np.eye(6) if covariance is None else covariance, (n, 1, 1))
-    return Tracks(
-        stream=STREAM,
-        epoch=bytes(16),
-        seq=seq,
+    return tracks_message(
+        STREAM,
+        seq,
+        ids,
         stamp_ns=seq * 1_000_000_000,
-        session="0" * 32,
-        profile="kitti",
-        cloud_used=False,
-        labels=["Car"],
-        id=ids,
-        label=[0] * n,
-        center=[[10.0 * seq, float(row), 1.0] for row in range(n)] or np.zeros((0, 3)),
-        size=np.tile([4.0, 2.0, 1.5], (n, 1)),
-        yaw=one * 0.5,
-        velocity=np.tile([2.0, 1.0], (n, 1)),
-        yaw_rate=one,
-        acceleration=one,
-        existence=one * 0.75,
-        score=np.linspace(0.9, 0.1, n),
-        covariance=each,
-        age=one,
-        time_since_detection=one * 0,
-        detection=np.arange(n),
+        center=[[10.0 * seq, float(row), 1.0] for row in range(len(ids))] or np.zeros((0, 3)),
+        size=[4.0, 2.0, 1.5],
+        yaw=0.5,
+        velocity=[2.0, 1.0],
+        existence=0.75,
+        score=np.linspace(0.9, 0.1, len(ids)),
+        covariance=np.eye(6) if covariance is None else covariance,
     )
 
 

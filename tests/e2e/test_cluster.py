@@ -75,7 +75,7 @@ class Cluster:
         return self._folder / ("common" if self.nats is None else f"own-{number}")
 
     def owners(self) -> dict[str, str]:
-        """Which member tracks which stream, by what they announce."""
+        """The member of each stream, by the announcements."""
         keys = self.node.alive(KEYS.all_owners())
         return {KEYS.stream_of(key): KEYS.instance_of(key) for key in keys}
 
@@ -371,7 +371,7 @@ def test_a_cut_between_two_routers(tmp_path: Path) -> None:
     """Frames that are in the log and do not arrive are tracked from there, also of publishers without a cache.
 
     The way between two routers is cut, that to the NATS server is not: the member on the far side keeps its partitions.
-    Whole again, what comes twice is tracked once.
+    Whole again, repeated messages are tracked once.
     """
     (tmp_path / "nats").mkdir()
     with (
@@ -419,7 +419,7 @@ def purge(nats: NatsProcess) -> None:
 
 @pytest.mark.parametrize("cluster", ["nats"], indirect=True)
 def test_all_leases_and_checkpoints_are_purged(cluster: Cluster) -> None:
-    """Members write again what they hold, and their sessions go on, to the byte, also after a kill."""
+    """Members write their leases again, and their sessions go on, to the byte, also after a kill."""
     assert cluster.nats is not None
     first, second = members = [cluster.member(name) for name in "ab"]
     for member in members:

@@ -54,7 +54,7 @@ def test_a_dead_link_loses_nothing(side: str) -> None:
 def test_what_is_lost_is_named() -> None:
     """Tracks that the cache no longer holds when the link is back are named, with the stamps around them.
 
-    So are those that a program was too slow to take.
+    So are messages for which a program was too slow.
     """
     sensor = Sensor(stream=STREAM)
     messages = [decode(payload, Tracks) for payload in expected(40, sensor)[0]]

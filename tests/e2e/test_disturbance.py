@@ -73,7 +73,7 @@ def link(service: ServiceProcess) -> Iterator[Connection]:
 def test_a_client_killed_in_the_middle(
     service: ServiceProcess, link: Connection, expected: bytes, replay: Callable[[], Any], tmp_path: Path
 ) -> None:
-    """SIGKILL of one client while another replays: the other's file is that of an undisturbed run."""
+    """SIGKILL of one client while another replays: the other's file equals an undisturbed run."""
     with (
         Subscriber("replay/*/0007", connection=link) as tracks,
         Subscriber("replay/*/0000", connection=link) as others,
@@ -149,7 +149,7 @@ def test_garbage_on_every_key(
 def test_classes_that_no_profile_has(
     service: ServiceProcess, link: Connection, expected: bytes, replay: Callable[[], Any], tmp_path: Path
 ) -> None:
-    """A stream full of unknown classes gets tracks of none of them, and disturbs nobody."""
+    """A stream full of unknown classes gets tracks of none of them, and disturbs no other stream."""
     seen: list[Problem] = []
     with (
         Publisher("a/b/unknown", connection=link) as publisher,

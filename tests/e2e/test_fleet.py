@@ -1,4 +1,4 @@
-"""A service process beside a router: ended, cut off, without room on its disk."""
+"""A service process and a router: ended, cut off, without room on its disk."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_a_store_that_is_deleted_while_in_use(tmp_path: Path) -> None:
 
 
 def test_killed_before_its_first_checkpoint(tmp_path: Path) -> None:
-    """Fault 2: whoever begins the session once more publishes under a higher run, which replaces the others."""
+    """Fault 2: a member that begins the session once more publishes under a higher run, which replaces the others."""
     with Fleet(tmp_path, checkpoint_s=3600.0) as fleet, Node(fleet.endpoint) as node:
         runs: list[set[int]] = []
         for instance in "abc":
@@ -128,7 +128,7 @@ def test_killed_before_its_first_checkpoint(tmp_path: Path) -> None:
 def test_a_full_disk(tmp_path: Path) -> None:
     """Fault 19: no byte more can be written: tracking goes on, the status says degraded; with room again it is ready.
 
-    What was tracked meanwhile is kept then: the next process goes on to the byte.
+    The frames tracked meanwhile are kept then: the next process goes on to the byte.
     """
     with Fleet(tmp_path, checkpoint_s=0.1) as fleet, Node(fleet.endpoint) as node:
         service = fleet.service("a")

@@ -1,4 +1,4 @@
-"""SIGKILL while several sensors feed one session: nobody can tell afterwards."""
+"""SIGKILL while several sensors feed one session: no trace of it is left."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def moved_with_its_sensor(node: Node, before: SessionState) -> None:
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_killed_while_two_sensors_feed_one_session(tmp_path: Path, workers: int) -> None:
-    """State and tracks are those of no kill, to the byte, with one process and with workers."""
+    """State and tracks equal a run without a kill, to the byte, with one process and with workers."""
     optipmb.warm_up()
     frames: list[Detections] = drive(40)
     one, merged = Session(FUSED, optipmb.load_profile("nuscenes"), Policy(recovery_wait_ns=0), fused=True), Merged()

@@ -1,4 +1,4 @@
-"""SIGKILL at random moments while recorded sequences are replayed: nobody can tell afterwards, but for the outage."""
+"""SIGKILL at random moments while recorded sequences are replayed: no trace is left but the outage."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from optipmb_client.incoming import Inbox
 from optipmb_service.settings import ZoneSettings
 from optipmb_service.stream.values import Policy
 from real_data import kitti_root
-from recorded import KEYS, Replay, kitti, undisturbed
+from recorded import KEYS, Replay, kitti
+from sessions import undisturbed
 
 import optipmb
 
@@ -82,7 +83,7 @@ def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[
             replay.finish(RESTART_S)
             outages.append(_outage(replay, killed))
             for recording in recordings:
-                tracks, digest, events = undisturbed(recording, "kitti", Policy(zones=zones))
+                tracks, digest, events = undisturbed(recording.messages, "kitti", Policy(zones=zones))
                 result = replay.results[recording.stream]
                 assert [result.tracks[seq] for seq in range(FRAMES)] == [{one} for one in tracks], (round_, SEED)
                 state = replay.state(recording.stream)

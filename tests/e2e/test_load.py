@@ -1,4 +1,4 @@
-"""`optipmb load` against a real service: what it counts is what the service counts."""
+"""`optipmb load` against a real service: both count the same."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The log of detections: a successor elsewhere knows what nobody tracked, also of publishers without a cache."""
+"""The log of detections: a successor elsewhere tracks the frames of an outage, also of publishers without a cache."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def test_a_successor_reads_what_nobody_tracked(logged: Logged) -> None:
 
 
 def test_two_bridges_write_once_and_wait_for_the_servers(logged: Logged) -> None:
-    """Each message is in the log once, also those that were published while no server was there."""
+    """Each message is in the log once, also when published while no server was there."""
     first = logged.bridge
     with LogProcess(logged.endpoint, logged.nats.url, "second") as second:
         second.wait_receiving(logged.node)

@@ -1,4 +1,4 @@
-"""Whatever comes, a service takes no more memory than it may: real processes, their peak read from the system."""
+"""A service stays within its memory under any input: real processes, their peak read from the system."""
 
 from __future__ import annotations
 

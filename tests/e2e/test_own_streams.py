@@ -42,7 +42,7 @@ def _compiled() -> None:
 
 
 class Pair:
-    """Two services, each behind a proxy that counts the bytes that it is sent; a node beside the first."""
+    """Two services, each behind a proxy that counts the bytes sent to it; a node at the first."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -134,7 +134,7 @@ def only_own(pair: Pair) -> bool:
 
 
 def test_a_member_receives_its_own_streams(pair: Pair, capsys: pytest.CaptureFixture[str]) -> None:
-    """Bytes that reach a member are those of its streams and 2 % more; of clouds of others nothing."""
+    """A member receives the bytes of its streams and 2 % more; of clouds of others nothing."""
     node = pair.node
     for instance, sensor in zip("ab", SENSORS, strict=False):
         node.move(instance, sensor.stream)  # each has some
@@ -162,7 +162,7 @@ def test_a_member_receives_its_own_streams(pair: Pair, capsys: pytest.CaptureFix
 
 
 def test_a_publisher_without_a_token_is_tracked_from_its_first_frame(pair: Pair) -> None:
-    """Its frames are tracked wherever its partition is, and after a kill -9 of whoever discovers, all of them."""
+    """Its frames are tracked wherever its partition is, and after a kill -9 of the discoverer, all of them."""
     node = pair.node
     for seq in range(20):
         raw(node, *(sensor.detections(seq) for sensor in SENSORS))
@@ -187,11 +187,11 @@ def test_a_publisher_without_a_token_is_tracked_from_its_first_frame(pair: Pair)
 
 
 def test_streams_that_move_lose_no_frame_and_no_cloud(pair: Pair) -> None:
-    """Streams without a cache move from member to member while they come: tracks are those of a session left alone."""
+    """Streams without a cache move from member to member while they come: tracks as of an undisturbed session."""
     node, sensors = pair.node, SENSORS[:2]
     node.move("a", sensors[0].stream)
     node.move("b", sensors[1].stream)
-    for sensor in sensors:  # the first clouds may come before whoever needs them knows of the stream
+    for sensor in sensors:  # the first clouds may come before the member knows of the stream
         until(lambda: begins(node, sensor), f"{sensor.stream} has begun")  # noqa: B023 - called here
     ending = threading.Event()
     sent = 1

@@ -34,7 +34,7 @@ def test_a_service_comes_up_and_ends(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_a_service_that_cannot_start_is_told_with_its_words() -> None:
-    """A wrong setting ends the service at its start: the error carries what it printed."""
+    """A wrong setting ends the service at its start: the error carries its output."""
     with (
         ServiceProcess(environment={"OPTIPMB_MAX_SESSIONS": "none"}) as service,
         pytest.raises(ServiceUnavailable, match="max_sessions"),
@@ -72,7 +72,7 @@ def test_the_service_ends_when_its_parent_is_killed() -> None:
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
 @pytest.mark.parametrize("stage", ["starting", "replaying"])
 def test_an_interrupted_demo_leaves_nothing_behind(tmp_path: Path, stage: str, number: int, status: int) -> None:
-    """Whatever ends the demo, at whichever stage: the service ends too, and there is no traceback."""
+    """However the demo ends, at any stage, the service ends too, and there is no traceback."""
     process = start("demo", "--out", tmp_path, "--frames", 10, "--speed", 0.1, fresh=True)
     assert process.stderr is not None
     try:

@@ -3,6 +3,8 @@
 import contextlib
 import re
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -19,11 +21,9 @@ from optipmb_tools.datasets import DatasetError, open_dataset
 from optipmb_tools.recordings.files import RecordingFile
 from optipmb_tools.run.replay import Pace, Replaying, replay
 from optipmb_tools.run.service_process import ServiceProcess
-from real_data import kitti_root
+from real_data import REPOSITORY, kitti_root
 
 if TYPE_CHECKING:
-    import subprocess
-
     from optipmb_tools.datasets import Dataset
 
 FRAMES = 15
@@ -149,7 +149,7 @@ def play_into_another(path: Path, folder: Path, capsys: pytest.CaptureFixture[st
 def test_four_streams_played_into_a_fresh_service(
     service: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Ids, sessions, numbers, stamps and every byte of the tracks are those of the recording; offline, too."""
+    """Ids, sessions, numbers, stamps and every byte of the tracks equal the recording; offline, too."""
     path = recorded_replay(service, tmp_path, open_dataset("scene", **VALUES), *FOUR)
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()
@@ -232,7 +232,7 @@ def test_a_stream_that_was_tracked_before_is_reported(incident: Path, capsys: py
 def test_a_killed_recording_still_plays(
     service: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """SIGKILL in the middle of a stream: what was written until a second before is there, and plays the same."""
+    """SIGKILL in the middle of a stream: messages until a second before are there, and play the same."""
     path = tmp_path / "cut.mcap"
     with recording(service, path) as process, Subscriber("replay/*/0000", service.endpoint) as tracks:
         replaying = start("replay", *SCENE, "--option", "frames=60", "--speed", 1, "--connect", service.endpoint)
@@ -269,7 +269,30 @@ def test_kitti(service: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFi
 def test_what_cannot_be_is_one_line_with_status_2(
     arguments: tuple[str, ...], words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Wrong files and options are told before anything is connected."""
+    """Wrong files and options are reported before anything is connected."""
     assert run(arguments) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert words in line
+
+
+def test_a_car_keeps_its_id_where_the_world_moves(
+    service: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The example of the documentation prints one track in both worlds; its recording plays to the same bytes."""
+    page = (REPOSITORY / "docs" / "operation.md").read_text(encoding="utf-8")
+    found = re.search(r"## When the world moves.*?```python\n(.*?)```", page, re.DOTALL)
+    assert found is not None
+    where = f', connect="{service.endpoint}"'
+    code = found[1].replace("timeout=10)", f"timeout=60{where})").replace('frame="world")', f'frame="world"{where})')
+    assert code.count(where) == 2
+    path = tmp_path / "moved.mcap"
+    with recording(service, path) as recorder:
+        run = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, timeout=200)
+        wait_for(lambda: count(path, "tracks") >= 20, service)
+        recorder.send_signal(signal.SIGINT)
+        recorder.communicate(timeout=DEADLINE_S)
+    lines = [line.split() for line in run.stdout.splitlines()]
+    assert {(line[1], line[3]) for line in lines} == {("0", "1"), ("1", "1")}
+    assert [float(one) for one in lines[-1][5:]] == pytest.approx([100.0, 59.5], abs=0.3)
+    played = result_of(run_here(capsys, "play", path, "--connect", service.endpoint, "--json"))
+    assert [(one["frames"], one["recorded"], one["equal"]) for one in played["streams"]] == [(20, 20, 20)]

@@ -39,7 +39,7 @@ class Both:
         return result_of(run_here(self._capsys, "track", *data, "--out", self.out / "track", "--json"))
 
     def replay(self, *data: object) -> Any:
-        """Replay what was tracked; the files are the same, and not empty."""
+        """Replay a tracked data set; the files are the same, and not empty."""
         out = self.out / "replay"
         replayed = result_of(
             run_here(self._capsys, "replay", *data, "--connect", self._endpoint, "--out", out, "--json")
@@ -69,7 +69,7 @@ def test_scene_at_full_speed(both: Both) -> None:
 
 
 def test_three_streams_at_once(both: Both) -> None:
-    """Three scenes sent at the same time, as fast as can be: each file is that of its scene alone."""
+    """Three scenes sent at the same time, as fast as can be: each file equals that of its scene alone."""
     data = (*WITHOUT_CLOUDS, "--sequences", "0000", "0001", "0002")
     both.track(*data)
     assert len({(both.out / "track" / f"000{number}.txt").read_bytes() for number in range(3)}) == 3

@@ -21,7 +21,7 @@ SCENE = ("--dataset", "scene", "--profile", "kitti", "--option", "frames=70", "-
 
 
 def test_no_cloud_is_lost_by_a_takeover(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The result is that of offline tracking, byte for byte, though the takeover takes longer than the cloud cache."""
+    """The result equals offline tracking, byte for byte, though the takeover takes longer than the cloud cache."""
     optipmb.warm_up()
     done = run_here(capsys, "track", *SCENE, "--out", str(tmp_path / "offline"))
     assert done.returncode == 0, done.stderr

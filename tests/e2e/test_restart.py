@@ -9,18 +9,18 @@ import sqlite3
 from typing import TYPE_CHECKING
 
 import pytest
-from alone import tracked_alone
 from optipmb_schemas import Keys, ResetRequest
 from optipmb_service.stream.checkpoint import DIGEST, HEAD, MAGIC, VERSION
 from router import Node, Sensor, plain
 from service_process import ServiceProcess
+from takeovers import expected
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 KEYS = Keys()
-NUMBERS = 200
-"""Keys of about 50 streams of one process."""
+NUMBERS = 100
+"""Keys of about 25 streams of one process."""
 TOGETHER, MOST = 20, 15
 """Streams that are open at once, and how often others follow them."""
 FRAMES = 8
@@ -63,7 +63,7 @@ def test_streams_that_come_and_go_without_end_have_a_process_restart(
                 assert service.wait_ready() == ready
             node.send(*(sensor.detections(seq) for seq in range(FRAMES, 2 * FRAMES)))
             tracks = [plain(one) for one in node.tracks(sensor.stream, 2 * FRAMES)]
-            assert tracks == tracked_alone(sensor, 2 * FRAMES)
+            assert tracks == expected(2 * FRAMES, sensor, "generic")[0]
         assert service.end(signal.SIGTERM, deadline_s=END_S)[0] == 0
         assert options or service.errors.count(" keys_used_up ") == 1
         assert service.output == []

@@ -138,7 +138,7 @@ def ids(message: Any) -> list[int]:
 
 
 def horizons_of(session: zenoh.Session, stream: str) -> list[float]:
-    """Ask which horizons the session of a stream has; none while nobody answers."""
+    """Ask which horizons the session of a stream has; none without an answer."""
     answers = [one.ok for one in session.get(Keys().query(stream, "parameters"), timeout=PATIENCE_S)]
     parameters = [decode(one.payload.to_bytes(), SessionParameters) for one in answers if one is not None]
     return parameters[0].horizons.tolist() if parameters and parameters[0].horizons is not None else []
@@ -237,7 +237,7 @@ def test_either_side_may_restart(robot: Robot, scene: DataSequence, tmp_path: Pa
 
 
 def test_what_is_wrong_on_the_other_side_is_reported(robot: Robot, scene: DataSequence, tmp_path: Path) -> None:
-    """A clock that starts late, frames that tf lacks, quality of service or definitions that do not fit are told."""
+    """A clock that starts late, frames that tf lacks, and wrong quality of service or definitions are reported."""
     frames = frames_of(scene)
     boxes = json.loads(json.dumps(next(one for one in frames[0] if one.topic == "/detector/boxes").message))
     with bridge(robot, tmp_path, points="/points", tf_wait_s=1.0) as process, ready_client(robot) as client:

@@ -98,7 +98,7 @@ def refused(config: Path, **changes: Any) -> bool:
 
 @pytest.mark.parametrize("role", [NODE, VIEWER, SERVICE])
 def test_a_certificate_of_the_authority_is_let_in(network: Network, role: str) -> None:
-    """Whoever has a certificate of the authority links to the router."""
+    """A process with a certificate of the authority links to the router."""
     with Party(network.config(role)) as party:
         party.settle()
 
@@ -163,7 +163,7 @@ def test_a_node_gets_tracks_of_its_own_detections(network: Network, service: Ser
 
 @pytest.mark.parametrize("topic", ["detections", "points"])
 def test_a_node_cannot_write_for_another(node: Party, viewer: Party, topic: str) -> None:
-    """What a node publishes under another node's name reaches nobody."""
+    """A message under another node's name reaches no subscriber."""
     theirs, own = (f"{KEYS.prefix}/{name}/lidar/{topic}" for name in (OTHER, ROBOT))
     node.put(theirs, b"forged")
     assert node.deliver(own, b"own", viewer)
@@ -257,7 +257,7 @@ def test_a_bridge_into_the_log_uses_the_certificate_of_a_service(
 
 
 def test_a_service_cannot_write_inputs(network: Network, viewer: Party) -> None:
-    """A service writes tracks and no detections: with its key nobody can forge what sensors saw."""
+    """A service writes tracks and no detections: its key forges no detections of sensors."""
     with Party(network.config(SERVICE)) as tracker:
         tracker.put(KEYS.detections(LIDAR), b"forged")
         assert tracker.deliver(KEYS.tracks(LIDAR), b"after", viewer)
@@ -267,7 +267,7 @@ def test_a_service_cannot_write_inputs(network: Network, viewer: Party) -> None:
 def test_a_viewer_reads_and_asks_but_changes_nothing(
     network: Network, node: Party, viewer: Party, service: ServiceProcess
 ) -> None:
-    """A viewer sees the status and all streams; its orders are not heard, and what it writes reaches nobody."""
+    """A viewer sees the status and all streams; its orders are not heard, and its messages reach no subscriber."""
     (status,) = viewer.ask(KEYS.all_status())
     assert decode(status, ServiceStatus).instance == "tracker"
     assert b"optipmb_info" in viewer.ask(KEYS.metrics("tracker"))[0]

@@ -41,7 +41,7 @@ KEYS = Keys()
 
 @dataclass
 class Sample:
-    """What was seen of the service at a moment."""
+    """Figures of the service at a moment."""
 
     at_s: float
     memory_kb: int

@@ -8,12 +8,12 @@ import time
 from typing import TYPE_CHECKING
 
 import pytest
-from alone import tracked_alone
 from commands import run_here
 from optipmb_schemas import Keys, MoveRequest, ServiceStatus, Tracks, decode
 from processes import descendants, wait_until_ended
 from router import Node, Sensor, plain, until
 from service_process import ServiceProcess
+from takeovers import expected
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -88,7 +88,8 @@ def test_workers_share_the_streams(service: ServiceProcess) -> None:
         for seq in range(FRAMES):
             node.send(*(sensor.detections(seq) for sensor in sensors))
         for sensor in sensors:
-            assert [plain(message) for message in node.tracks(sensor.stream, FRAMES)] == tracked_alone(sensor, FRAMES)
+            found = [plain(message) for message in node.tracks(sensor.stream, FRAMES)]
+            assert found == expected(FRAMES, sensor, "generic")[0]
         status = status_when(node, lambda status: status.frames >= FRAMES * len(STREAMS))
         assert status.state == "ready"
         parts = [node.ask(KEYS.status(f"pair-w{index}"), ServiceStatus) for index in range(2)]
@@ -118,11 +119,11 @@ def one_each(node: Node, site: str) -> dict[int, Sensor]:
 
 
 def goes_on(node: Node, sensor: Sensor, seq: int) -> None:
-    """Send a frame and wait for its tracks: the newest are those of a session that nothing happened to."""
+    """Send a frame and wait for its tracks: the newest equal an undisturbed session."""
     node.send(sensor.detections(seq))
     arrived(node, sensor.stream, seq)
     newest = [plain(message) for message in node.tracks(sensor.stream, seq + 1) if message.seq == seq]
-    assert newest[-1] == tracked_alone(sensor, seq + 1)[seq]
+    assert newest[-1] == expected(seq + 1, sensor, "generic")[0][seq]
 
 
 def test_the_streams_of_a_killed_worker_go_on(service: ServiceProcess) -> None:
@@ -167,7 +168,7 @@ def test_a_stream_can_be_moved(service: ServiceProcess) -> None:
             node.send(*(sensor.detections(seq) for seq in range(number * FRAMES, (number + 1) * FRAMES)))
             status_when(node, lambda status: workers_of(status).get(sensor.stream) == target)  # noqa: B023 - called here
         received = node.tracks(sensor.stream, 3 * FRAMES)
-        assert [plain(message) for message in received] == tracked_alone(sensor, 3 * FRAMES)
+        assert [plain(message) for message in received] == expected(3 * FRAMES, sensor, "generic")[0]
         problem = node.refused(KEYS.move("pair"), MoveRequest(stream=sensor.stream, worker=2))
         assert (problem.path, problem.received) == ("worker", "2")
 

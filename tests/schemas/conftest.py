@@ -17,6 +17,7 @@ from optipmb_schemas import (
     Points,
     Pose,
     Problem,
+    Relocation,
     ResetRequest,
     ServiceStatus,
     SessionParameters,
@@ -30,6 +31,7 @@ from optipmb_schemas import (
 
 EPOCH = bytes(range(16))
 POSE = Pose(translation=np.array([10.0, 20.0, 1.5]), quaternion=np.array([0.6, 0.0, 0.0, 0.8]))
+MOTION = Relocation(world=3, translation=np.array([10.0, -2.0, 0.5]), quaternion=np.array([0.8, 0.0, 0.0, -0.6]))
 VIEW = FieldOfView(azimuth=np.array([2.5, -2.5]), elevation=np.array([-0.4, 0.2]), range=np.array([0.5, 80]))
 HEADER = {"stream": "site-1/node.2/lidar_3", "epoch": EPOCH, "seq": 7, "stamp_ns": 1_700_000_000_123_456_789}
 
@@ -49,7 +51,9 @@ def _examples() -> list[Message]:
         has_points=True,
         field_of_view=VIEW,
     )
-    points = Points(**HEADER, frame="sensor", pose=POSE, xyz=np.arange(30, dtype="f4").reshape(10, 3))
+    points = Points(
+        **HEADER, frame="sensor", pose=POSE, relocation=MOTION, xyz=np.arange(30, dtype="f4").reshape(10, 3)
+    )
     tracks = Tracks(
         **HEADER,
         session="0123456789abcdef" * 2,
@@ -58,6 +62,7 @@ def _examples() -> list[Message]:
         cloud_used=True,
         gap=2,
         ignored=3,
+        world=3,
         labels=("car", "pedestrian"),
         id=np.array([3, 8]),
         label=np.array([1, 0]),
@@ -66,6 +71,7 @@ def _examples() -> list[Message]:
         yaw=np.array([0.1, -0.2]),
         heading_confidence=np.array([0.9, 0.5]),
         confirmed=np.array([1, 0]),
+        measured=np.array([7, 4]),
         class_probability=np.array([[0.25, 0.75], [1.0, 0.0]], dtype="f4"),
         velocity=np.array([[1.0, 2.0], [0.0, 0.5]]),
         yaw_rate=np.array([0.01, 0.0]),
@@ -189,8 +195,15 @@ def example_of(examples: dict[str, Message]) -> Callable[[type[Message]], Messag
     assert isinstance(events, Events)
     assert tracks.delivery is not None
     assert events.zones is not None
-    held = {"Pose": POSE, "FieldOfView": VIEW, "Delivery": tracks.delivery, "SessionSummary": status.sessions[0]}
-    held |= {"ZoneEvent": events.events[0], "ZoneCount": events.zones[0]}
+    held = {
+        "Pose": POSE,
+        "Relocation": MOTION,
+        "FieldOfView": VIEW,
+        "Delivery": tracks.delivery,
+        "SessionSummary": status.sessions[0],
+        "ZoneEvent": events.events[0],
+        "ZoneCount": events.zones[0],
+    }
     return lambda kind: {**examples, **held}[kind.__name__]
 
 

@@ -121,7 +121,8 @@ def test_every_byte_replaced_by_others(examples: dict[str, Message], name: str) 
     example, found = examples[name], 0
     payload = encode(example)
     for at, byte in enumerate(payload):
-        for other in {0, 0x7F, 0xC0, 0xFF, byte ^ 1, byte ^ 0x80} - {byte}:
+        others = (0, 0x7F, 0xC0, 0xFF, byte ^ 1, byte ^ 0x80)
+        for other in set(others[at % 3 :: 3]) - {byte}:
             found += check(payload[:at] + bytes([other]) + payload[at + 1 :], type(example))
     assert found
 

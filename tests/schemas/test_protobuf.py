@@ -10,7 +10,7 @@ import msgpack
 import numpy as np
 import pytest
 from optipmb_schemas import MessageError, SessionParameters, decode, encode, encode_json, encoding_of
-from optipmb_schemas.messages import Detections, Message, Points, Tracks
+from optipmb_schemas.messages import Detections, Message, Points, Relocation, Tracks
 from optipmb_schemas.protobuf import convert, export
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf.convert import transcode
@@ -86,6 +86,17 @@ def test_covariances_survive(example_of: Any) -> None:
     proto.position_covariance.data = np.array([np.eye(3), np.eye(3), -np.eye(3)]).tobytes()
     with pytest.raises(MessageError, match=r"position_covariance\[2\]"):
         convert.from_proto(proto, Detections)
+
+
+@pytest.mark.parametrize(
+    "unknown",
+    [{"yaw": None, "size": None}, {"yaw": [0.5, np.nan, 1.0], "size": [[4.0, np.nan, 1.5], [np.nan] * 3, [1.0] * 3]}],
+)
+def test_detections_without_headings_and_sizes_survive(unknown: dict[str, Any], example_of: Any) -> None:
+    """Absent columns stay absent, and unknown numbers unknown."""
+    center = np.array([[1.0, 2.0, np.nan], [3.0, 4.0, 0.5], [5.0, 6.0, np.nan]])
+    message = Detections(**(dict(example_of(Detections).present()) | unknown | {"center": center}))
+    assert encode(convert.from_proto(proto_of(message), Detections)) == encode(message)
 
 
 @pytest.mark.parametrize("rows", [0, 1, 5000])
@@ -178,6 +189,14 @@ def test_tracks_of_any_number_are_transcoded(rows: int, example_of: Any) -> None
     known = (many.stream, many.epoch, many.seq, many.stamp_ns, many.revision, many.delivery.run)
     assert (transcoded.stream, transcoded.epoch, transcoded.seq, transcoded.stamp_ns) == known[:4]
     assert (transcoded.revision, transcoded.run) == known[4:]
+
+
+def test_tracks_after_a_motion_of_the_world_are_transcoded(example_of: Any) -> None:
+    """They say which motion, in both forms."""
+    tracks = example_of(Tracks).model_copy(update={"relocation": example_of(Relocation)})
+    transcoded = transcode(encode(tracks), encoding=encoding_of(Tracks)).message()
+    assert transcoded == convert.to_proto(tracks)
+    assert transcoded.relocation.world == transcoded.world == 3
 
 
 def without_rows(fields: dict[str, Any]) -> None:

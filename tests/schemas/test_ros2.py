@@ -258,6 +258,27 @@ def autoware(**changes: Any) -> Any:
     return types.new(f"{package}/DetectedObjects", header=header, objects=[one])
 
 
+def test_what_a_detector_does_not_measure_is_unknown() -> None:
+    """A length of zero, an orientation that is not available, a quaternion of zeros; the twist counts all the same."""
+    types = own_types()
+    flat = types.new("geometry_msgs/msg/Vector3", x=4.0, y=0.0, z=0.0)
+    message = autoware(dimensions=flat)
+    message.objects[0].kinematics.orientation_availability = 0
+    boxes = boxes_of(message)
+    np.testing.assert_array_equal(boxes.size, [[4.0, np.nan, np.nan]])
+    assert np.isnan(boxes.yaw).all()
+    np.testing.assert_allclose(boxes.velocity, [[0.0, 4.0]], atol=1e-12)
+    zeros = types.new("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=0.0)
+    message = autoware()
+    message.objects[0].kinematics.pose_with_covariance.pose.orientation = zeros
+    boxes = boxes_of(message)
+    assert np.isnan(boxes.yaw).all()
+    assert boxes.size.tolist() == [[4.0, 2.0, 1.5]]
+    np.testing.assert_allclose(boxes.velocity, [[4.0, 0.0]], atol=1e-12)
+    with pytest.raises(MessageError, match=r"objects\[0\].shape.dimensions.y: expected a positive length"):
+        boxes_of(autoware(dimensions=types.new("geometry_msgs/msg/Vector3", x=4.0, y=-1.0, z=0.0)))
+
+
 def test_an_object_of_autoware_is_read_whole() -> None:
     """The likeliest class, the existence probability, and the twist turned out of the frame of the object."""
     boxes = boxes_of(autoware())
@@ -330,7 +351,7 @@ def test_other_shapes_become_boxes() -> None:
 
 @pytest.mark.parametrize("more", [(), (0.75, 10.0)])
 def test_predicted_objects_have_the_paths_of_tracks(more: tuple[float, ...]) -> None:
-    """A path is the box now and at each of the horizons of ROS; tracks without these have none."""
+    """A path is the box now and at each of the horizons of ROS; tracks without these, or without heading, say so."""
     horizons = sorted((*HORIZONS, *more))
     at = np.array(horizons)
     tracks = SimpleNamespace(
@@ -350,7 +371,9 @@ def test_predicted_objects_have_the_paths_of_tracks(more: tuple[float, ...]) -> 
         path_position=np.stack([np.c_[1 + at, 2 * np.ones(len(at))], np.c_[5 - at, at]]),
         path_yaw=np.stack([0.25 + at / 8, at / 4]).astype("f4"),
     )
+    tracks.measured = np.array([7, 2])
     made = dict(messages(own_types(), cast("Tracks", tracks), 5, "map", "a/b/c"))
+    assert [one.kinematics.orientation_availability for one in made[""].objects] == [2, 0]
     paths = [one.kinematics.predicted_paths for one in made["/predicted"].objects]
     for row, (path,) in enumerate(paths):
         assert (path.time_step.sec, path.time_step.nanosec, path.confidence) == (0, 500_000_000, 1.0)

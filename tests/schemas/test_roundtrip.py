@@ -23,6 +23,7 @@ from optipmb_schemas import (
     Points,
     Pose,
     Problem,
+    Relocation,
     ResetRequest,
     ServiceStatus,
     SessionParameters,
@@ -98,7 +99,17 @@ def placed(draw: st.DrawFn) -> dict[str, Any]:
     """Return the fields that all messages of a publisher have."""
     frame = draw(st.sampled_from(["world", "sensor"]))
     pose = draw(poses()) if frame == "sensor" else draw(st.none() | poses())
-    return {**draw(headers()), "frame": frame, "pose": pose}
+    return {**draw(headers()), "frame": frame, "pose": pose, "relocation": draw(st.none() | relocations())}
+
+
+@st.composite
+def relocations(draw: st.DrawFn) -> Relocation:
+    """Return motions of the world."""
+    turn = draw(st.floats(-7.0, 7.0))
+    quaternion = np.array([np.cos(turn), 0.0, 0.0, np.sin(turn)])
+    return Relocation(
+        world=draw(st.integers(1, 2**31 - 1)), translation=draw(rows((3,), -FAR, FAR)), quaternion=quaternion
+    )
 
 
 @st.composite
@@ -108,13 +119,22 @@ def detections(draw: st.DrawFn) -> Detections:
     velocity = draw(st.none() | rows((m, 2), -1e3, 1e3))
     if velocity is not None:
         velocity[draw(arrays(np.bool_, m))] = np.nan
+    center, size, yaw = (
+        draw(rows((m, 3), -FAR, FAR)),
+        draw(rows((m, 3), 0, 1e4, above=True)),
+        draw(rows((m,), -1e4, 1e4)),
+    )
+    if draw(st.booleans()):
+        center[draw(arrays(np.bool_, m)), 2] = np.nan
+        size[draw(arrays(np.bool_, (m, 3)))] = np.nan
+        yaw[draw(arrays(np.bool_, m))] = np.nan
     return Detections(
         **draw(placed()),
         labels=tuple(names),
         label=draw(whole(m, 0, len(names) - 1)),
-        center=draw(rows((m, 3), -FAR, FAR)),
-        size=draw(rows((m, 3), 0, 1e4, above=True)),
-        yaw=draw(rows((m,), -1e4, 1e4)),
+        center=center,
+        size=draw(st.sampled_from([None, size])),
+        yaw=draw(st.sampled_from([None, yaw])),
         score=draw(rows((m,), 0, 1, above=True)),
         velocity=velocity,
         has_points=draw(st.none() | st.booleans()),
@@ -164,6 +184,8 @@ def tracks(draw: st.DrawFn) -> Tracks:
         cloud_used=draw(st.booleans()),
         gap=draw(count),
         ignored=draw(count),
+        world=draw(st.none() | count),
+        relocation=draw(st.none() | relocations()),
         labels=tuple(names),
         id=np.sort(np.array(draw(st.lists(count, min_size=n, max_size=n, unique=True)), dtype="i8")),
         label=draw(whole(n, 0, len(names) - 1)),

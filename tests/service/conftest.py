@@ -51,7 +51,7 @@ def start(_compiled: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
 
 @pytest.fixture
 def node(start: Start) -> Iterator[Node]:
-    """A node beside a service with default settings."""
+    """A node at a service with default settings."""
     _, endpoint = start()
     with Node(endpoint) as one:
         yield one

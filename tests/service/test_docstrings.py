@@ -27,7 +27,7 @@ def arguments(function: ast.FunctionDef | ast.AsyncFunctionDef) -> set[str]:
 
 
 def attributes(owner: ast.ClassDef) -> set[str]:
-    """The names of a class, and those that its methods give to an object."""
+    """The names of a class, and the attributes that its methods set."""
     names = {
         part.target.id for part in owner.body if isinstance(part, ast.AnnAssign) and isinstance(part.target, ast.Name)
     }

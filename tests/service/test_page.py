@@ -49,7 +49,7 @@ def test_the_tables_are_current() -> None:
 
 
 def test_a_page_that_is_not_current_is_found(tmp_path: Path) -> None:
-    """The check sees a table that was not made anew, and writing makes it anew."""
+    """The check finds a stale table, and writing updates it."""
     copy = tmp_path / "page.md"
     copy.write_text(REFERENCE.read_text(encoding="utf-8").replace("`cloud_wait_s`", "`cloud_wait`"), encoding="utf-8")
     assert main(["--check", str(copy)]) == 1
@@ -58,13 +58,13 @@ def test_a_page_that_is_not_current_is_found(tmp_path: Path) -> None:
 
 
 def test_every_setting_is_described() -> None:
-    """No setting without a word on what it does."""
+    """Every setting has a description."""
     for table in (Settings, LimitSettings, SiteSettings, Ros2Settings, Ros2Stream):
         assert docstrings(table).keys() >= table.model_fields.keys()
 
 
 def test_every_log_event_is_described() -> None:
-    """The events that the code logs and those of the table are the same."""
+    """The code logs the events of the table."""
     logged = set()
     for call in calls(LEVELS):
         receiver = call.func.value if isinstance(call.func, ast.Attribute) else None
@@ -74,7 +74,7 @@ def test_every_log_event_is_described() -> None:
 
 
 def test_every_problem_is_described() -> None:
-    """The codes that the code reports, with those of the schemas, are those of the table."""
+    """The code and the schemas report the codes of the table."""
     reported = set(get_args(Code))
     for call in calls({"problem_of", "_problem", "_refuse", "_report", "report"}):
         code = call.args[0] if call.args else None

@@ -190,7 +190,7 @@ class Process(Around):
             then()
 
     def recall(self, stream: str, restore: Any, then: Any, _: object = None) -> None:
-        """Restore what was kept."""
+        """Restore a kept state."""
         then(restore(decode_checkpoint(self._saved[stream])) if stream in self._saved else None)
 
     def publish(self, payload: bytes) -> None:

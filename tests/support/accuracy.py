@@ -5,8 +5,8 @@ from functools import cache
 from pathlib import Path
 
 from optipmb_tools.datasets import DataSequence, open_dataset
-from optipmb_tools.results import FullTable, ResultTable
-from optipmb_tools.tuning.clips import Clip, load, of_class, track_fully
+from optipmb_tools.results import FullTable
+from optipmb_tools.tuning.clips import Clip, load, of_class, track_clip
 from optipmb_tools.tuning.scoring import Figures, Scorer, rules_of, scorer_of
 from optipmb_tools.tuning.values import only
 from real_data import kitti_root, nuscenes_root
@@ -37,11 +37,11 @@ def material(dataset: str, detections: str) -> tuple[dict[str, Scorer], dict[str
 
 
 @cache
-def tracked(profile: str, detections: str, name: str) -> list[tuple[ResultTable, FullTable]]:
+def tracked(profile: str, detections: str, name: str) -> list[FullTable]:
     """The tracks of one class by one profile, sequence by sequence."""
     _, clips = material(profile.removesuffix("-paper"), detections)
     parameters = only(optipmb.load_profile(profile), name)
-    return [track_fully(clip, parameters) for clip in clips[name]]
+    return [track_clip(clip, parameters) for clip in clips[name]]
 
 
 @cache
@@ -49,7 +49,7 @@ def figures(profile: str, detections: str, name: str) -> Figures:
     """The figures of one class by one profile."""
     scorers, clips = material(profile.removesuffix("-paper"), detections)
     tracks = zip(clips[name], tracked(profile, detections, name), strict=True)
-    return scorers[name].figures([scorers[name].measure(clip, table) for clip, (table, _) in tracks])
+    return scorers[name].figures([scorers[name].measure(clip, table) for clip, table in tracks])
 
 
 def without_motion(profile: Path) -> bytes:

@@ -21,7 +21,7 @@ DEADLINE_S = 90.0
 
 @contextlib.contextmanager
 def browser(profile: Path, *flags: str) -> Iterator[Chrome]:
-    """Chromium with an empty profile that asks nobody anything by itself."""
+    """Chromium with an empty profile and no requests of its own."""
     chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
     if chromium is None or driver is None:
         pytest.skip("Debian's packages chromium and chromium-driver are not installed")

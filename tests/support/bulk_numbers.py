@@ -1,4 +1,4 @@
-"""A task over numbers, beside nothing that is slow to import: every process of a pool imports it."""
+"""A task over numbers, in a module that imports quickly: every process of a pool imports it."""
 
 import os
 import signal

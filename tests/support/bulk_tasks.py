@@ -86,7 +86,7 @@ class Dying:
         return self._executor.submit(task)
 
     def take(self, future: Future[Any]) -> Any:
-        """Give what came of it."""
+        """Give its result."""
         return self._executor.take(future)
 
     def __enter__(self) -> Self:
@@ -95,4 +95,4 @@ class Dying:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """The executor is closed by whoever made it."""
+        """The caller closes the executor."""

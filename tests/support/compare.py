@@ -1,4 +1,4 @@
-"""Comparison of the tracker's density and tracks with those of the oracle, and of bytes with bytes."""
+"""Comparison of the tracker's density and tracks with the oracle's, and of bytes with bytes."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def _stacked(objects: Sequence[Any], name: str, like: np.ndarray[Any, Any]) -> n
 
 
 def assert_matches(oracle: Oracle, wanted: OracleTracks, density: Density, tracks: Tracks, when: str) -> None:
-    """The whole density and all tracks are those of the oracle."""
+    """The whole density and all tracks equal the oracle's."""
     assert density.stamp_ns == oracle.stamp_ns, when
     np.testing.assert_array_equal(density.bernoulli.id, [b.id for b in oracle.bernoulli], err_msg=f"{when} ids")
     assert density.next_id == oracle.next_id, when
@@ -56,7 +56,7 @@ def assert_matches(oracle: Oracle, wanted: OracleTracks, density: Density, track
         found = getattr(density.bernoulli, name)
         assert_close(found, _stacked(oracle.bernoulli, name, found), f"{when} bernoulli.{name}")
     if density.class_probability is not None:
-        own = [row[row > 0] for row in density.class_probability]  # those of the group
+        own = [row[row > 0] for row in density.class_probability]  # the classes of the group
         assert_close(np.concatenate([*own, []]), np.concatenate([*[b.pi for b in oracle.bernoulli], []]), f"{when} pi")
     for name in POISSON:
         found = getattr(density.poisson, name)

@@ -125,7 +125,7 @@ class World:
         self.compare()
 
     def compare(self) -> None:
-        """States and tracks are those of the sessions that nothing happened to."""
+        """States and tracks equal the undisturbed sessions."""
         for stream, session in self.sessions.items():
             where = f"seed {self.seed}, stream {stream}"
             other = self.undisturbed[stream]

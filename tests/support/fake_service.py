@@ -6,9 +6,7 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Self
 
-import numpy as np
 import zenoh
-from numpy.typing import NDArray
 from optipmb_client.incoming import Arrival
 from optipmb_client.zenoh.session import Session
 from optipmb_schemas import (
@@ -28,8 +26,8 @@ from optipmb_schemas import (
     encoding_of,
 )
 from routers import open_client
+from tracks_message import SESSION, tracks_message
 
-SESSION = "0123456789abcdef0123456789abcdef"
 KEYS = Keys()
 
 
@@ -43,7 +41,7 @@ class Behaviour:
 
 @dataclass
 class Seen:
-    """What has come in: everything by stream."""
+    """Messages received, in their order."""
 
     detections: list[Detections] = field(default_factory=list)
     points: list[Points] = field(default_factory=list)
@@ -161,32 +159,19 @@ class FakeService:
 
 def tracks_of(message: Detections) -> Tracks:
     """One track per detection, as if the sensor frame were the world."""
-    count = len(message.label)
-
-    def zeros(*shape: int) -> NDArray[np.float64]:
-        return np.zeros((count, *shape))
-
-    return Tracks(
-        stream=message.stream,
+    return tracks_message(
+        message.stream,
+        message.seq,
+        range(len(message.label)),
         epoch=message.epoch,
-        seq=message.seq,
         stamp_ns=message.stamp_ns,
-        session=SESSION,
-        profile="kitti",
         cloud_used=bool(message.has_points),
         labels=message.labels,
-        id=np.arange(count),
         label=message.label,
         center=message.center,
         size=message.size,
         yaw=message.yaw,
-        velocity=zeros(2),
-        yaw_rate=zeros(),
-        acceleration=zeros(),
-        existence=zeros() + 1.0,
         score=message.score,
-        covariance=zeros(6, 6),
-        age=zeros(),
-        time_since_detection=zeros(),
-        detection=np.arange(count),
+        covariance=0,
+        detection=range(len(message.label)),
     )

@@ -1,4 +1,4 @@
-"""A router process and service processes beside it, sharing a store: started, frozen, killed, and always ended."""
+"""A router process and service processes that share a store: started, frozen, killed, and always ended."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class Fleet:
 
     Args:
         folder: where the store is.
-        environment: settings of all services, on top of those that the tests need.
+        environment: settings of all services, on top of the defaults of tests.
     """
 
     def __init__(self, folder: Path, **environment: object) -> None:

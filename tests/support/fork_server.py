@@ -38,7 +38,7 @@ def load() -> None:
 
 
 def serve(asking: socket.socket) -> str:
-    """Fork for every request, until nobody can send one; returns in a new process the module that it is to run."""
+    """Fork for every request until the socket closes; return in the new process the module to run."""
     while True:
         packet, files, _, _ = socket.recv_fds(asking, LARGEST, FILES)
         if not packet:
@@ -55,7 +55,7 @@ def serve(asking: socket.socket) -> str:
             os.write(writing, str(child).encode())
             os._exit(0)
         os.close(writing)
-        os.waitpid(between, 0)  # before the answer: from here on the new process belongs to whoever asked
+        os.waitpid(between, 0)  # before the answer: from here on the new process belongs to the caller
         asking.send(os.read(reading, 32))
         for one in (reading, *files):
             os.close(one)

@@ -82,7 +82,7 @@ class Forked(subprocess.Popen[str]):
                 files = [own if one == -1 else one for own, one in enumerate((stdin, stdout, stderr))]
                 socket.send_fds(asking, [json.dumps(request).encode()], files)
                 self.pid = int(asking.recv(32))
-            except BaseException:  # the answer may still come: it must not be taken for that of the next request
+            except BaseException:  # the answer may still come: the next request must not get it
                 asking.close()
                 server.cache_clear()
                 raise

@@ -1,6 +1,6 @@
 """Calls of the public API with good and bad arguments, a program of its own: `NUMBA_BOUNDSCHECK=1 python …`.
 
-Whatever goes in, a call returns or raises an `OptipmbError`. Everything is drawn from fixed seeds.
+With any input a call returns or raises an `OptipmbError`. Everything is drawn from fixed seeds.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def odd_frames(seed: int) -> None:
 
 
 def odd_densities(seed: int) -> None:
-    """Densities with a column changed at random; those that do not fit are refused, the others are stepped."""
+    """Densities with a column changed at random; they are refused or stepped."""
     rng = np.random.default_rng(seed)
     parameters = PROFILES[0]
     tracker = optipmb.Tracker(parameters)

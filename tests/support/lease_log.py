@@ -47,7 +47,7 @@ class MemoryLeases:
         """Whether answers arrive; without them what was asked is done nevertheless."""
 
     def follow(self, after: int) -> list[Record]:
-        """Return what has changed."""
+        """Return the changed records."""
         self._reach()
         changed = [record for record in self.shared.records.values() if record.revision > after]
         return sorted(changed, key=lambda record: record.revision)
@@ -75,7 +75,7 @@ class MemoryLeases:
         return False
 
     def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
-        """Keep what has the newest fence."""
+        """Keep the checkpoints with the newest fence."""
         self._reach()
         refused = set()
         for stream, one in checkpoints.items():
@@ -114,7 +114,7 @@ class MemoryLeases:
 
 
 class Alone(Member):
-    """Leases of all partitions, for the checkpoints of a store that nobody else uses.
+    """Leases of all partitions, for the checkpoints of a store without other users.
 
     Args:
         store: where they are.

@@ -37,7 +37,7 @@ class LogProcess(ServiceProcess):
         )
 
     def ask(self, path: str) -> str:
-        """What it answers over HTTP; nothing while it does not."""
+        """Its answer over HTTP; empty without one."""
         try:
             with urllib.request.urlopen(f"http://{self.http}{path}", timeout=10) as answer:
                 return str(answer.read().decode())

@@ -45,6 +45,18 @@ RULES: list[tuple[str, str, Any, str]] = [
     ("Detections", "pose", {"translation": [0, 0, 0], "quaternion": [1, 0, 0, 0.1]}, "pose.quaternion"),
     ("Detections", "pose", {"translation": [0, 0, 0], "quaternion": [0, 0, 0, 0]}, "pose.quaternion"),
     ("Detections", "pose", {"translation": [0, 0, 0], "quaternion": [1, 0, 0]}, "pose.quaternion"),
+    *(
+        ("Detections", "relocation", {"world": 1, "translation": [0, 0, 0], "quaternion": [1, 0, 0, 0]} | wrong, path)
+        for wrong, path in (
+            ({"world": 0}, "relocation.world"),
+            ({"world": 2**31}, "relocation.world"),
+            ({"translation": [0, 0]}, "relocation.translation"),
+            ({"quaternion": [0.999, 0.03, 0.0, 0.0]}, "relocation.quaternion"),
+            ({"quaternion": [1, 0, -0.001, 0.01]}, "relocation.quaternion"),
+            ({"quaternion": [0.9, 0, 0, 0]}, "relocation.quaternion"),
+        )
+    ),
+    ("Tracks", "world", -1, "world"),
     ("Detections", "field_of_view", [-1, 1], "field_of_view"),
     ("Detections", "field_of_view", {"azimuth": [-1, 1]}, "field_of_view.elevation"),
     *(
@@ -93,8 +105,9 @@ RULES: list[tuple[str, str, Any, str]] = [
     # what the numbers of arrays are
     ("Detections", "center", [[0, 0, 0], [0, INF, 0], [0, 0, 0]], "center[1][1]"),
     ("Detections", "center", [[0, 0, 0], [0, 0, 0], [0, 0, -2e8]], "center[2][2]"),
-    ("Detections", "center", [[0, 0, 0], [0, 0, NAN], [0, 0, 0]], "center[1][2]"),
-    ("Detections", "center", [[0, 0, 0], [0, 0, None], [0, 0, 0]], "center[1][2]"),
+    ("Detections", "center", [[0, 0, 0], [0, NAN, 0], [0, 0, 0]], "center[1][1]"),
+    ("Detections", "center", [[0, 0, 0], [0, None, None], [0, 0, 0]], "center[1][1]"),
+    ("Detections", "center", [[0, 0, 0], [0, 0, None], [0, 0, INF]], "center[2][2]"),
     ("Detections", "center", [[0, 0, 0], [0, 0, "1"], [0, 0, 0]], "center[1][2]"),
     ("Detections", "center", [[0, 0, 0], [0, 0, True], [0, 0, 0]], "center[1][2]"),
     ("Detections", "center", [[0, 0, 0], [0, 0, [1]], [0, 0, 0]], "center[1][2]"),
@@ -102,7 +115,9 @@ RULES: list[tuple[str, str, Any, str]] = [
     ("Detections", "size", [[1, 1, 1], [1, 1, 1], [1, -0.0, 1]], "size[2][1]"),
     ("Detections", "size", [[1, 1, 1], [-1, 1, 1], [1, 1, 1]], "size[1][0]"),
     ("Detections", "size", [[1, 1, 1], [1, 1, 1], [1, 1, 2e4]], "size[2][2]"),
-    ("Detections", "yaw", [0, NAN, 0], "yaw[1]"),
+    ("Detections", "size", [[1, 1, 1], [1, NAN, 1], [1, 1, 0]], "size[2][2]"),
+    ("Detections", "yaw", [NAN, None, "1"], "yaw[2]"),
+    ("Detections", "yaw", [NAN, 0, INF], "yaw[2]"),
     ("Detections", "yaw", [0, 0, INF], "yaw[2]"),
     ("Detections", "yaw", [0, 0, 1e5], "yaw[2]"),
     ("Detections", "score", [0.5, 0.5, -1e-9], "score[2]"),
@@ -156,6 +171,8 @@ RULES: list[tuple[str, str, Any, str]] = [
     ("Tracks", "age", [0, -1], "age[1]"),
     ("Tracks", "time_since_detection", [0, -1], "time_since_detection[1]"),
     ("Tracks", "detection", [-2, 0], "detection[0]"),
+    ("Tracks", "measured", [7, 8], "measured[1]"),
+    ("Tracks", "measured", [7], "measured"),
     ("Tracks", "class_probability", [[0.5, 0.5]], "class_probability"),
     ("Tracks", "class_probability", [[0.5, 0.5, 0.0]] * 2, "class_probability"),
     ("Tracks", "class_probability", [[0.5, 0.5], [0.5, 1.5]], "class_probability[1][1]"),

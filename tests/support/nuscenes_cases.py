@@ -38,7 +38,7 @@ class Rows:
 
     @property
     def existence(self) -> Floats:
-        """Nobody reads it."""
+        """It is not read."""
         return self.score
 
 
@@ -138,7 +138,7 @@ class _Track:
 class GreedyTracker:
     """Gives each detection, best first, to the nearest prediction in reach, or starts a track; keeps lost ones a while.
 
-    Predictions go on at the velocity of the last two detections. The score of a track is that of its detection.
+    Predictions go on at the velocity of the last two detections. A track has the score of its detection.
     """
 
     def __init__(self, *, patience: int = 3) -> None:

@@ -1,7 +1,7 @@
 """The slow twin of the tracker: Algorithm 1 of the paper with one Python object per component and no shortcuts.
 
 Conventions as in `oracle_formulas`. Nothing here imports the tracker: `Oracle` reads parameters, modules and frames
-by attribute. Where the paper is silent the decisions are those of the tracker's docstrings.
+by attribute. Where the paper is silent the tracker's docstrings decide.
 """
 # ruff: noqa: N806 - Q and W are the names that the paper uses
 
@@ -80,7 +80,7 @@ class NewObject:
 
 @dataclass
 class OracleTracks:
-    """The extracted tracks in columns of the same names as those of the tracker."""
+    """The extracted tracks in columns with the tracker's names."""
 
     columns: dict[str, Array] = field(default_factory=dict)
 
@@ -215,6 +215,10 @@ class Oracle:
             return False
         distance, c = math.hypot(*(component.mean[:2] - z.xy)), self.classes[component.label]
         spread = math.sqrt(component.covariance[2, 2])
+        if distance > c.gate and isinstance(component, Bernoulli):
+            turn = (z.yaw - component.mean[3] + math.pi / 2) % math.pi - math.pi / 2
+            if turn**2 > 1.5**2 * (component.covariance[3, 3] + c.measurement_noise.heading**2):
+                return False
         return distance <= max(c.gate, c.gate_deviations * spread * self.dt)
 
     def _log_likelihood(self, component: Bernoulli | Poisson, z: Measurement) -> float:

@@ -15,7 +15,7 @@ def running(pid: int) -> bool:
 
 
 def wait_until_ended(pids: set[int], timeout: float) -> set[int]:
-    """Wait until processes have ended; give those that still run after `timeout` seconds."""
+    """Wait until processes have ended; return the ones that still run after `timeout` seconds."""
     deadline = time.monotonic() + timeout
     while (left := {pid for pid in pids if running(pid)}) and time.monotonic() < deadline:
         time.sleep(0.02)  # they are no children of this process: there is nothing to wait on

@@ -65,7 +65,7 @@ class Network:
         self.router.__exit__(kind, error, trace)
 
     def make(self, *more: str) -> str:
-        """Make what is not there yet; gives what the command said."""
+        """Create missing certificates; return the command's output."""
         done = make(self.folder, *self.options, *more)
         assert done.returncode == 0, done.stderr
         return done.stdout
@@ -83,12 +83,12 @@ class Network:
 
 
 class Party:
-    """A plain Zenoh session with a configuration; collects what it subscribes to.
+    """A plain Zenoh session with a configuration; collects the messages of its subscriptions.
 
     Args:
         config: the file.
         patience_ms: how long it tries to link.
-        changes: values over those of the file.
+        changes: values over the file.
 
     Raises:
         zenoh.ZError: it cannot link to the router.
@@ -112,7 +112,7 @@ class Party:
         self.session.close()  # type: ignore[no-untyped-call]  # zenoh's stubs leave it untyped
 
     def read(self, *patterns: str) -> Self:
-        """Collect what is published under patterns."""
+        """Collect the messages under patterns."""
 
         def take(sample: zenoh.Sample) -> None:
             with self._changed:
@@ -126,7 +126,7 @@ class Party:
         return self
 
     def settle(self) -> None:
-        """Return when the router has taken what was sent so far: it answers in order."""
+        """Return when the router has taken all messages so far: it answers in order."""
         self.tokens(Keys().all_alive())
 
     def wait(self, enough: Callable[[list[tuple[str, bytes]]], bool], deadline_s: float = DEADLINE_S) -> bool:

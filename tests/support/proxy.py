@@ -1,4 +1,4 @@
-"""A network between processes that takes its time, and can be cut: what is on its way waits until it is whole again."""
+"""A network between processes that takes its time, and can be cut: bytes on their way wait until it is whole again."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Proxy:
         self._whole.clear()
 
     def mend(self) -> None:
-        """Pass on what waited, and what comes."""
+        """Forward waiting and new bytes."""
         self._whole.set()
 
     def strand(self) -> None:
@@ -92,7 +92,7 @@ class Proxy:
                 self._sockets.append(near)
                 try:
                     far = socket.create_connection(self._target)
-                except OSError:  # nobody there
+                except OSError:  # no listener
                     near.shutdown(socket.SHUT_RDWR)
                     continue
                 self._sockets.append(far)

@@ -1,4 +1,4 @@
-"""Recorded sequences as the messages that a sensor would send, and what an undisturbed session makes of them."""
+"""Recorded sequences as the messages that a sensor would send, and a replay of them through a service."""
 
 from __future__ import annotations
 
@@ -11,13 +11,9 @@ from typing import TYPE_CHECKING
 
 from optipmb_client.merging import FinalEvents
 from optipmb_schemas import Detections, Events, Keys, Points, Pose, SessionState, Tracks, decode, encode, encoding_of
-from optipmb_service.stream.checkpoint import digest_of
-from optipmb_service.stream.session import Session
-from optipmb_service.stream.values import Policy, Tracked, events_of
 from optipmb_tools.datasets import open_dataset
 from router import plain
-
-import optipmb
+from sessions import bare_events
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -35,6 +31,11 @@ class Recording:
 
     stream: str
     frames: list[tuple[Detections, Points | None]]
+
+    @property
+    def messages(self) -> list[Detections | Points]:
+        """The clouds and frames in order, each cloud before its frame."""
+        return [one for detections, points in self.frames for one in (points, detections) if one is not None]
 
 
 def kitti(root: Path, name: str, stream: str, frames: int) -> Recording:
@@ -83,29 +84,9 @@ def recording(kind: str, root: Path, detector: str, name: str, stream: str, fram
     return Recording(stream, made)
 
 
-def undisturbed(
-    recording: Recording, profile: str, policy: Policy | None = None
-) -> tuple[list[bytes], str, list[bytes]]:
-    """Tracks of every frame, digest of the last state, and events of a session that nothing happens to."""
-    session = Session(recording.stream, optipmb.load_profile(profile), policy)
-    outputs = []
-    for detections, points in recording.frames:
-        if points is not None:
-            outputs += session.on_points(points, 0)
-        outputs += session.on_detections(detections, 0)
-    tracked = [output for output in outputs if isinstance(output, Tracked)]
-    events = [bare_events(events_of(one.header, one.events, None)) for one in tracked if one.events]
-    return [plain(one.tracks) for one in tracked], digest_of(session.snapshot()), events
-
-
-def bare_events(message: Events) -> bytes:
-    """The bytes of the events of a frame that must be the same in every run."""
-    return encode(message.model_copy(update={"delivery": None, "revision": 0, "zones": None}))
-
-
 @dataclass
 class Replayed:
-    """What came back of a recording: by frame the distinct tracks, in the order of their revisions."""
+    """Results of a recording: by frame the distinct tracks, in the order of their revisions."""
 
     tracks: dict[int, set[bytes]] = field(default_factory=dict)
     repeated: int = 0
@@ -136,7 +117,7 @@ class Replay:
             detections = connection.cached_sender(
                 KEYS.detections(recording.stream), encoding_of(Detections), cache=len(recording.frames)
             )
-            # Clouds too are kept: what was tracked with its cloud before a kill must be tracked with it again.
+            # Clouds too are kept: a frame tracked with its cloud before a kill must be tracked with it again.
             points = connection.plain_sender(
                 KEYS.points(recording.stream), encoding_of(Points), cache=len(recording.frames)
             )

@@ -40,7 +40,7 @@ class Around:
             pass
 
     def turn(self) -> bool:
-        """Run what was submitted first; False when there was nothing."""
+        """Run the oldest work; False without any."""
         if not self._working:
             return False
         work = self._working.pop(0)
@@ -57,7 +57,7 @@ class Around:
     def recall(
         self, stream: str, restore: Callable[[Checkpoint], Any], then: Callable[[Any], None], _: object = None
     ) -> None:
-        """Restore what was kept."""
+        """Restore a kept state."""
         then(restore(self.kept[stream]) if stream in self.kept else None)
 
     def forget(self, _: str) -> None:
@@ -84,7 +84,7 @@ class Around:
         return self
 
     def look(self) -> None:
-        """Nobody waits for anything."""
+        """Wake no waiting thread."""
 
     release = look
 
@@ -109,7 +109,7 @@ def streams_of(
         Settings(instance="test", store="none", step_limit_s=60, **settings),  # kernels may have to be compiled
         profiles or Profiles.read("nuscenes", {}),
         open_publisher=parts.open_publisher,
-        reporter=reporter or ProblemReporter(lambda _: None, lambda *_: None),
+        reporter=reporter or ProblemReporter(lambda _: None),
         scheduler=parts,
         member=parts,
         checkpoints=parts,

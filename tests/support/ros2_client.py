@@ -14,7 +14,7 @@ from typing import Any, Self
 import numpy as np
 from optipmb_schemas.ros2.types import own_types
 
-os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")  # what it imports looks for git, which nothing here needs
+os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")  # its imports look for git, which nothing here needs
 
 import zenoh_ros2_sdk as sdk
 from zenoh_ros2_sdk import discovery
@@ -62,7 +62,7 @@ class Ros2Client:
             about = {"msg_definition": own_types().definition(kind), "type_hash": hash_by_sdk(kind)}
             self._publishers[topic] = sdk.ROS2Publisher(topic, kind, **(self._where | about | options))
             ends = time.monotonic() + DEADLINE_S
-            while not self._publishers[topic].pub.matching_status.matching:  # what is sent before that is lost
+            while not self._publishers[topic].pub.matching_status.matching:  # earlier messages are lost
                 assert time.monotonic() < ends, f"nobody subscribes to {topic}"
                 time.sleep(0.01)
         publisher = self._publishers[topic]
@@ -70,7 +70,7 @@ class Ros2Client:
         publisher.publish(**{name: getattr(message, name) for name in message.__dataclass_fields__})
 
     def subscribe(self, topic: str, kind: str, *, name: str = "", **options: Any) -> None:
-        """Collect what comes on a topic, under another name where one is given."""
+        """Collect the messages of a topic, under another name where one is given."""
         received = self.received[name or topic] = []
 
         def take(message: Any) -> None:
@@ -82,7 +82,7 @@ class Ros2Client:
         self._subscribers.append(sdk.ROS2Subscriber(topic, kind, take, **(self._where | about | options)))
 
     def wait(self, topic: str, true: Callable[[list[Any]], bool]) -> list[Any]:
-        """Wait until what came on a topic is as wanted, and give it."""
+        """Wait until the messages of a topic are as wanted, and return them."""
         with self._changed:
             met = self._changed.wait_for(lambda: true(self.received[topic]), DEADLINE_S)
             assert met, f"{topic}: {len(self.received[topic])} messages; {self._diagnosis()}"

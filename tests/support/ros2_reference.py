@@ -38,7 +38,7 @@ class Values:
         self._count = 0
 
     def message(self, fields: dict[str, str], nested: Any) -> Fields:
-        """Give the fields of a message; `nested` gives those of other types by name."""
+        """Give the fields of a message; `nested` has the fields of other types by name."""
         return {name: self._value(kind, nested) for name, kind in fields.items()}
 
     def _value(self, kind: str, nested: Any) -> Any:

@@ -1,6 +1,6 @@
-"""A sensor's messages, and a node on a real Zenoh network that sends them and waits for what comes back.
+"""A sensor's messages, and a node on a real Zenoh network that sends them and waits for answers.
 
-Nothing here sleeps: whoever waits is woken by a message, or fails at a deadline.
+Nothing here sleeps: a wait ends with a message, or fails at a deadline.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def plain(tracks: Tracks) -> bytes:
 
 @dataclass
 class Collected:
-    """What came in so far, and a way to wait for more."""
+    """Messages received so far, and a way to wait for more."""
 
     items: list[tuple[str, bytes, str]] = field(default_factory=list)
     times_ns: list[int] = field(default_factory=list)
@@ -112,7 +112,7 @@ class Collected:
             self.changed.notify_all()
 
     def wait(self, enough: Callable[[list[tuple[str, bytes, str]]], bool], what: str) -> None:
-        """Wait until `enough` of what came in; fails at the deadline."""
+        """Wait until the messages are `enough`; fails at the deadline."""
         with self.changed:
             if not self.changed.wait_for(lambda: enough(self.items), DEADLINE_S):
                 raise AssertionError(f"{what} did not come within {DEADLINE_S:g} s; {len(self.items)} messages came")
@@ -152,7 +152,7 @@ class Node:
             self._publisher(key, type(message), cached=topic == "detections").put(encode(message))
 
     def send_plain(self, *messages: Detections) -> None:
-        """Publish detections as who knows nothing of caches and of tokens: they are gone when nobody takes them."""
+        """Publish detections without caches and tokens: they are lost without a subscriber."""
         for message in messages:
             key = self.keys.detections(message.stream)
             self.session.put(key, encode(message), encoding=encoding_of(message), express=True)
@@ -308,7 +308,7 @@ def _configuration(endpoint: str, more: dict[str, object]) -> zenoh.Config:
 
 
 def until(true: Callable[[], bool], what: str | Callable[[], str], deadline_s: float = DEADLINE_S) -> None:
-    """Ask again and again, for what sends no message; fails at the deadline, and says what is not so."""
+    """Ask again and again, for what sends no message; fails at the deadline with the name of the condition."""
     ends = time.monotonic() + deadline_s
     pause = threading.Event()
     while not true():

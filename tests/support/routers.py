@@ -21,7 +21,7 @@ _locks = (Path(tempfile.gettempdir()) / f"optipmb-test-ports-{os.getuid()}").ope
 
 
 def free_endpoint() -> str:
-    """An endpoint on the loopback interface where nobody listens, which no other test gets before this process ends."""
+    """A free endpoint on the loopback interface, which no other test gets before this process ends."""
     first = os.getpid() * 61 + len(_taken)
     for number in range(len(PORTS)):
         port = PORTS[(first + number) % len(PORTS)]
@@ -42,7 +42,9 @@ def free_endpoint() -> str:
 def open_router(endpoint: str, *others: str, adminspace: bool = False) -> zenoh.Session:
     """A router that listens at `endpoint`, linked to others; close it (it is a context manager)."""
     values: dict[str, object] = {"mode": "router", "listen/endpoints": [endpoint], "connect/endpoints": list(others)}
-    return _open(values | {"adminspace/enabled": adminspace})
+    # Half a second, in which routers find others; without others there is nothing to wait for.
+    delay: dict[str, object] = {} if others else {"scouting/delay": 0}
+    return _open(values | delay | {"adminspace/enabled": adminspace})
 
 
 def open_client(endpoint: str) -> zenoh.Session:

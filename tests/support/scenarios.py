@@ -362,7 +362,7 @@ class Recorded:
         return self.sessions.setdefault(name, f"{len(self.sessions):032x}")
 
     def summary(self) -> dict[str, str]:
-        """Return what is compared."""
+        """Return the values that are compared."""
         for _, content in sorted(self.final.plain().items()):
             self.add("final", content)
         return {kind: f"{self.counts[kind]} {self.digests[kind].hexdigest()[:32]}" for kind in sorted(self.counts)}

@@ -229,6 +229,16 @@ def scene(seed: int, options: Options = Options()) -> Iterator[SceneFrame]:
         bodies = [body for body in bodies if body.frames_left > 0]
 
 
+def partial(
+    given: SceneFrame, headings: NDArray[np.bool_], sizes: NDArray[np.bool_], heights: NDArray[np.bool_]
+) -> SceneFrame:
+    """The frame without the headings, sizes and heights of some detections."""
+    center = given.center.copy()
+    center[heights, 2] = np.nan
+    size = np.where(sizes[:, None], np.nan, given.size)
+    return replace(given, yaw=np.where(headings, np.nan, given.yaw), size=size, center=center)
+
+
 def frame_of(parameters: Parameters, given: SceneFrame) -> Frame:
     """The tracker's frame of a scene's frame."""
     import optipmb  # noqa: PLC0415 - scenes can be generated without the tracker

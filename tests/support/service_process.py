@@ -28,7 +28,7 @@ class ServiceProcess:
         options: what follows the command's name.
         environment: variables on top of this process's, which loses its own settings.
         listen: whether a free endpoint is given to it.
-        fresh: whether it is a new interpreter, for what is claimed of a start, of memory and of what is loaded; else
+        fresh: whether it is a new interpreter, for claims about a start, memory and loaded modules; else
             it is forked from a process that has imports and kernels behind it.
     """
 
@@ -51,7 +51,7 @@ class ServiceProcess:
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
-            # Tests that want state say where it is to be kept; nobody's own is touched.
+            # Tests that want state say where it is kept; no user's own is touched.
             env=clean | {"OPTIPMB_STORE": "none"} | dict(environment or {}),
         )
         self._threads = [threading.Thread(target=read, daemon=True) for read in (self._read_out, self._read_errors)]
@@ -107,12 +107,12 @@ class ServiceProcess:
 
     @property
     def errors(self) -> str:
-        """What it has written to stderr."""
+        """Its stderr so far."""
         return "".join(self._errors)
 
     @property
     def output(self) -> list[str]:
-        """The lines on stdout that nobody has taken."""
+        """The lines on stdout that were not read yet."""
         lines = []
         while not self._lines.empty():
             if (line := self._lines.get()) is not None:

@@ -7,15 +7,18 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from optipmb_schemas import Problem, Tracks, encode
-from optipmb_service.stream.values import Begun, Output, Quarantined, Tracked
+from optipmb_schemas import Detections, Events, Problem, Tracks, encode
+from optipmb_service.stream.checkpoint import digest_of
+from optipmb_service.stream.session import Session
+from optipmb_service.stream.values import Begun, Output, Quarantined, Tracked, events_of
 
 import optipmb
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
-    from optipmb_service.stream.session import Session
+    from optipmb_schemas import Points
+    from optipmb_service.stream.values import Policy
     from router import Sensor
 
 
@@ -30,12 +33,12 @@ def problems(outputs: Iterable[Output]) -> list[Problem]:
 
 
 def begun(outputs: Iterable[Output]) -> list[str]:
-    """Why sessions began anew."""
+    """Reasons of the restarts of sessions."""
     return [output.reason for output in outputs if isinstance(output, Begun)]
 
 
 def dumps(outputs: Iterable[Output]) -> list[Quarantined]:
-    """What was saved of failures."""
+    """Dumps of failures."""
     return [output for output in outputs if isinstance(output, Quarantined)]
 
 
@@ -72,8 +75,26 @@ class Merged:
 
 
 def plain(message: Tracks) -> bytes:
-    """The bytes of tracks that must be those of the run in order."""
+    """The bytes of tracks that must equal the run in order."""
     return encode(message.model_copy(update={"delivery": None, "revision": 0}))
+
+
+def undisturbed(
+    messages: Sequence[Detections | Points], profile: str, policy: Policy | None = None
+) -> tuple[list[bytes], str, list[bytes]]:
+    """The tracks of every frame, the digest of the last state, and the events of a session that nothing happens to."""
+    session = Session(messages[0].stream, optipmb.load_profile(profile), policy)
+    outputs: list[Output] = []
+    for one in messages:
+        outputs += session.on_detections(one, 0) if isinstance(one, Detections) else session.on_points(one, 0)
+    tracked = [one for one in outputs if isinstance(one, Tracked)]
+    events = [bare_events(events_of(one.header, one.events, None)) for one in tracked if one.events]
+    return [plain(one) for one in tracks(outputs)], digest_of(session.snapshot()), events
+
+
+def bare_events(message: Events) -> bytes:
+    """The bytes of the events of a frame that must be the same in every run."""
+    return encode(message.model_copy(update={"delivery": None, "revision": 0, "zones": None}))
 
 
 class Failing:
@@ -125,7 +146,7 @@ class Chained:
         numbers = np.frombuffer(digest.digest(), np.uint8).astype(np.float64)
         born = not len(density.bernoulli)
         known = density.bernoulli
-        # Whatever else a Bernoulli has is one.
+        # All other columns of a Bernoulli are one.
         ones = {name: np.ones((1, *column.shape[1:]), column.dtype) for name, column in known.columns()}
         rows = optipmb.Bernoullis(**ones).replaced(
             mean=numbers.reshape(8, 6)[:1] / 100.0,

@@ -1,4 +1,4 @@
-"""A stream that several services take over from each other: what comes of it is that of a session left alone."""
+"""A stream that several services take over from each other: the result equals an undisturbed session."""
 
 from __future__ import annotations
 
@@ -9,12 +9,8 @@ from typing import TYPE_CHECKING
 
 from fleet import PROFILE
 from optipmb_schemas import Keys, SessionState, Tracks, decode
-from optipmb_service.stream.checkpoint import digest_of
-from optipmb_service.stream.session import Session
-from optipmb_service.stream.values import Tracked
 from router import Sensor, plain, until
-
-import optipmb
+from sessions import undisturbed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,15 +21,13 @@ KEYS = Keys()
 SENSOR = Sensor()
 
 
-def expected(frames: int, sensor: Sensor = SENSOR) -> tuple[list[bytes], str]:
+def expected(frames: int, sensor: Sensor = SENSOR, profile: str = PROFILE) -> tuple[list[bytes], str]:
     """Tracks and the digest of the state of a session that nothing happens to."""
-    session = Session(sensor.stream, optipmb.load_profile(PROFILE))
-    outputs = [output for seq in range(frames) for output in session.on_detections(sensor.detections(seq), 0)]
-    return [plain(one.tracks) for one in outputs if isinstance(one, Tracked)], digest_of(session.snapshot())
+    return undisturbed([sensor.detections(seq) for seq in range(frames)], profile)[:2]
 
 
 def distinct(node: Node, sensor: Sensor = SENSOR) -> dict[int, set[bytes]]:
-    """What was published for each frame, repetitions set aside."""
+    """The distinct tracks published for each frame."""
     found: dict[int, set[bytes]] = {}
     key = KEYS.tracks(sensor.stream)
     for payload in [payload for at, payload, _ in node.tracks_seen.items if at == key]:

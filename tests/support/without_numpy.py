@@ -29,7 +29,7 @@ def outcomes_without(cases: Sequence[Case]) -> list[Any]:
 
 
 def outcome(action: str, kind: str, given: Any) -> Any:
-    """Give what comes of one case: the message in both forms and its numbers as lists, or the text of the error.
+    """Give the result of one case: the message in both forms and its numbers as lists, or the text of the error.
 
     Args:
         action: `make` a message of the fields `given`, `decode` it from bytes, or `publish` it as a cloud.

@@ -1,10 +1,11 @@
-"""What a planner relies on: speeds under hard braking."""
+"""What a planner relies on: speeds under hard braking, and of parked cars that are missed."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pytest
 
 import optipmb
 
@@ -32,3 +33,15 @@ def test_hard_braking_is_followed() -> None:
         found = followed(place, 0.1, seed)
         error = np.array([one.velocity[0, 0] for one in found[30:]]) - speed[30:]
         assert np.sqrt(np.mean(error**2)) < 1.3
+
+
+@pytest.mark.parametrize(("turn", "same"), [(0.0, True), (0.1, True), (0.9, False), (1.5, False)])
+@pytest.mark.parametrize(("profile", "label"), [("generic", "car"), ("kitti", "Car")])
+def test_a_missed_car_is_not_its_neighbour(profile: str, label: str, turn: float, *, same: bool) -> None:
+    """At 2 Hz what was seen once may be 8 m ahead in the next frame, unless the box there heads another way."""
+    tracker = optipmb.OnlineTracker(profile)
+    found = []
+    for k, x in enumerate((0.0, 8.0)):
+        boxes: Any = {"center": [[x, 0.3, 0.0]], "size": [[4.2, 1.8, 1.5]], "yaw": [turn * k], "score": [0.95]}
+        found.append(tracker.update({**boxes, "label": [label]}, t=0.5 * k))
+    assert (found[0].id.tolist() == found[1].id.tolist()) == same

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from compare import TRACKS, density_bytes, digest, tracks_bytes
 from oracle_formulas import Measurement, confidence, report
-from scenes import Options, SceneCloud, SceneFrame, SensorPose, frame_of, random_parameters, scene
+from scenes import Options, SceneCloud, SceneFrame, SensorPose, frame_of, partial, random_parameters, scene
 
 import optipmb
 from optipmb.parameters import parse_parameters
@@ -131,6 +131,13 @@ def test_a_density_may_start_with_a_later_id() -> None:
     assert later.next_id == first.next_id + 99
 
 
+def assert_same_known(one: optipmb.StepResult, other: optipmb.StepResult) -> None:
+    """What is known of the tracks is the same."""
+    assert (one.measured is None) == (other.measured is None)
+    if one.measured is not None and other.measured is not None:
+        np.testing.assert_array_equal(one.measured, other.measured)
+
+
 def moved(given: SceneFrame, angle: float, shift: np.ndarray) -> SceneFrame:
     """The frame in a world that was rotated about z and shifted."""
     c, s = np.cos(angle), np.sin(angle)
@@ -146,14 +153,20 @@ def moved(given: SceneFrame, angle: float, shift: np.ndarray) -> SceneFrame:
     return replace(given, center=center, yaw=given.yaw + angle, velocity=velocity, cloud=cloud)
 
 
+@pytest.mark.parametrize("unknown", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_the_world_frame_does_not_matter(seed: int) -> None:
-    """Rotate and shift the world: the same tracks, rotated and shifted, to 1e-6."""
+def test_the_world_frame_does_not_matter(seed: int, unknown: float) -> None:
+    """Rotate and shift the world: the same tracks, rotated and shifted, to 1e-6, whatever headings are unknown."""
     rng = np.random.default_rng(seed)
     angle, shift = rng.uniform(-3, 3), rng.uniform(-500, 500, 3)
     frames = list(scene(seed, Options(frames=60, ties=False)))  # ties are broken by coordinates, which turn too
+    turned_frames = [moved(given, angle, shift) for given in frames]
+    if unknown:
+        absent = [rng.random((3, len(given.score))) < unknown for given in frames]
+        frames = [partial(given, *rows) for given, rows in zip(frames, absent, strict=True)]
+        turned_frames = [partial(given, *rows) for given, rows in zip(turned_frames, absent, strict=True)]
     parameters = parse_parameters(random_parameters(seed + 20))
-    turned = run(parameters, [moved(given, angle, shift) for given in frames])
+    turned = run(parameters, turned_frames)
     c, s = np.cos(angle), np.sin(angle)
     rotation = np.array([[c, -s], [s, c]])
     full = np.eye(6)
@@ -165,11 +178,17 @@ def test_the_world_frame_does_not_matter(seed: int) -> None:
         for name in ("size", "yaw_rate", "acceleration", "existence", "score", "age", "time_since_detection"):
             np.testing.assert_allclose(getattr(b, name), getattr(a, name), atol=1e-6, rtol=1e-6, err_msg=name)
         np.testing.assert_allclose(b.center[:, :2], a.center[:, :2] @ rotation.T + shift[:2], atol=1e-6)
-        np.testing.assert_allclose(b.center[:, 2], a.center[:, 2] + shift[2], atol=1e-6)
-        np.testing.assert_allclose(np.exp(1j * b.yaw), np.exp(1j * (a.yaw + angle)), atol=1e-6)
+        raised = shift[2] * (1.0 if one.measured is None else one.measured >= 4)  # those of known height
+        np.testing.assert_allclose(b.center[:, 2], a.center[:, 2] + raised, atol=1e-6)
+        assert_same_known(one, other)
+        unknown_yet = (a.velocity == 0.0).all(axis=1) & (a.heading_confidence == 0.5)  # detected once
+        faces = np.where(unknown_yet, 0.0, 1.0)
+        np.testing.assert_allclose(faces * np.exp(1j * b.yaw), faces * np.exp(1j * (a.yaw + angle)), atol=1e-6)
         np.testing.assert_allclose(b.velocity, a.velocity @ rotation.T, atol=1e-6)
         scale = 1e-6 * max(1.0, float(np.abs(a.covariance).max(initial=0)))
-        np.testing.assert_allclose(b.covariance, full @ a.covariance @ full.T, atol=scale)
+        shown = np.ones((len(a), 6, 6))
+        shown[faces == 0.0, :2, 2:] = shown[faces == 0.0, 2:, :2] = 0.0  # along a direction that says nothing
+        np.testing.assert_allclose(b.covariance * shown, full @ a.covariance @ full.T * shown, atol=scale)
         assert len(one.density.poisson) == len(other.density.poisson)
 
 

@@ -45,6 +45,21 @@ TWINS = {
     "calibration.calibrate_rows": "test_twins.test_rows_are_calibrated_as_numpy_interpolates",
     "calibration.log_odds": "test_twins.test_log_odds_are_bounded",
     "class_posterior.label_probability": "test_class_posterior.test_pairs_weigh_by_what_the_detector_calls_them",
+    "geometry.boxes_overlap": "test_unknown_heading.test_boxes_of_unknown_heading_overlap_alike_in_all_axes",
+    "predict.heading_unknown": "test_unknown_heading.test_the_prediction_is_that_of_a_linear_model",
+    "predict.predict_without_heading": "test_unknown_heading.test_the_prediction_is_that_of_a_linear_model",
+    "preprocess.below": "test_unknown_heading.test_the_order_of_detections_does_not_matter",
+    "preprocess.differ": "test_unknown_heading.test_the_order_of_detections_does_not_matter",
+    "table.known_length": "test_unknown_heading.test_a_point_has_the_box_of_its_class_until_one_is_measured",
+    "unknown_heading.all_measured": "test_unknown_heading.test_a_point_has_the_box_of_its_class_until_one_is_measured",
+    "unknown_heading.begin_turning": "test_unknown_heading.test_a_heading_is_found_taken_and_lost",
+    "unknown_heading.face_along": "test_unknown_heading.test_the_update_is_the_linear_kalman_filter",
+    "unknown_heading.find_heading": "test_unknown_heading.test_a_heading_is_found_taken_and_lost",
+    "unknown_heading.lose_heading": "test_unknown_heading.test_a_heading_is_found_taken_and_lost",
+    "unknown_heading.scale_across": "test_unknown_heading.test_a_heading_is_found_taken_and_lost",
+    "unknown_heading.show_heading": "test_unknown_heading.test_a_heading_is_found_taken_and_lost",
+    "unknown_heading.take_heading": "test_unknown_heading.test_a_heading_is_found_taken_and_lost",
+    "unknown_heading.turn_axes": "test_unknown_heading.test_the_update_is_the_linear_kalman_filter",
     "class_posterior.update_classes": "test_class_posterior.test_the_posterior_is_bayes_rule",
     "class_posterior.weigh_by_class": "test_class_posterior.test_pairs_weigh_by_what_the_detector_calls_them",
     "density.labels_within": "test_safety.test_labels_are_within_the_classes",
@@ -75,6 +90,7 @@ TWINS = {
     "hypotheses._grown": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
     "hypotheses.close_gates": "test_field_of_view.test_gates_are_closed_for_what_cannot_be_detected",
     "hypotheses.detection_costs": "test_hypotheses.test_costs_and_association_probabilities_are_the_formulas",
+    "hypotheses.exclude_turned": "test_twins.test_hypotheses_are_those_of_their_parts",
     "hypotheses.first_detections": "test_hypotheses.test_each_kind_of_first_detection_has_its_formula",
     "hypotheses.gate": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
     "hypotheses.gate_widening": "test_hypotheses.test_a_gate_widens_by_what_r_is_above_that_of_the_class",
@@ -192,10 +208,12 @@ def test_values_are_allowed_as_numpy_says(data: st.DataObject, count: int, worst
     center, size = drawn(1, (count, 3), COORDINATES), drawn(2, (count, 3), LENGTHS)
     yaw, score, velocity = drawn(3, (count,), COORDINATES), drawn(4, (count,), SCORES), drawn(5, (count, 2), SPEEDS)
     unknown = np.isnan(velocity).all(axis=1, keepdims=True)
+    far = np.abs(np.where(np.isnan(center) & [False, False, True], 0.0, center))
+    known_size, known_yaw = np.where(np.isnan(size), 1.0, size), np.where(np.isnan(yaw), 0.0, yaw)
     wanted = (
         bool(((label >= 0) & (label < 3)).all())
-        and bool((np.abs(center) <= MAX_COORDINATE).all() and (np.abs(yaw) <= MAX_COORDINATE).all())
-        and bool(((size > 0) & (size <= MAX_COORDINATE)).all() and ((score > 0) & (score <= 1)).all())
+        and bool((far <= MAX_COORDINATE).all() and (np.abs(known_yaw) <= MAX_COORDINATE).all())
+        and bool(((known_size > 0) & (known_size <= MAX_COORDINATE)).all() and ((score > 0) & (score <= 1)).all())
         and bool(((np.abs(velocity) <= MAX_SPEED) | unknown).all())
     )
     assert allowed(label, 3, center, size, yaw, score, velocity) == wanted
@@ -279,7 +297,7 @@ def test_measurements_are_the_chosen_rows(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_hypotheses_are_those_of_their_parts(seed: int) -> None:
-    """Gates, costs, ln e = ln(mu p_d) + ln N and first-time detections, in the order of the columns."""
+    """Gates, headings beyond eta_dist, costs, ln e = ln(mu p_d) + ln N and first-time detections, column by column."""
     rng = np.random.default_rng(seed)
     root = rng.normal(0, 0.5, (20, 6, 6))
     mean, covariance = rng.normal(0, 4, (20, 6)), root @ np.swapaxes(root, 1, 2) + 0.01 * np.eye(6)
@@ -290,15 +308,19 @@ def test_hypotheses_are_those_of_their_parts(seed: int) -> None:
     old, new = slice(0, 12), slice(12, 20)
     classes = class_rows(2, noise_position=noise, clutter_intensity=clutter, birth_intensity=birth)
     classes["birth_score"], classes["birth_over_clutter"] = threshold, [True, False]
-    classes["gate"], classes["gate_deviations"] = distance, [0.0, 3.0]
+    classes["gate"], classes["gate_deviations"], classes["noise_heading"] = distance, [0.0, 30.0], 0.15
     parts = [{"mean": mean[rows], "covariance": covariance[rows], "label": label[rows]} for rows in (old, new)]
     objects = BernoulliArrays(**dict(Bernoullis.empty().columns()) | parts[0] | {"existence": weight[old]})
     components = PoissonArrays(**dict(Poissons.empty().columns()) | parts[1] | {"weight": weight[new]})
-    empty = np.empty(15)
-    measurements = Measurements(position, empty, np.empty((15, 2)), np.empty((15, 4)), score, measured, measured)
+    yaw = rng.uniform(-np.pi, np.pi, 15)
+    measurements = Measurements(position, yaw, np.empty((15, 2)), np.empty((15, 4)), score, measured, measured)
     found = local_hypotheses(objects, components, p_d, measurements, Groups(UNGROUPED, UNGROUPED), 0.15, classes)
     radius = gate_radii(covariance, label, 0.15, classes)
     row, measurement, likelihood = gate(*parts[0].values(), radius[old], position, measured, classes, False)
+    apart = np.linalg.norm(position[measurement] - mean[row, :2], axis=1)
+    turn = (yaw[measurement] - mean[row, 3] + np.pi / 2) % np.pi - np.pi / 2
+    turned = turn**2 > 1.5**2 * (covariance[row, 3, 3] + 0.15**2)
+    likelihood[(apart > distance[label[row]]) & turned] = -np.inf
     association = np.empty(15)
     cost = detection_costs(row, measurement, likelihood, weight[old], p_d[old], association)
     component, announced, log_e = gate(*parts[1].values(), radius[new], position, measured, classes, False)

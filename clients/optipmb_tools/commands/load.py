@@ -47,7 +47,7 @@ class RunOptions:
 def load(
     *, made: GeneratedOptions, data: RecordedOptions, how: RunOptions, service: ServiceOptions, as_json: AsJson = False
 ) -> None:
-    """Send frames of many sensors through a running service, and show how long their tracks take and what is lost.
+    """Send frames of many sensors through a running service, and show how long their tracks take and how many are lost.
 
     Ends with status 1 when frames were lost, or the latency that was asked for was not held.
     """

@@ -89,7 +89,7 @@ def track(
     A profile may also be a TOML file here. Replaying the same data through a service gives the same files.
     With --smooth, positions, headings and velocities also use later frames, which no service can.
 
-    With --dump, the frames that a service saved are gone through once more instead. Status 1 and one line say which
+    With --dump, the frames that a service saved are tracked again instead. Status 1 and one line say which
     of them raises which error; status 0 that none does any more.
     """
     if dump is not None:

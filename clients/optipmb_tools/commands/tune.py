@@ -37,19 +37,13 @@ METRICS = ("combination", "samota", "amota", "mota", "hota", "both")
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProfileOptions:
-    """Options of the profile that is tuned."""
+class TuneOptions:
+    """Options of the new profile, of the estimate and of the search."""
 
     profile: Profile = None
     classes: Classes = None
     out: Out = Path("out/tune")
     name: Annotated[str | None, typer.Option(help="Name of the new profile.", show_default=False)] = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class EstimateOptions:
-    """Options of the estimate."""
-
     estimate_only: Annotated[bool, typer.Option("--estimate-only", help="Estimate, and search nothing.")] = False
     reference: Annotated[
         str | None,
@@ -59,12 +53,6 @@ class EstimateOptions:
             show_default=False,
         ),
     ] = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class SearchOptions:
-    """Options of the search."""
-
     metric: Annotated[str, typer.Option(help=f"What is maximised: {', '.join(METRICS)}.")] = "combination"
     trials: Annotated[int, typer.Option(min=1, help="Trials of the search on all sequences.")] = 120
     folds: Annotated[int, typer.Option(min=0, help="Groups of sequences that are left out in turn; 0: none.")] = 3
@@ -83,15 +71,7 @@ class TuneJobs(JobOptions):
     jobs: Annotated[int, typer.Option(min=1, help="Sequences tracked at once.")] = 1
 
 
-def tune(
-    data: LabelledOptions,
-    *,
-    into: ProfileOptions,
-    estimation: EstimateOptions,
-    search: SearchOptions,
-    jobs: TuneJobs,
-    as_json: AsJson = False,
-) -> None:
+def tune(data: LabelledOptions, *, how: TuneOptions, jobs: TuneJobs, as_json: AsJson = False) -> None:
     """Estimate the parameters of each class from labelled data, then refine them by tracking.
 
     A second call with the same --out continues where the first one ended.
@@ -99,45 +79,45 @@ def tune(
     from optipmb_tools import tuning  # noqa: PLC0415  loads the tracker and its compiler
     from optipmb_tools.run.profiles import profile_compared  # noqa: PLC0415  as above
 
-    reference, out = estimation.reference, into.out
-    if not estimation.estimate_only:
+    reference, out = how.reference, how.out
+    if not how.estimate_only:
         needed("optipmb tune", "tune", "optuna")
-    if search.metric not in METRICS:
-        raise UsageError(f"--metric: one of {', '.join(METRICS)}, received {search.metric!r}")
-    if reference is not None and not estimation.estimate_only:
+    if how.metric not in METRICS:
+        raise UsageError(f"--metric: one of {', '.join(METRICS)}, received {how.metric!r}")
+    if reference is not None and not how.estimate_only:
         raise UsageError("--reference: with --estimate-only, which writes a profile that --profile then tunes")
     opened = data.open()
     asked, chosen = opened.dataset.arguments, opened.sequences
-    parameters = profile_compared(into.profile or opened.dataset.profile, chosen)
+    parameters = profile_compared(how.profile or opened.dataset.profile, chosen)
     curves: tuning.Curves = {}
     if reference is not None:
-        parameters, curves = tuning.calibrate_scores(asked, reference, chosen, parameters, into.classes, out, into.name)
-    source = tuning.Source.of(asked.name, asked.detections, chosen, parameters, into.classes)
+        parameters, curves = tuning.calibrate_scores(asked, reference, chosen, parameters, how.classes, out, how.name)
+    source = tuning.Source.of(asked.name, asked.detections, chosen, parameters, how.classes)
     estimates = tuning.estimate_all(source, parameters, out)
     if not as_json:
         for one in estimates.values():
             print_table(_estimate(one, {path: tuning.value_of(parameters, one.name, path) for path in one.values}))
-    if estimation.estimate_only:
+    if how.estimate_only:
         _say_estimates(estimates, curves, reference, out, as_json=as_json)
         return
     plan = tuning.Plan(
-        metric=search.metric,
-        trials=search.trials,
-        fold_trials=search.fold_trials or max(1, search.trials // 2),
-        folds=search.folds,
-        copies=search.degrade,
-        seed=search.seed,
-        everything=search.everything,
+        metric=how.metric,
+        trials=how.trials,
+        fold_trials=how.fold_trials or max(1, how.trials // 2),
+        folds=how.folds,
+        copies=how.degrade,
+        seed=how.seed,
+        everything=how.everything,
     )
     with jobs.executor(opened.frames, jobs.jobs) as executor, tuning.TrialDisplay() as display:
-        tuned = tuning.tune_all(source, parameters, plan, out, display, into.name, executor)
+        tuned = tuning.tune_all(source, parameters, plan, out, display, how.name, executor)
     if as_json:
-        results: Mapping[str, Any] = {name: one.to_json() for name, one in tuned.classes.items()}
-        print_json({"command": "tune", "profile": tuned.profile, "classes": results})
+        results: Mapping[str, Any] = {name: one.to_json() for name, one in tuned.items()}
+        print_json({"command": "tune", "profile": out / "tuned.toml", "classes": results})
         return
-    for refined in tuned.classes.values():
+    for refined in tuned.values():
         print_table(_report(refined))
-    say(f"profile in {tuned.profile}")
+    say(f"profile in {out / 'tuned.toml'}")
 
 
 def _say_estimates(

@@ -31,8 +31,8 @@ TICK_S = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShownOptions:
-    """Options of the content."""
+class WatchOptions:
+    """Options of the content and of the viewer."""
 
     streams: Annotated[
         list[str] | None,
@@ -42,11 +42,6 @@ class ShownOptions:
     poisson: Annotated[
         bool, typer.Option("--poisson", help="Ask the service where it expects objects not yet detected, and show it.")
     ] = False
-
-
-@dataclass(frozen=True, kw_only=True)
-class ViewerOptions:
-    """Options of the viewer."""
 
     web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser instead of opening a window.")] = (
         False
@@ -66,8 +61,7 @@ def watch(
         Path | None, typer.Argument(help="A recording; default: the running service.", show_default=False)
     ] = None,
     *,
-    shown: ShownOptions,
-    viewer: ViewerOptions,
+    how: WatchOptions,
     speed: Annotated[str, typer.Option(help="Of a recording: 1 as recorded, 10 ten times as fast, max.")] = "max",
     seconds: Annotated[float | None, typer.Option(min=0.1, help="End after so many seconds.")] = None,
     service: ServiceOptions,
@@ -77,23 +71,23 @@ def watch(
 
     Ends when it is interrupted, or at the end of a recording with --save. With --foxglove also problems, as logs.
     """
-    if viewer.web + viewer.foxglove + (viewer.save is not None) > 1:
+    if how.web + how.foxglove + (how.save is not None) > 1:
         raise UsageError("expected one of --web, --foxglove and --save, received several")
-    if shown.poisson and (file is not None or viewer.foxglove):
+    if how.poisson and (file is not None or how.foxglove):
         raise UsageError("--poisson: expected without a recording or --foxglove, which show no densities; received one")
     pace = speed_of(speed)
-    if viewer.foxglove:
+    if how.foxglove:
         needed("watching with Foxglove", "record", "foxglove")
     else:
         needed("watching", "watch", "rerun")
-    messages = _live(service, timeout, shown) if file is None else _recorded(file, pace, shown)
+    messages = _live(service, timeout, how) if file is None else _recorded(file, pace, how)
     first = next(messages, None)  # an error of the source is reported before a viewer opens
     ends = None if seconds is None else time.monotonic() + seconds
     until = _until(itertools.chain([first], messages), ends)
-    if viewer.foxglove:
-        _in_foxglove(until, viewer, ends)
+    if how.foxglove:
+        _in_foxglove(until, how, ends)
         return
-    _in_rerun(until, shown.streams[0] if shown.streams and "*" not in shown.streams[0] else None, viewer, ends)
+    _in_rerun(until, how, ends)
 
 
 def _until(messages: Iterable[Message | None], ends: float | None) -> Iterator[Message]:
@@ -109,58 +103,58 @@ def _stay(ends: float | None) -> None:
     threading.Event().wait(None if ends is None else max(0.0, ends - time.monotonic()))
 
 
-def _in_foxglove(messages: Iterable[Message], viewer: ViewerOptions, ends: float | None) -> None:
+def _in_foxglove(messages: Iterable[Message], how: WatchOptions, ends: float | None) -> None:
     from optipmb_tools.views.foxglove import FoxgloveServer  # noqa: PLC0415  an extra of the installation
 
-    with FoxgloveServer(viewer.host, viewer.foxglove_port) as server:
+    with FoxgloveServer(how.host, how.foxglove_port) as server:
         say(f"open {server.address} in Foxglove (Open connection, Foxglove WebSocket)")
         for message in messages:
             server.show(message)
         _stay(ends)
 
 
-def _in_rerun(messages: Iterable[Message], followed: str | None, viewer: ViewerOptions, ends: float | None) -> None:
+def _in_rerun(messages: Iterable[Message], how: WatchOptions, ends: float | None) -> None:
     import rerun as rr  # noqa: PLC0415  an extra of the installation
 
     from optipmb_tools.views.viewer import View  # noqa: PLC0415  as above
 
     recording = rr.RecordingStream("optipmb")
-    if viewer.web:
-        source = recording.serve_grpc(grpc_port=viewer.data_port)
-        rr.serve_web_viewer(web_port=viewer.web_port, open_browser=False, connect_to=source)
-        say(f"watch at http://localhost:{viewer.web_port}/?url={source.replace(':', '%3A').replace('/', '%2F')}")
-    elif viewer.save is None:
+    if how.web:
+        source = recording.serve_grpc(grpc_port=how.data_port)
+        rr.serve_web_viewer(web_port=how.web_port, open_browser=False, connect_to=source)
+        say(f"watch at http://localhost:{how.web_port}/?url={source.replace(':', '%3A').replace('/', '%2F')}")
+    elif how.save is None:
         recording.spawn()
     else:
-        viewer.save.parent.mkdir(parents=True, exist_ok=True)
-        recording.save(viewer.save)
-    view = View(recording, followed)
+        how.save.parent.mkdir(parents=True, exist_ok=True)
+        recording.save(how.save)
+    view = View(recording, how.streams[0] if how.streams and "*" not in how.streams[0] else None)
     try:
         for message in messages:
             view.show(message)
-        if viewer.web:
+        if how.web:
             _stay(ends)
     finally:
         recording.flush()
-    if viewer.save is not None:
-        say(f"saved in {viewer.save}")
+    if how.save is not None:
+        say(f"saved in {how.save}")
 
 
-def _live(service: ServiceOptions, timeout: float, shown: ShownOptions) -> Iterator[Message | None]:
+def _live(service: ServiceOptions, timeout: float, how: WatchOptions) -> Iterator[Message | None]:
     """Yield messages as they come; None now and then while there are none."""
     from optipmb_client.incoming import Inbox  # noqa: PLC0415  of a running service
 
     from optipmb_tools.views.density_queries import DensityQueries  # noqa: PLC0415  as above
 
     keys = Keys(service.prefix)
-    topics = [topic for topic in TOPICS if shown.points or topic != "points"]
-    wanted = [keys.matching(pattern, topic) for pattern in shown.streams or ["*/*/*"] for topic in topics]
+    topics = [topic for topic in TOPICS if how.points or topic != "points"]
+    wanted = [keys.matching(pattern, topic) for pattern in how.streams or ["*/*/*"] for topic in topics]
     inbox = Inbox(WAITING)
     with contextlib.ExitStack() as stack:
         connection = stack.enter_context(service.connection(timeout))
         for key in wanted:
             connection.subscribe(key, inbox)
-        queries = stack.enter_context(DensityQueries(connection, inbox, service.prefix)) if shown.poisson else None
+        queries = stack.enter_context(DensityQueries(connection, inbox, service.prefix)) if how.poisson else None
         while True:
             arrival = inbox.get(TICK_S)
             message = None if arrival is None else _message(arrival.key, arrival.payload, arrival.encoding)
@@ -169,14 +163,14 @@ def _live(service: ServiceOptions, timeout: float, shown: ShownOptions) -> Itera
             yield message
 
 
-def _recorded(file: Path, speed: float | None, shown: ShownOptions) -> Iterator[Message | None]:
+def _recorded(file: Path, speed: float | None, how: WatchOptions) -> Iterator[Message | None]:
     """Yield the messages of a recording, at its pace."""
     needed("recordings", "record", "mcap", need="need")
     from optipmb_tools.recordings.files import RecordingFile  # noqa: PLC0415  packages of an extra
 
     zero: float | None = None
     for one in RecordingFile(file):
-        if (shown.streams and one.stream not in shown.streams) or (one.topic == "points" and not shown.points):
+        if (how.streams and one.stream not in how.streams) or (one.topic == "points" and not how.points):
             continue
         if speed is not None:
             after = one.received_ns / 1e9 / speed
@@ -207,7 +201,7 @@ def plot(
     score: Annotated[float | None, typer.Option(help="Least mean score of a track; default: the best one.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Draw the tracks of one sequence from above, with what was missed and confused where the truth is known."""
+    """Draw the tracks of one sequence from above, with misses and confused ids where the truth is known."""
     tables = ("table", "pyarrow") if any(one and one.suffix in SUFFIXES for one in (data.data, *tracks)) else ()
     needed("optipmb plot", ",".join(("plot", *tables[:1])), "matplotlib", "scipy", *tables[1:])
     from optipmb_tools.evaluation import default_rules, evaluate_files  # noqa: PLC0415  loads the solvers of scipy

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from optipmb_schemas import Tracks
 
-from optipmb_tools.datasets.interface import DataSequence, Dataset, DetectionFrame, chosen, relabelled
+from optipmb_tools.datasets.interface import DataSequence, Dataset, DetectionFrame, chosen
 from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Ints, Pose
 
@@ -38,8 +38,7 @@ class FusedSequence(DataSequence):
     def frames(self) -> Iterator[DetectionFrame]:
         """Yield every frame in the order in which the service tracks them."""
         for index, (_, _, frame) in enumerate(self._merged()):
-            label = relabelled(frame.label, frame.labels, self.labels)
-            yield replace(frame, index=index, labels=self.labels, label=label)
+            yield replace(frame, index=index)
 
     def _merged(self) -> Iterator[tuple[int, int, DetectionFrame]]:
         streams = (_numbered(number, one) for number, one in enumerate(self.sensors))

@@ -54,7 +54,7 @@ class DetectionFrame:
     index: int
     stamp_ns: int
     pose: Pose  # world from sensor; the identity where the detector gives boxes in the world frame
-    labels: tuple[str, ...]  # class names, the same for all frames of a sequence
+    labels: tuple[str, ...]  # class names
     label: Ints  # (M,) index into `labels`
     center: Floats  # (M, 3)
     size: Floats  # (M, 3)
@@ -262,30 +262,19 @@ def class_like(name: str, names: Sequence[str]) -> str | None:
     return like(name, tuple(names))
 
 
-def relabelled(label: Ints, names: Sequence[str], labels: Sequence[str]) -> Ints:
-    """Return indices into `names` as indices into `labels`."""
-    place = np.array([labels.index(name) for name in names], dtype=np.int64)
-    return place[label] if len(label) else label
-
-
 def selected_frames(sequence: DataSequence, classes: Sequence[str]) -> Iterator[DetectionFrame]:
     """Yield the frames of a sequence with the detections of some classes; with all of them when none is named.
 
     Raises:
         UsageError: The sequence has no detections of one of the classes.
     """
+    wanted = {name: class_like(name, sequence.labels) for name in classes}
+    if unknown := [name for name, known in wanted.items() if known is None]:
+        known = ", ".join(sequence.labels)
+        raise UsageError(f"sequence {sequence.name} has no detections of class {unknown[0]!r} (it has: {known})")
     for frame in sequence.frames():
-        if not classes:
-            yield frame
-            continue
-        wanted = [(name, class_like(name, frame.labels)) for name in classes]
-        unknown = [name for name, known in wanted if known is None]
-        if unknown:
-            known = ", ".join(frame.labels)
-            raise UsageError(f"sequence {sequence.name} has no detections of class {unknown[0]!r} (it has: {known})")
-        yield frame.take(
-            np.isin(frame.label, [i for i, name in enumerate(frame.labels) if name in dict(wanted).values()])
-        )
+        chosen = [i for i, name in enumerate(frame.labels) if name in wanted.values()]
+        yield frame.take(np.isin(frame.label, chosen)) if classes else frame
 
 
 class Preloaded(DataSequence):

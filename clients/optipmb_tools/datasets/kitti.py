@@ -25,6 +25,7 @@ from optipmb_tools.datasets.interface import Cloud, DataSequence, Dataset, Detec
 from optipmb_tools.files import DatasetError, numbers, read_points, read_rows
 from optipmb_tools.geometry import Floats, Ints, Pose, pose_of, stack_poses, to_world
 from optipmb_tools.results.kitti import SUBMISSION_SCORES, write_kitti_results
+from optipmb_tools.table_files import Columns
 
 PERIOD_NS = 100_000_000
 EARTH_RADIUS_M = 6_378_137.0  # of the mercator projection that KITTI's development kit uses
@@ -45,6 +46,8 @@ _AXES[:3, :3] = SENSOR_FROM_CAMERA
 _ROTATION_ERROR = 1e-3  # far more than the rounding of the text, far less than a matrix that is no rotation
 _DETECTION = "frame type x1 y1 x2 y2 score h w l x y z ry alpha"
 _LABEL = "frame id type truncated occluded alpha x1 y1 x2 y2 h w l x y z ry"
+_WHOLE = ("frame", "id", "truncated", "occluded")  # columns of whole numbers
+_PARTS = {"box2d": "x1 y1 x2 y2", "hwl": "h w l", "bottom": "x y z"}
 _MATRICES = {
     "P2": ("P2", (3, 4)),
     "R0_rect": ("R0_rect", (3, 3)),
@@ -64,23 +67,6 @@ class Calibration:
     projection: Floats  # P2: (3, 4) image of camera 2 <- rectified camera 0
     rectified_from_velodyne: Floats  # (4, 4)
     velodyne_from_imu: Floats | None  # (4, 4); None where the file has none
-
-
-@dataclass(frozen=True)
-class BoxFile:
-    """Rows of a file of detections or labels, ordered by frame; boxes as in the file, in the rectified camera frame."""
-
-    frame: Ints
-    type: tuple[str, ...]  # of labels
-    box2d: Floats  # (R, 4)
-    hwl: Floats  # (R, 3)
-    bottom: Floats  # (R, 3)
-    rotation_y: Floats
-    alpha: Floats
-    score: Floats  # (R,) of detections: a logit or a probability
-    id: Ints  # of labels
-    truncation: Ints
-    occlusion: Ints
 
 
 class KittiSequence(DataSequence):
@@ -164,10 +150,9 @@ class KittiSequence(DataSequence):
             read_detections(folder / f"{self.name}.txt", count, _TYPE_CODES.get(label))
             for label, folder in self._folders.items()
         ]
-        label = np.repeat(np.arange(len(files)), [len(file.frame) for file in files])
+        label = np.repeat(np.arange(len(files)), [len(file["frame"]) for file in files])
         frame, bottom, hwl, rotation_y, score = (
-            np.concatenate([getattr(file, name) for file in files])
-            for name in ("frame", "bottom", "hwl", "rotation_y", "score")
+            np.concatenate([file[name] for file in files]) for name in ("frame", "bottom", "hwl", "ry", "score")
         )
         order = np.argsort(frame, kind="stable")
         center, size, yaw = sensor_from_kitti(bottom, hwl, rotation_y)
@@ -193,27 +178,26 @@ class KittiSequence(DataSequence):
         if not path.exists():
             return None
         file = read_labels(path, len(self))
-        types = np.asarray(file.type, dtype=np.str_)
-        kept = types != "DontCare"
-        labels = tuple(sorted(set(types[kept].tolist())))
-        center, size, yaw = sensor_from_kitti(file.bottom[kept], file.hwl[kept], file.rotation_y[kept])
+        kept = file["type"] != "DontCare"
+        boxes = {name: column[kept] for name, column in file.items()}
+        frame, types, occlusion, truncation = (boxes[name] for name in ("frame", "type", "occluded", "truncated"))
+        labels = tuple(sorted(set(types.tolist())))
+        center, size, yaw = sensor_from_kitti(boxes["bottom"], boxes["hwl"], boxes["ry"])
         rotation, translation = stack_poses(self.poses)
-        frame = file.frame[kept]
         center, yaw = to_world(rotation[frame], translation[frame], center, yaw)
-        occlusion, truncation = file.occlusion[kept], file.truncation[kept]
         return Truth.of(
             labels,
             frame,
-            id=file.id[kept],
-            label=np.searchsorted(labels, types[kept]).astype(np.int64) if labels else np.empty(0, dtype=np.int64),
+            id=boxes["id"],
+            label=np.searchsorted(labels, types).astype(np.int64) if labels else np.empty(0, dtype=np.int64),
             center=center,
             size=size,
             yaw=yaw,
             occlusion=occlusion,
             truncation=truncation,
-            box2d=file.box2d[kept],
+            box2d=boxes["box2d"],
             ignored=(occlusion > _MAX_OCCLUSION) | (truncation > 0),
-            regions=Regions(file.frame[~kept], file.box2d[~kept]),
+            regions=Regions(file["frame"][~kept], file["box2d"][~kept]),
         )
 
 
@@ -437,8 +421,8 @@ def _turn(axis: int, angle: Floats) -> Floats:
     return rotation
 
 
-def read_labels(path: Path, frames: int) -> BoxFile:
-    """Return the annotations of a sequence of `frames` frames.
+def read_labels(path: Path, frames: int) -> Columns:
+    """Return the annotations of a sequence of `frames` frames, ordered by frame, as `read_detections` does.
 
     Raises:
         DatasetError: A line has not 17 fields, a field is no number, or a frame lies outside the sequence.
@@ -451,11 +435,15 @@ def read_labels(path: Path, frames: int) -> BoxFile:
     values = numbers(path, [(line, [*fields[:2], *fields[3:]]) for line, fields in rows], count - 1, _LABEL)
     _check_frames(path, [line for line, _ in rows], values[:, 0], frames)
     order = np.argsort(values[:, 0], kind="stable")
-    return _box_file(_LABEL.replace(" type", ""), values[order], tuple(rows[i][1][2] for i in order))
+    types = np.array([rows[i][1][2] for i in order], dtype=np.str_)
+    return _columns(_LABEL.replace(" type", ""), values[order]) | {"type": types}
 
 
-def read_detections(path: Path, frames: int, type_code: int | None) -> BoxFile:
-    """Return the detections of a sequence of `frames` frames.
+def read_detections(path: Path, frames: int, type_code: int | None) -> Columns:
+    """Return the detections of a sequence of `frames` frames, ordered by frame.
+
+    Columns are named as the fields of the file; `box2d` (R, 4), `hwl` (R, 3) and `bottom` (R, 3) are several of them.
+    Boxes are in the rectified camera frame, scores are logits or probabilities.
 
     Args:
         path: The file.
@@ -476,33 +464,14 @@ def read_detections(path: Path, frames: int, type_code: int | None) -> BoxFile:
     bad = np.flatnonzero(values[:, 1] != (values[:, 1] if type_code is None else type_code))
     if len(bad):
         raise DatasetError(path, f"type {type_code}", f"type {values[bad[0], 1]:g}", line=lines[bad[0]])
-    return _box_file(_DETECTION, values[np.argsort(values[:, 0], kind="stable")])
+    return _columns(_DETECTION, values[np.argsort(values[:, 0], kind="stable")])
 
 
-def _box_file(names: str, values: Floats, types: tuple[str, ...] = ()) -> BoxFile:
-    """Return the columns of a file, by the names of its fields."""
-    place = {name: number for number, name in enumerate(names.split())}
-    none = np.zeros(len(values))
-
-    def column(name: str) -> Floats:
-        return values[:, place[name]] if name in place else none
-
-    def columns(*wanted: str) -> Floats:
-        return values[:, [place[name] for name in wanted]]
-
-    return BoxFile(
-        frame=column("frame").astype(np.int64),
-        type=types,
-        box2d=columns("x1", "y1", "x2", "y2"),
-        hwl=columns("h", "w", "l"),
-        bottom=columns("x", "y", "z"),
-        rotation_y=column("ry"),
-        alpha=column("alpha"),
-        score=column("score"),
-        id=column("id").astype(np.int64),
-        truncation=column("truncated").astype(np.int64),
-        occlusion=column("occluded").astype(np.int64),
-    )
+def _columns(names: str, values: Floats) -> Columns:
+    found = dict(zip(names.split(), values.T, strict=True))
+    whole = {name: found[name].astype(np.int64) for name in _WHOLE if name in found}
+    parts = {name: np.column_stack([found[one] for one in fields.split()]) for name, fields in _PARTS.items()}
+    return found | whole | parts
 
 
 def _check_frames(path: Path, lines: list[int], frame: Floats, frames: int) -> None:

@@ -16,9 +16,9 @@ from pathlib import Path
 from optipmb_schemas import Detections, Points, Tracks, decode
 
 from optipmb_tools.camera import synthetic_camera
-from optipmb_tools.datasets.interface import IDENTITY, Cloud, DataSequence, Dataset, DetectionFrame, relabelled
+from optipmb_tools.datasets.interface import IDENTITY, Cloud, DataSequence, Dataset, DetectionFrame
 from optipmb_tools.files import DatasetError
-from optipmb_tools.geometry import Floats, Pose, rotation_of, to_sensor
+from optipmb_tools.geometry import Floats, Pose, box_columns, rotation_of, to_sensor
 from optipmb_tools.recordings.files import Recorded, RecordingFile
 from optipmb_tools.recordings.plan import StreamPlan, plan, steps
 from optipmb_tools.results.kitti import write_kitti_results
@@ -64,10 +64,10 @@ class RecordedSequence(DataSequence):
                 index=index,
                 stamp_ns=message.stamp_ns,
                 pose=pose,
-                labels=self.labels,
-                label=relabelled(message.label, message.labels, self.labels),
+                labels=message.labels,
+                label=message.label,
                 center=center,
-                size=message.size,
+                size=box_columns(message)[0],
                 yaw=yaw,
                 score=message.score,
                 velocity=velocity,
@@ -162,7 +162,8 @@ def _placed(message: Detections) -> tuple[Pose, Floats, Floats, Floats | None, F
 
     Boxes in the world frame are carried to a sensor with a field of view.
     """
-    center, yaw, velocity, covariance = message.center, message.yaw, message.velocity, message.position_covariance
+    center, (_, yaw) = message.center, box_columns(message)
+    velocity, covariance = message.velocity, message.position_covariance
     if message.frame == "sensor" or message.pose is None or message.field_of_view is None:
         return _pose(message), center, yaw, velocity, covariance
     pose = Pose(message.pose.translation, message.pose.quaternion)

@@ -109,7 +109,8 @@ def headings_along(sequences: "Iterable[DataSequence]") -> tuple[float, int]:
     key, seconds, x, y, heading, label = (np.concatenate(column) for column in zip(*parts, strict=True))
     moves = find_moves(key.astype(np.int64), seconds, np.column_stack([x, y]), label.astype(np.int64))
     off = np.abs(moves.turn(heading[moves.start]))
-    return float(np.mean(np.minimum(off, np.pi - off) < SAME_DIRECTION)) if len(moves) else 1.0, len(moves)
+    off = off[np.isfinite(off)]  # the other headings are unknown
+    return float(np.mean(np.minimum(off, np.pi - off) < SAME_DIRECTION)) if len(off) else 1.0, len(off)
 
 
 def _linked(before: Ints, after: Ints, xy: Floats, kind: Ints, passed: float) -> tuple[Ints, Ints]:

@@ -145,24 +145,15 @@ class NuScenesSequence(DataSequence):
         submission = self._dataset.need_submission()
         for index, token in enumerate(self.samples):
             boxes = submission.boxes(token)
-            if len(boxes) and not (boxes.score.min() >= 0.0 and boxes.score.max() <= 1.0):
+            if ((boxes["score"] < 0.0) | (boxes["score"] > 1.0)).any():
                 raise DatasetError(submission.path, f"scores from 0 to 1 in results.{token}", "others")
-            center = boxes.center.copy()
+            boxes["score"] = np.maximum(boxes["score"], _LEAST_SCORE)
             if self._dataset.z_bottom:
-                center[:, 2] += 0.5 * boxes.size[:, 2]
-            yield DetectionFrame(
-                index=index,
-                stamp_ns=int(self.stamp_us[index]) * 1000,
-                pose=IDENTITY,
-                labels=NUSCENES_CLASSES,
-                label=boxes.label,
-                center=center,
-                size=boxes.size,
-                yaw=boxes.yaw,
-                score=np.maximum(boxes.score, _LEAST_SCORE),
-                velocity=boxes.velocity if np.isfinite(boxes.velocity).any() else None,
-                cloud=self._cloud(index),
-            )
+                boxes["center"][:, 2] += 0.5 * boxes["size"][:, 2]
+            if not np.isfinite(boxes["velocity"]).any():
+                del boxes["velocity"]
+            stamp_ns = int(self.stamp_us[index]) * 1000
+            yield DetectionFrame(index, stamp_ns, IDENTITY, NUSCENES_CLASSES, **boxes, cloud=self._cloud(index))
 
     def _cloud(self, index: int) -> Cloud | None:
         path = self._scans[index]

@@ -36,7 +36,6 @@ from optipmb_tools.datasets.interface import (
     Dataset,
     DetectionFrame,
     Points,
-    relabelled,
 )
 from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Pose
@@ -422,12 +421,11 @@ class RosbagSequence(DataSequence):
         planned = self.plan.frames[index]
         pose = self.plan.clouds.get(planned.stamp_ns)
         columns = {name: getattr(boxes, name) for name in DETECTION_COLUMNS}
-        columns["label"] = relabelled(boxes.label, boxes.labels, self.labels)
         return DetectionFrame(
             index=index,
             stamp_ns=planned.stamp_ns,
             pose=planned.pose,
-            labels=self.labels,
+            labels=boxes.labels,
             **columns,
             cloud=None if cloud is None or pose is None else Cloud(partial(self._points, cloud), *pose),
         )

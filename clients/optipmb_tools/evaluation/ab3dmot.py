@@ -37,10 +37,8 @@ from optipmb_tools.evaluation.clear import Counts
 from optipmb_tools.evaluation.figures import defined, ratio
 from optipmb_tools.geometry import Floats, Ints
 
-IOU_LIMITS = (0.25, 0.5, 0.7)
-"""3D intersections over union at which figures are usually given."""
-POINTS = 40
-"""Recall points (L)."""
+IOU_LIMITS = (0.25, 0.5, 0.7)  # 3D intersections over union at which figures are usually given
+POINTS = 40  # recall points (L)
 
 _MOSTLY = 0.8
 _HARDLY = 0.2
@@ -50,15 +48,13 @@ _HARDLY = 0.2
 class Point:
     """The counts at one recall point."""
 
-    recall: float
-    """r"""
+    recall: float  # r
     threshold: float
-    counts: Counts
-    """TP has the matched boxes of truth that does not count, too."""
+    counts: Counts  # TP has the matched boxes of truth that does not count, too
 
     @property
     def smota(self) -> float:
-        """MOTA scaled to what is possible at the recall, in [0, 1]; NaN where no truth counts."""
+        """MOTA scaled to its largest value at the recall, in [0, 1]; NaN where no truth counts."""
         counts, recall = self.counts, self.recall
         scaled = 1.0 - ratio(counts.errors - (1.0 - recall) * counts.truth, recall * counts.truth)
         return float(np.clip(scaled, 0.0, 1.0))
@@ -68,14 +64,10 @@ class Point:
 class Ab3dmotResult:
     """Figures of one class over all sequences, at one least overlap."""
 
-    limit: float
-    """Least 3D intersection over union of a match."""
-    points: tuple[Point, ...]
-    """The recall points that are reached, in ascending order of recall; at most 40."""
-    threshold: float
-    """Lowest mean score of the tracks that are kept for the highest MOTA; minus infinity keeps all."""
-    best: Counts
-    """At that threshold."""
+    limit: float  # least 3D intersection over union of a match
+    points: tuple[Point, ...]  # the recall points that are reached, in ascending order of recall; at most 40
+    threshold: float  # lowest mean score of the tracks that are kept for the highest MOTA; minus infinity keeps all
+    best: Counts  # at that threshold
 
     @property
     def samota(self) -> float:
@@ -118,7 +110,6 @@ def evaluate_ab3dmot(cases: Sequence[Case], limit: float = IOU_LIMITS[0]) -> Ab3
     Args:
         cases: the class in each sequence, by `cases.ab3dmot_rules` with at most this limit.
         limit: least 3D intersection over union of a match.
-
     """
     sequences = [_Sequence(case.pairs(case.similarity >= limit)) for case in cases]
     matches = [sequence.match(-np.inf) for sequence in sequences]
@@ -147,7 +138,6 @@ def recall_points(scores: Floats, count: int) -> list[tuple[float, float]]:
     Args:
         scores: (S,) mean scores of the tracks of all matched boxes.
         count: number of truth boxes, found or not.
-
     """
     found: list[tuple[float, float]] = []
     recall = 0.0

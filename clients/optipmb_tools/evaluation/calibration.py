@@ -35,8 +35,7 @@ DECILES = 10
 
 _DIMENSIONS = 2
 _LEVEL = 0.95
-NORMAL_95 = 1.959963984540054
-"""A standard normal variable is between minus and plus this with 95 %."""
+NORMAL_95 = 1.959963984540054  # a standard normal variable is between minus and plus this with 95 %
 
 
 @dataclass(frozen=True)
@@ -45,30 +44,21 @@ class Decile:
 
     low: float
     high: float
-    count: int
-    """Track boxes that are said to exist with a probability from `low` to `high`."""
-    predicted: float
-    """Their mean probability; NaN where there are none."""
-    observed: float
-    """Share of these boxes that is matched to an object; NaN without any."""
+    count: int  # track boxes that are said to exist with a probability from `low` to `high`
+    predicted: float  # their mean probability; NaN where there are none
+    observed: float  # share of these boxes that is matched to an object; NaN without any
 
 
 @dataclass(frozen=True)
 class CalibrationResult:
     """Samples of one class; results of several sequences add up."""
 
-    nees: Floats
-    """(N,) of the matched track boxes."""
-    owner: Ints
-    """(N,) which object each is of; objects of all sequences are numbered through."""
-    error: Floats
-    """(N,) distance, metres."""
-    spread: Floats
-    """(N,) distance to be expected, metres: the root of the trace of P."""
-    existence: Floats
-    """(K,) probability of every track box that counts."""
-    true: Bools
-    """(K,) whether it is matched."""
+    nees: Floats  # (N,) of the matched track boxes
+    owner: Ints  # (N,) which object each is of; objects of all sequences are numbered through
+    error: Floats  # (N,) distance, metres
+    spread: Floats  # (N,) distance to be expected, metres: the root of the trace of P
+    existence: Floats  # (K,) probability of every track box that counts
+    true: Bools  # (K,) whether it is matched
 
     def __add__(self, other: "CalibrationResult") -> "CalibrationResult":
         shifted = other.owner + (self.owner.max() + 1 if len(self.owner) else 0)
@@ -158,7 +148,6 @@ def evaluate_calibration(
 
     Raises:
         DatasetError: the two kinds of tracks are not of one run.
-
     """
     none = np.empty(0)
     start = CalibrationResult(none, np.empty(0, np.int64), none, none, none, np.empty(0, np.bool_))
@@ -169,14 +158,10 @@ def evaluate_calibration(
 class Sample:
     """The tracks of one sequence that count, and the objects that they are of."""
 
-    row: Ints
-    """(K,) in the tracks with all columns."""
-    true: Bools
-    """(K,) whether the track is matched to an object."""
-    offset: Floats
-    """(K, 2) offset of the track from its object, metres; NaN where it has none."""
-    owner: Ints
-    """(K,) id of the object, -1 where it has none."""
+    row: Ints  # (K,) in the tracks with all columns
+    true: Bools  # (K,) whether the track is matched to an object
+    offset: Floats  # (K, 2) offset of the track from its object, metres; NaN where it has none
+    owner: Ints  # (K,) id of the object, -1 where it has none
 
 
 def sample(truth: Truth, tracks: ResultTable, full: FullTable, name: str, rules: Rules) -> Sample:

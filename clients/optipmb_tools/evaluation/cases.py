@@ -25,8 +25,7 @@ _HALF = 0.5
 
 Measure = Literal["iou_3d", "iou_2d", "distance"]
 
-CENTRE_DISTANCE = 2.0
-"""Centres farther apart than this, in metres, have no similarity (D_0 of the OptiPMB paper)."""
+CENTRE_DISTANCE = 2.0  # centres farther apart than this, in metres, have no similarity (D_0 of the OptiPMB paper)
 IOU_LIMIT = 0.25
 
 
@@ -35,8 +34,7 @@ class Rules:
     """How truth and tracks are compared."""
 
     measure: Measure = "iou_3d"
-    limit: float = IOU_LIMIT
-    """Least intersection over union, or largest distance in metres, of a pair that may match."""
+    limit: float = IOU_LIMIT  # least intersection over union, or largest distance in metres, of a pair that may match
     continuity: bool = True
     """A truth object stays with the track it matched last as long as the two may match; otherwise each frame is matched
     on its own."""
@@ -93,28 +91,17 @@ class Case:
     """One class in one sequence; rows are ordered by frame."""
 
     sequence: str
-    truth_frame: Ints
-    """(T,)"""
-    truth_id: Ints
-    """(T,)"""
-    ignored: Bools
-    """(T,) truth that is neither to be found nor wrong to find."""
-    track_frame: Ints
-    """(K,)"""
-    track_id: Ints
-    """(K,)"""
-    excused: Bools
-    """(K,) tracks that are not false when nothing matches them."""
-    track_score: Floats
-    """(K,)"""
-    truth_row: Ints
-    """(P,) of the pairs that may match"""
-    track_row: Ints
-    """(P,)"""
-    cost: Floats
-    """(P,)"""
-    similarity: Floats
-    """(P,) averaged for MOTP: the intersection over union, or the distance."""
+    truth_frame: Ints  # (T,)
+    truth_id: Ints  # (T,)
+    ignored: Bools  # (T,) truth that is neither to be found nor wrong to find
+    track_frame: Ints  # (K,)
+    track_id: Ints  # (K,)
+    excused: Bools  # (K,) tracks that are not false when nothing matches them
+    track_score: Floats  # (K,)
+    truth_row: Ints  # (P,) of the pairs that may match
+    track_row: Ints  # (P,)
+    cost: Floats  # (P,)
+    similarity: Floats  # (P,) averaged for MOTP: the intersection over union, or the distance
 
     @property
     def pair_frame(self) -> Ints:
@@ -165,7 +152,6 @@ def prepare(truth: Truth, tracks: ResultTable, name: str, rules: Rules, sequence
 
     Raises:
         DatasetError: overlaps are asked for of boxes without size or heading.
-
     """
     shapes = (truth.size, truth.yaw, tracks.size, tracks.yaw)
     if rules.measure == "iou_3d" and any(np.isnan(one).any() for one in shapes):
@@ -265,8 +251,7 @@ def counted(case: Case, rules: Rules) -> Case:
     )
 
 
-Solver = Callable[[Ints, Ints, Floats], Ints]
-"""Rows, columns and values of pairs -> the indices of those to take."""
+Solver = Callable[[Ints, Ints, Floats], Ints]  # Rows, columns and values of pairs -> the indices of those to take
 
 
 def most_pairs(row: Ints, column: Ints, cost: Floats) -> Ints:
@@ -313,7 +298,6 @@ def assign_frames(frame: Ints, row: Ints, column: Ints, value: Floats, solver: S
         column: (P,) unlike in different frames.
         value: (P,) cost or gain.
         solver: one that takes every uncontested pair.
-
     """
     # Most pairs are uncontested and are taken without solving.
     alone = uncontested(row, column)
@@ -381,7 +365,6 @@ def track_changes(case: Case, match: Ints, counted: Bools, *, memory: bool = Tru
         match: (T,) as `match_frames` returns it.
         counted: (T,) truth rows; matches of the others are no matches.
         memory: the match before may be any earlier one; otherwise only the object's previous row counts.
-
     """
     order = np.lexsort((case.truth_frame, case.truth_id))
     place = np.flatnonzero((counted & (match >= 0))[order])
@@ -397,14 +380,10 @@ def track_changes(case: Case, match: Ints, counted: Bools, *, memory: bool = Tru
 class Lives:
     """How well each object was followed."""
 
-    share: Floats
-    """(O,) of its boxes that are matched."""
-    delay: Ints
-    """(O',) boxes before the first match of objects that have one."""
-    longest: Ints
-    """(O',) the most boxes in a row without a match, of objects that have one."""
-    breaks: int
-    """Times without a match between times with one."""
+    share: Floats  # (O,) of its boxes that are matched
+    delay: Ints  # (O',) boxes before the first match of objects that have one
+    longest: Ints  # (O',) the most boxes in a row without a match, of objects that have one
+    breaks: int  # times without a match between times with one
 
 
 def lives(owner: Ints, frame: Ints, matched: Bools) -> Lives:

@@ -29,12 +29,9 @@ class Switch(NamedTuple):
 
     sequence: str
     frame: int
-    truth: int
-    """Id of the object."""
-    old: int
-    """Id of the track until then."""
-    new: int
-    """Id of the track from this frame on."""
+    truth: int  # id of the object
+    old: int  # id of the track until then
+    new: int  # id of the track from this frame on
 
 
 class Miss(NamedTuple):
@@ -42,32 +39,23 @@ class Miss(NamedTuple):
 
     sequence: str
     frame: int
-    truth: int
-    """Id of the object."""
+    truth: int  # id of the object
 
 
 @dataclass(frozen=True)
 class Counts:
     """Counts of boxes and objects of one class; results of several sequences add up."""
 
-    truth: int = 0
-    """Truth boxes that count (GT)."""
-    true: int = 0
-    """Matched ones (TP)."""
-    false: int = 0
-    """Track boxes that match nothing (FP)."""
-    missed: int = 0
-    """Truth boxes that count and that nothing matches (FN)."""
-    switches: int = 0
-    """Changes of identity (IDS)."""
-    fragments: int = 0
-    """FRAG"""
-    objects: int = 0
-    """Truth objects of which at least one box counts."""
+    truth: int = 0  # truth boxes that count (GT)
+    true: int = 0  # matched ones (TP)
+    false: int = 0  # track boxes that match nothing (FP)
+    missed: int = 0  # truth boxes that count and that nothing matches (FN)
+    switches: int = 0  # changes of identity (IDS)
+    fragments: int = 0  # FRAG
+    objects: int = 0  # truth objects of which at least one box counts
     mostly_tracked: int = 0
     mostly_lost: int = 0
-    similarity: float = 0.0
-    """Sum of the measure over the matched boxes."""
+    similarity: float = 0.0  # sum of the measure over the matched boxes
 
     def __add__(self, other: Self) -> Self:
         return type(self)(**{name: value + getattr(other, name) for name, value in vars(self).items()})
@@ -117,8 +105,7 @@ class Counts:
 class ClearResult(Counts):
     """CLEAR figures of one class; results of several sequences add up."""
 
-    changes: tuple[Switch, ...] = ()
-    """Of identity, in order of sequences and frames."""
+    changes: tuple[Switch, ...] = ()  # of identity, in order of sequences and frames
     misses: tuple[Miss, ...] = ()
 
     def summary(self) -> dict[str, float | None]:
@@ -138,7 +125,6 @@ def evaluate_clear(
         name: the class.
         rules: how to compare; by default boxes that overlap by a quarter match.
         sequence: name of the sequence, for the lists of switches and misses.
-
     """
     rules = rules or Rules()
     return clear(prepare(truth, tracks, name, rules, sequence), rules)

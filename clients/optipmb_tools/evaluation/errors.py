@@ -1,7 +1,7 @@
 """Errors of boxes in every direction, of tracks and of the detections that they are made of.
 
 Conventions: world frame, metres and radians, box minus label. `along` and `across` are offsets of the centre along and
-across the heading of the label, `height` is that of the centre upwards. Headings are compared modulo pi; a box is
+across the heading of the label, `height` is the offset upwards. Headings are compared modulo pi; a box is
 backward when its heading is off by more than half of pi. Tracks count from an existence probability of a half on; only
 boxes with a detection of their own in the frame are compared, so that both columns are of the same objects at the same
 times. Labels and tracks belong together as in `optipmb_tools.evaluation.calibration`. Where the dataset was opened
@@ -22,12 +22,9 @@ from optipmb_tools.results import FullTable, ResultTable
 
 DIRECTIONS = ("along", "across", "height", "heading", "length", "width", "tall")
 """Columns of the errors; the last three are errors of the size."""
-CONFIRMED = 0.5
-"""Existence probability from which tracks count."""
-RANGES = (0.0, 20.0, 40.0, np.inf)
-"""Distances from the sensor, m."""
-SPEEDS = (0.0, 1.0, 8.0, np.inf)
-"""Speeds of tracks, m/s."""
+CONFIRMED = 0.5  # existence probability from which tracks count
+RANGES = (0.0, 20.0, 40.0, np.inf)  # distances from the sensor, m
+SPEEDS = (0.0, 1.0, 8.0, np.inf)  # speeds of tracks, m/s
 _HEADING = 3
 _HALF = 0.5 * np.pi
 
@@ -36,18 +33,12 @@ _HALF = 0.5 * np.pi
 class ErrorResult:
     """Boxes of confirmed tracks of one class that match a label; results of several sequences add up."""
 
-    track: Floats
-    """(N, 7) errors of tracks, headings in (-pi, pi]."""
-    detection: Floats
-    """(N, 7) errors of their detections; NaN where they were missed."""
-    heading_variance: Floats
-    """(N,) of the tracks, rad^2."""
-    distance: Floats
-    """(N,) from the sensor, m."""
-    speed: Floats
-    """(N,) of the track, m/s."""
-    without: str = ""
-    """Why there are no detections to compare with; empty where there are."""
+    track: Floats  # (N, 7) errors of tracks, headings in (-pi, pi]
+    detection: Floats  # (N, 7) errors of their detections; NaN where they were missed
+    heading_variance: Floats  # (N,) of the tracks, rad^2
+    distance: Floats  # (N,) from the sensor, m
+    speed: Floats  # (N,) of the track, m/s
+    without: str = ""  # why there are no detections to compare with; empty where there are
 
     def __add__(self, other: "ErrorResult") -> "ErrorResult":
         columns = {name: value for name, value in vars(self).items() if name != "without"}
@@ -99,7 +90,6 @@ def evaluate_errors(
         parts: each sequence with its truth, its tracks and everything known of them, all in the world frame.
         name: the class.
         rules: how to compare; centres.
-
     """
     none, boxes = np.empty(0), np.empty((0, len(DIRECTIONS)))
     return sum((_sequence_errors(*part, name, rules) for part in parts), ErrorResult(boxes, boxes, none, none, none))
@@ -135,7 +125,6 @@ def _detections(sequence: DataSequence, full: FullTable, rows: Ints) -> tuple[Fl
 
     Raises:
         DatasetError: there are no detections, or others than the tracks were made of.
-
     """
     center, size, yaw = (np.full((len(rows), *tail), np.nan) for tail in ((3,), (3,), ()))
     names = np.array(full.labels, dtype=np.str_)[full.label]

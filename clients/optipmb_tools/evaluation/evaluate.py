@@ -34,12 +34,9 @@ class ClassResult:
     """The CLEAR MOT figures of one class."""
 
     name: str
-    total: ClearResult
-    """All tracks, all sequences."""
-    sequences: dict[str, ClearResult]
-    """All tracks, by sequence."""
-    sweep: Sweep
-    """All sequences, over thresholds on the mean score of a track."""
+    total: ClearResult  # all tracks, all sequences
+    sequences: dict[str, ClearResult]  # all tracks, by sequence
+    sweep: Sweep  # all sequences, over thresholds on the mean score of a track
 
 
 def evaluate_files(
@@ -60,7 +57,6 @@ def evaluate_files(
 
     Raises:
         DatasetError: a sequence has no truth, or its result file is missing or wrong.
-
     """
     cases: dict[str, list[Case]] = {name: [] for name in names}
     pairs = read_compared(sequences, results, names, warn)
@@ -83,32 +79,25 @@ class Recording:
     sequence: DataSequence
     truth: Truth
     tracks: ResultTable
-    full: FullTable | None
-    """All columns of the same tracks, where they were kept."""
+    full: FullTable | None  # all columns of the same tracks, where they were kept
 
 
 @dataclass(frozen=True)
 class Settings:
     """Options of the figures."""
 
-    limits: tuple[float, ...] = IOU_LIMITS
-    """Least 3D intersections over union for AB3DMOT's protocol."""
-    cutoff: float = CUTOFF
-    """c of GOSPA and OSPA, metres."""
-    order: float = ORDER
-    """p of GOSPA and OSPA."""
+    limits: tuple[float, ...] = IOU_LIMITS  # least 3D intersections over union for AB3DMOT's protocol
+    cutoff: float = CUTOFF  # c of GOSPA and OSPA, metres
+    order: float = ORDER  # p of GOSPA and OSPA
 
 
 @dataclass(frozen=True)
 class TrackFigures:
     """Figures of the tracks of one class that reach a score."""
 
-    threshold: float
-    """Lowest mean score of these tracks; minus infinity for all."""
-    hota_2d: HotaResult | None
-    """KITTI only."""
-    hota: HotaResult
-    """Of centres in the plane."""
+    threshold: float  # lowest mean score of these tracks; minus infinity for all
+    hota_2d: HotaResult | None  # KITTI only
+    hota: HotaResult  # of centres in the plane
     gospa: GospaResult
 
 
@@ -117,16 +106,11 @@ class ClassFigures:
     """The figures of one class over all sequences."""
 
     name: str
-    ab3dmot: tuple[Ab3dmotResult, ...]
-    """One for each limit; KITTI only."""
-    everything: TrackFigures
-    """Of all tracks."""
-    best: TrackFigures | None
-    """Of the tracks from the best threshold on."""
-    calibration: CalibrationResult | None
-    """Where the tracks were kept with all columns."""
-    errors: ErrorResult | None
-    """Likewise."""
+    ab3dmot: tuple[Ab3dmotResult, ...]  # one for each limit; KITTI only
+    everything: TrackFigures  # of all tracks
+    best: TrackFigures | None  # of the tracks from the best threshold on
+    calibration: CalibrationResult | None  # where the tracks were kept with all columns
+    errors: ErrorResult | None  # likewise
 
     def summary(self) -> dict[str, object]:
         """Return the figures by name; None where missing."""
@@ -154,7 +138,6 @@ def load_recordings(
 
     Raises:
         DatasetError: a sequence has no truth, or its results are missing or wrong.
-
     """
     if dataset == "nuscenes":
         return _nuscenes_recordings(sequences, results)
@@ -214,7 +197,6 @@ def evaluate_figures(
         settings: options of the figures.
         thresholds: lowest mean score of the tracks that are also evaluated without the others, by class; for KITTI by
             default the threshold with the highest MOTA of AB3DMOT's protocol at its first limit.
-
     """
     settings, thresholds = settings or Settings(), thresholds or {}
     present = {name for one in recordings for table in (one.truth, one.tracks) for name in table.names.tolist()}
@@ -267,14 +249,11 @@ class Evaluation:
     """Data of one tracker that all tasks share; can be sent to another process without `here`."""
 
     data: DatasetArguments
-    names: tuple[str, ...]
-    """Of the sequences."""
+    names: tuple[str, ...]  # of the sequences
     tracks: Path
     settings: Settings
-    classes: tuple[str, ...] = ()
-    """Names that classes of truth and tracks are mapped to."""
-    here: Sequence[DataSequence] | None = None
-    """The sequences, where this process has opened them."""
+    classes: tuple[str, ...] = ()  # names that classes of truth and tracks are mapped to
+    here: Sequence[DataSequence] | None = None  # the sequences, where this process has opened them
 
     @cached_property
     def recordings(self) -> Sequence[Recording]:
@@ -293,7 +272,6 @@ def figures_of(shared: Evaluation, task: tuple[str, float | None]) -> list[Class
 
     Raises:
         DatasetError: as `load_recordings`.
-
     """
     name, threshold = task
     thresholds: Mapping[str, float] = {} if threshold is None else {name: threshold}

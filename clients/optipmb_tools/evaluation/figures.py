@@ -17,11 +17,9 @@ Kind = Literal["share", "count", "metres", "match", "plain"]
 class Figure(NamedTuple):
     """One evaluation figure."""
 
-    title: str
-    """Title of its column."""
+    title: str  # title of its column
     kind: Kind
-    summed: bool = False
-    """Over several classes it is the sum; otherwise the mean of the classes that have it."""
+    summed: bool = False  # over several classes it is the sum; otherwise the mean of the classes that have it
 
 
 def _named(kind: Kind, *names: str, summed: bool = False) -> dict[str, Figure]:

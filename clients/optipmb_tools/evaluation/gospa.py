@@ -34,12 +34,9 @@ class GospaResult:
 
     frames: int = 0
     gospa: float = 0.0
-    localisation: float = 0.0
-    """Part of GOSPA: inaccurate places."""
-    missed: float = 0.0
-    """Part of GOSPA: missed objects."""
-    false: float = 0.0
-    """Part of GOSPA: false tracks."""
+    localisation: float = 0.0  # part of GOSPA: inaccurate places
+    missed: float = 0.0  # part of GOSPA: missed objects
+    false: float = 0.0  # part of GOSPA: false tracks
     ospa: float = 0.0
 
     def __add__(self, other: "GospaResult") -> "GospaResult":
@@ -64,7 +61,6 @@ def evaluate_gospa(parts: Iterable[tuple[Case, int]], rules: Rules, order: float
         parts: the class in each sequence and the number of frames of the sequence that are compared.
         rules: those by which the cases were prepared; centres, and their limit is the cut-off c.
         order: p, at least 1.
-
     """
     return sum((_gospa(counted(case, rules), frames, rules.limit, order) for case, frames in parts), GospaResult())
 
@@ -74,7 +70,7 @@ def _gospa(case: Case, frames: int, cutoff: float, order: float) -> GospaResult:
     near = case.pairs(case.cost < cutoff)
     power = near.cost**order
     limit = cutoff**order
-    # A pair is worth what it saves: either of the two metrics charges c^p for two that are left alone or far apart.
+    # A pair is worth its saving: either of the two metrics charges c^p for two boxes that are alone or far apart.
     taken = assign_frames(near.pair_frame, near.truth_row, near.track_row, limit - power, best_pairs)
     when = near.pair_frame[taken]
     stop = 1 + max(case.truth_frame.max(initial=-1), case.track_frame.max(initial=-1))

@@ -28,8 +28,7 @@ from optipmb_tools.evaluation.cases import Case, Rules, assign_frames, best_pair
 from optipmb_tools.evaluation.figures import defined
 from optipmb_tools.geometry import Bools, Floats, Ints
 
-ALPHAS: Floats = np.arange(0.05, 0.99, 0.05)
-"""(19,) levels"""
+ALPHAS: Floats = np.arange(0.05, 0.99, 0.05)  # (19,) levels
 
 _EPSILON = float(np.finfo(np.float64).eps)
 
@@ -38,16 +37,11 @@ _EPSILON = float(np.finfo(np.float64).eps)
 class HotaResult:
     """Sums of HOTA by level; results of several sequences add up."""
 
-    true: Floats
-    """(19,) TP"""
-    missed: Floats
-    """(19,) FN"""
-    false: Floats
-    """(19,) FP"""
-    association: Floats
-    """(19,) sum over TP of TPA / (TPA + FNA + FPA)"""
-    location: Floats
-    """(19,) sum over TP of S"""
+    true: Floats  # (19,) TP
+    missed: Floats  # (19,) FN
+    false: Floats  # (19,) FP
+    association: Floats  # (19,) sum over TP of TPA / (TPA + FNA + FPA)
+    location: Floats  # (19,) sum over TP of S
 
     def __add__(self, other: "HotaResult") -> "HotaResult":
         return HotaResult(**{name: value + getattr(other, name) for name, value in vars(self).items()})
@@ -92,8 +86,7 @@ class HotaResult:
         return {name: defined(value) for name, value in figures.items()}
 
 
-NOTHING = HotaResult(*(np.zeros(len(ALPHAS)) for _ in range(5)))
-"""Of a sequence without truth and without tracks."""
+NOTHING = HotaResult(*(np.zeros(len(ALPHAS)) for _ in range(5)))  # of a sequence without truth and without tracks
 
 
 def evaluate_hota(cases: Iterable[Case], rules: Rules) -> HotaResult:
@@ -102,7 +95,6 @@ def evaluate_hota(cases: Iterable[Case], rules: Rules) -> HotaResult:
     Args:
         cases: the class in each sequence, with all pairs that are similar at all.
         rules: those by which the cases were prepared.
-
     """
     return sum((_hota(part, similarity(part, rules)) for part in (counted(case, rules) for case in cases)), NOTHING)
 

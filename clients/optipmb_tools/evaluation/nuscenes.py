@@ -55,30 +55,21 @@ class NuScenesConfig:
 
     class_range: Mapping[str, float] = field(default_factory=lambda: dict(CLASS_RANGE))
     """Metres from the car, by class; these classes are evaluated."""
-    match_distance: float = 2.0
-    """Metres in the plane below which a track may match an object."""
-    min_recall: float = 0.1
-    """The lowest recall at which MOTAR and MOTP are taken."""
-    thresholds: int = 40
-    """Number of recalls from there to 1."""
-    worst_motp: float = 2.0
-    """MOTP at recalls that are not reached."""
+    match_distance: float = 2.0  # metres in the plane below which a track may match an object
+    min_recall: float = 0.1  # the lowest recall at which MOTAR and MOTP are taken
+    thresholds: int = 40  # number of recalls from there to 1
+    worst_motp: float = 2.0  # MOTP at recalls that are not reached
 
 
 @dataclass(frozen=True)
 class TrackBoxes:
     """Boxes of one scene that have an id: annotated objects or tracks."""
 
-    frame: Ints
-    """(R,)"""
-    id: Ints
-    """(R,)"""
-    label: Ints
-    """(R,) index into `NUSCENES_CLASSES`."""
-    center: Floats
-    """(R, 3)"""
-    score: Floats
-    """(R,) mean score of the track; NaN for truth."""
+    frame: Ints  # (R,)
+    id: Ints  # (R,)
+    label: Ints  # (R,) index into `NUSCENES_CLASSES`
+    center: Floats  # (R, 3)
+    score: Floats  # (R,) mean score of the track; NaN for truth
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -92,14 +83,10 @@ class TrackBoxes:
 class Racks:
     """Annotated bicycle racks."""
 
-    frame: Ints
-    """(B,)"""
-    center: Floats
-    """(B, 3)"""
-    size: Floats
-    """(B, 3) length, width, height"""
-    rotation: Floats
-    """(B, 3, 3) world from rack"""
+    frame: Ints  # (B,)
+    center: Floats  # (B, 3)
+    size: Floats  # (B, 3) length, width, height
+    rotation: Floats  # (B, 3, 3) world from rack
 
     def hold(self, frame: Ints, center: Floats) -> Bools:
         """Return which places (R, 3) lie in a rack of their frame (R,)."""
@@ -115,10 +102,8 @@ class NuScenesScene:
     """The truth of one scene, ready to be compared with any number of results."""
 
     name: str
-    stamp_us: Ints
-    """(F,)"""
-    ego: Floats
-    """(F, 2) place of the car."""
+    stamp_us: Ints  # (F,)
+    ego: Floats  # (F, 2) place of the car
     racks: Racks
     truth: TrackBoxes
 
@@ -182,7 +167,6 @@ def interpolate(boxes: TrackBoxes, stamp_us: Ints) -> TrackBoxes:
     Args:
         boxes: ordered by frame; an id at most once in a frame.
         stamp_us: (F,) microseconds.
-
     """
     _, first, which = np.unique(boxes.id, return_index=True, return_inverse=True)
     rank = first[which]  # ids in order of appearance
@@ -244,15 +228,11 @@ def pair(truth: TrackBoxes, tracks: TrackBoxes, label: int, limit: float) -> Cas
 class Matching:
     """Matches of the tracks with a score from a threshold on."""
 
-    event: Ints
-    """(T,) `Event` of each object in each of its frames."""
-    score: Floats
-    """(T,) of the track; NaN for misses."""
-    distance: Floats
-    """(T,) metres; 0 for misses."""
+    event: Ints  # (T,) `Event` of each object in each of its frames
+    score: Floats  # (T,) of the track; NaN for misses
+    distance: Floats  # (T,) metres; 0 for misses
     false_positives: int
-    frames: int
-    """In which there is an object or a track."""
+    frames: int  # in which there is an object or a track
 
     @classmethod
     def of(cls, case: Case, threshold: float = -np.inf) -> "Matching":
@@ -272,29 +252,22 @@ class Matching:
 class NuScenesFigures:
     """Figures of one class at one threshold, by their official names."""
 
-    threshold: float
-    """Lowest mean score of a track."""
+    threshold: float  # lowest mean score of a track
     recall: float
     motar: float
     gt: float
     mota: float
     motp: float
-    mt: float
-    """Objects tracked in at least 80 % of their frames."""
-    ml: float
-    """Objects tracked in less than 20 % of their frames."""
-    faf: float
-    """False positives in a hundred frames."""
+    mt: float  # objects tracked in at least 80 % of their frames
+    ml: float  # objects tracked in less than 20 % of their frames
+    faf: float  # false positives in a hundred frames
     tp: float
     fp: float
     fn: float
     ids: float
-    frag: float
-    """Breaks in the tracking of an object."""
-    tid: float
-    """Mean time until an object is tracked, seconds."""
-    lgd: float
-    """Mean longest time for which an object is not tracked, seconds."""
+    frag: float  # breaks in the tracking of an object
+    tid: float  # mean time until an object is tracked, seconds
+    lgd: float  # mean longest time for which an object is not tracked, seconds
 
     def to_json(self) -> dict[str, float | None]:
         """Return the figures by name; None where undefined."""
@@ -307,12 +280,9 @@ class NuScenesClass:
 
     amota: float
     amotp: float
-    best: NuScenesFigures
-    """At the threshold with the highest MOTA."""
-    recalls: tuple[float, ...]
-    """From 1 down."""
-    curve: tuple[NuScenesFigures | None, ...]
-    """At each of `recalls`; None where it is not reached."""
+    best: NuScenesFigures  # at the threshold with the highest MOTA
+    recalls: tuple[float, ...]  # from 1 down
+    curve: tuple[NuScenesFigures | None, ...]  # at each of `recalls`; None where it is not reached
 
     def to_json(self) -> dict[str, float | None]:
         """Return the figures by name; None where undefined."""
@@ -360,7 +330,6 @@ def score_thresholds(scores: Floats, count: int, recalls: Floats) -> Floats:
         scores: (S,) of the true positives, in any order.
         count: number of truth boxes.
         recalls: (H,) ascending.
-
     """
     if not len(scores):
         return np.full(len(recalls), np.nan)
@@ -456,7 +425,6 @@ def evaluate_nuscenes(
     Raises:
         DatasetError: the data or the results are not there or not in their layout, a scene has no annotations, or the
             results lack a sample of it.
-
     """
     config = config or NuScenesConfig()
     dataset = NuScenesDataset(root, clouds=False)
@@ -483,7 +451,6 @@ def evaluate_scenes(
         pairs: scenes, made by `prepare_scene` with the same settings, and their tracks in the world frame; frames count
             the keyframes of the scene.
         config: other settings than the official ones.
-
     """
     config = config or NuScenesConfig()
     scenes = [(scene, scene.tracks(table, config)) for scene, table in pairs]

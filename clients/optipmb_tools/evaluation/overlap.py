@@ -9,8 +9,7 @@ import numpy as np
 
 from optipmb_tools.geometry import Bools, Floats, box_corners
 
-_MAX_CORNERS = 8
-"""Two rectangles overlap in a polygon of at most eight corners."""
+_MAX_CORNERS = 8  # two rectangles overlap in a polygon of at most eight corners
 
 
 def iou_3d(first: tuple[Floats, Floats, Floats], second: tuple[Floats, Floats, Floats]) -> Floats:
@@ -22,7 +21,6 @@ def iou_3d(first: tuple[Floats, Floats, Floats], second: tuple[Floats, Floats, F
 
     Returns:
         (P,) in [0, 1].
-
     """
     (center_a, size_a, _), (center_b, size_b, _) = first, second
     top = np.minimum(center_a[:, 2] + 0.5 * size_a[:, 2], center_b[:, 2] + 0.5 * size_b[:, 2])

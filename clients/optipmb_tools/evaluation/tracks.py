@@ -11,7 +11,7 @@ from optipmb_tools.datasets.interface import class_like
 from optipmb_tools.datasets.kitti import KittiSequence
 from optipmb_tools.datasets.nuscenes import NuScenesSequence
 from optipmb_tools.datasets.table import ObjectTable, TableOptions, TableSequence, read_objects
-from optipmb_tools.results import FullTable, ResultTable, empty_table, full_path, read_full
+from optipmb_tools.results import FullTable, ResultTable, full_path, full_table, read_full
 from optipmb_tools.results.kitti import LEAST_SHOWN, read_kitti_results
 from optipmb_tools.results.nuscenes import NUSCENES_FILE, read_nuscenes_results, result_table
 from optipmb_tools.table_files import SUFFIXES, is_table
@@ -122,7 +122,7 @@ def _from_table(path: Path, sequence: DataSequence) -> ResultTable:
     (table,) = read_objects(path, [path], tables)
     key = _key(table, sequence, tables) if len(table.boxes.frame_stamp) else None
     if key is None:
-        return replace(empty_table(), notes=(f"{path}: no tracks of {sequence.name}",))
+        return replace(full_table((), {}), notes=(f"{path}: no tracks of {sequence.name}",))
     stamps = getattr(sequence, "stamps", None)
     if stamps is None:
         stamps = np.array([frame.stamp_ns for frame in sequence.frames()], dtype=np.int64)

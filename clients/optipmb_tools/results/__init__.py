@@ -72,14 +72,6 @@ class ResultTable(BoxTable):
     notes: tuple[str, ...] = ()  # assumptions about them, a line each
 
 
-def empty_table(labels: tuple[str, ...] = ()) -> ResultTable:
-    """Return a table without rows."""
-    none = np.empty(0, dtype=np.int64)
-    return ResultTable(
-        labels, none, none, none, np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0), np.empty((0, 4))
-    )
-
-
 def column_shape(name: str) -> tuple[int, ...]:
     """Return the shape of one row of a column of tracks."""
     return tuple(length for length in Tracks.arrays[name].shape if isinstance(length, int))
@@ -91,28 +83,31 @@ def stacked(parts: Sequence[Any], name: str) -> NDArray[Any]:
     return np.concatenate([empty, *(getattr(part, name) for part in parts)])
 
 
-@dataclass(frozen=True)
-class FullTable(BoxTable):
-    """All columns of the tracks of one sequence in the world frame, as in a file `NAME.npz` next to `NAME.txt`.
-
-    Result files of the benchmarks have no room for covariances and probabilities. This file holds every column as a
-    numpy array, one row per track and frame, ordered by frame and, in a frame, as in the result file; where tracks have
-    predicted paths, these too, named as in messages. The same tracks always give the same bytes.
-    """
+@dataclass(frozen=True, kw_only=True)
+class FullTable(ResultTable):
+    """All columns of the tracks of one sequence in the world frame."""
 
     velocity: Floats  # (R, 2)
     yaw_rate: Floats  # (R,)
     acceleration: Floats  # (R,) along the heading
     existence: Floats  # (R,) probability
-    score: Floats  # (R,)
     covariance: Floats  # (R, 6, 6) of x, y, speed, heading, turn rate, acceleration
     age: Floats  # (R,) since the first detection
     time_since_detection: Floats  # (R,)
     detection: Ints  # (R,) index of the detection in its frame, -1 while missed
 
 
-COLUMNS: Final = tuple(field.name for field in fields(FullTable) if field.name not in {"labels", "frame"})
-"""Columns of tracks in the order of the fields of `FullTable`."""
+# In the order of the message
+_COLUMNS: Final = tuple(name for name in Tracks.arrays if name in {field.name for field in fields(FullTable)})
+
+
+def full_table(labels: tuple[str, ...], tracks: Mapping[int, Any]) -> FullTable:
+    """Return the tracks of each frame (`optipmb.Tracks`, or messages) as one table, without image boxes."""
+    order = sorted(tracks)
+    parts = [tracks[index] for index in order]
+    frame = np.repeat(np.array(order, dtype=np.int64), [len(one.id) for one in parts])
+    columns: dict[str, Any] = {name: stacked(parts, name) for name in _COLUMNS}
+    return FullTable(labels=labels, frame=frame, box2d=np.full((len(frame), 4), np.nan), **columns)
 
 
 def full_path(result: Path) -> Path:
@@ -121,17 +116,20 @@ def full_path(result: Path) -> Path:
 
 
 def write_full(path: Path, tracks: Mapping[int, Tracks]) -> None:
-    """Write the tracks of a sequence by frame index; the file appears complete, or not at all."""
-    order = sorted(tracks)
-    parts = [tracks[index] for index in order]
-    count = [len(one.id) for one in parts]
-    columns = {name: stacked(parts, name) for name in COLUMNS}
-    labels = parts[0].labels if parts else ()
+    """Write the tracks of a sequence by frame index; the file appears complete, or not at all.
+
+    Result files of the benchmarks have no room for covariances and probabilities. This file holds every column as a
+    numpy array, one row per track and frame, ordered by frame and, in a frame, as in the result file; where tracks have
+    predicted paths, these too, named as in messages. The same tracks always give the same bytes.
+    """
+    parts = [tracks[index] for index in sorted(tracks)]
+    table = full_table(parts[0].labels if parts else (), tracks)
+    columns = {name: getattr(table, name) for name in _COLUMNS}
     horizons = [one.horizons for one in parts if one.horizons is not None]
-    if horizons and len(horizons) == len(order) and len({one.tobytes() for one in horizons}) == 1:
+    if horizons and len(horizons) == len(parts) and len({one.tobytes() for one in horizons}) == 1:
         columns |= {name: np.concatenate([getattr(one, name) for one in parts]) for name in PATHS[1:]}
         columns["horizons"] = horizons[0]
-    columns |= {"labels": np.array(labels, dtype=np.str_), "frame": np.repeat(np.array(order, dtype=np.int64), count)}
+    columns |= {"labels": np.array(table.labels, dtype=np.str_), "frame": table.frame}
     content = io.BytesIO()
     with ZipFile(content, "w", ZIP_DEFLATED) as archive:  # as numpy's own savez, but without the time of day
         for name, column in columns.items():
@@ -155,9 +153,9 @@ def read_full(path: Path) -> FullTable:
     except (BadZipFile, ValueError, EOFError) as error:
         raise DatasetError(path, what, "another kind of file") from error
     rows = len(arrays["frame"]) if arrays.get("frame", np.empty(())).ndim == 1 else -1
-    for name in ("labels", "frame", *COLUMNS):
-        shape = (rows, *(column_shape(name) if name in COLUMNS else ()))
+    for name in ("labels", "frame", *_COLUMNS):
+        shape = (rows, *(column_shape(name) if name in _COLUMNS else ()))
         if name not in arrays or (name != "labels" and arrays[name].shape != shape):
             raise DatasetError(path, f"{what}: {name}", f"shape {arrays[name].shape}" if name in arrays else "none")
-    labels = tuple(str(label) for label in arrays.pop("labels"))
-    return FullTable(labels, *(arrays[name] for name in ("frame", *COLUMNS)))
+    columns: dict[str, Any] = {name: arrays[name] for name in ("frame", *_COLUMNS)}
+    return FullTable(labels=tuple(map(str, arrays["labels"])), box2d=np.full((rows, 4), np.nan), **columns)

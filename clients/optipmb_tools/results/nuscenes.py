@@ -30,12 +30,11 @@ from optipmb_schemas import Tracks
 from optipmb_tools.datasets.interface import class_like
 from optipmb_tools.files import DatasetError, read_text, write_whole
 from optipmb_tools.geometry import Floats, Ints
-from optipmb_tools.results import ResultTable, stacked
+from optipmb_tools.results import ResultTable
 
 NUSCENES_CLASSES = ("bicycle", "bus", "car", "motorcycle", "pedestrian", "trailer", "truck")
 """The classes of the tracking benchmark; others that a file holds are left out."""
-NUSCENES_META = ("use_camera", "use_lidar", "use_radar", "use_map", "use_external")
-"""Inputs that a submission declares."""
+NUSCENES_META = ("use_camera", "use_lidar", "use_radar", "use_map", "use_external")  # inputs that a submission declares
 
 Kind: TypeAlias = Literal["detection", "tracking"]
 _Row: TypeAlias = "array[float]"
@@ -45,22 +44,6 @@ _UNTRACKED = frozenset(("barrier", "construction_vehicle", "traffic_cone", "vehi
 """Classes of the detection benchmark that the tracking benchmark lacks."""
 _LENGTHS = {"translation": 3, "size": 3, "rotation": 4}
 _PLANE = 2
-
-
-@dataclass(frozen=True)
-class Boxes:
-    """The boxes of one sample."""
-
-    label: Ints  # (M,) index into `NUSCENES_CLASSES`
-    center: Floats  # (M, 3)
-    size: Floats  # (M, 3) length, width, height
-    yaw: Floats  # (M,)
-    velocity: Floats  # (M, 2); a row is NaN where the velocity is unknown
-    score: Floats  # (M,)
-    id: tuple[str, ...]  # M texts; empty texts for detections
-
-    def __len__(self) -> int:
-        return len(self.label)
 
 
 @dataclass(frozen=True)
@@ -80,32 +63,33 @@ class Submission:
                 how = f"read as {known}" if known else "left out, for the tracking benchmark lacks it"
                 yield f"{self.path}: {count} boxes of class {name}: {how}"
 
-    def boxes(self, token: str) -> Boxes:
-        """Return the boxes of one sample.
+    def boxes(self, *tokens: str) -> dict[str, Any]:
+        """Return the boxes of samples as columns, named as in `DetectionFrame`; rows of velocity are NaN where unknown.
 
         Raises:
             DatasetError: The file does not have the sample, or a box has a number that cannot be one.
         """
-        if token not in self.rows:
-            raise DatasetError(self.path, "every sample, if need be with an empty list", f"no sample {token}")
-        rows = self.rows[token]
-        values = np.array([row for _, row in rows], dtype=np.float64).reshape(-1, _WIDTH)
+        if lacking := [token for token in tokens if token not in self.rows]:
+            raise DatasetError(self.path, "every sample, if need be with an empty list", f"no sample {lacking[0]}")
+        values = np.array([row for token in tokens for _, row in self.rows[token]], dtype=np.float64).reshape(
+            -1, _WIDTH
+        )
         velocity = values[:, 12:14]
         velocity[~np.isfinite(velocity).all(axis=1)] = np.nan
         size, rotation = values[:, [5, 4, 6]], values[:, 7:11]
         good = np.isfinite(values[:, :12]).all(axis=1) & (size > 0).all(axis=1) & (np.abs(rotation).max(axis=1) > 0)
         if not good.all():
-            place = f"results.{token}[{int(np.argmin(good))}]"
-            raise DatasetError(self.path, f"finite numbers, a size above 0 and a rotation in {place}", "others")
-        return Boxes(
-            label=values[:, 0].astype(np.int64),
-            center=values[:, 1:4],
-            size=size,
-            yaw=quaternion_yaw(rotation),
-            velocity=velocity,
-            score=values[:, 11],
-            id=tuple(name for name, _ in rows),
-        )
+            places = [f"results.{token}[{number}]" for token in tokens for number in range(len(self.rows[token]))]
+            expected = f"finite numbers, a size above 0 and a rotation in {places[int(np.argmin(good))]}"
+            raise DatasetError(self.path, expected, "others")
+        return {
+            "label": values[:, 0].astype(np.int64),  # index into `NUSCENES_CLASSES`
+            "center": values[:, 1:4],
+            "size": size,
+            "yaw": quaternion_yaw(rotation),
+            "velocity": velocity,
+            "score": values[:, 11],
+        }
 
 
 def quaternion_yaw(quaternion: Floats) -> Floats:
@@ -283,15 +267,15 @@ def result_table(results: Submission, scene: str, samples: Sequence[str]) -> Res
     Raises:
         DatasetError: A sample is missing, or an id stands twice in a sample.
     """
-    frames = [results.boxes(token) for token in samples]
-    names = [name for boxes in frames for name in boxes.id]
-    for token, boxes in zip(samples, frames, strict=True):
-        if len(set(boxes.id)) < len(boxes):
-            twice = next(name for i, name in enumerate(boxes.id) if name in boxes.id[:i])
-            raise DatasetError(results.path, f"a tracking_id once in results.{token}", f"{twice!r} again")
-    label, center, size, yaw, score = (stacked(frames, name) for name in ("label", "center", "size", "yaw", "score"))
-    frame, image = np.repeat(np.arange(len(frames)), [len(boxes) for boxes in frames]), np.full((len(names), 4), np.nan)
-    return ResultTable(NUSCENES_CLASSES, frame, _numbers(scene, names), label, center, size, yaw, score, image)
+    boxes = results.boxes(*samples)
+    boxes.pop("velocity")
+    names = [[name for name, _ in results.rows[token]] for token in samples]
+    for token, ids in zip(samples, names, strict=True):
+        if twice := [name for i, name in enumerate(ids) if name in ids[:i]]:
+            raise DatasetError(results.path, f"a tracking_id once in results.{token}", f"{twice[0]!r} again")
+    frame = np.repeat(np.arange(len(samples)), list(map(len, names)))
+    identity, image = _numbers(scene, list(itertools.chain(*names))), np.full((len(frame), 4), np.nan)
+    return ResultTable(labels=NUSCENES_CLASSES, frame=frame, id=identity, box2d=image, **boxes)
 
 
 def _numbers(scene: str, names: Sequence[str]) -> Ints:

@@ -13,7 +13,8 @@ from optipmb_client.errors import UsageError
 from optipmb_schemas import Detections, Dump, DumpedFrame, MessageError, Points, Pose, Tracks, decode_dump
 
 import optipmb
-from optipmb_tools.run.tracking import track_fields
+from optipmb_tools.datasets.interface import DETECTION_COLUMNS
+from optipmb_tools.run.tracking import fields_of
 
 
 @dataclass(frozen=True)
@@ -84,17 +85,11 @@ def _step(
         parameters,
         stamp_ns=message.stamp_ns,
         labels=message.labels,
-        label=message.label,
-        center=message.center,
-        size=message.size,
-        yaw=message.yaw,
-        score=message.score,
-        velocity=message.velocity,
+        **{name: getattr(message, name) for name in DETECTION_COLUMNS},
         pose=None if message.frame == "world" else _pose(message),
         field_of_view=optipmb.FieldOfView.of(
             message.field_of_view, None if message.pose is None else _place(message.pose)
         ),
-        position_covariance=message.position_covariance,
         cloud=None if given.points is None else optipmb.PointCloud(given.points.xyz, _pose(given.points)),
     )
     found = steps.step(density, frame)
@@ -107,7 +102,7 @@ def _step(
         profile=parameters.name,
         cloud_used=given.points is not None,
         labels=tuple(parameters.classes),
-        **track_fields(found.tracks, found.paths, found.class_probability),
+        **fields_of(found.tracks, found.paths, class_probability=found.class_probability, measured=found.measured),
     )
     return found.density
 

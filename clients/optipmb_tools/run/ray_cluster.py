@@ -120,7 +120,7 @@ def _run(call: list[Any], folder: str, wanted: str, task: Any) -> bytes:
     global _held  # noqa: PLW0603  a worker has no other place to keep anything
     if version("optipmb") != wanted:
         raise RuntimeError(f"optipmb {version('optipmb')} is installed there, here it is {wanted}")
-    os.chdir(folder)  # paths mean what they mean for the caller
+    os.chdir(folder)  # relative paths are the caller's
     (reference,) = call
     if _held is None or _held[0] != reference.hex():
         _held = None

@@ -68,7 +68,7 @@ class Smoother:
         label = np.concatenate([one.label for one in objects])
         mean = np.concatenate([one.mean for one in objects])
         covariance = np.concatenate([one.covariance for one in objects])
-        mean[shown, :2], mean[shown, PHI] = extracted.center[:, :2], extracted.yaw  # speeds are those of the filter
+        mean[shown, :2], mean[shown, PHI] = extracted.center[:, :2], extracted.yaw  # speeds stay the filter's
         factors = self._factors(extracted.label)
         lasting = self._lasting(extracted.label, evidence, extracted.yaw)
         covariance[shown] = (extracted.covariance - lasting) / factors
@@ -134,7 +134,8 @@ def smooth(
     """
     order = np.argsort(identity, kind="stable")
     before, after = order[:-1], order[1:]
-    follows = identity[before] == identity[after]
+    known = covariance[:, OMEGA, OMEGA] != 0.0  # those of unknown heading stay (`optipmb.unknown_heading`)
+    follows = (identity[before] == identity[after]) & known[before] & known[after]
     before, after = before[follows], after[follows]
     predicted, spread, gain = _predictions(
         mean[before], covariance[before], (stamp_ns[after] - stamp_ns[before]) * 1e-9, label[before], table

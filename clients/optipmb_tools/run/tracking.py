@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from optipmb_client.errors import ClientError, UsageError
-from optipmb_schemas import Tracks, class_fields, path_fields
+from optipmb_schemas import Tracks, path_fields, track_fields
 
 import optipmb
 from optipmb import (
@@ -34,7 +34,6 @@ from optipmb import (
 )
 from optipmb_tools.datasets import DataSequence, Dataset, DatasetArguments, DetectionFrame, selected_frames
 from optipmb_tools.files import remove_unfinished
-from optipmb_tools.geometry import Floats
 from optipmb_tools.results.output import Latency, Results, horizons_for, latency
 from optipmb_tools.run.bulk import Executor, Failed, Here, in_order, run
 from optipmb_tools.table_files import Columns
@@ -140,22 +139,20 @@ def track_whole(
     if smoother is not None:
         for index, one in smoother.tracks():
             paths = predict_tracks(one, parameters.horizons, parameters) if parameters.horizons else None
-            found[index] = found[index].model_copy(update=track_fields(one, paths))
+            found[index] = found[index].model_copy(update=fields_of(one, paths))
     return Tracked(found, clouds, detections, dict(left_out), estimated, tuple(steps), time.monotonic() - begun)
 
 
-def track_fields(
-    tracks: optipmb.Tracks, paths: PredictedPaths | None, class_probability: Floats | None = None
-) -> dict[str, Any]:
-    """Return tracks, their paths and classes as fields of the message.
+def fields_of(tracks: optipmb.Tracks, paths: PredictedPaths | None, **others: Any) -> dict[str, Any]:
+    """Return tracks, their paths and other columns that there may be as fields of the message.
 
     Raises:
-        MessageError: Paths or classes hold numbers that no message may.
+        MessageError: Paths or others hold numbers that no message may.
     """
     fields = dict(tracks.columns()) | {"confirmed": tracks.confirmed.astype(np.int64)}
     if paths is not None:
         fields |= path_fields(paths.horizons, paths.mean, paths.covariance)
-    return fields if class_probability is None else fields | class_fields(class_probability)
+    return fields | track_fields(**others)
 
 
 def _message(parameters: Parameters, sequence: DataSequence, frame: DetectionFrame, result: StepResult) -> Tracks:
@@ -170,7 +167,9 @@ def _message(parameters: Parameters, sequence: DataSequence, frame: DetectionFra
         "cloud_used": frame.cloud is not None,
         "labels": parameters.labels,
     }
-    return Tracks.trusted(header | track_fields(result.tracks, result.paths, result.class_probability))
+    others = {"class_probability": result.class_probability, "measured": result.measured}
+    fields = fields_of(result.tracks, result.paths, **others)
+    return Tracks.trusted(header | fields)
 
 
 @dataclass(frozen=True)

@@ -31,45 +31,34 @@ from scipy.optimize import brentq, isotonic_regression
 from optipmb import Calibration, Parameters
 from optipmb_tools.evaluation.calibration import NORMAL_95, CalibrationResult, calibration, rows_of, sample
 from optipmb_tools.geometry import Bools, Floats, Ints, wrap_angle
-from optipmb_tools.results import FullTable, ResultTable
-from optipmb_tools.tuning.clips import Clip, track_fully
+from optipmb_tools.results import FullTable
+from optipmb_tools.tuning.clips import Clip, track_clip
 from optipmb_tools.tuning.scoring import Figures, Scorer, folds_of, metric, standard_error, without_folds
 from optipmb_tools.tuning.values import rounded, with_calibration, with_values
 
-MEMORIES = (0.3, 0.5, 0.7, 0.8)
-"""Tried for the weight that evidence keeps over a nominal period."""
-MISSED = 1.0
-"""Log odds that a miss counts for against a track."""
-LEAST_TRACKS, LEAST_MATCHED = 200, 50
-"""With fewer boxes of tracks, or of tracks on objects, there is no calibration."""
+MEMORIES = (0.3, 0.5, 0.7, 0.8)  # tried for the weight that evidence keeps over a nominal period
+MISSED = 1.0  # log odds that a miss counts for against a track
+LEAST_TRACKS, LEAST_MATCHED = 200, 50  # with fewer boxes of tracks, or of tracks on objects, there is no calibration
 _EDGES = (0.0, 0.05, 0.15, 0.3, 0.5, 0.7, 0.85, 0.95, 1.0)
-_LEAST_KNOT = 30
-"""Boxes of tracks that a knot stands on."""
+_LEAST_KNOT = 30  # boxes of tracks that a knot stands on
 _FIFTHS = 5
-_CERTAIN = (0.001, 0.999)
-"""Beyond these no share that was measured is known."""
+_CERTAIN = (0.001, 0.999)  # beyond these no share that was measured is known
 _WIDEST, _MOST = 10.0, 1.5
 _HALF_WINDOW_S = 0.5
 _LEVEL, _FACTORS = 0.95, (0.1, 1.0)
 _NEES = 2.0
-_SCALE = 28.0
-"""Width of the evidence, from one surest to the other, as the score tells it."""
+_SCALE = 28.0  # width of the evidence, from one surest to the other, as the score tells it
 
 
 @dataclass(frozen=True)
 class _Rows:
     """The tracks of one sequence that count."""
 
-    evidence: Floats
-    """(K,)"""
-    true: Bools
-    """(K,)"""
-    error: Floats
-    """(H, 2) of the matched ones, along and across the heading, m"""
-    variance: Floats
-    """(H, 2) that the filter expects, m^2"""
-    mixed: Floats
-    """(H,) covariance of the two"""
+    evidence: Floats  # (K,)
+    true: Bools  # (K,)
+    error: Floats  # (H, 2) of the matched ones, along and across the heading, m
+    variance: Floats  # (H, 2) that the filter expects, m^2
+    mixed: Floats  # (H,) covariance of the two
     motion: Floats
     """(H, 2) errors of speed and turn rate in standard deviations of the filter; NaN where the truth is not known"""
 
@@ -87,7 +76,6 @@ def calibrate(
         scorer: of the class.
         parameters: of the tracks, with this class only.
         memory: the one to take; None tries several.
-
     """
     best: tuple[float, float, list[_Rows]] | None = None
     for one in MEMORIES if memory is None else (memory,):
@@ -106,8 +94,9 @@ def measured_calibration(clips: Sequence[Clip], scorer: Scorer, parameters: Para
     """Return the calibration figures of the tracks of some sequences."""
     parts = []
     for clip in clips:
-        tracks, full = _tracked(clip, scorer, parameters)
-        parts.append(calibration(clip.world, tracks, full, scorer.name, scorer.near))
+        tracks = track_clip(clip, parameters)
+        counted = tracks.take(scorer.counts(clip, tracks))
+        parts.append(calibration(clip.world, counted, tracks, scorer.name, scorer.near))
     return reduce(add, parts)
 
 
@@ -131,11 +120,6 @@ def cross_calibration(clips: Sequence[Clip], scorer: Scorer, parameters: Paramet
     return reduce(add, parts)
 
 
-def _tracked(clip: Clip, scorer: Scorer, parameters: Parameters) -> tuple[ResultTable, FullTable]:
-    tracks, full = track_fully(clip, parameters)
-    return tracks.take(scorer.counts(clip, tracks)), full
-
-
 def _rows(clip: Clip, scorer: Scorer, parameters: Parameters, memory: float) -> _Rows:
     """Track a sequence; the score carries the evidence."""
     probe = Calibration(
@@ -147,8 +131,8 @@ def _rows(clip: Clip, scorer: Scorer, parameters: Parameters, memory: float) -> 
         along=(0.0,),
         across=(0.0,),
     )
-    tracks, full = _tracked(clip, scorer, with_calibration(parameters, scorer.name, probe))
-    found = sample(clip.world, tracks, full, scorer.name, scorer.near)
+    full = track_clip(clip, with_calibration(parameters, scorer.name, probe))
+    found = sample(clip.world, full.take(scorer.counts(clip, full)), full, scorer.name, scorer.near)
     matched, owner = found.row[found.true], found.owner[found.true]
     turn, offset = full.yaw[matched], found.offset[found.true]
     ahead = np.column_stack([np.cos(turn), np.sin(turn)])
@@ -303,10 +287,8 @@ class Ranking:
     score: str
     figures: Figures
     value: float
-    gain: float
-    """Of the objective over x_s."""
-    error: float
-    """Standard error of the gain."""
+    gain: float  # of the objective over x_s
+    error: float  # standard error of the gain
 
 
 def rank(clips: Sequence[Clip], scorer: Scorer, parameters: Parameters, objective: str) -> tuple[Ranking, ...]:
@@ -317,13 +299,12 @@ def rank(clips: Sequence[Clip], scorer: Scorer, parameters: Parameters, objectiv
         scorer: of the class.
         parameters: of the tracks, with a calibration.
         objective: one of `optipmb_tools.tuning.scoring.METRICS`.
-
     """
     probe = with_values(parameters, scorer.name, {"calibration.score_of_evidence": 1.0})
-    tracked = [track_fully(clip, probe) for clip in clips]
-    scores_of = [_scores(clip, full, parameters.nominal_period) for clip, (_, full) in zip(clips, tracked, strict=True)]
+    tracked = [track_clip(clip, probe) for clip in clips]
+    scores_of = [_scores(clip, full, parameters.nominal_period) for clip, full in zip(clips, tracked, strict=True)]
     scores = {
-        name: [replace(tracks, score=one[name]) for (tracks, _), one in zip(tracked, scores_of, strict=True)]
+        name: [replace(tracks, score=one[name]) for tracks, one in zip(tracked, scores_of, strict=True)]
         for name in scores_of[0]
     }
     objects = [len(set(clip.truth.id[~clip.truth.ignored].tolist())) for clip in clips]

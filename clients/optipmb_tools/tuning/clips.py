@@ -5,7 +5,6 @@ the sensor frame of each row's frame, where KITTI compares, and in the world fra
 """
 
 import zlib
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +14,7 @@ from optipmb_tools.camera import Camera
 from optipmb_tools.datasets import DataSequence, DatasetError, Truth
 from optipmb_tools.evaluation import Rules
 from optipmb_tools.geometry import Floats, Ints, stack_poses, to_sensor, wrap_angle
-from optipmb_tools.results import COLUMNS, FullTable, ResultTable, stacked
+from optipmb_tools.results import FullTable, full_table
 from optipmb_tools.results.kitti import LEAST_SHOWN
 from optipmb_tools.run.tracking import tracker_frame
 
@@ -28,20 +27,13 @@ class Clip:
     """One sequence with its detections of some classes."""
 
     name: str
-    labels: tuple[str, ...]
-    """The classes, as the parameters that will be used have them."""
-    frames: tuple[Frame, ...]
-    """(F,) world frame."""
-    rotation: Floats
-    """(F, 3, 3) world from sensor."""
-    translation: Floats
-    """(F, 3)"""
-    camera: Camera | None
-    """In whose image the benchmark counts; None where it does not."""
-    truth: Truth
-    """Of these classes and those alike, in the sensor frame of each row's frame."""
-    world: Truth
-    """The same in the world frame."""
+    labels: tuple[str, ...]  # the classes, as the parameters that will be used have them
+    frames: tuple[Frame, ...]  # (F,) world frame
+    rotation: Floats  # (F, 3, 3) world from sensor
+    translation: Floats  # (F, 3)
+    camera: Camera | None  # in whose image the benchmark counts; None where it does not
+    truth: Truth  # of these classes and those alike, in the sensor frame of each row's frame
+    world: Truth  # the same in the world frame
 
     @property
     def stamps(self) -> Ints:
@@ -55,7 +47,6 @@ def load(sequence: DataSequence, parameters: Parameters, rules: Rules) -> Clip:
     Raises:
         DatasetError: it has no truth, or one of some frames only, by which clutter cannot be counted.
         UsageError: it has values that the tracker refuses.
-
     """
     frames = list(sequence.frames())  # first: a generated scene takes its truth from the scans that its frames needed
     truth = sequence.truth()
@@ -97,16 +88,11 @@ def of_class(clip: Clip, name: str, rules: Rules) -> Clip:
 class Degradation:
     """How much worse the detections of a degraded copy are."""
 
-    drop: float = 0.1
-    """Share of the detections that are lost."""
-    position: float = 0.1
-    """Standard deviation of the noise added to x and to y, m."""
-    heading: float = 0.05
-    """Of the noise added to the heading, rad."""
-    velocity: float = 0.2
-    """Of the noise added to each component of a known velocity, m/s."""
-    score: float = 0.5
-    """Of the noise added to the logit of the score."""
+    drop: float = 0.1  # share of the detections that are lost
+    position: float = 0.1  # standard deviation of the noise added to x and to y, m
+    heading: float = 0.05  # of the noise added to the heading, rad
+    velocity: float = 0.2  # of the noise added to each component of a known velocity, m/s
+    score: float = 0.5  # of the noise added to the logit of the score
 
 
 def degrade(clip: Clip, degradation: Degradation, seed: int, copy: int = 0) -> Clip:
@@ -148,7 +134,7 @@ def _worse(frame: Frame, degradation: Degradation, rng: np.random.Generator) -> 
 
 def track_clip(
     clip: Clip, parameters: Parameters, modules: Modules | None = None, *, every_frame: bool = False
-) -> ResultTable:
+) -> FullTable:
     """Return the tracks of a clip in the world frame, with image boxes where there is a camera.
 
     Args:
@@ -156,25 +142,10 @@ def track_clip(
         parameters: with the classes of the clip.
         modules: of the tracker.
         every_frame: also step through frames in which nothing can happen; the tracks are the same.
-
     """
-    return _table(clip, parameters, list(_steps(clip, parameters, modules, every_frame=every_frame)))
-
-
-def track_fully(clip: Clip, parameters: Parameters) -> tuple[ResultTable, FullTable]:
-    """Return the tracks of a clip as `track_clip` does, and all their columns."""
-    found = list(_steps(clip, parameters, None, every_frame=False))
-    table, parts = _table(clip, parameters, found), [tracks for _, tracks in found]
-    return table, FullTable(table.labels, table.frame, *(stacked(parts, name) for name in COLUMNS))
-
-
-def _steps(
-    clip: Clip, parameters: Parameters, modules: Modules | None, *, every_frame: bool
-) -> Iterator[tuple[int, Tracks]]:
-    """Yield the tracks of each frame that has any."""
     tracker = Tracker(parameters, modules)
     least = min(one.score_filter for one in parameters.classes.values())
-    density = tracker.initial()
+    density, found = tracker.initial(), dict[int, Tracks]()
     for index, frame in enumerate(clip.frames):
         # Nothing there and nothing new: the step would give the same density with another stamp, which nothing reads.
         empty = not len(density.bernoulli) and not len(density.poisson)
@@ -182,18 +153,10 @@ def _steps(
             continue
         result = tracker.step(density, frame)
         density = result.density
-        if len(result.tracks.id):
-            yield index, result.tracks
-
-
-def _table(clip: Clip, parameters: Parameters, found: Sequence[tuple[int, Tracks]]) -> ResultTable:
-    parts = [tracks for _, tracks in found]
-    when: Ints = np.repeat([index for index, _ in found], [len(tracks) for tracks in parts]).astype(np.int64)
-    identity, label, center, size, yaw, score = (
-        stacked(parts, name) for name in ("id", "label", "center", "size", "yaw", "score")
-    )
-    image = np.full((len(when), 4), np.nan)
-    if clip.camera is not None and parts:
-        local, turned = to_sensor(clip.rotation[when], clip.translation[when], center, yaw)
-        image = clip.camera.boxes(local, size, turned, LEAST_SHOWN)[0]  # as the result files have it
-    return ResultTable(parameters.labels, when, identity, label, center, size, yaw, score, image)
+        found[index] = result.tracks
+    table = full_table(parameters.labels, found)
+    if clip.camera is None or not len(table):
+        return table
+    place = clip.rotation[table.frame], clip.translation[table.frame]
+    center, yaw = to_sensor(*place, table.center, table.yaw)
+    return replace(table, box2d=clip.camera.boxes(center, table.size, yaw, LEAST_SHOWN)[0])  # as in result files

@@ -4,7 +4,7 @@ Each figure comes from one place: R from detections minus labels, Q from the lab
 detection of each object, p_d0 and mu_c / A from the found labels and the false detections. Standard deviations are
 winsorised (`spread`), for detections and labels are wrong in a few places by much. Estimates are where a search begins,
 not where it must end: a detector's errors last over frames, labels have errors of their own, and a motion model has to
-cover what it leaves out.
+cover the rest.
 
 Detections and labels belong together in the world frame: in each frame as many pairs as possible are made within a
 distance, and of those ways the one of least total distance is taken.
@@ -34,24 +34,18 @@ from optipmb_tools.results import ResultTable
 from optipmb_tools.tuning.clips import Clip
 from optipmb_tools.tuning.values import Value, rounded, value_of
 
-WINDOW_S = 1.0
-"""Pieces of trajectories in which motion is fitted; at low frame rates four frames."""
-PAIR_LIMIT = 2.0
-"""Largest distance between a detection and its label, m; the gate where that is less."""
-MOVING = 0.5
-"""Speed from which an object moves, m/s."""
-LEAST_PAIRS = 20
-"""With fewer detections on labels there is nothing to estimate from."""
+WINDOW_S = 1.0  # pieces of trajectories in which motion is fitted; at low frame rates four frames
+PAIR_LIMIT = 2.0  # largest distance between a detection and its label, m; the gate where that is less
+MOVING = 0.5  # speed from which an object moves, m/s
+LEAST_PAIRS = 20  # with fewer detections on labels there is nothing to estimate from
 _BINS = 10
 _GAP_QUANTILE = 0.98
 _SMALL = 1e-2
-_NORMAL = 1.482602218505602
-"""Standard deviation of a Gaussian in units of its median absolute value."""
+_NORMAL = 1.482602218505602  # standard deviation of a Gaussian in units of its median absolute value
 _REACH = 3.0
 _LEAST_POINTS = 4
 GROUPS = 25
-LEAST_TRUE = 50
-"""With fewer detections on labels, of either detector, there is no curve."""
+LEAST_TRUE = 50  # with fewer detections on labels, of either detector, there is no curve
 _BOUND = 1e-6
 _DIGITS = 3
 
@@ -60,18 +54,12 @@ _DIGITS = 3
 class Trajectory:
     """One labelled object."""
 
-    frame: Ints
-    """(R,) ascending"""
-    time: Floats
-    """(R,) s"""
-    position: Floats
-    """(R, 2) m"""
-    yaw: Floats
-    """(R,) rad"""
-    velocity: Floats
-    """(R, 2) m/s; NaN where unknown"""
-    ignored: Bools
-    """(R,)"""
+    frame: Ints  # (R,) ascending
+    time: Floats  # (R,) s
+    position: Floats  # (R, 2) m
+    yaw: Floats  # (R,) rad
+    velocity: Floats  # (R, 2) m/s; NaN where unknown
+    ignored: Bools  # (R,)
 
 
 def trajectories(clip: Clip, name: str) -> dict[int, Trajectory]:
@@ -106,26 +94,16 @@ class Pairs:
     """Detections of one class, and which label each belongs to; rows are ordered by frame."""
 
     clip: str
-    frame: Ints
-    """(M,)"""
-    score: Floats
-    """(M,)"""
-    place: Floats
-    """(M, 2) in the sensor frame, m"""
-    position: Floats
-    """(M, 2)"""
-    yaw: Floats
-    """(M,)"""
-    velocity: Floats
-    """(M, 2); NaN where unknown"""
-    object: Ints
-    """(M,) id of the label; -1 for none"""
-    false: Bools
-    """(M,) belongs to no label and is not excused"""
-    truth: int
-    """Labels that count"""
-    found: int
-    """Labels that a detection belongs to"""
+    frame: Ints  # (M,)
+    score: Floats  # (M,)
+    place: Floats  # (M, 2) in the sensor frame, m
+    position: Floats  # (M, 2)
+    yaw: Floats  # (M,)
+    velocity: Floats  # (M, 2); NaN where unknown
+    object: Ints  # (M,) id of the label; -1 for none
+    false: Bools  # (M,) belongs to no label and is not excused
+    truth: int  # labels that count
+    found: int  # labels that a detection belongs to
     frames: int
 
 
@@ -138,7 +116,6 @@ def pair_detections(clip: Clip, name: str, least: float, limit: float, rules: Ru
         least: lowest score of the detections that are used.
         limit: largest distance of a pair, m.
         rules: which labels are ignored, and which detections are excused.
-
     """
     frames = clip.frames
     when: Ints = np.repeat(np.arange(len(frames)), [len(frame.score) for frame in frames]).astype(np.int64)
@@ -184,14 +161,10 @@ _COLUMNS = ("center", "size", "yaw", "velocity", "score")
 class Residuals:
     """Detections against their labels, ordered by object and then by frame."""
 
-    gap: Floats
-    """(H,) s since the detection before of the same object; NaN for the first"""
-    position: Floats
-    """(H, 2) m"""
-    heading: Floats
-    """(H,) rad in [-pi, pi)"""
-    velocity: Floats
-    """(H, 2) m/s; NaN where one of the two is unknown"""
+    gap: Floats  # (H,) s since the detection before of the same object; NaN for the first
+    position: Floats  # (H, 2) m
+    heading: Floats  # (H,) rad in [-pi, pi)
+    velocity: Floats  # (H, 2) m/s; NaN where one of the two is unknown
 
     @property
     def first(self) -> Bools:
@@ -232,10 +205,8 @@ class ScoreBin:
     low: float
     high: float
     detections: int
-    score: float
-    """Mean."""
-    precision: float
-    """Share that belongs to a label."""
+    score: float  # mean
+    precision: float  # share that belongs to a label
 
 
 @dataclass(frozen=True)
@@ -247,22 +218,14 @@ class Estimate:
     objects: int
     detections: int
     pairs: int
-    values: dict[str, Value]
-    """By path in the profile."""
-    flip_rate: float
-    """Share of detections whose heading is nearer to the opposite of the label's."""
-    lasting: float
-    """Correlation of the position errors of neighbouring detections of one object."""
-    usual_position: float
-    """Standard deviation of the usual position error, by the median, m."""
-    detection: float
-    """Share of labels found, from the score filter on."""
-    clutter: float
-    """False detections per frame, from the score filter on."""
-    clutter_area: float
-    """Area that false detections come from, m^2."""
-    longest_gap: float
-    """Nominal periods within which 98 of 100 breaks between detections of an object end."""
+    values: dict[str, Value]  # by path in the profile
+    flip_rate: float  # share of detections whose heading is nearer to the opposite of the label's
+    lasting: float  # correlation of the position errors of neighbouring detections of one object
+    usual_position: float  # standard deviation of the usual position error, by the median, m
+    detection: float  # share of labels found, from the score filter on
+    clutter: float  # false detections per frame, from the score filter on
+    clutter_area: float  # area that false detections come from, m^2
+    longest_gap: float  # nominal periods within which 98 of 100 breaks between detections of an object end
     bins: tuple[ScoreBin, ...]
     score_scale: float
     score_shift: float
@@ -289,7 +252,6 @@ def estimate(clips: Sequence[Clip], name: str, parameters: Parameters, rules: Ru
         name: the class.
         parameters: their score filter, gate, clutter rate and nominal period are used.
         rules: of the benchmark: which labels are ignored and which detections excused.
-
     """
     table = parameters.classes[name]
     paths = [trajectories(clip, name) for clip in clips]
@@ -500,16 +462,11 @@ def spread(errors: Floats) -> float:
 class Motion:
     """Motion of an object at the middles of windows of time that do not overlap."""
 
-    time: Floats
-    """(W,) s"""
-    speed: Floats
-    """(W,) along the heading, m/s"""
-    acceleration: Floats
-    """(W,) along the heading, m/s^2"""
-    heading: Floats
-    """(W,) rad, unwrapped"""
-    turn_rate: Floats
-    """(W,) rad/s"""
+    time: Floats  # (W,) s
+    speed: Floats  # (W,) along the heading, m/s
+    acceleration: Floats  # (W,) along the heading, m/s^2
+    heading: Floats  # (W,) rad, unwrapped
+    turn_rate: Floats  # (W,) rad/s
     variance: Floats
     """(W, 4) of the errors of speed, acceleration, heading and turn rate that the scatter of the points leaves"""
 
@@ -522,7 +479,6 @@ def fit_motion(time: Floats, position: Floats, yaw: Floats, window: float) -> Mo
         position: (R, 2) m.
         yaw: (R,) rad.
         window: length of a piece, s; pieces with fewer than four points are left out.
-
     """
     turned = np.unwrap(yaw)
     piece: Ints = np.floor((time - time[0]) / window + 1e-9).astype(np.int64)

@@ -15,19 +15,16 @@ import numpy as np
 
 from optipmb import Parameters
 from optipmb_tools.evaluation.calibration import CalibrationResult
-from optipmb_tools.run.bulk import Executor
 from optipmb_tools.tuning.calibrate import Ranking, calibrate, cross_calibration, rank
-from optipmb_tools.tuning.clips import Clip, Degradation, degrade
+from optipmb_tools.tuning.clips import Degradation
 from optipmb_tools.tuning.display import TrialDisplay
 from optipmb_tools.tuning.estimate import estimate
-from optipmb_tools.tuning.scoring import MARGIN, Figures, Gain, Measured, Objective, Scorer, folds_of, plain_figures
+from optipmb_tools.tuning.scoring import MARGIN, Figures, Gain, Measured, Objective, folds_of, plain_figures
 from optipmb_tools.tuning.search import Dimension, Search, Values, dimensions, penalty, repaired
 from optipmb_tools.tuning.values import Value, only, value_of, with_calibration, with_heading_sign, with_values
 
-PENALTY = 0.0005
-"""Cost of a value that is a whole range away from its start."""
-WORTH = 0.0002
-"""Least gain in the score less the margin for which a changed value is kept."""
+PENALTY = 0.0005  # cost of a value that is a whole range away from its start
+WORTH = 0.0002  # least gain in the score less the margin for which a changed value is kept
 _EVIDENCE_WEIGHTS = (0.0, 0.5, 1.0)
 _SETTLED = ("metric", "copies", "seed", "everything")
 """Settings of a plan on which the trials depend; their number is not among them, so there can be more later."""
@@ -38,16 +35,12 @@ class Plan:
     """Options of a session."""
 
     metric: str = "combination"
-    trials: int = 120
-    """Of the search on all sequences."""
-    fold_trials: int = 60
-    """Of each search with a fold left out."""
+    trials: int = 120  # of the search on all sequences
+    fold_trials: int = 60  # of each search with a fold left out
     folds: int = 3
-    copies: int = 1
-    """Degraded copies of the detections, in addition to the plain ones."""
+    copies: int = 1  # degraded copies of the detections, in addition to the plain ones
     seed: int = 0
-    everything: bool = False
-    """Search the values of the paper's table too."""
+    everything: bool = False  # search the values of the paper's table too
 
 
 @dataclass(frozen=True)
@@ -57,12 +50,9 @@ class ChangedValue:
     path: str
     start: Value
     value: Value
-    gain: float
-    """Of the objective, over putting it back."""
-    error: float
-    """Standard error of the gain."""
-    positive: int
-    """In how many of `groups` choices of sequences, each without one fold, there is a gain."""
+    gain: float  # of the objective, over putting it back
+    error: float  # standard error of the gain
+    positive: int  # in how many of `groups` choices of sequences, each without one fold, there is a gain
     groups: int
 
 
@@ -70,10 +60,8 @@ class ChangedValue:
 class Scored:
     """Figures of some sequences with the parameters of one candidate."""
 
-    figures: tuple[Figures, ...]
-    """Of each variant of the detections."""
-    value: float
-    """Of the objective."""
+    figures: tuple[Figures, ...]  # of each variant of the detections
+    value: float  # of the objective
 
 
 @dataclass(frozen=True)
@@ -97,20 +85,16 @@ class Refined:
     name: str
     plan: Plan
     sequences: tuple[str, ...]
-    parameters: Parameters
-    """With this class only."""
+    parameters: Parameters  # with this class only
     changes: tuple[ChangedValue, ...]
-    before: Scored
-    """All sequences."""
-    after: Scored
-    """The same with the new parameters; these sequences chose them."""
+    before: Scored  # all sequences
+    after: Scored  # the same with the new parameters; these sequences chose them
     folds: tuple[FoldResult, ...]
     crossed: Scored | None
     """All sequences together, each with the parameters that were found without it; None without folds."""
     calibration: CalibrationResult
     """Of all sequences, each with the calibration that the others give; one alone with its own."""
-    ranking: tuple[Ranking, ...]
-    """Scores that tracks could be ranked by; empty without a calibration."""
+    ranking: tuple[Ranking, ...]  # scores that tracks could be ranked by; empty without a calibration
     trials: int
 
     def to_json(self) -> dict[str, Any]:
@@ -163,34 +147,28 @@ def _spread(values: Sequence[float]) -> float | None:
 
 
 def refine(
-    clips: Sequence[Clip],
-    scorer: Scorer,
+    objective: Objective,
     parameters: Parameters,
     plan: Plan,
     storage: Path,
     context: Mapping[str, Any],
     display: TrialDisplay,
-    executor: Executor | None = None,
 ) -> Refined:
     """Tune one class.
 
     Args:
-        clips: with this class only.
-        scorer: of this class.
+        objective: of this class, with clips that have it only.
         parameters: where the search begins; other classes in them do not matter.
         plan: options.
         storage: the file that keeps the trials.
         context: other settings that the trials depend on, such as the names of the data.
         display: shows the progress.
-        executor: where sequences are tracked; by default in this process.
 
     Raises:
         UsageError: the storage holds trials of another session.
-
     """
-    name, base, everyone = scorer.name, only(parameters, scorer.name), tuple(range(len(clips)))
-    copies = [[degrade(clip, Degradation(), plan.seed, i) for clip in clips] for i in range(plan.copies)]
-    objective = Objective([clips, *copies], scorer, plan.metric, executor, display.note)
+    clips, scorer, name = objective.variants[0], objective.scorer, objective.scorer.name
+    base, everyone = only(parameters, name), tuple(range(len(clips)))
     groups = folds_of(objective.boxes, plan.folds)
     trials = len(groups) * plan.fold_trials + plan.trials
     display.begin(name, trials)
@@ -244,8 +222,7 @@ class Candidates:
     objective: Objective
     clips: Sequence[int]
     base: Parameters
-    note: Callable[[str], None] = lambda _: None
-    """Called with each step."""
+    note: Callable[[str], None] = lambda _: None  # called with each step
 
     def parameters(self, values: Values) -> Parameters:
         """Return the parameters of a candidate from its changed values."""
@@ -300,8 +277,7 @@ class _Session:
     storage: Path
     context: dict[str, Any]
     display: TrialDisplay
-    memory: float | None
-    """Of the evidence, for all searches; None where there is too little to calibrate."""
+    memory: float | None  # of the evidence, for all searches; None where there is too little to calibrate
     evidence_weight: float | None = None
     """In the score, for all searches: tracks that are ranked by different scores cannot be ranked together."""
 

@@ -19,15 +19,14 @@ from optipmb import Parameters, ScoreCalibration
 from optipmb_tools.datasets import DataSequence, DatasetArguments
 from optipmb_tools.files import write_whole
 from optipmb_tools.run.bulk import Executor
-from optipmb_tools.tuning.clips import Clip, load, of_class
+from optipmb_tools.tuning.clips import Clip, Degradation, degrade, load, of_class
 from optipmb_tools.tuning.display import TrialDisplay
 from optipmb_tools.tuning.estimate import Estimate, estimate, pair_all, score_curve
 from optipmb_tools.tuning.refine import Plan, Refined, refine
-from optipmb_tools.tuning.scoring import rules_of, scorer_of
+from optipmb_tools.tuning.scoring import Objective, rules_of, scorer_of
 from optipmb_tools.tuning.values import only, with_classes, with_score_calibration, with_values, write_profile
 
-Curves = dict[str, ScoreCalibration | None]
-"""By class; None where there was too little to measure one."""
+Curves = dict[str, ScoreCalibration | None]  # by class; None where there was too little to measure one
 
 
 @dataclass(frozen=True)
@@ -35,8 +34,7 @@ class Source:
     """The data."""
 
     dataset: str
-    detections: str
-    """Name of the detector."""
+    detections: str  # name of the detector
     sequences: Sequence[DataSequence]
     clips: Sequence[Clip]
     classes: tuple[str, ...]
@@ -55,7 +53,6 @@ class Source:
         Raises:
             DatasetError: a sequence has no truth.
             UsageError: a class is not in the parameters, or has no labels.
-
         """
         clips = [load(sequence, parameters, rules_of(dataset)) for sequence in sequences]
         labelled = {name for clip in clips for name in set(clip.truth.names[~clip.truth.ignored].tolist())}
@@ -80,14 +77,6 @@ class Source:
         """The data in a few words."""
         detections = f", detections {Path(self.detections).name}" if self.detections else ""
         return f"{self.dataset}{detections}, sequences {' '.join(one.name for one in self.sequences)}"
-
-
-@dataclass(frozen=True)
-class Tuned:
-    """Result of a tuning run."""
-
-    profile: Path
-    classes: dict[str, Refined]
 
 
 def estimate_all(source: Source, parameters: Parameters, out: Path) -> dict[str, Estimate]:
@@ -130,7 +119,6 @@ def calibrate_scores(
     Raises:
         DatasetError: there is no such detector, or a sequence has no truth.
         UsageError: the reference has none of the sequences, or a class is not there.
-
     """
     names = {one.name for one in sequences}
     known = [one for one in replace(data, detections=reference).open().sequences(["all"]) if one.name in names]
@@ -167,12 +155,11 @@ def tune_all(
     display: TrialDisplay,
     name: str | None = None,
     executor: Executor | None = None,
-) -> Tuned:
+) -> dict[str, Refined]:
     """Tune every class, and write `report.json` and `tuned.toml`, a profile with a name of one's own or the old one's.
 
     Raises:
         UsageError: the folder has trials of other data or options.
-
     """
     out.mkdir(parents=True, exist_ok=True)
     results = {}
@@ -185,7 +172,9 @@ def tune_all(
             "detected": _sum(source.of_class(label)),
         }
         clips = source.of_class(label)
-        results[label] = refine(clips, scorer, parameters, plan, out / "trials.db", context, display, executor)
+        copies = [[degrade(clip, Degradation(), plan.seed, i) for clip in clips] for i in range(plan.copies)]
+        objective = Objective([clips, *copies], scorer, plan.metric, executor, display.note)
+        results[label] = refine(objective, parameters, plan, out / "trials.db", context, display)
     _write_json(out / "report.json", {name: one.to_json() for name, one in results.items()})
     scope = "all parameters" if plan.everything else "noise, birth spread, area, forgetting"
     held_out = (
@@ -197,9 +186,9 @@ def tune_all(
         f" {plan.copies} degraded copies; seed {plan.seed}."
     )
     tables = {name: one.parameters for name, one in results.items()}
-    profile = out / "tuned.toml"
-    write_profile(profile, with_classes(parameters, tables, name or _named(parameters, "tuned"), provenance))
-    return Tuned(profile, results)
+    title = name or _named(parameters, "tuned")
+    write_profile(out / "tuned.toml", with_classes(parameters, tables, title, provenance))
+    return results
 
 
 def _sum(clips: Sequence[Clip]) -> list[float]:

@@ -53,10 +53,8 @@ METRICS: Mapping[str, str] = {
 }
 _SINGLE = {"samota": "sAMOTA", "amota": "AMOTA", "mota": "MOTA", "hota": "HOTA"}
 _SWITCH = 0.1
-MARGIN_FOLDS = 5
-"""Folds of sequences for the standard error."""
-MARGIN = 1.0
-"""Standard errors that are subtracted from a gain."""
+MARGIN_FOLDS = 5  # folds of sequences for the standard error
+MARGIN = 1.0  # standard errors that are subtracted from a gain
 _REMEMBERED = 6
 _NOTHING = 1e-9
 
@@ -85,26 +83,19 @@ def plain_figures(figures: Figures) -> dict[str, float | int | None]:
 class Measured:
     """One sequence: truth and tracks with the pairs that may match."""
 
-    case: Case
-    """By the rules of the benchmark."""
-    near: Case
-    """By the distance of the centres, for HOTA."""
-    official: Case | None = None
-    """By the rules of the nuScenes benchmark."""
+    case: Case  # by the rules of the benchmark
+    near: Case  # by the distance of the centres, for HOTA
+    official: Case | None = None  # by the rules of the nuScenes benchmark
 
 
 @dataclass(frozen=True)
 class Scorer:
     """Compares tracks with the truth, for one class."""
 
-    name: str
-    """The class."""
-    rules: Rules
-    """Which labels are ignored, and which tracks are excused."""
-    near: Rules
-    """By the distance of centres, for HOTA."""
-    scenes: Mapping[str, NuScenesScene] | None = None
-    """By sequence, where the nuScenes benchmark gives the figures."""
+    name: str  # the class
+    rules: Rules  # which labels are ignored, and which tracks are excused
+    near: Rules  # by the distance of centres, for HOTA
+    scenes: Mapping[str, NuScenesScene] | None = None  # by sequence, where the nuScenes benchmark gives the figures
 
     @property
     def config(self) -> NuScenesConfig:
@@ -196,7 +187,6 @@ def folds_of(weights: Sequence[int], count: int) -> list[tuple[int, ...]]:
     Args:
         weights: of the sequences, such as their number of truth boxes.
         count: number of folds; fewer when fewer sequences have any weight, and none when only one has.
-
     """
     heavy = sorted((i for i, weight in enumerate(weights) if weight), key=lambda i: (-weights[i], i))
     count = min(count, len(heavy))
@@ -219,7 +209,6 @@ def standard_error(gains: Floats) -> float:
 
     Args:
         gains: of all sequences, and of the sequences without each fold.
-
     """
     count = len(gains) - 1
     return math.sqrt((count - 1) * float(np.var(gains[1:]))) if count else 0.0
@@ -229,13 +218,10 @@ def standard_error(gains: Floats) -> float:
 class Gain:
     """Gain of one set of parameters over another."""
 
-    value: float
-    """Score of the first, over all sequences."""
+    value: float  # score of the first, over all sequences
     gain: float
-    error: float
-    """Standard error of the gain."""
-    positive: int
-    """In how many of `groups` choices of sequences, each without one fold, there is a gain."""
+    error: float  # standard error of the gain
+    positive: int  # in how many of `groups` choices of sequences, each without one fold, there is a gain
     groups: int
 
     @property

@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from optipmb_client.errors import ClientError, UsageError
-from optipmb_schemas.installation import install_command
+from optipmb_client.errors import UsageError
 
 from optipmb import Parameters
+from optipmb_tools.extras import needed
 from optipmb_tools.tuning.clips import Clip
 from optipmb_tools.tuning.values import Value, rounded, value_of
 
@@ -75,12 +75,9 @@ _CLOUD = ("expected_points", "detection_floor")
 
 _TPE_EVERY = 6
 _TPE_WARMUP = 4
-_SPREAD = 0.15
-"""Standard deviation of a small move, as a share of the range."""
-_MOVED = (0.5, 0.3, 0.2)
-"""Probabilities that a move changes one value, two, three."""
-_KEPT_PERCENT = 25.0
-"""A trial continues while its score is among the best so many percent."""
+_SPREAD = 0.15  # standard deviation of a small move, as a share of the range
+_MOVED = (0.5, 0.3, 0.2)  # probabilities that a move changes one value, two, three
+_KEPT_PERCENT = 25.0  # a trial continues while its score is among the best so many percent
 
 
 @dataclass(frozen=True)
@@ -131,7 +128,6 @@ def dimensions(
         estimated: other values to begin with, by path.
         clips: values that have no effect on them, such as those about velocities without any, are left out.
         everything: also the values of the paper's table.
-
     """
     known = [np.isfinite(frame.velocity).all(axis=1) for clip in clips for frame in clip.frames]
     velocities = any(row.any() for row in known)
@@ -239,7 +235,6 @@ class Search:
             trials: in all, earlier sessions included.
             score: the score of values.
             on_trial: called after each trial with the best score so far.
-
         """
         for number in range(len(self.trials), trials):
             rng = np.random.Generator(np.random.PCG64([self._seed, number]))
@@ -289,11 +284,10 @@ class Search:
 
 
 def _load_optuna() -> Any:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            import optuna  # noqa: PLC0415  an extra that only this needs
-    except ImportError as error:
-        raise ClientError(f"tuning needs optuna, which is not installed: {install_command('tune')}") from error
+    needed("tuning", "tune", "optuna")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import optuna  # noqa: PLC0415  an extra that only this needs
+
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     return optuna

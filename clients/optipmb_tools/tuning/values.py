@@ -38,7 +38,6 @@ def with_values(parameters: Parameters, name: str, values: Mapping[str, Value | 
 
     Raises:
         UsageError: there is no such parameter, or a value is not allowed.
-
     """
     document = parameters.model_dump()
     for path, value in values.items():

@@ -28,8 +28,7 @@ _ROWS = (
     *("", "adp", "rpp", "ote", "habm", "adp rpp", "rpp ote", "adp ote", "adp habm", "habm rpp", "habm ote"),
     *("adp rpp ote", "adp habm rpp", "habm rpp ote", "adp habm ote", "adp habm rpp ote"),
 )
-ROWS = tuple(frozenset(row.split()) for row in _ROWS)
-"""The modules that are on, in the order of the paper's table."""
+ROWS = tuple(frozenset(row.split()) for row in _ROWS)  # the modules that are on, in the order of the paper's table
 
 
 @dataclass(frozen=True)
@@ -46,8 +45,7 @@ class Row:
 
     variant: Variant
     classes: dict[str, Figures]
-    overall: Figures
-    """Means over the classes; counts are sums."""
+    overall: Figures  # means over the classes; counts are sums
     frames_per_second: float
 
     def to_json(self) -> dict[str, Any]:
@@ -69,7 +67,6 @@ def sweep(parameters: Parameters, classes: Sequence[str], path: str, values: Seq
 
     Raises:
         UsageError: there is no such parameter, or a value is not allowed.
-
     """
     variants = []
     for value in values:
@@ -87,7 +84,6 @@ def measure_variants(source: Source, variants: Sequence[Variant], on_clip: Calla
         source: the data; its classes are reported, all classes of the parameters are tracked.
         variants: with the classes of the source's clips.
         on_clip: called with the frames of each clip of each variant when it is tracked.
-
     """
     scorers = [scorer_of(source.dataset, name, source.sequences) for name in source.classes]
     warm_up()
@@ -118,10 +114,9 @@ def write_sweep(folder: Path, result: Mapping[str, Any], *, picture: bool) -> No
 
     Args:
         folder: is made where it is not there.
-        result: `sweeps` has for each parameter its `values`, those of the `profile` by class, and `figures`: by class
-            a mapping for each value.
+        result: `sweeps` has for each parameter its `values`, the profile's own by class (`profile`), and `figures`: by
+            class a mapping for each value.
         picture: whether to draw.
-
     """
     folder.mkdir(parents=True, exist_ok=True)
     rows = [

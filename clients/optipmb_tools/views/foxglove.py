@@ -43,7 +43,7 @@ from foxglove.messages import (
 from optipmb_client.errors import UsageError
 from optipmb_schemas import Detections, Message, Points, Problem, Tracks
 
-from optipmb_tools.geometry import rotation_of, to_world
+from optipmb_tools.geometry import rotation_of, shown_boxes, to_world
 from optipmb_tools.views.colours import rgb_of
 
 FRAME: Final = "world"
@@ -77,7 +77,7 @@ class Shown(NamedTuple):
 
 
 class FoxgloveMessages:
-    """Converts messages; remembers which tracks of each stream are shown, to delete those that end."""
+    """Converts messages; remembers which tracks of each stream are shown, to delete ended ones."""
 
     def __init__(self) -> None:
         self._shown: dict[str, set[int]] = {}
@@ -168,12 +168,13 @@ def _figures(tracks: Tracks) -> bytes:
 
 def _boxes(detections: Detections) -> SceneUpdate:
     """Return one entity with all boxes: each update replaces the previous one."""
-    center, yaw = detections.center, detections.yaw
+    size, yaw = shown_boxes(detections)
+    center = np.nan_to_num(detections.center)
     if detections.frame == "sensor" and (pose := detections.pose) is not None:
         center, yaw = to_world(rotation_of(pose.quaternion), pose.translation, center, yaw)
     cubes = [
-        CubePrimitive(pose=_pose(place, turn), size=_vector(size), color=GREY)
-        for place, turn, size in zip(center.tolist(), yaw.tolist(), detections.size.tolist(), strict=True)
+        CubePrimitive(pose=_pose(place, turn), size=_vector(sides), color=GREY)
+        for place, turn, sides in zip(center.tolist(), yaw.tolist(), size.tolist(), strict=True)
     ]
     stamp = _stamp(detections.stamp_ns)
     return SceneUpdate(entities=[SceneEntity(timestamp=stamp, frame_id=FRAME, id="detections", cubes=cubes)])

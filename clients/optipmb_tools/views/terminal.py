@@ -28,7 +28,7 @@ RECENT_S = 30.0  # how long a problem is new
 LATE_MS = 50.0  # latency that is worth a colour
 VERY_LATE_MS = 200.0
 SHOWN_PROBLEMS = 6
-FIGURES = 38  # characters of the columns that even a narrow view has beside the stream
+FIGURES = 38  # characters of the columns of a narrow view without the stream
 FRAME_LINES = 6  # lines of the view that are neither services, streams nor problems
 # Columns that a narrow terminal does not show, the first ones first
 SPARE = {

@@ -15,7 +15,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from optipmb_schemas import Density, Detections, Message, Points, Tracks
 
-from optipmb_tools.geometry import Floats, rotation_of
+from optipmb_tools.geometry import Floats, rotation_of, shown_boxes
 from optipmb_tools.views.colours import rgb_of
 
 TRAIL_S: Final = 5.0
@@ -144,11 +144,12 @@ class View:
 
     def _show_detections(self, detections: Detections) -> None:
         name = detections.stream
-        center, turn = _to_world(detections, detections.center)
+        center, turn = _to_world(detections, np.nan_to_num(detections.center))
+        size, yaw = shown_boxes(detections)
         boxes = rr.Boxes3D(
             centers=center,
-            half_sizes=0.5 * detections.size,
-            quaternions=_turned(detections.yaw + turn),
+            half_sizes=0.5 * size,
+            quaternions=_turned(yaw + turn),
             colors=GREY,
             radii=0.5 * LINE,
         )

@@ -211,7 +211,7 @@ def _tracks(fields: Any, limits: Limits) -> EncodedTracks | None:
     Fields that are not known here are of a newer version, and are left out.
     """
     scalars = {name: value for name in _SCALARS if (value := getattr(fields, name)) is not UNSET}
-    if len(fields.labels) > limits.max_labels or None in scalars.values():
+    if len(fields.labels) > limits.max_labels or None in scalars.values() or "relocation" in scalars:
         return None
     (rows,), (horizons,) = fields.id.shape, fields.horizons.shape or (0,)
     if not (0 <= rows <= limits.max_tracks and 0 <= horizons <= limits.max_horizons):

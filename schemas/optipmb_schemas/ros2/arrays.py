@@ -42,9 +42,9 @@ class Boxes:
     center: NDArray[np.float64]
     """(M, 3) m."""
     size: NDArray[np.float64]
-    """(M, 3) length, width, height, m."""
+    """(M, 3) length, width, height, m; NaN where unknown, 0 in the message."""
     yaw: NDArray[np.float64]
-    """(M,) rad."""
+    """(M,) rad; NaN where unknown: a quaternion of zeros, or `orientation_availability` is `UNAVAILABLE`."""
     score: NDArray[np.float64]
     """(M,) in [0, 1]; an object of score 0 is left out and counted by the service."""
     velocity: NDArray[np.float64] | None
@@ -184,13 +184,14 @@ def _of_autoware(number: int, detected: Any) -> _Row:
     if kinematics.has_twist:
         twist = f"{path}.kinematics.twist_with_covariance.twist.linear"
         along, across, _ = _vector(twist, kinematics.twist_with_covariance.twist.linear)
-        cos, sin = math.cos(yaw), math.sin(yaw)  # the twist is in the frame of the object
+        turn = 0.0 if math.isnan(yaw) else yaw  # the twist is in the frame of the object
+        cos, sin = math.cos(turn), math.sin(turn)
         velocity = (cos * along - sin * across, sin * along + cos * across)
     return _Row(
         label=CLASS_NAMES.get(int(best.label), "unknown"),
         center=center,
         size=size,
-        yaw=yaw,
+        yaw=yaw if kinematics.orientation_availability else math.nan,
         score=_score(f"{path}.existence_probability", score),
         covariance=_covariance(f"{where}.covariance", kinematics.pose_with_covariance.covariance)
         if kinematics.has_position_covariance
@@ -218,7 +219,8 @@ def _shape(path: str, shape: Any, center: list[float], yaw: float) -> tuple[list
     low, high = corners.min(axis=0), corners.max(axis=0)
     length, width = (high - low).tolist()
     along, across = ((high + low) / 2).tolist()
-    cos, sin = math.cos(yaw), math.sin(yaw)
+    turn = 0.0 if math.isnan(yaw) else yaw
+    cos, sin = math.cos(turn), math.sin(turn)
     moved = [center[0] + cos * along - sin * across, center[1] + sin * along + cos * across, center[2]]
     return moved, [length, width, height]
 
@@ -234,9 +236,9 @@ def _vector(path: str, value: Any) -> list[float]:
 def _size(path: str, value: Any) -> list[float]:
     size = _vector(path, value)
     for axis, number in zip("xyz", size, strict=True):
-        if number <= 0:
-            raise invalid(f"{path}.{axis}", "a positive length", number)
-    return size
+        if number < 0:
+            raise invalid(f"{path}.{axis}", "a positive length, or 0 where unknown", number)
+    return [number or math.nan for number in size]
 
 
 def _covariance(path: str, value: Any) -> Sequence[float]:
@@ -253,8 +255,10 @@ def _score(path: str, value: float) -> float:
 
 
 def _yaw(path: str, value: Any) -> float:
-    """Return the direction of the x axis of a rotation, seen from above."""
+    """Return the direction of the x axis of a rotation, seen from above; NaN of a quaternion of zeros."""
     w, x, y, z = float(value.w), float(value.x), float(value.y), float(value.z)
+    if w == x == y == z == 0.0:
+        return math.nan
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     if not abs(norm - 1) <= _NORM:
         raise invalid(path, "a unit quaternion", f"norm {norm:.6g}")

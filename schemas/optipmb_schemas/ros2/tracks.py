@@ -52,7 +52,7 @@ STANDING: Final = 0.3
 
 _CLASSES: Final = {name: number for number, name in CLASS_NAMES.items()} | {"cyclist": 6, "van": 1}
 """Autoware's numbers by lower-case class names, KITTI's among them; 0 is unknown."""
-_SIGN_UNKNOWN, _SIGN_KNOWN = 1, 2
+_UNAVAILABLE, _SIGN_UNKNOWN, _SIGN_KNOWN = 0, 1, 2
 _SIZE: Final = 6
 _X, _Y, _SPEED, _HEADING, _TURN, _ACCELERATION = range(_SIZE)
 _DELETE_ALL: Final = 3
@@ -83,7 +83,7 @@ def messages(types: Types, tracks: Tracks, stamp_ns: int, frame: str, stream: st
     """
     header = header_of(stamp_ns, frame)
     key = hashlib.blake2b(stream.encode(), digest_size=8).digest()
-    at = np.flatnonzero(np.isin(tracks.horizons, HORIZONS)) if has_paths(tracks) else None  # type: ignore[arg-type]
+    at = np.flatnonzero(np.isin(tracks.horizons, HORIZONS)) if has_paths(tracks) else None  # type: ignore[arg-type]  # then it has horizons
     found: dict[str, list[Fields]] = {end: [] for end in TOPICS}
     stamped = {"header": header, "texture": {"header": header}}
     clear = {"action": _DELETE_ALL, "pose": _pose([0.0, 0.0, 0.0], 0.0), "color": {"a": 1.0}}
@@ -97,8 +97,10 @@ def messages(types: Types, tracks: Tracks, stamp_ns: int, frame: str, stream: st
         found["/predicted"].append(objects | {"kinematics": predicted | {"predicted_paths": _paths(tracks, row, at)}})
         confidence = getattr(tracks, "heading_confidence", None)
         faces = confidence is None or confidence[row] >= FACES
+        known = getattr(tracks, "measured", None)
+        unavailable = known is not None and not int(known[row]) & 1
         tracked |= {
-            "orientation_availability": _SIGN_KNOWN if faces else _SIGN_UNKNOWN,
+            "orientation_availability": _UNAVAILABLE if unavailable else _SIGN_KNOWN if faces else _SIGN_UNKNOWN,
             "is_stationary": math.hypot(*tracks.velocity[row].tolist()) < STANDING,
         }
         found[""].append(objects | {"kinematics": tracked})

@@ -22,7 +22,7 @@ from optipmb_service.stream.kept_tracks import order_of
 from optipmb_service.stream.problems import problem_of
 from optipmb_service.telemetry.health import Reporter
 from optipmb_service.telemetry.metrics import LOG_METRICS, PROBLEM_METRICS
-from optipmb_service.telemetry.problem_reporter import ProblemReporter, log_problem
+from optipmb_service.telemetry.problem_reporter import ProblemReporter
 
 if TYPE_CHECKING:
     from optipmb_client.incoming import Arrival
@@ -51,7 +51,7 @@ class LogBridge(Reporter):
         self._limits = settings.limits.limits()
         self._grace_s = settings.grace_s
         self.invalid = 0
-        self.reporter = ProblemReporter(client.publish_problem, log_problem)
+        self.reporter = ProblemReporter(client.publish_problem)
         keep: dict[Topic, Retention] = {"detections": Retention(settings.log_s, settings.log_mb * MEGABYTE)}
         if settings.log_tracks_s:
             keep["tracks"] = Retention(settings.log_tracks_s, settings.log_tracks_mb * MEGABYTE)

@@ -37,7 +37,7 @@ from optipmb_service.telemetry.metrics import (
     Metrics,
     StreamFigures,
 )
-from optipmb_service.telemetry.problem_reporter import ProblemReporter, log_problem
+from optipmb_service.telemetry.problem_reporter import ProblemReporter
 from optipmb_service.zenoh.transport import Transport
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ class Service(Reporter):
         except TransportError:
             store.close(JOIN_S)
             raise
-        self._reporter = ProblemReporter(self._transport.publish_problem, log_problem)
+        self._reporter = ProblemReporter(self._transport.publish_problem)
         self._scheduler = Scheduler()
         self._member = Member(settings.instance, store, settings.lease_s)
         self._checkpoints = CheckpointWriter(
@@ -270,46 +270,33 @@ class Service(Reporter):
                 summary = stream.summary(now_ns)
             except Exception as error:
                 log.exception("internal_error", stream=stream.name)
-                self._internal("the line of a session in the status", stream.name, f"{type(error).__name__}: {error}")
+                expected, received = "the line of a session in the status", f"{type(error).__name__}: {error}"
+                self._report("internal", stream=stream.name, expected=expected, received=received)
             else:
                 summaries += [summary] if summary is not None else []
         return tuple(summaries)
 
     def report_certificate(self, why: str) -> None:
         """Report that a certificate has ended."""
-        self._report("certificate", "certificates that hold", why, message=why)
+        self._report("certificate", expected="certificates that hold", received=why, message=why)
 
     def _report_returned(self, token: str, due: int, newest: int) -> None:
         expected, received = f"messages numbered from {due} on by Zenoh", f"numbers that began again, now {newest}"
         message = f"Publisher: expected {expected}, received {received}; remove `id` from its Zenoh configuration."
         stream = schemas.Keys(self._settings.prefix).stream_of(token)
-        self._report("numbers_back", expected, received, stream=stream, message=message)
+        self._report("numbers_back", stream=stream, expected=expected, received=received, message=message)
 
     def _report_duplicate_name(self) -> None:
-        name = self._settings.instance
+        name, expected = self._settings.instance, "a name that no other process has"
         message = f"Setting instance: another process is named {name}, too; give each a name of its own."
-        self._report("duplicate_name", "a name that no other process has", name, path="instance", message=message)
+        self._report("duplicate_name", path="instance", expected=expected, received=name, message=message)
 
     def _unkept(self, stream: str, why: str) -> None:
         """Report that the state of a stream cannot be kept."""
-        self._internal("a state that can be written down", stream, why)
+        self._report("internal", stream=stream, expected="a state that can be written down", received=why)
 
-    def _internal(self, expected: str, stream: str, received: str) -> None:
-        message = f"Stream: expected {expected}, received {received}."
-        self._report("internal", expected, received, stream=stream, message=message)
-
-    def _report(
-        self, code: str, expected: str, received: str, *, message: str, stream: str = "", path: str = ""
-    ) -> None:
-        problem = problem_of(
-            code,
-            stream=stream,
-            instance=self._settings.instance,
-            path=path,
-            expected=expected,
-            received=received,
-            message=message,
-        )
+    def _report(self, code: str, *, stream: str = "", **texts: str) -> None:
+        problem = problem_of(code, subject="Stream", stream=stream, instance=self._settings.instance, **texts)
         self._reporter.report(problem, time.monotonic_ns())
 
     def _figures(self) -> StreamFigures:

@@ -121,7 +121,7 @@ async def _serve(
     settle()
     watching = loop.create_task(watch_keys(asked, lambda: service.key_numbers, settings.restart_keys))
     with grpc_edge(settings, service.client(), health.metrics):
-        # In this order: messages may come as soon as the ready line is out, and this event precedes those of sessions.
+        # In this order: messages may come as soon as the ready line is out, after this event come those of sessions.
         log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
         if parent is None:
             say_ready("instance", settings.instance, (*settings.endpoints, *settings.connect))
@@ -162,8 +162,7 @@ def warm_up(private: Path | None = None) -> None:
 def _release_compiler() -> None:
     """Give back the pages of the compiler's code: 52 of 205 MB, read to load the kernels and not read again.
 
-    They are a file's, never written to, so the next use, should there be one, reads them anew. Where this is not Linux
-    they stay.
+    They map a file and are never written to: a later use reads the file again. On other systems than Linux they stay.
     """
     if sys.platform != "linux":
         return

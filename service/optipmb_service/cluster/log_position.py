@@ -3,17 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
-
-
-class _Message(Protocol):
-    @property
-    def epoch(self) -> bytes: ...
-    @property
-    def seq(self) -> int: ...
 
 
 @dataclass(frozen=True)
@@ -32,9 +25,9 @@ class Position:
     seq: int
     tracked: bool
 
-    def before(self, message: _Message) -> bool:
-        """Return whether a message is not later than this."""
-        return message.epoch in self.epochs or (message.epoch == self.epoch and message.seq <= self.seq)
+    def covers(self, epoch: bytes, seq: int) -> bool:
+        """Return whether a frame is not later than this one."""
+        return epoch in self.epochs or (epoch == self.epoch and seq <= self.seq)
 
 
 @dataclass(frozen=True)

@@ -397,7 +397,10 @@ class LogReader:
         self, stream: str, position: Position | None, following: dict[str, int | None], messages: list[LogMessage]
     ) -> None:
         """Append the messages of a stream from the number on that follows the last read; note the next one."""
-        before = (lambda _: False) if position is None else position.before
+
+        def before(message: LogMessage) -> bool:
+            return position is not None and position.covers(message.epoch, message.seq)
+
         number = following.get(stream)
         if number is None:
             back_s = max(OUTAGE_S, self._back_s) if position and position.tracked else self._back_s

@@ -51,7 +51,7 @@ KEY: Final = "key.pem"
 
 _JWT: Final = re.compile(r"-+BEGIN NATS USER JWT-+\s+(\S+)\s+-+END")
 _SEED: Final = re.compile(r"-+BEGIN USER NKEY SEED-+\s+(\S+)\s+-+END")
-_SEED_BYTES: Final = 36  # of a user's seed: two that say what it is, the seed, a checksum
+_SEED_BYTES: Final = 36  # of a user's seed: a prefix of two, the seed, a checksum
 
 
 class RefusedError(Exception):

@@ -78,7 +78,7 @@ class MemberLocks:
         self._file: IO[bytes] | None = None
 
     def is_free(self, member: str) -> bool:
-        """Return whether nobody holds the lock of a member. A file that is missing says nothing about its process."""
+        """Return whether the lock of a member is free. A missing file says nothing about its process."""
         if member == self._member or self._folder is None:
             return False
         try:
@@ -131,7 +131,7 @@ class MemberLocks:
 
 
 def in_use(path: Path) -> bool:
-    """Return whether a member lives that keeps its leases beside a file of checkpoints."""
+    """Return whether a living member has its leases in the folder of a file of checkpoints."""
     for lock in path.with_name(MEMBERS).glob("*"):
         with contextlib.suppress(OSError):  # it has gone meanwhile
             if _locked(lock):
@@ -356,7 +356,7 @@ class SqliteStore:
     def put(self, write: Write) -> int | None:
         """Write a record; return its revision, None when the one to be replaced is not the newest.
 
-        With its first record a member takes its lock, and the last one, its own or that of another member, removes it.
+        A member takes its lock with its first record; its last record, its own or another member's, removes it.
         """
         kind, _, name = write.key.partition("/")
         begins = kind == "member" and write.over == 0 and write.value != ENDED
@@ -375,7 +375,7 @@ class SqliteStore:
         return int(last) + 1
 
     def gone(self, member: str) -> bool:
-        """Return whether nobody holds the lock of a member. A file that is missing says nothing about its process."""
+        """Return whether the lock of a member is free. A missing file says nothing about its process."""
         return self._locks.is_free(member)
 
     def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:

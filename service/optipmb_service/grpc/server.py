@@ -25,7 +25,7 @@ from optipmb_service.grpc import inputs, outputs
 from optipmb_service.grpc.access import Access, credentials
 from optipmb_service.grpc.calls import Call, CallerGoneError, EndCall, ending_with_caller
 from optipmb_service.grpc.network import Network
-from optipmb_service.telemetry.problem_reporter import ProblemReporter, log_problem
+from optipmb_service.telemetry.problem_reporter import ProblemReporter
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
@@ -116,7 +116,7 @@ class Server:
         self.limits = settings.limits.limits()
         self.network = Network(client, self._invalid)
         self._calls: set[Call] = set()
-        self._reporter = ProblemReporter(client.publish_problem, log_problem)
+        self._reporter = ProblemReporter(client.publish_problem)
         self._most = settings.grpc_calls
         self._access = Access(
             certificates=settings.grpc_tls is not None, names=settings.grpc_names, tokens=settings.grpc_tokens
@@ -203,7 +203,7 @@ class Server:
                 except EndCall as raised:
                     end = raised
                 if end is not None:
-                    # A request may be 32 MB, and the frames of what it has raised hold it until the next collection.
+                    # A request may be 32 MB, and the frames of its exceptions hold it until the next collection.
                     end.__traceback__ = end.__context__ = end.__cause__ = None
                     code = end.code.name
                     status = end.status()

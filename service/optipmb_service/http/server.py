@@ -243,5 +243,5 @@ class _Connection(H11Protocol):
         return self.cycle is not None and not self.cycle.response_complete
 
     def _end_without_request(self) -> None:
-        if self.headers is None:  # its type says that it never is
-            self.transport.abort()  # type: ignore[unreachable]
+        if self.headers is None:
+            self.transport.abort()  # type: ignore[unreachable]  # uvicorn types the headers as always there

@@ -8,7 +8,7 @@ A message of a topic goes to `<domain>/<topic>/<type>/<hash>`. Nodes and endpoin
 in which `%` stands for `/`. Quality of service is `reliability:durability:history,depth:deadline:lifespan:liveliness`
 as numbers of rmw, empty where it is the default. Humble has no hashes of types and writes `TypeHashNotSupported`.
 
-rmw_zenoh delivers whatever the quality of service, and a type with another definition has another key, so its messages
+rmw_zenoh delivers with any quality of service, and a type with another definition has another key, so its messages
 do not arrive. `Matching` reports what DDS would refuse.
 """
 
@@ -63,7 +63,7 @@ def ros_type(name: str) -> str:
 
 @dataclass(frozen=True)
 class Qos:
-    """Quality of service, as DDS has it: the offer must be at least what is asked for."""
+    """Quality of service, as DDS has it: the offer must reach the request."""
 
     reliable: bool = True
     transient_local: bool = False

@@ -40,6 +40,7 @@ from optipmb_service.stream.values import (
     SensorName,
     Whole,
 )
+from optipmb_service.stream.worlds import Worlds  # noqa: TC001 - pydantic reads the annotation
 from optipmb_service.telemetry.stream_meter import MAX_COUNT
 
 if TYPE_CHECKING:
@@ -231,8 +232,9 @@ def _packed(value: Any) -> Any:
     if isinstance(value, FilterState):
         density, sensors = value.density, dict(sorted(value.sensors.items()))
         clock = {"stamp_ns": density.stamp_ns, "next_id": density.next_id}
-        if table["zones"] is None:
-            del table["zones"]
+        for name in ("zones", "worlds"):
+            if table[name] is None:
+                del table[name]
         return clock | table | {"density": optipmb.bytes_of(density), "sensors": sensors}
     return table
 
@@ -279,6 +281,7 @@ class _State(BaseModel):
     counts: FrameCounts
     sensors: Annotated[dict[SensorName, SensorState], Field(max_length=MAX_SENSORS)]
     zones: _Zones | None = None
+    worlds: Worlds | None = None
 
 
 class _Frame(BaseModel):

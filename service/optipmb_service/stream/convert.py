@@ -17,6 +17,7 @@ import optipmb_schemas as schemas
 
 import optipmb
 from optipmb.frame import frame_of_checked
+from optipmb.table import ClassTable
 from optipmb_service.stream.values import Tracked
 
 if TYPE_CHECKING:
@@ -124,7 +125,7 @@ def density_of(
         weight=poisson.weight,
         mean=poisson.mean,
         covariance=poisson.covariance,
-        z=poisson.auxiliary[:, 3],
+        z=ClassTable.of(parameters).known_boxes(poisson.label, poisson.auxiliary)[:, 3],
     )
 
 
@@ -153,8 +154,8 @@ def tracks_of(result: optipmb.StepResult, stream: str, frame_id: FrameId, **fiel
         **fields,
     }
     others: dict[str, Any] = {}
-    if result.class_probability is not None:
-        others |= schemas.class_fields(result.class_probability)
+    if result.measured is not None or result.class_probability is not None:
+        others |= schemas.track_fields(measured=result.measured, class_probability=result.class_probability)
     if (paths := result.paths) is not None:
         others |= schemas.path_fields(paths.horizons, paths.mean, paths.covariance)
     if not optipmb.sound(tracks):

@@ -7,6 +7,7 @@ turn comes.
 
 from __future__ import annotations
 
+import math
 import zlib
 from array import array
 from bisect import insort
@@ -14,6 +15,7 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final
 
+import optipmb
 from optipmb_service.stream.state import size_of
 from optipmb_service.stream.timeline import JUMP_FRAMES, WINDOW, FusedTimeline, Order, Verdict
 from optipmb_service.stream.values import SECOND
@@ -45,6 +47,9 @@ SHORTEST_ARRIVAL_NS: Final = SECOND // 10
 """Frames that all came within less time are from a cache: their arrival tells nothing."""
 
 UNITS: Final = {"microseconds": 10**3, "milliseconds": 10**6, "seconds": 10**9}
+
+STEADY: Final = (1.0, 5.0, math.radians(1.0), 0.5)
+"""How far a pose may be from where the motion of a sensor leads: m, m/s^2, rad and rad/s^2."""
 
 CERTAIN: Final = 3.0
 """Factor by which the ratio of arrival and stamps may differ from that of a unit."""
@@ -107,6 +112,7 @@ class SensorQueue:
         self._behind = False
         self.clouds = CloudBuffer(policy.clouds, policy.cloud_bytes)
         self.stamps = StampCheck()
+        self.poses = PoseCheck()
         self._checksums = b"", array("I")
         """Epoch of the newest publisher, and the checksums of its newest frames, by number."""
         self._claim = b"", -1, 0, 0
@@ -362,3 +368,54 @@ class StampCheck:
                     f"{CHECKED_FRAMES} frames in {took_ns / SECOND:.1f} s, {advance_ns} apart: stamps look like {unit}"
                 )
         return ""
+
+
+class PoseCheck:
+    """Check that the poses of a sensor go on as it moves; it decides about nothing but a report.
+
+    A sensor moves with the velocity and turn rate of its last two poses, and may change them within `STEADY`.
+    """
+
+    def __init__(self) -> None:
+        self._world = self._astray = 0
+        self._last: tuple[int, optipmb.Relocation] | None = None
+        self._rate: optipmb.Relocation | None = None
+
+    def add(self, message: schemas.Detections, policy: Policy) -> str:
+        """Return the jump of the pose of a frame that was not announced; empty without one.
+
+        Poses that the sensor cannot have reached are refused elsewhere.
+        """
+        if message.pose is None:
+            return ""
+        (x, y, height), (w, _, _, z) = message.pose.translation.tolist(), message.pose.quaternion.tolist()
+        here = optipmb.Relocation(x, y, height, 2.0 * math.atan2(z, w))
+        world = self._world if message.relocation is None else message.relocation.world
+        if self._last is None or world != self._world or self._astray >= policy.astray_frames:
+            self._world, self._astray, self._last, self._rate = world, 0, (message.stamp_ns, here), None
+            return ""
+        then_ns, there = self._last
+        dt = (message.stamp_ns - then_ns) / SECOND
+        if dt <= 0.0:
+            return ""
+        rate = _difference(here, there, 1.0 / dt) if self._rate is None else self._rate
+        ahead = optipmb.Relocation(*(one + dt * change for one, change in zip(there, rate, strict=True)))
+        x, y, height, turn = _difference(here, ahead)
+        far, (metres, acceleration, angle, change) = math.hypot(x, y, height), STEADY
+        if policy.max_speed and math.dist(here[:3], there[:3]) > policy.pose_margin + policy.max_speed * dt:
+            self._astray += 1
+            return ""
+        self._astray, self._last = 0, (message.stamp_ns, here)
+        if far <= metres + acceleration * dt * dt and abs(turn) <= angle + change * dt * dt:
+            self._rate = _difference(here, there, 1.0 / dt)
+            return ""
+        motion = optipmb.Relocation(0.0, 0.0, 0.0, turn)
+        self._rate = optipmb.Relocation(*motion.place(rate[:3]), rate.theta)
+        shift = [f"{one - other:.3f}" for one, other in zip(here, motion.place(ahead[:3]), strict=False)]
+        jump = f"{far:.2f} m and {math.degrees(turn):.2f} degrees"
+        return f"a jump by {jump}, as of a motion by [{', '.join(shift)}] m and {turn:.5f} rad"
+
+
+def _difference(one: optipmb.Relocation, other: optipmb.Relocation, factor: float = 1.0) -> optipmb.Relocation:
+    x, y, z, theta = (factor * (a - b) for a, b in zip(one, other, strict=True))
+    return optipmb.Relocation(x, y, z, factor * math.remainder(theta / factor, 2.0 * math.pi))

@@ -50,6 +50,10 @@ CODES: Final = {
         "The sensor cannot have reached this pose since its last frame; the frame is refused.",
         "Check the localisation; if it is right, raise `max_speed`.",
     ),
+    "world_jump": (
+        "The pose is not where the sensor was moving. The frame is used, and tracks may end: their world has moved.",
+        "Announce motions of the world as `relocation`. Otherwise check the localisation.",
+    ),
     "time_jump": (
         "The stamp is over `gap_limit_s` ahead or `rewind_s` behind; frames are refused until three in a row agree.",
         "Check the sensor's clock.",

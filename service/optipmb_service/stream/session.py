@@ -619,6 +619,9 @@ class Session:
         if found := queue.stamps.add(frame_id.stamp_ns, since_ns):
             expected = "stamps in nanoseconds that advance with time"
             outputs.append(self._problem("clock", frame_id, "stamp_ns", expected, found))
+        if self._policy.jumps == "report" and (found := queue.poses.add(message, self._policy)):
+            expected = "a pose where the motion of the sensor leads, or a `relocation`"
+            outputs.append(self._problem("world_jump", frame_id, "pose", expected, found))
         if (
             frame_id.seq % SCORED_EVERY == 0 and not self.parameters.self_calibration
         ):  # which never filters the upper half of a class
@@ -750,7 +753,7 @@ class Session:
             outputs.append(self._problem("no_pose", frame_id, "pose", "the pose of a sensor that moves", received))
         step_ns = (self._clock() - began_ns) // max(1, len(outcomes))
         for one in outcomes:
-            if (one.unknown or one.tracks is None) and not one.frame.revision:
+            if (one.unknown or one.fault or one.tracks is None) and not one.frame.revision:
                 outputs += self._left_out(one)
             if (tracks := one.tracks) is not None:
                 self._deliveries.corrected += one.frame.revision > 0
@@ -829,7 +832,9 @@ class Session:
             self._problem("unknown_class", frame.frame_id, "labels", expected, repr(label), count)
             for label, count in (outcome.unknown or {}).items()
         ]
-        if outcome.tracks is not None:
+        if (fault := outcome.fault) is not None:
+            problems.append(self._problem("invalid_value", frame.frame_id, fault.path, fault.expected, fault.received))
+        if outcome.tracks is not None or fault is not None:
             return problems
         if frame.place.opens is Verdict.UNCONFIRMED:
             expected = f"a stamp near the one before, or {JUMP_FRAMES} frames in a row that agree on the jump"

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     import optipmb
     from optipmb.zones import ZoneState
+    from optipmb_service.stream.worlds import Worlds
 
 ClassName = Annotated[str, Field(strict=True, max_length=64)]
 _Metres = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -107,6 +108,7 @@ class FilterState:
         counts: of the frames.
         sensors: each sensor by its stream; the only one of a stream's own session by an empty name.
         zones: what is known of the zones; None: it has none.
+        worlds: its world frames; None: no relocation was announced.
     """
 
     density: optipmb.Density
@@ -118,6 +120,7 @@ class FilterState:
     counts: FrameCounts = field(default_factory=FrameCounts)
     sensors: Mapping[str, SensorState] = field(default_factory=dict)
     zones: ZoneState | None = None
+    worlds: Worlds | None = None
 
     def sensor(self, name: str) -> SensorState:
         """Return the state of a sensor, the initial one before its first frame."""

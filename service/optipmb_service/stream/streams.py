@@ -727,5 +727,6 @@ def policy_of(settings: Settings) -> Policy:
         late_clouds=settings.late_clouds,
         recovery_wait_ns=round(settings.recovery_wait_s * SECOND),
         max_speed=settings.max_speed,
+        jumps=settings.jumps,
         at_once=1,  # other streams have their turn between two frames
     )

@@ -11,6 +11,7 @@ had in order; tracks that were published under the other id are corrected like a
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import math
@@ -32,6 +33,7 @@ from optipmb_service.stream import convert
 from optipmb_service.stream.state import FilterState, FrameCounts, PoseHistory, SensorState
 from optipmb_service.stream.timeline import JUMP_FRAMES, FrameId, Verdict
 from optipmb_service.stream.values import MAX_LABELS, MAX_SENSORS, SECOND, Begun
+from optipmb_service.stream.worlds import in_one_world, relocated
 from optipmb_service.telemetry.stream_meter import total
 
 if TYPE_CHECKING:
@@ -40,6 +42,7 @@ if TYPE_CHECKING:
     from optipmb.zones import Event
     from optipmb_service.stream.state import Inputs, Position, ProcessedFrame
     from optipmb_service.stream.values import Policy, Reason, Tracked
+    from optipmb_service.stream.worlds import Relocated
 
 GIVE_UP_NS: Final = SECOND
 """Sensor time after which a density that makes every frame too much is given up."""
@@ -61,6 +64,7 @@ class Outcome:
         begun: the session id that it starts, if any.
         unknown: the classes that the profile lacks, with the number of objects of each, when not reported before.
         effort: why the frame was refused, when it needs more computing than a frame may.
+        fault: of its relocation.
     """
 
     frame: ProcessedFrame
@@ -68,6 +72,7 @@ class Outcome:
     begun: Begun | None = None
     unknown: dict[str, int] | None = None
     effort: optipmb.EffortError | None = None
+    fault: optipmb.FrameError | None = None
 
 
 class Transition:
@@ -123,13 +128,33 @@ class Transition:
         if inputs is None:
             message = frame.message
             inputs = message, *convert.frame_of(self.parameters, message)
+        message, seen, ignored = inputs
+        if frame.points is not None and in_one_world(message, frame.points):
+            seen = replace(seen, cloud=convert.cloud_of(frame.points))
+        world = relocated(before, frame_id, message.relocation, seen)
+        before, inputs = world.state, (message, world.frame, ignored)
+        if world.lost:
+            pose_history = before.sensor(frame_id.sensor).pose_history
+            return _refused(before, frame, pose_history, "astray"), Outcome(frame, fault=world.fault)
+        after, outcome = self._step(before, frame, inputs, world)
+        if world.announced and outcome.tracks is not None:
+            outcome.tracks.others["relocation"] = message.relocation
+        return after, outcome if world.fault is None else replace(outcome, fault=world.fault)
+
+    def _step(
+        self, before: FilterState, frame: ProcessedFrame, inputs: Inputs, world: Relocated
+    ) -> tuple[FilterState, Outcome]:
+        """Process a frame in the world of the density."""
+        frame_id, message = frame.frame_id, inputs[0]
         begun = self._begun(before, frame)
-        moved = self.on_new_clock(before, frame, inputs[0])
+        moved = self.on_new_clock(before, frame, message)
         if moved is not None:
             before, begun = moved, self._begin(before, frame, "clock")
+        if world.restarts:
+            begun = self._begin(before, frame, "world")
         sensor = before.sensor(frame_id.sensor)
         known = PoseHistory() if begun else sensor.pose_history
-        pose_history, where = check_pose(known, inputs[0], self._policy)
+        pose_history, where = check_pose(known, message, self._policy, world.ahead)
         if where == "moved" and self._others_stayed(before, frame_id):
             # The sensors of a session move together: this one waits for the others to say the same.
             there, before_it = pose_history.position, sensor.pose_history
@@ -186,6 +211,8 @@ class Transition:
         state = base
         for frame in frames:
             anew = begins_with(state, frame)
+            if (world := relocated(state, frame.frame_id, frame.message.relocation)).announced:
+                base, state, anew, dumped = world.state, world.state, False, []  # and one world
             if (moved := self.on_new_clock(state, frame)) is not None:
                 base, state, anew, dumped = moved, moved, False, []  # a dump has one clock
             try:
@@ -251,8 +278,6 @@ class Transition:
             density = before.density if keeps else self.no_objects(before.density.next_id)
             before = before.begun_anew(density, begun.session)
         sensor = before.sensor(frame_id.sensor)
-        if frame.points is not None:
-            seen = replace(seen, cloud=convert.cloud_of(frame.points))
         result = self._tracker.step(before.density, seen)
         used = bool(result.diagnostics.cloud_used)
         same = sensor.tracked is not None and sensor.tracked[0] == frame_id.epoch
@@ -268,6 +293,7 @@ class Transition:
             cloud_used=used,
             gap=gap,
             ignored=ignored,
+            **({"world": before.worlds.number} if before.worlds else {}),
             labels=self.parameters.labels,
         )
         zones, tracks.events = self._zones(before, result.tracks, frame_id.stamp_ns)
@@ -292,6 +318,7 @@ class Transition:
             counts=_counted(before, frame, frames=1, gaps=gap, clouds_used=used, repaired=repaired),
             sensors=_sensors(before, frame_id.sensor, known),
             zones=zones,
+            worlds=before.worlds,
         )
         return after, Outcome(frame, tracks, begun, unknown)
 
@@ -318,7 +345,7 @@ class Transition:
 
 
 def check_pose(
-    before: PoseHistory, message: schemas.Detections, policy: Policy
+    before: PoseHistory, message: schemas.Detections, policy: Policy, ahead: Sequence[optipmb.Relocation] = ()
 ) -> tuple[PoseHistory, Literal["near", "astray", "moved"]]:
     """Check whether a sensor can be where a frame says it is.
 
@@ -330,6 +357,7 @@ def check_pose(
         before: poses of the frames before it.
         message: the frame.
         policy: what a sensor can do.
+        ahead: motions that bring the frame to the world of the poses.
 
     Returns:
         The poses with this frame, and whether the sensor is near where it was, astray (the frame is to be refused), or
@@ -338,7 +366,8 @@ def check_pose(
     if message.pose is None or policy.max_speed <= 0:
         return before, "near"
     x, y, z = message.pose.translation.tolist()
-    position, stamp_ns = (x, y, z), message.stamp_ns
+    position = functools.reduce(lambda place, one: one.place(place), ahead, (x, y, z))
+    stamp_ns = message.stamp_ns
     there = PoseHistory(stamp_ns, position)
     if before.stamp_ns is None or _near(before.stamp_ns, before.position, stamp_ns, position, policy):
         return there, "near"

@@ -90,6 +90,7 @@ class Policy:
         max_speed: fastest that a sensor moves; 0: any pose is taken.
         pose_margin: how far a pose may lie from where that speed allows.
         astray_frames: frames in a row that agree on another place until the session restarts there.
+        jumps: what is done about poses that jump within reach: `report` or `off`.
         zones: those whose events the session finds.
         at_once: frames that are ready which one call takes through the tracker; the next calls take the others. More
             are taken only while more than `held_bytes` are held.
@@ -110,6 +111,7 @@ class Policy:
     max_speed: float = 100.0
     pose_margin: float = 10.0
     astray_frames: int = 5
+    jumps: Literal["off", "report"] = "report"
     at_once: int = 2**62
     zones: tuple[Zone, ...] = ()
 
@@ -215,7 +217,7 @@ def events_of(header: dict[str, Any], events: Sequence[Event], counts: ZoneCount
     return schemas.Events(**fields)
 
 
-Reason = Literal["first", "jump", "clock", "publisher", "pose", "effort", "reset", "parameters", "quarantine"]
+Reason = Literal["first", "jump", "clock", "publisher", "pose", "world", "effort", "reset", "parameters", "quarantine"]
 """Why the density started again; `clock`: after a step back, with its objects."""
 
 

@@ -63,19 +63,10 @@ class ProblemReporter:
 
     Args:
         publish: sends a problem on its stream's key.
-        log: writes a line about a problem; the second argument is how many it stands for.
-        wall: the time, ns since 1970, that problems are reported with.
     """
 
-    def __init__(
-        self,
-        publish: Callable[[schemas.Problem], None],
-        log: Callable[[schemas.Problem, int], None],
-        wall: Callable[[], int] = time.time_ns,
-    ) -> None:
-        self._wall = wall
+    def __init__(self, publish: Callable[[schemas.Problem], None]) -> None:
         self._publish = publish
-        self._log = log
         self._lock = threading.Lock()
         self._kinds: OrderedDict[tuple[str, str, str], _Kind] = OrderedDict()
         self._newest: deque[schemas.Problem] = deque(maxlen=NEWEST)
@@ -127,17 +118,17 @@ class ProblemReporter:
     def _due(self, kind: _Kind, now_ns: int) -> tuple[schemas.Problem | None, int, int]:
         """Take what may be reported of a kind now, called with the lock: how many to publish and how many to log."""
         publish = bool(kind.gathered) and now_ns - kind.published_ns >= PUBLISH_EVERY_NS
-        log = bool(kind.unlogged) and now_ns - kind.logged_ns >= LOG_EVERY_NS
+        write = bool(kind.unlogged) and now_ns - kind.logged_ns >= LOG_EVERY_NS
         publish = publish and self._published.take(now_ns)
-        log = log and self._logged.take(now_ns)
-        if kind.last is None or not (publish or log):
+        write = write and self._logged.take(now_ns)
+        if kind.last is None or not (publish or write):
             return None, 0, 0
-        problem = kind.last.model_copy(update={"reported_ns": self._wall()})
-        published, logged = kind.gathered if publish else 0, kind.unlogged if log else 0
+        problem = kind.last.model_copy(update={"reported_ns": time.time_ns()})
+        published, logged = kind.gathered if publish else 0, kind.unlogged if write else 0
         if publish:
             kind.gathered, kind.published_ns = 0, now_ns
             self._newest.append(problem.model_copy(update={"count": published}))
-        if log:
+        if write:
             kind.unlogged, kind.logged_ns = 0, now_ns
         return problem, published, logged
 
@@ -146,17 +137,5 @@ class ProblemReporter:
         if problem is not None and published:
             self._publish(problem.model_copy(update={"count": published}))
         if problem is not None and logged:
-            self._log(problem, logged)
-
-
-def log_problem(problem: schemas.Problem, count: int) -> None:
-    """Write a line about a problem that stands for so many."""
-    log.warning(
-        "problem",
-        stream=problem.stream,
-        code=problem.code,
-        path=problem.path,
-        expected=problem.expected,
-        received=problem.received,
-        count=count,
-    )
+            shown = problem.model_dump(include={"stream", "code", "path", "expected", "received"})
+            log.warning("problem", **shown, count=logged)

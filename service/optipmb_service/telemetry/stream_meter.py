@@ -100,7 +100,7 @@ class StreamMeter:
 def total(*counts: int) -> int:
     """Return the sum of counts; beyond the highest it stays there.
 
-    A publisher chooses its sequence numbers, and what is missing between two of them is counted.
+    A publisher chooses its sequence numbers, and all numbers between two of them count as missing.
     """
     return min(sum(counts), MAX_COUNT)
 
@@ -141,6 +141,6 @@ class MessageCounters(Counters):
         )
 
     def since(self, earlier: Counters, now: Counters) -> MessageCounters:
-        """Return this with what came to a session between two times."""
+        """Return the sum with the growth of a session's counters between two times."""
         come = {one.name: getattr(now, one.name) - getattr(earlier, one.name) for one in fields(Counters)}
         return self + MessageCounters(**come)

@@ -306,7 +306,7 @@ class Transport:
         """Say that this instance is alive; to be called when it is ready."""
         self._alive = self._client.token(self._keys.alive(self._instance))
 
-    def open_publisher(self, stream: str, events: bool = False) -> StreamPublisher:  # noqa: FBT001, FBT002
+    def open_publisher(self, stream: str, events: bool = False) -> StreamPublisher:  # noqa: FBT001, FBT002 - as `Streams` calls it
         """Open the publishers of a stream: of its tracks, and with `events` of those.
 
         Say that this instance tracks it, and declare its inputs' keys.

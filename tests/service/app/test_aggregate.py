@@ -22,7 +22,7 @@ class Network:
         self.asked, self.gate = threading.Event(), threading.Event()
 
     def client(self) -> SimpleNamespace:
-        """Return what has a router."""
+        """Return a client with a router."""
         return SimpleNamespace(failure="", linked=lambda: True)
 
     def ask(self, key: str, timeout: float, payload: bytes = b"", encoding: str = "") -> None:

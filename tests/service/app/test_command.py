@@ -179,7 +179,7 @@ def refused(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
 def test_wrong_use_is_one_clear_line(
     options: tuple[str, ...], says: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Status 2 and one line on stderr that says what is wrong; nothing on stdout."""
+    """Status 2 and one line on stderr about the error; nothing on stdout."""
     refused(capsys, monkeypatch, *options, says=says)
 
 
@@ -242,7 +242,7 @@ def test_json_logs_and_an_own_profile(tmp_path: Path) -> None:
 
 
 def config(capsys: pytest.CaptureFixture[str], *options: str) -> str:
-    """Run `config` in this process; returns what it prints."""
+    """Run `config` in this process; return its output."""
     with pytest.raises(SystemExit) as ended:
         cli.main(("config", *options))
     shown = capsys.readouterr()
@@ -315,7 +315,7 @@ def test_config_prints_no_password(capsys: pytest.CaptureFixture[str]) -> None:
     ],
 )
 def test_who_listens_for_others_without_protection_is_told(options: tuple[str, ...], said: list[str]) -> None:
-    """Addresses beyond this machine without TLS or access control are named; those of this machine are not."""
+    """Addresses beyond this machine without TLS or access control are named; addresses of this machine are not."""
     pairs = dict(zip(options[::2], options[1::2], strict=True))
     assert (
         list(load(None, {name[2:].replace("-", "_"): value for name, value in pairs.items()}).settings.unprotected)

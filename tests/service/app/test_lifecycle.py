@@ -42,7 +42,7 @@ def environment(hang: str = "", **settings: object) -> dict[str, str]:
 
 
 def processes(folder: Path, router: str, hang: str = "") -> dict[str, ServiceProcess]:
-    """Start one of every kind; those that need a router use this one."""
+    """Start one of every kind; clients use this router."""
     topics = folder / "ros2.toml"
     topics.write_text('[ros2.streams."site/node/lidar"]\ndetections = "/boxes"\n')
     nowhere = free_endpoint().removeprefix("tcp/")
@@ -140,7 +140,7 @@ def test_a_control_loop_that_hangs_is_ended_by_the_first_signal() -> None:
 
 
 def test_the_time_of_a_frozen_process_does_not_count() -> None:
-    """A process that is stopped during its end has, when it continues, what was left of its time before."""
+    """A process that is stopped during its end has the rest of its time when it continues."""
     with ServiceProcess("router", environment=environment("close"), fresh=True) as router:
         router.wait_ready()
         began = time.monotonic()

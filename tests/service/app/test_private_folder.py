@@ -1,4 +1,4 @@
-"""Folders of processes: gone with those that end, and with the next start after those that were killed."""
+"""Folders of processes: removed at their end, or at the next start after a kill."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def holder() -> tuple[subprocess.Popen[str], Path]:
 def test_what_a_killed_process_left_is_removed_and_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The folder of a killed process goes with the next start; that of a living one, and other folders, stay."""
+    """The folder of a killed process goes with the next start; the folder of a living one, and other folders, stay."""
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", None)  # it is remembered otherwise
     (tmp_path / "optipmb-other").mkdir()

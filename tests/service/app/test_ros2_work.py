@@ -1,4 +1,4 @@
-"""The thread of the bridge to ROS 2: what comes in, and what is due."""
+"""The thread of the bridge to ROS 2: messages, and timers."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def nats(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NatsProcess]:
 
 @pytest.fixture(params=["memory", "sqlite", "nats"])
 def make(request: pytest.FixtureRequest) -> Iterator[Make]:
-    """Makes ways to one store, each as that of another process; every test has a store of its own."""
+    """Makes ways to one store, each as of another process; every test has a store of its own."""
     made: list[LeaseStore] = []
     if request.param == "memory":
         shared = Shared()
@@ -128,7 +128,7 @@ def test_of_writes_at_once_one_wins(make: Make) -> None:
 
 
 def test_what_changed_is_followed(make: Make) -> None:
-    """Whoever follows gets the newest record of each key that changed since, in the order of the revisions."""
+    """A follower gets the newest record of each key that changed since, in the order of the revisions."""
     one, other = make(), make()
     first = one.put(Write("partition/1", "a/1", 0))
     second = other.put(Write("member/a.b_c/1", "alive", 0))
@@ -145,7 +145,7 @@ def test_what_changed_is_followed(make: Make) -> None:
 
 
 def test_a_checkpoint_is_refused_for_its_fence(make: Make) -> None:
-    """Who held a partition before saves nothing more; what is kept comes back to the byte, also the one before it."""
+    """A former holder of a partition saves nothing; the newest checkpoint and the one before come back to the byte."""
     one, other = make(), make()
     data = [random.Random(number).randbytes(200_000) for number in range(3)]
     key = partition_key(partition_of(STREAM))
@@ -286,7 +286,7 @@ def test_what_is_wished_for_comes_and_stays(make: Make) -> None:
 
 
 def test_who_has_been_wished_for_everything_has_it(make: Make) -> None:
-    """What is wished goes before an equal share."""
+    """Wishes go before an equal share."""
     one, other = HandMember("one", make()), HandMember("other", make())
     even(one, other)
     streams = {partition_of(stream): stream for stream in map(str, range(1000))}
@@ -299,9 +299,9 @@ def test_who_has_been_wished_for_everything_has_it(make: Make) -> None:
 
 
 def test_who_drains_holds_nothing(make: Make) -> None:
-    """A member that drains gives all to the others and takes nothing, also what is wished for it, until that is undone.
+    """A member that drains gives all to the others and takes nothing, wishes included, until that is undone.
 
-    It says so to those that look; a few partitions at a time are held by nobody.
+    Its record says so; a few partitions at a time have no holder.
     """
     members = [HandMember(name, make()) for name in "abc"]
     even(*members)
@@ -345,7 +345,7 @@ def test_a_drain_that_is_undone_leaves_nothing_between(make: Make) -> None:
 
 
 def test_the_last_member_drains_in_vain(make: Make) -> None:
-    """Nobody is there to take what it leaves: nobody waits for that or confirms it, and it goes on tracking.
+    """No member can take its partitions: the drain is neither awaited nor confirmed, and it goes on tracking.
 
     That also holds for members that all drain: each keeps its share.
     """

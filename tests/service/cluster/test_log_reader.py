@@ -1,4 +1,4 @@
-"""What is read of the log for a session is bounded, and the newest of it is given."""
+"""Reading the log for a session is bounded; it gets the newest frames."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def filled(tmp_path: Path) -> Iterator[MessageLog]:
 
 
 def asked(reader: LogReader) -> Callable[[], list[int]]:
-    """Ask for the frames after the one that was tracked last; waits for the numbers of those that are given first."""
+    """Ask for the frames after the one that was tracked last; waits for the numbers of the first result."""
     found: list[list[int]] = []
     came = threading.Event()
 
@@ -75,7 +75,7 @@ def missed(reader: LogReader) -> list[int]:
 
 
 def test_the_newest_frames_are_given(filled: MessageLog, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All that came after a position, but no more than a session takes, nor what is older than of use."""
+    """All frames after a position, as many as a session takes, and none too old for it."""
     reader = LogReader(filled, 0.0)
     assert missed(reader) == list(range(TRACKED + 1, FRAMES))
     monkeypatch.setattr(message_log, "MOST_FRAMES", 5)
@@ -107,7 +107,7 @@ def test_the_time_for_a_stream_begins_with_its_turn(filled: MessageLog, monkeypa
 
 
 def test_a_session_begins_whatever_the_log_says(filled: MessageLog, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An error that nobody foresaw, in the reading or before it, is as if nothing had been missed."""
+    """An unforeseen error, in the reading or before it, is as if nothing had been missed."""
     monkeypatch.setattr(filled, "since", AsyncMock(side_effect=ValueError("no JSON")))
     reader = LogReader(filled, 0.0)
     assert missed(reader) == []
@@ -119,7 +119,7 @@ def test_a_session_begins_whatever_the_log_says(filled: MessageLog, monkeypatch:
 
 
 def test_what_was_closed_does_not_come_back(filled: MessageLog) -> None:
-    """A session of several sensors that was closed by a query begins with what comes, not with what the log has."""
+    """A session of several sensors that was closed by a query begins with new frames, not with those in the log."""
     session = Session("a/b/fused", optipmb.load_profile("nuscenes"), Policy(), fused=True)
     closed = forgotten(session.snapshot())
     found: list[list[tuple[Packet, bool]]] = []

@@ -1,4 +1,4 @@
-"""What waits for the log is bounded in bytes; what is dropped is said."""
+"""The queue of the log is bounded in bytes; dropped messages are reported."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_without_servers_the_oldest_messages_go() -> None:
 
 
 def test_a_message_that_the_servers_do_not_take_keeps_none_waiting(log: MessageLog) -> None:
-    """One that is too large with its headers is reported; those beside it are written."""
+    """One that is too large with its headers is reported; the others are written."""
     lost: list[tuple[str, str]] = []
     most = log.connection.client().max_payload
     writer = LogWriter(log, KEEP, lambda *one: lost.append(one))
@@ -92,7 +92,7 @@ def test_a_failure_holds_until_something_is_written(log: MessageLog, monkeypatch
 
 
 def test_a_message_that_may_not_be_published_is_given_up(tmp_path: Path) -> None:
-    """One on whose subject the server lets nobody publish is lost after some tries; those behind it are written."""
+    """One on a forbidden subject is lost after some tries; the next ones are written."""
     address = free_endpoint().removeprefix("tcp/")
     file = tmp_path / "nats.conf"
     file.write_text(f"""
@@ -181,7 +181,7 @@ def test_servers_that_are_away_cost_no_message(tmp_path: Path, monkeypatch: pyte
 
 
 def test_two_writers_on_three_servers_write_each_message_once(tmp_path: Path) -> None:
-    """Both are told of what the other one is just writing, which is no failure: neither is ever degraded."""
+    """The server tells both that the other is just writing, which is no failure: neither is ever degraded."""
     count = 1000
     with NatsTrio(tmp_path) as servers:
         logs = [MessageLog(servers.urls, "optipmb/v1") for _ in range(2)]

@@ -1,4 +1,4 @@
-"""NATS servers that let nobody in but those they know: real servers, with certificates and users of each kind."""
+"""NATS servers with access control: real servers, with certificates and users of each kind."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def test_a_user_or_token_in_a_file(
 
 
 def test_nothing_is_said_to_a_server_without_tls(tmp_path: Path) -> None:
-    """Where the address says tls:// and the server, or whoever stands before it, offers none, no password leaves."""
+    """Where the address says tls:// and the server, or a proxy before it, offers none, no password leaves."""
     heard: list[bytes] = []
     with socket.create_server(("127.0.0.1", 0)) as listener:
 

@@ -36,7 +36,7 @@ def store(request: pytest.FixtureRequest, tmp_path: Path) -> SqliteStore:
 
 
 def test_the_newest_is_loaded(tmp_path: Path) -> None:
-    """What was saved last comes back, also from another process."""
+    """The newest checkpoint comes back, also from another process."""
     one, other = SqliteStore(tmp_path / "s"), SqliteStore(tmp_path / "s")
     leases = Alone(one)
     assert one.load("a/b/c") is None
@@ -64,7 +64,7 @@ def test_a_torn_one_is_set_aside_and_the_one_before_it_is_used(store: SqliteStor
 
 
 def test_when_all_are_torn_there_is_none(store: SqliteStore) -> None:
-    """A stream without a readable checkpoint begins anew."""
+    """A stream without a readable checkpoint begins again."""
     leases = Alone(store)
     leases.save({"s": b"torn"})
     assert load_newest(store, "s", int, ValueError, lambda _: None) is None
@@ -103,7 +103,7 @@ def test_a_checkpoint_takes_few_pages(tmp_path: Path) -> None:
 
 
 def test_the_log_beside_the_file_stays_small(tmp_path: Path) -> None:
-    """However much is written, and whatever the size of the pages, the write-ahead log goes round within its bound."""
+    """The write-ahead log stays within its bound, with pages of any size."""
     for name in ("new.db", "old.db"):
         if name == "old.db":
             with contextlib.closing(sqlite3.connect(tmp_path / name)) as before:
@@ -135,7 +135,7 @@ def test_what_is_no_store_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_is_an_error_and_loses_nothing(tmp_path: Path) -> None:
-    """When the file may not grow, saving fails as a whole, and what was there stays."""
+    """When the file may not grow, saving fails as a whole, and the older checkpoints stay."""
     store = SqliteStore(tmp_path / "s")
     leases = Alone(store)
     leases.save({"a": b"1", "b": b"1"})

@@ -19,6 +19,7 @@ from optipmb_service.http.page import Live, live_frame
 from optipmb_service.settings import Settings
 from optipmb_service.zenoh import client
 from router import until
+from tracks_message import tracks_message
 from watched import KEYS, Session, Watched, key_of, publication, served
 
 from optipmb import Georeference
@@ -32,32 +33,22 @@ DEADLINE_S = 60.0
 
 
 def tracks(seq: int) -> Tracks:
-    """One track, a long way from the origin, and one that is not confirmed, of a frame."""
-    both = np.ones(2)
-    return Tracks(
-        stream=STREAM,
-        epoch=bytes(16),
-        seq=seq,
+    """One track, a long way from the origin, and one that is not confirmed."""
+    return tracks_message(
+        STREAM,
+        seq,
+        [5, 6],
         stamp_ns=seq * 100_000_000,
-        session="0" * 32,
-        profile="kitti",
-        cloud_used=False,
-        labels=["Car"],
-        id=[5, 6],
-        label=[0, 0],
-        center=np.array([[100.12345, -7.0, 1.0], [0.0, 0.0, 0.0]]),
-        size=[[4.0, 2.0, 1.5]] * 2,
-        yaw=both / 3,
-        heading_confidence=both * 0.875,
-        velocity=[[1.0, 2.0]] * 2,
-        yaw_rate=both,
-        acceleration=both,
+        center=[[100.12345, -7.0, 1.0], [0.0, 0.0, 0.0]],
+        size=[4.0, 2.0, 1.5],
+        yaw=1 / 3,
+        heading_confidence=0.875,
+        velocity=[1.0, 2.0],
         existence=[0.75, 0.25],
-        score=both * 0.5,
-        covariance=np.stack([np.eye(6)] * 2),
-        age=both * 2,
-        time_since_detection=both * 0.2,
-        detection=[-1, -1],
+        score=0.5,
+        age=2,
+        time_since_detection=0.2,
+        detection=-1,
         confirmed=[1, 0],
     )
 

@@ -40,6 +40,10 @@ def messages(draw: st.DrawFn) -> schemas.Detections:
     pose = draw(st.sampled_from(POSES))
     velocity = column("velocity", 2)
     velocity[draw(arrays(bool, count))] = np.nan
+    center, size, yaw = column("center", 3), column("size", 3), column("yaw")
+    center[draw(arrays(bool, count)), 2] = np.nan
+    size[draw(arrays(bool, (count, 3)))] = np.nan
+    yaw[draw(arrays(bool, count))] = np.nan
     spread = [draw(st.sampled_from(SPREADS)) for _ in range(count)]
     view = schemas.FieldOfView(azimuth=[-1.0, 1.0], elevation=[-0.5, 0.5], range=[0.0, 50.0])
     return schemas.Detections(
@@ -48,9 +52,9 @@ def messages(draw: st.DrawFn) -> schemas.Detections:
         pose=schemas.Pose(translation=pose[0], quaternion=pose[1]) if pose else None,
         labels=LABELS,
         label=draw(arrays(np.int64, count, elements=st.integers(0, len(LABELS) - 1))),
-        center=column("center", 3) / draw(st.sampled_from([1.0, 1e6])),
-        size=column("size", 3),
-        yaw=column("yaw"),
+        center=center / draw(st.sampled_from([1.0, 1e6])),
+        size=draw(st.sampled_from([None, size])),
+        yaw=draw(st.sampled_from([None, yaw])),
         score=column("score"),
         velocity=draw(st.sampled_from([None, velocity])),
         field_of_view=draw(st.sampled_from([None, view])),

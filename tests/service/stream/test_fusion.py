@@ -33,27 +33,19 @@ KEYS = Keys()
 OTHER = Sensor("site/other/lidar", b"o" * 16)
 
 
-def undisturbed(frames: list[Detections]) -> dict[tuple[bytes, int], bytes]:
-    """What a session gives that gets the frames in order."""
+def undisturbed(frames: list[Detections]) -> tuple[dict[tuple[bytes, int], bytes], str]:
+    """Tracks, and the digest of the state, of a session that gets the frames in order."""
     one, merged = Session(FUSED, optipmb.load_profile("nuscenes"), Policy(recovery_wait_ns=0), fused=True), Merged()
     for frame in frames:
         merged.take(one.on_detections(frame, 0))
-    return merged.plain()
-
-
-def undisturbed_digest(frames: list[Detections]) -> str:
-    """The digest of the state of such a session."""
-    one = Session(FUSED, optipmb.load_profile("nuscenes"), Policy(recovery_wait_ns=0), fused=True)
-    for frame in frames:
-        one.on_detections(frame, 0)
-    return digest_of(one.snapshot())
+    return merged.plain(), digest_of(one.snapshot())
 
 
 def test_a_car_keeps_its_id_through_the_service(start: Callable[..., Any]) -> None:
     """Two sensors publish, each on its key; the tracks on the key of both are those of the frames in order."""
     _, endpoint = start(fuse=["site/node/*"])
     frames, merged = drive(), Merged()
-    wanted = undisturbed(frames)
+    wanted, _ = undisturbed(frames)
     with Node(endpoint) as node:
         node.send(*frames, OTHER.detections(0))
         node.tracks(OTHER.stream, 1)
@@ -117,7 +109,7 @@ def test_after_a_restart_no_cache_is_waited_for_that_has_answered_or_is_gone(
         until(partial(reached, len(rest)), "all are tracked", 50.0)
         state = tracked()
     assert state is not None
-    assert (state.digest, state.late, state.gaps) == (undisturbed_digest(rest), 0, 0)
+    assert (state.digest, state.late, state.gaps) == (undisturbed(rest)[1], 0, 0)
 
 
 def test_a_sensor_that_is_heard_of_after_the_session_began_loses_no_frame(
@@ -145,7 +137,7 @@ def test_a_sensor_that_is_heard_of_after_the_session_began_loses_no_frame(
         monkeypatch.setattr(optipmb_service.stream.recovery, "BACK_NS", 0)
         until(lambda: reached(80), "all are tracked")
         state = node.ask(KEYS.query(FUSED, "state"), SessionState)
-    assert (state.digest, state.late, state.gaps) == (undisturbed_digest(frames), 0, 0)
+    assert (state.digest, state.late, state.gaps) == (undisturbed(frames)[1], 0, 0)
 
 
 def test_queries_are_answered_for_the_session(start: Callable[..., Any]) -> None:

@@ -18,6 +18,7 @@ from optipmb_service.stream.streams import Scheduler
 from optipmb_service.telemetry.problem_reporter import LOGGED_PER_SECOND, PUBLISHED_PER_SECOND, ProblemReporter
 from optipmb_service.telemetry.stream_meter import StreamMeter
 from router import SECOND, Sensor
+from structlog.testing import capture_logs
 
 import optipmb
 
@@ -101,17 +102,6 @@ def test_a_step_that_does_not_end_does_not_keep_the_scheduler() -> None:
 # Problems
 
 
-def reporter() -> tuple[ProblemReporter, list[Problem], list[tuple[str, int]]]:
-    """A problem reporter, what it publishes, what it logs."""
-    published: list[Problem] = []
-    logged: list[tuple[str, int]] = []
-    return (
-        ProblemReporter(published.append, lambda problem, count: logged.append((problem.code, count))),
-        published,
-        logged,
-    )
-
-
 def problem(stream: str = "a/b/c", code: str = "late", count: int = 1) -> Problem:
     """Some problem."""
     return problem_of(code, stream=stream, instance="x", message="m", count=count)
@@ -121,19 +111,21 @@ def problem(stream: str = "a/b/c", code: str = "late", count: int = 1) -> Proble
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, SECOND)), max_size=80))
 def test_no_problem_is_lost_and_few_are_published(steps: list[tuple[int, int]]) -> None:
     """Counts on the key and in the log add up to what was reported, each kind at most once a second, once in ten."""
-    one, published, logged = reporter()
+    published: list[Problem] = []
+    one = ProblemReporter(published.append)
     now, last = 0, dict[str, int]()
-    for kind, step in steps:
-        now += step
-        before = len(published)
-        one.report(problem(stream=f"a/b/{kind}"), now)
-        for told in published[before:]:
-            assert now - last.get(told.stream, -SECOND) >= SECOND
-            last[told.stream] = now
-    one.flush(now + 10 * SECOND)
+    with capture_logs() as logged:
+        for kind, step in steps:
+            now += step
+            before = len(published)
+            one.report(problem(stream=f"a/b/{kind}"), now)
+            for told in published[before:]:
+                assert now - last.get(told.stream, -SECOND) >= SECOND
+                last[told.stream] = now
+        one.flush(now + 10 * SECOND)
     assert (
         sum(told.count for told in published)
-        == sum(count for _, count in logged)
+        == sum(line["count"] for line in logged)
         == len(steps)
         == sum(one.counts().values())
     )
@@ -141,16 +133,19 @@ def test_no_problem_is_lost_and_few_are_published(steps: list[tuple[int, int]]) 
 
 def test_a_flood_on_ever_new_keys_is_bounded() -> None:
     """Ten thousand kinds in one second make a few lines and messages, and a bounded memory."""
-    one, published, logged = reporter()
-    for number in range(10_000):
-        one.report(problem(stream=f"a/b/{number}"), 5)
+    published: list[Problem] = []
+    one = ProblemReporter(published.append)
+    with capture_logs() as logged:
+        for number in range(10_000):
+            one.report(problem(stream=f"a/b/{number}"), 5)
     assert (len(published), len(logged)) == (PUBLISHED_PER_SECOND, LOGGED_PER_SECOND)
     assert len(one.newest()) == 20
 
 
 def test_elements_of_an_array_are_one_kind() -> None:
     """Which element was wrong does not make a new kind of problem; a new class name does."""
-    one, published, _ = reporter()
+    published: list[Problem] = []
+    one = ProblemReporter(published.append)
     for number in range(5):
         one.report(problem_of("invalid_value", stream="a/b/c", instance="x", message="m", path=f"score[{number}]"), 0)
         one.report(problem_of("unknown_class", stream="a/b/c", instance="x", message="m", received=f"'{number}'"), 0)

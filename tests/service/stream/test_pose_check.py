@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_schemas import Detections, Pose
+from optipmb_schemas import Detections, Pose, Relocation
 from optipmb_service.stream.checkpoint import state_bytes
 from optipmb_service.stream.session import Session
 from optipmb_service.stream.values import Output, Policy
@@ -93,3 +95,41 @@ def test_refusals_do_not_depend_on_arrival(order: list[int], far: set[int]) -> N
     feed(one, {seq: places[seq] for seq in order})
     feed(other, places)
     assert state_bytes(one.snapshot()) == state_bytes(other.snapshot())
+
+
+def shifted(seq: int, motion: optipmb.Relocation | None, turn: float = 0.02) -> Detections:
+    """A frame of a sensor that drives along a bend, in the world after a motion that nobody announced."""
+    yaw = turn * seq
+    pose = optipmb.Pose(
+        np.array([50.0 + seq, 0.02 * seq * seq, 1.8]), np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
+    )
+    pose = pose if motion is None else motion.pose(pose)
+    return SENSOR.detections(
+        seq, frame="sensor", pose=Pose(translation=pose.translation, quaternion=pose.quaternion), objects=0
+    )
+
+
+def test_a_jump_within_reach_is_reported_once() -> None:
+    """The problem has the motion, by which the jump could have been announced; the frames are tracked."""
+    motion = optipmb.Relocation(3.0, -1.0, 0.5, 0.04)
+    messages = [shifted(seq, motion if seq >= 10 else None) for seq in range(20)]
+    one = session()
+    outputs = [output for message in messages for output in one.on_detections(message, 0)]
+    found = problems(outputs)
+    assert [(problem.code, problem.path, problem.seq) for problem in found] == [("world_jump", "pose", 10)]
+    numbers = [float(number) for number in re.findall(r"-?\d+\.\d+", found[0].received)]
+    assert numbers[2:] == pytest.approx(motion, abs=0.2)
+    assert one.counters.frames == 20
+    off = session(policy=Policy(jumps="off"))
+    assert not problems(output for message in messages for output in off.on_detections(message, 0))
+
+
+def test_an_announced_jump_and_a_bend_are_none() -> None:
+    """Neither a relocation, nor braking and turning as vehicles do, nor frames that are late or missing."""
+    motion = optipmb.Relocation(30.0, -1.0, 0.5, 1.0)
+    said = Relocation(world=1, translation=np.array(motion[:3]), quaternion=np.array([np.cos(0.5), 0, 0, np.sin(0.5)]))
+    one = session()
+    order = [0, 1, 2, 4, 3, 5, 9, 10, 12, 11, 13, 20, 21]
+    frames = [shifted(seq, motion if seq >= 10 else None) for seq in order]
+    said_frames = [frame.model_copy(update={"relocation": said if frame.seq >= 10 else None}) for frame in frames]
+    assert not problems(output for frame in said_frames for output in one.on_detections(frame, 0))

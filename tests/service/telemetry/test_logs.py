@@ -67,7 +67,7 @@ def test_a_stderr_that_nobody_reads_stops_nothing(full_pipe: tuple[int, int, int
 def test_lines_beyond_the_queue_are_counted(
     full_pipe: tuple[int, int, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Lines that nobody reads in time are dropped; the others come in order, then a line with how many are missing."""
+    """Unread lines beyond the queue are dropped; the others come in order, then a line with how many are missing."""
     reader, writer, size = full_pipe
     told = tmp_path / "stderr"
     with told.open("w") as stderr, os.fdopen(os.dup(writer), "w") as file:

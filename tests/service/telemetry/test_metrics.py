@@ -39,7 +39,7 @@ def without_worker(line: str) -> str:
 
 
 def test_durations_are_counted_as_prometheus_counts_them() -> None:
-    """Buckets, their ends, counts and sums are those of the client's own histogram."""
+    """Buckets, their ends, counts and sums equal the client's own histogram."""
     registry = CollectorRegistry()
     histogram = Histogram("optipmb_latency_seconds", "x", buckets=SECONDS, registry=registry)
     for seconds in DURATIONS:

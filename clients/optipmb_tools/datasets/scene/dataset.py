@@ -14,7 +14,7 @@ import numpy as np
 from optipmb_schemas import Tracks
 
 from optipmb_tools.camera import synthetic_camera
-from optipmb_tools.datasets.interface import Cloud, DataSequence, Dataset, DetectionFrame, Regions, Truth
+from optipmb_tools.datasets.interface import Cloud, DataSequence, Dataset, DetectionFrame, Truth
 from optipmb_tools.datasets.scene.detector import CLASSES, Found, Seen, detect
 from optipmb_tools.datasets.scene.lidar import Scan, scan
 from optipmb_tools.datasets.scene.traffic import World, build_world, fixed_boxes
@@ -22,12 +22,9 @@ from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Bools, Floats, Ints, Pose, planar_pose, rotation_of, to_sensor, wrap_angle
 from optipmb_tools.results.kitti import write_kitti_results
 
-HEIGHT = 1.75
-"""Of the sensor above the ground."""
-RADIUS = 60.0
-"""Objects farther away are neither detected nor part of the truth."""
-MIN_POINTS = 5
-"""An object with fewer points cannot be expected to be found: its truth is ignored."""
+HEIGHT = 1.75  # of the sensor above the ground
+RADIUS = 60.0  # objects farther away are neither detected nor part of the truth
+MIN_POINTS = 5  # an object with fewer points cannot be expected to be found: its truth is ignored
 
 HIDDEN_S = 2.0
 """An object that no ray has met for longer is a new one when it is seen again, as is one that was out of range: without
@@ -42,16 +39,12 @@ class SceneOptions:
 
     seed: int = 0
     frames: int = 200
-    rate: float = 10.0
-    """Frames per second."""
-    vehicles: int = 20
-    """Cars, a good third of them parked."""
+    rate: float = 10.0  # frames per second
+    vehicles: int = 20  # Cars, a good third of them parked
     pedestrians: int = 12
     cyclists: int = 5
-    clouds: bool = True
-    """Frames carry their point cloud."""
-    velocity: bool = False
-    """Detections carry a velocity."""
+    clouds: bool = True  # frames carry their point cloud
+    velocity: bool = False  # detections carry a velocity
 
     def __post_init__(self) -> None:
         for name, low, high in _BOUNDS:
@@ -178,10 +171,9 @@ class SceneSequence(DataSequence):
         points = returns[when, which]
         covered = np.stack([self._scanned[i][1] for i in range(len(self))])[when, which]
         level = np.digitize(np.nan_to_num(covered, nan=0.0), [0.1, 0.5])
-        count = len(when)
-        return Truth(
-            labels=CLASSES,
-            frame=when.astype(np.int64),
+        return Truth.of(
+            CLASSES,
+            when.astype(np.int64),
             id=identity[when, which],
             label=world.label[which],
             center=world.center[when, which],
@@ -189,12 +181,9 @@ class SceneSequence(DataSequence):
             yaw=wrap_angle(world.yaw[when, which]),
             velocity=world.velocity[when, which],
             occlusion=level.astype(np.int64),
-            truncation=np.zeros(count, dtype=np.int64),
             covered=covered,
             points=points,
-            box2d=np.full((count, 4), np.nan),
             ignored=points < MIN_POINTS,
-            regions=Regions(np.empty(0, dtype=np.int64), np.empty((0, 4))),
         )
 
 
@@ -232,7 +221,6 @@ class SceneDataset(Dataset):
 
         Raises:
             DatasetError: a name is not of four digits, or there is none.
-
         """
         wanted = dict.fromkeys("0000" if name == "all" else name for name in names)
         for name in wanted:
@@ -254,7 +242,6 @@ def scene_options(options: dict[str, float | bool]) -> SceneOptions:
 
     Raises:
         DatasetError: an option is not known or out of its bounds.
-
     """
     known = {field.name: field.type for field in fields(SceneOptions)}
     for name in options:

@@ -18,36 +18,26 @@ CLASSES = ("Car", "Pedestrian", "Cyclist")
 SIZES: Floats = np.array([[4.3, 1.82, 1.55], [0.7, 0.65, 1.74], [1.75, 0.65, 1.74]])
 """Typical length, width and height of each class."""
 MIN_SCORE = 0.1
-FALSE = -1
-"""Source of a detection that is no object."""
+FALSE = -1  # source of a detection that is no object
 
 _FLIP = np.array([0.01, 0.06, 0.03])
 _YAW_ERROR = np.array([0.03, 0.2, 0.08])
 _MIX = np.array([0.5, 0.3, 0.2])
-_STUDENT = 5.0
-"""Degrees of freedom of the errors."""
+_STUDENT = 5.0  # degrees of freedom of the errors
 
 
 @dataclass(frozen=True)
 class Seen:
     """The objects in range at one time."""
 
-    index: Ints
-    """(N,) which objects of the scene they are."""
-    label: Ints
-    """(N,) index into `CLASSES`."""
-    center: Floats
-    """(N, 3)"""
-    size: Floats
-    """(N, 3)"""
-    yaw: Floats
-    """(N,)"""
-    velocity: Floats
-    """(N, 2) over ground along the axes of the sensor."""
-    points: Ints
-    """(N,) returned points."""
-    ease: Floats
-    """(N,) how easily the object is recognised now, about standard normal, slowly changing."""
+    index: Ints  # (N,) which objects of the scene they are
+    label: Ints  # (N,) index into `CLASSES`
+    center: Floats  # (N, 3)
+    size: Floats  # (N, 3)
+    yaw: Floats  # (N,)
+    velocity: Floats  # (N, 2) over ground along the axes of the sensor
+    points: Ints  # (N,) returned points
+    ease: Floats  # (N,) how easily the object is recognised now, about standard normal, slowly changing
 
 
 @dataclass(frozen=True)
@@ -60,8 +50,7 @@ class Found:
     yaw: Floats
     velocity: Floats
     score: Floats
-    source: Ints
-    """(M,) index of the object as in `Seen.index`, or `FALSE`."""
+    source: Ints  # (M,) index of the object as in `Seen.index`, or `FALSE`
 
 
 def detection_probability(points: Ints, ease: Floats) -> Floats:
@@ -79,7 +68,6 @@ def detect(seen: Seen, sites: Floats, radius: float, height: float, rng: np.rand
         radius: how far it looks.
         height: of the sensor above the ground.
         rng: the source of all chance.
-
     """
     chance = detection_probability(seen.points, seen.ease)
     logit = -2.2 + np.log1p(seen.points) + 0.6 * seen.ease + 0.3 * rng.standard_normal(len(chance))

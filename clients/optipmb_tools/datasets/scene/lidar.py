@@ -19,13 +19,10 @@ BEAMS: Floats = np.array(
 """Elevations of the 32 beams: sparse on the near ground, dense where objects are."""
 AZIMUTHS = 900
 RANGE = 80.0
-GROUND = -1
-"""Owner of a ray that ends on the ground."""
-NOTHING = -2
-"""Owner of a ray that ends nowhere."""
+GROUND = -1  # owner of a ray that ends on the ground
+NOTHING = -2  # owner of a ray that ends nowhere
 
-_PARALLEL = 1e-12
-"""Slopes below this count as this, which keeps divisions finite."""
+_PARALLEL = 1e-12  # slopes below this count as this, which keeps divisions finite
 _TANGENT = np.tan(BEAMS)
 _COSINE = np.cos(BEAMS)
 _STEP = 2.0 * np.pi / AZIMUTHS
@@ -39,14 +36,10 @@ _FORWARD, _LEFT = np.tile(np.cos(_AZIMUTH), len(BEAMS)), np.tile(np.sin(_AZIMUTH
 class Scan:
     """What a scan hit."""
 
-    xyz: NDArray[np.float32]
-    """(P, 3) returned points with noise."""
-    owner: Ints
-    """(P,) index of the box that returned the point, or `GROUND`."""
-    points: Ints
-    """(N,) returned points on each box."""
-    covered: Floats
-    """(N,) fraction of the rays that would meet the box but are stopped before it; NaN where none would."""
+    xyz: NDArray[np.float32]  # (P, 3) returned points with noise
+    owner: Ints  # (P,) index of the box that returned the point, or `GROUND`
+    points: Ints  # (N,) returned points on each box
+    covered: Floats  # (N,) fraction of the rays that would meet the box but are stopped before it; NaN where none would
 
 
 def cast(center: Floats, size: Floats, yaw: Floats, height: float) -> tuple[Floats, Ints, Floats]:
@@ -60,7 +53,6 @@ def cast(center: Floats, size: Floats, yaw: Floats, height: float) -> tuple[Floa
 
     Returns:
         Horizontal distance (beams, azimuths), owner (beams, azimuths), and the covered fraction (N,).
-
     """
     with np.errstate(divide="ignore"):
         ground = np.where(_TANGENT < 0.0, -height / _TANGENT, np.inf)

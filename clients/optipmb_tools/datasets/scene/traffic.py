@@ -26,54 +26,38 @@ HALF_LENGTH, HALF_WIDTH, CORNER = 32.0, 25.0, 15.0
 """Of the middle of the street round the block, and the radius of its corners."""
 LANE, CYCLE_LANE, PARKING, KERB, PAVEMENT = 1.75, 4.4, 6.6, 8.2, 10.6
 """Distances of the strips from the middle of the street."""
-_WALKING_LANES = (0.5, 1.5)
-"""Distances of pedestrians from the middle of their way, on its right."""
-_WAY = 20.0
-"""Length of the pavement on either side of a crosswalk."""
-_LINE = 4.2
-"""Distance of the vehicles' stop lines from the middle of the crosswalk."""
-_WAITING = 6.0
-"""Distance of waiting pedestrians from the middle of the street."""
-_SIGN = ((1.0, 1.0), (-1.0, -1.0))
-"""Both sides of the block, of which one is the other turned by pi."""
+_WALKING_LANES = (0.5, 1.5)  # distances of pedestrians from the middle of their way, on its right
+_WAY = 20.0  # length of the pavement on either side of a crosswalk
+_LINE = 4.2  # distance of the vehicles' stop lines from the middle of the crosswalk
+_WAITING = 6.0  # distance of waiting pedestrians from the middle of the street
+_SIGN = ((1.0, 1.0), (-1.0, -1.0))  # both sides of the block, of which one is the other turned by pi
 
 _CYCLE_S = 36.0
 _GREEN_S, _WALK_S = (0.0, 15.0), (20.0, 22.5)
 """Parts of the cycle of the lights in which vehicles and pedestrians may pass; then the crosswalk is cleared."""
-_BRAKING = 3.5
-"""A road user that would have to brake harder passes the lights."""
+_BRAKING = 3.5  # a road user that would have to brake harder passes the lights
 _HARDEST = 6.0
 _AT_LINE = 0.5
 _PAUSE_EVERY_S, _PAUSE_S = 40.0, 6.0
-_PAUSE_ZONE = (5.0, 30.0)
-"""Distance to the next crosswalk at which a pedestrian may stand for a while."""
+_PAUSE_ZONE = (5.0, 30.0)  # distance to the next crosswalk at which a pedestrian may stand for a while
 _FREE = 1e4
 _STEP = 0.05
 _PARKED_SHARE = 0.35
-_TURNED = 0.15
-"""Share of the parked cars that stand the other way round."""
-_MEMORY_S = 0.8
-"""How long it lasts that an object is easy or hard to recognise."""
+_TURNED = 0.15  # share of the parked cars that stand the other way round
+_MEMORY_S = 0.8  # how long it lasts that an object is easy or hard to recognise
 
 
 @dataclass(frozen=True)
 class World:
     """The road users of a scene at each of its frames."""
 
-    label: Ints
-    """(O,) index into `CLASSES`."""
-    size: Floats
-    """(O, 3)"""
-    center: Floats
-    """(F, O, 3)"""
-    yaw: Floats
-    """(F, O)"""
-    velocity: Floats
-    """(F, O, 2)"""
-    ease: Floats
-    """(F, O) how easily each is recognised, about standard normal."""
-    carrier: Floats
-    """(F, 3) x, y and yaw of the vehicle that carries the sensor."""
+    label: Ints  # (O,) index into `CLASSES`
+    size: Floats  # (O, 3)
+    center: Floats  # (F, O, 3)
+    yaw: Floats  # (F, O)
+    velocity: Floats  # (F, O, 2)
+    ease: Floats  # (F, O) how easily each is recognised, about standard normal
+    carrier: Floats  # (F, 3) x, y and yaw of the vehicle that carries the sensor
 
 
 class Driver(NamedTuple):
@@ -83,10 +67,8 @@ class Driver(NamedTuple):
     braking: Floats | float
     headway: Floats | float
     standstill: Floats | float
-    sideways: Floats | float
-    """Acceleration in bends."""
-    clearing: Floats | float
-    """Length of the crossing that is entered only when there is room behind it."""
+    sideways: Floats | float  # acceleration in bends
+    clearing: Floats | float  # length of the crossing that is entered only when there is room behind it
 
 
 _DRIVERS = {
@@ -255,7 +237,6 @@ def build_world(counts: tuple[int, int, int], times: Floats, rng: np.random.Gene
         counts: vehicles without the one that carries the sensor, pedestrians, cyclists.
         times: (F,) from 0, equally spaced.
         rng: the source of all chance.
-
     """
     vehicles, pedestrians, cyclists = counts
     parked, busy = round(_PARKED_SHARE * vehicles), min(2, vehicles // 8)
@@ -338,7 +319,6 @@ def _shuttle(sign: float, times: Floats, offset: float, reach: float) -> tuple[F
         times: (F,)
         offset: time into the round at time 0.
         reach: distance of the axles from the middle.
-
     """
     turn = np.linspace(0.0, 0.5 * np.pi, 65)
     bend = np.column_stack([8.0 + 5.0 * (1.0 - np.cos(turn)), -7.5 + 5.0 * np.sin(turn)])

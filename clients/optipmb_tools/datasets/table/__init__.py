@@ -45,7 +45,7 @@ _WRITTEN: Final = frozenset({"existence", "confirmed", "age", "time_since_detect
 """Columns by which a table of tracks that OptiPMB wrote is known."""
 _HEAD: Final = 4096
 _UNITS: Final = {"yaw": "radians", "heading": "x", "sizes": "lwh", "axes": "z-up"}
-"""Options that such a table is read with, beside those of the user about its times and classes."""
+"""Options that such a table is read with, in addition to the user's options about its times and classes."""
 _PLACES: Final = ("time", "rate", "column.stamp", "column.frame", "column.recording", "column.sensor")
 
 

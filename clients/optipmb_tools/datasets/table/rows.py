@@ -55,8 +55,8 @@ class Boxes:
     frame_number: NDArray[Any] | None  # (R,) number of the frame as the table has it; None where it has none
     row: Ints  # (B,) row of each box, counted from 0
     center: Floats  # (B, 3)
-    size: Floats  # (B, 3); NaN in a table of objects that has neither l nor w
-    yaw: Floats  # (B,); NaN in a table of objects that has none
+    size: Floats  # (B, 3); NaN in a table that has neither l nor w
+    yaw: Floats  # (B,); NaN in a table that has none
     velocity: Floats | None  # (B, 2); rows of NaN where unknown
     position_covariance: Floats | None
     """(B, 3, 3) of the errors of the centres along the axes of the boxes, m^2; of NaN where unknown, None without."""
@@ -89,7 +89,7 @@ def read_tables(
     Args:
         paths: Files, or folders with a file for each frame. Tables without rows give no boxes.
         reading: Options of the user; receives the findings.
-        scored: Whether boxes are detections, which have a score, a size and a heading.
+        scored: Whether boxes are detections, which have a score.
         loaded: Tables that were read already.
 
     Raises:
@@ -171,18 +171,15 @@ class _Table:
         series = np.unique(key, return_inverse=True)[1] * (len(reading.files) + 1) + file
         stamp, time, time_column = self._stamps(series)
         center = self._centers()
-        centres = not scored and not {"l", "w"} & found.keys()
-        side = 1.0 if centres else None
-        size = np.column_stack([self._numbers("l", side), self._numbers("w", side), self._numbers("h", 1.5)])
-        yaw, yaw_unit = self._yaw(otherwise=None if scored else 0.0)
+        centres = not {"l", "w"} & found.keys()
+        ends = (("l", 1.0 if centres else None), ("w", 1.0 if centres else None), ("h", 1.5))
+        size = np.column_stack([self._numbers(role, without) for role, without in ends])
+        yaw, yaw_unit = self._yaw(otherwise=None if scored and not centres else 0.0)
         turned = yaw_unit != "none"
-        if centres or not turned:
-            reading.note("sizes", "no columns for the size or the heading: only centres can be compared")
         score = self._numbers("score", 1.0)
         names, id_ = self._names(), self._ids()
-        for role, text in ((self._height, "z = 0"), ("h", "a height of 1.5 m"), ("score", "a score of 1")):
-            if role not in found and (scored or role != "score"):
-                reading.note(role, f"no column for {role}: {text} for every box")
+        points = scored and centres  # not even the height is taken for granted
+        self._note_missing(scored=scored, points=points, boxes=turned and not centres)
         empty = np.isnan(center[:, :2]).all(axis=1) & (centres | np.isnan(size[:, :2]).all(axis=1))
         kept = self._valid(np.asarray(~empty), center, size, yaw, score, names)
         if "score" in found and scored:
@@ -223,7 +220,7 @@ class _Table:
             frame_time=time,
             frame_number=self._columns[found["frame"].name] if "frame" in found else None,
             row=row,
-            center=center,
+            center=np.insert(plane, 2, np.nan, axis=1) if points and self._height not in found else center,
             size=np.full_like(size, np.nan) if centres else size,
             yaw=yaw if turned else np.full_like(yaw, np.nan),
             velocity=velocity,
@@ -236,6 +233,15 @@ class _Table:
             sensor_column=found["sensor"].name if "sensor" in found else "",
             keys=keys,
         )
+
+    def _note_missing(self, *, scored: bool, points: bool, boxes: bool) -> None:
+        """Note what is assumed of columns that there are not."""
+        if not boxes:
+            meaning = "they are unknown" if scored else "only centres can be compared"
+            self._reading.note("sizes", f"no columns for the size or the heading: {meaning}")
+        for role, text in ((self._height, "z = 0"), ("h", "a height of 1.5 m"), ("score", "a score of 1")):
+            if role not in self._found and (scored if role == "score" else not points):
+                self._reading.note(role, f"no column for {role}: {text} for every box")
 
     @property
     def _height(self) -> str:
@@ -560,8 +566,7 @@ class _Motion:
         return np.asarray(np.arctan2(turned[:, 1], turned[:, 0]), dtype=np.float64)
 
 
-_FORWARD: Final = 0.8
-"""Share of forward moves from which a common motion is that of traffic, not of the sensor."""
+_FORWARD: Final = 0.8  # share of forward moves from which traffic shares a motion, not the sensor
 _LEAST_TURN: Final = 1e-6
 _INVERSE: Final = np.array([1.0, -1.0, -1.0, -1.0])
 

@@ -1,0 +1,139 @@
+"""A world that moves under its objects: the same density in other coordinates (not in the paper).
+
+After a loop closure, a fix of a satellite receiver or a change of map, a localisation says that what was at p is at
+
+    p' = R(theta) p + t
+
+in the new world, R a turn about z. Means and covariances are moved, speeds, turn rates and all that has no place stay.
+The motion model has no preferred place or direction, so that tracks go on as if the world had always been so. Nothing
+is added to covariances: the motion is exact.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple, Self, TypeVar
+
+import numpy as np
+
+from optipmb.density import PHI, Bernoullis, Poissons
+from optipmb.errors import DensityError
+from optipmb.frame import MAX_COORDINATE, Pose
+from optipmb.rows import read_only
+
+if TYPE_CHECKING:
+    from optipmb.density import Density
+    from optipmb.frame import Frame
+    from optipmb.rows import Array
+
+Place = tuple[float, float, float]
+_Rows = TypeVar("_Rows", Bernoullis, Poissons)
+
+
+class Relocation(NamedTuple):
+    """The motion from one world frame to the next.
+
+    Attributes:
+        x, y, z: t, m.
+        theta: turn about z, rad.
+    """
+
+    x: float
+    y: float
+    z: float
+    theta: float
+
+    @classmethod
+    def of(cls, pose: Pose) -> Self:
+        """Return the motion that a pose of the old world in the new one is, but for its tilt."""
+        w, _, _, z = pose.quaternion.tolist()
+        x, y, height = pose.translation.tolist()
+        return cls(x, y, height, 2.0 * math.atan2(z, w))
+
+    def place(self, place: Place) -> Place:
+        """Return where a place comes to."""
+        cos, sin = math.cos(self.theta), math.sin(self.theta)
+        x, y, z = place
+        return cos * x - sin * y + self.x, sin * x + cos * y + self.y, z + self.z
+
+    def points(self, points: Array) -> Array:
+        """Return where points (N, 2) come to."""
+        cos, sin = math.cos(self.theta), math.sin(self.theta)
+        x, y = points[:, 0], points[:, 1]
+        return np.column_stack((cos * x - sin * y + self.x, sin * x + cos * y + self.y))
+
+    def pose(self, pose: Pose) -> Pose:
+        """Return a pose in the new world."""
+        cos, sin = math.cos(0.5 * self.theta), math.sin(0.5 * self.theta)
+        w, x, y, z = pose.quaternion.tolist()
+        turned = (cos * w - sin * z, cos * x - sin * y, cos * y + sin * x, cos * z + sin * w)
+        x, y, z = pose.translation.tolist()
+        return Pose(np.array(self.place((x, y, z))), np.array(turned))
+
+    def density(self, density: Density) -> Density:
+        """Return a density in the new world.
+
+        Raises:
+            DensityError: an object would be beyond all positions on Earth.
+        """
+        if not any(self):
+            return density
+        moved = replace(density, bernoulli=self._rows(density.bernoulli), poisson=self._rows(density.poisson))
+        if density.sensor is None:
+            return moved
+        cos, sin = math.cos(self.theta), math.sin(self.theta)
+        vx, vy, turn, *evidence = density.sensor.tolist()
+        v = cos * vx - sin * vy + turn * self.y, sin * vx + cos * vy - turn * self.x
+        return replace(moved, sensor=read_only(np.array([*v, turn, *evidence])))
+
+    def frame(self, frame: Frame) -> Frame:
+        """Return a frame in the new world.
+
+        Raises:
+            FrameError: an object would be beyond all positions on Earth.
+        """
+        if not any(self):
+            return frame
+        view, cloud, spread = frame.field_of_view, frame.cloud, frame.position_covariance
+        center = np.column_stack((self.points(frame.center[:, :2]), frame.center[:, 2] + self.z))
+        turn = self._replace(x=0.0, y=0.0)
+        if spread is not None:
+            (xx, xy, yy), cos, sin = spread.T, math.cos(self.theta), math.sin(self.theta)
+            crossed, mixed = cos * sin, 2.0 * cos * sin * xy
+            spread = np.column_stack((
+                cos * cos * xx - mixed + sin * sin * yy,
+                crossed * (xx - yy) + (cos * cos - sin * sin) * xy,
+                sin * sin * xx + mixed + cos * cos * yy,
+            ))  # fmt: skip
+        return replace(
+            frame,
+            center=center,
+            yaw=_wrapped(frame.yaw + self.theta),
+            velocity=turn.points(frame.velocity),
+            position_covariance=spread,
+            cloud=None if cloud is None else replace(cloud, pose=self.pose(cloud.pose)),
+            field_of_view=None if view is None else view.at(self.pose(view.pose or ORIGIN)),
+            pose=self.pose(frame.pose or ORIGIN),
+        )
+
+    def _rows(self, rows: _Rows) -> _Rows:
+        turn = np.eye(6)
+        turn[:2, :2] = (math.cos(self.theta), -math.sin(self.theta)), (math.sin(self.theta), math.cos(self.theta))
+        mean, auxiliary = rows.mean.copy(), rows.auxiliary
+        mean[:, :2] = self.points(mean[:, :2])
+        mean[:, PHI] = _wrapped(mean[:, PHI] + self.theta)
+        if self.z:
+            auxiliary = auxiliary + np.array([0.0, 0.0, 0.0, self.z])
+        farthest = max(np.abs(mean[:, :2]).max(initial=0.0), np.abs(auxiliary[:, 3]).max(initial=0.0))
+        if farthest > MAX_COORDINATE:
+            raise DensityError(f"{rows.part}.mean", f"coordinates up to {MAX_COORDINATE:g} m", f"{farthest:g}")
+        return rows.replaced(mean=mean, covariance=turn @ rows.covariance @ turn.T, auxiliary=auxiliary)
+
+
+ORIGIN = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+
+
+def _wrapped(heading: Array) -> Array:
+    """Return headings within (-pi, pi]."""
+    return heading - 2.0 * math.pi * np.ceil((heading - math.pi) / (2.0 * math.pi))
