@@ -174,6 +174,11 @@ class DataSequence(ABC):
     def frames(self) -> Iterator[DetectionFrame]:
         """Yield every frame in order, also those without detections."""
 
+    @property
+    def stamps(self) -> Ints:
+        """(F,) nanoseconds; `frames` may count from another origin."""
+        return np.array([frame.stamp_ns for frame in self.frames()], dtype=np.int64)
+
     def truth(self) -> Truth | None:
         """Return the annotations; None where the data set has none."""
         return None

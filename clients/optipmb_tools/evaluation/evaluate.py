@@ -22,9 +22,9 @@ from optipmb_tools.evaluation.errors import ErrorResult, evaluate_errors
 from optipmb_tools.evaluation.figures import defined
 from optipmb_tools.evaluation.gospa import CUTOFF, ORDER, GospaResult, evaluate_gospa
 from optipmb_tools.evaluation.hota import HotaResult, evaluate_hota
-from optipmb_tools.evaluation.tracks import read_compared, read_full_tracks
-from optipmb_tools.results import FullTable, ResultTable, full_path, read_full
-from optipmb_tools.results.nuscenes import read_nuscenes_results, result_table
+from optipmb_tools.evaluation.tracks import read_compared, read_full_tracks, result_file
+from optipmb_tools.results import FullTable, ResultTable
+from optipmb_tools.results.nuscenes import read_nuscenes_results, result_table, scene_file
 
 _ROUNDING = 1e-9
 
@@ -143,7 +143,7 @@ def load_recordings(
         return _nuscenes_recordings(sequences, results)
     pairs = zip(sequences, read_compared(sequences, results, names), strict=True)
     return [
-        Recording(one, truth, tracks.to_world(one.poses), read_full_tracks(results, one))
+        Recording(one, truth, tracks.to_world(one.poses), read_full_tracks(result_file(results, one.name)))
         for one, (truth, tracks) in pairs
     ]
 
@@ -161,8 +161,7 @@ def _nuscenes_recordings(sequences: Sequence[DataSequence], results: Path) -> li
         # The benchmark compares near boxes only, by class; truth farther away is ignored already.
         reach = np.array([CLASS_RANGE.get(name, 0.0) for name in table.labels] or [0.0])
         near = sequence.ego_distance(table.frame, table.center) < reach[table.label]
-        beside = full_path(submission.path.parent / "scenes" / f"{sequence.name}.json")
-        full = read_full(beside) if beside.is_file() else None
+        full = read_full_tracks(scene_file(submission.path.parent, sequence.name))
         recordings.append(Recording(sequence, truth, table.take(near), full))
     return recordings
 

@@ -92,11 +92,6 @@ def _confirmed(tracks: Tracks) -> "NDArray[np.int64]":
     return np.ones(len(tracks.id), np.int64) if tracks.confirmed is None else np.asarray(tracks.confirmed, np.int64)
 
 
-def join(parts: Sequence[Columns]) -> Columns:
-    """Return tables with the same columns as one, one below the other."""
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else {}
-
-
 @dataclass(frozen=True)
 class Latency:
     """Quantiles of durations, in milliseconds."""
@@ -171,8 +166,8 @@ class Results:
 
         Sequences that were not taken are missing in the table; a file of a benchmark is written of all or not at all.
         """
-        parts = {name: written for name, written in self._taken.items() if not isinstance(written, Path)}
+        parts = [written for _, written in sorted(self._taken.items()) if not isinstance(written, Path)]
         if parts:
-            write_table(self._out, join([parts[name] for name in sorted(parts)]))
+            write_table(self._out, {name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
         elif all(one.name in self._taken for one in sequences):
             self._dataset.join(self._out, sequences)
