@@ -146,7 +146,8 @@ def _from_table(path: Path, sequence: DataSequence) -> ResultTable:
 def _key(table: ObjectTable, sequence: DataSequence, tables: TableOptions) -> str | None:
     """Return the key of a sequence in a table of tracks; None where it has other recordings of the dataset only."""
     keys = table.boxes.keys
-    for one in (".".join(sequence.key_columns.values()), sequence.name):
+    counted = sequence.name.lstrip("0") or "0"  # a text table has no way to say that 0004 is not the number 4
+    for one in (".".join(sequence.key_columns.values()), sequence.name, counted):
         if one in keys:
             return one
     if tables.recordings & keys.keys():
