@@ -25,8 +25,7 @@ from optipmb_tools.table_files import Columns, is_table, write_table
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from optipmb_tools.datasets.interface import DataSequence, Dataset
-    from optipmb_tools.georeference import Georeference
+    from optipmb_tools.datasets.interface import DataSequence, Dataset, Georeference
 
 _STATE: Final = ("x", "y", "v", "phi", "omega", "a")
 COVARIANCE: Final = {f"cov_{_STATE[i]}_{_STATE[j]}": (i, j) for i in range(6) for j in range(i, 6)}
