@@ -128,13 +128,7 @@ class ClassFigures:
 def load_recordings(
     dataset: str, sequences: Sequence[DataSequence], results: Path, names: Sequence[str] = ()
 ) -> list[Recording]:
-    """Return the sequences with their truth and their tracks.
-
-    Args:
-        dataset: its name, on which the layout of the result files depends.
-        sequences: each must have a truth.
-        results: the folder of the result files.
-        names: as for `read_compared`.
+    """Return the sequences with their truth and their tracks, which each data set has in a layout of its own.
 
     Raises:
         DatasetError: a sequence has no truth, or its results are missing or wrong.
@@ -264,10 +258,8 @@ class Evaluation:
 def figures_of(shared: Evaluation, task: tuple[str, float | None]) -> list[ClassFigures]:
     """Return the figures of one class; none for a class that neither truth nor tracks have.
 
-    Args:
-        shared: data.
-        task: the class, and the threshold of the tracks that are also evaluated without the others; None: as
-            `evaluate_figures` chooses it.
+    The task is the class, and the threshold of the tracks that are also evaluated without the others; None: as
+    `evaluate_figures` chooses it.
 
     Raises:
         DatasetError: as `load_recordings`.
