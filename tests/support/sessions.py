@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import threading
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -102,6 +104,35 @@ class Failing:
         if len(frame.score) == self._count:
             raise ZeroDivisionError("seven")
         return self._tracker.step(density, frame)
+
+
+class Gated:
+    """Trackers of a service whose steps wait, from the `first` one on, until the gate is opened.
+
+    Attributes:
+        steps: the stream's tracker of each step so far.
+        entered: set when a step waits.
+        gate: lets steps through once it is set.
+    """
+
+    def __init__(self, first: int = 1) -> None:
+        self.steps: list[object] = []
+        self.entered, self.gate = threading.Event(), threading.Event()
+        self._first = first
+
+    def tracker(self, parameters: optipmb.Parameters) -> Any:
+        """Make the tracker of a session."""
+        inner, made = optipmb.Tracker(parameters), SimpleNamespace()
+
+        def step(density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
+            self.steps.append(made)
+            if len(self.steps) >= self._first:
+                self.entered.set()
+                assert self.gate.wait(60)
+            return inner.step(density, frame)
+
+        made.step = step
+        return made
 
 
 NOTHING = (
