@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import threading
 from dataclasses import dataclass, replace
@@ -135,17 +136,14 @@ class Gated:
         return made
 
 
-NOTHING = (
-    optipmb.Tracker(optipmb.load_profile("nuscenes"))
-    .step(
-        optipmb.Tracker(optipmb.load_profile("nuscenes")).initial(),
-        optipmb.make_frame(
-            optipmb.load_profile("nuscenes"), stamp_ns=0, labels=(), label=[], center=[], size=[], yaw=[], score=[]
-        )[0],
-    )
-    .diagnostics
-)
-"""Of a step without detections."""
+@functools.cache
+def nothing() -> optipmb.Diagnostics:
+    """The diagnostics of a step without detections."""
+    parameters = optipmb.load_profile("nuscenes")
+    tracker = optipmb.Tracker(parameters)
+    columns: Any = dict.fromkeys(("labels", "label", "center", "size", "yaw", "score"), ())
+    frame, _ = optipmb.make_frame(parameters, stamp_ns=0, **columns)
+    return tracker.step(tracker.initial(), frame).diagnostics
 
 
 @dataclass
@@ -199,7 +197,7 @@ class Chained:
             detection=np.array([-1]),
             confirmed=np.ones(1, np.bool_),
         )
-        return optipmb.StepResult(after, found, replace(NOTHING, cloud_used=frame.cloud is not None, born=int(born)))
+        return optipmb.StepResult(after, found, replace(nothing(), cloud_used=frame.cloud is not None, born=int(born)))
 
 
 def chained(parameters: optipmb.Parameters) -> Chained:
