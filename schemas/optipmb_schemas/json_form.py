@@ -43,6 +43,9 @@ Alt = Annotated[float, Meta(description="Height above the ellipsoid in m.")]
 Position = Annotated[tuple[float, float, float], Meta(description="Centre: x, y, z in m, world frame.")]
 Yaw = Annotated[float, Meta(description="Heading in radians, counter-clockwise from x of the world frame.")]
 Speed = Annotated[float, Meta(description="Speed in m/s.")]
+Known = float | None
+Spot = Annotated[tuple[float, float, Known], Meta(description="Centre: x, y, z in m, world frame; null: not known.")]
+Size = Annotated[tuple[Known, Known, Known], Meta(description="Length, width, height in m; null: not known.")]
 Class = Annotated[str, Meta(description="Name of the class.")]
 
 
@@ -53,9 +56,9 @@ class EdgeTrack(Struct, frozen=True, rename={"kind": "class"}):
     kind: Class | UnsetType = UNSET
     confirmed: Annotated[bool, Meta(description="Whether the object is taken to exist.")] | UnsetType = UNSET
     existence: Annotated[float, Meta(description="Probability that the object exists.")] | UnsetType = UNSET
-    position: Position | UnsetType = UNSET
-    size: Annotated[tuple[float, float, float], Meta(description="Length, width, height in m.")] | UnsetType = UNSET
-    yaw: Yaw | UnsetType = UNSET
+    position: Spot | UnsetType = UNSET
+    size: Size | UnsetType = UNSET
+    yaw: Yaw | UnsetType | None = UNSET
     speed: Speed | UnsetType = UNSET
     velocity: Annotated[tuple[float, float], Meta(description="Velocity in m/s along x and y.")] | UnsetType = UNSET
     age_s: Annotated[float, Meta(description="Seconds since its first detection.")] | UnsetType = UNSET
@@ -157,11 +160,16 @@ def is_confirmed(tracks: Tracks) -> NDArray[np.bool_]:
 def tracks_json(tracks: Tracks, selection: Selection = EVERYTHING, place: Place | None = None) -> bytes:
     """Return the selected tracks of a frame as one text."""
     rows = np.flatnonzero(selection.rows(tracks))
+    center, size, yaw = tracks.center, tracks.size, tracks.yaw
+    if tracks.measured is not None:  # NaN becomes null
+        heading, sized, high = (tracks.measured & bit > 0 for bit in (1, 2, 4))
+        center = np.where(high[:, None] | np.array([True, True, False]), center, np.nan)
+        size, yaw = np.where(sized[:, None], size, np.nan), np.where(heading, yaw, np.nan)
     numbers = {
         "existence": tracks.existence,
-        "position": tracks.center,
-        "size": tracks.size,
-        "yaw": tracks.yaw,
+        "position": center,
+        "size": size,
+        "yaw": yaw,
         "speed": np.hypot(*tracks.velocity.T),
         "velocity": tracks.velocity,
         "age_s": tracks.age,
@@ -172,7 +180,7 @@ def tracks_json(tracks: Tracks, selection: Selection = EVERYTHING, place: Place 
         "class": map(tracks.labels.__getitem__, tracks.label[rows].tolist()),
         "confirmed": is_confirmed(tracks)[rows].tolist(),
         **{name: np.round(column[rows], DIGITS).tolist() for name, column in numbers.items()},
-        **dict(zip(PLACE, _placed(tracks.center[rows], tracks.yaw[rows], place), strict=True)),
+        **dict(zip(PLACE, _placed(tracks.center[rows], yaw[rows], place), strict=True)),
     }
     if selection.fields:
         columns |= dict.fromkeys(columns.keys() - selection.fields - {"id"}, repeat(UNSET))

@@ -194,6 +194,7 @@ def tracks(draw: st.DrawFn) -> Tracks:
         velocity=draw(rows((n, 2), -1e5, 1e5)),
         covariance=draw(rows((n, 6, 6), -1e30, 1e30)),
         detection=draw(whole(n, -1, INT64)),
+        measured=draw(st.none() | whole(n, 0, 7)),
         delivery=draw(st.none() | delivery),
         **column,
         **draw(paths(n)),
@@ -404,10 +405,20 @@ def test_the_json_of_the_edges_has_the_numbers_of_the_columns(message: Tracks) -
         "age_s": message.age,
         "seen_s": message.time_since_detection,
     }
+    known = np.full(len(message.id), 7) if message.measured is None else message.measured
     for name, column in columns.items():
-        assert [one[name] for one in text["objects"]] == np.round(column, 3).tolist()
+        wanted = np.round(column, 3).tolist()
+        for row, bits in enumerate(known.tolist()):
+            if name == "yaw" and not bits & 1:
+                wanted[row] = None
+            elif name == "size" and not bits & 2:
+                wanted[row] = [None] * 3
+            elif name == "position" and not bits & 4:
+                wanted[row][2] = None
+        assert [one[name] for one in text["objects"]] == wanted
     near = np.linalg.norm(message.center, axis=1) <= 1e5
-    assert ["lat" in one and 0 <= one["heading"] < 360 for one in text["objects"]] == near.tolist()
+    assert ["lat" in one for one in text["objects"]] == near.tolist()
+    assert [0 <= one.get("heading", -1) < 360 for one in text["objects"]] == (near & (known % 2 == 1)).tolist()
 
 
 @given(tracks(), st.frozensets(st.sampled_from(sorted(FIELDS))), st.floats(0, 1), st.integers(0, 1))
