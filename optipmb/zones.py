@@ -260,18 +260,19 @@ def observe(
     rows = np.flatnonzero(tracks.detection >= 0)
     identities = tracks.id.tolist()
     nowhere = (math.nan, math.nan)
-    before = np.array([known[i].place[:2] if i in known else nowhere for i in tracks.id[rows].tolist()]).reshape(-1, 2)
+    seen_before = [known.get(identities[row]) for row in rows.tolist()]
+    before = np.array([one.place[:2] if one else nowhere for one in seen_before]).reshape(-1, 2)
     center = np.ascontiguousarray(tracks.center[rows])
     where, net = locate(center, before, *(shapes or Shapes.of(zones)))
     marked = ((where != 0) | (net != 0)).any(axis=1).tolist()
     everywhere = (1 << len(zones)) - 1
-    for at, (row, (x, y, z)) in enumerate(zip(rows.tolist(), center.tolist(), strict=True)):
+    velocity, yaws, label = tracks.velocity, tracks.yaw, tracks.label
+    for at, (row, (x, y, z), old) in enumerate(zip(rows.tolist(), center.tolist(), seen_before, strict=True)):
         identity = identities[row]
-        old = known.get(identity)
         seen = Seen(stamp_ns, (x, y, z), everywhere, {}, {}, *(old[5:] if old else ()))
         if marked[at] or (old and (old.visits or old.beside)):
-            speed, yaw = math.hypot(*tracks.velocity[row].tolist()), float(tracks.yaw[row])
-            now = Event("", "entered", 0, identity, labels[tracks.label[row]], stamp_ns, (x, y, z), speed, yaw)
+            speed, yaw = math.hypot(*velocity[row].tolist()), float(yaws[row])
+            now = Event("", "entered", 0, identity, labels[label[row]], stamp_ns, (x, y, z), speed, yaw)
             seen, more = _moved(zones, old, seen, now, where[at].tolist(), net[at].tolist())
             if seen.confirmed:  # once is enough
                 events += more

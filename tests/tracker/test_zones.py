@@ -143,6 +143,14 @@ def test_how_a_line_is_crossed(path: list[tuple[float, float] | None], direction
     assert [one.direction for one in events_of([GATE], along(*path))] == directions
 
 
+def test_a_bent_line_is_crossed_where_it_is() -> None:
+    """Not where the way crosses the chord between its ends."""
+    bend = Zone("bend", line=((0, 0), (0, 10), (10, 10)))
+    (crossing,) = events_of([bend], along((-2, 5), (12, 5)))
+    assert crossing.position == pytest.approx((0.0, 5.0, 0.0))
+    assert crossing.at_ns == round(STEP_NS * 2 / 14)
+
+
 def test_events_wait_until_the_track_is_confirmed() -> None:
     """They come with the frame that confirms it, with their own times; otherwise never."""
     frames = [frame({7: (5, 5)}, confirmed=step >= 12) for step in range(14)]
