@@ -350,6 +350,11 @@ def test_density_of_a_stream(node: Node) -> None:
     assert (len(nothing.weight), nothing.session, nothing.stamp_ns) == (0, "0" * 32, None)
 
 
+def test_zones_of_a_stream_without_any(node: Node) -> None:
+    """q/zones is refused, with the name of the stream."""
+    assert node.refused(KEYS.query(SENSOR.stream, "zones")).received == repr(SENSOR.stream)
+
+
 def test_questions_that_are_none_are_refused(node: Node) -> None:
     """Unknown questions, wrong payloads and stranger keys get an error reply, at once."""
     assert node.refused("optipmb/v1/site/node/lidar/q/nonsense").code == "invalid_value"
