@@ -338,7 +338,7 @@ def relocated(state: ZoneState, relocation: Relocation) -> ZoneState:
             place=relocation.place(seen.place),
             known=0,
             visits={name: visit(one) for name, one in seen.visits.items()},
-            beside={name: (at_ns, relocation.place(place)) for name, (at_ns, place) in seen.beside.items()},
+            near={name: (at_ns, relocation.place(place)) for name, (at_ns, place) in seen.near.items()},
             held=tuple(event(one) for one in seen.held),
         )
         for identity, seen in state.tracks.items()
