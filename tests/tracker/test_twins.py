@@ -258,7 +258,7 @@ def test_rows_are_calibrated_as_numpy_interpolates(seed: int) -> None:
             turn = np.array([[cos, -sin], [sin, cos]])
             covariance[k] *= np.outer(factors[c], factors[c])
             squared = velocity[k] @ velocity[k]
-            velocity[k] *= squared / (squared + covariance[k, 2, 2])
+            velocity[k] *= squared**2 / (squared**2 + (3 * covariance[k, 2, 2]) ** 2)
             covariance[k, :2, :2] += turn @ np.diag([along**2, across**2]) @ turn.T
             score[k] = np.average([score[k], 0.5 + 0.5 * evidence[n] / SURE], weights=[1 - weight[c], weight[c]])
     np.testing.assert_allclose(told, existence, rtol=1e-12)
