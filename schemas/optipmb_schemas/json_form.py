@@ -19,7 +19,7 @@ from optipmb_schemas.codec import encode_json
 from optipmb_schemas.control import Problem
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable
 
     from numpy.typing import NDArray
 
@@ -40,30 +40,33 @@ YEARS_NS: Final = (946_684_800 * 10**9, 4_102_444_800 * 10**9)  # 2000 and 2100
 Lat = Annotated[float, Meta(description="Latitude in degrees (WGS84), 9 decimals. Absent: the site has no place.")]
 Lon = Annotated[float, Meta(description="Longitude in degrees, 9 decimals.")]
 Alt = Annotated[float, Meta(description="Height above the ellipsoid in m.")]
-Position = Annotated[tuple[float, float, float], Meta(description="Centre: x, y, z in m, world frame.")]
+Position = Annotated[tuple[float, float, float | None], Meta(description="Centre: x, y, z in m, world frame.")]
+Size = Annotated[tuple[float, float, float], Meta(description="Length, width, height in m.")]
+Velocity = Annotated[tuple[float, float], Meta(description="Velocity in m/s along x and y.")]
+Heading = Annotated[float, Meta(description="Degrees clockwise from true north, in [0, 360).")]
 Yaw = Annotated[float, Meta(description="Heading in radians, counter-clockwise from x of the world frame.")]
 Speed = Annotated[float, Meta(description="Speed in m/s.")]
 Class = Annotated[str, Meta(description="Name of the class.")]
 
 
 class EdgeTrack(Struct, frozen=True, rename={"kind": "class"}):
-    """One track. Fields that a reader did not ask for are absent."""
+    """One track. Fields that a reader did not ask for are absent; what was never measured is null."""
 
     id: Annotated[int, Meta(description="Identity: unique in the stream, never used again.")]
     kind: Class | UnsetType = UNSET
     confirmed: Annotated[bool, Meta(description="Whether the object is taken to exist.")] | UnsetType = UNSET
     existence: Annotated[float, Meta(description="Probability that the object exists.")] | UnsetType = UNSET
     position: Position | UnsetType = UNSET
-    size: Annotated[tuple[float, float, float], Meta(description="Length, width, height in m.")] | UnsetType = UNSET
-    yaw: Yaw | UnsetType = UNSET
+    size: Size | UnsetType | None = UNSET
+    yaw: Yaw | UnsetType | None = UNSET
     speed: Speed | UnsetType = UNSET
-    velocity: Annotated[tuple[float, float], Meta(description="Velocity in m/s along x and y.")] | UnsetType = UNSET
+    velocity: Velocity | UnsetType = UNSET
     age_s: Annotated[float, Meta(description="Seconds since its first detection.")] | UnsetType = UNSET
     seen_s: Annotated[float, Meta(description="Seconds since its last detection.")] | UnsetType = UNSET
     lat: Lat | UnsetType = UNSET
     lon: Lon | UnsetType = UNSET
     alt: Alt | UnsetType = UNSET
-    heading: Annotated[float, Meta(description="Degrees clockwise from true north, in [0, 360).")] | UnsetType = UNSET
+    heading: Heading | UnsetType | None = UNSET
 
 
 FIELDS: Final = frozenset(msgspec.structs.asdict(EdgeTrack(0))) - {"id", "kind"} | {"class"}
@@ -123,6 +126,10 @@ class EdgeZones(_Frame, frozen=True, tag="zones", kw_only=True):
     ]
 
 
+MEASURED: Final = {1: ("yaw", "heading"), 2: ("size",)}
+"""Fields by the bits of `Tracks.measured`; None where a bit is not set."""
+HEIGHT: Final = 4
+
 FRAMES: Final = (EdgeTracks, EdgeEvent, EdgeZones)
 
 
@@ -167,13 +174,19 @@ def tracks_json(tracks: Tracks, selection: Selection = EVERYTHING, place: Place 
         "age_s": tracks.age,
         "seen_s": tracks.time_since_detection,
     }
-    columns: dict[str, Iterable[Any]] = {
+    columns: dict[str, Any] = {
         "id": tracks.id[rows].tolist(),
         "class": map(tracks.labels.__getitem__, tracks.label[rows].tolist()),
         "confirmed": is_confirmed(tracks)[rows].tolist(),
         **{name: np.round(column[rows], DIGITS).tolist() for name, column in numbers.items()},
         **dict(zip(PLACE, _placed(tracks.center[rows], tracks.yaw[rows], place), strict=True)),
     }
+    for row, bits in enumerate([] if tracks.measured is None else tracks.measured[rows].tolist()):
+        for name in (name for bit, names in MEASURED.items() if not bits & bit for name in names):
+            if columns[name][row] is not UNSET:
+                columns[name][row] = None
+        if not bits & HEIGHT:
+            columns["position"][row][2] = None
     if selection.fields:
         columns |= dict.fromkeys(columns.keys() - selection.fields - {"id"}, repeat(UNSET))
     return msgspec.json.encode(

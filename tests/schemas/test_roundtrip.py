@@ -428,6 +428,40 @@ def test_a_selection_leaves_out_rows_and_fields(
     assert [one["id"] for one in chosen] == message.id[expected].tolist()
 
 
+def test_the_json_has_null_for_what_was_never_measured() -> None:
+    """By the bits of `measured`: heading, size, height; a place without a heading keeps its other fields."""
+    three = np.ones((3, 3))
+    fields = dict.fromkeys(("yaw", "yaw_rate", "acceleration", "existence", "score", "age"), np.ones(3))
+    message = Tracks(
+        stream="a/b/c",
+        epoch=bytes(16),
+        seq=0,
+        stamp_ns=0,
+        session="0" * 32,
+        profile="generic",
+        cloud_used=False,
+        labels=("car",),
+        id=np.arange(3),
+        label=np.zeros(3, int),
+        center=three,
+        size=three,
+        velocity=three[:, :2],
+        covariance=np.zeros((3, 6, 6)),
+        time_since_detection=np.ones(3),
+        detection=np.zeros(3, int),
+        measured=np.array([7, 0, 2]),
+        **fields,
+    )
+    place = Georeference((48.0, 11.0, 500.0)).to_geographic
+    for text in (tracks_json(message), tracks_json(message, place=place)):
+        validator("EdgeTracks").validate(json.loads(text))
+        whole, none, sized = json.loads(text)["objects"]
+        assert None not in whole.values()
+        assert (none["yaw"], none["size"], none["position"]) == (None, None, [1.0, 1.0, None])
+        assert (sized["yaw"], sized["size"], sized["position"][2]) == (None, [1.0, 1.0, 1.0], None)
+    assert (sized["heading"], "lat" in sized) == (None, True)
+
+
 @given(zone_events())
 def test_the_json_of_events_has_one_text_for_each(message: Events) -> None:
     """Every event and the counts conform to their schemas, with classes by name."""
