@@ -76,6 +76,9 @@ START = 5.0
 BRAKING = 3.0
 """And braking that would end at minus so many times the speed, less one, ends at a standstill."""
 
+ACCELERATIONS = 3.0
+"""Standard deviations of an acceleration that objects of unknown heading are allowed, for nothing follows theirs."""
+
 TINY_PIVOT = 1e-12
 """A pivot of the square root is lifted to this: a covariance that lost rank in rounding is repaired, and counted."""
 
@@ -225,7 +228,8 @@ def predict_without_heading(
 ) -> None:
     """Predict a state of `optipmb.unknown_heading`: arguments as in `predict_state`.
 
-    The velocity gains the noise of a speed in both directions, and what an acceleration changes over dt.
+    The velocity gains the noise of a speed in both directions, and what an acceleration of `ACCELERATIONS` standard
+    deviations of a birth changes over dt.
     """
     cos_phi, sin_phi = math.cos(mean[PHI]), math.sin(mean[PHI])
     for s in range(STATE):
@@ -246,7 +250,7 @@ def predict_without_heading(
     for s in range(STATE):
         for t in range(s):
             covariance_out[t, s] = covariance_out[s, t]
-    gained = own.process_noise[V] ** 2 * dt + (own.birth_unknown[A] * dt) ** 2
+    gained = own.process_noise[V] ** 2 * dt + (ACCELERATIONS * own.birth_unknown[A] * dt) ** 2
     for s in range(4):
         covariance_out[s, s] += gained if s >= V else own.process_noise[s] ** 2 * dt
 

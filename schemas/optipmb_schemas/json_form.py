@@ -19,7 +19,7 @@ from optipmb_schemas.codec import encode_json
 from optipmb_schemas.control import Problem
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
     from numpy.typing import NDArray
 
@@ -40,33 +40,33 @@ YEARS_NS: Final = (946_684_800 * 10**9, 4_102_444_800 * 10**9)  # 2000 and 2100
 Lat = Annotated[float, Meta(description="Latitude in degrees (WGS84), 9 decimals. Absent: the site has no place.")]
 Lon = Annotated[float, Meta(description="Longitude in degrees, 9 decimals.")]
 Alt = Annotated[float, Meta(description="Height above the ellipsoid in m.")]
-Position = Annotated[tuple[float, float, float | None], Meta(description="Centre: x, y, z in m, world frame.")]
-Size = Annotated[tuple[float, float, float], Meta(description="Length, width, height in m.")]
-Velocity = Annotated[tuple[float, float], Meta(description="Velocity in m/s along x and y.")]
-Heading = Annotated[float, Meta(description="Degrees clockwise from true north, in [0, 360).")]
+Position = Annotated[tuple[float, float, float], Meta(description="Centre: x, y, z in m, world frame.")]
 Yaw = Annotated[float, Meta(description="Heading in radians, counter-clockwise from x of the world frame.")]
 Speed = Annotated[float, Meta(description="Speed in m/s.")]
+Known = float | None
+Spot = Annotated[tuple[float, float, Known], Meta(description="Centre: x, y, z in m, world frame; null: not known.")]
+Size = Annotated[tuple[Known, Known, Known], Meta(description="Length, width, height in m; null: not known.")]
 Class = Annotated[str, Meta(description="Name of the class.")]
 
 
 class EdgeTrack(Struct, frozen=True, rename={"kind": "class"}):
-    """One track. Fields that a reader did not ask for are absent; what was never measured is null."""
+    """One track. Fields that a reader did not ask for are absent."""
 
     id: Annotated[int, Meta(description="Identity: unique in the stream, never used again.")]
     kind: Class | UnsetType = UNSET
     confirmed: Annotated[bool, Meta(description="Whether the object is taken to exist.")] | UnsetType = UNSET
     existence: Annotated[float, Meta(description="Probability that the object exists.")] | UnsetType = UNSET
-    position: Position | UnsetType = UNSET
-    size: Size | UnsetType | None = UNSET
+    position: Spot | UnsetType = UNSET
+    size: Size | UnsetType = UNSET
     yaw: Yaw | UnsetType | None = UNSET
     speed: Speed | UnsetType = UNSET
-    velocity: Velocity | UnsetType = UNSET
+    velocity: Annotated[tuple[float, float], Meta(description="Velocity in m/s along x and y.")] | UnsetType = UNSET
     age_s: Annotated[float, Meta(description="Seconds since its first detection.")] | UnsetType = UNSET
     seen_s: Annotated[float, Meta(description="Seconds since its last detection.")] | UnsetType = UNSET
     lat: Lat | UnsetType = UNSET
     lon: Lon | UnsetType = UNSET
     alt: Alt | UnsetType = UNSET
-    heading: Heading | UnsetType | None = UNSET
+    heading: Annotated[float, Meta(description="Degrees clockwise from true north, in [0, 360).")] | UnsetType = UNSET
 
 
 FIELDS: Final = frozenset(msgspec.structs.asdict(EdgeTrack(0))) - {"id", "kind"} | {"class"}
@@ -126,10 +126,6 @@ class EdgeZones(_Frame, frozen=True, tag="zones", kw_only=True):
     ]
 
 
-MEASURED: Final = {1: ("yaw", "heading"), 2: ("size",)}
-"""Fields by the bits of `Tracks.measured`; None where a bit is not set."""
-HEIGHT: Final = 4
-
 FRAMES: Final = (EdgeTracks, EdgeEvent, EdgeZones)
 
 
@@ -164,29 +160,28 @@ def is_confirmed(tracks: Tracks) -> NDArray[np.bool_]:
 def tracks_json(tracks: Tracks, selection: Selection = EVERYTHING, place: Place | None = None) -> bytes:
     """Return the selected tracks of a frame as one text."""
     rows = np.flatnonzero(selection.rows(tracks))
+    center, size, yaw = tracks.center, tracks.size, tracks.yaw
+    if tracks.measured is not None:  # NaN becomes null
+        heading, sized, high = (tracks.measured & bit > 0 for bit in (1, 2, 4))
+        center = np.where(high[:, None] | np.array([True, True, False]), center, np.nan)
+        size, yaw = np.where(sized[:, None], size, np.nan), np.where(heading, yaw, np.nan)
     numbers = {
         "existence": tracks.existence,
-        "position": tracks.center,
-        "size": tracks.size,
-        "yaw": tracks.yaw,
+        "position": center,
+        "size": size,
+        "yaw": yaw,
         "speed": np.hypot(*tracks.velocity.T),
         "velocity": tracks.velocity,
         "age_s": tracks.age,
         "seen_s": tracks.time_since_detection,
     }
-    columns: dict[str, Any] = {
+    columns: dict[str, Iterable[Any]] = {
         "id": tracks.id[rows].tolist(),
         "class": map(tracks.labels.__getitem__, tracks.label[rows].tolist()),
         "confirmed": is_confirmed(tracks)[rows].tolist(),
         **{name: np.round(column[rows], DIGITS).tolist() for name, column in numbers.items()},
-        **dict(zip(PLACE, _placed(tracks.center[rows], tracks.yaw[rows], place), strict=True)),
+        **dict(zip(PLACE, _placed(tracks.center[rows], yaw[rows], place), strict=True)),
     }
-    for row, bits in enumerate([] if tracks.measured is None else tracks.measured[rows].tolist()):
-        for name in (name for bit, names in MEASURED.items() if not bits & bit for name in names):
-            if columns[name][row] is not UNSET:
-                columns[name][row] = None
-        if not bits & HEIGHT:
-            columns["position"][row][2] = None
     if selection.fields:
         columns |= dict.fromkeys(columns.keys() - selection.fields - {"id"}, repeat(UNSET))
     return msgspec.json.encode(

@@ -174,6 +174,32 @@ def test_foxglove_finds_boxes_plots_and_logs_beside_our_messages(tmp_path: Path)
     assert [one.topic for one in RecordingFile(tmp_path / "a.mcap")] == ["detections", "tracks", "problems"]
 
 
+@pytest.mark.parametrize("frame", ["world", "sensor"])
+def test_points_without_boxes_are_shown_and_read_again(frame: str, tmp_path: Path) -> None:
+    """Foxglove has half a metre of each, at the height of the sensor; a reader knows what is not known."""
+    pose = Pose(translation=np.array([1.0, 0.0, 2.0]), quaternion=np.array([1.0, 0.0, 0.0, 0.0]))
+    center = np.array([[3.0, 4.0, np.nan], [5.0, 6.0, 0.5]])
+    unknown = {"size": None, "yaw": None, "center": center, "frame": frame, "pose": pose}
+    with RecordingWriter(tmp_path / "a.mcap") as writer:
+        for seq in range(3):
+            put(writer, detections(seq).model_copy(update=unknown), 10 + seq)
+    factory, cubes = DecoderFactory(), []
+    with (tmp_path / "a.mcap").open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            if channel.topic.endswith("detections/scene"):
+                decoder = factory.decoder_for(channel.message_encoding, schema)
+                assert decoder is not None
+                cubes += decoder(message.data).entities[0].cubes
+    x, z = (1.0, 2.0) if frame == "sensor" else (0.0, 0.0)
+    places = [(one.pose.position.x, one.pose.position.z, one.size.x, one.size.z) for one in cubes[:2]]
+    assert places == [(3.0 + x, z, 0.5, 0.5), (5.0 + x, 0.5 + z, 0.5, 0.5)]
+    (sequence,) = open_dataset(dataset_at(tmp_path), tmp_path).sequences(["all"])
+    first = next(iter(sequence.frames()))
+    np.testing.assert_array_equal(first.center, center)
+    assert np.isnan(first.size).all()
+    assert np.isnan(first.yaw).all()
+
+
 def test_foxglove_is_served_live(tmp_path: Path) -> None:
     """A client of Foxglove's protocol gets the scene, the cloud, plots and logs, by the schemas that it is sent."""
     problem = Problem(stream=STREAM, instance="one", code="pose", message="it jumped", stamp_ns=5)

@@ -194,6 +194,7 @@ def tracks(draw: st.DrawFn) -> Tracks:
         velocity=draw(rows((n, 2), -1e5, 1e5)),
         covariance=draw(rows((n, 6, 6), -1e30, 1e30)),
         detection=draw(whole(n, -1, INT64)),
+        measured=draw(st.none() | whole(n, 0, 7)),
         delivery=draw(st.none() | delivery),
         **column,
         **draw(paths(n)),
@@ -404,10 +405,20 @@ def test_the_json_of_the_edges_has_the_numbers_of_the_columns(message: Tracks) -
         "age_s": message.age,
         "seen_s": message.time_since_detection,
     }
+    known = np.full(len(message.id), 7) if message.measured is None else message.measured
     for name, column in columns.items():
-        assert [one[name] for one in text["objects"]] == np.round(column, 3).tolist()
+        wanted = np.round(column, 3).tolist()
+        for row, bits in enumerate(known.tolist()):
+            if name == "yaw" and not bits & 1:
+                wanted[row] = None
+            elif name == "size" and not bits & 2:
+                wanted[row] = [None] * 3
+            elif name == "position" and not bits & 4:
+                wanted[row][2] = None
+        assert [one[name] for one in text["objects"]] == wanted
     near = np.linalg.norm(message.center, axis=1) <= 1e5
-    assert ["lat" in one and 0 <= one["heading"] < 360 for one in text["objects"]] == near.tolist()
+    assert ["lat" in one for one in text["objects"]] == near.tolist()
+    assert [0 <= one.get("heading", -1) < 360 for one in text["objects"]] == (near & (known % 2 == 1)).tolist()
 
 
 @given(tracks(), st.frozensets(st.sampled_from(sorted(FIELDS))), st.floats(0, 1), st.integers(0, 1))
@@ -426,40 +437,6 @@ def test_a_selection_leaves_out_rows_and_fields(
     if confirmed:
         expected &= (message.existence > 0.5) & (message.age > 0)
     assert [one["id"] for one in chosen] == message.id[expected].tolist()
-
-
-def test_the_json_has_null_for_what_was_never_measured() -> None:
-    """By the bits of `measured`: heading, size, height; a place without a heading keeps its other fields."""
-    three = np.ones((3, 3))
-    fields = dict.fromkeys(("yaw", "yaw_rate", "acceleration", "existence", "score", "age"), np.ones(3))
-    message = Tracks(
-        stream="a/b/c",
-        epoch=bytes(16),
-        seq=0,
-        stamp_ns=0,
-        session="0" * 32,
-        profile="generic",
-        cloud_used=False,
-        labels=("car",),
-        id=np.arange(3),
-        label=np.zeros(3, int),
-        center=three,
-        size=three,
-        velocity=three[:, :2],
-        covariance=np.zeros((3, 6, 6)),
-        time_since_detection=np.ones(3),
-        detection=np.zeros(3, int),
-        measured=np.array([7, 0, 2]),
-        **fields,
-    )
-    place = Georeference((48.0, 11.0, 500.0)).to_geographic
-    for text in (tracks_json(message), tracks_json(message, place=place)):
-        validator("EdgeTracks").validate(json.loads(text))
-        whole, none, sized = json.loads(text)["objects"]
-        assert None not in whole.values()
-        assert (none["yaw"], none["size"], none["position"]) == (None, None, [1.0, 1.0, None])
-        assert (sized["yaw"], sized["size"], sized["position"][2]) == (None, [1.0, 1.0, 1.0], None)
-    assert (sized["heading"], "lat" in sized) == (None, True)
 
 
 @given(zone_events())

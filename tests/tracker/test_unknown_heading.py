@@ -61,7 +61,7 @@ def test_the_prediction_is_that_of_a_linear_model(seed: int) -> None:
     assert predict_state(mean, covariance, dt, own, np.empty((6, 6)), np.empty((12, 6)), out, spread) == 0
     step = np.eye(4) + dt * np.eye(4, k=2)
     m, p = plain(mean, covariance)
-    gained = 0.7**2 * dt + (1.5 * dt) ** 2
+    gained = 0.7**2 * dt + (3.0 * 1.5 * dt) ** 2
     assert_same(plain(out, spread), (step @ m, step @ p @ step.T + np.diag([0.04 * dt] * 2 + [gained] * 2)))
     assert out[3] == mean[3]
     assert heading_unknown(spread)
