@@ -298,69 +298,71 @@ class Api:
 
     async def tracks(self, request: Request) -> Response:
         """Answer with the newest frame of each stream."""
-        wish = await self._wish(request)
+        _, wish = await self._asked(request)
         (key,) = wish.keys(self._readers.keys)
         return _array([one.tracks(wish.selection) for one in await self._newest(key)])
 
     async def zones(self, request: Request) -> Response:
         """Answer with the newest counts of the zones of each stream."""
-        wish = await self._wish(request)
+        _, wish = await self._asked(request)
         key = self._readers.keys.matching(wish.streams[0], "events")
         newest = await self._newest(key, RECENT, lambda one: one.zones is not None)
         return _array([one.zones or b"" for one in newest])
 
     async def stream(self, request: Request) -> Response:
         """Answer with server-sent events."""
-        wish = await self._wish(request)
+        _, wish = await self._asked(request)
         return self._readers.stream(wish.keys(self._readers.keys), lambda: Reader(wish), HEADERS)
 
     async def socket(self, websocket: WebSocket) -> None:
         """Serve a WebSocket."""
-        wish, reader = await self._wish(websocket), None
+        caller, wish = await self._asked(websocket)
         leave = self._readers.enter()
         try:
             reader = Reader(wish)
             async with contextlib.AsyncExitStack() as joined:
                 await joined.enter_async_context(self._readers.joined(wish.keys(self._readers.keys), reader))
-                offered = PROTOCOL in websocket.scope["subprotocols"]
-                await websocket.accept(PROTOCOL if offered else None)
-                sending = asyncio.create_task(_send(websocket, reader))
+                await websocket.accept(PROTOCOL if PROTOCOL in websocket.scope["subprotocols"] else None)
+                works = _send(websocket, reader), self._listen(websocket, caller, reader, joined)
+                tasks = [asyncio.create_task(work) for work in works]
                 try:
-                    await self._listen(websocket, reader, joined)
+                    done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
                 finally:
-                    sending.cancel()
-                    await asyncio.wait((sending,))
+                    for task in tasks:
+                        task.cancel()
+                    await asyncio.wait(tasks)
+                for task in done:
+                    task.result()
         finally:
             leave()
 
-    async def _listen(self, websocket: WebSocket, reader: Reader, joined: contextlib.AsyncExitStack) -> None:
+    async def _listen(
+        self, websocket: WebSocket, caller: Caller, reader: Reader, joined: contextlib.AsyncExitStack
+    ) -> None:
         """Change what a reader wants as often as it says so, until it goes."""
-        caller = await self._readers.caller(websocket)
-        with contextlib.suppress(WebSocketDisconnect):
-            while True:
-                message = await websocket.receive()
-                if message["type"] == "websocket.disconnect":
-                    return
+        while (message := await websocket.receive())["type"] != "websocket.disconnect":
+            try:
+                wish = wish_of(msgspec.json.decode(message.get("text") or "", type=_Incoming).subscribe)
+                keys = wish.keys(self._readers.keys)
+                caller.may_read(wish.streams[0])
+            except (msgspec.DecodeError, schemas.MessageError, NotAllowedError) as error:
+                await websocket.close(MALFORMED, str(error)[:100])
+                return
+            reader.want(wish)
+            async with joined.pop_all():  # what it read before, until it has the rest
                 try:
-                    asked = msgspec.json.decode(message.get("text") or "", type=_Incoming)
-                    wish = wish_of(asked.subscribe)
-                    keys = wish.keys(self._readers.keys)
-                    caller.may_read(wish.streams[0])
-                except (msgspec.DecodeError, schemas.MessageError, NotAllowedError) as error:
-                    await websocket.close(MALFORMED, str(error)[:100])
+                    await joined.enter_async_context(self._readers.joined(keys, reader))
+                except TransportError as error:
+                    await websocket.close(TRY_AGAIN, str(error)[:100])
                     return
-                before = joined.pop_all()
-                reader.want(wish)
-                await joined.enter_async_context(self._readers.joined(keys, reader))
-                await before.aclose()
 
-    async def _wish(self, connection: HTTPConnection) -> Wish:
-        """Return what a caller asks for, and may read."""
+    async def _asked(self, connection: HTTPConnection) -> tuple[Caller, Wish]:
+        """Return who asks, and for what they may read."""
         caller = await self._readers.caller(connection)
         wish = wish_of(connection.query_params)
         wish.keys(self._readers.keys)
         caller.may_read(wish.streams[0])
-        return wish
+        return caller, wish
 
     async def _newest(
         self, key: str, most: int = 1, fits: Callable[[Publication], bool] = lambda _: True
