@@ -22,12 +22,9 @@ from typing import TYPE_CHECKING, Any
 
 import optipmb_schemas as schemas
 from optipmb_service.app.worker import warm_up
-from optipmb_service.settings import Settings
 from optipmb_service.stream import convert
 from optipmb_service.stream import stream as stream_module
 from optipmb_service.stream.checkpoint import encode_checkpoint
-from optipmb_service.stream.persistence import CheckpointWriter
-from optipmb_service.stream.profiles import Profiles
 from optipmb_service.stream.session import Session
 from optipmb_service.stream.stream import Stream
 from optipmb_service.stream.streams import Streams
@@ -80,52 +77,6 @@ class Parts:
         return taken
 
 
-class Network:
-    """Everything around the streams: it grants them all, takes their tracks, and gives them their turns."""
-
-    strained = False
-
-    def __init__(self) -> None:
-        self.waiting: list[Callable[[], bool]] = []
-        self.published = 0
-        self.problems: list[str] = []
-
-    def submit(self, work: Callable[[], bool]) -> None:
-        """Take the work of a stream that has something to do."""
-        self.waiting.append(work)
-
-    def run(self) -> None:
-        """Give turns until no stream has anything to do."""
-        while self.waiting:
-            if (work := self.waiting.pop(0))():
-                self.waiting.append(work)
-
-    def holds(self, stream: str) -> bool:
-        """Every stream is tracked here."""
-        return bool(stream)
-
-    def fence(self, stream: str) -> int:
-        """Return the fence of all streams."""
-        return len(stream)
-
-    def may_write(self, stream: str, fence: int | None) -> bool:
-        """All may be published."""
-        return fence == self.fence(stream)
-
-    def open_publisher(self, stream: str, _zones: bool) -> Network:  # noqa: FBT001 - the signature of the service
-        """Be the publisher of a stream."""
-        del stream
-        return self
-
-    def publish(self, payload: bytes) -> None:
-        """Take tracks."""
-        self.published += bool(payload)
-
-    def publish_problem(self, problem: schemas.Problem) -> None:
-        """Note what must not come."""
-        self.problems.append(str(problem))
-
-
 def packets(objects: int, points: int) -> Iterator[list[Any]]:
     """Yield the messages of each frame, its cloud first."""
     keys = schemas.Keys()
@@ -148,11 +99,18 @@ def packets(objects: int, points: int) -> Iterator[list[Any]]:
 
 def measured(objects: int, points: int) -> dict[str, float]:
     """Return the median microseconds of each part of a frame."""
+    sys.path.append(str(HERE / "tests" / "support"))
+    from registries import Around, streams_of  # noqa: PLC0415 - found by the path above
+
+    class Counting(Around):
+        published = 0
+
+        def publish(self, _: bytes) -> None:
+            self.published += 1
+
     configure("console", "error")
     warm_up()
     parts = Parts()
-    network: Any = Network()  # in the place of several parts
-    nothing: Any = None
     timed: tuple[tuple[str, Any, str], ...] = (
         ("handing over", Streams, "receive"),
         ("decoding", stream_module, "message_of"),
@@ -170,18 +128,8 @@ def measured(objects: int, points: int) -> dict[str, float]:
     )
     for part, owner, name in timed:
         setattr(owner, name, parts.time(part, getattr(owner, name)))
-    streams: Any = Streams(
-        Settings(instance="cost", store="none"),
-        Profiles.read("nuscenes", {}),
-        open_publisher=network.open_publisher,
-        reporter=ProblemReporter(network.publish_problem),
-        scheduler=network,
-        member=network,
-        checkpoints=CheckpointWriter(nothing, 1.0, network, off=""),
-        log=None,
-        arm=lambda *_: None,
-        metrics=Metrics(),
-    )
+    network, problems = Counting(), list[schemas.Problem]()
+    streams: Any = streams_of(network, reporter=ProblemReporter(problems.append), tracker=optipmb.Tracker)
     rows: list[dict[str, float]] = []
     checkpoints: list[float] = []
     for k, frame in enumerate(packets(objects, points)):
@@ -195,8 +143,8 @@ def measured(objects: int, points: int) -> dict[str, float]:
                 began_ns = time.thread_time_ns()
                 encode_checkpoint(streams.of(STREAM).session.snapshot())
                 checkpoints.append((time.thread_time_ns() - began_ns) / 1e3 / CHECKPOINT_EVERY)
-    if network.published != WARM + FRAMES or network.problems:
-        raise RuntimeError(f"{network.published} frames were answered, {network.problems[:1]}")
+    if network.published != WARM + FRAMES or problems:
+        raise RuntimeError(f"{network.published} frames were answered, {problems[:1]}")
     medians = {part: median(row[part] for row in rows) for part in rows[0]}
     return medians | {"checkpoint": median(checkpoints), "sum": sum(medians.values()) + median(checkpoints)}
 

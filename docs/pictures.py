@@ -1,4 +1,4 @@
-"""Pictures of docs/concepts.md: `python docs/pictures.py docs/images`. Needs the extra `plot`."""
+"""Pictures of docs/concepts.md and docs/zones.md: `python docs/pictures.py docs/images`. Needs the extra `plot`."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 import optipmb
+from optipmb.zones import Zone, ZoneState, observe
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,6 +22,8 @@ RATE = 10
 FRAMES = 70
 MISSED = range(30, 40)
 GHOST_FRAMES = (5, 7)
+ENTERS = 20
+"""Frame in which the second car of the zone comes."""
 
 
 def place_of(frame: int) -> tuple[float, float]:
@@ -97,9 +100,44 @@ def draw_existence(axes: Axes, tracks: list[optipmb.OnlineTracks]) -> None:
     axes.set_ylabel("existence")
 
 
+def draw_zones(figure: Figure) -> None:
+    """Draw two cars that pass a zone and a line, their events, and how many were inside."""
+    zones = (Zone("yard", polygon=((6, -6), (20, -6), (22, 4), (8, 8))), Zone("gate", line=((14, -9), (15, 11))))
+    tracker, state, inside, paths = optipmb.OnlineTracker("generic"), ZoneState(), [], {}
+    axes, counts = figure.subplots(2, 1, height_ratios=(4, 1))
+    labels = optipmb.load_profile("generic").labels
+    for k in range(90):
+        places = [(0.4 * k - 3, 0.5 * np.sin(k / 12) - 2, 0.0), (30 - 0.4 * (k - ENTERS), 5 - 0.03 * k, np.pi)]
+        cars = [{"class": "car", "x": x, "y": y, "yaw": yaw, "score": 0.9} for x, y, yaw in places[: 1 + (k >= ENTERS)]]
+        one = tracker.update([car | {"l": 4.5, "w": 1.9} for car in cars], t=k / RATE)
+        state, events = observe(zones, state, k * 10**9 // RATE, one.tracks, labels)
+        inside.append(sum(state.counts.get("yard", {}).get("inside", {}).values()))
+        for i, identity in enumerate(one.id.tolist()):
+            paths.setdefault(identity, []).append(one.center[i, :2])
+        for event in events:
+            x, y, _ = event.position
+            axes.plot(x, y, "o", color=GHOST, markersize=5)
+            text = f"{event.kind} {event.direction}".strip()
+            axes.annotate(text, (x, y), (4, -13 if event.id == 1 else 6), textcoords="offset points", fontsize=8)
+    axes.fill(*np.array(zones[0].polygon).T, color=TRUTH, alpha=0.3, label="zone yard")
+    axes.plot(*np.array(zones[1].line).T, color="#222222", linewidth=2, label="line gate")
+    for identity, path in paths.items():
+        axes.plot(*np.array(path).T, color=CAR if identity == 1 else "#009E73", label=f"car {identity}")
+    counts.step(np.arange(90) / RATE, inside, color=CAR, where="post")
+    counts.set_ylabel("inside")
+    counts.set_xlabel("time (s)")
+    counts.set_yticks([0, 1, 2])
+    axes.set_aspect("equal")
+    axes.legend(frameon=False, fontsize=8, loc="upper left", ncols=2)
+
+
 def main(folder: Path) -> None:
     """Write the pictures into a folder."""
     tracks, found = scene()
+    figure = Figure(figsize=(6.0, 4.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    draw_zones(figure)
+    figure.savefig(folder / "zones.png", dpi=110, metadata={"Software": None})
     for name, size in (("track", (6.0, 4.2)), ("ellipse", (6.0, 4.2)), ("existence", (6.0, 3.0))):
         figure = Figure(figsize=size, layout="constrained")
         FigureCanvasAgg(figure)

@@ -67,7 +67,8 @@ def associate(row: Index, measurement: Index, cost: Array, first_cost: Array, n_
     start = np.zeros(n_objects + 1, np.int64)  # where the pairs of each object start
     for n in row:
         start[n + 1] += 1
-    start = np.cumsum(start)
+    for n in range(n_objects):
+        start[n + 1] += start[n]
     gain = np.empty(row.shape[0])
     for k in range(row.shape[0]):
         gain[k] = cost[k] - first_cost[measurement[k]]

@@ -20,22 +20,27 @@ What the stages of a step take is described once, here; docstrings list what a s
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import logging
 import os
+import subprocess
+import sys
 import tempfile
 import time
-from functools import cache, partial
+from contextlib import ExitStack, contextmanager, suppress
+from functools import cache, partial, wraps
 from pathlib import Path
 from stat import S_ISDIR, S_IWGRP, S_IWOTH
 from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 import numba
+import numpy as np
 from numba.core import config, event
 from numba.core.caching import IndexDataCacheFile
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     F = TypeVar("F", bound=Callable[..., object])
 else:
@@ -55,12 +60,17 @@ def _digest() -> str:
 
 _SOURCES: Final = _digest()
 
-PROGRESS_S: Final = 10.0
+PROGRESS_S: Final = 5.0
 """Time between two lines about the progress of a compilation."""
+
+PROCESSES: Final = "OPTIPMB_COMPILE_PROCESSES"
+"""Environment variable: how many processes compile; 0 compiles each kernel at its first call, in its own process."""
+MOST_PROCESSES: Final = 4
+"""More are not faster: a third of the time is that of one kernel."""
 
 
 class _Progress(event.Listener):
-    """Log that kernels of the package are compiled, and how far it is: a first frame may take a minute.
+    """Log that kernels of the package are compiled, and how far it is: a first frame may take half a minute.
 
     These are warnings, because Python prints those to standard error where a program has not configured logging.
     """
@@ -69,20 +79,34 @@ class _Progress(event.Listener):
         self.kernels: set[str] = set()
         """All kernels of the modules imported so far."""
         self.compiled: set[str] = set()
+        self.built: set[str] | None = None
+        """Those that other processes compiled for this one; None while nothing was missing."""
         self.said_at: float | None = None
+        self.is_helper = False
+        """Whether this process compiles for another one, which reads the names of the kernels."""
 
     def on_start(self, event: Any) -> None:
         """Announce the first compilation of this process."""
-        if self.said_at is None and self._name(event) in self.kernels:
+        if self._name(event) in self.kernels:
+            self.announce()
+
+    def on_end(self, event: Any) -> None:
+        """Count a compiled kernel."""
+        if (name := self._name(event)) in self.kernels:
+            self.count(name)
+
+    def announce(self) -> None:
+        """Say that a compilation begins, once in a process."""
+        if self.said_at is None and not self.is_helper:
             self.said_at = time.monotonic()
             _log.warning("optipmb: compiling the tracker, once after an installation; it takes up to a minute")
 
-    def on_end(self, event: Any) -> None:
+    def count(self, name: str) -> None:
         """Count a compiled kernel, with a line every few seconds."""
-        if (name := self._name(event)) not in self.kernels:
-            return
         self.compiled.add(name)
-        if self.said_at is not None and time.monotonic() > self.said_at + PROGRESS_S:
+        if self.is_helper:
+            print(name, flush=True)  # noqa: T201 - to that process
+        elif self.said_at is not None and time.monotonic() > self.said_at + PROGRESS_S:
             self.said_at = time.monotonic()
             _log.warning("optipmb: compiled %d of %d kernels", len(self.compiled), len(self.kernels))
 
@@ -92,8 +116,41 @@ class _Progress(event.Listener):
         return f"{function.__module__}.{function.__qualname__}"
 
 
-_progress: Final = _Progress()
-event.register("numba:compile", _progress)  # type: ignore[no-untyped-call]  # numba has no types
+progress: Final = _Progress()
+event.register("numba:compile", progress)  # type: ignore[no-untyped-call]  # numba has no types
+
+
+class _Calls:
+    """The calls of kernels from Python, in a process in which numba compiles nothing (``NUMBA_DISABLE_JIT=1``)."""
+
+    def __init__(self) -> None:
+        self.signatures: dict[tuple[str, Any], None] = {}
+        """Names of kernels and types of their arguments."""
+        self._inside = False
+
+    def recorded(self, function: F) -> F:
+        """Return a kernel that runs as Python and records the types that Python calls it with."""
+        name = f"{function.__module__}.{function.__qualname__}"
+
+        @wraps(function)
+        def call(*arguments: Any) -> Any:
+            if self._inside:
+                return function(*arguments)
+            self.signatures[name, tuple(map(numba.typeof, arguments))] = None
+            self._inside = True
+            try:  # columns of a class are attributes to numba, which they are in a recarray
+                return function(*(np.asarray(one).view(np.recarray) if _has_names(one) else one for one in arguments))
+            finally:
+                self._inside = False
+
+        return cast("F", call)
+
+
+def _has_names(value: object) -> bool:
+    return isinstance(value, np.ndarray) and value.dtype.names is not None
+
+
+calls: Final = _Calls()
 
 
 def kernel(function: F) -> F:
@@ -114,15 +171,17 @@ def long_kernel(function: F) -> F:
 
 
 def _compiled(function: F, *, nogil: bool) -> F:
-    _progress.kernels.add(f"{function.__module__}.{function.__qualname__}")
-    jit = partial(numba.njit, nogil=nogil, error_model="numpy")
+    options: Any = config  # it has names that are set at run time
+    if options.DISABLE_JIT:
+        return calls.recorded(function)
+    progress.kernels.add(f"{function.__module__}.{function.__qualname__}")
+    jit = partial(numba.njit, nogil=nogil, error_model="numpy", no_cfunc_wrapper=True)
     try:
         compiled: Any = jit(cache=True)(function)
     except RuntimeError:  # numba finds no folder that this user may write to
         folder = _private_folder()
         if folder is None:
             return cast("F", jit()(function))
-        options: Any = config  # it has names that are set at run time
         usual, options.CACHE_DIR = options.CACHE_DIR, folder
         try:
             compiled = jit(cache=True)(function)
@@ -130,7 +189,7 @@ def _compiled(function: F, *, nogil: bool) -> F:
             options.CACHE_DIR = usual
     cache = compiled._cache._cache_file  # noqa: SLF001 - numba has no public name for it
     cache._source_stamp = _SOURCES  # noqa: SLF001 - as above
-    cache.__class__ = _Index
+    cache.__class__ = _PackageIndex if function.__module__.startswith(f"{__package__}.") else _Index
     return cast("F", compiled)
 
 
@@ -142,6 +201,76 @@ class _Index(IndexDataCacheFile):
             return super()._load_index()  # type: ignore[no-untyped-call]  # numba ships no types
         except (AttributeError, ImportError):
             return {}
+
+
+class _PackageIndex(_Index):
+    """An index of the package: when machine code is missing, that of all kernels is, and processes compile it."""
+
+    def load(self, key: Any) -> Any:
+        """Return the machine code of one kernel, None where it has to be compiled here."""
+        data = super().load(key)  # type: ignore[no-untyped-call]  # as above
+        if data is None and progress.built is None and (count := _processes()):
+            with _one_at_a_time(Path(self._cache_path)) as writable:
+                data = super().load(key)  # type: ignore[no-untyped-call]  # as above
+                if data is None and writable:
+                    progress.built = set()
+                    _compile_all(count, progress.built)
+                    data = super().load(key)  # type: ignore[no-untyped-call]  # as above
+        return data
+
+
+def _processes() -> int:
+    """Return how many processes compile; none where Python is part of another program, which would start anew."""
+    if not sys.executable or hasattr(sys, "frozen"):
+        return 0
+    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    wanted = os.environ.get(PROCESSES, "")
+    return int(wanted) if wanted.isdecimal() else min(available, MOST_PROCESSES)
+
+
+@contextmanager
+def _one_at_a_time(folder: Path) -> Iterator[bool]:
+    """Hold the lock of a folder of machine code; yield whether the folder can be written to."""
+    with ExitStack() as stack:
+        with suppress(OSError):  # nothing can be written there, or its file system has no locks
+            folder.mkdir(parents=True, exist_ok=True)
+            file = stack.enter_context((folder / "optipmb.lock").open("a"))
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                _log.warning("optipmb: waiting for another process, which compiles the tracker")
+                fcntl.flock(file, fcntl.LOCK_EX)
+        yield os.access(folder, os.W_OK)
+
+
+def _compile_all(count: int, built: set[str]) -> None:
+    """Compile all kernels in so many processes, and add their names; what is missing afterwards is compiled here.
+
+    One process, which compiles nothing, runs the tracker to find out the types of arguments. It writes them to a file,
+    and their numbers to a pipe, from which each of the others takes the next.
+    """
+    progress.announce()
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), PROCESSES: "0"}
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+
+        def pipe() -> list[Any]:
+            return [stack.enter_context(os.fdopen(end, mode)) for end, mode in zip(os.pipe(), "rw", strict=True)]
+
+        def start(program: str, stdin: Any, stdout: Any, **also: str) -> None:
+            command = [sys.executable, "-c", f"import optipmb.warm; optipmb.warm.{program}", str(Path(folder) / "plan")]
+            process = subprocess.Popen(command, stdin=stdin, stdout=stdout, env=environment | also)  # noqa: S603 - our own
+            stack.callback(process.wait)
+            stack.callback(process.terminate)
+
+        (waiting, numbers), (names, done) = pipe(), pipe()
+        start("plan()", subprocess.DEVNULL, numbers, NUMBA_DISABLE_JIT="1")
+        for _ in range(count):
+            start("build()", waiting, done)
+        for end in (waiting, numbers, done):  # the other processes have them, and a pipe ends with the last of those
+            end.close()
+        for name in names:
+            built.add(name.strip())
+            progress.count(name.strip())
 
 
 @cache

@@ -434,7 +434,8 @@ def pairs_of_many(
 @kernel
 def _grown(array: Index, capacity: int) -> Index:
     larger = np.empty(capacity, array.dtype)
-    larger[: array.shape[0]] = array
+    for k in range(array.shape[0]):
+        larger[k] = array[k]
     return larger
 
 

@@ -165,7 +165,8 @@ def sort_canonically(order: Index, score: Array, center: Array, size: Array, yaw
                 else:
                     merged[k] = order[right]
                     right += 1
-        order[:] = merged
+        for k in range(count):  # a slice would bring in the text of numba's error about shapes: 4 s of compilation
+            order[k] = merged[k]
         width *= 2
 
 

@@ -24,7 +24,6 @@ from optipmb.rows import read_only
 
 if TYPE_CHECKING:
     from optipmb.density import Density
-    from optipmb.frame import Frame
     from optipmb.rows import Array
 
 Place = tuple[float, float, float]
@@ -87,53 +86,16 @@ class Relocation(NamedTuple):
         v = cos * vx - sin * vy + turn * self.y, sin * vx + cos * vy - turn * self.x
         return replace(moved, sensor=read_only(np.array([*v, turn, *evidence])))
 
-    def frame(self, frame: Frame) -> Frame:
-        """Return a frame in the new world.
-
-        Raises:
-            FrameError: an object would be beyond all positions on Earth.
-        """
-        if not any(self):
-            return frame
-        view, cloud, spread = frame.field_of_view, frame.cloud, frame.position_covariance
-        center = np.column_stack((self.points(frame.center[:, :2]), frame.center[:, 2] + self.z))
-        turn = self._replace(x=0.0, y=0.0)
-        if spread is not None:
-            (xx, xy, yy), cos, sin = spread.T, math.cos(self.theta), math.sin(self.theta)
-            crossed, mixed = cos * sin, 2.0 * cos * sin * xy
-            spread = np.column_stack((
-                cos * cos * xx - mixed + sin * sin * yy,
-                crossed * (xx - yy) + (cos * cos - sin * sin) * xy,
-                sin * sin * xx + mixed + cos * cos * yy,
-            ))  # fmt: skip
-        return replace(
-            frame,
-            center=center,
-            yaw=_wrapped(frame.yaw + self.theta),
-            velocity=turn.points(frame.velocity),
-            position_covariance=spread,
-            cloud=None if cloud is None else replace(cloud, pose=self.pose(cloud.pose)),
-            field_of_view=None if view is None else view.at(self.pose(view.pose or ORIGIN)),
-            pose=self.pose(frame.pose or ORIGIN),
-        )
-
     def _rows(self, rows: _Rows) -> _Rows:
         turn = np.eye(6)
         turn[:2, :2] = (math.cos(self.theta), -math.sin(self.theta)), (math.sin(self.theta), math.cos(self.theta))
         mean, auxiliary = rows.mean.copy(), rows.auxiliary
         mean[:, :2] = self.points(mean[:, :2])
-        mean[:, PHI] = _wrapped(mean[:, PHI] + self.theta)
+        heading = mean[:, PHI] + self.theta
+        mean[:, PHI] = heading - 2.0 * math.pi * np.ceil((heading - math.pi) / (2.0 * math.pi))
         if self.z:
             auxiliary = auxiliary + np.array([0.0, 0.0, 0.0, self.z])
-        farthest = max(np.abs(mean[:, :2]).max(initial=0.0), np.abs(auxiliary[:, 3]).max(initial=0.0))
+        farthest = max(np.abs(mean[:, :2]).max(initial=0.0), np.nanmax(np.abs(auxiliary[:, 3]), initial=0.0))
         if farthest > MAX_COORDINATE:
             raise DensityError(f"{rows.part}.mean", f"coordinates up to {MAX_COORDINATE:g} m", f"{farthest:g}")
         return rows.replaced(mean=mean, covariance=turn @ rows.covariance @ turn.T, auxiliary=auxiliary)
-
-
-ORIGIN = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
-
-
-def _wrapped(heading: Array) -> Array:
-    """Return headings within (-pi, pi]."""
-    return heading - 2.0 * math.pi * np.ceil((heading - math.pi) / (2.0 * math.pi))

@@ -164,6 +164,14 @@ def needed_shares(classes: Array) -> Array:
 
 
 @kernel
+def copy_rows(slots: Slots, first: int, out: Slots) -> None:
+    """Copy slots from `first` on to the first rows of `out`; assigning arrays takes numba seconds to compile."""
+    for s in range(first, SLOTS):
+        for b in range(SLOT):
+            out[s - first, b] = slots[s, b]
+
+
+@kernel
 def next_slot(slots: Slots, counts: Array, needed: float) -> None:
     """Evaluate the middle slot of an object, and begin a new one.
 
@@ -172,7 +180,11 @@ def next_slot(slots: Slots, counts: Array, needed: float) -> None:
         counts: (`COUNTS`, `BINS`) of the class; is written.
         needed: share of looks in which a lasting object is detected.
     """
-    hits, looks = slots[:, :BINS].sum(axis=1).astype(np.float64), slots[:, OF_LOOKS].astype(np.float64)
+    hits, looks = np.zeros(SLOTS), np.empty(SLOTS)
+    for s in range(SLOTS):
+        looks[s] = slots[s, OF_LOOKS]
+        for b in range(BINS):
+            hits[s] += slots[s, b]
     lasting = False
     for other in (0, 2):
         lasting |= hits[1] + hits[other] >= max(LEAST_HITS, needed * (looks[1] + looks[other]))
@@ -186,7 +198,8 @@ def next_slot(slots: Slots, counts: Array, needed: float) -> None:
             middle = min(max(int(mean / hits[1] + 0.5), 0), BINS - 1)
             counts[HITS, middle] += share * hits[1]
             counts[LOOKS, middle] += share * looks[1]
-    slots[0], slots[1], slots[2] = slots[1].copy(), slots[2].copy(), 0
+    copy_rows(slots, 1, slots)
+    slots[SLOTS - 1] = 0
 
 
 @kernel
@@ -225,7 +238,8 @@ def learn(
     for k in range(objects_id.shape[0] + 1):
         last = k == objects_id.shape[0]
         while n < before_id.shape[0] and (last or before_id[n] < objects_id[k]):
-            own = slots[n].copy()
+            own = np.empty((SLOTS, SLOT), np.uint16)
+            copy_rows(slots[n], 0, own)
             for _ in range(SLOTS - 1):
                 next_slot(own, classes[before_label[n]], lasting[before_label[n]])
             n += 1
@@ -233,7 +247,7 @@ def learn(
             break
         own = kept_slots[k]
         if n < before_id.shape[0] and before_id[n] == objects_id[k]:
-            own[:] = slots[n]
+            copy_rows(slots[n], 0, own)
             own[SLOTS - 1, TICKS] = min(own[SLOTS - 1, TICKS] + 1e4 * dt + 0.5, MOST_TICKS)
             n += 1
         if own[SLOTS - 1, TICKS] >= SLOT_TICKS and own[SLOTS - 1, OF_LOOKS] > 1:

@@ -304,14 +304,20 @@ def first_detected_states(
     """
     first_kind, announced, log_e = hypotheses.first_kind, hypotheses.announced, hypotheses.log_e
     birth_states(rows, measurements, classes, mean_out, covariance_out)
-    wanted = np.flatnonzero(first_kind[rows] == FROM_POISSON)
-    if wanted.shape[0] == 0:
+    wanted, count = np.empty(rows.shape[0], np.int64), 0
+    for k in range(rows.shape[0]):
+        if first_kind[rows[k]] == FROM_POISSON:
+            wanted[count] = k
+            count += 1
+    if count == 0:
         return 0
+    wanted = wanted[:count]
     # The pairs of each measurement, one measurement after the other.
     first = np.zeros(first_kind.shape[0] + 1, np.int64)
     for m in announced:
         first[m + 1] += 1
-    first = np.cumsum(first)
+    for m in range(first_kind.shape[0]):
+        first[m + 1] += first[m]
     fill = first.copy()
     of_measurement = np.empty(announced.shape[0], np.int64)
     for pair in range(announced.shape[0]):
@@ -326,9 +332,10 @@ def first_detected_states(
         m = rows[wanted[i]]
         begin, end = start[i], start[i] + first[m + 1] - first[m]
         start[i + 1] = end
-        pairs[begin:end] = of_measurement[first[m] : first[m + 1]]
-        largest = log_e[pairs[begin:end]].max()
-        others = 0.0
+        largest, others = -math.inf, 0.0
+        for k in range(begin, end):
+            pairs[k] = of_measurement[first[m] + k - begin]
+            largest = max(largest, log_e[pairs[k]])
         for k in range(begin, end):
             weight[k] = math.exp(log_e[pairs[k]] - largest)
             if k > begin:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import gc
+import os
+import pickle
 import sys
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
+from optipmb import compiled
 from optipmb.errors import EffortError
 from optipmb.extract import sound
 from optipmb.field_of_view import FieldOfView
@@ -18,7 +22,7 @@ from optipmb.geometry import bev_iou
 from optipmb.parameters import load_profile, parse_parameters
 from optipmb.paths import predict_tracks
 from optipmb.sensor_motion import Pairs, common_motion, sideways
-from optipmb.tracker import Modules, Tracker
+from optipmb.tracker import Modules, Tracker, update
 from optipmb.zones import Shapes, Zone, crossings, locate
 
 
@@ -35,36 +39,46 @@ def kernels() -> dict[str, Any]:
 
 
 def compilations() -> int:
-    """Count what this process has compiled so far because it was not in the cache."""
-    return sum(sum(kernel.stats.cache_misses.values()) for kernel in kernels().values())
+    """Count what was compiled so far, by this process or for it, because it was not in the cache."""
+    here = sum(sum(kernel.stats.cache_misses.values()) for kernel in kernels().values())
+    return here + len(compiled.progress.built or ())
 
 
 def warm_up() -> int:
     """Compile all kernels, or load them from the cache, by running a few frames through a tracker.
 
-    The first call after an installation compiles (about a minute); later processes load the machine code (under a
-    second). Call it before the first frame that is waited for.
+    The first call after an installation compiles, in several processes, for up to a minute; later processes load the
+    machine code (under a second). Call it before the first frame that is waited for.
 
     Returns:
         How many kernels had to be compiled; none in a prepared installation.
     """
     before = compilations()
-    # A compiler fills the memory with small objects that live long; the default walks through them again and again.
-    thresholds = gc.get_threshold()
-    gc.set_threshold(100_000, *thresholds[1:])
-    try:
-        _run()
-        bev_iou(np.zeros((1, 5)), np.zeros((1, 5)))
-        place, label = np.zeros((1, 2)), np.zeros(1, np.int64)
-        pairs = Pairs(place, label, place, label)
-        common_motion(pairs, np.zeros(3), 0.0, 0.0, 0.0)
-        sideways(pairs, place, np.zeros(1), np.zeros(1, np.bool_))
-        line = Zone("line", line=((0.0, 0.0), (1.0, 0.0)))
-        locate(np.zeros((1, 3)), np.zeros((1, 2)), *Shapes.of([line]))
-        crossings(np.array(line.line), 0.0, 0.0, 0.0, 0.0)
-    finally:
-        gc.set_threshold(*thresholds)
+    _run()
     return compilations() - before
+
+
+def plan() -> None:
+    """Find out, without compiling, which kernels Python calls with which types of arguments.
+
+    They go to the file that is the argument, their numbers to the output.
+    """
+    _run()
+    largest = f"{update.__module__}.{update.__name__}"
+    calls = sorted(compiled.calls.signatures, key=lambda call: call[0] != largest)
+    Path(sys.argv[1]).write_bytes(pickle.dumps(calls))
+    os.write(sys.stdout.fileno(), bytes(range(len(calls))))
+
+
+def build() -> None:
+    """Compile kernels of the plan in the file that is the argument: those whose numbers are read from the input."""
+    compiled.progress.is_helper = True
+    # A compiler fills the memory with small objects that live long; the default walks through them again and again.
+    gc.set_threshold(100_000, *gc.get_threshold()[1:])
+    known = kernels()
+    while number := os.read(sys.stdin.fileno(), 1):
+        name, signature = pickle.loads(Path(sys.argv[1]).read_bytes())[number[0]]  # noqa: S301 - of a process of ours
+        known[name].compile(signature)
 
 
 def _run() -> None:
@@ -106,3 +120,11 @@ def _run() -> None:
     with suppress(EffortError):
         Tracker(parameters, max_pairs=8).step(posterior, given)
     Tracker(parameters, Modules(habm=False)).step(posterior, given)
+    bev_iou(np.zeros((1, 5)), np.zeros((1, 5)))
+    place, label = np.zeros((1, 2)), np.zeros(1, np.int64)
+    pairs = Pairs(place, label, place, label)
+    common_motion(pairs, np.zeros(3), 0.0, 0.0, 0.0)
+    sideways(pairs, place, np.zeros(1), np.zeros(1, np.bool_))
+    line = Zone("line", line=((0.0, 0.0), (1.0, 0.0)))
+    locate(np.zeros((1, 3)), np.zeros((1, 2)), *Shapes.of([line]))
+    crossings(np.array(line.line), 0.0, 0.0, 0.0, 0.0)

@@ -54,7 +54,7 @@ class Zone:
         line: 2 to 100 points, m.
         z: heights, m, between which centres are inside.
         classes: the classes that count; empty: all.
-        margin: m; an object leaves farther outside than this, and is beside a line nearer than this.
+        margin: m; an object leaves farther outside than this, and is at a line nearer than this.
         min_s: visits that are shorter give no event.
         lost_s: an object that was not detected for longer has left.
         dwell_s: times inside after which there is an event.
@@ -128,7 +128,7 @@ class Seen(NamedTuple):
     known: int
     """bits of the zones that know where it was; not: it appears there"""
     visits: Mapping[str, Visit]
-    beside: Mapping[str, Moment]
+    near: Mapping[str, Moment]
     """lines that it is near: where it was before it came near"""
     confirmed: bool = False
     held: tuple[Event, ...] = ()
@@ -136,7 +136,7 @@ class Seen(NamedTuple):
 
 @dataclass(frozen=True)
 class ZoneState:
-    """What is known of all zones after a frame."""
+    """State of all zones after a frame."""
 
     tracks: Mapping[int, Seen] = field(default_factory=dict)
     counts: Mapping[str, Mapping[str, Mapping[str, int]]] = field(default_factory=dict)
@@ -178,7 +178,7 @@ def locate(
     """Return where centres (N, 3) are, and how often they crossed lines since `before` (N, 2), NaN where unknown.
 
     Returns:
-        (N, Z) 2 inside a zone, 1 outside but within its margin, or within that of a line, 0 elsewhere; (N, Z) crossings
+        (N, Z) 2 inside a zone, 1 outside but within its margin, or a line's, 0 elsewhere; (N, Z) crossings
         of a line to the left less those to the right.
     """
     where = np.zeros((len(center), len(closed)), np.int8)
@@ -261,18 +261,19 @@ def observe(
     rows = np.flatnonzero(tracks.detection >= 0)
     identities = tracks.id.tolist()
     nowhere = (math.nan, math.nan)
-    before = np.array([known[i].place[:2] if i in known else nowhere for i in tracks.id[rows].tolist()]).reshape(-1, 2)
+    seen_before = [known.get(identities[row]) for row in rows.tolist()]
+    before = np.array([one.place[:2] if one else nowhere for one in seen_before]).reshape(-1, 2)
     center = np.ascontiguousarray(tracks.center[rows])
     where, net = locate(center, before, *(shapes or Shapes.of(zones)))
     marked = ((where != 0) | (net != 0)).any(axis=1).tolist()
     everywhere = (1 << len(zones)) - 1
-    for at, (row, (x, y, z)) in enumerate(zip(rows.tolist(), center.tolist(), strict=True)):
+    velocity, yaws, label = tracks.velocity, tracks.yaw, tracks.label
+    for at, (row, (x, y, z), old) in enumerate(zip(rows.tolist(), center.tolist(), seen_before, strict=True)):
         identity = identities[row]
-        old = known.get(identity)
         seen = Seen(stamp_ns, (x, y, z), everywhere, {}, {}, *(old[5:] if old else ()))
-        if marked[at] or (old and (old.visits or old.beside)):
-            speed, yaw = math.hypot(*tracks.velocity[row].tolist()), float(tracks.yaw[row])
-            now = Event("", "entered", 0, identity, labels[tracks.label[row]], stamp_ns, (x, y, z), speed, yaw)
+        if marked[at] or (old and (old.visits or old.near)):
+            speed, yaw = math.hypot(*velocity[row].tolist()), float(yaws[row])
+            now = Event("", "entered", 0, identity, labels[label[row]], stamp_ns, (x, y, z), speed, yaw)
             seen, more = _moved(zones, old, seen, now, where[at].tolist(), net[at].tolist())
             if seen.confirmed:  # once is enough
                 events += more
@@ -300,7 +301,7 @@ def observe(
 
 
 def adapted(zones: Sequence[Zone], state: ZoneState) -> ZoneState:
-    """Return the state for these zones: those that are new or were changed begin anew, but for their numbers."""
+    """Return the state for these zones: new and changed ones start empty, except for their numbers."""
     digests = tuple(one.digest for one in zones)
     if digests == state.zones:
         return state
@@ -310,7 +311,7 @@ def adapted(zones: Sequence[Zone], state: ZoneState) -> ZoneState:
         identity: seen._replace(
             known=sum(1 << place for place, one in enumerate(digests) if seen.known & old.get(one, 0)),
             visits={name: one for name, one in seen.visits.items() if name in kept},
-            beside={name: one for name, one in seen.beside.items() if name in kept},
+            near={name: one for name, one in seen.near.items() if name in kept},
             held=tuple(one for one in seen.held if one.zone in kept),
         )
         for identity, seen in state.tracks.items()
@@ -337,7 +338,7 @@ def relocated(state: ZoneState, relocation: Relocation) -> ZoneState:
             place=relocation.place(seen.place),
             known=0,
             visits={name: visit(one) for name, one in seen.visits.items()},
-            beside={name: (at_ns, relocation.place(place)) for name, (at_ns, place) in seen.beside.items()},
+            near={name: (at_ns, relocation.place(place)) for name, (at_ns, place) in seen.near.items()},
             held=tuple(event(one) for one in seen.held),
         )
         for identity, seen in state.tracks.items()
@@ -356,16 +357,16 @@ def _moved(
 ) -> tuple[Seen, list[Event]]:
     """Return a track after a detection, and its events."""
     events: list[Event] = []
-    visits, beside = (dict(old.visits), dict(old.beside)) if old else ({}, {})
+    visits, near = (dict(old.visits), dict(old.near)) if old else ({}, {})
     known, last = seen.known, (old.stamp_ns, old.place) if old else (-1, now.position)
     for k, zone in enumerate(zones):
-        if not (where[k] or net[k] or zone.name in visits or zone.name in beside):
+        if not (where[k] or net[k] or zone.name in visits or zone.name in near):
             continue
         counts, bit = not zone.classes or now.label in zone.classes, 1 << k
         if zone.line:
-            began = beside.pop(zone.name, None)
+            began = near.pop(zone.name, None)
             if where[k]:
-                beside[zone.name] = began or last
+                near[zone.name] = began or last
                 continue
             if (net[k] or began) and counts and (began or last)[0] >= 0:
                 crossed, at_ns, place = _crossing(zone.line, began or last, now)
@@ -402,7 +403,7 @@ def _moved(
         if where[k] == _OUTSIDE:
             del visits[zone.name]
             events += _left(zone, visit, now, "crossed")
-    return seen._replace(visits=visits, beside=beside, known=known), events
+    return seen._replace(visits=visits, near=near, known=known), events
 
 
 def _lost(

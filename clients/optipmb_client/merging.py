@@ -14,7 +14,7 @@ from typing import NamedTuple
 from optipmb_schemas import Events, Tracks
 
 MOST_HELD = 4096
-"""Messages that are held of a stream; beyond, the oldest are lost, as where a service cannot write checkpoints."""
+"""Messages held of a stream; beyond it the oldest are dropped, as when a service cannot write checkpoints."""
 MOST_SESSIONS = 1024
 """Sessions of a stream whose order is remembered."""
 
@@ -72,8 +72,8 @@ def _digest(tracks: Tracks) -> bytes:
 class FinalEvents:
     """Holds events of a stream until they are final, and gives out each message once, in the order of the frames.
 
-    A run that goes on for another publishes again all that is not final. So a later run voids what is held of earlier
-    ones, but for the last frame that is final.
+    A run that goes on for another publishes again all events that are not final. So a later run voids the messages held
+    of earlier ones, except of the last final frame.
     """
 
     def __init__(self) -> None:
@@ -85,7 +85,7 @@ class FinalEvents:
         self._final = 0, 0
 
     def take(self, message: Events) -> list[Events]:
-        """Take a message; return those that are final now."""
+        """Add a message; return the messages that are final now."""
         delivery, run, is_new = message.delivery, _run(message), message.session not in self._sessions
         if run < self._run and not is_new:
             return []
@@ -97,7 +97,8 @@ class FinalEvents:
         if delivery and delivery.final_session in self._sessions:
             self._final = max(self._final, (self._sessions[delivery.final_session], delivery.final_ns or 0))
         if run > self._run:
-            self.held = {frame: one for frame, one in self.held.items() if self._place(one) <= self._final}
+            valid = (one for one in self.held.items() if _run(one[1]) >= run or self._place(one[1]) <= self._final)
+            self.held = dict(valid)
         self._run = run
         frame = message.sensor, message.epoch, message.seq
         if self._place(message) >= self._final:

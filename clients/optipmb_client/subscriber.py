@@ -118,7 +118,7 @@ class EventSubscriber(_Subscription):
         pattern: Name of a stream, `site/node/sensor`, or a pattern with `*` in the place of names: `garage/*/*`.
         connect: As for `Subscriber`, like all options that are not named here.
         final: Give out each message once it does not change any more, in order: to count. Else give out all at once,
-            with those that replace earlier ones: to raise alarms.
+            with corrections of earlier ones: to raise alarms.
         timeout: Iterating ends when nothing has come for so many seconds; None: never.
 
     Raises:

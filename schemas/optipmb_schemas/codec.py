@@ -46,7 +46,7 @@ from optipmb_schemas.control import (
 )
 from optipmb_schemas.errors import MessageError, invalid, show
 from optipmb_schemas.limits import DEFAULT, Limits
-from optipmb_schemas.messages import Density, Detections, Events, FieldOfView, Points, Pose, Tracks
+from optipmb_schemas.messages import Density, Detections, Events, FieldOfView, Points, Pose, Relocation, Tracks
 from optipmb_schemas.model import Message
 
 try:
@@ -584,8 +584,8 @@ MOST_NUMBERS: Final = 2**13
 """Numbers of a message up to which the ranges of all columns are compared at once."""
 
 _TypedDict: Any = TypedDict  # made of types that are not known before
-_PARTS: Final[frozenset[type[Message]]] = frozenset({Pose, FieldOfView})
-"""Messages inside others that have required float64 arrays of fixed lengths and closed ranges alone."""
+_PARTS: Final[frozenset[type[Message]]] = frozenset({Pose, FieldOfView, Relocation})
+"""Messages inside others that have numbers and required float64 arrays of fixed lengths and closed ranges alone."""
 _BOUNDS: Final = ("ge", "gt", "le", "lt")
 REFUSED: Final = (msgspec.MsgspecError, ValueError, TypeError, LookupError, RecursionError, struct.error)
 """Errors of a payload that is not valid, or not in this form."""
@@ -664,16 +664,16 @@ def _checked_scalars(kind: type[Message], *values: Any) -> tuple[dict[str, Any],
 
 
 @lru_cache(1024)
-def _part(kind: type[Message], *data: bytes) -> Message:
-    """Return a message of a few arrays of their bytes."""
+def _part(kind: type[Message], numbers: tuple[Any, ...], *data: bytes) -> Message:
+    """Return a message of numbers and of a few arrays of their bytes."""
     arrays = {}
-    for (name, described), numbers in zip(kind.arrays.items(), data, strict=True):
-        values = struct.unpack(f"<{described.shape[0]}d", numbers)
+    for (name, described), column in zip(kind.arrays.items(), data, strict=True):
+        values = struct.unpack(f"<{described.shape[0]}d", column)
         _need(all(described.low <= one <= described.high for one in values))
-        arrays[name] = np.frombuffer(numbers)
+        arrays[name] = np.frombuffer(column)
     for name, check in _checks_of(kind):
         check(arrays[name])
-    message = kind.trusted(arrays)
+    message = kind.trusted(dict(zip(_numbers_of(kind), numbers, strict=True)) | arrays)
     message.check()
     return message
 
@@ -705,7 +705,8 @@ class _Builder:
         kind = self._kind
         if self._is_part:
             _need(self._shapes_in(fields) == self._fixed)
-            return _part(kind, *map(bytes, self._data_in(fields)))
+            numbers = tuple([getattr(fields, name) for name in self._numbers])
+            return _part(kind, numbers, *map(bytes, self._data_in(fields)))
         scalars, names = _checked_scalars(kind, *self._scalars_in(fields))
         values, given = scalars.copy(), set(names)
         for name in self._numbers:

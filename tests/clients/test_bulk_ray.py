@@ -16,9 +16,6 @@ from optipmb_tools.run.bulk import Executor, executor_for
 from optipmb_tools.run.profiles import profile_for
 from optipmb_tools.run.tracking import TrackedSequence, Tracking, track
 
-ray = pytest.importorskip("ray")
-cluster_utils = pytest.importorskip("ray.cluster_utils")
-
 pytestmark = [pytest.mark.ray, pytest.mark.filterwarnings("default")]  # warnings of Ray are its own
 
 BYTES = 100 * 2**20
@@ -41,7 +38,8 @@ def plain(data: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, byt
 
 @pytest.fixture(scope="module", autouse=True)
 def surroundings() -> Iterator[None]:
-    """Workers find the tasks of the tests, and nothing is reported to anybody."""
+    """Workers find the tasks of the tests, and nothing is reported; Ray is imported by `make ray` alone."""
+    pytest.importorskip("ray")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", str(Path(bulk_tasks.__file__).parent))
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
@@ -57,7 +55,9 @@ def cluster() -> Iterator[Any]:
         with pytest.MonkeyPatch.context() as patch:  # the head notes its address in a folder that it does not make
             patch.setenv("RAY_TMPDIR", folder)
             (Path(folder) / "ray").mkdir()
-            made = cluster_utils.Cluster(initialize_head=True, head_node_args={**common, **head})
+            made = pytest.importorskip("ray.cluster_utils").Cluster(
+                initialize_head=True, head_node_args={**common, **head}
+            )
         for _ in range(2):
             made.add_node(num_cpus=1, **common)
         yield made

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from optipmb_client.zenoh.handles import Reading, Sender
 
-ALONE: Final = '{mode: "peer", scouting: {multicast: {enabled: false}}, listen: {endpoints: []}}'
+ALONE: Final = '{mode: "peer", scouting: {delay: 0, multicast: {enabled: false}}, listen: {endpoints: []}}'
 
 
 def _cached(connection: Connection, key: str) -> Sender:

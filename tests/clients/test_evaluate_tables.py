@@ -341,3 +341,14 @@ def test_a_shift_of_all_scores_changes_no_figure(bench: Bench) -> None:
         assert found["best"].pop("score") == pytest.approx(0.3 + shift, abs=1e-9)
         reports.append(json.dumps(found))
     assert len(set(reports)) == 1
+
+
+def test_a_table_of_several_sequences_that_are_named_by_digits_is_evaluated(bench: Bench) -> None:
+    """Scenes are called 0000 and 0001: their tracks in one CSV file give the figures that result files give."""
+    scenes = ("--dataset", "scene", "--sequences", "0000", "0001", "--option", "frames=20")
+    figures = []
+    for name in ("t.csv", "files"):
+        assert bench.run("track", *scenes, "--out", bench.folder / name, "--jobs", "1").returncode == 0
+        found = result_of(bench.run("evaluate", *scenes, "--tracks", bench.folder / name, "--json", "--jobs", "1"))
+        figures.append({label: one["all"]["MOTA"] for label, one in found["classes"].items()})
+    assert figures[0] == figures[1]

@@ -55,7 +55,6 @@ def test_the_tracker_is_imported_for_offline_tracking_alone() -> None:
     offline = {path for path in importers("optipmb_tools", "optipmb") if not path.startswith("tuning/")}
     assert offline == {
         "datasets/interface.py",
-        "georeference.py",
         *(f"run/{name}.py" for name in ("dumps", "profiles", "smoothing", "tracking")),
     }
 

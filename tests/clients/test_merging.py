@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from optipmb_client.merging import Merging, Novelty
-from optipmb_schemas import Delivery, Tracks
+from optipmb_client.merging import FinalEvents, Merging, Novelty
+from optipmb_schemas import Delivery, Events, Tracks, ZoneEvent
 from tracks_message import tracks_message
+
+LABELS = ("car",)
 
 
 def message(seq: int, *, content: int, revision: int = 0, run: int = 0, session: str = "0" * 32) -> Tracks:
@@ -83,3 +86,85 @@ def test_the_end_does_not_depend_on_the_way(messages: list[Sent]) -> None:
         seq: max((one for one in messages if one.seq == seq), key=lambda one: (one.run, one.revision))
         for seq in {one.seq for one in messages}
     }
+
+
+A, B = "a" * 32, "b" * 32
+
+
+def events(seq: int, n: int, *, run: int = 1, revision: int = 0, session: str = A, final: tuple[str, int]) -> Events:
+    """The event `n` of a frame, and up to where events are final."""
+    delivery = Delivery(
+        instance="test",
+        received_ns=0,
+        published_ns=0,
+        queue_ms=0,
+        decode_ms=0,
+        step_ms=0,
+        run=run,
+        final_session=final[0],
+        final_ns=final[1],
+    )
+    where = {"label": 0, "at_ns": seq, "position": (0.0, 0.0, 0.0), "speed": 0.0, "yaw": 0.0, "direction": "left"}
+    event = ZoneEvent(zone="gate", kind="crossed", n=n, id=1, **where)
+    place = {"stream": "a/b/c", "epoch": bytes(16), "seq": seq, "stamp_ns": seq, "session": session}
+    return Events(**place, revision=revision, labels=LABELS, events=(event,) if n else (), delivery=delivery)
+
+
+@pytest.mark.parametrize(
+    ("messages", "released"),
+    [
+        ([events(1, 1, final=(A, 0)), events(3, 2, final=(A, 3)), events(9, 3, final=(A, 9))], [1, 2]),
+        # A correction, one without events, and repetitions, before and after the frame is final.
+        (
+            [
+                events(1, 1, final=(A, 0)),
+                events(2, 7, final=(A, 0)),
+                events(3, 8, final=(A, 0)),
+                events(2, 2, revision=1, final=(A, 0)),
+                events(3, 0, revision=1, final=(A, 0)),
+                events(2, 7, final=(A, 0)),
+                events(5, 3, final=(A, 5)),
+                events(1, 1, final=(A, 0)),
+                events(9, 4, final=(A, 9)),
+            ],
+            [1, 2, 3],
+        ),
+        # A later run goes on behind frame 2: later frames of the earlier one are void, wherever they come.
+        (
+            [
+                events(2, 1, final=(A, 2)),
+                events(4, 7, final=(A, 2)),
+                events(5, 2, run=2, final=(A, 2)),
+                events(6, 8, final=(A, 9)),
+                events(9, 3, run=2, final=(A, 9)),
+            ],
+            [1, 2],
+        ),
+        # All of earlier sessions is final, with those of a session that is heard of late.
+        (
+            [events(5, 1, final=(A, 0)), events(2, 2, session=B, final=(B, 0)), events(4, 3, session=B, final=(B, 3))],
+            [1, 2],
+        ),
+        (
+            [
+                events(5, 1, session=B, run=2, final=(B, 0)),
+                events(8, 7, final=(A, 0)),
+                events(6, 2, session=B, run=2, final=(B, 6)),
+            ],
+            [1],
+        ),
+        # A service without checkpoints counts runs and events from the beginning.
+        (
+            [
+                events(5, 1, run=2, final=(A, 0)),
+                events(9, 1, session=B, final=(B, 0)),
+                events(12, 2, session=B, final=(B, 12)),
+            ],
+            [1, 1],
+        ),
+    ],
+)
+def test_events_come_once_when_they_are_final(messages: list[Events], released: list[int]) -> None:
+    """In the order of the frames, as the last run and revision says."""
+    merged = FinalEvents()
+    assert [event.n for one in messages for final in merged.take(one) for event in final.events] == released

@@ -24,9 +24,16 @@ from nuscenes_tables import (
     write_scan,
 )
 from optipmb_tools.datasets import DatasetError, open_dataset
-from optipmb_tools.datasets import nuscenes_tables as tables_module
-from optipmb_tools.datasets.nuscenes import SPLITS, NuScenesDataset, NuScenesSequence, read_sweep, scenes_of_split
-from optipmb_tools.datasets.nuscenes_tables import box_velocity, read_table
+from optipmb_tools.datasets import nuscenes as tables_module
+from optipmb_tools.datasets.nuscenes import (
+    SPLITS,
+    NuScenesDataset,
+    NuScenesSequence,
+    box_velocity,
+    read_sweep,
+    read_table,
+    scenes_of_split,
+)
 from optipmb_tools.geometry import rotation_of
 from real_data import nuscenes_root
 

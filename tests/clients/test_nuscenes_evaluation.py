@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from evaluation_cases import tracks_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from nuscenes_cases import COLUMNS, Rows, disturbed_tracks, greedy_tracks, truth_tracks, write
@@ -32,7 +33,6 @@ from optipmb_tools.evaluation.nuscenes import (
     pair,
     prepare_scene,
 )
-from optipmb_tools.results import ResultTable
 from optipmb_tools.results.nuscenes import NUSCENES_CLASSES
 from real_data import nuscenes_root
 
@@ -64,28 +64,11 @@ def scene_of(rows: Sequence[Row], frames: int = 10) -> NuScenesScene:
     return NuScenesScene("made", stamps, np.zeros((frames, 2)), NO_RACKS, interpolate(boxes(rows), stamps))
 
 
-def table_of(rows: Sequence[tuple[int, int, float, float, float]], names: Sequence[str] | str = "car") -> ResultTable:
-    """Give tracks: frame, id, x, y, score."""
-    count = len(rows)
-    names = [names] * count if isinstance(names, str) else names
-    return ResultTable(
-        labels=NUSCENES_CLASSES,
-        frame=np.array([row[0] for row in rows], dtype=np.int64),
-        id=np.array([row[1] for row in rows], dtype=np.int64),
-        label=np.array([NUSCENES_CLASSES.index(name) for name in names], dtype=np.int64),
-        center=np.array([[row[2], row[3], 0.0] for row in rows]).reshape(-1, 3),
-        size=np.ones((count, 3)),
-        yaw=np.zeros(count),
-        score=np.array([row[4] for row in rows], dtype=np.float64),
-        box2d=np.full((count, 4), np.nan),
-    )
-
-
 def cars(
     truth: Sequence[Row], tracks: Sequence[tuple[int, int, float, float, float]], frames: int = 10
 ) -> NuScenesClass:
     """Evaluate cars of one scene."""
-    return evaluate_scenes([(scene_of(truth, frames), table_of(tracks))]).classes["car"]
+    return evaluate_scenes([(scene_of(truth, frames), tracks_of(tracks, "car"))]).classes["car"]
 
 
 def still(identity: int, x: float, frames: Sequence[int] = range(10), y: float = 0.0) -> list[Row]:
@@ -217,7 +200,7 @@ def test_classes_without_truth_are_undefined_and_do_not_weigh() -> None:
     """Tracks of a class that the truth lacks change nothing, and its figures are null in JSON."""
     scene = scene_of(TWO)
     wrong = [*followed(TWO), *followed(still(50, 5.0))]
-    scores = evaluate_scenes([(scene, table_of(wrong, ["car"] * 20 + ["bus"] * 10))])
+    scores = evaluate_scenes([(scene, tracks_of(wrong, ["car"] * 20 + ["bus"] * 10))])
     assert scores.overall["amota"] == 1.0
     assert math.isnan(scores.classes["bus"].amota)
     shown = json.loads(json.dumps(scores.to_json(), allow_nan=False))
@@ -229,7 +212,7 @@ def test_classes_without_truth_are_undefined_and_do_not_weigh() -> None:
 
 def test_nothing_at_all_is_undefined() -> None:
     """A scene without truth and without tracks gives undefined figures and no warning."""
-    scores = evaluate_scenes([(scene_of([]), table_of([]))])
+    scores = evaluate_scenes([(scene_of([]), tracks_of([], "car"))])
     assert math.isnan(scores.overall["amota"])
     assert scores.overall["fp"] == 0
 
@@ -242,7 +225,7 @@ def test_overall_figures_are_sums_and_means() -> None:
     truth = TrackBoxes(*both)
     truth = truth.take(np.argsort(truth.frame, kind="stable"))
     scene = NuScenesScene("made", stamps, np.zeros((10, 2)), NO_RACKS, truth)
-    overall = evaluate_scenes([(scene, table_of(followed(still(1, 0.0))))]).overall
+    overall = evaluate_scenes([(scene, tracks_of(followed(still(1, 0.0)), "car"))]).overall
     assert overall["fn"] == 10 + 10
     assert overall["ml"] == 2
     assert overall["gt"] == 15
@@ -251,11 +234,11 @@ def test_overall_figures_are_sums_and_means() -> None:
 
 def test_several_scenes_are_one_evaluation() -> None:
     """Counts of scenes add up, thresholds are common, and equal ids in two scenes are different tracks."""
-    first = (scene_of(still(1, 0.0)), table_of(followed(still(7, 0.0), 0.9)))
-    second = (scene_of(still(1, 10.0)), table_of(followed(still(7, 10.0), 0.4)))
+    first = (scene_of(still(1, 0.0)), tracks_of(followed(still(7, 0.0), 0.9), "car"))
+    second = (scene_of(still(1, 10.0)), tracks_of(followed(still(7, 10.0), 0.4), "car"))
     best = evaluate_scenes([first, second]).classes["car"].best
     assert (best.gt, best.tp, best.ids, best.mt, best.threshold) == (20, 20, 0, 2, 0.4)
-    alone = evaluate_scenes([first, (second[0], table_of([]))]).classes["car"].best
+    alone = evaluate_scenes([first, (second[0], tracks_of([], "car"))]).classes["car"].best
     assert (alone.tp, alone.fn) == (10, 10)
 
 
@@ -410,7 +393,7 @@ def test_tracks_are_filtered_as_the_truth_is(tmp_path: Path) -> None:
     rack = Thing("rack", "static_object.bicycle_rack", 1, (102.0, 203.0, 1.0), 0.0, (4.0, 4.0, 4.0))
     scene = prepare_scene(prepared(tmp_path, [rack]), NuScenesConfig())
     rows = [(frame, identity, x, y, 0.5) for frame in range(3) for identity, x, y in ((1, 151, 200), (2, 102, 203))]
-    table = table_of(rows, ["car", "bicycle"] * 3)
+    table = tracks_of(rows, ["car", "bicycle"] * 3)
     kept = scene.tracks(table, NuScenesConfig())
     # The bicycle is dropped in frame 1, and filled in again: it was there before and after.
     assert kept.id.tolist() == [2, 2, 2]

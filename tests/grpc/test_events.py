@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import grpc
 import pytest
 from gateway import detections, frame
-from optipmb_client import EventSubscriber
+from optipmb_client import Connection, EventSubscriber
+from optipmb_schemas import Events, Keys, decode
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ def test_history_comes_first_and_once(stub: Any, stream: str) -> None:
 def test_the_client_library_counts_over_both_networks(
     service: ServiceProcess, gateway: GatewayProcess, stub: Any, stream: str
 ) -> None:
-    """Final events are the same over gRPC and Zenoh."""
+    """Final events are the same over gRPC and Zenoh; `q/zones` has their sums."""
     name = stream.replace("yard", "zoned")
     events(stub, name, 3)
     for endpoint in (service.endpoint, f"grpc://{gateway.address}"):
@@ -68,6 +69,13 @@ def test_the_client_library_counts_over_both_networks(
                 if len(found) >= len(EVENTS):
                     break
         assert found == EVENTS
+    with Connection(service.endpoint) as connection:
+        (answer,) = connection.query(Keys().query(name, "zones"))
+    counts = {
+        one.zone: (sum(one.entered), sum(one.left), sum(one.to_right))
+        for one in decode(answer.payload, Events).zones or ()
+    }
+    assert counts == {"gate": (0, 0, 1), "yard": (1, 1, 0)}
 
 
 @pytest.mark.parametrize(("asked", "path"), [({"kinds": ["came"]}, "kinds"), ({"pattern": "a/**"}, "pattern")])

@@ -111,9 +111,8 @@ def test_the_examples_are_a_settings_file(tmp_path: Path) -> None:
 
 def test_the_zones_of_the_example_are_valid(tmp_path: Path) -> None:
     """The settings on the page of zones are accepted as they stand."""
-    (example,) = re.findall(
-        r"```toml\n(.*?)```", OPERATION.with_name("zones.md").read_text(encoding="utf-8"), re.DOTALL
-    )
+    text = OPERATION.with_name("zones.md").read_text(encoding="utf-8")
     file = tmp_path / "zones.toml"
-    file.write_text(example, encoding="utf-8")
-    assert [one.zone(name).name for name, one in load(file).settings.zones.items()] == ["yard", "gate"]
+    file.write_text("\n".join(re.findall(r"```toml\n(.*?)```", text, re.DOTALL)), encoding="utf-8")
+    settings = load(file).settings
+    assert [settings.zone(name, "garage").name for name in settings.zones] == ["yard", "gate", "exit"]

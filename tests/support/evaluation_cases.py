@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from optipmb_tools.camera import Camera, alpha_of, kitti_from_sensor
-from optipmb_tools.datasets import Regions, Truth
+from optipmb_tools.datasets import Truth
 from optipmb_tools.results import ResultTable
 
 LABELS = ("Car", "Van", "Pedestrian", "Person", "Cyclist")
@@ -24,34 +24,29 @@ def truth_of(rows: Sequence[TruthRow], names: Sequence[str] | str = "Car", ignor
     names = [names] * count if isinstance(names, str) else names
     mask = np.zeros(count, dtype=np.bool_)
     mask[list(ignored)] = True
-    truth = Truth(
-        labels=LABELS,
-        frame=np.array([row[0] for row in rows], dtype=np.int64),
+    truth = Truth.of(
+        LABELS,
+        np.array([row[0] for row in rows], dtype=np.int64),
         id=np.array([row[1] for row in rows], dtype=np.int64),
         label=np.array([LABELS.index(name) for name in names], dtype=np.int64),
         center=np.array([[row[2], row[3], 0.0] for row in rows], dtype=np.float64).reshape(-1, 3),
         size=np.tile(SIZE, (count, 1)),
         yaw=np.zeros(count),
-        velocity=np.zeros((count, 2)),
-        occlusion=np.zeros(count, dtype=np.int64),
-        truncation=np.zeros(count, dtype=np.int64),
-        covered=np.zeros(count),
-        points=np.full(count, 100, dtype=np.int64),
         box2d=np.tile(IMAGE, (count, 1)),
         ignored=mask,
-        regions=Regions(np.empty(0, dtype=np.int64), np.empty((0, 4))),
     )
     return truth.take(np.argsort(truth.frame, kind="stable"))
 
 
-def tracks_of(rows: Sequence[TrackRow], name: str = "Car") -> ResultTable:
+def tracks_of(rows: Sequence[TrackRow], names: Sequence[str] | str = "Car") -> ResultTable:
     """Give tracks of one size, in any order."""
     count = len(rows)
+    labels = (names,) if isinstance(names, str) else tuple(dict.fromkeys(names))
     table = ResultTable(
-        labels=(name,),
+        labels=labels,
         frame=np.array([row[0] for row in rows], dtype=np.int64),
         id=np.array([row[1] for row in rows], dtype=np.int64),
-        label=np.zeros(count, dtype=np.int64),
+        label=np.array([0 if isinstance(names, str) else labels.index(names[i]) for i in range(count)], dtype=np.int64),
         center=np.array([[row[2], row[3], 0.0] for row in rows], dtype=np.float64).reshape(-1, 3),
         size=np.tile(SIZE, (count, 1)),
         yaw=np.zeros(count),

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
+import threading
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -111,17 +114,43 @@ class Failing:
         return self._tracker.step(density, frame)
 
 
-NOTHING = (
-    optipmb.Tracker(optipmb.load_profile("nuscenes"))
-    .step(
-        optipmb.Tracker(optipmb.load_profile("nuscenes")).initial(),
-        optipmb.make_frame(
-            optipmb.load_profile("nuscenes"), stamp_ns=0, labels=(), label=[], center=[], size=[], yaw=[], score=[]
-        )[0],
-    )
-    .diagnostics
-)
-"""Of a step without detections."""
+class Gated:
+    """Trackers of a service whose steps wait, from the `first` one on, until the gate is opened.
+
+    Attributes:
+        steps: the stream's tracker of each step so far.
+        entered: set when a step waits.
+        gate: lets steps through once it is set.
+    """
+
+    def __init__(self, first: int = 1) -> None:
+        self.steps: list[object] = []
+        self.entered, self.gate = threading.Event(), threading.Event()
+        self._first = first
+
+    def tracker(self, parameters: optipmb.Parameters) -> Any:
+        """Make the tracker of a session."""
+        inner, made = optipmb.Tracker(parameters), SimpleNamespace()
+
+        def step(density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
+            self.steps.append(made)
+            if len(self.steps) >= self._first:
+                self.entered.set()
+                assert self.gate.wait(60)
+            return inner.step(density, frame)
+
+        made.step = step
+        return made
+
+
+@functools.cache
+def nothing() -> optipmb.Diagnostics:
+    """The diagnostics of a step without detections."""
+    parameters = optipmb.load_profile("nuscenes")
+    tracker = optipmb.Tracker(parameters)
+    columns: Any = dict.fromkeys(("labels", "label", "center", "size", "yaw", "score"), ())
+    frame, _ = optipmb.make_frame(parameters, stamp_ns=0, **columns)
+    return tracker.step(tracker.initial(), frame).diagnostics
 
 
 @dataclass
@@ -175,7 +204,7 @@ class Chained:
             detection=np.array([-1]),
             confirmed=np.ones(1, np.bool_),
         )
-        return optipmb.StepResult(after, found, replace(NOTHING, cloud_used=frame.cloud is not None, born=int(born)))
+        return optipmb.StepResult(after, found, replace(nothing(), cloud_used=frame.cloud is not None, born=int(born)))
 
 
 def chained(parameters: optipmb.Parameters) -> Chained:

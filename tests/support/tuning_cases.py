@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from optipmb_tools.datasets import DetectionFrame, Pose, Regions, Truth
+from optipmb_tools.datasets import DetectionFrame, Pose, Truth
 from optipmb_tools.geometry import Floats, wrap_angle
 
 LABELS = ("Car", "Pedestrian", "Cyclist")
@@ -82,23 +82,15 @@ def recorded(habits: Habits, seed: int = 0, frames: int = 200, objects: int = 30
             )
         )
     flat = path.reshape(count, 5)
-    none = np.zeros(count, dtype=np.int64)
-    truth = Truth(
-        labels=LABELS,
-        frame=np.repeat(np.arange(frames), objects),
+    truth = Truth.of(
+        LABELS,
+        np.repeat(np.arange(frames), objects),
         id=np.tile(np.arange(objects), frames),
-        label=none,
+        label=np.zeros(count, dtype=np.int64),
         center=np.column_stack([flat[:, :2], np.zeros(count)]),
         size=np.tile(size, (frames, 1)),
         yaw=wrap_angle(flat[:, 2]),
         velocity=_velocity(flat),
-        occlusion=none,
-        truncation=none,
-        covered=np.full(count, np.nan),
-        points=none - 1,
-        box2d=np.full((count, 4), np.nan),
-        ignored=np.zeros(count, dtype=np.bool_),
-        regions=Regions(np.empty(0, dtype=np.int64), np.empty((0, 4))),
     )
     return Recorded(name, given, truth)
 

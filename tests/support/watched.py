@@ -91,7 +91,7 @@ class Session:
         if selector == KEYS.all_status():
             return [Answer("status", encode(one), encoding_of(one), ok=True) for one in self.statuses]
         key, _, parameters = selector.partition("/@adv/**")
-        assert parameters == "?_max=1"
+        assert parameters.startswith("?_max=")
         found = [(at, one) for at, one in self.cache if fnmatch.fnmatchcase(at, key)]
         return [Answer(at, encode(one), encoding_of(one), ok=True) for at, one in found]
 
@@ -210,13 +210,15 @@ def tracks(seq: int, stream: str = STREAM, run: int = 0, count: int = 2) -> Trac
     )
 
 
-def delivery(run: int, seq: int) -> Delivery:
+def delivery(run: int, seq: int, final_ns: int | None = None) -> Delivery:
     """Return how a message came about."""
-    return Delivery(instance="one", received_ns=0, published_ns=seq, queue_ms=0.0, decode_ms=0.0, step_ms=0.0, run=run)
+    times = dict.fromkeys(("queue_ms", "decode_ms", "step_ms"), 0.0)
+    final = {} if final_ns is None else {"final_session": "0" * 32, "final_ns": final_ns}
+    return Delivery(instance="one", received_ns=0, published_ns=seq, run=run, **times, **final)
 
 
-def events(seq: int, count: int = 1, stream: str = STREAM) -> Events:
-    """Return events of a frame, and its counts."""
+def events(seq: int, count: int = 1, stream: str = STREAM, final_ns: int | None = None, **changes: Any) -> Events:
+    """Return events of a frame, and its counts; with `final_ns` those of frames before are final."""
     one = ZoneEvent(
         zone="gate",
         kind="crossed",
@@ -239,8 +241,13 @@ def events(seq: int, count: int = 1, stream: str = STREAM) -> Events:
         labels=["car", "pedestrian"],
         events=[one.model_copy(update={"n": seq * 1000 + at}) for at in range(count)],
         zones=[ZoneCount(zone="gate", **counts)],
-        delivery=delivery(0, seq),
-    )
+        delivery=delivery(0, seq, final_ns),
+    ).model_copy(update=changes)
+
+
+def settled(seq: int) -> Events:
+    """Return what makes the events of earlier frames final."""
+    return events(seq, 0, final_ns=seq, zones=None)
 
 
 PROBLEM = Problem(stream=STREAM, instance="one", code="late", message="Late.")

@@ -19,11 +19,12 @@ ALLOWED = {
     "tomllib", "types", "typing",
 }  # fmt: skip
 EXCEPTIONS = {
-    "compiled": {"logging", "os", "stat", "tempfile", "time"},  # to show why a first frame takes a minute; a folder
-    "warm": {"gc"},  # to collect less often while a compiler fills the memory
+    # to show why a first frame takes a while; a folder; processes that compile
+    "compiled": {"fcntl", "logging", "os", "stat", "subprocess", "tempfile", "time"},
+    "warm": {"gc", "os", "pickle"},  # the programs of those processes
     "online": {"datetime", "matplotlib", "pandas", "pyarrow", "supervision"},  # dates, and forms that users ask for
 }
-TOUCHES_FILES = {"compiled", "parameters", "prepared"}
+TOUCHES_FILES = {"compiled", "parameters", "prepared", "warm"}
 DOES_IO = {"open", "print", "input", "exec", "eval", "__import__"}
 
 

@@ -151,8 +151,8 @@ TWINS = {
     "update.moment_match": "test_update.test_a_mixture_keeps_its_mean_and_covariance",
     "update.ukf_update": "test_update.test_the_update_is_the_textbook_ukf",
     "update.ukf_updates": "test_update.test_the_update_is_the_textbook_ukf",
-    "zones.crossings": "test_zones.test_places_and_crossings_are_those_of_plain_geometry",
-    "zones.locate": "test_zones.test_places_and_crossings_are_those_of_plain_geometry",
+    "zones.crossings": "test_zones.test_places_and_crossings_are_those_of_shapely",
+    "zones.locate": "test_zones.test_places_and_crossings_are_those_of_shapely",
     "update.workspace": "test_update.test_the_update_is_the_textbook_ukf",
 }
 """Kernel -> the test that holds it, or the kernel that it is a part of, against plain numpy or a textbook formula."""

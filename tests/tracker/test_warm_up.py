@@ -112,6 +112,24 @@ def test_kernels_are_counted_while_another_thread_imports(monkeypatch: pytest.Mo
     assert "imported_meanwhile" in sys.modules
 
 
+def test_programs_that_start_at_once_compile_once_together() -> None:
+    """One of them has all kernels compiled, by several processes; the other waits for it, and has what it needs."""
+    program = "import optipmb; print(optipmb.warm_up())"
+    with tempfile.TemporaryDirectory() as cache:
+        environment = os.environ | {"NUMBA_CACHE_DIR": cache, "NUMBA_OPT": "0", "OPTIPMB_COMPILE_PROCESSES": "2"}
+        command = [sys.executable, "-c", program]
+        started = [
+            subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+            for _ in range(2)
+        ]
+        answers = [one.communicate(timeout=570) for one in started]
+    assert [one.returncode for one in started] == [0, 0], answers
+    (none, waited), (compiled, announced) = sorted(answers, key=lambda answer: int(answer[0]))
+    assert (int(none), int(compiled)) == (0, len(kernels()))
+    assert waited == "optipmb: waiting for another process, which compiles the tracker\n"
+    assert announced.startswith("optipmb: compiling the tracker, once after an installation")
+
+
 def test_a_compilation_is_announced_once_with_its_progress() -> None:
     """A process without cached kernels says once that it compiles, then how many are compiled, on standard error."""
     program = (
@@ -119,7 +137,7 @@ def test_a_compilation_is_announced_once_with_its_progress() -> None:
         "import numpy as np, optipmb; optipmb.bev_iou(np.zeros((1, 5)), np.zeros((1, 5)))"
     )
     with tempfile.TemporaryDirectory() as cache:
-        environment = os.environ | {"NUMBA_CACHE_DIR": cache}
+        environment = os.environ | {"NUMBA_CACHE_DIR": cache, "OPTIPMB_COMPILE_PROCESSES": "0"}
         command = [sys.executable, "-c", program]
         done = subprocess.run(command, capture_output=True, text=True, timeout=280, check=True, env=environment)
     first, *progress = done.stderr.splitlines()

@@ -1,13 +1,15 @@
-"""Events of zones and lines: what holds for all of them, and a replay by plain geometry."""
+"""Events of zones and lines: what holds for all of them, and a replay by shapely."""
 
 from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from shapely import LineString, Point, Polygon
 
 from optipmb import ParameterError
 from optipmb.zones import COUNTS, Event, Shapes, Zone, ZoneState, end, locate, observe
@@ -143,6 +145,14 @@ def test_how_a_line_is_crossed(path: list[tuple[float, float] | None], direction
     assert [one.direction for one in events_of([GATE], along(*path))] == directions
 
 
+def test_a_bent_line_is_crossed_where_it_is() -> None:
+    """Not where the way crosses the chord between its ends."""
+    bend = Zone("bend", line=((0, 0), (0, 10), (10, 10)))
+    (crossing,) = events_of([bend], along((-2, 5), (12, 5)))
+    assert crossing.position == pytest.approx((0.0, 5.0, 0.0))
+    assert crossing.at_ns == round(STEP_NS * 2 / 14)
+
+
 def test_events_wait_until_the_track_is_confirmed() -> None:
     """They come with the frame that confirms it, with their own times; otherwise never."""
     frames = [frame({7: (5, 5)}, confirmed=step >= 12) for step in range(14)]
@@ -208,61 +218,43 @@ def test_what_holds_for_all_paths(seed: int) -> None:
     np.testing.assert_allclose([one.at_ns for one in again], [one.at_ns for one in events], atol=1000)
 
 
-def encloses(polygon: Sequence[tuple[float, ...]], place: NDArray[np.float64]) -> bool:
-    """Return whether the directions to the corners turn once around a place."""
-    angles = np.arctan2(*(np.asarray(polygon)[:, :2] - place).T[::-1])
-    turns = (np.roll(angles, -1) - angles + np.pi) % (2 * np.pi) - np.pi
-    return bool(abs(turns.sum()) > np.pi)
-
-
-def nearest(points: Sequence[tuple[float, ...]], place: NDArray[np.float64], *, closed: bool) -> float:
-    """Return the distance of a place to the pieces between points."""
-    begin = np.asarray(points, np.float64)
-    way = np.roll(begin, -1, axis=0) - begin
-    begin, way = (begin, way) if closed else (begin[:-1], way[:-1])
-    share = np.clip(((place - begin) * way).sum(axis=1) / (way**2).sum(axis=1), 0, 1)
-    return float(np.hypot(*(begin + share[:, None] * way - place).T).min())
-
-
-def crossed(line: Sequence[tuple[float, ...]], a: NDArray[np.float64], b: NDArray[np.float64]) -> int:
-    """Return how often a move crosses a line to the left less to the right, by solving for the place on each piece."""
-    net = 0
-    for begin, end_ in zip(np.asarray(line)[:-1], np.asarray(line)[1:], strict=True):
-        way = np.column_stack([b - a, begin - end_])
-        along, across = np.linalg.solve(way, begin - a)
-        if 0 < along < 1 and 0 < across < 1:
-            net += 1 if np.linalg.det(way) > 0 else -1
-    return net
+def crossed(line: LineString, a: NDArray[np.float64], b: NDArray[np.float64]) -> int:
+    """Return how often a move crosses a line to the left less to the right."""
+    path, corners = LineString([a, b]), np.asarray(line.coords)
+    pieces = (piece for piece in pairwise(corners) if path.intersects(LineString(piece)))
+    return int(sum(np.sign(np.linalg.det([end_ - begin, b - a])) for begin, end_ in pieces))
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_places_and_crossings_are_those_of_plain_geometry(seed: int) -> None:
-    """The kernel says of random moves what angles, distances and linear equations say."""
+def test_places_and_crossings_are_those_of_shapely(seed: int) -> None:
+    """The kernel says of random moves what shapely says."""
     rng = np.random.default_rng(seed)
     center, before = rng.uniform((-15, -12, -4), (27, 30, 9), (400, 3)), rng.uniform(-15, 30, (400, 2))
     before[:20] = np.nan
     zones = [replace(one, z=(-1, 6)) if one.polygon else one for one in SHAPES]
     where, net = locate(center, before, *Shapes.of(zones))
     for k, zone in enumerate(zones):
+        shape = Polygon(zone.polygon) if zone.polygon else LineString(zone.line)
         for place, last, found, crossings in zip(center, before, where[:, k], net[:, k], strict=True):
-            near = nearest(zone.polygon or zone.line, place[:2], closed=bool(zone.polygon))
+            far = shape.distance(Point(place[:2]))
             if zone.line:
-                assert found == (near < zone.margin)
-                assert crossings == (0 if np.isnan(last[0]) else crossed(zone.line, last, place[:2]))
+                assert found == (far < zone.margin)
+                assert crossings == (0 if np.isnan(last[0]) else crossed(shape, last, place[:2]))
                 continue
             beyond = max(-1 - place[2], place[2] - 6, 0)
-            inside = encloses(zone.polygon, place[:2])
-            expected = 2 if inside and not beyond else int(max(0 if inside else near, beyond) <= zone.margin)
+            inside = shape.contains(Point(place[:2]))
+            expected = 2 if inside and not beyond else int(max(far, beyond) <= zone.margin)
             assert (found, crossings) == (expected, 0)
     assert {0, 1, 2} == set(where.ravel().tolist())
     assert {-1, 0, 1} <= set(net.ravel().tolist())
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_plain_geometry_finds_the_same_visits_and_crossings(seed: int) -> None:
+def test_shapely_finds_the_same_visits_and_crossings(seed: int) -> None:
     """Of zones and lines without dead band or least time, from the detected positions alone."""
     star, gate = SHAPES[1], SHAPES[3]
     star, frames = replace(star, lost_s=1e6), walks(seed)
+    area, line = Polygon(star.polygon), LineString(gate.line)
     for one in frames:
         one.confirmed[:] = True
     found = Counter((one.zone, one.kind, one.id, one.direction) for one in events_of([star, gate], frames))
@@ -271,11 +263,11 @@ def test_plain_geometry_finds_the_same_visits_and_crossings(seed: int) -> None:
     for one in frames:
         for row in np.flatnonzero(one.detection >= 0).tolist():
             identity, place = int(one.id[row]), one.center[row, :2]
-            inside = encloses(star.polygon, place)
+            inside = area.contains(Point(place))
             before, was = known.get(identity, (place, False))
             if inside is not was:
                 expected["star", "entered" if inside else "left", identity, ""] += 1
-            if (before != place).any() and (net := crossed(gate.line, before, place)):
+            if (before != place).any() and (net := crossed(line, before, place)):
                 expected["gate", "crossed", identity, "left" if net > 0 else "right"] += 1
             known[identity] = place, inside
     assert found == expected

@@ -52,11 +52,10 @@ def check(data: DataOptions, *, as_json: AsJson = False) -> None:
 
 
 def _recording(sequence: "DataSequence") -> dict[str, Any]:
-    stamps = np.array([frame.stamp_ns for frame in sequence.frames()], dtype=np.int64)
-    steps = np.diff(stamps) / 1e9
+    steps = np.diff(sequence.stamps) / 1e9
     return {
         "recording": sequence.name,
-        "frames": len(stamps),
+        "frames": len(sequence),
         "Hz": round(1.0 / float(np.median(steps)), 3) if len(steps) and np.median(steps) else None,
         "seconds": round(float(steps.sum()), 3),
         "longest_gap_s": round(float(steps.max(initial=0.0)), 3),

@@ -60,7 +60,7 @@ def demo(
         pictures = [out / "tracks.png", out / "tracks.gif"]
         try:
             for one in pictures:
-                draw_results(one, sequence, [out], [results])
+                draw_results(one, sequence, [out], [results], numbered=True)
         except ClientError as error:  # pictures are worth having, not worth failing for
             progress.note(str(error))
             pictures = []
@@ -85,6 +85,6 @@ def demo(
         f"precision {figures.precision:.3f}, recall {figures.recall:.3f}"
     )
     lines.append(f"files     {replayed.file}: the tracks, a line for each box, in the format of KITTI's results")
-    lines += [f"          {one}" for one in pictures]
+    lines += [f"          {one}: the tracks that are worth showing, numbered from 1" for one in pictures]
     report(shown, *lines, as_json=as_json)
     complain([replayed])

@@ -161,10 +161,7 @@ class DatasetOptions:
         return found
 
     def open(self, **more: float | str) -> Data:
-        """Open the data set and the chosen sequences, all by default; print the assumptions.
-
-        Args:
-            more: Further options of the data set.
+        """Open the data set, with further options, and the chosen sequences, all by default; print the assumptions.
 
         Raises:
             DatasetError, UsageError: Any of it is not there, or not allowed.

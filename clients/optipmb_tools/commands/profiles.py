@@ -2,7 +2,7 @@
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from optipmb_client.errors import UsageError
@@ -11,9 +11,6 @@ from rich.text import Text
 
 from optipmb_tools.commands.options import AsJson, plain_table, print_json, print_table, report, say
 from optipmb_tools.files import write_whole
-
-if TYPE_CHECKING:
-    from optipmb_tools.run.profiles import FieldOfProfile
 
 
 def profiles(
@@ -47,14 +44,14 @@ def profiles(
     elif as_json:
         print_json({"command": "profiles", "profile": parameters.model_dump()})
     elif explain:
-        print_table(Group(*(Text(_line(field)) for field in library.fields_of(parameters))))
+        print_table(Group(*(Text(_line(*field)) for field in library.fields_of(parameters.classes))))
     else:
         say(library.profile_source(name).rstrip())
 
 
-def _line(field: "FieldOfProfile") -> str:
-    values = ", ".join(f"{name} {value:g}" for name, value in field.values.items())
-    return f"{field.path}: {field.description}\n    {values}"
+def _line(path: str, description: str, values: dict[str, float]) -> str:
+    shown = ", ".join(f"{name} {value:g}" for name, value in values.items())
+    return f"{path}: {description}\n    {shown}"
 
 
 def _list(*, as_json: bool) -> None:

@@ -25,6 +25,7 @@ from rich.live import Live
 
 from optipmb_tools.commands.options import AsJson, Origin, print_json, print_table, report
 from optipmb_tools.commands.service_options import ServiceOptions
+from optipmb_tools.datasets.interface import georeference_of
 from optipmb_tools.table_files import SUFFIXES, write_table
 from optipmb_tools.views.terminal import StatusView, status_tables
 
@@ -101,11 +102,7 @@ def tracks(
         raise UsageError("--last: not together with --from and --to")
     if out is not None and out.suffix.lower() not in SUFFIXES:
         raise UsageError(f"--out: a table such as tracks.csv or tracks.parquet, not {out}")
-    georeference = None
-    if origin is not None:
-        from optipmb_tools.georeference import georeference_of  # noqa: PLC0415  imports the tracker
-
-        georeference = georeference_of(origin)
+    georeference = None if origin is None else georeference_of(origin)
     with service.connection(2.0) as connection:
         if last is not None:
             state = session_state(connection, stream, prefix=service.prefix)

@@ -12,6 +12,7 @@ from optipmb_tools.datasets.interface import (
     Preloaded,
     Regions,
     Truth,
+    georeference_of,
     selected_frames,
 )
 from optipmb_tools.extras import needed
@@ -74,8 +75,6 @@ def open_dataset(
         raise DatasetError("--fuse", "a table with a column `sensor`, or a recording (.mcap)", name)
     georeference = None
     if "origin" in options:
-        from optipmb_tools.georeference import georeference_of  # noqa: PLC0415  imports the tracker
-
         georeference = georeference_of(options["origin"])
     if name != "table":  # whose latitudes and longitudes need it
         options.pop("origin", None)

@@ -20,7 +20,7 @@ from optipmb_tools.geometry import Bools, Floats, Ints, Pose
 from optipmb_tools.results import BoxTable
 
 if TYPE_CHECKING:
-    from optipmb_tools.georeference import Georeference
+    from optipmb import Georeference as Georeference  # noqa: PLC0414  for others too
 
 Points = NDArray[np.float32]
 _T = TypeVar("_T")
@@ -174,6 +174,11 @@ class DataSequence(ABC):
     def frames(self) -> Iterator[DetectionFrame]:
         """Yield every frame in order, also those without detections."""
 
+    @property
+    def stamps(self) -> Ints:
+        """(F,) nanoseconds; `frames` may count from another origin."""
+        return np.array([frame.stamp_ns for frame in self.frames()], dtype=np.int64)
+
     def truth(self) -> Truth | None:
         """Return the annotations; None where the data set has none."""
         return None
@@ -260,6 +265,20 @@ def class_like(name: str, names: Sequence[str]) -> str | None:
     from optipmb.class_names import like  # noqa: PLC0415  loads the tracker, which equal names do not need
 
     return like(name, tuple(names))
+
+
+def georeference_of(origin: float | str) -> "Georeference":
+    """Return the place of the world frame on the globe that `--origin` names.
+
+    Raises:
+        DatasetError: It names none.
+    """
+    from optipmb import Georeference, ParameterError  # noqa: PLC0415  loads the tracker, which few data sets need
+
+    try:
+        return Georeference.parse(str(origin))
+    except ParameterError as error:
+        raise DatasetError(f"--{error.path}", error.expected, error.received) from error
 
 
 def selected_frames(sequence: DataSequence, classes: Sequence[str]) -> Iterator[DetectionFrame]:

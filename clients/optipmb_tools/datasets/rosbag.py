@@ -63,10 +63,7 @@ class Stamped(NamedTuple):
 
 
 class Bag:
-    """A rosbag2 folder, or one MCAP or SQLite file of it.
-
-    Args:
-        path: The folder with `metadata.yaml`, or the file.
+    """A rosbag2 folder (with `metadata.yaml`), or one MCAP or SQLite file of it.
 
     Raises:
         DatasetError: It is none, or was not closed properly.
@@ -307,14 +304,9 @@ def detection_topics(bag: Bag) -> tuple[str, ...]:
 
 
 def write_bag(path: Path, bag: Bag, plan: Plan, tracks: Mapping[int, Tracks], *, keep_input: bool) -> Path:
-    """Write the tracks (world frame) of one topic of a bag, by frame index.
+    """Write the tracks (world frame) of one topic of a bag, by frame index; return the file.
 
-    Args:
-        path: The file; returned.
-        bag: Where the detections come from.
-        plan: Its frames.
-        tracks: The tracks of each frame.
-        keep_input: Also copy every message of the bag.
+    With `keep_input` every message of the bag is copied too.
 
     Raises:
         DatasetError: A topic that is to be copied has a type that the bag does not define.

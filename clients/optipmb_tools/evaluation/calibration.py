@@ -141,10 +141,7 @@ def evaluate_calibration(
 ) -> CalibrationResult:
     """Return the figures of one class over all sequences.
 
-    Args:
-        parts: the truth, the tracks and everything known of them in each sequence, all in the world frame.
-        name: the class.
-        rules: how to compare; centres.
+    Each sequence has its truth, its tracks and all columns of the tracks, in the world frame; rules compare centres.
 
     Raises:
         DatasetError: the two kinds of tracks are not of one run.

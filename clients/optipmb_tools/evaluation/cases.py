@@ -141,14 +141,7 @@ class Case:
 
 
 def prepare(truth: Truth, tracks: ResultTable, name: str, rules: Rules, sequence: str = "") -> Case:
-    """Return the case of one class.
-
-    Args:
-        truth: annotations of a sequence.
-        tracks: results for it, in the same frame of reference.
-        name: the class.
-        rules: how to compare.
-        sequence: the name of the sequence, for reports.
+    """Return the case of one class; `sequence` is the name in reports.
 
     Raises:
         DatasetError: overlaps are asked for of boxes without size or heading.

@@ -117,15 +117,7 @@ class ClearResult(Counts):
 def evaluate_clear(
     truth: Truth, tracks: ResultTable, name: str, rules: Rules | None = None, *, sequence: str = ""
 ) -> ClearResult:
-    """Return the CLEAR figures of one class in one sequence.
-
-    Args:
-        truth: annotations.
-        tracks: results in the same frame of reference.
-        name: the class.
-        rules: how to compare; by default boxes that overlap by a quarter match.
-        sequence: name of the sequence, for the lists of switches and misses.
-    """
+    """Return the CLEAR figures of one class in one sequence; by default boxes that overlap by a quarter match."""
     rules = rules or Rules()
     return clear(prepare(truth, tracks, name, rules, sequence), rules)
 

@@ -84,13 +84,7 @@ class ErrorResult:
 def evaluate_errors(
     parts: Iterable[tuple[DataSequence, Truth, ResultTable, FullTable]], name: str, rules: Rules
 ) -> ErrorResult:
-    """Return the errors of one class over all sequences.
-
-    Args:
-        parts: each sequence with its truth, its tracks and everything known of them, all in the world frame.
-        name: the class.
-        rules: how to compare; centres.
-    """
+    """Return the errors of one class over all sequences; parts and rules as for `evaluate_calibration`."""
     none, boxes = np.empty(0), np.empty((0, len(DIRECTIONS)))
     return sum((_sequence_errors(*part, name, rules) for part in parts), ErrorResult(boxes, boxes, none, none, none))
 

@@ -22,9 +22,9 @@ from optipmb_tools.evaluation.errors import ErrorResult, evaluate_errors
 from optipmb_tools.evaluation.figures import defined
 from optipmb_tools.evaluation.gospa import CUTOFF, ORDER, GospaResult, evaluate_gospa
 from optipmb_tools.evaluation.hota import HotaResult, evaluate_hota
-from optipmb_tools.evaluation.tracks import read_compared, read_full_tracks
-from optipmb_tools.results import FullTable, ResultTable, full_path, read_full
-from optipmb_tools.results.nuscenes import read_nuscenes_results, result_table
+from optipmb_tools.evaluation.tracks import read_compared, read_full_tracks, result_file
+from optipmb_tools.results import FullTable, ResultTable
+from optipmb_tools.results.nuscenes import read_nuscenes_results, result_table, scene_file
 
 _ROUNDING = 1e-9
 
@@ -128,13 +128,7 @@ class ClassFigures:
 def load_recordings(
     dataset: str, sequences: Sequence[DataSequence], results: Path, names: Sequence[str] = ()
 ) -> list[Recording]:
-    """Return the sequences with their truth and their tracks.
-
-    Args:
-        dataset: its name, on which the layout of the result files depends.
-        sequences: each must have a truth.
-        results: the folder of the result files.
-        names: as for `read_compared`.
+    """Return the sequences with their truth and their tracks, which each data set has in a layout of its own.
 
     Raises:
         DatasetError: a sequence has no truth, or its results are missing or wrong.
@@ -143,7 +137,7 @@ def load_recordings(
         return _nuscenes_recordings(sequences, results)
     pairs = zip(sequences, read_compared(sequences, results, names), strict=True)
     return [
-        Recording(one, truth, tracks.to_world(one.poses), read_full_tracks(results, one))
+        Recording(one, truth, tracks.to_world(one.poses), read_full_tracks(result_file(results, one.name)))
         for one, (truth, tracks) in pairs
     ]
 
@@ -161,8 +155,7 @@ def _nuscenes_recordings(sequences: Sequence[DataSequence], results: Path) -> li
         # The benchmark compares near boxes only, by class; truth farther away is ignored already.
         reach = np.array([CLASS_RANGE.get(name, 0.0) for name in table.labels] or [0.0])
         near = sequence.ego_distance(table.frame, table.center) < reach[table.label]
-        beside = full_path(submission.path.parent / "scenes" / f"{sequence.name}.json")
-        full = read_full(beside) if beside.is_file() else None
+        full = read_full_tracks(scene_file(submission.path.parent, sequence.name))
         recordings.append(Recording(sequence, truth, table.take(near), full))
     return recordings
 
@@ -265,10 +258,8 @@ class Evaluation:
 def figures_of(shared: Evaluation, task: tuple[str, float | None]) -> list[ClassFigures]:
     """Return the figures of one class; none for a class that neither truth nor tracks have.
 
-    Args:
-        shared: data.
-        task: the class, and the threshold of the tracks that are also evaluated without the others; None: as
-            `evaluate_figures` chooses it.
+    The task is the class, and the threshold of the tracks that are also evaluated without the others; None: as
+    `evaluate_figures` chooses it.
 
     Raises:
         DatasetError: as `load_recordings`.

@@ -90,12 +90,7 @@ NOTHING = HotaResult(*(np.zeros(len(ALPHAS)) for _ in range(5)))  # of a sequenc
 
 
 def evaluate_hota(cases: Iterable[Case], rules: Rules) -> HotaResult:
-    """Return the figures of one class over all sequences.
-
-    Args:
-        cases: the class in each sequence, with all pairs that are similar at all.
-        rules: those by which the cases were prepared.
-    """
+    """Return the figures of one class over all sequences, from cases with all pairs that are similar at all."""
     return sum((_hota(part, similarity(part, rules)) for part in (counted(case, rules) for case in cases)), NOTHING)
 
 

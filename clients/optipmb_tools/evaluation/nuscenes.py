@@ -445,13 +445,7 @@ def evaluate_nuscenes(
 def evaluate_scenes(
     pairs: Sequence[tuple[NuScenesScene, ResultTable]], config: NuScenesConfig | None = None
 ) -> NuScenesScores:
-    """Return the figures of tracks that are in memory.
-
-    Args:
-        pairs: scenes, made by `prepare_scene` with the same settings, and their tracks in the world frame; frames count
-            the keyframes of the scene.
-        config: other settings than the official ones.
-    """
+    """Return the figures of tracks in memory, in the world frame; their frames count the keyframes of a scene."""
     config = config or NuScenesConfig()
     scenes = [(scene, scene.tracks(table, config)) for scene, table in pairs]
     classes = {}

@@ -13,15 +13,7 @@ _MAX_CORNERS = 8  # two rectangles overlap in a polygon of at most eight corners
 
 
 def iou_3d(first: tuple[Floats, Floats, Floats], second: tuple[Floats, Floats, Floats]) -> Floats:
-    """Return the intersection over union of the volumes of pairs of boxes.
-
-    Args:
-        first: centres (P, 3), sizes (P, 3) and yaws (P,) of the first box of each pair.
-        second: the same of the second.
-
-    Returns:
-        (P,) in [0, 1].
-    """
+    """Return the intersection over union (P,) of the volumes of pairs of boxes: centres, sizes (P, 3) and yaws (P,)."""
     (center_a, size_a, _), (center_b, size_b, _) = first, second
     top = np.minimum(center_a[:, 2] + 0.5 * size_a[:, 2], center_b[:, 2] + 0.5 * size_b[:, 2])
     bottom = np.maximum(center_a[:, 2] - 0.5 * size_a[:, 2], center_b[:, 2] - 0.5 * size_b[:, 2])

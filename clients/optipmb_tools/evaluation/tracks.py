@@ -16,8 +16,6 @@ from optipmb_tools.results.kitti import LEAST_SHOWN, read_kitti_results
 from optipmb_tools.results.nuscenes import NUSCENES_FILE, read_nuscenes_results, result_table
 from optipmb_tools.table_files import SUFFIXES, is_table
 
-__all__ = ["read_compared", "read_full_tracks", "read_tracks"]
-
 _OTHERS = ("Van", "Truck", "Person_sitting", "Person", "Tram")
 """Classes of KITTI that are no synonyms of evaluated ones."""
 
@@ -94,7 +92,7 @@ def read_tracks(results: Path, sequence: DataSequence) -> ResultTable:
     if isinstance(sequence, NuScenesSequence) and (results.suffix == ".json" or (results / NUSCENES_FILE).is_file()):
         scene = result_table(read_nuscenes_results(results), sequence.name, sequence.samples)
         return scene.to_sensor(sequence.poses)
-    path = _file(results, sequence.name)
+    path = result_file(results, sequence.name)
     if is_table(path):
         return _with_image(path, _from_table(path, sequence).to_sensor(sequence.poses), sequence)
     table = read_kitti_results(path)
@@ -103,13 +101,14 @@ def read_tracks(results: Path, sequence: DataSequence) -> ResultTable:
     return _with_image(path, table, sequence)
 
 
-def read_full_tracks(results: Path, sequence: DataSequence) -> FullTable | None:
-    """Return all that is known of the tracks; None where it was not written."""
-    beside = full_path(_file(results, sequence.name))
-    return read_full(beside) if beside.is_file() else None
+def read_full_tracks(result: Path) -> FullTable | None:
+    """Return all columns of the tracks of a result file; None where they were not written."""
+    path = full_path(result)
+    return read_full(path) if path.is_file() else None
 
 
-def _file(results: Path, name: str) -> Path:
+def result_file(results: Path, name: str) -> Path:
+    """Return the file of a sequence in a folder of results, or the table of tracks that they are."""
     if is_table(results) and not results.is_dir():
         return results
     tables = (results / f"{name}{suffix}" for suffix in SUFFIXES)
@@ -123,10 +122,7 @@ def _from_table(path: Path, sequence: DataSequence) -> ResultTable:
     key = _key(table, sequence, tables) if len(table.boxes.frame_stamp) else None
     if key is None:
         return replace(full_table((), {}), notes=(f"{path}: no tracks of {sequence.name}",))
-    stamps = getattr(sequence, "stamps", None)
-    if stamps is None:
-        stamps = np.array([frame.stamp_ns for frame in sequence.frames()], dtype=np.int64)
-    rows, frame, _, notes = table.at(key, stamps, getattr(sequence, "numbers", None))
+    rows, frame, _, notes = table.at(key, sequence.stamps, sequence.numbers)
     boxes = table.boxes
     if (frame < 0).any():
         line = table.line(int(rows[np.flatnonzero(frame < 0)[0]]))
@@ -150,8 +146,8 @@ def _from_table(path: Path, sequence: DataSequence) -> ResultTable:
 def _key(table: ObjectTable, sequence: DataSequence, tables: TableOptions) -> str | None:
     """Return the key of a sequence in a table of tracks; None where it has other recordings of the dataset only."""
     keys = table.boxes.keys
-    columns: dict[str, str] = getattr(sequence, "key_columns", {})
-    for one in (".".join(columns.values()), sequence.name):
+    counted = sequence.name.lstrip("0") or "0"  # a text table has no way to say that 0004 is not the number 4
+    for one in (".".join(sequence.key_columns.values()), sequence.name, counted):
         if one in keys:
             return one
     if tables.recordings & keys.keys():

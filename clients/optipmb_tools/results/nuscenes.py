@@ -183,12 +183,7 @@ def write_scene(
 ) -> Path:
     """Write the tracks (world frame) of one scene, by frame index, with an empty list for samples without tracks.
 
-    Args:
-        out: Folder of all scenes.
-        scene: Its name.
-        samples: Tokens of its samples, in order of time.
-        meta: `meta` of the detections.
-        tracks: The tracks of each frame.
+    The samples are tokens in order of time; `meta` comes from the detections.
 
     Raises:
         DatasetError: A track is of a class that the benchmark does not have.

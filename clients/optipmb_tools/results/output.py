@@ -25,8 +25,7 @@ from optipmb_tools.table_files import Columns, is_table, write_table
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from optipmb_tools.datasets.interface import DataSequence, Dataset
-    from optipmb_tools.georeference import Georeference
+    from optipmb_tools.datasets.interface import DataSequence, Dataset, Georeference
 
 _STATE: Final = ("x", "y", "v", "phi", "omega", "a")
 COVARIANCE: Final = {f"cov_{_STATE[i]}_{_STATE[j]}": (i, j) for i in range(6) for j in range(i, 6)}
@@ -90,11 +89,6 @@ def track_columns(
 def _confirmed(tracks: Tracks) -> "NDArray[np.int64]":
     """Return which tracks are confirmed, 1 or 0: all, where the service does not tell."""
     return np.ones(len(tracks.id), np.int64) if tracks.confirmed is None else np.asarray(tracks.confirmed, np.int64)
-
-
-def join(parts: Sequence[Columns]) -> Columns:
-    """Return tables with the same columns as one, one below the other."""
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else {}
 
 
 @dataclass(frozen=True)
@@ -171,8 +165,8 @@ class Results:
 
         Sequences that were not taken are missing in the table; a file of a benchmark is written of all or not at all.
         """
-        parts = {name: written for name, written in self._taken.items() if not isinstance(written, Path)}
+        parts = [written for _, written in sorted(self._taken.items()) if not isinstance(written, Path)]
         if parts:
-            write_table(self._out, join([parts[name] for name in sorted(parts)]))
+            write_table(self._out, {name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
         elif all(one.name in self._taken for one in sequences):
             self._dataset.join(self._out, sequences)

@@ -259,14 +259,7 @@ def run_load(
     prefix: str = PREFIX,
     on_frame: Callable[[int], None] = lambda _count: None,
 ) -> Run:
-    """Send a load through a running service.
-
-    Args:
-        connection: To the service.
-        load: How much.
-        frames: Frames to send.
-        prefix: First part of all keys.
-        on_frame: Called with the number of frames sent.
+    """Send a load through a running service; `on_frame` gets the number of frames sent.
 
     Raises:
         ServiceUnavailable: No service answers.

@@ -1,8 +1,7 @@
 """Parameter profiles: by name, from a file, or made for the data."""
 
 import itertools
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from statistics import median
 from typing import Any, Final
 
@@ -52,29 +51,16 @@ def read_profile(profile: str) -> Parameters:
         raise UsageError(f"--profile {profile}: {error}") from error
 
 
-@dataclass(frozen=True)
-class FieldOfProfile:
-    """A field of a profile."""
-
-    path: str  # below a class
-    description: str
-    values: dict[str, float]  # by class
-
-
-def fields_of(parameters: Parameters) -> Iterator[FieldOfProfile]:
-    """Yield every field with numbers of the classes of a profile."""
-    yield from _fields_of("", dict(parameters.classes))
-
-
-def _fields_of(path: str, tables: dict[str, Any]) -> Iterator[FieldOfProfile]:
+def fields_of(tables: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, str, dict[str, float]]]:
+    """Yield path, description and values by class of every field with numbers, of a profile's classes."""
     for name, field in type(next(iter(tables.values()))).model_fields.items():
         values = {label: getattr(table, name) for label, table in tables.items()}
         numbers = {label: value for label, value in values.items() if isinstance(value, (int, float))}
         inner = {label: value for label, value in values.items() if hasattr(value, "model_fields_set")}
         if numbers:
-            yield FieldOfProfile(path + name, field.description or "", numbers)
+            yield path + name, field.description or "", numbers
         if inner:
-            yield from _fields_of(f"{path}{name}.", inner)
+            yield from fields_of(inner, f"{path}{name}.")
 
 
 def profile_for(profile: str, sequences: Sequence[DataSequence]) -> Parameters:

@@ -87,16 +87,7 @@ class ReplayedSequence:
 
 
 class Exchange:
-    """Frames that were published on one stream, and the tracks that came back.
-
-    Args:
-        stream: Name of the stream.
-        link: To the service or its router.
-        frames: Number of frames to come.
-        pace: How fast.
-        prefix: First part of all keys.
-        on_frame: Called when the tracks of a frame have come back.
-    """
+    """Frames that were published on one stream, and the tracks that came back, each of which `on_frame` counts."""
 
     def __init__(
         self, stream: str, link: Link, frames: int, *, pace: Pace, prefix: str, on_frame: Callable[[], None]

@@ -38,11 +38,7 @@ _TURN: Final = np.array([-1.0 if s in {V, A} else 1.0 for s in range(STATE)])
 
 
 class Smoother:
-    """Collects the frames of one sequence, in order, and returns their tracks smoothed.
-
-    Args:
-        parameters: the profile that the sequence is tracked with.
-    """
+    """Collects the frames of one sequence, in order, and returns their tracks smoothed."""
 
     def __init__(self, parameters: Parameters) -> None:
         self._table = ClassTable.of(parameters)

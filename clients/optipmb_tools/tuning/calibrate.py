@@ -69,14 +69,7 @@ class _Rows:
 def calibrate(
     clips: Sequence[Clip], scorer: Scorer, parameters: Parameters, memory: float | None = None
 ) -> Calibration | None:
-    """Return the calibration of a class, or None where there is too little to measure.
-
-    Args:
-        clips: with this class only.
-        scorer: of the class.
-        parameters: of the tracks, with this class only.
-        memory: the one to take; None tries several.
-    """
+    """Return the calibration of a class; None where there is too little to measure. Without `memory` try several."""
     best: tuple[float, float, list[_Rows]] | None = None
     for one in MEMORIES if memory is None else (memory,):
         rows = [_rows(clip, scorer, parameters, one) for clip in clips]
@@ -292,14 +285,7 @@ class Ranking:
 
 
 def rank(clips: Sequence[Clip], scorer: Scorer, parameters: Parameters, objective: str) -> tuple[Ranking, ...]:
-    """Return how well each score ranks the same tracks.
-
-    Args:
-        clips: with the class of the scorer only.
-        scorer: of the class.
-        parameters: of the tracks, with a calibration.
-        objective: one of `optipmb_tools.tuning.scoring.METRICS`.
-    """
+    """Return how well each score ranks the same tracks, of parameters with a calibration."""
     probe = with_values(parameters, scorer.name, {"calibration.score_of_evidence": 1.0})
     tracked = [track_clip(clip, probe) for clip in clips]
     scores_of = [_scores(clip, full, parameters.nominal_period) for clip, full in zip(clips, tracked, strict=True)]

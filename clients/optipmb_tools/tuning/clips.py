@@ -137,11 +137,7 @@ def track_clip(
 ) -> FullTable:
     """Return the tracks of a clip in the world frame, with image boxes where there is a camera.
 
-    Args:
-        clip: with detections of the classes of the parameters.
-        parameters: with the classes of the clip.
-        modules: of the tracker.
-        every_frame: also step through frames in which nothing can happen; the tracks are the same.
+    With `every_frame` it also steps through frames in which nothing can happen; the tracks are the same.
     """
     tracker = Tracker(parameters, modules)
     least = min(one.score_filter for one in parameters.classes.values())

@@ -245,14 +245,7 @@ def _plain(value: Any) -> Any:
 
 
 def estimate(clips: Sequence[Clip], name: str, parameters: Parameters, rules: Rules) -> Estimate:
-    """Return the estimates of one class.
-
-    Args:
-        clips: of this class only.
-        name: the class.
-        parameters: their score filter, gate, clutter rate and nominal period are used.
-        rules: of the benchmark: which labels are ignored and which detections excused.
-    """
+    """Return the estimates of one class from clips with this class only."""
     table = parameters.classes[name]
     paths = [trajectories(clip, name) for clip in clips]
     everything = pair_all(clips, name, parameters, rules)
@@ -528,9 +521,7 @@ def counted_scores(pairs: Sequence[Pairs]) -> tuple[Floats, Bools]:
 def score_curve(own: Sequence[Pairs], reference: Sequence[Pairs]) -> ScoreCalibration | None:
     """Return the curve from a detector's scores to the reference's; None where there is too little to measure it.
 
-    Args:
-        own: all detections of one class, paired with its labels.
-        reference: the same of the reference detector.
+    Both have all detections of one class, paired with its labels.
     """
     samples = [counted_scores(pairs) for pairs in (own, reference)]
     if min(int(true.sum()) for _, true in samples) < LEAST_TRUE:

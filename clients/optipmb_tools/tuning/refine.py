@@ -154,15 +154,9 @@ def refine(
     context: Mapping[str, Any],
     display: TrialDisplay,
 ) -> Refined:
-    """Tune one class.
+    """Tune the class of an objective, whose clips have it only; the search begins at the parameters.
 
-    Args:
-        objective: of this class, with clips that have it only.
-        parameters: where the search begins; other classes in them do not matter.
-        plan: options.
-        storage: the file that keeps the trials.
-        context: other settings that the trials depend on, such as the names of the data.
-        display: shows the progress.
+    The storage keeps the trials; `context` has other settings on which they depend, such as the names of the data.
 
     Raises:
         UsageError: the storage holds trials of another session.

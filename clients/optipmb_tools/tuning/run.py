@@ -104,14 +104,7 @@ def calibrate_scores(
 ) -> tuple[Parameters, Curves]:
     """Measure the curves from a detector's scores to a reference detector's, and write `calibrated.toml`.
 
-    Args:
-        data: the dataset with the detector.
-        reference: the name of the reference detector.
-        sequences: of the dataset; used where the reference has them too.
-        parameters: the profile; score calibrations that it has are replaced.
-        classes: as of a `Source`.
-        out: the folder.
-        name: of the new profile.
+    Sequences count where the reference has them too; score calibrations of the parameters are replaced.
 
     Returns:
         The profile with the curves, and the curve of each class, None where there is too little to measure one.

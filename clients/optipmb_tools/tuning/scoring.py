@@ -207,8 +207,7 @@ def without_folds(clips: Sequence[int], weights: Sequence[int]) -> list[tuple[in
 def standard_error(gains: Floats) -> float:
     """Return the jackknife's standard error of a gain; 0 where there are too few sequences to tell.
 
-    Args:
-        gains: of all sequences, and of the sequences without each fold.
+    Gains are of all sequences, then of the sequences without each fold.
     """
     count = len(gains) - 1
     return math.sqrt((count - 1) * float(np.var(gains[1:]))) if count else 0.0

@@ -175,15 +175,7 @@ Score = Callable[[Values, Callable[[float], None]], float]
 
 
 class Search:
-    """One study in a storage.
-
-    Args:
-        storage: path of the SQLite file; several studies share it.
-        name: of the study.
-        settings: settings that the trials depend on; a study that has others is refused.
-        space: the search space.
-        starts: candidates that are tried first.
-        seed: of all chance.
+    """One study in a SQLite file, which several studies share; a study of other settings is refused.
 
     Raises:
         ClientError: Optuna is not installed.
@@ -229,12 +221,9 @@ class Search:
     def run(
         self, trials: int, score: Score, on_trial: Callable[[float], None] = lambda _best: None
     ) -> dict[str, Value]:
-        """Continue until there are `trials` trials; return the best values.
+        """Continue until there are `trials` trials, of earlier sessions too; return the best values.
 
-        Args:
-            trials: in all, earlier sessions included.
-            score: the score of values.
-            on_trial: called after each trial with the best score so far.
+        After each trial `on_trial` gets the best score so far.
         """
         for number in range(len(self.trials), trials):
             rng = np.random.Generator(np.random.PCG64([self._seed, number]))

@@ -80,10 +80,8 @@ def sweep(parameters: Parameters, classes: Sequence[str], path: str, values: Seq
 def measure_variants(source: Source, variants: Sequence[Variant], on_clip: Callable[[int], None]) -> Iterator[Row]:
     """Track everything once with each variant; yield its row when it is done.
 
-    Args:
-        source: the data; its classes are reported, all classes of the parameters are tracked.
-        variants: with the classes of the source's clips.
-        on_clip: called with the frames of each clip of each variant when it is tracked.
+    The classes of the source are reported, all classes of the parameters are tracked; `on_clip` gets the frames of each
+    clip of each variant when it is tracked.
     """
     scorers = [scorer_of(source.dataset, name, source.sequences) for name in source.classes]
     warm_up()

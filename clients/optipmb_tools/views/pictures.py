@@ -7,6 +7,7 @@ the installation and is imported when the first picture is drawn.
 
 import contextlib
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -368,6 +369,8 @@ def draw_results(
     folders: Sequence[Path],
     results: "Sequence[Sequence[ClassResult]]",
     score: float | None = None,
+    *,
+    numbered: bool = False,
 ) -> None:
     """Draw the result files of a sequence from above.
 
@@ -378,6 +381,7 @@ def draw_results(
         results: Figures of the classes of each tracker; their misses and identity changes are marked.
         score: Least mean score of the tracks that are shown; default: the best threshold of each class by `results`,
             without results the tracks that were confirmed.
+        numbered: Number the tracks that are shown from 1; default: their ids.
 
     Raises:
         DatasetError: There is no such result file, or it is wrong.
@@ -394,7 +398,15 @@ def draw_results(
         best = [result.sweep.results[result.sweep.best] for result in own]
         if not own and score is None:
             table = _confirmed(table, folder)
-        panels.append(Panel(_from_score(table, own, score), best, name if len(names) > 1 else ""))
+        table = _from_score(table, own, score)
+        if numbered:
+            known, which = np.unique(table.id, return_inverse=True)
+            number = {identity: place + 1 for place, identity in enumerate(known.tolist())}
+            table = replace(table, id=which + 1)
+            for k, one in enumerate(best):
+                changes = [change._replace(old=number[change.old], new=number[change.new]) for change in one.changes]
+                best[k] = replace(one, changes=tuple(changes))
+        panels.append(Panel(table, best, name if len(names) > 1 else ""))
     if picture.suffix == ".gif":
         animate_tracks(picture, sequence, panels[0].tracks, sequence.truth())
     else:

@@ -205,7 +205,8 @@ def config_command(
     for name in values.keys() - plain.keys():
         typer.echo(f"\n[{name}]  # {loaded.sources[name]}")
         for key, value in values[name].items():
-            typer.echo(f"{_toml(key) if name == 'profiles' else key} = {_toml(value)}")
+            shown = f"{_toml(key) if name == 'profiles' else key} = {_toml(value)}"
+            typer.echo(f"# {key} is not set" if value is None else shown)
 
 
 @app.command("router")
@@ -237,6 +238,7 @@ def ros2_command(**given: Unpack[RouterOptions]) -> None:
 @app.command("mqtt")
 @_taking(RouterOptions)
 def mqtt_command(
+    *,
     broker: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Broker; as mqtt://127.0.0.1:1883, or mqtts:// with TLS.")
     ] = None,

@@ -11,9 +11,7 @@ twice a second. Logs go to stderr, which both share.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import ctypes
-import fcntl
 import json
 import mmap
 import signal
@@ -43,7 +41,6 @@ log = structlog.get_logger("optipmb_service")
 
 HOUSEKEEPING_S: Final = 0.5
 WRONG_USE: Final = 2
-LOCK: Final = "lock"  # file that one worker at a time holds while it compiles
 UNUSED: Final = "scipy.linalg"
 COMPILER: Final = "libllvmlite"
 MAPS: Final = Path("/proc/self/maps")
@@ -108,7 +105,7 @@ async def _serve(
         # The loop's time and the deadlines are one clock, the monotonic one.
         loop.call_soon_threadsafe(loop.call_at, at_ns / 1e9, wake)
 
-    await unless(asked, lambda: warm_up(private))
+    await unless(asked, warm_up)
     if asked.is_set():
         return None
     if not settings.is_router:
@@ -139,24 +136,21 @@ async def _serve(
     return await asyncio.to_thread(service.stop, asked.bound.left())
 
 
-def warm_up(private: Path | None = None) -> None:
-    """Compile the kernels, or load them; of workers with a private folder one at a time.
+def warm_up() -> None:
+    """Compile the kernels, or load them.
 
     With its array functions numba loads scipy's linear algebra where that is installed: 15 of 220 MB, and a twelfth of
     the processor time of the start, for functions that no kernel uses. It does without where there is none, so it is
     shown none.
     """
-    with contextlib.ExitStack() as stack:
-        if private is not None:
-            fcntl.flock(stack.enter_context((private / LOCK).open("a")), fcntl.LOCK_EX)
-        if UNUSED not in sys.modules:
-            sys.modules[UNUSED] = None  # type: ignore[assignment]  # what makes an import fail, as Python has it
-            try:
-                import_module("numba.np.arraymath")
-            finally:
-                del sys.modules[UNUSED]
-        optipmb.warm_up()
-        _release_compiler()
+    if UNUSED not in sys.modules:
+        sys.modules[UNUSED] = None  # type: ignore[assignment]  # what makes an import fail, as Python has it
+        try:
+            import_module("numba.np.arraymath")
+        finally:
+            del sys.modules[UNUSED]
+    optipmb.warm_up()
+    _release_compiler()
 
 
 def _release_compiler() -> None:

@@ -16,6 +16,7 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
 
 import optipmb_schemas as schemas
+from optipmb_client.merging import FinalEvents
 from optipmb_schemas import json_form
 from optipmb_schemas.json_form import EVERYTHING, Selection
 
@@ -242,6 +243,8 @@ class Wish:
     topics: frozenset[str]
     selection: Selection = EVERYTHING
     max_rate_hz: float = 0.0
+    final: bool = True
+    """Whether it gets events when they do not change any more, each once, or as they are published."""
 
     def keys(self, keys: schemas.Keys) -> list[str]:
         """Return the keys to subscribe to.
@@ -265,6 +268,7 @@ class Reader:
         self.outbox: Outbox[Text] = Outbox()
         self.lost_events = 0
         self._events = events
+        self._held: dict[str, FinalEvents] = collections.defaultdict(FinalEvents)
         self.want(wish)
 
     def want(self, wish: Wish) -> None:
@@ -294,11 +298,17 @@ class Reader:
             text = Text("problems", stream, partial(json_form.problem_json, message))
             put(f"problems {stream}", text, size, PROBLEMS)
         elif one.topic == "events":
-            for event in one.events if "events" in topics else ():
+            for event in self._due(one) if "events" in topics else ():
                 text = Text("events", stream, partial(bytes, event))
                 self.lost_events += put("events", text, len(event), self._events)
             if "zones" in topics and (counts := one.zones) is not None:
                 put(f"zones {stream}", Text("zones", stream, partial(bytes, counts)), len(counts))
+
+    def _due(self, one: Publication) -> list[bytes]:
+        if not self._wish.final:
+            return one.events
+        due = self._held[one.message.stream].take(one.message)
+        return [text for message in due for text in json_form.event_json(message, one.place)]
 
 
 class Feeds:
@@ -340,13 +350,13 @@ class Feeds:
 
         return self.session.read_newest(key, read, most=1 if key.endswith("/detections") else WAITING)
 
-    def newest(self, key: str) -> list[Publication]:
-        """Return the newest message of each publisher's cache under a key expression; may wait.
+    def newest(self, key: str, most: int = 1) -> list[Publication]:
+        """Return the newest messages of each publisher's cache under a key expression; may wait.
 
         Raises:
             TransportError: the network cannot be used.
         """
-        answers = self.session.query(f"{key}/@adv/**?_max=1", timeout=QUERY_S)
+        answers = self.session.query(f"{key}/@adv/**?_max={most}", timeout=QUERY_S)
         return [Publication(one.key, one.payload, one.encoding, self._places) for one in answers if one.ok]
 
 

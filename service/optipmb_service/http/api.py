@@ -42,6 +42,7 @@ RETRY_MS: Final = 15_000  # a reader whose stream cannot be subscribed to comes 
 PROTOCOL: Final = "optipmb.v1"  # subprotocol of the WebSocket
 BEARER: Final = "bearer."  # a second subprotocol with the token of a browser, which can set no header
 NAMES: Final = 256
+RECENT: Final = 32  # messages of events among which one has counts: those of more than a second
 TRY_AGAIN, MALFORMED = 1013, 1008  # why a WebSocket was closed
 HEADERS: Final = {"cache-control": "no-store", "x-content-type-options": "nosniff", "referrer-policy": "no-referrer"}
 
@@ -236,6 +237,7 @@ class _Asked(Struct, frozen=True):
     min_existence: Annotated[float, Meta(ge=0, le=1)] = 0.0
     max_rate_hz: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
     fields: Names = frozenset()
+    events: Literal["final", "now"] = "final"
 
 
 class _Incoming(Struct, forbid_unknown_fields=True):
@@ -269,7 +271,7 @@ def wish_of(parameters: Mapping[str, Any]) -> Wish:
     if wrong := asked.fields - FIELDS:
         raise schemas.MessageError("invalid_value", "fields", f"of {', '.join(sorted(FIELDS))}", ascii(min(wrong))[:80])
     selection = Selection(asked.classes, asked.confirmed, asked.min_existence, asked.fields)
-    return Wish((asked.stream,), asked.topics, selection, asked.max_rate_hz)
+    return Wish((asked.stream,), asked.topics, selection, asked.max_rate_hz, asked.events == "final")
 
 
 class Api:
@@ -304,7 +306,8 @@ class Api:
         """Answer with the newest counts of the zones of each stream."""
         wish = await self._wish(request)
         key = self._readers.keys.matching(wish.streams[0], "events")
-        return _array([text for one in await self._newest(key) if (text := one.zones) is not None])
+        newest = await self._newest(key, RECENT, lambda one: one.zones is not None)
+        return _array([one.zones or b"" for one in newest])
 
     async def stream(self, request: Request) -> Response:
         """Answer with server-sent events."""
@@ -359,11 +362,13 @@ class Api:
         caller.may_read(wish.streams[0])
         return wish
 
-    async def _newest(self, key: str) -> list[Publication]:
+    async def _newest(
+        self, key: str, most: int = 1, fits: Callable[[Publication], bool] = lambda _: True
+    ) -> list[Publication]:
         """Return the newest message of each stream, by stream: that of the newest run."""
         newest: dict[str, Publication] = {}
-        found = await asyncio.to_thread(self._readers.feeds().newest, key)
-        for one in sorted((one for one in found if one.message is not None), key=_order):
+        found = await asyncio.to_thread(self._readers.feeds().newest, key, most)
+        for one in sorted((one for one in found if one.message is not None and fits(one)), key=_order):
             newest[one.message.stream] = one
         return [newest[stream] for stream in sorted(newest)]
 

@@ -21,7 +21,11 @@ from optipmb.table import ClassTable
 from optipmb_service.stream.values import Tracked
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from optipmb_service.stream.timeline import FrameId
+
+    Motions = Sequence[optipmb.Relocation]
 
 IDENTITY = optipmb.Pose(translation=np.zeros(3), quaternion=np.array([1.0, 0.0, 0.0, 0.0]))
 """The pose of arrays that are in the world frame already."""
@@ -30,17 +34,23 @@ _intervals: Final = attrgetter("azimuth", "elevation", "range")
 _boxes: Final = attrgetter("label", "center", "size", "yaw", "score", "velocity")
 
 
-def pose_of(message: schemas.Detections | schemas.Points) -> optipmb.Pose | None:
-    """Return world from sensor, or None for a message in the world frame.
+def pose_of(message: schemas.Detections | schemas.Points, ahead: Motions = ()) -> optipmb.Pose | None:
+    """Return the pose of what a message holds after motions of the world, or None for the world itself.
 
     Raises:
         optipmb.FrameError: the pose is missing or no rigid motion.
     """
     if message.frame == "world":
-        return None
+        return _moved(IDENTITY, ahead) if ahead else None
     if message.pose is None:
         raise optipmb.FrameError("pose", "the pose of the sensor", "nothing")
-    return _pose(message.pose.translation.tobytes(), message.pose.quaternion.tobytes())
+    return _moved(_pose(message.pose.translation.tobytes(), message.pose.quaternion.tobytes()), ahead)
+
+
+def _moved(pose: optipmb.Pose, ahead: Motions) -> optipmb.Pose:
+    for motion in ahead:
+        pose = motion.pose(pose)
+    return pose
 
 
 @lru_cache(1024)
@@ -49,22 +59,22 @@ def _pose(translation: bytes, quaternion: bytes) -> optipmb.Pose:
     return optipmb.Pose(np.frombuffer(translation), np.frombuffer(quaternion))
 
 
-def view_of(message: schemas.Detections, pose: optipmb.Pose | None) -> optipmb.FieldOfView | None:
+def view_of(message: schemas.Detections, ahead: Motions = ()) -> optipmb.FieldOfView | None:
     """Return the field of view of a frame in the axes of its sensor, None when the sensor sees everything.
 
     Args:
         message: the message of the frame.
-        pose: `pose_of` the message.
+        ahead: motions of the world since.
 
     Raises:
         optipmb.FrameError: an interval is none.
     """
     if message.field_of_view is None:
         return None
-    view = _view(*(interval.tobytes() for interval in _intervals(message.field_of_view)))
-    if pose is None and message.pose is not None:
-        pose = _pose(message.pose.translation.tobytes(), message.pose.quaternion.tobytes())
-    return view if pose is None else view.at(pose)
+    view, pose = _view(*(interval.tobytes() for interval in _intervals(message.field_of_view))), message.pose
+    if pose is None:
+        return view
+    return view.at(_moved(_pose(pose.translation.tobytes(), pose.quaternion.tobytes()), ahead))
 
 
 @lru_cache(1024)
@@ -74,17 +84,21 @@ def _view(*intervals: bytes) -> optipmb.FieldOfView:
     return optipmb.FieldOfView(azimuth, elevation, distance)
 
 
-def cloud_of(message: schemas.Points) -> optipmb.PointCloud:
-    """Return the cloud as the tracker reads it.
+def cloud_of(message: schemas.Points, ahead: Motions = ()) -> optipmb.PointCloud:
+    """Return the cloud as the tracker reads it, after motions of the world.
 
     Raises:
         optipmb.FrameError: wrong shape or pose.
     """
-    return optipmb.PointCloud(xyz=message.xyz, pose=pose_of(message) or IDENTITY)
+    return optipmb.PointCloud(xyz=message.xyz, pose=pose_of(message, ahead) or IDENTITY)
 
 
-def frame_of(parameters: optipmb.Parameters, message: schemas.Detections) -> tuple[optipmb.Frame, int]:
+def frame_of(
+    parameters: optipmb.Parameters, message: schemas.Detections, ahead: Motions = ()
+) -> tuple[optipmb.Frame, int]:
     """Return the frame without its cloud, and how many objects were left out because the profile lacks their class.
+
+    Motions of the world since the message bring the frame to the newest one.
 
     The message was checked when it was made, within bounds that no frame has narrower: arrays are shared, not looked at
     once more.
@@ -92,8 +106,8 @@ def frame_of(parameters: optipmb.Parameters, message: schemas.Detections) -> tup
     Raises:
         optipmb.FrameError: a pose or covariance is none, or an object is too far in the world frame; `path` names it.
     """
-    columns, pose, spread = _boxes(message), pose_of(message), message.position_covariance
-    view = view_of(message, pose)
+    columns, pose, spread = _boxes(message), pose_of(message, ahead), message.position_covariance
+    view = view_of(message, ahead)
     return frame_of_checked(parameters, message.stamp_ns, message.labels, columns, pose, None, view, spread)
 
 

@@ -260,7 +260,7 @@ class StreamQueries:
     def _zones(self, stream: Stream, request: Query) -> None:
         counts = stream.session.zone_counts() if stream.session else None
         if counts is None:
-            raise schemas.MessageError("invalid_value", "key", "a stream with zones and frames", stream.name)
+            raise schemas.MessageError("invalid_value", "key", "a stream with zones and frames", repr(stream.name))
         request.answer(self._keys.query(stream.name, "zones"), counts)
 
     def _reset(self, stream: Stream, request: Query) -> _State:

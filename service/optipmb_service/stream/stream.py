@@ -311,7 +311,7 @@ class Stream:
             log.warning("publisher_failed", stream=self.name, error=str(error))
 
     def _republish_events(self) -> None:
-        """Publish the events of the window in this run: those that the run before published behind it are void."""
+        """Publish the events of the window in this run, which voids later events of the run before."""
         now = Arrival(time.time_ns(), time.monotonic_ns(), 0)
         for tracked in self.session.again() if self.session and self._policy.zones else ():
             tracked.ticket = now

@@ -129,15 +129,19 @@ class Transition:
             message = frame.message
             inputs = message, *convert.frame_of(self.parameters, message)
         message, seen, ignored = inputs
+        world = relocated(before, frame_id, message.relocation)
+        if world.ahead:
+            try:
+                seen, ignored = convert.frame_of(self.parameters, message, world.ahead)
+            except optipmb.FrameError as error:
+                world = world._replace(ahead=None, fault=error)
+        if world.ahead is None:
+            history = before.sensor(frame_id.sensor).pose_history
+            return _refused(world.state, frame, history, "astray"), Outcome(frame, fault=world.fault)
         if frame.points is not None and in_one_world(message, frame.points):
-            seen = replace(seen, cloud=convert.cloud_of(frame.points))
-        world = relocated(before, frame_id, message.relocation, seen)
-        before, inputs = world.state, (message, world.frame, ignored)
-        if world.lost:
-            pose_history = before.sensor(frame_id.sensor).pose_history
-            return _refused(before, frame, pose_history, "astray"), Outcome(frame, fault=world.fault)
-        after, outcome = self._step(before, frame, inputs, world)
-        if world.announced and outcome.tracks is not None:
+            seen = replace(seen, cloud=convert.cloud_of(frame.points, world.ahead))
+        after, outcome = self._step(world.state, frame, (message, seen, ignored), world)
+        if world.change == "moves" and outcome.tracks is not None:
             outcome.tracks.others["relocation"] = message.relocation
         return after, outcome if world.fault is None else replace(outcome, fault=world.fault)
 
@@ -150,11 +154,11 @@ class Transition:
         moved = self.on_new_clock(before, frame, message)
         if moved is not None:
             before, begun = moved, self._begin(before, frame, "clock")
-        if world.restarts:
+        if world.change == "restarts":
             begun = self._begin(before, frame, "world")
         sensor = before.sensor(frame_id.sensor)
         known = PoseHistory() if begun else sensor.pose_history
-        pose_history, where = check_pose(known, message, self._policy, world.ahead)
+        pose_history, where = check_pose(known, message, self._policy, world.ahead or ())
         if where == "moved" and self._others_stayed(before, frame_id):
             # The sensors of a session move together: this one waits for the others to say the same.
             there, before_it = pose_history.position, sensor.pose_history
@@ -211,7 +215,7 @@ class Transition:
         state = base
         for frame in frames:
             anew = begins_with(state, frame)
-            if (world := relocated(state, frame.frame_id, frame.message.relocation)).announced:
+            if (world := relocated(state, frame.frame_id, frame.message.relocation)).change == "moves":
                 base, state, anew, dumped = world.state, world.state, False, []  # and one world
             if (moved := self.on_new_clock(state, frame)) is not None:
                 base, state, anew, dumped = moved, moved, False, []  # a dump has one clock

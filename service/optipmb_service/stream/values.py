@@ -198,7 +198,7 @@ class Tracked:
 
 
 def events_of(header: dict[str, Any], events: Sequence[Event], counts: ZoneCounts | None) -> schemas.Events:
-    """Return the message of a frame whose header, as that of its tracks, has the classes in force."""
+    """Return the message of a frame with the header of its tracks."""
     named = (label for zone in (counts or {}).values() for by_class in zone.values() for label in by_class)
     # Of a profile that was in force before there may be classes that this one lacks.
     labels = tuple(dict.fromkeys((*header["labels"], *(one.label for one in events), *sorted(named))))

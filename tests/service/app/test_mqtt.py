@@ -12,7 +12,7 @@ from broker import Broker, mosquitto
 from optipmb_client.errors import ClientError
 from optipmb_schemas.json_form import Selection, event_json, problem_json, tracks_json, zones_json
 from optipmb_service.settings import MqttSettings, Settings
-from watched import PROBLEM, STREAM, Session, events, tracks
+from watched import PROBLEM, STREAM, Session, events, settled, tracks
 
 aiomqtt = pytest.importorskip("aiomqtt")
 mqtt = pytest.importorskip("optipmb_service.app.mqtt")
@@ -62,7 +62,7 @@ async def test_topics_are_keys_and_payloads_the_texts_of_readers(session: Sessio
         assert bridge.state == "degraded"
         await until(lambda: bridge.connected)
         assert (bridge.state, bridge.failure) == ("ready", "")
-        session.publish(tracks(1), events(1, 2), PROBLEM)
+        session.publish(tracks(1), events(1, 2), settled(2), PROBLEM)
         await broker.wait(1, "/problems")
         await broker.wait(1, "/zones")
         found = {(one.topic, one.qos, one.retain): one.payload for one in broker.messages}
@@ -86,11 +86,11 @@ async def test_events_wait_for_the_broker_and_tracks_do_not(session: Session) ->
         broker.silent = False
         await until(lambda: bridge.connected)
         broker.silent = True
-        session.publish(events(1, 2))
+        session.publish(events(1, 2), settled(2))
         await broker.wait(2, "/events")
         await broker.__aexit__()
         await until(lambda: not bridge.connected)
-        session.publish(tracks(1), PROBLEM, *(events(seq, 1) for seq in (2, 3)))
+        session.publish(tracks(1), PROBLEM, events(3), settled(4), events(5), settled(6))
         assert "degraded" in bridge.state
         broker.messages.clear()
         broker.silent = False
@@ -98,10 +98,10 @@ async def test_events_wait_for_the_broker_and_tracks_do_not(session: Session) ->
             await broker.wait(4, "/events")
             await broker.wait(2, "/zones")
             sent = [json.loads(one)["n"] for one in broker.of("/events")]
-            assert sent == [1000, 1001, 2000, 3000]
-            assert json.loads(broker.of("/zones")[-1])["seq"] == 3
-            session.publish(tracks(5))
-            assert [json.loads(one)["seq"] for one in await broker.wait(1, "/tracks")] == [5]
+            assert sent == [1000, 1001, 3000, 5000]
+            assert json.loads(broker.of("/zones")[-1])["seq"] == 5
+            session.publish(tracks(7))
+            assert [json.loads(one)["seq"] for one in await broker.wait(1, "/tracks")] == [7]
             assert broker.of("/problems") == []
 
 
@@ -115,7 +115,7 @@ async def test_the_oldest_events_are_lost_where_too_many_wait(
         pass
     async with bridging(session, broker) as bridge:
         await asyncio.to_thread(session.wait, 3)
-        session.publish(events(1, 5))
+        session.publish(events(1, 5), settled(2))
         assert bridge.lost == 2
         async with broker:
             assert [json.loads(one)["n"] for one in await broker.wait(3, "/events")] == [1002, 1003, 1004]
@@ -129,7 +129,7 @@ async def test_settings_choose_streams_topics_and_the_rate(session: Session) -> 
         for seq in range(6):
             session.publish(tracks(seq))
             await until(lambda: bridge.published["tracks"] == 1 + (seq == 5))  # noqa: B023 - awaited here
-        assert [json.loads(one)["seq"] for one in broker.of("/tracks")] == [0, 5]
+        assert [json.loads(one)["seq"] for one in await broker.wait(2, "/tracks")] == [0, 5]
 
 
 @pytest.mark.parametrize("name", ["credentials", "tls"])
@@ -145,7 +145,7 @@ async def test_a_real_broker_keeps_counts_and_says_who_is_gone(session: Session,
     with mosquitto(tmp_path) as address:
         async with bridging(session, address, tracks_hz=0) as bridge:
             await until(lambda: bridge.connected)
-            session.publish(tracks(1), events(1, 2))
+            session.publish(tracks(1), events(1, 2), settled(2))
             await until(lambda: bridge.published.total() == 4)
             port = int(address.rpartition(":")[2])
             async with aiomqtt.Client("127.0.0.1", port, protocol=aiomqtt.ProtocolVersion.V5) as client:
@@ -156,8 +156,8 @@ async def test_a_real_broker_keeps_counts_and_says_who_is_gone(session: Session,
                     if len(held) == 2:
                         break
                 assert held == {ALIVE: b"1", f"{TOPIC}/zones": zones_json(events(1))}
-                session.publish(events(2))
+                session.publish(events(3, zones=None), settled(4))
                 async for message in client.messages:
-                    assert (str(message.topic), message.payload) == (f"{TOPIC}/events", event_json(events(2))[0])
+                    assert (str(message.topic), message.payload) == (f"{TOPIC}/events", event_json(events(3))[0])
                     assert message.properties.ContentType == "application/json"
                     break

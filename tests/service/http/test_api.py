@@ -141,7 +141,7 @@ def test_get_stream_and_socket_give_the_same_text(session: Session, address: str
 def test_all_topics_come_on_one_connection(session: Session, address: str) -> None:
     """Events and problems are texts of their own, counts too; what was not asked for does not come."""
     expected = [*event_json(events(1, 2)), zones_json(events(1)), problem_json(PROBLEM)]
-    with socket(address, f"stream={STREAM}&topics=events,zones,problems") as connection:
+    with socket(address, f"stream={STREAM}&topics=events,zones,problems&events=now") as connection:
         session.publish(tracks(1), events(1, 2), PROBLEM)
         found = sorted(connection.recv().encode() for _ in expected)
         assert found == sorted(text for text in expected if text is not None)
@@ -188,6 +188,7 @@ def test_streams_are_those_of_all_services(session: Session, address: str) -> No
         (f"stream={ALL}&topics=tracks,points", "topics[1]"),
         (f"stream={ALL}&fields=colour", "fields"),
         (f"stream={ALL}&class=car", "class"),
+        (f"stream={ALL}&events=soon", "events"),
     ],
 )
 def test_a_bad_parameter_is_refused_with_its_path(address: str, query: str, path: str) -> None:
@@ -328,9 +329,23 @@ async def test_the_rate_is_bounded_in_sensor_time() -> None:
     assert sent == [0, 2, 2]
 
 
+async def test_events_come_once_when_they_are_final_or_as_they_are_published() -> None:
+    """A revision replaces what is not final; who wants events now gets both."""
+    final, now = (Reader(Wish((ALL,), frozenset({"events"}), final=final)) for final in (True, False))
+    corrected = events(1, 3, revision=1)
+    published = [events(1, 2), corrected, events(5, 1, final_ns=5)]
+    for reader in (final, now):
+        for message in published:
+            reader.receive(publication(message))
+    assert [await final.take() for _ in range(3)] == event_json(corrected)
+    with pytest.raises(TimeoutError):
+        await final.take(0.01)
+    assert [await now.take() for _ in range(6)] == [text for message in published for text in event_json(message)]
+
+
 async def test_a_reader_that_loses_events_has_to_come_again() -> None:
     """So many events wait, of all streams together; with one more, the reader ends."""
-    reader = Reader(Wish((ALL,), frozenset({"events"})))
+    reader = Reader(Wish((ALL,), frozenset({"events"}), final=False))
     reader.receive(publication(events(1, EVENTS)))
     assert json.loads(await reader.take() or b"")["n"] == 1000
     reader.receive(publication(events(2, 1)))
@@ -342,7 +357,7 @@ async def test_a_reader_that_loses_events_has_to_come_again() -> None:
 def test_a_socket_that_loses_events_is_closed(session: Session, address: str) -> None:
     """A client that reads nothing is closed with the code for trying again later."""
     small = ((SOL_SOCKET, SO_RCVBUF, 4096),)
-    with socket(address, f"stream={STREAM}&topics=events,tracks&confirmed=0", sockopt=small) as connection:
+    with socket(address, f"stream={STREAM}&topics=events,tracks&confirmed=0&events=now", sockopt=small) as connection:
         for seq in range(30):
             session.publish(tracks(seq, count=2000), events(seq, 100))
         assert closed(connection) == 1013

@@ -36,6 +36,7 @@ from optipmb_service.telemetry.metrics import Metrics
 from optipmb_service.telemetry.stream_meter import MAX_COUNT
 from optipmb_service.zenoh.inputs import Packet
 from router import Node, Sensor, until
+from sessions import Gated
 
 import optipmb
 
@@ -154,7 +155,7 @@ def test_catching_up_from_the_log_keeps_no_other_waiting(
 ) -> None:
     """What a stream has missed is tracked in its order, before what it sends, and others are tracked in between."""
     missed, newest = 200, 203
-    reached, gate, steps = threading.Event(), threading.Event(), []
+    gated = Gated(missed // 10)
 
     class Log:
         def fetch(self, session: str, checkpoint: object, first: Take, later: Take) -> None:
@@ -168,54 +169,34 @@ def test_catching_up_from_the_log_keeps_no_other_waiting(
         def close(self, timeout: float) -> None:
             """Nothing is open."""
 
-    class Noted:
-        def __init__(self, parameters: optipmb.Parameters) -> None:
-            self._tracker = optipmb.Tracker(parameters)
-
-        def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
-            steps.append(self)
-            if len(steps) == missed // 10:
-                reached.set()
-                assert gate.wait(60)
-            return self._tracker.step(density, frame)
-
     monkeypatch.setattr("optipmb_service.app.service.open_log", lambda _: Log())
-    service, endpoint = start(tracker=Noted)
+    service, endpoint = start(tracker=gated.tracker)
     with Node(endpoint) as node:
         node.send(CAREFUL.detections(0))
         node.tracks(CAREFUL.stream, 1)
         node.send(CARELESS.detections(missed))
-        assert reached.wait(60)
+        assert gated.entered.wait(60)
         node.send(CAREFUL.detections(1), *(CARELESS.detections(seq) for seq in range(missed + 1, newest)))
         queues = {CAREFUL.stream: 1, CARELESS.stream: 3}  # with the one that began its session
         until(lambda: {one.stream: one.queue for one in service.status().sessions} == queues, "frames wait")
-        gate.set()
+        gated.gate.set()
         assert [one.seq for one in node.tracks(CARELESS.stream, newest)] == list(range(newest))
         node.tracks(CAREFUL.stream, 2)
-    second = [index for index, one in enumerate(steps) if one is steps[0]][1]
+    second = [index for index, one in enumerate(gated.steps) if one is gated.steps[0]][1]
     assert second < missed // 2
 
 
 def test_a_tracking_thread_that_is_stuck_is_not_healthy(start: Callable[..., Any]) -> None:
     """A step that does not end is seen from outside: neither alive nor ready, until it ends."""
-    gate = threading.Event()
-
-    class Stuck:
-        def __init__(self, parameters: optipmb.Parameters) -> None:
-            self._tracker = optipmb.Tracker(parameters)
-
-        def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
-            gate.wait(20)
-            return self._tracker.step(density, frame)
-
-    service, endpoint = start(tracker=Stuck, stuck_s=1.0)
+    gated = Gated()
+    service, endpoint = start(tracker=gated.tracker, stuck_s=1.0)
     health = ProcessHealth("test", Metrics())
     health.report(service)
     with Node(endpoint) as node:
         node.send(CARELESS.detections(0))
         until(lambda: not health.alive(), "the thread is seen to be stuck")
         assert not health.ready()
-        gate.set()
+        gated.gate.set()
         node.tracks(CARELESS.stream, 1)
         until(lambda: health.beat() is None and health.alive() and health.ready(), "it works again")
 
@@ -422,28 +403,19 @@ def test_instances_without_a_common_store_are_told_of_each_other(start: Callable
 
 def test_messages_that_wait_are_bounded_in_bytes(start: Callable[..., Any]) -> None:
     """A hundred messages of 1 MB while a step does not end: the queue keeps what it may, the rest is shed."""
-    gate, entered = threading.Event(), threading.Event()
+    gated = Gated()
 
-    class Waits:
-        def __init__(self, parameters: optipmb.Parameters) -> None:
-            self._tracker = optipmb.Tracker(parameters)
-
-        def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
-            entered.set()
-            gate.wait(20)
-            return self._tracker.step(density, frame)
-
-    service, endpoint = start(tracker=Waits, stream_mb=16, memory_mb=16)
+    service, endpoint = start(tracker=gated.tracker, stream_mb=16, memory_mb=16)
     queued = service._streams.queued
     with Node(endpoint) as node:
         node.send(CARELESS.detections(0))
-        assert entered.wait(20)
+        assert gated.entered.wait(20)
         for number in range(100):
             node.send_raw(KEYS.detections(CARELESS.stream), bytes([number]) * 2**20)
         until(lambda: queued.used > 2 * 2**20, "they came")
         node.send(CARELESS.detections(1))
         assert queued.used <= 4 * 2**20
-        gate.set()
+        gated.gate.set()
         node.tracks(CARELESS.stream, 2)
         until(lambda: queued.used == 0, "all is worked off")
     assert service.status().shed > 0
@@ -453,26 +425,17 @@ def test_the_first_frames_of_many_new_streams_wait_for_room(
     start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Three times as many streams as may be new at once begin while a step does not end: each is tracked afterwards."""
-    gate, entered, most = threading.Event(), threading.Event(), 16
+    gated, most = Gated(), 16
     monkeypatch.setattr("optipmb_service.stream.streams.MAX_UNPROVEN", most)
 
-    class Waits:
-        def __init__(self, parameters: optipmb.Parameters) -> None:
-            self._tracker = optipmb.Tracker(parameters)
-
-        def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
-            entered.set()
-            gate.wait(60)
-            return self._tracker.step(density, frame)
-
-    service, _ = start(tracker=Waits)
+    service, _ = start(tracker=gated.tracker)
     streams = service._streams
     for sensor in [CARELESS, *(Sensor(f"s{number}/node/lidar") for number in range(3 * most))]:
         now_ns, payload = time.monotonic_ns(), encode(sensor.detections(0))
         key = KEYS.detections(sensor.stream)
         streams.receive(Packet(key, payload, len(payload), encoding_of(Detections), time.time_ns(), now_ns))
-        assert entered.wait(60)
-    gate.set()
+        assert gated.entered.wait(60)
+    gated.gate.set()
     until(lambda: service.status().frames == 1 + 3 * most, "all are tracked")
     status = service.status()
     assert (status.refused, status.shed, len(streams.tracking())) == (0, 0, 1 + 3 * most)

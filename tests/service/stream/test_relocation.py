@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from fusing import FUSED
-from optipmb_schemas import Detections, FieldOfView, Pose, Relocation, Tracks
+from optipmb_schemas import Detections, FieldOfView, Pose, Relocation, Tracks, decode, encode
 from optipmb_service.stream.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
 from optipmb_service.stream.session import Session
 from optipmb_service.stream.values import Output, Policy, Tracked
 from real_data import kitti_root
 from recorded import recording
 from router import SECOND, Sensor
-from sessions import Merged, begun, plain, problems, tracks
+from sessions import Merged, begun, dumps, plain, problems, tracks
 
 import optipmb
 from optipmb.zones import Zone
@@ -253,6 +253,29 @@ def test_a_publisher_may_restart_with_the_numbers_of_its_world() -> None:
     outputs = feed(one, late)
     assert begun(outputs) == []
     assert [message.world for message in tracks(outputs)] == [1] * 5
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_any_numbers_leave_a_state_that_can_be_read(*, several: bool) -> None:
+    """Whatever publishers number, in epochs of theirs: the tracks and the checkpoint hold numbers that they may."""
+    chance = random.Random(4)
+    one = Session(FUSED, PROFILE, fused=True, policy=Policy(recovery_wait_ns=0)) if several else session()
+    for seq in range(200):
+        which = chance.randrange(3)
+        motion, world = chance.choice([JUMP, BACK]), chance.choice([1, 1, 2, 3, 4, 7, 2**31 - 1])
+        message = SENSOR.detections(
+            seq,
+            stream=f"site/node/{which}" if several else SENSOR.stream,
+            epoch=bytes([which + seq // 50 * several]) * 16,
+            relocation=chance.choice([None, announced(motion, world)]),
+        )
+        outputs = one.on_detections(message, 0)
+        assert not dumps(outputs)
+        for tracked in tracks(outputs):
+            assert decode(encode(tracked), Tracks) == tracked
+        data = encode_checkpoint(one.snapshot())
+        assert encode_checkpoint(decode_checkpoint(data)) == data
+    assert one.counters.frames > 50
 
 
 def test_another_motion_into_a_known_world_is_reported() -> None:

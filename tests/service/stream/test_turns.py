@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 from optipmb_schemas import Keys, SessionState
 from optipmb_service.cluster.sqlite import SqliteStore
 from router import Node, Sensor, until
-
-import optipmb
+from sessions import Gated
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -26,20 +25,9 @@ CARELESS = Sensor("site/careless/lidar")
 def test_frames_that_are_ready_together_keep_no_other_waiting(start: Callable[..., Any]) -> None:
     """Sixty frames have waited for clouds that never came: another stream is tracked between them."""
     held, wait_s = 60, 2.0
-    reached, gate, steps = threading.Event(), threading.Event(), []
+    gated = Gated(2)
 
-    class Noted:
-        def __init__(self, parameters: optipmb.Parameters) -> None:
-            self._tracker = optipmb.Tracker(parameters)
-
-        def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
-            steps.append(self)
-            if len(steps) == 2:
-                reached.set()
-                assert gate.wait(60)
-            return self._tracker.step(density, frame)
-
-    service, endpoint = start(tracker=Noted, cloud_wait_s=wait_s, queue_frames=2 * held)
+    service, endpoint = start(tracker=gated.tracker, cloud_wait_s=wait_s, queue_frames=2 * held)
 
     def queues(careful: int, careless: int) -> None:
         expected = {CAREFUL.stream: careful, CARELESS.stream: careless}
@@ -52,14 +40,14 @@ def test_frames_that_are_ready_together_keep_no_other_waiting(start: Callable[..
         queues(0, held)
         due = time.monotonic() + wait_s
         node.send(CAREFUL.detections(1))
-        assert reached.wait(60)
+        assert gated.entered.wait(60)
         node.send(CAREFUL.detections(2))
         queues(1, held)
         until(lambda: time.monotonic() > due, "all are due")
-        gate.set()
+        gated.gate.set()
         assert [one.seq for one in node.tracks(CARELESS.stream, held)] == list(range(held))
         node.tracks(CAREFUL.stream, 3)
-    third = [index for index, one in enumerate(steps) if one is steps[0]][2]
+    third = [index for index, one in enumerate(gated.steps) if one is gated.steps[0]][2]
     assert third < held // 2
 
 

@@ -40,6 +40,7 @@ from optipmb_service.stream.values import Tracked
 from optipmb_service.zenoh.transport import Transport
 from router import Node, Sensor, plain, until
 from routers import free_endpoint, open_router
+from sessions import Gated
 
 import optipmb
 
@@ -349,6 +350,11 @@ def test_density_of_a_stream(node: Node) -> None:
     assert (len(nothing.weight), nothing.session, nothing.stamp_ns) == (0, "0" * 32, None)
 
 
+def test_zones_of_a_stream_without_any(node: Node) -> None:
+    """q/zones is refused, with the name of the stream."""
+    assert node.refused(KEYS.query(SENSOR.stream, "zones")).received == repr(SENSOR.stream)
+
+
 def test_questions_that_are_none_are_refused(node: Node) -> None:
     """Unknown questions, wrong payloads and stranger keys get an error reply, at once."""
     assert node.refused("optipmb/v1/site/node/lidar/q/nonsense").code == "invalid_value"
@@ -458,21 +464,15 @@ def test_sessions_are_limited_and_idle_ones_freed(start: Callable[..., Any]) -> 
 
 def test_an_overloaded_stream_sheds_its_oldest(start: Callable[..., Any]) -> None:
     """More frames than the queue holds while a step takes its time: the oldest go, counted and reported."""
-    entered, gate = threading.Event(), threading.Event()
+    gated = Gated()
 
-    class Slow(optipmb.Tracker):
-        def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
-            entered.set()
-            assert gate.wait(60)
-            return super().step(density, frame)
-
-    service, endpoint = start(tracker=Slow, queue_frames=4)
+    service, endpoint = start(tracker=gated.tracker, queue_frames=4)
     with Node(endpoint) as node:
         node.send(SENSOR.detections(0))
-        assert entered.wait(60)
+        assert gated.entered.wait(60)
         node.send(*(SENSOR.detections(seq) for seq in range(1, 11)))
         until(lambda: service.status().sessions[0].shed == 6, "six frames are shed")
-        gate.set()
+        gated.gate.set()
         received = node.tracks(SENSOR.stream, 5)
         assert [(message.seq, message.gap) for message in received] == [(0, 0), (7, 6), (8, 0), (9, 0), (10, 0)]
         assert node.problem(SENSOR.stream, "shed").count == 6
@@ -506,20 +506,14 @@ def test_a_silent_stream_is_stale(start: Callable[..., Any]) -> None:
 
 def test_a_step_that_does_not_end_does_not_keep_the_service(start: Callable[..., Any]) -> None:
     """Stopping gives up on a stuck step after the grace and closes the network all the same."""
-    entered, gate = threading.Event(), threading.Event()
+    gated = Gated()
 
-    class Stuck(optipmb.Tracker):
-        def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
-            entered.set()
-            gate.wait(60)
-            return super().step(density, frame)
-
-    service, endpoint = start(tracker=Stuck, grace_s=0.2)
+    service, endpoint = start(tracker=gated.tracker, grace_s=0.2)
     with Node(endpoint) as node:
         node.send(SENSOR.detections(0))
-        assert entered.wait(60)
+        assert gated.entered.wait(60)
         assert not service.stop()
-    gate.set()
+    gated.gate.set()
 
 
 def test_a_router_that_goes_and_comes_loses_nothing(start: Callable[..., Any]) -> None:

@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from optipmb_tools.datasets.interface import georeference_of
 from optipmb_tools.datasets.motion import SAME_DIRECTION, Moves, find_moves, overlapping
 from optipmb_tools.datasets.table.names import Column, find_columns
 from optipmb_tools.datasets.table.values import (
@@ -252,8 +253,6 @@ class _Table:
         origin, found = self._reading.options.get("origin"), self._found
         if "x" in found or "lat" not in found or origin is None:
             return np.column_stack([self._numbers("x"), self._numbers("y"), self._numbers("z", 0.0)])
-        from optipmb_tools.georeference import georeference_of  # noqa: PLC0415  imports the tracker
-
         alt = self._numbers("alt") if self._height == "alt" else None
         center = georeference_of(origin).to_world(self._numbers("lat"), self._numbers("lon"), alt)
         if alt is None:

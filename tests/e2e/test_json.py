@@ -1,0 +1,139 @@
+"""JSON of a real service: the same texts over HTTP, WebSocket and MQTT, and a page of another origin draws them."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import re
+import threading
+import urllib.request
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from broker import Broker
+from browser import browser, console, wait
+from optipmb_schemas.json_form import Selection, tracks_json
+from router import Node, Sensor
+from service_process import ServiceProcess
+from websocket import create_connection
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+PAGE = Path(__file__).parents[2] / "examples/json/index.html"
+SENSOR = Sensor()
+FRAMES = 12
+CONFIRMED = Selection(confirmed=True)
+ZONES = """
+[zones.all]
+streams = ["*/*/*"]
+polygon = [[-500, -500], [500, -500], [500, 500], [-500, 500]]
+min_s = 0
+"""
+
+
+@pytest.fixture
+def service(tmp_path: Path) -> Iterator[ServiceProcess]:
+    """A service that counts all objects."""
+    file = tmp_path / "zones.toml"
+    file.write_text(ZONES)
+    options = ("--http", "127.0.0.1:0", "--log-format", "json", "--settings", str(file))
+    with ServiceProcess(*options, environment={"OPTIPMB_HTTP_ORIGINS": "null", "OPTIPMB_REWIND_S": "0"}) as process:
+        process.wait_ready()
+        yield process
+
+
+def address_of(service: ServiceProcess) -> str:
+    """Where a service answers."""
+    return str(re.findall(r'"http", .*?"address": "([^"]+)"|"address": "([^"]+)"', service.errors)[0][1])
+
+
+def read(address: str, count: int, subscribed: threading.Event) -> list[bytes]:
+    """Read so many server-sent events."""
+    with urllib.request.urlopen(f"http://{address}/api/v1/stream?stream={SENSOR.stream}", timeout=60) as response:
+        assert response.readline() == b": hello\n"
+        subscribed.set()
+        lines = (line[6:-1] for line in response if line.startswith(b"data: "))
+        return [next(lines) for _ in range(count)]
+
+
+def frames(service: ServiceProcess, address: str) -> tuple[list[bytes], list[bytes]]:
+    """Publish frames and compare what readers get; return the texts of tracks and of events."""
+    base, query = f"http://{address}/api/v1", f"stream={SENSOR.stream}&topics=tracks,events&events=now"
+    socket = create_connection(f"ws://{address}/api/v1/ws?{query}", timeout=60, suppress_origin=True)
+    subscribed = threading.Event()
+    with contextlib.closing(socket), Node(service.endpoint) as node, ThreadPoolExecutor(1) as pool:
+        reading = pool.submit(read, address, FRAMES, subscribed)
+        assert subscribed.wait(60)
+        expected: list[bytes] = []
+        texts: list[bytes] = []
+        for seq in range(FRAMES):
+            node.send(SENSOR.detections(seq))
+            expected.append(tracks_json(node.tracks(SENSOR.stream, seq + 1)[-1], CONFIRMED))
+            while len(of(texts, "tracks")) <= seq:
+                texts.append(str(socket.recv()).encode())
+        assert of(texts, "tracks") == reading.result() == expected
+        assert get(f"{base}/tracks?stream=*/*/*") == b"[%b]" % expected[-1]
+        assert [one["stream"] for one in json.loads(get(f"{base}/streams"))] == [SENSOR.stream]
+        assert json.loads(get(f"{base}/zones?stream=*/*/*"))[0]["zones"]["all"]
+    return expected, of(texts, "event")
+
+
+def get(url: str) -> bytes:
+    """Return the body of an answer."""
+    with urllib.request.urlopen(url, timeout=60) as response:  # noqa: S310 - of the service
+        return bytes(response.read())
+
+
+def of(texts: list[bytes], kind: str) -> list[bytes]:
+    """Return the texts of a type."""
+    return [text for text in texts if json.loads(text)["type"] == kind]
+
+
+async def test_every_edge_gives_the_text_of_the_published_tracks(service: ServiceProcess) -> None:
+    """Tracks, events and counts by WebSocket and MQTT, tracks as server-sent events, the newest by GET."""
+    address = address_of(service)
+    async with Broker() as broker:
+        options = ("mqtt", "--connect", service.endpoint, "--broker", f"mqtt://127.0.0.1:{broker.port}")
+        environment = {"OPTIPMB_MQTT__TRACKS_HZ": "0"}
+        with ServiceProcess(*options, listen=False, environment=environment) as bridge:
+            assert (await asyncio.to_thread(bridge.wait_ready)).startswith("ready mqtt=mqtt://127.0.0.1:")
+            await broker.wait(1, "/alive")
+
+            expected, happened = await asyncio.to_thread(frames, service, address)
+            assert happened
+            assert await broker.wait(FRAMES, "/tracks") == expected
+            assert set(await broker.wait(1, "/events")) <= set(happened)
+            assert broker.of("/zones")
+            status, _ = await asyncio.to_thread(bridge.end)
+            assert status == 0
+        assert await broker.wait(2, "/alive") == [b"1", b"0"]
+
+
+def test_the_example_page_draws_tracks(service: ServiceProcess, tmp_path: Path) -> None:
+    """Opened from a file, an origin that the settings name, it shows what is tracked; its console stays empty."""
+    over = threading.Event()
+
+    def publish() -> None:
+        with Node(service.endpoint) as node:
+            for seq in range(10_000):
+                if over.wait(0.05):
+                    return
+                node.send(SENSOR.detections(seq))
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        with browser(tmp_path) as chrome:
+            chrome.get(f"file://{PAGE}?host={address_of(service)}")
+            wait(chrome, "/^[1-9][0-9]* tracks$/.test(document.title)")
+            wait(chrome, "document.querySelector('p').textContent.includes('entered all')")
+            drawn = "context.getImageData(0, 0, canvas.width, canvas.height).data.some(value => value > 0)"
+            wait(chrome, drawn)
+            assert console(chrome) == []
+    finally:
+        over.set()
+        thread.join()
