@@ -134,6 +134,7 @@ TWINS = {
     "association.surviving_objects": "test_kernels.test_objects_survive_by_existence_and_misses",
     "self_calibration.bin_of": "test_self_calibration.test_a_bin_is_that_of_the_log_odds",
     "self_calibration.calibrate": "test_self_calibration.test_scores_go_through_the_isotonic_curve",
+    "self_calibration.copy_rows": "test_self_calibration.test_frames_are_counted_as_plain_python_counts",
     "self_calibration.curves": "test_self_calibration.test_scores_go_through_the_isotonic_curve",
     "self_calibration.on_curve": "test_self_calibration.test_scores_go_through_the_isotonic_curve",
     "self_calibration.learn": "test_self_calibration.test_frames_are_counted_as_plain_python_counts",
