@@ -9,7 +9,7 @@ tracks leave the tracker, so that the recursion stays the paper's:
     existence   f(e_k)
     covariance  F P F + U diag(along(e_k), across(e_k))^2 U' on x and y, U turned by the heading
     score       (1 - w) x_s + w (1 + e_k / e_max) / 2        e_max the bound of l_k
-    velocity    v v^2 / (v^2 + P_vv)                         of least mean square error: parked cars hardly move
+    velocity    v v^4 / [v^4 + (3 P_vv)^2]                   below one standard deviation hardly any
 
 f, along and across are piecewise linear and were measured on training data, as were the factors F of speed and turn
 rate: process noise that lets a braking car stay one track is more than most objects show. lambda holds for one period.
@@ -45,6 +45,9 @@ if TYPE_CHECKING:
 
 SURE: Final = 14.0
 """Log odds of the surest detection, and minus those of the least sure one: a score of one in a million from certain."""
+
+UNSURE: Final = 3.0
+"""Variances of a speed at whose square half of the velocity is published: parked cars hardly move."""
 
 
 @kernel
@@ -95,7 +98,8 @@ def calibrate_rows(
                 covariance[row, s, t] *= factor
                 covariance[row, t, s] *= factor
         squared = velocity[row, 0] ** 2 + velocity[row, 1] ** 2
-        weight = squared / (squared + covariance[row, V, V]) if squared > 0.0 else 0.0
+        doubt = UNSURE * covariance[row, V, V]
+        weight = squared * squared / (squared * squared + doubt * doubt) if squared > 0.0 else 0.0
         velocity[row, 0] *= weight
         velocity[row, 1] *= weight
         cos, sin = math.cos(yaw[row]), math.sin(yaw[row])

@@ -335,7 +335,7 @@ def _unknown(count: int, *shape: int) -> NDArray[np.float64]:
 
 
 def _to_world(center: NDArray[np.float64], rotation: NDArray[np.float64], translation: Array) -> NDArray[np.float64]:
-    """Return centres in the world; one without z is taken to be at the height of the sensor, and has none there."""
+    """Return centres in the world. A centre without z is at the height of the sensor, and has no z in the world."""
     moved: NDArray[np.float64] = center @ rotation.T + translation
     if np.isnan(moved.sum()):
         flat = np.isnan(center[:, 2])

@@ -24,10 +24,6 @@ REACH: Final = (  # the gate, m, and the standard deviation of an unknown speed,
     ("pedestrian", (1.8, 2.0)), ("bicycle", (2.5, 5.0)), ("motorcycle", (2.5, 12.0)), (OTHER, (2.5, 10.0)),
 )  # fmt: skip
 GATE_DEVIATIONS: Final = 2.75
-GROUPED: Final = frozenset({"car", "truck"})
-SIZED: Final = frozenset({"truck", "bus", "trailer"})
-AGILE: Final = frozenset({"pedestrian"})
-TWO_WHEELED: Final = frozenset({"bicycle", "motorcycle"})
 
 REMEMBERED_S: Final = 2.0
 """How long an object is kept without a detection."""
@@ -37,8 +33,6 @@ SHOWN_S: Final = 0.4
 """How long a track is shown without a detection; two frames at least."""
 EVIDENCE: Final = tuple(round(-3.0 + 0.5 * k, 1) for k in range(13))
 EXISTENCE: Final = tuple(round(1.0 / (1.0 + math.exp(0.56 - 1.82 * e)), 3) for e in EVIDENCE)
-MEMORY: Final = 0.8
-"""Weight that the evidence keeps over a tenth of a second."""
 
 
 def generic_parameters(labels: Iterable[str], period: float, *, name: str = "auto") -> Parameters:
@@ -70,9 +64,9 @@ def generic_parameters(labels: Iterable[str], period: float, *, name: str = "aut
 
 def _of_class(kind: str, period: float) -> dict[str, Any]:
     gate, unknown_speed = dict(REACH)[kind]
-    agile, two_wheeled, sized = kind in AGILE, kind in TWO_WHEELED, kind in SIZED
+    agile, two_wheeled, sized = kind == "pedestrian", kind.endswith("cycle"), kind in {"truck", "bus", "trailer"}
     return {
-        **({"group": "vehicle", "suppress_in_group": False} if kind in GROUPED else {}),
+        **({"group": "vehicle", "suppress_in_group": False} if kind in {"car", "truck"} else {}),
         "score_filter": 0.05,
         "announce_score": 0.15,
         "birth_score": 0.5,
@@ -93,12 +87,7 @@ def _of_class(kind: str, period: float) -> dict[str, Any]:
         "extract_misses": max(2, round(SHOWN_S / period)),
         "max_misses": max(4, round(REMEMBERED_S / period)),
         "min_existence": 1e-4,  # objects are kept for their time, not for their misses
-        "heading_sign": {  # vehicles reverse at up to 4 m/s
-            "memory": 0.9,
-            "detection": 1.0,
-            "motion": 1.0,
-            "speed": 1.0 if agile or two_wheeled else 4.0,
-        },
+        "heading_sign": {"speed": 1.0 if agile or two_wheeled else 4.0},  # vehicles reverse at up to 4 m/s
         "birth_heading_speed": 1.0,
         "birth_over_clutter": True,  # a wide gate holds components that are of other objects
         "birth_overlap": 0.1,
@@ -107,7 +96,7 @@ def _of_class(kind: str, period: float) -> dict[str, Any]:
         "confirm_from": 0.5,
         "confirm_until": 0.3,
         "calibration": {
-            "memory": round(MEMORY ** (10.0 * period), 4),
+            "memory": round(0.8 ** (10.0 * period), 4),  # 0.8 over a tenth of a second
             "missed": 1.0,
             "evidence": EVIDENCE,
             "existence": EXISTENCE,

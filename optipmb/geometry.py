@@ -124,10 +124,10 @@ def iou_exceeds(first: Array, second: Array, threshold: float) -> bool:
 
 @kernel
 def boxes_overlap(first: Array, second: Array, threshold: float) -> bool:
-    """Tell what `iou_exceeds` does of boxes whose yaw may be NaN, unknown.
+    """Tell whether `box_iou` is above a threshold, of boxes whose yaw may be unknown, NaN.
 
-    An unknown yaw is taken for that of the other box. Two boxes of unknown yaw are squares of their areas that face
-    each other: nothing depends on the axes of the world.
+    A box of unknown yaw takes the yaw of the other. Two of them are squares of their areas that face each other. So the
+    result does not depend on the axes of the world.
     """
     if not (math.isnan(first[4]) or math.isnan(second[4])):
         return iou_exceeds(first, second, threshold)

@@ -156,7 +156,7 @@ class ClassTable:
         return column
 
     def known_boxes(self, label: NDArray[np.int64], auxiliary: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return x_A of objects (N, 4), with what is usual in their classes in place of what is unknown."""
+        """Return x_A of objects (N, 4), with the usual values of their classes in place of unknown ones."""
         unknown = np.isnan(auxiliary)
         if not unknown.any():
             return auxiliary
@@ -190,7 +190,7 @@ class ClassTable:
 
 @kernel
 def known_length(length: float, s: int, own: ClassRow) -> float:
-    """Return entry `s` of a size, m, or that of the class where it is unknown, NaN."""
+    """Return entry `s` of a size, m; of the class's default size where it is unknown, NaN."""
     return own.default_size[s] if math.isnan(length) else length
 
 
@@ -201,7 +201,7 @@ _USUAL: Final = MappingProxyType({
 
 
 def usual_size(name: str) -> tuple[float, float, float]:
-    """Return length, width and height of an object, m, by what the name of its class means."""
+    """Return length, width and height of an object, m, by the meaning of its class name."""
     return _USUAL.get(common_name(name) or "", (1.5, 1.5, 1.5))
 
 

@@ -1,19 +1,19 @@
-"""States of objects whose heading nobody measured and whose motion has not shown it yet (not in the paper).
+"""States of objects whose heading neither a detection nor their motion has shown yet (not in the paper).
 
 Radars, people counters and cameras on a ground plane give points. Such an object moves at constant velocity in any
 direction, so its state is linear. It is kept in the six entries of the motion state, in axes along its velocity:
 
     m = [x, y, v, phi, 0, 0]      velocity v along phi, none across
-    P                             row and column phi hold the velocity ACROSS phi, m/s; those of omega and a are zero
+    P                             row and column phi hold the velocity ACROSS phi, m/s; omega and a have zeros
 
-A variance of omega that is zero marks these rows: no other state has one. A turn of the world turns them as all others.
-Birth, prediction and update are those of a Kalman filter with position and velocity; two detections of an object give
-what a two-point initialisation would. phi of an object that was detected once is the direction from the origin of the
-world: it does not depend on the axes, and says nothing.
+A variance of omega that is zero marks these rows; no other state has one. Turning the world turns them like all states.
+Birth, prediction and update are a Kalman filter of position and velocity. Two detections of an object give the state of
+a two-point initialisation. After one detection phi is the direction from the origin of the world: it does not depend on
+the axes and carries no information.
 
-The heading becomes known where a detection brings one, or where the velocity reaches `CERTAIN` standard deviations:
-row and column phi are divided by v, and omega and a begin as at a birth. It is lost where a detection without heading
-finds it less certain than `LOST`.
+The heading becomes known where a detection brings one, or where the velocity reaches `CERTAIN` standard deviations: row
+and column phi are divided by v, and omega and a begin as at a birth. It is lost where a detection without heading finds
+it less certain than `LOST`.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def scale_across(covariance: Array, factor: float) -> None:
 
 @kernel
 def turn_axes(covariance: Array, cos: float, sin: float) -> None:
-    """Turn the axes of the velocity, rows and columns v and phi of a covariance (6, 6), by an angle."""
+    """Turn the axes of the velocity, rows and columns v and phi of a covariance (6, 6)."""
     for s in range(STATE):
         along, across = covariance[s, V], covariance[s, PHI]
         covariance[s, V], covariance[s, PHI] = cos * along + sin * across, cos * across - sin * along

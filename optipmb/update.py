@@ -10,8 +10,8 @@ of the measured velocity. Two cases that the paper leaves open: without a veloci
 heading and v = 0 under a wide prior; and the direction of a velocity slower than `birth_heading_speed` is mostly noise,
 so the heading is that of the box and the speed is the velocity along it.
 
-A detection without heading (NaN) leaves the last row out. Its birth, and what follows until the heading is known, is
-that of `optipmb.unknown_heading`.
+A detection without heading (NaN) leaves the last row out. An object is born without heading then, and stays so until
+one is known (`optipmb.unknown_heading`).
 """
 
 from __future__ import annotations

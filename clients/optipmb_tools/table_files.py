@@ -111,7 +111,8 @@ def read_table(path: Path, options: Mapping[str, str] | None = None) -> Columns:
             raise DatasetError(path, "a table", "an empty file")
         table = _read(pa, path, kind, options)
     except OSError as error:  # pyarrow's errors of content are of this kind too
-        raise DatasetError(path, f"a table ({kind})", error.strerror or str(error)) from error
+        found = "no such file" if isinstance(error, FileNotFoundError) else error.strerror or str(error)
+        raise DatasetError(path, f"a table ({kind})", found) from error
     except pa.ArrowException as error:
         raise DatasetError(path, f"a table ({kind})", str(error)) from error
     columns: Columns = {}

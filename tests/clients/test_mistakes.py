@@ -81,7 +81,7 @@ MISTAKES: list[tuple[str, Any, list[str], int, str]] = [
     ("no header", "0.0,1,2,3,4,5,6,7,8\n", [], 2, "a first line with the names of the columns"),
     ("an empty file", "", [], 2, "expected a table, received an empty file"),
     ("a header alone", "t,x,y,z,l,w,h,yaw,score,class\n", [], 2, "expected rows, received none"),
-    ("no such file", None, [], 2, "expected a table (.csv), received No such file or directory"),
+    ("no such file", None, [], 2, "expected a table (.csv), received no such file"),
     ("a wrong profile", boxes(), ["--profile", "kiti"], 2, "(is kitti meant?)"),
     ("a wrong option", boxes(), ["--option", "jaw=degrees"], 2, "--option jaw: expected one of time, rate, group, yaw"),
     ("no tracks", boxes(score=np.full(ROWS, 0.01)), ["--profile", "kitti"], 1, "no tracks came of 90 detections"),

@@ -26,7 +26,7 @@ def section() -> str:
 
 def recipes() -> dict[str, list[tuple[str, str]]]:
     """Give the code blocks of each recipe with their languages."""
-    parts = re.split(r"^\*\*(.+?)\.\*\*", section(), flags=re.MULTILINE)[1:]
+    parts = re.split(r"^### (.+)$", section(), flags=re.MULTILINE)[1:]
     found = zip(parts[::2], parts[1::2], strict=True)
     return {name: re.findall(r"^```(\w+)\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE) for name, text in found}
 

@@ -53,7 +53,7 @@ def test_getting_started(tmp_path: Path) -> None:
 
 def test_a_table_with_other_names(tmp_path: Path) -> None:
     """One car, although its columns, units and class have names of their own."""
-    run(blocks("docs/tutorials.md", "Track your detector's table"), tmp_path)
+    run(blocks("docs/tutorials.md", "Track your detector's CSV table"), tmp_path)
     rows = (tmp_path / "tracks.csv").read_text().splitlines()[1:]
     assert len(rows) == 5
     assert {row.split(",")[2] for row in rows} == {"1"}

@@ -388,7 +388,7 @@ class Oracle:
             mean, covariance = report(c, b.measurement, b.mean, b.covariance)
             x, y, v, phi, omega, a = mean
             existence, score, covariance = calibrate(c, b, mean, covariance)
-            told = v if c.calibration is None or v == 0.0 else v**3 / (v**2 + covariance[2, 2])
+            told = v if c.calibration is None or v == 0.0 else v**5 / (v**4 + (3 * covariance[2, 2]) ** 2)
             sign, doubt = confidence(c, b.heading_odds)
             covariance = covariance + np.diag([0.0, 0.0, 0.0, doubt, 0.0, 0.0])
             b.confirmed = existence >= (c.confirm_until if b.confirmed else c.confirm_from)

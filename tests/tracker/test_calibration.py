@@ -86,11 +86,12 @@ def test_the_lasting_error_lies_along_and_across_the_heading() -> None:
 
 
 def test_a_parked_car_hardly_moves() -> None:
-    """Velocities are weighted by v^2 / (v^2 + P_vv): hardly any where the speed is not certain."""
+    """Velocities are weighted by v^4 / (v^4 + (3 P_vv)^2): hardly any where the speed is not certain."""
     told, plain = (followed(one) for one in (with_calibration(speed=0.5), PAPER))
     v = math.hypot(*plain.velocity[0])
     assert 0.0 < v < 0.3
-    np.testing.assert_allclose(told.velocity, plain.velocity * v**2 / (v**2 + told.covariance[0, 2, 2]), rtol=1e-12)
+    weight = v**4 / (v**4 + (3 * told.covariance[0, 2, 2]) ** 2)
+    np.testing.assert_allclose(told.velocity, plain.velocity * weight, rtol=1e-12)
 
 
 def followed(parameters: optipmb.Parameters) -> optipmb.Tracks:

@@ -262,7 +262,10 @@ def test_births_are_forbidden_as_set_logic_says(seed: int) -> None:
     z = random_measurements(rng, m)
     row, measurement = np.nonzero(rng.random((n, m)) < 0.5)
     kind, first = rng.choice([FROM_POISSON, CLUTTER, NEWBORN], m), rng.uniform(0.1, 1, m)
-    objects = objects_of(label=label, extracted=extracted, mean=mean, auxiliary=auxiliary, born_ns=born)
+    known = np.tile(np.eye(6), (n, 1, 1))  # headings
+    objects = objects_of(
+        label=label, extracted=extracted, mean=mean, covariance=known, auxiliary=auxiliary, born_ns=born
+    )
     limit = np.array([0.1, 1.0])
     overlap = bev_iou(
         np.column_stack([mean[:, :2], auxiliary[:, :2], mean[:, 3]]),

@@ -116,7 +116,7 @@ def test_programs_that_start_at_once_compile_once_together() -> None:
     """One of them has all kernels compiled, by several processes; the other waits for it, and has what it needs."""
     program = "import optipmb; print(optipmb.warm_up())"
     with tempfile.TemporaryDirectory() as cache:
-        environment = os.environ | {"NUMBA_CACHE_DIR": cache, "NUMBA_OPT": "0", "OPTIPMB_COMPILE_PROCESSES": "2"}
+        environment = os.environ | {"NUMBA_CACHE_DIR": cache, "OPTIPMB_COMPILE_PROCESSES": "2"}
         command = [sys.executable, "-c", program]
         started = [
             subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)

@@ -46,6 +46,8 @@ _CERTAIN = (0.001, 0.999)  # beyond these no share that was measured is known
 _WIDEST, _MOST = 10.0, 1.5
 _HALF_WINDOW_S = 0.5
 _LEVEL, _FACTORS = 0.95, (0.1, 1.0)
+_UNWEIGHTED = 1e-3
+"""Factor with which velocities are published as they are: the factor is measured on them."""
 _NEES = 2.0
 _SCALE = 28.0  # width of the evidence, from one surest to the other, as the score tells it
 
@@ -123,6 +125,7 @@ def _rows(clip: Clip, scorer: Scorer, parameters: Parameters, memory: float) -> 
         existence=(1.0,),
         along=(0.0,),
         across=(0.0,),
+        speed=_UNWEIGHTED,
     )
     full = track_clip(clip, with_calibration(parameters, scorer.name, probe))
     found = sample(clip.world, full.take(scorer.counts(clip, full)), full, scorer.name, scorer.near)
@@ -139,7 +142,7 @@ def _rows(clip: Clip, scorer: Scorer, parameters: Parameters, memory: float) -> 
         error=np.column_stack([(offset * ahead).sum(axis=1), (offset * aside).sum(axis=1)]),
         variance=np.column_stack([np.einsum("ni,nij,nj->n", axis, covariance, axis) for axis in (ahead, aside)]),
         mixed=np.asarray(np.einsum("ni,nij,nj->n", ahead, covariance, aside)),
-        motion=np.column_stack(motion) / np.sqrt(full.covariance[matched][:, [2, 4], [2, 4]]),
+        motion=np.column_stack(motion) / np.sqrt(full.covariance[matched][:, [2, 4], [2, 4]]) * (_UNWEIGHTED, 1.0),
     )
 
 

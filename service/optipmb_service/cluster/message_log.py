@@ -23,14 +23,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 import structlog
 from nats.errors import Error as NatsError
 
-from optipmb_service.cluster.nats_connection import (
-    ERRORS,
-    NatsConnection,
-    NobodyAnswersError,
-    RefusedError,
-    text_of,
-    token,
-)
+from optipmb_service.cluster.nats_connection import ERRORS, NO_STREAM, NatsConnection, RefusedError, text_of, token
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping, Sequence
@@ -51,7 +44,6 @@ NEAR_S: Final = 2.0  # how near to the first message that is wanted a reader beg
 BATCH: Final = 128
 BATCH_BYTES: Final = 2**21
 MISSING_S: Final = 0.1  # a missing log is not looked for again for so long: every new session would ask
-NO_LOG: Final = 10059
 TOO_LARGE: Final = 10054
 WRITTEN_NOW: Final = 10158  # another bridge writes the same message, and several servers have not agreed on it yet
 AGAIN_S: Final = 0.05
@@ -250,7 +242,7 @@ class MessageLog:
         try:
             state = (await self.connection.ask(f"STREAM.INFO.{name}", request))["state"]
         except RefusedError as refused:
-            if refused.code == NO_LOG:
+            if refused.code == NO_STREAM:
                 return []
             raise
         return sorted("/".join(map(text_of, one.split(".")[1:])) for one in state.get("subjects") or ())
@@ -272,7 +264,7 @@ class MessageLog:
             return []
         try:
             messages = await self.connection.read(self._names[topic], request)
-        except NobodyAnswersError:  # the log does not exist yet
+        except RefusedError:  # the log does not exist yet
             self._missing_until[topic] = time.monotonic() + MISSING_S
             return []
         return [_found(topic, one) for one in messages]

@@ -43,7 +43,7 @@ LEAST: Final = (2, 12)  # first version of the server that refuses a checkpoint 
 EXISTS: Final = 10058
 ENDS: Final = frozenset({"204", "404"})  # status that ends a batch: that was all, or there is nothing
 NOBODY: Final = "503"
-
+NO_STREAM: Final = 10059  # there is no JetStream stream of a name, or none that answers now
 
 CA: Final = "ca.pem"
 CERTIFICATE: Final = "cert.pem"
@@ -67,10 +67,6 @@ class RefusedError(Exception):
 
 
 ERRORS: Final = (NatsError, RefusedError, TimeoutError, OSError)  # failures of a request to the servers
-
-
-class NobodyAnswersError(NatsError):
-    """There is no JetStream stream of a name, or none that answers now."""
 
 
 class SecuredClient(Client):
@@ -232,7 +228,11 @@ class NatsConnection:
         return answer
 
     async def read(self, name: str, request: Mapping[str, Any]) -> list[Msg]:
-        """Return the messages of a JetStream stream that a request names, from the server that is nearest."""
+        """Return the messages of a JetStream stream that a request names, from the server that is nearest.
+
+        Raises:
+            RefusedError: there is no such stream, or none that answers now.
+        """
         client = self.client()
         inbox = client.new_inbox()
         subscription = await client.subscribe(inbox)
@@ -245,7 +245,7 @@ class NatsConnection:
                 if status in ENDS:
                     break
                 if status == NOBODY:
-                    raise NobodyAnswersError(f"nobody answers for {name}")
+                    raise RefusedError({"err_code": NO_STREAM, "description": f"nobody answers for {name}"})
                 if status is not None:
                     raise NatsError(f"status {status}")
                 messages.append(message)

@@ -12,7 +12,7 @@ const canvas = at("canvas"), pen = canvas.getContext("2d");
 const view = { x: 0, y: 0, scale: 6, follow: true }; // centre in metres, pixels per metre
 const fingers = new Map(); // pointer id -> [x, y]
 let chosen = decodeURIComponent(location.hash.slice(1));
-let frame = null, trails = new Map(), selected = null, source = null, came = 0, dirty = true, moved = 0, fitted = false;
+let frame = null, trails = new Map(), names = [], selected = null, source = null, came = 0, dirty = true, moved = 0, fitted = false;
 
 // What the service says
 
@@ -174,6 +174,7 @@ function draw() {
       pen.globalAlpha = shown.has(id) ? sure(shown.get(id)) : 0.25; // a track that has ended fades
       line(trail, COLOURS[id % COLOURS.length], 1.5);
     }
+    names = [];
     for (const track of frame.tracks) box(track);
     pen.globalAlpha = 1;
     if (frame.sensor !== null) sensor(...frame.sensor);
@@ -228,9 +229,15 @@ function box(track) {
   pen.setLineDash([]);
   pen.strokeStyle = "#ffffffd0";
   const name = bold || view.scale > NAMED ? `${track[ID]} ${frame.labels[track[LABEL]]}` : track[ID];
-  pen.strokeText(name, px, py - 4);
-  pen.fillStyle = "#222";
-  pen.fillText(name, px, py - 4);
+  let above = py - 4;
+  const wide = pen.measureText(name).width, taken = ([x, y, w]) => Math.abs(x - px) < (w + wide) / 2 && Math.abs(y - above) < 12;
+  while (names.some(taken) && above > py - 60) above -= 13; // above the names that are there
+  if (bold || !names.some(taken)) {
+    names.push([px, above, wide]);
+    pen.strokeText(name, px, above);
+    pen.fillStyle = "#222";
+    pen.fillText(name, px, above);
+  }
   pen.globalAlpha = 1;
 }
 
