@@ -151,7 +151,7 @@ class Cell:
                 waits.extend(_delays(table.id[mine], clip.stamps[table.frame[mine]], confirmed[mine]))
             figures = plain_figures(scorer.figures(all_of))
             confirmed_share = sum(int((table.names[sure_of] == name).sum()) for _, table, sure_of in tracked)
-            count = sum(int((table.names == name).sum()) for _, table, _, _ in tracked)
+            count = sum(int((table.names == name).sum()) for _, table, _ in tracked)
             extra = (
                 plain_figures(scorer.figures(sure))["HOTA, all"],
                 confirmed_share / max(count, 1),

@@ -26,8 +26,7 @@ from optipmb_tools.datasets.interface import (
     Truth,
     chosen,
 )
-from optipmb_tools.datasets.table.names import ALIASES
-from optipmb_tools.datasets.table.rows import NO_ID, Boxes, read_tables
+from optipmb_tools.datasets.table.rows import ALIASES, NO_ID, Boxes, read_tables
 from optipmb_tools.datasets.table.values import Finding, Reading
 from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Bools, Floats, Ints, Pose, stack_poses, to_world
