@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 PAGE = Path(__file__).parents[2] / "examples/json/index.html"
 SENSOR = Sensor()
-FRAMES = 12
+FRAMES = 30
 CONFIRMED = Selection(confirmed=True)
 ZONES = """
 [zones.all]
