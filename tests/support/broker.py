@@ -63,7 +63,7 @@ class Broker:
 
     async def wait(self, count: int, end: str) -> list[bytes]:
         """Wait for so many messages of the topics that end so."""
-        async with asyncio.timeout(8):
+        async with asyncio.timeout(60):
             while len(self.of(end)) < count:  # noqa: ASYNC110 - it runs on the loop of the test
                 await asyncio.sleep(0.01)
         return self.of(end)

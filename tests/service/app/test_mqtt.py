@@ -43,7 +43,7 @@ async def bridging(session: Session, broker: Broker | str, **settings: Any) -> A
 
 async def until(true: Callable[[], bool]) -> None:
     """Wait until something is so."""
-    async with asyncio.timeout(8):
+    async with asyncio.timeout(60):
         while not true():  # noqa: ASYNC110 - nothing tells of it
             await asyncio.sleep(0.01)
 
