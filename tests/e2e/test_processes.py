@@ -87,7 +87,11 @@ def test_an_interrupted_demo_leaves_nothing_behind(tmp_path: Path, stage: str, n
             children = descendants(process.pid)  # told of the stage, the service is being started
         assert children
         os.kill(process.pid, number)
-        out, err = process.communicate(timeout=120)
+        try:
+            out, err = process.communicate(timeout=120)
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGABRT)  # prints where each thread is
+            out, err = process.communicate(timeout=120)
     finally:
         process.kill()
         process.wait()
