@@ -19,7 +19,7 @@ from optipmb.density import PHI, V, X, Y
 from optipmb.errors import EffortError
 from optipmb.frame import PLAIN
 from optipmb.geometry import NOBODY, block, empty_torus, insert
-from optipmb.predict import wrap
+from optipmb.predict import heading_unknown, wrap
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -139,6 +139,8 @@ def exclude_turned(
     widening = gate_widening(measurements.position, measurements.label, classes)
     for k in range(row.shape[0]):
         n, m = row[k], measurement[k]
+        if math.isnan(measurements.yaw[m]) or heading_unknown(objects.covariance[n]):
+            continue
         own, position = classes[objects.label[n]], measurements.position[m]
         squared = (position[0] - objects.mean[n, X]) ** 2 + (position[1] - objects.mean[n, Y]) ** 2
         turn = 0.5 * wrap(2.0 * (measurements.yaw[m] - objects.mean[n, PHI]))
