@@ -115,8 +115,8 @@ def _run() -> None:
         sound(result.tracks)
     predict_tracks(result.tracks, [0.5], parameters)
     points: dict[str, Any] = {"label": [0], "center": [[0.2, 0.0, np.nan]], "score": [0.9]}
-    given, _ = make_frame(parameters, stamp_ns=5 * 500_000_000, labels=("pedestrian",), **points)
-    posterior = tracker.step(posterior, given).density
+    point, _ = make_frame(parameters, stamp_ns=5 * 500_000_000, labels=("pedestrian",), **points)
+    tracker.step(posterior, point)
     with suppress(EffortError):
         Tracker(parameters, max_pairs=8).step(posterior, given)
     Tracker(parameters, Modules(habm=False)).step(posterior, given)

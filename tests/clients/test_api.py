@@ -187,7 +187,6 @@ BAD = [
     ({"label": 1}, "label"),
     ({"center": [[1, 2, 3], [1, 2]]}, "center[1]"),
     ({"center": 5}, "center"),
-    ({"size": None}, "size"),
     ({"pose": np.eye(4)}, "pose"),
     ({"pose": 5}, "pose"),
     ({"points": [[1, 2, 3], [1, 2]]}, "xyz[1]"),

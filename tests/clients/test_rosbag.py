@@ -276,7 +276,11 @@ def set_at(path: str, value: Any) -> Callable[[dict[str, Any]], None]:
 @pytest.mark.parametrize(
     ("place", "value", "text"),
     [
-        ("detections.0.bbox.size.y", 0.0, r"detections\[0\].bbox.size.y: expected a positive length, received 0.0"),
+        (
+            "detections.0.bbox.size.y",
+            -1.0,
+            r"detections\[0\].bbox.size.y: expected a positive length, or 0 where unknown",
+        ),
         ("detections.0.results", [], r"detections\[0\].results: expected at least one hypothesis"),
         ("detections.0.bbox.center.orientation.w", 3.0, r"orientation: expected a unit quaternion"),
         ("detections.0.results.0.hypothesis.score", 1.5, r"score: expected a score in \[0, 1\], received 1.5"),

@@ -116,7 +116,8 @@ def test_a_client_that_has_no_schema(gateway: GatewayProcess, stub: Any, stream:
     pool = descriptor_pool.DescriptorPool(database)
     service = pool.FindServiceByName(SERVICE)
     assert {method.name for method in service.methods} == {
-        "Track", "Publish", "Subscribe", "QueryTracks", "GetState", "Reset", "SetParameters", "ListStreams",
+        "Track", "Publish", "Subscribe", "SubscribeEvents", "QueryTracks", "GetState", "Reset", "SetParameters",
+        "ListStreams",
     }  # fmt: skip
     method = service.FindMethodByName("GetState")
     asked = GetMessageClass(method.input_type)(stream=stream)

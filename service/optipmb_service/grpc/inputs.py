@@ -56,7 +56,7 @@ async def track(call: Call) -> None:
     message = await inputs.next()
     if message is None:
         return
-    answers = _Answers(outbox)
+    answers = _Answers(call, outbox)
     keys, network = call.gateway.client.keys, call.gateway.network
     async with (
         network.subscribed(keys.tracks(inputs.stream), answers.listener),
@@ -99,7 +99,7 @@ async def publish(call: Call) -> None:
     message = await inputs.next()
     if message is None:
         return
-    acknowledgements, answers = _Acknowledgements(outbox), _Answers(outbox)
+    acknowledgements, answers = _Acknowledgements(outbox), _Answers(call, outbox)
     answers.listener.begin(())
     problems = call.gateway.client.keys.problems(inputs.stream)
     async with (
@@ -230,9 +230,7 @@ class _Inputs:
         gateway = self._call.gateway
         problem = schemas.Problem.of(error, stream=self.stream, instance=gateway.instance)
         known = {name: getattr(message, name) for name in ("seq", "stamp_ns") if message.HasField(name)}
-        problem = problem.model_copy(update={name: value for name, value in known.items() if value >= 0})
-        gateway.refused(problem)
-        return problem
+        return problem.model_copy(update={name: value for name, value in known.items() if value >= 0})
 
 
 class _Answers:
@@ -245,15 +243,17 @@ class _Answers:
         listener: takes tracks and problems.
     """
 
-    def __init__(self, outbox: Outbox[bytes]) -> None:
+    def __init__(self, call: Call, outbox: Outbox[bytes]) -> None:
+        self._gateway = call.gateway
         self._outbox = outbox
         self._reported: collections.deque[tuple[str, str]] = collections.deque(maxlen=RESPONSES)
         self.in_flight = _InFlight()
         self.listener = Listener(self._answer)
 
     def report(self, problem: schemas.Problem) -> None:
-        """Report a message that was refused here; the problem also comes back from the network."""
+        """Report a message that was refused here, to the caller and the network, from which it comes back."""
         self._reported.append((problem.code, problem.path))
+        self._gateway.refused(problem)
         response = Item.of_problem(problem).response
         self._outbox.put(problem.stream, response, len(response))
 

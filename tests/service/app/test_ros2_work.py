@@ -17,7 +17,7 @@ HANGS_S = 30.0
 
 def test_more_than_can_be_handled_keeps_nothing_waiting_that_is_due(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where each message is followed by the next, diagnostics are sent and the work returns in its time."""
-    node: Any = SimpleNamespace(endpoint=lambda *about: about)
+    node: Any = SimpleNamespace(endpoint=lambda *about: about, client=None)
     work = _Work(load(None, {"store": "none"}).settings, node)
     diagnosed: list[float] = []
     monkeypatch.setattr(work, "_diagnose", lambda: diagnosed.append(time.monotonic()))
