@@ -127,7 +127,7 @@ def draw_zones(figure: Figure) -> None:
     counts.set_ylabel("inside")
     counts.set_xlabel("time (s)")
     counts.set_yticks([0, 1, 2])
-    axes.set_aspect("equal")
+    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
     axes.legend(frameon=False, fontsize=8, loc="upper left", ncols=2)
 
 
