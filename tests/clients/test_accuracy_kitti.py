@@ -66,7 +66,7 @@ def test_boxes_of_pedestrians_match_at_half_their_volume(detections: str, least:
     scorers, clips = material("kitti", detections)
     scorer = replace(scorers["Pedestrian"], rules=replace(scorers["Pedestrian"].rules, limit=0.5))
     tracks = zip(clips["Pedestrian"], tracked("kitti", detections, "Pedestrian"), strict=True)
-    found = scorer.figures([scorer.measure(clip, table) for clip, (table, _) in tracks])
+    found = scorer.figures([scorer.measure(clip, table) for clip, table in tracks])
     assert found["sAMOTA"] >= least
 
 
@@ -130,7 +130,7 @@ def test_boxes_of_cars_lie_nearer_than_those_of_their_detector(detections: str, 
     scorers, clips = material("kitti", detections)
     near = scorers["Car"].near
     columns = (sequences_of("kitti", detections), clips["Car"], tracked("kitti", detections, "Car"))
-    parts = [(one, clip.world, *both) for one, clip, both in zip(*columns, strict=True)]
+    parts = [(one, clip.world, table, table) for one, clip, table in zip(*columns, strict=True)]
     found = evaluate_errors(parts, "Car", near)
     figures_of: Any = found.figures(found.detected)
     for direction in ("along", "across", "height", "heading"):

@@ -34,8 +34,8 @@ def test_nuscenes_is_tracked_like_by_the_best_public_trackers(name: str, amota: 
 def test_velocities_are_those_of_the_labels(name: str, error: float, moving: float) -> None:
     """The root mean square error, m/s, and the share above 0.3 m/s of what stands, at 2 Hz without velocities."""
     scorers, clips = material("nuscenes", "centerpoint")
-    (clip,), ((tracks, full),) = clips[name], tracked("nuscenes", "centerpoint", name)
-    truth, found = clip.world, sample(clip.world, tracks, full, name, scorers[name].near)
+    (clip,), (full,) = clips[name], tracked("nuscenes", "centerpoint", name)
+    truth, found = clip.world, sample(clip.world, full, full, name, scorers[name].near)
     row, owner = found.row[found.true], found.owner[found.true]
     before, after = (rows_of(truth.frame, truth.id, full.frame[row] + shift, owner) for shift in (-1, 1))
     row, before, after = (rows[(before >= 0) & (after >= 0)] for rows in (row, before, after))
