@@ -121,6 +121,29 @@ def paths_of(tracks: Tracks, times: Array, table: ClassTable) -> PredictedPaths:
     return paths
 
 
+def tracks_ahead(tracks: Tracks, seconds: float, table: ClassTable) -> Tracks:
+    """Predict tracks that are known to be of the classes of the table by a time: motion, ages and existence.
+
+    Boxes, scores and `confirmed` stay; no track has a detection.
+    """
+    paths = paths_of(tracks, np.array([seconds]), table)
+    mean = paths.mean[:, 0]
+    speed, yaw = mean[:, V], mean[:, PHI]
+    survival = table["survival"][tracks.label] ** (seconds / table.period)
+    return tracks.replaced(
+        center=np.column_stack((mean[:, :2], tracks.center[:, 2])),
+        yaw=yaw,
+        velocity=np.column_stack((speed * np.cos(yaw), speed * np.sin(yaw))),
+        yaw_rate=mean[:, OMEGA],
+        acceleration=mean[:, A],
+        existence=tracks.existence * survival,
+        covariance=paths.covariance[:, 0],
+        age=tracks.age + seconds,
+        time_since_detection=tracks.time_since_detection + seconds,
+        detection=np.full(len(tracks), -1),
+    )
+
+
 def _horizons(values: Sequence[float] | Array) -> Array:
     try:
         times = np.array(values, dtype=np.float64)

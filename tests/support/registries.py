@@ -79,7 +79,7 @@ class Around:
         """All may be published."""
         return True
 
-    def open_publisher(self, _: str, events: bool = False) -> Around:  # noqa: ARG002, FBT001, FBT002 - as the service calls it
+    def open_publisher(self, _: str, **kinds: bool) -> Around:  # noqa: ARG002 - as the service calls it
         """Be the publisher of a stream."""
         return self
 
