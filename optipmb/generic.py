@@ -1,8 +1,8 @@
-"""Parameters for detectors that nobody tuned: careful values from the classes, the rate and the scores.
+"""Parameters without tuning, for any detector: careful values from the classes and the rate.
 
-Everything that counts frames follows from durations and the period. Noise is that of an average LiDAR detector, rather
-too wide than too narrow. The tracker calibrates scores itself (`optipmb.self_calibration`), so that thresholds and the
-curve of existence hold for any detector.
+Counts of frames follow from durations and the period. The noise fits an average LiDAR detector and is rather too wide.
+The tracker calibrates scores itself (`optipmb.self_calibration`), so that thresholds and the curve of existence hold for
+any detector.
 """
 
 from __future__ import annotations
