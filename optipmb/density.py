@@ -6,9 +6,9 @@ compared, hashed and stored as it is. It is never written after it is made.
 Motion state x_M = [x, y, v, phi, omega, a]: position on the ground plane (m), speed along the heading (m/s, negative
 when reversing), heading (rad, in (-pi, pi]), turn rate (rad/s), acceleration (m/s^2).
 Auxiliary state x_A = [length, width, height, z]: box size and height of the box's centre, m; NaN where no detection
-gave it. States without a heading are those of `optipmb.unknown_heading`.
+gave it. `optipmb.unknown_heading` describes states without a heading.
 
-It is stored as named arrays (`bernoulli.mean`, `poisson.weight`) or as bytes; what is read back is checked.
+It is stored as named arrays (`bernoulli.mean`, `poisson.weight`) or as bytes, and checked when it is read back.
 """
 
 from __future__ import annotations
@@ -246,7 +246,7 @@ class Density:
         next_id: the id of the next new track; ids are never reused.
         bernoulli: detected potential objects.
         poisson: undetected potential objects.
-        labels: names of the classes that the labels point into, those of the parameters.
+        labels: names of the classes of the parameters, which the labels point into.
         misses: of the detected objects; None while no frame has had a field of view: every frame looks at all of them.
         class_probability: (N, C) posterior of each detected object over the classes (`optipmb.class_posterior`); None
             where the profile has no groups.
@@ -317,7 +317,7 @@ SENSOR: Final = "sensor"
 """Name of `Density.sensor` among the columns."""
 
 MOST_COUNTED: Final = 1e9
-"""Bound of counts of scores, and of numbers of the sensor's motion; those of the tracker are far below."""
+"""Bound of stored counts of scores and of the sensor's motion, far above all that the tracker makes."""
 
 ROUNDING: Final = 1e-6
 """By how much the sum of probabilities may differ from 1."""
@@ -328,7 +328,7 @@ _Rows = TypeVar("_Rows", bound=Rows)
 def fitting(density: Density, classes: int) -> bool:
     """Tell whether the parts of a density fit together and its classes exist, so that kernels stay within its arrays.
 
-    What `density_of` and the tracker make does; what others put together, or wrote into a column, may not.
+    `density_of` and the tracker make such densities; one that a caller assembled or wrote to may not be.
     """
     misses, objects, pi = density.misses, density.bernoulli, density.class_probability
     if pi is not None and not (isinstance(pi, np.ndarray) and pi.shape == (len(objects), classes)):
@@ -359,7 +359,7 @@ def check_fitting(density: Density, labels: tuple[str, ...]) -> None:
     """Refuse a density whose parts do not fit together.
 
     Raises:
-        DensityError: names the column, with what was expected and received.
+        DensityError: names the column, what it should hold and what it holds.
     """
     if fitting(density, len(labels)):
         return
@@ -416,10 +416,10 @@ def bytes_of(density: Density) -> dict[str, bytes]:
 
 
 def columns_in(parts: Mapping[str, bytes], classes: int) -> dict[str, NDArray[Any]]:
-    """Return the named arrays that bytes hold: what `columns_of` gives for the density of which `bytes_of` made them.
+    """Return the named arrays that bytes hold: inverse of `bytes_of`, with the names of `columns_of`.
 
     Args:
-        parts: `bernoulli` and `poisson`; `misses`, `classes` and those of `COUNTED` where the density has them.
+        parts: `bernoulli` and `poisson`; `misses`, `classes`, `sensor` and `calibration.…` where the density has them.
         classes: of the parameters that the density belongs to.
 
     Raises:

@@ -130,12 +130,9 @@ def extract(
     *,
     two_thresholds: bool,
 ) -> Tracks:
-    """Extract the tracks, and mark the objects that were extracted, and those that are confirmed.
+    """Extract the tracks, and mark extracted and confirmed objects in the posterior, which is new.
 
-    Arguments of its own:
-        posterior: not yet given away.
-        measurement: (N,) measurement of each object, negative where missed.
-        two_thresholds: whether OTE is on.
+    `measurement` (N,) is negative where an object is missed; `two_thresholds` tells whether OTE is on.
     """
     given = tuple(measurements), tuple(moment)
     objects, missed_from_ns = posterior.bernoulli.words, posterior.missed_from_ns
@@ -230,14 +227,7 @@ def select_tracks(
 def confirm(
     rows: Index, label: Index, existence: Array, classes: Sequence[ClassRow], confirmed: Flags, now: Flags
 ) -> None:
-    """Confirm tracks with hysteresis: from one existence on, and until it falls below another.
-
-    Arguments of its own:
-        rows: (K,) objects.
-        existence: (K,) of the tracks, as published.
-        confirmed: (N,) whether they were, the integers 0 and 1; is written.
-        now: (K,) receives whether they are.
-    """
+    """Confirm tracks with hysteresis: write `now` (K,) by the published existence, and `confirmed` of their objects."""
     for k in range(rows.shape[0]):
         own = classes[label[k]]
         now[k] = existence[k] >= (own.confirm_until if confirmed[rows[k]] else own.confirm_from)
@@ -282,7 +272,7 @@ def sound(tracks: Tracks) -> bool:
 
 
 def unsound(tracks: Tracks) -> tuple[str, str, str]:
-    """Return what is wrong with tracks that are not `sound`: path of the first value, expected, received."""
+    """Return the first fault of tracks that are not `sound`: path, expected, received."""
     for name, low, high in _BOUNDS:
         values = getattr(tracks, name)
         for place in np.argwhere(~((low <= values) & (values <= high)))[:1]:

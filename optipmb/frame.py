@@ -49,7 +49,7 @@ MAX_COORDINATE = 1e8
 """Coordinates beyond this (metres) are not positions on Earth; the limit keeps squares far from overflow."""
 
 MAX_SPEED = 1e3
-"""Velocities beyond this (m/s) are not those of objects on a road; squared, they would drown a covariance."""
+"""No object on a road is faster (m/s); squared, such a velocity would drown a covariance."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Pose:
     def __post_init__(self) -> None:
         translation = _shaped("pose.translation", self.translation, (3,))
         quaternion = _shaped("pose.quaternion", self.quaternion, (4,))
-        # A few numbers are looked at one by one faster than as an array; the arrays are for naming what is wrong.
+        # Comparing a few numbers one by one is faster than as an array; the array names the wrong one.
         w, x, y, z = quaternion.tolist()
         if not all(abs(value) <= MAX_COORDINATE for value in translation.tolist()):
             _bounded("pose.translation", translation, MAX_COORDINATE)
@@ -85,7 +85,7 @@ class Pose:
 
     @property
     def is_identity(self) -> bool:
-        """Whether the sensor's coordinates are those of the world, exactly."""
+        """Whether sensor and world have the same coordinates, exactly."""
         return self.translation.tolist() == [0.0] * 3 and self.quaternion.tolist() in _UNTURNED
 
     @cached_property
@@ -144,13 +144,13 @@ class Frame:
         score: (M,) in (0, 1]; what the thresholds of the class mean by it (`optipmb.frame`).
         label: (M,) int64, index into the classes of the parameters.
         source: (M,) int64, index of the object in the arrays that the caller gave.
-        labels: names of the classes that `label` points into, those of the parameters.
+        labels: names of the classes of the parameters, which `label` points into.
         cloud: the scan of the same stamp, or None.
         field_of_view: of the sensor, with its pose; None: it sees everything.
-        position_covariance: (M, 3) R_xx, R_xy and R_yy of each position, m^2; NaN, or None: those of the class.
+        position_covariance: (M, 3) R_xx, R_xy and R_yy of each position, m^2; NaN, or None: R of the class.
         pose: world from sensor; None: the sensor stands at the origin of the world.
 
-    The arrays cannot be written to, so that what was checked stays as it was.
+    The arrays cannot be written to, so that they stay as they were checked.
 
     Raises:
         FrameError: wrong shapes, types or values.
@@ -254,7 +254,7 @@ def make_frame(
     size = _unknown(m, 3) if size is None else _shaped("size", size, (m, 3))
     yaw = _unknown(m) if yaw is None else _shaped("yaw", yaw, (m,))
     velocity = _unknown(m, 2) if velocity is None else _shaped("velocity", velocity, (m, 2))
-    scored = read_only(np.where(score == 0.0, 1.0, score))  # those are left out, whatever they are
+    scored = read_only(np.where(score == 0.0, 1.0, score))  # objects of score 0 are left out
     given = which, len(labels), center, size, yaw, scored, velocity
     if not allowed(*given):
         _refuse(*given)
@@ -274,11 +274,11 @@ def frame_of_checked(
     field_of_view: FieldOfView | None,
     position_covariance: NDArray[np.float64] | None,
 ) -> tuple[Frame, int]:
-    """Make a frame as `make_frame` does of what its caller has checked: only covariances are checked here.
+    """Make a frame as `make_frame` does, of arrays that the caller has checked: only covariances are checked here.
 
     Every value is one that `make_frame` allows, and every array has the type, the shape and the order of one in a
-    frame. They are not copied but become read-only, so nobody may change them. `columns` are label, center, size, yaw,
-    score and velocity; size, yaw and velocity may be None.
+    frame. The arrays are not copied but become read-only. `columns` are label, center, size, yaw, score and velocity;
+    size, yaw and velocity may be None.
 
     Raises:
         FrameError: a covariance is none, or an object is too far in the world frame.
@@ -315,7 +315,7 @@ def frame_of_checked(
     for column in columns if spread is None else (*columns, spread):
         column.flags.writeable = False
     if rotation is not None and not allowed(known, len(names), center, size, yaw, score, velocity):
-        # What is too far only in the world: the constructor names it.
+        # Too far in the world only: the constructor names the object.
         return Frame(stamp_ns, *columns, *rest), m - source.shape[0]
     frame = object.__new__(Frame)
     frame.__dict__.update(zip(Frame.__dataclass_fields__, (stamp_ns, *columns, *rest), strict=True))
@@ -415,7 +415,7 @@ def _bounded(path: str, values: NDArray[np.float64], bound: float) -> None:
 
 def _array(path: str, values: ArrayLike, dtype: type[np.float64] | None) -> NDArray[Any]:
     try:
-        # A copy in one piece: a frame is its own, wherever the arrays come from.
+        # A copy in one piece: a frame shares no memory with the caller.
         return read_only(np.array(values, dtype=dtype, order="C"))
     except (TypeError, ValueError) as error:
         raise FrameError(path, "an array of numbers", repr(values)[:80]) from error
@@ -438,13 +438,7 @@ def calibrated(curve: ScoreCalibration, score: NDArray[np.float64]) -> NDArray[n
 def calibrate_scores(
     parameters: Parameters, label: NDArray[np.int64], score: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return scores, those of the classes that have a curve gone through it.
-
-    Args:
-        parameters: the profile.
-        label: (M,) index into its classes; -1 for a class that it lacks.
-        score: (M,) in [0, 1]; the same array comes back where no class has a curve.
-    """
+    """Return scores (M,) in [0, 1], calibrated where their class has a curve; without curves the same array."""
     for index, table in enumerate(parameters.classes.values()):
         if table.score_calibration is not None:
             score = np.where(label == index, calibrated(table.score_calibration, score), score)
@@ -461,15 +455,15 @@ LARGEST_VARIANCE: Final = 1e8
 """Largest variance, m^2."""
 
 SYMMETRY: Final = 1e-6
-"""Share of the largest variance by which opposite entries may differ: those of float32 do."""
+"""Share of the largest variance by which opposite entries may differ, as float32 rounds them."""
 
 
 def horizontal_covariance(covariance: Array, rotation: Array | None) -> Array:
-    """Check covariances of positions and return those of x and y in the world.
+    """Check covariances of positions and return their part of x and y in the world.
 
     Args:
         covariance: (M, 3, 3) of x, y and z along the axes of the arrays, m^2; of NaN where unknown.
-        rotation: (3, 3) from these axes to the world; None: they are those of the world.
+        rotation: (3, 3) from these axes to the world; None: they are the same.
 
     Returns:
         (M, 3) variance of x, covariance of x and y, variance of y; NaN where unknown.
@@ -500,7 +494,7 @@ def horizontal_covariance(covariance: Array, rotation: Array | None) -> Array:
 
 
 def semidefinite(horizontal: Array) -> NDArray[np.bool_]:
-    """Tell which rows (M, 3) of R_xx, R_xy and R_yy can be those of a covariance, up to rounding, or are of NaN."""
+    """Tell which rows (M, 3) of R_xx, R_xy and R_yy are a covariance, up to rounding, or NaN."""
     xx, xy, yy = horizontal.T
     good = (xx > 0.0) & (yy > 0.0) & (xy * xy <= (1.0 + SYMMETRY) * xx * yy) & (np.maximum(xx, yy) < np.inf)
     return np.asarray(good | np.isnan(horizontal).all(axis=1), np.bool_)

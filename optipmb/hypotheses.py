@@ -79,7 +79,7 @@ def local_hypotheses(
     """Enumerate the hypotheses that pass the class gate and the distance gate, with their costs.
 
     Resolutions: a likelihood outside the gate counts as zero in p_a, as its cost is infinite; mu_+ in e^j already
-    contains the survival probability that Algorithm 1 writes beside it. Where classes have groups, the gate of an
+    contains the survival probability, which Algorithm 1 writes out. Where classes have groups, the gate of an
     object is open to its group, and the likelihood has the factor p(d) of `optipmb.class_posterior`.
     """
     grouped, count = groups.confusion.shape[0] > 0, objects.label.shape[0]
@@ -108,11 +108,7 @@ def local_hypotheses(
 
 @kernel
 def close_gates(p_d: Array, radius: Array) -> None:
-    """Write a negative radius, in which nothing lies, for what cannot be detected: no cost is that of p_d = 0.
-
-    Arguments of its own:
-        radius: (N,) gating distances, m; some are replaced.
-    """
+    """Write a negative radius, in which nothing lies, for objects that cannot be detected: p_d = 0 has no cost."""
     for n in range(p_d.shape[0]):
         if p_d[n] == 0.0:
             radius[n] = -1.0
@@ -447,14 +443,11 @@ UNLIMITED: Final = 2**62
 def check_effort(prior: Density, measurements: Measurements, dt: float, table: ClassTable, most: int) -> None:
     """Refuse a frame with too many pairs in the gates.
 
-    Counted are the measurements in the gate of each predicted object and Poisson component, and in that of each
-    measurement, which may be an object of the next step.
-
-    Arguments of its own:
-        most: pairs that are allowed.
+    Measurements count that lie in the gate of a predicted object or Poisson component, or of a measurement, which may
+    be an object of the next step.
 
     Raises:
-        EffortError: there are more.
+        EffortError: there are more than `most`.
     """
     bernoulli, poisson, count = prior.bernoulli, prior.poisson, measurements.score.shape[0]
     if (len(bernoulli) + len(poisson) + count) * count <= most:

@@ -1,10 +1,10 @@
 """Where tracks are going: their states at times ahead, by the motion model of their class (eq. Motion Predict).
 
 Between two horizons the state is predicted in equal steps of at most one nominal period, each as in `optipmb.predict`.
-One long step would be another motion: its noise of speed and heading would reach no position. The covariance is that of
-the filter. The mean is the motion of the state itself and not the mean of the sigma points: where the heading may turn
-far in the time ahead, the latter hardly moves at all, and no object goes that way. A turn rate and an acceleration of
-which little is known move it little: each counts by ``x^2 / (x^2 + P_xx)``, the weight of least mean square error.
+One long step would be another motion: its noise of speed and heading would reach no position. The covariance is the
+filter's. The mean is the motion of the state itself and not the mean of the sigma points: where the heading may turn
+far in the time ahead, the latter hardly moves at all, and no object goes that way. Uncertain turn rates and
+accelerations count less: each has the weight ``x^2 / (x^2 + P_xx)`` of least mean square error.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 MAX_STEPS: Final = 1000
-"""Most steps of a path, whatever the nominal period."""
+"""Most steps of a path, however short the nominal period."""
 
 ROUNDING: Final = 1e-6
 """Share of a period by which a step may be longer, so that rounding of a horizon costs no step more."""
@@ -50,8 +50,7 @@ class PredictedPaths:
         label: (N,) int64, index into the classes of the parameters.
         horizons: (H,) s after the stamp of the tracks.
         mean: (N, H, 6) [x, y, v, phi, omega, a]: m, m/s along the heading, rad in (-pi, pi], rad/s, m/s^2.
-        covariance: (N, H, 6, 6) of those; that of the heading with the doubt which way the object faces, as tracks
-            have it.
+        covariance: (N, H, 6, 6) of those, with the doubt which way the object faces, as in `Tracks`.
     """
 
     id: Index
@@ -188,15 +187,7 @@ def predict_paths(
     mean_out: Array,
     covariance_out: Array,
 ) -> None:
-    """Predict states to each of the horizons, in equal steps of at most a nominal period between them.
-
-    Arguments of its own:
-        mean: (N, 6) states now.
-        covariance: (N, 6, 6) their covariances.
-        horizons: (H,) ascending times ahead, s.
-        mean_out: (N, H, 6) receives the states at the horizons.
-        covariance_out: (N, H, 6, 6) receives their covariances.
-    """
+    """Predict states (N) to each of the horizons (H), in equal steps of at most a nominal period between them."""
     root, points = np.empty((STATE, STATE)), np.empty((2 * STATE, STATE))
     state, spread = np.empty((2, STATE)), np.empty((2, STATE, STATE))
     for n in range(mean.shape[0]):
@@ -224,7 +215,7 @@ def predict_paths(
 
 @kernel
 def move(mean: Array, dt: float, tau: float, mean_out: Array) -> None:
-    """Move a state (6,) over dt, s, under an acceleration with time constant tau, s, and write where it is then."""
+    """Move a state (6,) over dt, s, under an acceleration with time constant tau, s."""
     kept, turn = decay_and_turn(mean[OMEGA], dt, tau)
     dx, dy, v, a = displacement(mean[V], mean[PHI], mean[OMEGA], mean[A], dt, tau, kept, turn)
     mean_out[X], mean_out[Y], mean_out[V], mean_out[A] = mean[X] + dx, mean[Y] + dy, v, a

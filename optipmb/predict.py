@@ -6,7 +6,7 @@ ever, and not through a standstill. Without decay (tau infinite) the acceleratio
 
 The unscented transform uses the symmetric set of 2n = 12 points at distance sqrt(n) along the columns of a matrix
 square root, all of weight 1/12 (kappa = 0): no weight is negative, so the transformed covariance is positive
-semi-definite whatever the function.
+semi-definite for any function.
 
 The square root is the Cholesky factor of the covariance with the state REORDERED as [v, phi, omega, a, x, y],
 position last. Then the columns that bend (v, phi, omega, a) do not depend on the axes of the world, and the columns
@@ -71,13 +71,13 @@ SMALL_TURN = 0.1
 square."""
 
 START = 5.0
-"""Where the acceleration decays, it carries a speed to at most so many times its own beyond it (`travel`)."""
+"""Where the acceleration decays, it raises a speed by at most so many times itself (`travel`)."""
 
 BRAKING = 3.0
-"""And braking that would end at minus so many times the speed, less one, ends at a standstill."""
+"""Braking is limited to so many times ``|v| / tau`` (`travel`)."""
 
 ACCELERATIONS = 3.0
-"""Standard deviations of an acceleration that objects of unknown heading are allowed, for nothing follows theirs."""
+"""Standard deviations of the acceleration of objects of unknown heading, which no state follows."""
 
 TINY_PIVOT = 1e-12
 """A pivot of the square root is lifted to this: a covariance that lost rank in rounding is repaired, and counted."""
@@ -175,7 +175,7 @@ def travel(
 
 @kernel
 def decay_and_turn(omega: float, dt: float, tau: float) -> tuple[float, Turn]:
-    """Return `kept` and `turn` of `travel`; of an acceleration that does not decay, values that nothing reads."""
+    """Return `kept` and `turn` of `travel`; unused values where the acceleration does not decay."""
     if tau == math.inf:
         return 1.0, (1.0, 0.0, 1.0, 0.0)
     return math.exp(-dt / tau), turn_integrals(omega * dt)
@@ -340,7 +340,7 @@ def predict_state(
 
 @kernel
 def centred(points: Array, s: int) -> float:
-    """Take the mean of the points (12, 6) out of their entry s, and return it."""
+    """Subtract the mean of the points (12, 6) from their entry s, and return it."""
     shift = 0.0
     for i in range(2 * STATE):
         shift += WEIGHT * points[i, s]
@@ -354,14 +354,14 @@ LONGEST_STEP_S: Final = 6.0
 
 
 def predict(density: Density, moment: Moment, table: ClassTable) -> tuple[Density, int]:
-    """Carry the density from its stamp to that of a frame.
+    """Carry the density from its stamp to the stamp of a frame.
 
     Means and covariances follow the motion model of the class. The survival probability p_s holds for one nominal
     period of the stream: over dt it is ``p_s ** (dt / period)``, so that a stream at twice the rate does not forget
     twice as fast.
-    Components that a silent stream has carried past their limits (`max_misses`, `poisson_steps`) are removed before
-    they could be associated, but for what the last frame has seen: in a slow stream it lives until the next look. That
-    holds for components whatever the time, for objects up to `LONGEST_STEP_S`.
+    Objects and components that a silent stream has carried past their limits (`max_misses`, `poisson_steps`) are
+    removed before they could be associated. Those seen in the last frame live until the next look, as in a slow stream:
+    components always, objects up to `LONGEST_STEP_S`.
 
     Returns:
         The predicted density and how many covariances had to be repaired.
@@ -396,17 +396,12 @@ def predict_density(
 ) -> tuple[Index, Array, Array, int]:
     """Predict the objects and components that are within the limit of their class (eq. PPP_prediction, MB_prediction).
 
-    Arguments of its own:
-        object_words: array of `Bernoullis`.
-        missed_from_ns: `Density.missed_from_ns`.
-        component_words: array of `Poissons`.
-
     Returns:
         The (K,) objects that stay, the arrays of the predicted objects and components, and how many covariances had to
         be repaired.
 
     Raises:
-        ValueError: a label is none, and reading its parameters would leave their array.
+        ValueError: a label is of no class; its parameters would be read beyond their array.
     """
     if not labels_within(object_words, component_words, len(classes)):
         raise ValueError("labels of classes that there are not")
@@ -443,12 +438,9 @@ def predict_density(
 def rows_within(
     label: Index, since_ns: Index, seen_from_ns: int, undetected: bool, moment: Moment, classes: Sequence[ClassRow]
 ) -> Index:
-    """Return the rows that are within the limit of their class.
+    """Return the rows within `poisson_steps` of their class, if `undetected`, else `max_misses`.
 
-    Arguments of its own:
-        since_ns: (N,) stamp from which periods are counted.
-        seen_from_ns: rows counted from this stamp on stay, whatever the limit.
-        undetected: whether the limit is `poisson_steps`; else `max_misses`.
+    Periods count from `since_ns` (N,); rows with a stamp from `seen_from_ns` on stay.
     """
     kept, count = np.empty(label.shape[0], np.int64), 0
     for n in range(label.shape[0]):
@@ -466,9 +458,10 @@ def rows_within(
 def predict_rows(
     rows: Index, old: Bernoullis | Poissons, new: Bernoullis | Poissons, dt: float, classes: Sequence[ClassRow]
 ) -> int:
-    """Predict m_+ and P_+ of some rows (K,) of objects or components over dt, s, positive; their boxes stay.
+    """Predict m_+ and P_+ of some rows (K,) of objects or components over dt, s, positive; `new` receives them.
 
-    `new` receives what both have but for the weight. Returns how many covariances had to be repaired.
+    Returns:
+        How many covariances had to be repaired.
     """
     root, points = np.empty((STATE, STATE)), np.empty((2 * STATE, STATE))
     repaired = 0

@@ -1,7 +1,7 @@
 """From detections to measurements: canonical order, score filter and non-maximum suppression (Section IV.A).
 
-Measurements are put in an order of their own (best score first, then by coordinates), so that nothing that follows
-depends on the order in which a detector lists its boxes.
+Measurements are sorted (best score first, then by coordinates), so that no result depends on the order in which a
+detector lists its boxes.
 """
 
 from __future__ import annotations
@@ -54,11 +54,10 @@ class Measurements(NamedTuple):
 def preprocess(
     frame: Frame, table: ClassTable, most: int = UNLIMITED, score: Array | None = None
 ) -> tuple[Measurements, Index, int, int]:
-    """Remove detections scored below eta_sf, then those that overlap a better one by more than eta_iou.
+    """Remove detections scored below eta_sf, then detections that overlap a better one by more than eta_iou.
 
-    They are compared with detections of their class, and of the other classes of its group unless it has none or
-    `suppress_in_group` is off.
-    `score` (M,) stands for the scores of the frame.
+    They are compared within their class, or within its group where `suppress_in_group` is on. `score` (M,) replaces the
+    scores of the frame.
 
     Returns:
         The measurements, their rows in the frame, the number below the score filter and the number suppressed.
@@ -85,9 +84,9 @@ def select(detections: Columns, width: int, classes: Sequence[ClassRow], most: i
     """Choose the detections that are measurements, of center, size, yaw, velocity, score, label and source of all.
 
     Returns:
-        How many detections pass the score filter, or -1 when more than `most` pairs of boxes had to be looked at; the
-        rows of those that pass the suppression too, in their order; their columns of `Measurements`, `width` of them
-        for the position.
+        How many detections pass the score filter, or -1 when more than `most` pairs of boxes had to be compared; the
+        rows that pass the suppression too, in their order; their columns of `Measurements`, `width` of them for the
+        position.
     """
     center, size, yaw, _, score, label, source = detections
     chosen = np.empty(score.shape[0], np.int64)
@@ -120,7 +119,7 @@ def select(detections: Columns, width: int, classes: Sequence[ClassRow], most: i
 
 @kernel
 def precedes(m: int, n: int, score: Array, center: Array, size: Array, yaw: Array, source: Index) -> bool:
-    """Tell whether detection m stands before n: by falling score, then by coordinates, size, yaw and place."""
+    """Tell whether detection m comes before n: by falling score, then by coordinates, size, yaw and place."""
     if score[m] != score[n]:
         return bool(score[m] > score[n])
     for s in range(3):

@@ -26,16 +26,16 @@ if TYPE_CHECKING:
 
 
 class ClassRow(Protocol):
-    """What kernels read of a class; names as in `optipmb.parameters.ClassParameters`, where they are described.
+    """Parameters of a class for kernels; names as in `optipmb.parameters.ClassParameters`, where they are described.
 
     Attributes:
         group: the first class of the group, the class itself without one.
         group_size: G, how many classes the group has.
-        suppressed_with: the first class of those that eta_iou compares with it.
+        suppressed_with: the first of the classes that eta_iou compares with it.
         clutter_intensity: lambda_c = mu_c / A, 1/m^2.
         birth_intensity: mu_b0 / A, 1/m^2.
         acceleration_time: time constant of the acceleration, s, infinite where it is constant.
-        constant_velocity: whether the motion model is that of constant velocity.
+        constant_velocity: whether the motion model is constant velocity.
         default_size: (3,) length, width and height of an object of which they are unknown, m.
         process_noise: (6,) standard deviations in state order, per square root of a second.
         noise_position: standard deviation of z_x and z_y.
@@ -54,7 +54,7 @@ class ClassRow(Protocol):
         missed_evidence: l_miss.
         score_of_evidence: weight of the evidence in the score.
         factor_speed: on the standard deviation of the published speed.
-        factor_turn_rate: on that of the published turn rate.
+        factor_turn_rate: on the standard deviation of the published turn rate.
         knots: number of knots of the calibration, zero without one.
         knot_evidence: (`MAX_KNOTS`,) where its curves bend, ascending; this and the next are zero from `knots` on.
         knot_existence: (`MAX_KNOTS`,) existence probability there.
@@ -137,7 +137,7 @@ CLASS: Final = np.dtype([(name, _TYPES[kind]) for name, kind in ClassRow.__annot
 
 @dataclass(frozen=True, slots=True)
 class ClassTable:
-    """The classes of a profile, and what it says of all of them.
+    """The classes of a profile and the parameters common to them.
 
     Attributes:
         classes: (C,) array of `CLASS`, for kernels; `table["gate"]` is a column of it.

@@ -2,13 +2,13 @@
 
 The update runs for the pairs of the best global hypothesis only: costs need the position alone. z_M = [x, y, v_x, v_y,
 phi] = H(x_M) + w (eq. Single Object Measurement Model); a detection without velocity leaves the two velocity rows out,
-and H is then linear. Sigma points and square root are those of `optipmb.predict`. The innovation of phi is taken modulo
+and H is then linear. Sigma points and square root are as in `optipmb.predict`. The innovation of phi is taken modulo
 pi, in (-pi/2, pi/2]; the sign of the heading is followed apart (`optipmb.lightweight`).
 
 A birth starts at the measurement: m^0 = [z_x, z_y, speed, heading, 0, 0] under P^0 of its class, with speed and heading
 of the measured velocity. Two cases that the paper leaves open: without a velocity the object starts with the detected
 heading and v = 0 under a wide prior; and the direction of a velocity slower than `birth_heading_speed` is mostly noise,
-so the heading is that of the box and the speed is the velocity along it.
+so the box gives the heading, and the speed is the velocity along it.
 
 A detection without heading (NaN) leaves the last row out. An object is born without heading then, and stays so until
 one is known (`optipmb.unknown_heading`).
@@ -68,13 +68,9 @@ def ukf_updates(
     mean_out: Array,
     covariance_out: Array,
 ) -> int:
-    """Update states with the measurement of each; a negative measurement leaves the state as predicted.
+    """Update the states `row` (K,) with their measurements; a negative measurement leaves the state as predicted.
 
-    Arguments of its own:
-        row: (K,) state that each result is made of; where it is `NEW`, there is none, and nothing is written.
-        measurement: (K,) index of the associated measurement, or negative.
-        mean_out: (K, 6) receives the posterior means.
-        covariance_out: (K, 6, 6) receives the posterior covariances.
+    Nothing is written where `row` is `NEW`.
 
     Returns:
         How many covariances had to be repaired.
@@ -129,9 +125,7 @@ def ukf_update(
         z: (5,) z_M; NaN at 2 and 3 where the velocity is unknown, at 4 where the heading is.
         sigma: (6,) standard deviations of the measurement noise, ``R = diag(sigma^2)``, and last the covariance of z_x
             and z_y in R.
-        buffers: of `workspace`; what they hold does not matter.
-        mean_out: (6,) receives m.
-        covariance_out: (6, 6) receives P.
+        buffers: of `workspace`, with any content.
 
     Returns:
         Number of pivots that had to be repaired.
@@ -233,13 +227,9 @@ def ukf_update(
 def birth_states(
     rows: Index, measurements: Measurements, classes: Sequence[ClassRow], mean_out: Array, covariance_out: Array
 ) -> None:
-    """Compute m^0 and P^0 of the measurements in `rows` (eq. Newborn Hypothesis).
+    """Compute m^0 and P^0 of the measurements in `rows` (K,) (eq. Newborn Hypothesis).
 
-    Arguments of its own:
-        rows: (K,) measurements.
-        measurements: Z_k; where it has rho of `optipmb.frame`, P^0_xy is that of the class times rho.
-        mean_out: (K, 6) receives the means.
-        covariance_out: (K, 6, 6) receives the covariances, diagonal but for x and y.
+    P^0 is diagonal, but rho of `optipmb.frame` scales its part of x and y.
     """
     position, velocity, yaw = measurements.position, measurements.velocity, measurements.yaw
     own_noise = position.shape[1] > PLAIN
@@ -288,16 +278,11 @@ def first_detected_states(
     mean_out: Array,
     covariance_out: Array,
 ) -> int:
-    """Compute the states of the objects that the measurements in `rows` detect for the first time.
+    """Compute the states of the objects that the measurements in `rows` (K,), none of them clutter, detect first.
 
     A newborn is N(m^0, P^0) (eq. Newborn Hypothesis). An announced object is the mixture of its components J^m, each
     updated by the measurement, with weights ``e^j / e``, matched by one Gaussian (eq. First-Time Detection Hypothesis
     Update 1).
-
-    Arguments of its own:
-        rows: (K,) measurements, none of them clutter.
-        mean_out: (K, 6) receives the means.
-        covariance_out: (K, 6, 6) receives the covariances.
 
     Returns:
         How many covariances had to be repaired.
@@ -370,13 +355,8 @@ def moment_match(
     """Replace Gaussian mixtures by single Gaussians of the same mean and covariance.
 
     Headings are averaged as differences from the heading of the heaviest component, taken in (-pi, pi]. Where one of
-    them is unknown, the heaviest component stands for all.
-
-    Arguments of its own:
-        start: (K + 1,) where the components of each mixture start.
-        weight: (L,) weights, summing to one within each mixture.
-        mean_out: (K, 6) receives the means.
-        covariance_out: (K, 6, 6) receives the covariances.
+    them is unknown, the heaviest component stands for all. Mixture k has the components from `start[k]` to
+    `start[k + 1]`, whose weights sum to one.
     """
     for k in range(start.shape[0] - 1):
         first, last = start[k], start[k + 1]
