@@ -45,7 +45,6 @@ def pytest_collection() -> Generator[None, object, object]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that run by a command of their own."""
     marker_of = {HERE / name: marker for marker, names in OTHERS.items() for name in names}
     for item in items:
         if item.path in marker_of:

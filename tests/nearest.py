@@ -23,7 +23,6 @@ MANY = 8
 
 
 def main(since: str) -> int:
-    """Choose the tests and run them; returns the exit status."""
     tests = sorted(ROOT.glob("tests/*/**/test_*.py"))
     changed = _changed(since)
     imports = {path: _imports(path) for path in _modules() | set(tests)}
@@ -55,7 +54,6 @@ def _modules() -> set[Path]:
 
 
 def _imports(path: Path) -> set[Path]:
-    """Return the files that a file imports."""
     found: set[Path] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):

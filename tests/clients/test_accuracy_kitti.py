@@ -100,8 +100,6 @@ def test_cars_keep_their_ids_in_slow_streams(name: str, every: int, most: int) -
 
 
 def thinned(clip: Clip, every: int) -> Clip:
-    """Return a clip with each so many frames."""
-
     def rows_of(truth: Truth) -> Truth:
         kept, shown = truth.take(truth.frame % every == 0), truth.regions.frame % every == 0
         regions = Regions(truth.regions.frame[shown] // every, truth.regions.box2d[shown])

@@ -140,7 +140,6 @@ def test_what_a_publisher_sent_before_its_first_sample_came_is_not_lost(
 
 
 def plain_subscriber(session: zenoh.Session, key: str, handler: Any, **_: object) -> Any:
-    """Subscribe without asking any cache."""
     return session.declare_subscriber(key, handler)
 
 
@@ -263,7 +262,6 @@ def test_replies_of_two_services_are_both_kept(endpoint: str) -> None:
 
 
 def answer_with(questions: Iterable[zenoh.Query], text: bytes) -> None:
-    """Answer every query with a text."""
     for query in questions:
         with query:
             query.reply(query.key_expr, text)

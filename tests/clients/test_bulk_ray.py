@@ -26,13 +26,11 @@ SCENE = ("--dataset", "scene", "--option", "frames=12", "--option", "clouds=0", 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two hundred small recordings."""
     return recordings(tmp_path_factory.mktemp("recordings"))
 
 
 @pytest.fixture(scope="module")
 def plain(data: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """The result files of one process."""
     return tracked_plainly(data, tmp_path_factory.mktemp("plain"))
 
 
@@ -65,7 +63,6 @@ def cluster() -> Iterator[Any]:
 
 
 def with_word(word: str) -> list[str]:
-    """Give the command lines of all processes that have a word in them."""
     found = []
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         try:
@@ -78,7 +75,6 @@ def with_word(word: str) -> list[str]:
 
 
 def gone(word: str) -> bool:
-    """Wait until no process has a word in its command line."""
     until = time.monotonic() + WAIT_S
     while with_word(word):
         if time.monotonic() > until:
@@ -88,7 +84,6 @@ def gone(word: str) -> bool:
 
 
 def tracked(data: Path, out: Path, executor: Executor) -> list[TrackedSequence]:
-    """Track all recordings."""
     asked = DatasetArguments("table", data)
     opened = asked.open()
     sequences = opened.sequences(["all"])

@@ -36,7 +36,6 @@ def street(frames: int = FRAMES, direction: float = 0.0, yaw: float | None = Non
 
 
 def tracked(capsys: pytest.CaptureFixture[str], data: Path, *options: str, name: str = "t.csv") -> tuple[Table, str]:
-    """Track a table; give the tracks and what was said."""
     out = data.parent / "out" / name
     done = run_here(capsys, "track", data, "--out", out, *options)
     assert done.returncode == 0, done.stderr
@@ -52,7 +51,6 @@ def refused(capsys: pytest.CaptureFixture[str], data: Path, *options: str) -> st
 
 
 def write(path: Path, columns: Table, **changed: np.ndarray | None) -> Path:
-    """Write a table with some columns changed, or left out, and give its path."""
     write_table(path, {name: one for name, one in {**columns, **changed}.items() if one is not None})
     return path
 

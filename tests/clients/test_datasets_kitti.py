@@ -30,7 +30,6 @@ Tr_imu_to_velo: 1 0 0 -0.8 0 1 0 0.3 0 0 1 -0.8
 
 
 def write_root(base: Path, *, name: str = "0000", scores: tuple[str, ...] = ("2.0",), frames: int = 3) -> None:
-    """Write the smallest KITTI root with one sequence."""
     rows = "".join(ROW.format(score=score) + "\n" for score in scores)
     for place, text in {
         f"training/calib/{name}.txt": CALIBRATION,
@@ -42,14 +41,12 @@ def write_root(base: Path, *, name: str = "0000", scores: tuple[str, ...] = ("2.
 
 
 def read_all(root: Path) -> None:
-    """Read whatever frames and camera of the one sequence need."""
     sequence = only_sequence(root)
     list(sequence.frames())
     _ = sequence.camera
 
 
 def only_sequence(root: Path) -> KittiSequence:
-    """Open the one sequence of a written root."""
     return KittiDataset(root).sequences(["all"])[0]
 
 
@@ -246,7 +243,6 @@ def test_both_spellings_of_calibration_files_are_read(tmp_path: Path) -> None:
 
 
 def oxts_packet(latitude: float, longitude: float, altitude: float, yaw: float) -> str:
-    """Give a line of an oxts file."""
     fields = [latitude, longitude, altitude, 0.0, 0.0, yaw, *[0.0] * 24]
     return " ".join(f"{value:.12f}" for value in fields)
 
@@ -311,7 +307,6 @@ def test_clouds_are_read_when_they_are_asked_for(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def real() -> KittiDataset:
-    """The real data with the PointRCNN detections."""
     return KittiDataset(kitti_root(), "pointrcnn")
 
 

@@ -26,7 +26,6 @@ CAR, PEDESTRIAN, CYCLIST = range(3)
 
 
 def scene(seed: int = 0, frames: int = 150, **options: float) -> SceneSequence:
-    """Give one generated scene."""
     sequence = open_dataset("scene", seed=seed, frames=frames, **options).sequences(["all"])[0]
     assert isinstance(sequence, SceneSequence)
     return sequence
@@ -34,7 +33,6 @@ def scene(seed: int = 0, frames: int = 150, **options: float) -> SceneSequence:
 
 @pytest.fixture(scope="module")
 def scenes() -> list[SceneSequence]:
-    """Four scenes of half a minute."""
     return [scene(seed, 300) for seed in range(4)]
 
 
@@ -49,7 +47,6 @@ def observed(scenes: list[SceneSequence]) -> Observed:
 
 
 def digest(sequence: SceneSequence) -> str:
-    """Give a digest of all that a scene offers."""
     total = hashlib.sha256()
     for frame in sequence.frames():
         assert frame.cloud is not None

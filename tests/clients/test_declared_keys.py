@@ -38,7 +38,6 @@ def _subscribed(connection: Connection, key: str) -> Reading:
 
 @pytest.fixture
 def connection(tmp_path: Path) -> Iterator[Connection]:
-    """A connection alone."""
     file = tmp_path / "alone.json5"
     file.write_text(ALONE, encoding="utf-8")
     with Connection(config=file) as connection:

@@ -34,24 +34,19 @@ def cars(stamps: Any = None, scale: float = 1.0, **changed: Any) -> dict[str, np
 
 
 def take(columns: Mapping[str, np.ndarray], rows: Any) -> dict[str, np.ndarray]:
-    """Give some rows of a table."""
     return {name: values[rows] for name, values in columns.items()}
 
 
 class Bench:
-    """Runs `optipmb evaluate` on tables in a folder."""
-
     def __init__(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
         self.folder, self._capsys = folder, capsys
 
     def table(self, name: str, columns: Mapping[str, np.ndarray]) -> Path:
-        """Write a table and give its path."""
         path = self.folder / name
         write_table(path, columns)
         return path
 
     def run(self, *arguments: object, options: Sequence[str] = ()) -> Any:
-        """Run a command with options of the dataset."""
         return run_here(self._capsys, *arguments, *(word for one in options for word in ("--option", one)))
 
     def evaluate(
@@ -71,7 +66,6 @@ class Bench:
 
 @pytest.fixture
 def bench(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Bench:
-    """A folder for tables."""
     return Bench(tmp_path, capsys)
 
 

@@ -25,12 +25,10 @@ AGREED = json.loads((Path(__file__).with_name("devkit") / "ab3dmot.json").read_t
 
 
 def case_of(truth: list[TruthRow], tracks: list[TrackRow], ignored: tuple[int, ...] = ()) -> Case:
-    """Prepare cars."""
     return prepare(truth_of(truth, ignored=ignored), tracks_of(tracks), "Car", ab3dmot_rules())
 
 
 def result_of(truth: list[TruthRow], tracks: list[TrackRow], ignored: tuple[int, ...] = ()) -> Ab3dmotResult:
-    """Evaluate cars."""
     return evaluate_ab3dmot([case_of(truth, tracks, ignored)])
 
 

@@ -20,7 +20,6 @@ COVARIANCE = np.array([[0.09, 0.03], [0.03, 0.04]])
 
 
 def full_of(center: Floats, existence: Floats, covariance: Floats, frames: int, objects: int) -> FullTable:
-    """Give tracks with all columns, in the order of `parked`."""
     count = frames * objects
     whole = np.zeros((count, 6, 6))
     whole[:] = np.eye(6)

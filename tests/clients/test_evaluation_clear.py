@@ -30,12 +30,10 @@ def truth_of(rows: Iterable[Row], *, ignored: Iterable[Row] = ()) -> Truth:
 
 
 def tracks_of(rows: Iterable[Row], scores: dict[int, float] | None = None) -> ResultTable:
-    """Give tracks of the same cars."""
     return evaluation_cases.tracks_of([(*row, 0.0, (scores or {}).get(row[1], 1.0)) for row in sorted(rows)])
 
 
 def figures(result: ClearResult) -> tuple[int, int, int, int, int]:
-    """Give GT, TP, FP, FN and IDS."""
     return result.truth, result.true, result.false, result.missed, result.switches
 
 

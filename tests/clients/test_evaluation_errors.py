@@ -72,7 +72,6 @@ class Shifted:
         return getattr(self._given, name)
 
     def frames(self) -> list[DetectionFrame]:
-        """The frames with every box raised."""
         return [replace(frame, center=frame.center + np.array([0.0, 0.0, self._by])) for frame in self._given.frames()]
 
 

@@ -16,7 +16,6 @@ PATIENT = settings(deadline=None, max_examples=60)  # other work on the machine 
 def gospa_of(
     truth: list[TruthRow], tracks: list[TrackRow], frames: int = 1, cutoff: float = 2.0, order: float = 2.0
 ) -> GospaResult:
-    """Evaluate cars."""
     rules = Rules("distance", cutoff)
     return evaluate_gospa([(prepare(truth_of(truth), tracks_of(tracks), "Car", rules), frames)], rules, order)
 

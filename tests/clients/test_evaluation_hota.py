@@ -21,7 +21,6 @@ NEAR = Rules("distance", 2.0)
 
 
 def hota_of(truth: list[TruthRow], tracks: list[TrackRow], ignored: tuple[int, ...] = ()) -> HotaResult:
-    """Evaluate centres of cars."""
     return evaluate_hota([prepare(truth_of(truth, ignored=ignored), tracks_of(tracks), "Car", NEAR)], NEAR)
 
 

@@ -39,7 +39,6 @@ def served(frames: list[Detections]) -> list[Tracks]:
 
 
 def recorded(path: Path, frames: list[Detections]) -> Path:
-    """Write frames as they are recorded."""
     with RecordingWriter(path) as writer:
         for number, frame in enumerate(frames):
             writer.add(Keys().detections(frame.stream), encode(frame), encoding_of(frame), number)
@@ -62,7 +61,6 @@ def tabled(path: Path, frames: list[Detections]) -> Path:
 
 
 def same(sequence: FusedSequence, wanted: list[Tracks]) -> None:
-    """Compare the tracks of a sequence with those of a service, byte for byte."""
     found = track_whole(KITTI, sequence).tracks.values()
     assert len(found) == len(wanted)
     for ours, theirs in zip(found, wanted, strict=True):

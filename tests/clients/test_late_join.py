@@ -13,24 +13,18 @@ from optipmb_client.zenoh.late_join import CacheQueries, LateJoin
 
 @dataclass(frozen=True)
 class Entity:
-    """Who publishes."""
-
     zid: str = "abc"
     eid: int = 7
 
 
 @dataclass(frozen=True)
 class Info:
-    """The publisher of a sample, and its number there."""
-
     source_id: Entity
     source_sn: int
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What is read of Zenoh's samples."""
-
     source_info: Info | None
     key_expr: str = "a/b"
     payload: bytes = bytes(10)
@@ -51,7 +45,6 @@ class Joined:
         )
 
     def take(self, *numbers: int, source: Entity = Entity()) -> None:
-        """Samples that come live."""
         for number in numbers:
             self.join.take(sample(number, source))
 
@@ -64,7 +57,6 @@ class Joined:
 
 
 def sample(number: int, source: Entity = Entity()) -> Sample:
-    """A sample of a publisher."""
     return Sample(Info(source, number))
 
 
@@ -212,7 +204,6 @@ class LostQueries:
         self.ended: queue.SimpleQueue[bool] = queue.SimpleQueue()
 
     def ask(self) -> bool:
-        """Ask, and return how it ended."""
         self.queries.ask("a/b", self.replied.append, self.ended.put)
         return self.ended.get(timeout=60)
 

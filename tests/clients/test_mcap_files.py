@@ -45,7 +45,6 @@ SESSION = "0" * 32
 
 
 def detections(seq: int, *, stamp: int | None = None, has_points: bool | None = None) -> Detections:
-    """Two cars at frame `seq`."""
     return Detections(
         stream=STREAM,
         epoch=EPOCH,
@@ -63,7 +62,6 @@ def detections(seq: int, *, stamp: int | None = None, has_points: bool | None = 
 
 
 def points(seq: int, stamp: int) -> Points:
-    """A small cloud."""
     return Points(stream=STREAM, epoch=EPOCH, seq=seq, stamp_ns=stamp, frame="world", xyz=np.ones((3, 3), np.float32))
 
 
@@ -89,7 +87,6 @@ def tracks(seq: int, ids: list[int], *, cloud_used: bool = False, revision: int 
 
 
 def put(writer: RecordingWriter, message: Message, received_ns: int, *, json: bool = False) -> bytes:
-    """Add a message under its own key; give its bytes."""
     topics = {Detections: "detections", Points: "points", Tracks: "tracks", Problem: "problems"}
     topic = topics[type(message)]
     payload = encode_json(message) if json else encode(message)
@@ -329,7 +326,6 @@ def test_a_recording_is_never_written_over(tmp_path: Path) -> None:
 
 
 def recorded(message: Message, received_ns: int) -> Recorded:
-    """A message as a recording gives it."""
     topic = type(message).__name__.lower()
     return Recorded(
         STREAM, topic, encode(message), encoding_of(message), received_ns, getattr(message, "stamp_ns", received_ns)

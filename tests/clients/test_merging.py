@@ -68,7 +68,6 @@ class Sent:
 
     @property
     def tracks(self) -> Tracks:
-        """The message."""
         return message(self.seq, content=10 * self.run + self.revision, revision=self.revision, run=self.run)
 
 

@@ -42,12 +42,10 @@ PATIENT = settings(deadline=None)  # other work on the machine may make any exam
 
 
 def one_scene(frames: int = 3, things: list[Thing] | None = None, name: str = SCENE) -> Scene:
-    """Give a scene in which the car stands at (100, 200)."""
     return Scene(name, [(100.0, 200.0)] * frames, things or [])
 
 
 def opened(root: Path, scene: Scene, boxes: dict[str, list[dict[str, Any]]] | None = None) -> NuScenesSequence:
-    """Write a root with one scene and give that scene."""
     write_root(root, [scene])
     write_detections(root, "made", [scene], boxes)
     (sequence,) = NuScenesDataset(root).sequences(["all"])

@@ -24,7 +24,6 @@ FILE = "tracking_results.json"
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two scenes."""
     folder = write_root(tmp_path_factory.mktemp("nuscenes"), SCENES)
     token = SCENES[0].token(2)
     write_detections(folder, "made", SCENES, {token: [box(token)]})
@@ -32,7 +31,6 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def rows(count: int, **changes: Any) -> Rows:
-    """Give some tracks of cars."""
     number = np.arange(count, dtype=np.int64)
     one = np.ones(count)
     made = Rows(
@@ -183,7 +181,6 @@ def test_replaying_scenes_at_once_writes_the_same_file(endpoint: str, root: Path
 
 
 def track_box(**changes: Any) -> dict[str, Any]:
-    """Give one box of a result file."""
     base = {name: value for name, value in box("t").items() if not name.startswith("detection")}
     return base | {"tracking_id": "a", "tracking_name": "car", "tracking_score": 0.5} | changes
 

@@ -14,7 +14,6 @@ from optipmb_tools.run.tracking import Tracking, track, track_whole
 
 @pytest.fixture(scope="module")
 def dataset() -> Dataset:
-    """A small generated scene with clouds."""
     return open_dataset("scene", frames=20, vehicles=6, pedestrians=3, cyclists=2)
 
 

@@ -27,13 +27,11 @@ def checkout(tmp_path: Path) -> Path:
 
 
 def git(work: Path, *arguments: str) -> None:
-    """Run git, with nobody's settings."""
     person = ["-c", "user.name=x", "-c", "user.email=x@example.org"]
     subprocess.run(["git", "-C", work, *person, *arguments], check=True, capture_output=True)  # noqa: S607
 
 
 def commit(work: Path) -> None:
-    """Commit everything."""
     git(work, "add", "-A")
     git(work, "commit", "-q", "-m", "state")
 

@@ -20,13 +20,11 @@ QUICK = Pace(patience_s=60.0, service_s=60.0)
 
 @pytest.fixture(scope="module")
 def dataset() -> Dataset:
-    """A small generated scene with clouds."""
     return open_dataset("scene", frames=FRAMES, vehicles=6, pedestrians=2, cyclists=1)
 
 
 @pytest.fixture
 def link(endpoint: str) -> Iterator[Connection]:
-    """A connection to the router."""
     with Connection(endpoint) as connection:
         yield connection
 
@@ -39,7 +37,6 @@ def run(
     on_frame: Callable[[], None] = lambda: None,
     **options: object,
 ) -> list[ReplayedSequence]:
-    """Replay sequences of the scene."""
     how = replace(Replaying("kitti", QUICK), **options)  # type: ignore[arg-type]  # given by the tests
     return replay(link, dataset, dataset.sequences(names or ["0000"]), out, how, on_frame)
 

@@ -27,7 +27,6 @@ FRAMES = 60
 
 @pytest.fixture(scope="module")
 def sequence() -> DataSequence:
-    """A generated scene without clouds."""
     (one,) = open_dataset("scene", frames=FRAMES, vehicles=10, clouds=False, seed=4).sequences(["0000"])
     return one
 
@@ -61,7 +60,6 @@ def test_states_are_smoothed_as_the_article_has_it(*, turned: bool) -> None:
 
 
 def tracked(sequence: DataSequence, *, smooth: bool) -> dict[int, Tracks]:
-    """Track the sequence."""
     return track_whole(read_profile("kitti"), sequence, smooth=smooth).tracks
 
 

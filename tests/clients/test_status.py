@@ -44,7 +44,6 @@ def test_members_are_told_by_their_own_instance() -> None:
     """Of a member, and of the workers of an instance, what it says itself counts; other names only begin alike."""
 
     def member(name: str, age_s: float) -> MemberSummary:
-        """A member that was heard of so long ago."""
         return MemberSummary(member=name, state="alive", age_s=age_s, partitions=(), fences=())
 
     def service(instance: str, age_s: float) -> ServiceStatus:

@@ -20,20 +20,17 @@ CLASSES = ("Car", "Pedestrian")
 
 
 def table(path: Path, columns: Mapping[str, np.ndarray]) -> Path:
-    """Write a table and give its path."""
     write_table(path, columns)
     return path
 
 
 def only(dataset: TableDataset) -> TableSequence:
-    """Give the one recording of a dataset."""
     (sequence,) = dataset.sequences(["all"])
     assert isinstance(sequence, TableSequence)
     return sequence
 
 
 def same(one: DataSequence, other: DataSequence) -> None:
-    """Check that two recordings have the same frames."""
     for a, b in zip(one.frames(), other.frames(), strict=True):
         assert a.stamp_ns == b.stamp_ns
         for name in ("center", "size", "yaw", "score"):
@@ -42,7 +39,6 @@ def same(one: DataSequence, other: DataSequence) -> None:
 
 
 def notes_and_frames(path: Path, columns: Mapping[str, np.ndarray], **options: str) -> tuple[str, TableSequence]:
-    """Give what is said about a table, and its recording."""
     dataset = TableDataset(table(path, columns), options)
     return " | ".join(dataset.notes), only(dataset)
 

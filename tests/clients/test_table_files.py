@@ -16,7 +16,6 @@ PLAIN = "t,x,class\n0.0,1.5,car\n0.1,-2.25,Fuß\n"
 
 
 def same(one: Columns, other: Columns) -> None:
-    """Check that two tables have the same columns."""
     assert list(one) == list(other)
     for name, values in one.items():
         np.testing.assert_array_equal(values, other[name])
@@ -161,7 +160,6 @@ def test_lines_are_counted_with_comments_and_blank_lines(tmp_path: Path) -> None
 
 
 def frames_of(path: Path, **options: str) -> list[tuple[Any, ...]]:
-    """Give what the frames of the one recording of a table have, rounded."""
     (sequence,) = open_dataset("table", path, **options).sequences(["all"])
     return [
         (
@@ -174,7 +172,6 @@ def frames_of(path: Path, **options: str) -> list[tuple[Any, ...]]:
 
 
 def lists() -> list[dict[str, Any]]:
-    """Give the boxes of each frame as lists, as detectors write them."""
     columns = boxes(vx=np.tile([8.0, -6.0, 1.0], FRAMES), vy=np.zeros(3 * FRAMES))
     rows = np.column_stack([columns[name] for name in ("x", "y", "z", "l", "w", "h", "yaw", "vx", "vy")])
     return [
@@ -188,7 +185,6 @@ def lists() -> list[dict[str, Any]]:
 
 
 def flat(tmp_path: Path, **changed: Any) -> list[tuple[Any, ...]]:
-    """Give the frames of the same boxes in a flat table."""
     velocity = {"vx": np.tile([8.0, -6.0, 1.0], FRAMES), "vy": np.zeros(3 * FRAMES)}
     write_table(tmp_path / "flat.parquet", boxes(**(velocity | changed)))
     return frames_of(tmp_path / "flat.parquet")

@@ -13,19 +13,16 @@ HEIGHT = 40
 
 
 def session(stream: str, **changes: Any) -> SessionSummary:
-    """A stream that is well, but for changes."""
     fields = {"profile": "nuscenes", "state": "running", "rate_hz": 10.0, "latency_p50_ms": 2.0, "latency_p99_ms": 5.0}
     return SessionSummary(stream=stream, frames=100, tracks=7, age_s=0.1, **fields | changes)
 
 
 def service(instance: str = "one", *sessions: SessionSummary, **changes: Any) -> ServiceStatus:
-    """An instance that is well, but for changes."""
     fields = {"version": "1", "started_ns": 1, "uptime_s": 60.0, "state": "ready"}
     return ServiceStatus(instance=instance, sessions=sessions, **fields | changes)
 
 
 def text(view: StatusView, height: int = HEIGHT, width: int = 140) -> str:
-    """The view as a terminal would show it, without colours."""
     console = Console(width=width, record=True, file=io.StringIO())
     console.print(view.render(height, width))
     return console.export_text()

@@ -22,7 +22,6 @@ SCORER = scorer_of("scene", "Car", [])
 
 
 def clips_of(seeds: range, habits: Habits) -> list[Clip]:
-    """Recordings of cars 100 m apart."""
     recordings = [recorded(habits, seed, frames=60, objects=12, name=f"{seed:04d}") for seed in seeds]
     return [of_class(load(one, PAPER, RULES), "Car", RULES) for one in recordings]
 

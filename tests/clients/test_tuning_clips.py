@@ -25,7 +25,6 @@ PARAMETERS = optipmb.load_profile("kitti")
 
 
 def clip_of(habits: Habits | None = None, seed: int = 0) -> Clip:
-    """Make a clip of cars."""
     return load(recorded(habits or Habits(), seed, frames=40), PARAMETERS, rules_of("scene"))
 
 
@@ -59,7 +58,6 @@ _COLUMNS = ("center", "size", "yaw", "velocity", "score", "label", "source")
 
 
 def tracked(dataset: Dataset, names: list[str], out: Path) -> None:
-    """Write the result files of some sequences."""
     list(track(dataset, dataset.sequences(names), out, Tracking(profiles.read_profile("kitti-paper"))))
 
 

@@ -15,7 +15,6 @@ FEW = ["--trials", "3", "--fold-trials", "1", "--folds", "2"]
 
 
 def tune(out: Path, *options: str) -> None:
-    """Tune cars."""
     assert run(["tune", *CARS, *FEW, "--out", str(out), *options]) == 0
 
 

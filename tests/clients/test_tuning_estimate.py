@@ -17,7 +17,6 @@ PARAMETERS = optipmb.load_profile("kitti")
 
 
 def estimated(*sequences: Recorded) -> Estimate:
-    """Estimate cars."""
     rules = rules_of("scene")
     clips = [of_class(load(sequence, PARAMETERS, rules), "Car", rules) for sequence in sequences]
     return estimate(clips, "Car", only(PARAMETERS, "Car"), rules)

@@ -12,7 +12,6 @@ import optipmb
 
 @pytest.fixture
 def objective() -> Objective:
-    """Three recordings of cars."""
     whole, rules = optipmb.load_profile("kitti-paper"), rules_of("scene")
     sequences = [recorded(Habits(), seed, frames=25, objects=10, name=f"{seed:04d}") for seed in range(3)]
     clips = [of_class(load(one, whole, rules), "Car", rules) for one in sequences]

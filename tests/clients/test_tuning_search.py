@@ -39,12 +39,10 @@ def guessed(values: Mapping[str, Value], guess: Callable[[float], None]) -> floa
 
 
 def search(path: Path, *, seed: int = 0, settings: dict[str, int] | None = None) -> Search:
-    """Open the search."""
     return Search(path, "valley", settings or {"a": 1}, SPACE, [START], seed)
 
 
 def tried(found: Search) -> list[tuple[dict[str, Any], list[float]]]:
-    """Give values and scores of all trials."""
     return [(trial.params, trial.values) for trial in found.trials]
 
 

@@ -36,26 +36,21 @@ class Log:
         self.blueprints: list[Any] = []
 
     def log(self, path: str, *shown: Any, **_options: bool) -> None:
-        """Keep it."""
         self.entities[path] = shown
 
     def set_time(self, timeline: str, **when: Any) -> None:
-        """Keep it."""
         self.times.append((timeline, when))
 
     def send_blueprint(self, blueprint: Any) -> None:
-        """Keep it."""
         self.blueprints.append(blueprint)
 
     def column(self, path: str, name: str) -> Any:
-        """The values of a column of the first archetype at a path."""
         array = getattr(self.entities[path][0], name).as_arrow_array()
         assert isinstance(array, pa.Array)
         return array.to_pylist()
 
 
 def tracks(seq: int, ids: list[int], covariance: np.ndarray | None = None) -> Tracks:
-    """Tracks of these ids side by side, going along x."""
     return tracks_message(
         STREAM,
         seq,
@@ -107,7 +102,6 @@ def density() -> Density:
 
 
 def cloud() -> Points:
-    """Two points in the sensor's frame."""
     xyz = np.array([[1, 0, 0], [0, 1, 0]], np.float32)
     return Points(stream=STREAM, epoch=bytes(16), seq=0, stamp_ns=0, frame="sensor", pose=POSE, xyz=xyz)
 
@@ -187,13 +181,10 @@ def test_components_are_faint_ellipses_on_a_path_of_their_own() -> None:
 
 
 class Answering:
-    """Stands for a connection: answers every question about a density, and says who asked."""
-
     def __init__(self) -> None:
         self.asked: list[tuple[str, str]] = []
 
     def query(self, key: str, **_options: float) -> tuple[Answer, ...]:
-        """Answer."""
         self.asked.append((key, threading.current_thread().name))
         encoding = encoding_of(Density)
         return (Answer(key, b"no", encoding, ok=False), Answer(key, encode(density()), encoding, ok=True))
@@ -247,7 +238,6 @@ def test_colours_can_be_told_apart() -> None:
 
 @pytest.fixture
 def incident(tmp_path: Path) -> Path:
-    """A small recording."""
     path = tmp_path / "incident.mcap"
     keys = Keys()
     with RecordingWriter(path) as writer:

@@ -120,6 +120,5 @@ def _read(inbox: Inbox, replay: Replay) -> None:
 
 
 def _outage(replay: Replay, killed_ns: int) -> float:
-    """Seconds from the kill to the first new tracks after it."""
     after = [at for result in replay.results.values() for at in result.times_ns if at > killed_ns + 50_000_000]
     return (min(after) - killed_ns) / 1e9

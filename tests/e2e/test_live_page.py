@@ -31,7 +31,6 @@ DEADLINE_S = 60.0
 
 
 def service(*options: str) -> ServiceProcess:
-    """The service, always at the same addresses."""
     return ServiceProcess("--listen", ENDPOINT, "--http", HTTP, "--profile", "nuscenes", *options, listen=False)
 
 
@@ -67,7 +66,6 @@ def publishing(stream: str, label: str, length: float) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def chrome(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chrome]:
-    """A browser, and two streams for it to see."""
     with browser(tmp_path_factory.mktemp("profile")) as found:
         yield found
 
@@ -116,7 +114,6 @@ def test_the_page_shows_live_tracks_and_survives_a_restart(chrome: Chrome, tmp_p
 
 
 def loading_s(chrome: Chrome) -> float:
-    """Load the page; how long that took by the browser's clock."""
     chrome.get(BASE)
     return float(wait(chrome, "performance.getEntriesByType('navigation')[0].loadEventEnd")) / 1000
 

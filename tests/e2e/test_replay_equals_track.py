@@ -35,7 +35,6 @@ class Both:
         self._capsys = capsys
 
     def track(self, *data: object) -> Any:
-        """Track offline."""
         return result_of(run_here(self._capsys, "track", *data, "--out", self.out / "track", "--json"))
 
     def replay(self, *data: object) -> Any:
@@ -55,7 +54,6 @@ class Both:
 
 @pytest.fixture
 def both(service: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Both:
-    """Both ways, in a folder of its own."""
     return Both(service, tmp_path, capsys)
 
 

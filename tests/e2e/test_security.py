@@ -47,14 +47,12 @@ EVERYBODY = (
 
 @pytest.fixture(scope="module")
 def network(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Network]:
-    """A protected network with two nodes, two services and a viewer."""
     with Network(tmp_path_factory.mktemp("tls"), *EVERYBODY) as one:
         yield one
 
 
 @pytest.fixture(scope="module")
 def service(network: Network) -> Iterator[ServiceProcess]:
-    """The service of that network."""
     with network.service() as one:
         one.wait_ready()
         yield one
@@ -62,14 +60,12 @@ def service(network: Network) -> Iterator[ServiceProcess]:
 
 @pytest.fixture
 def node(network: Network) -> Iterator[Party]:
-    """The first node."""
     with Party(network.config(NODE)) as one:
         yield one
 
 
 @pytest.fixture
 def viewer(network: Network) -> Iterator[Party]:
-    """The viewer, who reads everything."""
     with Party(network.config(VIEWER)) as one:
         yield one.read(*(KEYS.all(topic) for topic in ("detections", "points", "tracks", "problems")))  # type: ignore[arg-type]  # all are topics
 
@@ -85,7 +81,6 @@ def publish(network: Network, role: str, stream: str, frames: int) -> Publisher:
 
 
 def refused(config: Path, **changes: Any) -> bool:
-    """Whether no link to the router can be had."""
     try:
         with Party(config, patience_ms=REFUSAL_MS, **changes):
             return False

@@ -23,7 +23,6 @@ with atheris.instrument_imports(include=["optipmb_schemas", "optipmb_service"]):
 
 
 def main(name: str, seconds: str, *options: str) -> None:
-    """Search; ends the process."""
     optipmb.warm_up()  # which may take longer than any bytes should
     learned, found, corpus = LEARNED / name, HERE / "found" / name, HERE / "corpus" / name
     for folder in (learned, found):

@@ -20,7 +20,6 @@ FRAMES = 60
 
 
 def events(stub: Any, stream: str, number: int, **asked: Any) -> list[tuple[str, str]]:
-    """Have a car drive through the yard; return the next events of a subscription."""
     call = stub.SubscribeEvents(pb.SubscribeEventsRequest(pattern=stream, **asked))
     call.initial_metadata()
     list(stub.Track(detections(frame(seq, stream)) for seq in range(FRAMES)))

@@ -30,12 +30,10 @@ SUBSCRIBER_BYTES = 512 * 2**10
 
 
 def tracked(stub: Any, stream: str, frames: Iterable[int] = range(30)) -> list[Any]:
-    """Have frames tracked; return the tracks that came back."""
     return [one.tracks for one in stub.Track(detections(frame(seq, stream)) for seq in frames)]
 
 
 def subscribed(stub: Any, **asked: Any) -> Any:
-    """A subscription that is in force."""
     call = stub.Subscribe(pb.SubscribeRequest(**asked))
     call.initial_metadata()
     return call

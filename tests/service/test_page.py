@@ -25,7 +25,6 @@ LEVELS = {"debug", "info", "warning", "error", "exception"}
 
 
 def calls(names: set[str]) -> list[ast.Call]:
-    """All calls of functions and methods of these names in the service."""
     found = []
     for source in SOURCES:
         for part in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):

@@ -111,7 +111,6 @@ class World:
         self._ticket = 0
 
     def run(self) -> None:
-        """Let it happen, then compare."""
         frames = round(self.seconds * SECOND / PERIOD_NS)
         for _ in range(frames):
             for one in self.streams:
@@ -125,7 +124,6 @@ class World:
         self.compare()
 
     def compare(self) -> None:
-        """States and tracks equal the undisturbed sessions."""
         for stream, session in self.sessions.items():
             where = f"seed {self.seed}, stream {stream}"
             other = self.undisturbed[stream]
@@ -257,7 +255,6 @@ class World:
 
 
 def give(session: Session, message: schemas.Message, now_ns: int) -> list[Any]:
-    """Hand a session a frame or a cloud."""
     if isinstance(message, schemas.Points):
         return list(session.on_points(message, now_ns))
     assert isinstance(message, schemas.Detections)
@@ -265,7 +262,6 @@ def give(session: Session, message: schemas.Message, now_ns: int) -> list[Any]:
 
 
 def garbled(payload: bytes, chance: random.Random) -> bytes:
-    """Return bytes that are no message any more: cut short, or with a field of another name."""
     if chance.random() < 0.5:
         return payload[: chance.randrange(len(payload))]
     return payload.replace(b"stamp_ns", b"stamp_ms")

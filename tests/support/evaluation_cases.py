@@ -39,7 +39,6 @@ def truth_of(rows: Sequence[TruthRow], names: Sequence[str] | str = "Car", ignor
 
 
 def tracks_of(rows: Sequence[TrackRow], names: Sequence[str] | str = "Car") -> ResultTable:
-    """Give tracks of one size, in any order."""
     count = len(rows)
     labels = (names,) if isinstance(names, str) else tuple(dict.fromkeys(names))
     table = ResultTable(
@@ -57,7 +56,6 @@ def tracks_of(rows: Sequence[TrackRow], names: Sequence[str] | str = "Car") -> R
 
 
 def parked(objects: int, frames: int, apart: float = 10.0) -> list[TruthRow]:
-    """Give objects that stand in a row, each in all frames."""
     return [(frame, one, apart * one, 0.0) for frame in range(frames) for one in range(objects)]
 
 
@@ -114,7 +112,6 @@ def _pose(frame: int) -> str:
 
 
 def _drive(chance: np.random.Generator, frames: int) -> tuple[list[str], list[str]]:
-    """Give the lines of a label file and of a result file."""
     labels, tracks = [], []
     following = 100
     for one in range(28):

@@ -39,8 +39,6 @@ START = np.diag([10.0] * MEASURED + [10_000.0] * 3)
 
 @dataclass(frozen=True)
 class Habits:
-    """What differs between the classes."""
-
     at_once: bool
     """All detections are assigned together; else the best pair first."""
     by_overlap: bool
@@ -71,7 +69,6 @@ class _Track:
 
 
 def kalman_tracks(clip: Clip, name: str) -> ResultTable:
-    """Track the detections of one class, in the world frame."""
     habits = HABITS[name]
     tracks: list[_Track] = []
     rows: list[Row] = []
@@ -114,7 +111,6 @@ def _update(track: _Track, box: Array, score: float) -> None:
 
 
 def _assigned(boxes: Array, tracks: Array, habits: Habits) -> list[tuple[int, int]]:
-    """Return pairs of a detection and a track."""
     if not len(boxes) or not len(tracks):
         return []
     apart = np.linalg.norm(boxes[:, None, :3] - tracks[None, :, :3], axis=2)

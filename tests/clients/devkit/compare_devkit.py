@@ -44,8 +44,6 @@ AGREED = Path(__file__).with_name("agreed.json")
 
 @dataclass(frozen=True)
 class Case:
-    """Tracks to be evaluated, by scene."""
-
     name: str
     root: Path
     detector: str
@@ -54,7 +52,6 @@ class Case:
 
 
 def cases(root: Path, folder: Path) -> Iterator[Case]:
-    """Give all cases: of the recorded scene, then of generated ones, which are written into a folder."""
     (sequence,) = NuScenesDataset(root, "centerpoint").sequences([SPLIT])
     scene = sequence.name
     # The official tools take distances by |a|^2 - 2 ab + |b|^2, which loses half of the digits near zero.
@@ -77,7 +74,6 @@ def cases(root: Path, folder: Path) -> Iterator[Case]:
 
 
 def official(python: Path, root: Path, results: Path) -> dict[str, Any]:
-    """Give the figures of the official tools."""
     script = Path(__file__).with_name("run_devkit.py")
     command = [python, script, root, "v1.0-mini", SPLIT, results]
     done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=900)
@@ -85,7 +81,6 @@ def official(python: Path, root: Path, results: Path) -> dict[str, Any]:
 
 
 def differences(ours: NuScenesScores, theirs: dict[str, Any], tolerance: float) -> Iterator[str]:
-    """Give a line for each figure that differs."""
     pairs = [("all", name, ours.overall[name], value) for name, value in theirs["overall"].items()]
     for label, values in theirs["classes"].items():
         scores = ours.classes[label]
@@ -109,7 +104,6 @@ def differences(ours: NuScenesScores, theirs: dict[str, Any], tolerance: float) 
 
 
 def main() -> int:
-    """Compare all cases."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--root", type=Path, required=True)
     parser.add_argument("--devkit", type=Path, required=True, help="the python of the other environment")

@@ -28,7 +28,6 @@ CONFIRMED = Selection(confirmed=True)
 
 @contextlib.asynccontextmanager
 async def bridging(session: Session, broker: Broker | str, **settings: Any) -> AsyncIterator[Any]:
-    """Run a bridge meanwhile."""
     address = broker if isinstance(broker, str) else f"mqtt://127.0.0.1:{broker.port}"
     network: Any = session
     bridge = mqtt.Bridge(Settings(instance="one", mqtt=MqttSettings(broker=address, **settings)), network)
@@ -42,7 +41,6 @@ async def bridging(session: Session, broker: Broker | str, **settings: Any) -> A
 
 
 async def until(true: Callable[[], bool]) -> None:
-    """Wait until something is so."""
     async with asyncio.timeout(60):
         while not true():  # noqa: ASYNC110 - nothing tells of it
             await asyncio.sleep(0.01)

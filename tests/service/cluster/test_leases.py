@@ -46,7 +46,6 @@ def _patient() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def nats(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NatsProcess]:
-    """A NATS server."""
     with NatsProcess(tmp_path_factory.mktemp("nats")) as server:
         yield server
 
@@ -83,8 +82,6 @@ def make(request: pytest.FixtureRequest) -> Iterator[Make]:
 
 
 def connected(store: LeaseStore) -> None:
-    """Wait until a store can be reached."""
-
     def reached() -> bool:
         try:
             store.follow(0)

@@ -41,27 +41,23 @@ OK = http.client.OK
 
 @pytest.fixture
 def watched() -> Watched:
-    """A service."""
     return Watched()
 
 
 @pytest.fixture
 def session(watched: Watched) -> Session:
-    """Its session."""
     assert watched.network is not None
     return watched.network
 
 
 @pytest.fixture
 def address(watched: Watched) -> Iterator[str]:
-    """Where it answers."""
     with served(watched, http_clients=4, http_origins=["https://map.example"]) as address:
         yield address
 
 
 @pytest.fixture
 def guarded(watched: Watched, tmp_path: Path) -> Iterator[str]:
-    """The same with tokens."""
     file = tmp_path / "tokens.json"
     file.write_text(json.dumps({hashlib.sha256(token.encode()).hexdigest(): name for token, name in TOKENS.items()}))
     with served(watched, http_tokens=str(file)) as address:
@@ -70,7 +66,6 @@ def guarded(watched: Watched, tmp_path: Path) -> Iterator[str]:
 
 @contextlib.contextmanager
 def asked(address: str, path: str, **headers: str) -> Iterator[http.client.HTTPResponse]:
-    """Ask for something; the answer's body is still to be read."""
     host, _, port = address.rpartition(":")
     with contextlib.closing(http.client.HTTPConnection(host, int(port), timeout=DEADLINE_S)) as connection:
         connection.request("GET", path, headers={"connection": "close", **headers})
@@ -79,14 +74,12 @@ def asked(address: str, path: str, **headers: str) -> Iterator[http.client.HTTPR
 
 
 def get(address: str, path: str, **headers: str) -> tuple[int, Any]:
-    """Status and JSON of an answer."""
     with asked(address, f"/api/v1/{path}", **headers) as response:
         return response.status, json.loads(response.read())
 
 
 @contextlib.contextmanager
 def lines(address: str, query: str) -> Iterator[Iterator[bytes]]:
-    """Read server-sent events; gives the texts as they come."""
     with asked(address, f"/api/v1/stream?{query}") as response:
         assert response.status == OK
         assert response.readline() == b": hello\n"
@@ -105,14 +98,12 @@ def socket(address: str, query: str, **options: Any) -> Iterator[WebSocket]:
 
 
 def refused(address: str, query: str, **options: Any) -> tuple[int, bytes]:
-    """Status and body with which a WebSocket is refused before the handshake."""
     with pytest.raises(WebSocketBadStatusException) as raised, socket(address, query, **options):
         pass
     return raised.value.status_code, raised.value.resp_body or b""
 
 
 def closed(connection: WebSocket) -> int:
-    """Read until the other side closes; return its code."""
     while True:
         opcode, data = connection.recv_data(control_frame=True)
         if opcode == ABNF.OPCODE_CLOSE:

@@ -47,7 +47,6 @@ Samples = dict[tuple[str, tuple[tuple[str, str], ...]], float]
 
 
 def get(address: str, path: str) -> tuple[int, str]:
-    """Status and body of an answer."""
     host, _, port = address.rpartition(":")
     connection = http.client.HTTPConnection(host, int(port), timeout=60)
     try:
@@ -60,7 +59,6 @@ def get(address: str, path: str) -> tuple[int, str]:
 
 
 def status_for(address: str, path: str, host: str) -> int:
-    """Return the status of an answer to a request that names a host."""
     name, _, port = address.rpartition(":")
     with closing(http.client.HTTPConnection(name, int(port), timeout=10)) as connection:
         connection.request("GET", path, headers={"host": host})
@@ -68,19 +66,16 @@ def status_for(address: str, path: str, host: str) -> int:
 
 
 def address_of(service: ServiceProcess) -> str:
-    """Where a service said that it answers."""
     service.wait_log('"event": "http"')
     return str(re.findall(r'"address": "([^"]+)"', service.errors)[0])
 
 
 def samples(text: str) -> Samples:
-    """Every figure of a text in Prometheus' format."""
     families = text_string_to_metric_families(text)
     return {(one.name, tuple(sorted(one.labels.items()))): one.value for family in families for one in family.samples}
 
 
 def free_address() -> str:
-    """An address where nobody listens."""
     return free_endpoint().removeprefix("tcp/")
 
 

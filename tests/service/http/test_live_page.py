@@ -33,7 +33,6 @@ DEADLINE_S = 60.0
 
 
 def tracks(seq: int) -> Tracks:
-    """One track, a long way from the origin, and one that is not confirmed."""
     return tracks_message(
         STREAM,
         seq,
@@ -71,27 +70,23 @@ DETECTIONS = Detections(
 
 @pytest.fixture
 def watched() -> Watched:
-    """A service."""
     return Watched()
 
 
 @pytest.fixture
 def session(watched: Watched) -> Session:
-    """Its session."""
     assert watched.network is not None
     return watched.network
 
 
 @pytest.fixture
 def address(watched: Watched) -> Iterator[str]:
-    """Where its page is."""
     with served(watched, http_clients=VIEWERS) as address:
         yield address
 
 
 @contextlib.contextmanager
 def asked(address: str, path: str) -> Iterator[http.client.HTTPResponse]:
-    """Ask for something; the answer's body is still to be read."""
     host, _, port = address.rpartition(":")
     connection = http.client.HTTPConnection(host, int(port), timeout=DEADLINE_S)
     connection.request("GET", path, headers={"connection": "close"})
@@ -104,14 +99,12 @@ def asked(address: str, path: str) -> Iterator[http.client.HTTPResponse]:
 
 
 def get(address: str, path: str) -> tuple[int, bytes]:
-    """Status and body of an answer."""
     with asked(address, path) as response:
         return response.status, response.read()
 
 
 @contextlib.contextmanager
 def looking(address: str) -> Iterator[Iterator[dict[str, object]]]:
-    """Look at the stream; gives the frames as they come."""
     with asked(address, f"/live?stream={STREAM}") as response:
         assert response.status == http.client.OK
         assert response.getheader("content-type", "").startswith("text/event-stream")

@@ -17,13 +17,10 @@ TOPICS = {True: "detections", False: "points"}
 
 
 class Lost:
-    """What backlogs lose of what they hold."""
-
     def __init__(self) -> None:
         self.packets: list[Packet] = []
 
     def __call__(self, _: str, packets: list[Packet]) -> None:
-        """Note it."""
         self.packets += packets
 
 
@@ -42,7 +39,6 @@ def live(**limits: Any) -> Backlog:
 
 
 def packet(number: int = 0, *, frame: bool = True, size: int = 0, at_s: float = 0, stream: str = "s") -> Packet:
-    """Return a packet known by its number."""
     return Packet(f"{stream}/{TOPICS[frame]}", bytes(size), size, "", number, round(at_s * SECOND))
 
 
@@ -58,7 +54,6 @@ def taken(backlog: Backlog) -> list[Packet]:
 
 
 def numbers(packets: list[Packet]) -> list[int]:
-    """Return the numbers of packets."""
     return [one.wall_ns for one in packets]
 
 

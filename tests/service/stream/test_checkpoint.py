@@ -257,7 +257,6 @@ def _set_profile(body: Any, **changes: Any) -> None:
 
 
 def _set(body: Any, column: str, number: bytes) -> None:
-    """Write the first number of a column of the objects."""
     density = body["head"]["density"]
     objects = bytearray(density["bernoulli"])
     at = optipmb.Bernoullis.described[column].begin * len(objects) // optipmb.Bernoullis.width

@@ -44,7 +44,6 @@ def test_caches_are_awaited_of_publishers_that_are_there_or_may_come_back() -> N
 
 
 def names(count: int, site: str = "site") -> list[str]:
-    """Names of streams."""
     return [f"{site}/node-{number}/lidar" for number in range(count)]
 
 

@@ -33,7 +33,6 @@ class Disturbed(RuleBasedStateMachine):
 
     @initialize(first=st.integers(0, 3))
     def begin(self, first: int) -> None:
-        """Nothing was sent yet."""
         self.sensor = Sensor()
         self.stamp_ns, self.seq = 10**6 * SECOND, first
         self.now_ns = 0
@@ -44,7 +43,6 @@ class Disturbed(RuleBasedStateMachine):
         self.saved = encode_checkpoint(self.session.snapshot())
 
     def fresh(self) -> Session:
-        """A session to which nothing has happened."""
         return Session(self.sensor.stream, NUSCENES, POLICY, tracker=chained)
 
     @rule(objects=st.integers(0, 3), step=st.sampled_from([0, 1, 1, 1, 2, 40, 70]), cloud=st.booleans())
@@ -65,30 +63,25 @@ class Disturbed(RuleBasedStateMachine):
 
     @rule(hours=st.sampled_from([-1, 1]))
     def jump(self, hours: int) -> None:
-        """The sensor's clock is set."""
         self.stamp_ns += hours * 3600 * SECOND
 
     @rule(lost=st.integers(1, 3))
     def drop(self, lost: int) -> None:
-        """Frames are lost for good, before any network."""
         self.seq += lost
 
     @precondition(lambda self: self.under_way)
     @rule(data=st.data())
     def deliver(self, data: st.DataObject) -> None:
-        """Any message that is under way arrives."""
         self.receive(self.under_way.pop(data.draw(st.integers(0, len(self.under_way) - 1))))
 
     @precondition(lambda self: self.under_way)
     @rule()
     def deliver_next(self) -> None:
-        """The next message arrives."""
         self.receive(self.under_way.pop(0))
 
     @precondition(lambda self: self.sent)
     @rule(data=st.data())
     def repeat(self, data: st.DataObject) -> None:
-        """Anything that was ever sent arrives, perhaps again."""
         self.receive(data.draw(st.sampled_from(self.sent)))
 
     @precondition(lambda self: self.sent)
@@ -100,7 +93,6 @@ class Disturbed(RuleBasedStateMachine):
 
     @rule(periods=st.integers(1, 30))
     def wait(self, periods: int) -> None:
-        """Time passes for the service."""
         self.now_ns += periods * SECOND // 10
         self.merged.take(self.session.on_tick(self.now_ns), self.session.run)
 

@@ -259,8 +259,6 @@ def test_what_a_checkpoint_contains_has_had_time_to_leave() -> None:
     written: list[float] = []
 
     class Watched(SqliteStore):
-        """Notes when it is written to."""
-
         def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
             written.append(time.monotonic())
             return super().save(checkpoints)

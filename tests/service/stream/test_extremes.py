@@ -73,7 +73,6 @@ def test_a_covariance_that_no_message_can_carry_is_not_published() -> None:
 
 
 def told(found: optipmb.Tracks, paths: optipmb.PredictedPaths | None = None) -> schemas.Tracks:
-    """The message for tracks."""
     return convert.tracks_of(
         optipmb.StepResult(None, found, None, paths),  # type: ignore[arg-type]  # of the tracks alone
         SENSOR.stream,
@@ -138,7 +137,6 @@ def test_paths_that_no_message_can_carry_are_not_published(entry: str, value: fl
 
 
 def tracks_after(frames: int) -> optipmb.Tracks:
-    """The tracks of the sensor's objects after some frames."""
     tracker = optipmb.Tracker(NUSCENES)
     density = tracker.initial()
     for seq in range(frames):

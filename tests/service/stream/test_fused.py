@@ -43,7 +43,6 @@ def in_order(count: int = 6) -> list[Detections]:
 
 
 def given_to(session: Session, frames: list[Detections]) -> list[Any]:
-    """What a session makes of frames."""
     return [output for frame in frames for output in session.on_detections(frame, 0)]
 
 
@@ -279,10 +278,7 @@ def test_what_is_remembered_of_sensors_is_bounded() -> None:
 
 
 class Tired(optipmb.Tracker):
-    """Refuses frames of seven objects for their effort."""
-
     def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
-        """Refuse, or go on."""
         if len(frame.score) == 7:
             raise optipmb.EffortError("pairs", "at most 7", "8")
         return super().step(density, frame)

@@ -102,13 +102,10 @@ def test_a_crowd_in_one_place_costs_its_stream_alone(start: Callable[..., Any]) 
 
 
 class Slow:
-    """A tracker whose steps take a while of processor time once."""
-
     def __init__(self, parameters: optipmb.Parameters, busy: list[float]) -> None:
         self._tracker, self._busy = optipmb.Tracker(parameters), busy
 
     def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
-        """Step, after computing for as long as is asked."""
         ends = time.thread_time() + (self._busy.pop() if self._busy else 0.0)
         while time.thread_time() < ends:
             pass

@@ -36,8 +36,6 @@ SENSOR = Sensor()
 
 
 class Message(NamedTuple):
-    """Tracks of a frame, as they are kept."""
-
     seq: int
     order: tuple[int, int] = (1, 0)
     stamp_ns: int = 0
@@ -48,12 +46,10 @@ class Message(NamedTuple):
 
 
 def at(*seqs: int, **fields: Any) -> list[Message]:
-    """Messages of frames whose stamps are their numbers in seconds."""
     return [Message(seq=seq, stamp_ns=seq * 10**9, **fields) for seq in seqs]
 
 
 def seqs(messages: Iterable[Any]) -> list[int]:
-    """Their numbers."""
     return [one.seq for one in messages]
 
 

@@ -41,7 +41,6 @@ def resident_mb(process: int) -> float:
 
 @pytest.fixture(scope="module")
 def busy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceProcess]:
-    """A service with its own router and a store, 50 streams of 40 objects in it."""
     optipmb.warm_up()  # a process that compiles keeps the compiler's memory
     sensors = [replace(SENSOR, stream=f"site/node{k}/lidar", objects=40) for k in range(STREAMS)]
     environment = {"OPTIPMB_STORE": str(tmp_path_factory.mktemp("store"))}

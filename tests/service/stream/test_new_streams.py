@@ -44,29 +44,24 @@ class Network:
         """Nothing comes here."""
 
     def watch_streams(self, published: Callable[..., None], discovered: Callable[..., None]) -> None:
-        """Tell of the streams that there are."""
         for stream in self._announced:
             discovered(KEYS.discovered([stream], "other", "run"), True)
         for stream in self._published:
             published(f"{KEYS.detections(stream)}/@adv/pub/1/2/_", "token", True)
 
     def subscribe(self, kind: str, stream: str, *, cached: bool) -> None:
-        """Note it."""
         self.subscribed.append((kind, stream, cached))
 
     def unsubscribe(self, inputs: Iterable[object]) -> None:
-        """Nothing is withdrawn here."""
         assert not list(inputs)
 
     def watch_owners(self, told: Callable[..., None] | None) -> None:
         """Nobody is heard of."""
 
     def discover(self, streams: set[str]) -> None:
-        """Nothing is announced here."""
         assert not streams
 
     def ask_recent(self, sessions: Sequence[str]) -> list[object]:
-        """Note it; nobody has anything."""
         asked = {session for group in self.asked for session in group}
         self.unasked.append(len({stream for _, stream, _ in self.subscribed} - asked))
         self.asked.append(list(sessions))
@@ -74,19 +69,15 @@ class Network:
 
 
 class Following(Network):
-    """Keeps what is subscribed to."""
-
     def __init__(self) -> None:
         super().__init__()
         self.now: set[tuple[str, str, bool]] = set()
 
     def subscribe(self, kind: str, stream: str, *, cached: bool) -> None:
-        """Add it."""
         assert (kind, stream, cached) not in self.now
         self.now.add((kind, stream, cached))
 
     def unsubscribe(self, inputs: Iterable[object]) -> None:
-        """Take it away."""
         left: Any = set(inputs)
         assert left <= self.now
         self.now -= left
@@ -96,8 +87,6 @@ class Following(Network):
 
 
 class Holding:
-    """A member that holds some partitions, which may change."""
-
     strained = False
 
     def __init__(self, held: set[int]) -> None:
@@ -105,16 +94,13 @@ class Holding:
 
     @property
     def partitions(self) -> set[int]:
-        """Return those of this moment."""
         return set(self._held)
 
     def holds(self, stream: str) -> bool:
-        """Whether a stream is of one of them."""
         return partition_of(stream) in self._held
 
 
 def member_of(network: Network, held: set[int]) -> tuple[Intake, Any]:
-    """Return the intake of a member that holds some partitions and tracks nothing yet."""
     streams = SimpleNamespace(
         on_owner=lambda: None,
         doubts_owners=False,
@@ -144,17 +130,14 @@ class Turning:
 
     @property
     def partitions(self) -> set[int]:
-        """Return them."""
         return self._held()
 
     @property
     def strained(self) -> bool:
-        """Whether it renews its lease late."""
         return bool(self._member.strained)
 
 
 def run(network: Network, intake: Intake, done: Callable[[], bool]) -> None:
-    """Have an intake work until something is reached."""
     intake.start()
     try:
         ends = time.monotonic() + WAIT_S
@@ -314,11 +297,9 @@ class Others(Around):
         self.problems: list[str] = []
 
     def holds(self, _: str) -> bool:
-        """Return whether this member has the streams."""
         return self.holding
 
     def report(self, problem: Any, _: int) -> None:
-        """Note a problem."""
         self.problems.append(problem.code)
 
 
@@ -332,11 +313,9 @@ class Kept:
         self.streams = streams_of(self.others, reporter=self.others, **settings)
 
     def crowded(self, crowded: bool) -> None:  # noqa: FBT001 - the state itself
-        """Say whether too many streams are new."""
         self._patch.setattr(streams, "MAX_UNPROVEN", 0 if crowded else 256)
 
     def tracked(self) -> list[int]:
-        """Return the counts of frames, by session, after all turns."""
         self.others.run()
         return [state.frames for one in self.streams.tracking() if (state := one.state()) is not None]
 
@@ -345,7 +324,6 @@ SENSOR = Sensor(STREAMS[0])
 
 
 def detections(number: int) -> Packet:
-    """Return a frame of a stream."""
     return packet_of(SENSOR.detections(number))
 
 

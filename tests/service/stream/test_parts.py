@@ -103,7 +103,6 @@ def test_a_step_that_does_not_end_does_not_keep_the_scheduler() -> None:
 
 
 def problem(stream: str = "a/b/c", code: str = "late", count: int = 1) -> Problem:
-    """Some problem."""
     return problem_of(code, stream=stream, instance="x", message="m", count=count)
 
 

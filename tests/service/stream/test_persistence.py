@@ -27,7 +27,6 @@ FIRST, SECOND = Sensor("site/first/lidar"), Sensor("site/second/lidar")
 
 
 def snapshot(sensor: Sensor) -> Checkpoint:
-    """The state of a session without a frame."""
     return Session(sensor.stream, optipmb.load_profile("nuscenes")).snapshot()
 
 
@@ -41,7 +40,6 @@ class Full(SqliteStore):
         self.may_fail = threading.Semaphore(0)
 
     def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
-        """Save, or fail."""
         if not self.full:
             return super().save(checkpoints)
         self.tries.release()

@@ -24,19 +24,16 @@ POLICY = Policy()
 
 
 def frame(seq: int, x: float) -> Detections:
-    """A frame of a sensor at x, with objects around it."""
     pose = Pose(translation=np.array([x, 0.0, 0.0]), quaternion=np.array([1.0, 0, 0, 0]))
     center = SENSOR.detections(seq).center
     return SENSOR.detections(seq, frame="sensor", pose=pose, center=center)
 
 
 def feed(one: Session, places: dict[int, float]) -> list[Output]:
-    """Give frames by number and place."""
     return [output for seq, x in places.items() for output in one.on_detections(frame(seq, x), 0)]
 
 
 def session(**changes: Any) -> Session:
-    """A session of the sensor's stream."""
     return Session(SENSOR.stream, NUSCENES, **changes)
 
 

@@ -28,7 +28,6 @@ AGAIN = replace(SENSOR, epoch=b"b" * 16, start_s=SENSOR.start_s + 1.5)
 
 
 def session(**changes: Any) -> Session:
-    """A session whose tracker raises for seven objects."""
     return Session(SENSOR.stream, NUSCENES, tracker=Failing, **changes)
 
 
@@ -93,10 +92,7 @@ def test_a_late_frame_that_fails_leaves_the_rest_alone() -> None:
 
 
 class FailingClouds(optipmb.Tracker):
-    """Raises for a cloud of seven points."""
-
     def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
-        """Step, or raise."""
         if frame.cloud is not None and len(frame.cloud.xyz) == 7:
             raise ZeroDivisionError("seven")
         return super().step(density, frame)
@@ -147,10 +143,7 @@ def test_a_dump_leads_to_the_same_density() -> None:
     seen: list[bytes] = []
 
     class Noting(Failing):
-        """Notes each density that comes in."""
-
         def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
-            """Note and step."""
             seen.append(b"".join(column.tobytes() for column in optipmb.columns_of(density).values()))
             return super().step(density, frame)
 

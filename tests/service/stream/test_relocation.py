@@ -32,14 +32,12 @@ BACK = optipmb.Relocation(-4.0, 20.0, -1.5, math.radians(-40.0))
 
 
 def announced(motion: optipmb.Relocation, world: int = 1) -> Relocation:
-    """The part of a message that says how its world came about."""
     half = 0.5 * motion.theta
     turn = np.array([math.cos(half), 0.0, 0.0, math.sin(half)])
     return Relocation(world=world, translation=np.array(motion[:3]), quaternion=turn)
 
 
 def moved(message: Detections, *motions: optipmb.Relocation) -> dict[str, Any]:
-    """The fields of a message in the world after motions."""
     fields = {name: getattr(message, name) for name in ("center", "yaw", "velocity", "pose")}
     for motion in motions:
         if message.pose is not None:
@@ -54,18 +52,15 @@ def moved(message: Detections, *motions: optipmb.Relocation) -> dict[str, Any]:
 
 
 def relocated(message: Detections, *motions: optipmb.Relocation, said: bool = True) -> Detections:
-    """A message in the world after motions, which it announces."""
     relocation = announced(motions[-1], len(motions)) if motions and said else None
     return message.model_copy(update=moved(message, *motions) | {"relocation": relocation})
 
 
 def session(**changes: Any) -> Session:
-    """A session of the sensor's stream."""
     return Session(SENSOR.stream, PROFILE, **changes)
 
 
 def feed(one: Session, messages: Iterable[Detections], now_ns: int = 0) -> list[Output]:
-    """Give messages to a session."""
     return [output for message in messages for output in one.on_detections(message, now_ns)]
 
 

@@ -23,7 +23,6 @@ WAIT_NS = Policy().cloud_wait_ns
 
 
 def session(**changes: Any) -> Session:
-    """A session of the sensor's stream."""
     return Session(SENSOR.stream, NUSCENES, **changes)
 
 

@@ -25,12 +25,10 @@ LOST = 10
 
 
 def session(**changes: Any) -> Session:
-    """A session of the sensor's stream."""
     return Session(SENSOR.stream, NUSCENES, instance="test", **changes)
 
 
 def feed(one: Session, seqs: Any, sensor: Sensor = SENSOR, **changes: Any) -> list[Output]:
-    """Give frames to a session at time zero."""
     return sessions.feed(one, seqs, sensor, **changes)
 
 

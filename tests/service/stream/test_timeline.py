@@ -22,7 +22,6 @@ A, B, C = (bytes([letter]) * 16 for letter in b"abc")
 
 
 def mark(seq: int, seconds: float, epoch: bytes = A) -> FrameId:
-    """A frame by number and seconds."""
     return FrameId(epoch, seq, round(seconds * SECOND))
 
 
@@ -46,7 +45,6 @@ def judge_all(marks: list[FrameId], *, window: bool = False) -> tuple[list[Decis
 
 
 def verdicts(marks: list[FrameId], *, window: bool = False) -> list[Verdict]:
-    """The verdicts on frames."""
     return [decision.verdict for decision in judge_all(marks, window=window)[0]]
 
 

@@ -25,7 +25,6 @@ TRACED = {str(Path(module.__file__)) for module in (stream, backlog)}
 
 
 def packet(seq: int) -> Packet:
-    """Return a frame as it comes."""
     return packet_of(SENSOR.detections(seq))
 
 

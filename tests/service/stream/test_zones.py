@@ -48,7 +48,6 @@ def final(outputs: Iterable[Output]) -> list[Event]:
 
 
 def in_order(policy: Policy = POLICY, frames: int = 40) -> tuple[list[Event], Session]:
-    """Return the events of frames in order."""
     session = Session(SENSOR.stream, PROFILE, policy)
     return final(feed(session, range(frames), SENSOR)), session
 
@@ -139,13 +138,11 @@ class Reader(Around):
         self.problems: list[Problem] = []
 
     def publish_events(self, payload: bytes) -> None:
-        """Read a message."""
         message = decode(payload, Events)
         self.messages.append(message)
         self.final += self.merged.take(message)
 
     def report(self, problem: Problem, _: int) -> None:
-        """Note a problem."""
         self.problems.append(problem)
 
     def serve(self, seqs: Iterable[int], lost: Iterable[int] = (), sensor: Sensor = SENSOR, **settings: Any) -> None:
@@ -167,7 +164,6 @@ class Reader(Around):
             self.run()
 
     def keep(self, streams: Streams) -> None:
-        """Write the states."""
         streams.keep()
         self.run()
         for checkpoint in self.kept.values():
@@ -175,13 +171,11 @@ class Reader(Around):
 
     @property
     def events(self) -> list[tuple[object, ...]]:
-        """The events of all frames, final or not."""
         rest = sorted(self.merged.held.values(), key=lambda one: one.stamp_ns)
         return told([*self.final, *rest])
 
 
 def told(messages: Iterable[Events]) -> list[tuple[object, ...]]:
-    """Return the events of messages."""
     return [
         (event.zone, event.kind, event.n, event.id, one.labels[event.label], event.at_ns, event.position)
         for one in messages
