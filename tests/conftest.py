@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 HERE = Path(__file__).parent
 
-# What a shell starts in the background ignores it, and hands that on to what it starts.
+# Background processes of a shell ignore it, and their children inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 forked.ALLOWED = True

@@ -1,6 +1,6 @@
 """The first ten minutes of four people: from an empty environment and the wheels to tracks, with what each of it took.
 
-What they type is taken from README.md and docs/messages.md. Nothing of the source tree can be imported.
+The commands come from README.md and docs/messages.md. Nothing of the source tree can be imported.
 Called as: python tests/paths.py DIST [PATH...]
     DIST  folder with the two wheels
     PATH  those to walk: csv python node kitti; default: all
@@ -87,7 +87,7 @@ class Environment:
         return sum(file.stat().st_blocks for file in files) * 512 / 2**20
 
     def run(self, program: str, *arguments: object, folder: Path | None = None, status: int = 0) -> str:
-        """Run a program of the environment and return what it printed; it must end with the status."""
+        """Run a program of the environment and return its output; it must end with the status."""
         command = [str(self.folder / "bin" / program), *map(str, arguments)]
         done = subprocess.run(
             command,
@@ -103,7 +103,7 @@ class Environment:
         return done.stdout if status == 0 else done.stderr
 
     def start(self, program: str, *arguments: object) -> "subprocess.Popen[str]":
-        """Start a program of the environment; what it says on standard error goes into a file."""
+        """Start a program of the environment; its standard error goes into a file."""
         command = [str(self.folder / "bin" / program), *map(str, arguments)]
         with (self.work / f"{program}.log").open("w") as log:
             return subprocess.Popen(

@@ -142,7 +142,7 @@ def test_class_names_and_indices_say_the_same(names: list[str]) -> None:
 
 
 class Recorder:
-    """In the place of a connection: keeps what is sent."""
+    """A connection that only records sent messages."""
 
     def __init__(self, sent: list[bytes], *, wanted: bool) -> None:
         self.wanted = wanted
@@ -374,7 +374,7 @@ def settle(subscriber: Subscriber, service: Service) -> None:
 
 
 def received(subscriber: Subscriber, count: int) -> list[Tracks]:
-    """What arrives: so many messages, and those that come behind them until the subscriber's timeout."""
+    """Return `count` messages and all further ones until the subscriber's timeout."""
     first = [subscriber.receive(DEADLINE_S) for _ in range(count)]
     return [*(one.tracks for one in first if one is not None), *subscriber]
 

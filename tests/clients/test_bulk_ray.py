@@ -108,7 +108,7 @@ def test_killed_workers_of_a_local_cluster_lose_nothing(data: Path, plain: dict[
 
 
 def test_commands_give_what_one_process_gives(cluster: Any, tmp_path: Path) -> None:
-    """`track`, `evaluate` and `tune` with `--ray ADDRESS` write and print what they do in one process."""
+    """`track`, `evaluate` and `tune` with `--ray ADDRESS` write and print the same as in one process."""
     few = ("--trials", "2", "--folds", "0", "--profile", "kitti-paper", "--classes", "Car")
     for name, options in (("plain", ()), ("ray", ("--ray", cluster.address))):
         for out in (tmp_path / name / "files", tmp_path / name / "t.csv"):
@@ -126,7 +126,7 @@ def test_commands_give_what_one_process_gives(cluster: Any, tmp_path: Path) -> N
 
 
 def test_a_killed_node_loses_nothing(cluster: Any, data: Path, plain: dict[str, bytes], tmp_path: Path) -> None:
-    """A node is killed in the middle of a recording, a worker in the middle of another: the bytes are those of one."""
+    """With a node and a worker killed during recordings, results equal one process byte for byte."""
     mark = tmp_path / "r050.begun"
     victims: list[str] = []
 

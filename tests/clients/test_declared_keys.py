@@ -1,4 +1,4 @@
-"""The keys that one connection can declare in its life: what is opened beyond is refused, and nothing is lost."""
+"""Keys that one connection can declare in its life: more are refused, and nothing is lost."""
 
 from __future__ import annotations
 

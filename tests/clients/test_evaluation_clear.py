@@ -23,7 +23,7 @@ Row = tuple[int, int, float]
 
 
 def truth_of(rows: Iterable[Row], *, ignored: Iterable[Row] = ()) -> Truth:
-    """Give truth cars along x; the ignored rows are those that are in both."""
+    """Give truth cars along x; rows in `ignored` are marked so."""
     table, hidden = sorted(rows), set(ignored)
     places = [place for place, row in enumerate(table) if row in hidden]
     return evaluation_cases.truth_of([(*row, 0.0) for row in table], ignored=places)

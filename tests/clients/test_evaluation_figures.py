@@ -146,7 +146,7 @@ def figures_of(kitti: tuple[Path, Path], results: Path, capsys: pytest.CaptureFi
 def test_results_without_image_boxes_are_projected(
     kitti: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """With -1 or 0 in the place of all image boxes the figures are those of projected boxes, and a line says so."""
+    """With -1 or 0 in place of all image boxes, figures use projected boxes, and a line says so."""
     shown = tmp_path / "shown"
     shown.mkdir()
     for one in open_dataset("kitti", kitti[0]).sequences(["all"]):

@@ -115,7 +115,7 @@ def test_a_box_ahead_is_projected_by_its_near_face() -> None:
 
 @pytest.mark.parametrize("center", [(-11.0, 0.0, 0.0), (11.0, 40.0, 0.0), (11.0, 0.0, 30.0)])
 def test_a_box_that_no_image_shows_is_without_height(center: tuple[float, float, float]) -> None:
-    """Behind the camera, beside its view and above it: 0 0 0 0."""
+    """Behind the camera, outside its view and above it: 0 0 0 0."""
     box, seen = image_box(center)
     assert not seen
     np.testing.assert_array_equal(box, np.zeros(4))

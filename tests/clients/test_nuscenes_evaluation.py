@@ -184,7 +184,7 @@ def test_unreached_recalls_count_as_the_worst() -> None:
 
 
 def test_no_tracks_give_the_worst_figures() -> None:
-    """Without any track nothing breaks: zero recall and accuracy, all missed and lost, what nobody knows undefined."""
+    """Without tracks: zero recall and accuracy, all missed and lost, undefined figures are NaN."""
     scores = cars(TWO, [])
     assert (scores.amota, scores.amotp) == (0.0, 2.0)
     best = scores.best
@@ -444,7 +444,7 @@ def test_results_without_any_box_are_no_error(root: Path, tmp_path: Path) -> Non
 
 
 def test_scenes_to_evaluate_can_be_chosen(root: Path, tmp_path: Path) -> None:
-    """Scenes are those of the file, or those asked for; in memory and by files the figures are the same."""
+    """Scenes are taken from the file or from the argument; in memory and by files the figures are the same."""
     sequences = NuScenesDataset(root).sequences(["all"])
     tracks = {one.name: disturbed_tracks(one, 4) for one in sequences}
     both = evaluated(root, tmp_path, tracks)
@@ -489,7 +489,7 @@ def recorded(root: Path, name: str) -> tuple[NuScenesDataset, list[Rows]]:
 
 @pytest.mark.parametrize("name", AGREED)
 def test_figures_are_those_of_the_official_tools(tmp_path: Path, name: str) -> None:
-    """On the recorded scene the figures are still those that the official tools agreed with (devkit/)."""
+    """On the recorded scene the figures still equal the official tools (devkit/)."""
     dataset, tracks = recorded(nuscenes_root(), name)
     (sequence,) = dataset.sequences(["mini_val"])
     shown = evaluate_nuscenes(nuscenes_root(), write(dataset, sequence, tracks, tmp_path)).to_json()

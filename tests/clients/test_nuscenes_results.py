@@ -65,7 +65,7 @@ def test_what_is_written_is_read_again(root: Path, tmp_path: Path) -> None:
 
 
 def test_every_sample_is_there(root: Path, tmp_path: Path) -> None:
-    """Samples without tracks, and frames never added, have an empty list; the meta is that of the detections."""
+    """Samples without tracks, and frames never added, have an empty list; the meta comes from the detections."""
     dataset = NuScenesDataset(root)
     (sequence,) = dataset.sequences(["scene-0103"])
     dataset.write(tmp_path, sequence, {2: rows(3), 3: rows(0)})
@@ -186,7 +186,7 @@ def track_box(**changes: Any) -> dict[str, Any]:
 
 
 def test_foreign_ids_are_numbered(tmp_path: Path) -> None:
-    """Ids of other trackers, whatever text or number they are, become numbers in order of appearance."""
+    """Ids of other trackers, text or number, become numbers in order of appearance."""
     path = tmp_path / "other.json"
     boxes = {"s0": [track_box(tracking_id="x9"), track_box(tracking_id=4)], "s1": [track_box(tracking_id="4")]}
     path.write_text(json.dumps({"meta": {}, "results": boxes}))

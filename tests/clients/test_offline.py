@@ -1,4 +1,4 @@
-"""Tracking in process: files that repeat, classes, profiles, and what is refused."""
+"""Tracking in process: repeatable files, classes, profiles, and refused input."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -91,7 +91,7 @@ def test_chosen_classes_are_the_only_ones() -> None:
 
 
 def test_a_class_that_the_data_lack_is_refused(dataset: Dataset) -> None:
-    """The error names the class and those that there are."""
+    """The error names the class and the known ones."""
     (sequence,) = dataset.sequences(["0000"])
     with pytest.raises(UsageError, match=r"'Tram'.*Car"):
         next(selected_frames(sequence, ["Tram"]))

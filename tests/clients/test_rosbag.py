@@ -283,7 +283,7 @@ def set_at(path: str, value: Any) -> Callable[[dict[str, Any]], None]:
     ],
 )
 def test_a_wrong_value_is_named(scene: DataSequence, place: str, value: object, text: str, tmp_path: Path) -> None:
-    """A wrong value is told with topic, time and field; a message without a pose is left out with a note."""
+    """A wrong value is reported with topic, time and field; a message without a pose is left out with a note."""
     path = changed(scene, tmp_path / "wrong.mcap", lambda one: of_detections(one, set_at(place, value)))
     try:
         (sequence,) = open_dataset("rosbag", path).sequences(["all"])
@@ -317,7 +317,7 @@ def test_a_bag_without_detections_is_reported(scene: DataSequence, tmp_path: Pat
 def test_classes_of_any_name_are_tracked(
     scene: DataSequence, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Without a profile one is made for the bag; with one, classes are renamed to those that it has."""
+    """Without a profile one is made for the bag; with one, classes are renamed to its classes."""
     numbers = {"Car": "0", "Pedestrian": "1", "Cyclist": "2"}
 
     def change(one: bags.Sent) -> bags.Sent:

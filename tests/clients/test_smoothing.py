@@ -33,7 +33,7 @@ def sequence() -> DataSequence:
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_states_are_smoothed_as_the_article_has_it(*, turned: bool) -> None:
-    """Interleaved tracks, also where the filter turned a state by pi on the way, become those of the textbook."""
+    """Interleaved tracks, also with a state turned by pi on the way, equal the textbook smoother."""
     rng, table = np.random.default_rng(3), ClassTable.of(load_profile("kitti"))
     times = np.cumsum(rng.uniform(0.05, 0.3, 8) * 1e9).astype(np.int64)
     starts = rng.normal((50.0, -20.0, 6.0, 2.0, 0.1, 0.3), 1.0, (3, 6))

@@ -152,7 +152,7 @@ def test_a_header_alone_gives_columns_without_rows(tmp_path: Path) -> None:
 
 
 def test_lines_are_counted_with_comments_and_blank_lines(tmp_path: Path) -> None:
-    """The line of a row is that of the file, whatever was left out before it."""
+    """The line of a row is the line in the file, also after rows left out."""
     (tmp_path / "d.csv").write_text("# made by hand\nt,x\n\n1,2\n# later\n3,4\n")
     assert [line_of(tmp_path / "d.csv", row) for row in (0, 1)] == [4, 6]
     (tmp_path / "d.txt").write_text("# t x\n1 2\n3 4\n")
@@ -270,7 +270,7 @@ def test_a_folder_of_kitti_object_results_is_one_recording(tmp_path: Path, capsy
 
 
 def test_a_folder_reads_its_tables_and_no_notes(tmp_path: Path) -> None:
-    """A text or JSON file beside tables is no recording."""
+    """A text or JSON file next to tables is no recording."""
     (tmp_path / "many").mkdir()
     write_table(tmp_path / "many" / "a.csv", boxes())
     (tmp_path / "many" / "README.txt").write_text("Boxes of a car park.\n")

@@ -46,7 +46,7 @@ def test_a_restart_is_no_negative_rate() -> None:
 
 
 def test_the_worst_come_first_and_the_rest_is_counted() -> None:
-    """With more streams than lines those that lose frames, then the silent, then the late are shown."""
+    """With more streams than lines, streams that lose frames come first, then the silent, then the late."""
     well = [session(f"a/b/well-{number:02}") for number in range(50)]
     late, silent = session("z/z/late", latency_p99_ms=300.0), session("z/z/silent", state="stale")
     view = StatusView("here")

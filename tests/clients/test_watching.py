@@ -1,4 +1,4 @@
-"""What is shown in Rerun of messages, and the command that shows it."""
+"""Messages shown in Rerun, and the command that shows them."""
 
 import subprocess
 import sys
@@ -28,7 +28,7 @@ DEADLINE_S = 60.0
 
 
 class Log:
-    """Stands for a Rerun recording: keeps what was logged last under each path."""
+    """A Rerun recording that keeps the newest entry of each path."""
 
     def __init__(self) -> None:
         self.entities: dict[str, tuple[Any, ...]] = {}
@@ -107,7 +107,7 @@ def cloud() -> Points:
 
 
 def test_tracks_are_boxes_of_their_colour_with_id_and_existence() -> None:
-    """Place, size, turn, velocity and colour are those of the message; only the surer ones have a label."""
+    """Place, size, turn, velocity and colour equal the message; only the surer tracks have a label."""
     log = Log()
     View(log).show(tracks(1, [3, 10, 11]))  # type: ignore[arg-type]  # stands for a recording
     path = f"{STREAM}/tracks"
@@ -125,7 +125,7 @@ def test_tracks_are_boxes_of_their_colour_with_id_and_existence() -> None:
 
 
 def test_ellipses_are_two_standard_deviations_long_and_turned() -> None:
-    """The covariance of the position is drawn along its own axes, whatever the other states are."""
+    """The covariance of the position is drawn along its own axes, for any other states."""
     turn, long, short = 0.6, 3.0, 0.5
     c, s = np.cos(turn), np.sin(turn)
     covariance = np.eye(6) * 100.0
@@ -151,7 +151,7 @@ def test_trails_are_the_last_five_seconds() -> None:
 
 
 def test_detections_and_clouds_are_shown_in_the_world() -> None:
-    """What comes in the sensor's frame is carried to where the sensor stood; the sensor is shown too."""
+    """Objects in the sensor's frame are moved to the sensor's pose; the sensor is shown too."""
     log = Log()
     view = View(log)  # type: ignore[arg-type]  # as above
     view.show(detections())
@@ -164,7 +164,7 @@ def test_detections_and_clouds_are_shown_in_the_world() -> None:
 
 
 def test_components_are_faint_ellipses_on_a_path_of_their_own() -> None:
-    """Place and covariance are those of the message; weight is the size of the point, and how dark both are."""
+    """Place and covariance equal the message; weight is the size of the point, and how dark both are."""
     log = Log()
     view = View(log)  # type: ignore[arg-type]  # as above
     view.show(density())
@@ -206,7 +206,7 @@ def test_only_streams_with_new_tracks_are_asked() -> None:
 
 
 def test_the_layout_is_sent_once_and_axes_have_metres() -> None:
-    """One layout, for the first stream; numbered axes near the sensor; a legend that names what is drawn."""
+    """One layout, for the first stream; numbered axes near the sensor; a legend of the drawn items."""
     log = Log()
     view = View(log)  # type: ignore[arg-type]  # as above
     view.show(detections())
@@ -230,7 +230,7 @@ def test_stamps_since_1970_are_times_and_small_ones_seconds() -> None:
 
 
 def test_colours_can_be_told_apart() -> None:
-    """Seven colours, all different, and the eighth track has that of the first."""
+    """Seven colours, all different; the eighth track repeats the first."""
     assert len(set(COLOURS)) == 7
     assert colour_of(0) == colour_of(7) == "#0072B2"
     assert rgb_of(0) == (0, 0x72, 0xB2)

@@ -1,4 +1,4 @@
-"""Certificates that end: who says so, and where; what is renewed is used."""
+"""Certificates that expire: who reports it, and where; a renewed one is used."""
 
 from __future__ import annotations
 

@@ -121,7 +121,7 @@ def _held(member: ServiceProcess) -> int:
 def test_members_take_over(cluster: Cluster, capsys: pytest.CaptureFixture[str]) -> None:
     """Fault 17: a member is killed, one on another router frozen and woken, a third ended: all goes on, to the byte.
 
-    The sessions stay the same ones, so no id is used twice. The frozen one publishes nothing of what it would have
+    The sessions stay the same ones, so no id is used twice. The frozen one publishes nothing that it would have
     tracked, says that it has lost its lease, and gets its share of the partitions again.
     """
     node = cluster.node
@@ -445,7 +445,7 @@ def test_a_member_that_dies_before_a_purge(cluster: Cluster) -> None:
 
 
 def test_a_member_that_was_cut_off_contests_nothing(tmp_path: Path) -> None:
-    """The member that looks at who tracks what is cut off for longer than links last: when all is whole, no problem."""
+    """The member that assigns streams is cut off for longer than links last: afterwards no problem remains."""
     (tmp_path / "nats").mkdir()
     names = ("a", "b", "c")
     with (
@@ -537,7 +537,7 @@ def test_the_server_is_gone_for_longer_than_a_lease(cluster: Cluster) -> None:
     """
     node, nats = cluster.node, cluster.nats
     assert nats is not None
-    service = cluster.member("pair", workers=2, lease_s=6.0)  # long, so that a busy machine costs nobody its lease
+    service = cluster.member("pair", workers=2, lease_s=6.0)  # long, so that no lease ends on a busy machine
     send(node, 0, 10, sensors=SENSORS)
     until(lambda: service.errors.count("held=32 ") == 2, "each worker holds half of the partitions")
     cluster.check(10, "pair-w0", "pair-w1")

@@ -109,7 +109,7 @@ async def test_every_edge_gives_the_text_of_the_published_tracks(service: Servic
 
 
 def test_the_example_page_draws_tracks(service: ServiceProcess, tmp_path: Path) -> None:
-    """Opened from a file, an origin that the settings name, it shows what is tracked; its console stays empty."""
+    """Opened from a file, an origin in the settings, it shows the tracks; its console stays empty."""
     over = threading.Event()
 
     def publish() -> None:

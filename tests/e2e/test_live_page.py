@@ -137,7 +137,7 @@ def shown_moving(chrome: Chrome) -> None:
 
 
 def figures(chrome: Chrome) -> None:
-    """A tap on a track shows its existence and score; a tap beside hides them."""
+    """A tap on a track shows its existence and score; a tap elsewhere hides them."""
     for place, hidden in (("toScreen(frame.tracks[1][X], frame.tracks[1][Y])", False), ("[60, 20]", True)):
         chrome.execute_script(
             f"const [x, y] = {place}, box = canvas.getBoundingClientRect();"
@@ -164,7 +164,7 @@ def phone(chrome: Chrome) -> None:
 def test_streams_of_workers_are_shown_and_workers_end_with_their_parent() -> None:
     """With several processes the page of the whole gets the tracks of whichever worker has the stream.
 
-    And kill -9 of the parent, which can tell nobody, leaves no worker behind.
+    And kill -9 of the parent, without any notice, leaves no worker behind.
     """
     with service("--workers", "2") as whole:
         whole.wait_ready()

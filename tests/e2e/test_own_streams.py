@@ -157,7 +157,7 @@ def test_a_member_receives_its_own_streams(pair: Pair, capsys: pytest.CaptureFix
 
 
 def test_a_publisher_without_a_token_is_tracked_from_its_first_frame(pair: Pair) -> None:
-    """Its frames are tracked wherever its partition is, and after a kill -9 of the discoverer, all of them."""
+    """All frames are tracked for any owner of the partition, and after a kill -9 of the discoverer."""
     node = pair.node
     for seq in range(20):
         raw(node, *(sensor.detections(seq) for sensor in SENSORS))

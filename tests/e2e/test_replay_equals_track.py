@@ -67,7 +67,7 @@ def test_scene_at_full_speed(both: Both) -> None:
 
 
 def test_three_streams_at_once(both: Both) -> None:
-    """Three scenes sent at the same time, as fast as can be: each file equals that of its scene alone."""
+    """Three scenes sent at the same time at full speed: each file equals its scene alone."""
     data = (*WITHOUT_CLOUDS, "--sequences", "0000", "0001", "0002")
     both.track(*data)
     assert len({(both.out / "track" / f"000{number}.txt").read_bytes() for number in range(3)}) == 3

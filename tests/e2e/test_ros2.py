@@ -90,7 +90,7 @@ def frames_of(sequence: DataSequence) -> list[list[bags.Sent]]:
 
 
 def publish_static(session: zenoh.Session, domain: int, message: dict[str, Any]) -> Any:
-    """Publish a static transform as rmw_zenoh does, with a cache for who comes late; keep what is returned."""
+    """Publish a static transform as rmw_zenoh does, with a cache for late subscribers; keep the result."""
     key = graph.TopicKey(domain, "/tf_static", TF, hash_by_sdk(TF)).key
     publisher = zenoh.ext.declare_advanced_publisher(
         session,

@@ -1,6 +1,6 @@
 """Who may do what on a protected network: every claim probed from both sides through a real router process.
 
-The router drops what is not allowed without a word. So what must not pass is followed by something that may, on the
+The router drops forbidden messages silently. So each forbidden message is followed by an allowed one, on the
 same link and to the same receiver: when that has come, the first would have come too.
 """
 

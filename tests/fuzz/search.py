@@ -1,6 +1,6 @@
 """Coverage-guided search for bytes that a decoder neither reads nor refuses.
 
-Run it as `python search.py TARGET SECONDS [OPTION...]`; further options are those of libFuzzer. It goes on from the
+Run it as `python search.py TARGET SECONDS [OPTION...]`; further options go to libFuzzer. It goes on from the
 results of earlier searches (out/fuzz), and from the kept files in this folder. Its findings go to `found/TARGET`,
 where the tests take it up, and ends.
 """

@@ -163,7 +163,7 @@ def test_limits_of_a_service_need_no_models(examples: dict[str, Message]) -> Non
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_value_replaced_by_every_other(examples: dict[str, Message], name: str) -> None:
-    """Any value of the message replaced, left out, or written twice: what is read equals the one by the models."""
+    """With any value of the message replaced, left out, or written twice, the result equals the models' result."""
     kind, tree, found = type(examples[name]), msgpack.unpackb(encode(examples[name])), 0
     for path in places(tree)[1:]:
         for value in (*SCALARS, ...):

@@ -411,7 +411,7 @@ def test_the_json_of_the_edges_has_the_numbers_of_the_columns(message: Tracks) -
 def test_a_selection_leaves_out_rows_and_fields(
     message: Tracks, fields: frozenset[str], least: float, confirmed: int
 ) -> None:
-    """The objects that are left are those of the whole text, with the fields that were asked for and `id`."""
+    """The remaining objects equal the whole text, with the requested fields and `id`."""
     selection = Selection(frozenset(message.labels[:1]), bool(confirmed), least, fields)
     whole = {one["id"]: one for one in json.loads(tracks_json(message))["objects"]}
     chosen = json.loads(tracks_json(message, selection))["objects"]

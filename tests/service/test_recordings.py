@@ -3,7 +3,7 @@
 `recordings.json` has, for each scenario, seam and tracker, how many outputs of each kind there were and the digest of
 their bytes. With the `chained` tracker, which hashes the frames in their order, they depend on the service alone. With
 the `filter` they depend on the tracker too, whose numbers may differ on another kind of processor. After a change that
-is meant to change bytes, `OPTIPMB_TEST_RECORD=1 pytest tests/service/test_recordings.py` writes the file anew.
+is meant to change bytes, `OPTIPMB_TEST_RECORD=1 pytest tests/service/test_recordings.py` rewrites the file.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ class SessionSeam:
 
 
 class Process(Around):
-    """The surroundings of a process that may hold the partitions, and records what it publishes."""
+    """The surroundings of a process that may hold the partitions; records published messages."""
 
     def __init__(self, out: Recorded, kept: dict[str, bytes]) -> None:
         super().__init__()

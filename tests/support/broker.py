@@ -29,7 +29,7 @@ class Message:
 
 @dataclass
 class Broker:
-    """Takes what is published, in the versions of the protocol that it knows; reads no subscriptions.
+    """Receives published messages, in the protocol versions that it knows; reads no subscriptions.
 
     Attributes:
         versions: the versions of the protocol that it knows: 4 is 3.1.1.

@@ -1,9 +1,9 @@
 """A seeded world of sensors, a network that disturbs and a service that crashes, all in one loop without time passing.
 
 `World(seed).run()` lets streams send frames and clouds on a fake clock through a fake transport that delays, reorders,
-repeats and garbles them, to sessions that are written down now and then, crash, and are taken up again from their last
-whole checkpoint, with what the publishers' caches hold given again. Beside it the same messages go, once and in order,
-to sessions to which nothing happens. In the end both must be at the same state and have given out the same tracks.
+repeats and garbles them, to sessions that are saved now and then, crash, and are restored from their last whole
+checkpoint and the publishers' caches. The same messages go, once and in order, to undisturbed sessions. In the end both
+must have the same state and have published the same tracks.
 """
 
 from __future__ import annotations

@@ -84,7 +84,7 @@ def write_kitti(root: Path, results: Path, seed: int, sequences: Sequence[str] =
     """Write a small benchmark with all that its rules name but no detections, and disturbed tracks; return its root.
 
     Objects drive ahead of a camera that drives along a bend; some are vans, some hidden or cut by the image for a
-    while, some so near to others that a track could be either's. Tracks are inaccurate, lost and taken up under another
+    while, some so near to others that a track could be either's. Tracks are inaccurate, lost and resumed under another
     id, twice on one object, false, small, or in regions without annotations. Their scores say a little about all that.
     """
     chance = np.random.default_rng(seed)

@@ -3,8 +3,8 @@
 Written from the paper and its published parameters for PointRCNN. Each track is a box [x, y, z, yaw, length, width,
 height] with a constant velocity per frame; measured states start with variance 10 and gain 1 a frame, velocities start
 with 10000 and gain 0.01, detections have variance 1. Detections are assigned by generalised intersection over union or
-by the distance of centres, all at once or the best pair first. A box is written from the third detection on, that of a
-pedestrian from the first, and for a frame or three after the last one, with the log odds of its latest detection. It
+by the distance of centres, all at once or the best pair first. A box is written from the third detection on (a
+pedestrian from the first), and for a frame or three after the last one, with the log odds of its latest detection. It
 works in the world frame, which is what its compensation of the camera's own motion comes to.
 """
 

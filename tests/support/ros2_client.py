@@ -1,6 +1,6 @@
 """A ROS 2 node by zenoh-ros2-sdk, a client of rmw_zenoh that is not ours; definitions and hashes are given to it.
 
-The SDK would fetch definitions of types from the network: it is given those of the product, and computes the hashes of
+The SDK would fetch definitions of types from the network: it gets the product's, and computes the hashes of
 types from them by its own rules.
 """
 
@@ -21,7 +21,7 @@ from zenoh_ros2_sdk import discovery
 from zenoh_ros2_sdk.session import ZenohSession
 from zenoh_ros2_sdk.utils import get_type_hash
 
-# As patient as the product: by default what has waited for a millisecond on a busy machine is dropped, reliable or not.
+# As patient as the product: by default messages that wait for a millisecond are dropped, reliable or not.
 DROP = "transport/link/tx/queue/congestion_control/drop"
 os.environ["ZENOH_CONFIG_OVERRIDE"] = f"{DROP}/wait_before_drop=1000000;{DROP}/max_wait_before_drop_fragments=5000000"
 SEPARATOR = "=" * 80 + "\nMSG: "

@@ -1,7 +1,7 @@
 """Writes `tests/schemas/ros2_reference.json` by ROS 2's own code: run it with a Python that has rclpy.
 
 For each type that is read or published live: the hash that ROS 2 has given the type, one message with another value in
-every field, and its bytes by ROS 2's serialiser. Where ROS 2 pads it leaves whatever is in memory. Packages that an
+every field, and its bytes by ROS 2's serialiser. Padding of ROS 2 holds arbitrary memory. Packages that an
 installation lacks (vision_msgs, autoware_perception_msgs) are built with colcon from their sources.
 
     source /opt/ros/kilted/setup.bash && python3 tests/support/ros2_reference.py

@@ -1,4 +1,4 @@
-"""Compare this project's figures by AB3DMOT's protocol with those of the published evaluation.
+"""Compare this project's figures by AB3DMOT's protocol with the published evaluation.
 
 The published evaluation lives in an environment of its own:
 

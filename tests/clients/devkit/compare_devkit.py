@@ -1,4 +1,4 @@
-"""Compare this project's nuScenes figures with those of the official tools on the same result files.
+"""Compare this project's nuScenes figures with the official tools on the same result files.
 
 The official tools need numpy 1, so they live in an environment of their own:
 
@@ -10,7 +10,7 @@ Then, in the environment of this project, from its root:
     export PYTHONPATH=tests/support
     python tests/clients/devkit/compare_devkit.py --root NUSCENES --devkit /tmp/devkit/bin/python
 
-NUSCENES is a root with `v1.0-mini` of scene-0103 and detections by CenterPoint. What is compared: the truth itself,
+NUSCENES is a root with `v1.0-mini` of scene-0103 and detections by CenterPoint. Compared are the truth itself,
 disturbed truth of several seeds, the greedy tracker on each detector, tracks in one frame only, and disturbed truth of
 generated pairs of scenes, with bicycle racks, unseen objects and uneven stamps. Ends with status 1 when any figure of
 any class, overall, at the best threshold or along the curve, differs by more than 1e-6. With `--keep` and no such

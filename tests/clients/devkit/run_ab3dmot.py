@@ -8,7 +8,7 @@ this project:
 Two accidents of the code are taken out, so that figures depend on nothing but tracks and truth:
 
 - The loop over thresholds keeps or drops the tracks that are exactly at a threshold by the rounding of a mean that is
-  taken again and again (the repackaged one drops them all). Here it is written anew and keeps them.
+  taken again and again (the repackaged one drops them all). This rewrite keeps them.
 - A track box that was matched at one threshold is remembered as matched at all later ones: if nothing matches it there,
   it is false even where it would not count otherwise. Here this is forgotten between thresholds.
 """

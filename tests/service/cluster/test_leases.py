@@ -475,7 +475,7 @@ def test_of_three_servers_one_may_be_lost(tmp_path: Path, monkeypatch: pytest.Mo
 
     Without two of them nothing is saved; when one is back, all goes on.
     """
-    monkeypatch.setattr(nats_connection, "CALL_S", 2.0)  # what is lost with a leader is asked again
+    monkeypatch.setattr(nats_connection, "CALL_S", 2.0)  # calls lost with a leader are repeated
     with NatsTrio(tmp_path) as servers:
         stores = [JetStream(servers.urls, "test") for _ in range(2)]
         members = [HandMember(name, store) for name, store in zip("ab", stores, strict=True)]

@@ -130,7 +130,7 @@ def test_get_stream_and_socket_give_the_same_text(session: Session, address: str
 
 
 def test_all_topics_come_on_one_connection(session: Session, address: str) -> None:
-    """Events and problems are texts of their own, counts too; what was not asked for does not come."""
+    """Events, problems and counts are texts of their own; topics not asked for do not come."""
     expected = [*event_json(events(1, 2)), zones_json(events(1)), problem_json(PROBLEM)]
     with socket(address, f"stream={STREAM}&topics=events,zones,problems&events=now") as connection:
         session.publish(tracks(1), events(1, 2), PROBLEM)
@@ -228,7 +228,7 @@ def test_a_file_of_tokens_that_cannot_be_used_ends_the_start(tmp_path: Path, con
 
 
 def test_pages_of_strangers_open_no_socket(session: Session, address: str) -> None:
-    """A browser names the page's origin and asks nobody before it opens one: only our own and listed origins may."""
+    """A browser names the page's origin without a check of its own: only our own and listed origins may connect."""
     query = f"stream={STREAM}"
     for origin in ("https://evil.example", "http://127.0.0.1:1", "null"):
         assert refused(address, query, origin=origin)[0] == http.client.FORBIDDEN
@@ -321,7 +321,7 @@ async def test_the_rate_is_bounded_in_sensor_time() -> None:
 
 
 async def test_events_come_once_when_they_are_final_or_as_they_are_published() -> None:
-    """A revision replaces what is not final; who wants events now gets both."""
+    """A revision replaces events that are not final; a reader of all events gets both."""
     final, now = (Reader(Wish((ALL,), frozenset({"events"}), final=final)) for final in (True, False))
     corrected = events(1, 3, revision=1)
     published = [events(1, 2), corrected, events(5, 1, final_ns=5)]

@@ -152,7 +152,7 @@ def test_viewers_get_the_newest_frame_and_not_too_often(session: Session, addres
         began = time.monotonic()
         for seq in range(200):
             session.publish(tracks(seq))
-            time.sleep(0.005)  # the pace is what is tested
+            time.sleep(0.005)  # the pace is the claim
         took = time.monotonic() - began
         times = []
         for frame in frames:
@@ -233,7 +233,7 @@ def test_wrong_streams_and_a_service_that_starts_are_shown(watched: Watched, add
 
 
 def test_a_frame_holds_what_is_drawn() -> None:
-    """Tracks by column; detections and the sensor in the world frame, whatever frame they came in."""
+    """Tracks by column; detections and the sensor in the world frame, for either input frame."""
     detections = DETECTIONS
     text = live_frame(publication(tracks(1)), publication(detections))
     assert text is not None
@@ -261,7 +261,7 @@ def test_a_frame_holds_what_is_drawn() -> None:
 
 
 async def test_only_the_newest_is_kept() -> None:
-    """What nobody took in time is replaced; of detections the newest eight are kept, or one that is large."""
+    """Unread frames are replaced; of detections the newest eight are kept, or one that is large."""
     live = Live(None)
     for number in range(10):
         live.receive(publication(DETECTIONS.model_copy(update={"stream": f"site/node/sensor-{number}"})))

@@ -1,4 +1,4 @@
-"""Which caches a session waits for, and how much of those that have answered is remembered."""
+"""Caches that a session waits for, and the bound on remembered answers."""
 
 from __future__ import annotations
 

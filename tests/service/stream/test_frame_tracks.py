@@ -1,4 +1,4 @@
-"""Tracks on their way out: the bytes that are put together without a message are those of the message."""
+"""Output tracks: bytes composed without a message equal the encoded message."""
 
 from __future__ import annotations
 

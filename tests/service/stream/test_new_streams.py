@@ -56,7 +56,7 @@ class Network:
         assert not list(inputs)
 
     def watch_owners(self, told: Callable[..., None] | None) -> None:
-        """Nobody is heard of."""
+        """There are no announcements."""
 
     def discover(self, streams: set[str]) -> None:
         assert not streams
@@ -201,7 +201,7 @@ def test_new_streams_wait_while_the_lease_is_renewed_late(*, cached: bool) -> No
         late.strained = len(steps) < 3
         return set(range(1, PARTITIONS))
 
-    intake._member = Turning(held, late)  # type: ignore[assignment]  # what is used of it
+    intake._member = Turning(held, late)  # type: ignore[assignment]  # the only attribute used
     run(network, intake, lambda: {stream for _, stream, _ in network.subscribed} == own)
     assert steps[:3] == [0, 0, 0]
 
@@ -219,7 +219,7 @@ def test_only_publishers_with_a_cache_are_subscribed_to_with_recovery() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_subscriptions_are_those_of_who_begins_now(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
-    """Whatever streams and partitions came and went before, step by step, and whether publishers have caches.
+    """For all earlier streams and partitions, step by step, with and without caches of publishers.
 
     Of streams whose detections are received no longer it is forgotten that their caches had answered.
     """
@@ -261,7 +261,7 @@ def test_subscriptions_are_those_of_who_begins_now(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.parametrize("fails", ["subscribe", "discover", "ask_recent", "take_up"])
 def test_a_step_that_fails_is_done_again(monkeypatch: pytest.MonkeyPatch, fails: str) -> None:
-    """Sessions that are held while their streams come here are taken up, whatever raised in between."""
+    """Sessions held for an arriving stream are resumed, even after an error in between."""
     network, held = Network(announced=STREAMS[:5], published=STREAMS[5:10]), set[int]()
     intake, member = member_of(network, held)
     kept, taken, failed = set[str](), set[str](), list[str]()
@@ -328,7 +328,7 @@ def detections(number: int) -> Packet:
 
 
 def test_what_others_received_reaches_a_stream_that_was_let_in(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stream that is let in while others are asked for what they received of it gets that as well."""
+    """A stream admitted while others are asked for their received messages gets these as well."""
     kept = Kept(monkeypatch)
     kept.streams.receive(detections(0))
     assert kept.tracked() == []
@@ -367,7 +367,7 @@ def test_what_is_put_off_counts_as_received(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_what_is_put_off_and_dropped_is_shed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the backlogs have no room for, and what has waited for too long, counts as shed, with a problem."""
+    """Messages beyond the backlogs' bounds of size and time count as shed, with a problem."""
     kept = Kept(monkeypatch, standby_mb=1)
     large = packet_of(SENSOR.detections(0, objects=1000))
     room = 2**20 // large.held
@@ -396,7 +396,7 @@ def test_what_is_put_off_is_within_the_quota(monkeypatch: pytest.MonkeyPatch) ->
 def test_what_a_session_passes_on_is_kept_until_it_is_asked_for(
     monkeypatch: pytest.MonkeyPatch, *, asked: bool
 ) -> None:
-    """Frames of a session that leaves are kept also where `standby_s` is 0, and count as shed if nobody asks."""
+    """Frames of a leaving session are kept also where `standby_s` is 0, and count as shed without a request."""
     kept = Kept(monkeypatch, standby_s=0)
     kept.crowded(False)
     held = [packet_of(SENSOR.detections(number, has_points=True)) for number in range(2)]

@@ -86,7 +86,7 @@ def test_silence_gives_a_sensor_time_to_move() -> None:
 @settings(max_examples=20, deadline=None)
 @given(st.permutations(range(8)), st.sets(st.integers(1, 7), max_size=6))
 def test_refusals_do_not_depend_on_arrival(order: list[int], far: set[int]) -> None:
-    """Which frames are astray follows from the frames in order, whatever came when."""
+    """Frames off the path follow from the frames in order, for any order of arrival."""
     places = {seq: 300.0 if seq in far else 0.0 for seq in range(8)}
     one, other = session(tracker=chained), session(tracker=chained)
     feed(one, {seq: places[seq] for seq in order})
@@ -95,7 +95,7 @@ def test_refusals_do_not_depend_on_arrival(order: list[int], far: set[int]) -> N
 
 
 def shifted(seq: int, motion: optipmb.Relocation | None, turn: float = 0.02) -> Detections:
-    """A frame of a sensor that drives along a bend, in the world after a motion that nobody announced."""
+    """A frame of a sensor that drives along a bend, in the world after an unannounced motion."""
     yaw = turn * seq
     pose = optipmb.Pose(
         np.array([50.0 + seq, 0.02 * seq * seq, 1.8]), np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])

@@ -71,7 +71,7 @@ def jumping(count: int = 20, at: int = 10, *motions: optipmb.Relocation) -> list
 
 
 def assert_moved(found: Sequence[Tracks], before: Sequence[Tracks], *motions: optipmb.Relocation) -> None:
-    """Tracks are those of another run in the world after motions: ids and detections equal, numbers nearly."""
+    """Tracks equal another run in the moved world: ids and detections equal, numbers nearly."""
     assert len(found) == len(before)
     for one, other in zip(found, before, strict=True):
         assert one.session == other.session
@@ -120,7 +120,7 @@ def test_no_motion_changes_nothing() -> None:
 
 
 def test_two_motions_are_their_product() -> None:
-    """Tracks after two jumps are those of the run without, moved by both; the tracks say where they happened."""
+    """Tracks after two jumps equal the run without, moved by both; the tracks give the positions of the jumps."""
     messages = [*jumping(10), *jumping(15, 0)[10:], *jumping(25, 0, JUMP, BACK)[15:]]
     found = tracks(feed(session(), messages))
     assert [(one.seq, one.world, one.relocation) for one in found if one.relocation] == [
@@ -252,7 +252,7 @@ def test_a_publisher_may_restart_with_the_numbers_of_its_world() -> None:
 
 @pytest.mark.parametrize("several", [False, True])
 def test_any_numbers_leave_a_state_that_can_be_read(*, several: bool) -> None:
-    """Whatever publishers number, in epochs of theirs: the tracks and the checkpoint hold numbers that they may."""
+    """For any world numbers of publishers and epochs, tracks and checkpoint hold valid numbers."""
     chance = random.Random(4)
     one = Session(FUSED, PROFILE, fused=True, policy=Policy(recovery_wait_ns=0)) if several else session()
     for seq in range(200):

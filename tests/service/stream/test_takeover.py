@@ -1,4 +1,4 @@
-"""A session passes from member to member: whatever comes in between, each of its frames is tracked once."""
+"""A session passes from member to member: each of its frames is tracked once, through all faults."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PARTITION = partition_of(NAME)
 
 
 class Cluster:
-    """A store and a lease that two members share; what they ask of the store waits until the test says so."""
+    """A store and a lease that two members share; their requests to the store wait for the test."""
 
     def __init__(self) -> None:
         self.kept: Checkpoint | None = None
@@ -71,7 +71,7 @@ class World:
         self._take(self.members[0])
 
     def send(self) -> None:
-        """Send a frame to those that receive it: all where no publisher has a cache."""
+        """Send a frame to its receivers: all members where no publisher has a cache."""
         for member in self._receiving if self._cached else self.members:
             member.streams.receive(packet_of(SENSOR.detections(self.sent)))
         self.sent += 1

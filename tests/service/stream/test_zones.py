@@ -1,4 +1,4 @@
-"""Events of zones in sessions: the same whatever came late, after a restore, and with other zones beside."""
+"""Events of zones in sessions: the same with late frames, after a restore, and with further zones."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_a_zone_that_was_changed_begins_anew_and_the_others_go_on() -> None:
 
 
 def test_sessions_without_zones_have_none_in_their_checkpoints() -> None:
-    """Their bytes are those of before."""
+    """Their bytes are unchanged."""
     _, session = in_order(Policy())
     assert b"zones" not in encode_checkpoint(session.snapshot())
 
@@ -146,7 +146,7 @@ class Reader(Around):
         self.problems.append(problem)
 
     def serve(self, seqs: Iterable[int], lost: Iterable[int] = (), sensor: Sensor = SENSOR, **settings: Any) -> None:
-        """Track frames in a process that begins with what was kept, and is killed after its states were kept.
+        """Track frames in a process that starts with the kept states, and is killed after saving its own.
 
         Every fifth frame the states are written too; those behind `lost` never are.
         """
@@ -196,7 +196,7 @@ def told(messages: Iterable[Events]) -> list[tuple[object, ...]]:
     ],
 )
 def test_final_events_never_change(runs: list[tuple[Iterable[int], Iterable[int]]]) -> None:
-    """In order, with late frames and through restarts they are those of a session of frames in order."""
+    """In order, with late frames and through restarts, they equal a session of frames in order."""
     reader = Reader()
     for seqs, lost in (*runs, (range(40, 60), ())):
         reader.serve(seqs, lost)
