@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 HERE = Path(__file__).parent
 
-# What a shell starts in the background ignores it, and hands that on to what it starts.
+# Background processes of a shell ignore it, and their children inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 forked.ALLOWED = True
@@ -45,7 +45,6 @@ def pytest_collection() -> Generator[None, object, object]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that run by a command of their own."""
     marker_of = {HERE / name: marker for marker, names in OTHERS.items() for name in names}
     for item in items:
         if item.path in marker_of:

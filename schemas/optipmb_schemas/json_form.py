@@ -1,6 +1,6 @@
 """JSON of the edges: one object per track, event and problem, for browsers, city platforms and Node-RED.
 
-A text is one frame of a WebSocket, one server-sent event, or the payload of one MQTT message. Numbers are those of the
+A text is one frame of a WebSocket, one server-sent event, or the payload of one MQTT message. Numbers equal the
 messages, rounded; stamps are texts, because 2^63 does not fit a number of JavaScript.
 """
 
@@ -152,7 +152,7 @@ EVERYTHING: Final = Selection()
 
 
 def is_confirmed(tracks: Tracks) -> NDArray[np.bool_]:
-    """Return which tracks (N,) are confirmed; without such a column, those that probably exist and were seen twice."""
+    """Return which tracks (N,) are confirmed; without such a column, probable tracks that were seen twice."""
     if tracks.confirmed is not None:
         return np.asarray(tracks.confirmed > 0)
     return np.asarray((tracks.existence > CONFIRMED_EXISTENCE) & (tracks.age > 0.0))

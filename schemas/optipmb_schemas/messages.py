@@ -369,7 +369,7 @@ def path_fields(horizons: Reals, mean: Reals, covariance: Reals) -> dict[str, Nu
 
 
 def track_fields(**columns: Numeric | None) -> dict[str, Numeric]:
-    """Return further columns of `Tracks`, but for those that are None, as fields.
+    """Return the further columns of `Tracks` that are not None, as fields.
 
     Raises:
         MessageError: they hold numbers that no message may.
@@ -514,7 +514,7 @@ def _is_covariance(matrix: Any) -> Any:
 def _semidefinite(xx: Any, yy: Any, zz: Any, xy: Any, xz: Any, yz: Any) -> Any:
     """Return whether no eigenvalue of a symmetric matrix is negative.
 
-    Cholesky's steps without the divisions: its errors of rounding are in proportion to the largest eigenvalue. Those of
+    Cholesky's steps without the divisions: its rounding errors are in proportion to the largest eigenvalue. Errors of
     a determinant as one sum are in proportion to its cube, and exceed the smallest eigenvalues of a long ellipsoid.
     """
     second, third, mixed = xx * yy - xy * xy, xx * zz - xz * xz, xx * yz - xy * xz

@@ -1,4 +1,4 @@
-"""Connections and what is opened on them, against a real router in the same process."""
+"""Connections, publishers and subscribers against a real router in the same process."""
 
 import math
 import re
@@ -22,7 +22,7 @@ from routers import free_endpoint, open_client, open_router
 
 
 def test_unreachable_router_is_one_error_within_the_timeout() -> None:
-    """Nobody listening gives ConnectionFailed naming the endpoint, after the timeout."""
+    """Without a listener, ConnectionFailed names the endpoint after the timeout."""
     address = free_endpoint()
     with pytest.raises(ConnectionFailed, match=address) as caught:
         Connection(address, timeout=0.5)
@@ -54,7 +54,7 @@ def test_a_configuration_with_an_id_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("timeout", [math.nan, -1.0])
 @pytest.mark.parametrize("scheme", ["tcp/", "grpc://"])
 def test_a_timeout_that_is_none_is_one_error(timeout: float, scheme: str) -> None:
-    """What is no time gives ConnectionFailed with what was expected, over Zenoh and over gRPC."""
+    """An invalid timeout raises ConnectionFailed with the expected values, over Zenoh and over gRPC."""
     with pytest.raises(ConnectionFailed, match=f"timeout: expected seconds, 0 or more, received {timeout}"):
         linked(f"{scheme}127.0.0.1:1", timeout=timeout)
 
@@ -122,7 +122,7 @@ def test_a_late_subscriber_gets_the_history_of_the_cache(endpoint: str) -> None:
 def test_what_a_publisher_sent_before_its_first_sample_came_is_not_lost(
     endpoint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A subscription that gets nothing but what is sent from now on brings the publisher's earlier messages first."""
+    """A subscription to live messages only still receives the publisher's earlier messages first."""
     monkeypatch.setattr(zenoh.ext, "declare_advanced_subscriber", plain_subscriber)
     inbox = Inbox(10_000)
     with Connection(endpoint) as sender, Connection(endpoint) as receiver:
@@ -140,7 +140,6 @@ def test_what_a_publisher_sent_before_its_first_sample_came_is_not_lost(
 
 
 def plain_subscriber(session: zenoh.Session, key: str, handler: Any, **_: object) -> Any:
-    """Subscribe without asking any cache."""
     return session.declare_subscriber(key, handler)
 
 
@@ -161,7 +160,7 @@ def test_an_unread_inbox_neither_blocks_the_publisher_nor_the_closing(endpoint: 
 
 
 def test_nothing_arrives_after_closing(endpoint: str) -> None:
-    """Whatever is still under way when a connection is closed, its inboxes stay as they are from then on."""
+    """Closing a connection leaves its inboxes unchanged, also while queries are pending."""
     for _ in range(5):
         inbox = Inbox(100_000)
         with Connection(endpoint) as sender:
@@ -177,7 +176,7 @@ def test_nothing_arrives_after_closing(endpoint: str) -> None:
 
 
 def test_a_closed_connection_is_one_clear_error(endpoint: str) -> None:
-    """Whatever is asked of a closed connection raises ConnectionFailed in one line; closing again does nothing."""
+    """Every call on a closed connection raises ConnectionFailed in one line; closing again does nothing."""
     connection = Connection(endpoint)
     sender = connection.cached_sender("a/b", "zenoh/bytes", cache=1)
     connection.close()
@@ -263,7 +262,6 @@ def test_replies_of_two_services_are_both_kept(endpoint: str) -> None:
 
 
 def answer_with(questions: Iterable[zenoh.Query], text: bytes) -> None:
-    """Answer every query with a text."""
     for query in questions:
         with query:
             query.reply(query.key_expr, text)

@@ -26,7 +26,6 @@ CAR, PEDESTRIAN, CYCLIST = range(3)
 
 
 def scene(seed: int = 0, frames: int = 150, **options: float) -> SceneSequence:
-    """Give one generated scene."""
     sequence = open_dataset("scene", seed=seed, frames=frames, **options).sequences(["all"])[0]
     assert isinstance(sequence, SceneSequence)
     return sequence
@@ -34,13 +33,12 @@ def scene(seed: int = 0, frames: int = 150, **options: float) -> SceneSequence:
 
 @pytest.fixture(scope="module")
 def scenes() -> list[SceneSequence]:
-    """Four scenes of half a minute."""
     return [scene(seed, 300) for seed in range(4)]
 
 
 @pytest.fixture(scope="module")
 def observed(scenes: list[SceneSequence]) -> Observed:
-    """For each frame of two scenes, the points of the boxes and what was detected; truth needs no more scans."""
+    """For each frame of two scenes, the points of the boxes and the detections; truth needs no further scans."""
     kept = []
     for sequence in scenes[:2]:
         seen = (sequence.observe(frame) for frame in range(len(sequence)))
@@ -49,7 +47,6 @@ def observed(scenes: list[SceneSequence]) -> Observed:
 
 
 def digest(sequence: SceneSequence) -> str:
-    """Give a digest of all that a scene offers."""
     total = hashlib.sha256()
     for frame in sequence.frames():
         assert frame.cloud is not None
@@ -63,7 +60,7 @@ def digest(sequence: SceneSequence) -> str:
 
 
 def test_the_same_seed_gives_the_same_bytes_in_another_process() -> None:
-    """Detections, clouds, poses and truth, whatever was asked first; another seed or scene gives others."""
+    """Detections, clouds, poses and truth do not depend on the order of access; another seed or scene differs."""
     here = scene(5, 4)
     here.truth()
     program = (
@@ -80,7 +77,7 @@ def test_the_same_seed_gives_the_same_bytes_in_another_process() -> None:
 
 
 def test_clouds_and_velocities_are_options() -> None:
-    """Without them everything else is the same; velocities are near those of the truth."""
+    """Without velocities all else is equal; with them, they are near the true ones."""
     plain, rich = scene(2, 5), scene(2, 5, clouds=0, velocity=1)
     assert plain.has_clouds
     assert not rich.has_clouds
@@ -93,7 +90,7 @@ def test_clouds_and_velocities_are_options() -> None:
 
 
 def test_detected_velocities_are_over_ground_along_the_axes_of_the_sensor() -> None:
-    """Turned by the sensor's pose, detected velocities agree with the true ones, whatever way the sensor drives."""
+    """Turned by the sensor's pose, detected velocities agree with the true ones in every driving direction."""
     sequence = scene(1, 60, velocity=1)
     error = []
     for frame in sequence.frames():
@@ -244,7 +241,7 @@ def test_pedestrians_do_not_walk_through_each_other(scenes: list[SceneSequence])
 
 
 def test_returned_points_lie_on_boxes_or_on_the_ground() -> None:
-    """Each point is within 15 cm of the surface of its box, or of the ground, whoever else stands near."""
+    """Each point is within 15 cm of the surface of its box or of the ground, also with neighbours."""
     sequence = scene(3, 40)
     place, extent = fixed_boxes()
     for frame in (0, 20, 39):

@@ -1,4 +1,4 @@
-"""The keys that one connection can declare in its life: what is opened beyond is refused, and nothing is lost."""
+"""Keys that one connection can declare in its life: more are refused, and nothing is lost."""
 
 from __future__ import annotations
 
@@ -38,7 +38,6 @@ def _subscribed(connection: Connection, key: str) -> Reading:
 
 @pytest.fixture
 def connection(tmp_path: Path) -> Iterator[Connection]:
-    """A connection alone."""
     file = tmp_path / "alone.json5"
     file.write_text(ALONE, encoding="utf-8")
     with Connection(config=file) as connection:

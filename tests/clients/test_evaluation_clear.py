@@ -23,19 +23,17 @@ Row = tuple[int, int, float]
 
 
 def truth_of(rows: Iterable[Row], *, ignored: Iterable[Row] = ()) -> Truth:
-    """Give truth cars along x; the ignored rows are those that are in both."""
+    """Give truth cars along x; rows in `ignored` are marked so."""
     table, hidden = sorted(rows), set(ignored)
     places = [place for place, row in enumerate(table) if row in hidden]
     return evaluation_cases.truth_of([(*row, 0.0) for row in table], ignored=places)
 
 
 def tracks_of(rows: Iterable[Row], scores: dict[int, float] | None = None) -> ResultTable:
-    """Give tracks of the same cars."""
     return evaluation_cases.tracks_of([(*row, 0.0, (scores or {}).get(row[1], 1.0)) for row in sorted(rows)])
 
 
 def figures(result: ClearResult) -> tuple[int, int, int, int, int]:
-    """Give GT, TP, FP, FN and IDS."""
     return result.truth, result.true, result.false, result.missed, result.switches
 
 

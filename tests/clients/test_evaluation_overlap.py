@@ -13,12 +13,10 @@ Boxes = tuple[Floats, Floats, Floats]
 
 
 def box(x: float, y: float, length: float, width: float, yaw: float, z: float = 0.0, height: float = 1.0) -> Boxes:
-    """Give one box as a column of one."""
     return np.array([[x, y, z]]), np.array([[length, width, height]]), np.array([yaw])
 
 
 def draw(rng: np.random.Generator, count: int) -> Boxes:
-    """Give many boxes near the origin."""
     return rng.uniform(-2, 2, (count, 3)), rng.uniform(0.3, 5, (count, 3)), rng.uniform(-np.pi, np.pi, count)
 
 

@@ -1,4 +1,4 @@
-"""A load: its frames, its search, and what it counts, against a service that is asked too."""
+"""A load: its frames, its search, and its counts, against a service that is queried too."""
 
 from __future__ import annotations
 

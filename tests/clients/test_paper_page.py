@@ -13,7 +13,6 @@ TABLES = ("Table I", "Table II", "Table III", "Table IV", "Table V", "Table VI")
 
 
 def section(title: str) -> str:
-    """Give a section of the page."""
     return PAGE[PAGE.index(f"## {title}") :].split("\n## ")[0]
 
 

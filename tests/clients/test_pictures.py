@@ -22,7 +22,6 @@ RULES = Rules(measure="distance", limit=2.0)
 
 
 def scene() -> tuple[DataSequence, Truth, ResultTable]:
-    """Give a short scene, its truth, and the truth as tracks with one change of identity and some misses."""
     sequence = open_dataset("scene", frames=20).sequences(["all"])[0]
     truth = sequence.truth()
     assert truth is not None
@@ -33,7 +32,6 @@ def scene() -> tuple[DataSequence, Truth, ResultTable]:
 
 
 def text_of(path: Path, monkeypatch: pytest.MonkeyPatch, *arguments: object) -> list[str]:
-    """Draw, and give all texts of the picture."""
     from matplotlib.figure import Figure  # noqa: PLC0415 - matplotlib is an extra
     from matplotlib.text import Text  # noqa: PLC0415 - matplotlib is an extra
 

@@ -15,7 +15,6 @@ FEW = ["--trials", "3", "--fold-trials", "1", "--folds", "2"]
 
 
 def tune(out: Path, *options: str) -> None:
-    """Tune cars."""
     assert run(["tune", *CARS, *FEW, "--out", str(out), *options]) == 0
 
 
@@ -81,7 +80,7 @@ def test_a_profile_is_matched_by_common_class_names(tmp_path: Path) -> None:
 def test_wrong_wishes_are_told_in_one_line(
     arguments: list[str], text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The status is 2, and the line says what is wrong."""
+    """The status is 2, and the line names the error."""
     assert run(["tune", *arguments, "--out", str(tmp_path)]) == 2
     error = capsys.readouterr().err.strip()
     assert text in error

@@ -37,7 +37,6 @@ def layer(entries: list[Entry]) -> bytes:
 
 
 def look(folder: Path, *layers: list[Entry], config: dict[str, Any] | None = None) -> Findings:
-    """Scan an image of these layers above the base."""
     files = {f"{number}.tar": layer(entries) for number, entries in enumerate([BASE, *layers])}
     manifest = [{"Config": "config.json", "Layers": list(files)}]
     files |= {

@@ -51,7 +51,7 @@ def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[
     """Fault 1: four recorded streams, SIGKILL in the middle, a new process: all is as without a kill.
 
     The tracks of every frame, repetitions set aside, the digest of the state and the events of zones are byte-equal to
-    those of a session that nothing happened to; events that were final did not change. Every round has a moment of its
+    an undisturbed session; events that were final did not change. Every round has a moment of its
     own.
     """
     root = kitti_root()
@@ -120,6 +120,5 @@ def _read(inbox: Inbox, replay: Replay) -> None:
 
 
 def _outage(replay: Replay, killed_ns: int) -> float:
-    """Seconds from the kill to the first new tracks after it."""
     after = [at for result in replay.results.values() for at in result.times_ns if at > killed_ns + 50_000_000]
     return (min(after) - killed_ns) / 1e9

@@ -47,7 +47,6 @@ class Logged:
         self._folder, self._fleet = folder, fleet
 
     def member(self, instance: str, **settings: object) -> ServiceProcess:
-        """Start a member with a folder of its own."""
         # Before its first checkpoint a stream is read as far back; a busy machine takes long to start a member.
         settings = {"standby_s": 300.0} | settings
         return self._fleet.service(instance, cluster=self.nats.url, store=self._folder / instance, **settings)
@@ -93,7 +92,6 @@ class Logged:
 
 @pytest.fixture
 def logged(tmp_path: Path) -> Iterator[Logged]:
-    """Without members."""
     (tmp_path / "nats").mkdir()
     with (
         NatsProcess(tmp_path / "nats") as nats,

@@ -23,7 +23,6 @@ BESIDE_MB = 400
 
 
 def peak_mb(pid: int) -> float:
-    """The most memory that a process has had."""
     (kilobytes,) = re.findall(r"^VmHWM:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text(), re.MULTILINE)
     return int(kilobytes) / 1024
 

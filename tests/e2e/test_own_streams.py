@@ -71,25 +71,21 @@ class Pair:
         until(lambda: all(half in one.errors for one in self.services.values()), "each has half of the partitions")
 
     def owners(self) -> dict[str, str]:
-        """Which service tracks which stream."""
         keys = self.node.alive(KEYS.all_owners())
         return {KEYS.stream_of(key): KEYS.instance_of(key) for key in keys}
 
     def figure(self, instance: str, name: str, topic: str) -> float:
-        """A metric of a service."""
         text = self.node.query(KEYS.metrics(instance))[0][2].decode()
         found = re.search(rf'^optipmb_{name}{{topic="{topic}"}} (\S+)$', text, re.MULTILINE)
         assert found, text
         return float(found[1])
 
     def frames(self, instance: str) -> int:
-        """Frames that a service has tracked."""
         return self.node.ask(KEYS.status(instance), ServiceStatus).frames
 
 
 @pytest.fixture
 def pair(tmp_path: Path) -> Iterator[Pair]:
-    """Two services without streams."""
     with Pair(tmp_path) as one:
         yield one
 
@@ -114,7 +110,6 @@ def with_clouds(sensor: Sensor, frames: int) -> dict[int, set[bytes]]:
 
 
 def clouds(pair: Pair, name: str) -> list[float]:
-    """What both services have counted of clouds."""
     return [pair.figure(instance, name, "points") for instance in "ab"]
 
 
@@ -162,7 +157,7 @@ def test_a_member_receives_its_own_streams(pair: Pair, capsys: pytest.CaptureFix
 
 
 def test_a_publisher_without_a_token_is_tracked_from_its_first_frame(pair: Pair) -> None:
-    """Its frames are tracked wherever its partition is, and after a kill -9 of the discoverer, all of them."""
+    """All frames are tracked for any owner of the partition, and after a kill -9 of the discoverer."""
     node = pair.node
     for seq in range(20):
         raw(node, *(sensor.detections(seq) for sensor in SENSORS))

@@ -59,7 +59,6 @@ def recording(service: ServiceProcess, path: Path) -> Iterator["subprocess.Popen
 
 
 def wait_for(condition: object, service: ServiceProcess) -> None:
-    """Wait until `condition()` holds."""
     assert callable(condition)
     deadline = time.monotonic() + DEADLINE_S
     while not condition():
@@ -170,7 +169,6 @@ def test_four_streams_played_into_a_fresh_service(
 
 @pytest.fixture(scope="module")
 def incident(service: ServiceProcess, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording of one stream."""
     return recorded_replay(service, tmp_path_factory.mktemp("incident"), open_dataset("scene", **VALUES), "0000")
 
 

@@ -1,6 +1,6 @@
 """Who may do what on a protected network: every claim probed from both sides through a real router process.
 
-The router drops what is not allowed without a word. So what must not pass is followed by something that may, on the
+The router drops forbidden messages silently. So each forbidden message is followed by an allowed one, on the
 same link and to the same receiver: when that has come, the first would have come too.
 """
 
@@ -47,14 +47,12 @@ EVERYBODY = (
 
 @pytest.fixture(scope="module")
 def network(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Network]:
-    """A protected network with two nodes, two services and a viewer."""
     with Network(tmp_path_factory.mktemp("tls"), *EVERYBODY) as one:
         yield one
 
 
 @pytest.fixture(scope="module")
 def service(network: Network) -> Iterator[ServiceProcess]:
-    """The service of that network."""
     with network.service() as one:
         one.wait_ready()
         yield one
@@ -62,14 +60,12 @@ def service(network: Network) -> Iterator[ServiceProcess]:
 
 @pytest.fixture
 def node(network: Network) -> Iterator[Party]:
-    """The first node."""
     with Party(network.config(NODE)) as one:
         yield one
 
 
 @pytest.fixture
 def viewer(network: Network) -> Iterator[Party]:
-    """The viewer, who reads everything."""
     with Party(network.config(VIEWER)) as one:
         yield one.read(*(KEYS.all(topic) for topic in ("detections", "points", "tracks", "problems")))  # type: ignore[arg-type]  # all are topics
 
@@ -85,7 +81,6 @@ def publish(network: Network, role: str, stream: str, frames: int) -> Publisher:
 
 
 def refused(config: Path, **changes: Any) -> bool:
-    """Whether no link to the router can be had."""
     try:
         with Party(config, patience_ms=REFUSAL_MS, **changes):
             return False

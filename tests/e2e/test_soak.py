@@ -41,8 +41,6 @@ KEYS = Keys()
 
 @dataclass
 class Sample:
-    """Figures of the service at a moment."""
-
     at_s: float
     memory_kb: int
     waiting: int

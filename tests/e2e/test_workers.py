@@ -45,7 +45,6 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceProcess
 
 
 def status_when(node: Node, reached: Callable[[ServiceStatus], bool], instance: str = "pair") -> ServiceStatus:
-    """The status, as soon as it is as wanted."""
     asked: list[ServiceStatus] = []
 
     def is_reached() -> bool:
@@ -57,7 +56,6 @@ def status_when(node: Node, reached: Callable[[ServiceStatus], bool], instance: 
 
 
 def arrived(node: Node, stream: str, seq: int) -> None:
-    """Wait for the tracks of a frame."""
     key = KEYS.tracks(stream)
     node.tracks_seen.wait(
         lambda items: any(at == key and decode(payload, Tracks).seq == seq for at, payload, _ in items),

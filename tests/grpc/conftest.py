@@ -18,7 +18,6 @@ NUMBERS = itertools.count()
 
 @pytest.fixture(scope="session")
 def service() -> Iterator[ServiceProcess]:
-    """A service with its own router."""
     yard = {"streams": ["zoned/*/*"], "polygon": [[10, -5], [30, -5], [30, 5], [10, 5]]}
     zones = {"yard": yard, "gate": {"streams": ["zoned/*/*"], "line": [[20, -5], [20, 5]]}}
     with ServiceProcess(environment={"OPTIPMB_ZONES": json.dumps(zones)}) as process:
@@ -36,11 +35,9 @@ def gateway(service: ServiceProcess) -> Iterator[GatewayProcess]:
 
 @pytest.fixture
 def stub(gateway: GatewayProcess) -> Any:
-    """The generated stub on a channel of its own."""
     return gateway.stub()
 
 
 @pytest.fixture
 def stream() -> str:
-    """A stream that no other test uses."""
     return f"yard/robot-{next(NUMBERS)}/lidar"

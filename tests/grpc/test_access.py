@@ -32,7 +32,6 @@ def caller(metadata, certificate):
 
 @pytest.fixture(scope="module")
 def network(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Network]:
-    """A protected network with a service."""
     with Network(tmp_path_factory.mktemp("tls"), *EVERYBODY) as one, one.service() as service:
         service.wait_ready()
         yield one
@@ -40,7 +39,6 @@ def network(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Network]:
 
 @pytest.fixture(scope="module")
 def secured(network: Network) -> Iterator[GatewayProcess]:
-    """Its gateway, with certificates."""
     folder = network.folder / "gateway" / "localhost"
     options = ("--zenoh-config", str(folder / "zenoh.json5"), "--grpc-tls", str(folder))
     names = {"OPTIPMB_GRPC_NAMES": str(folder / "names.json")}
@@ -50,19 +48,16 @@ def secured(network: Network) -> Iterator[GatewayProcess]:
 
 
 def channel(folder: Path, gateway: GatewayProcess) -> grpc.Channel:
-    """A channel with the certificate of a folder."""
     authority, key, certificate = ((folder / name).read_bytes() for name in ("ca.pem", "key.pem", "cert.pem"))
     port = gateway.address.rpartition(":")[2]
     return grpc.secure_channel(f"localhost:{port}", grpc.ssl_channel_credentials(authority, key, certificate))
 
 
 def stub(network: Network, role: str, gateway: GatewayProcess) -> Any:
-    """The generated stub with the certificate of a role."""
     return rpc.TrackingServiceStub(channel(network.folder / role, gateway))
 
 
 def denied(call: Any) -> grpc.StatusCode:
-    """The status that a call is refused with."""
     with pytest.raises(grpc.RpcError) as raised:
         list(call) if hasattr(call, "__iter__") else call()
     code: grpc.StatusCode = raised.value.code()

@@ -51,7 +51,6 @@ def counts(address: str) -> dict[str, float]:
 
 
 def wait_for(condition: Callable[[], bool], what: str) -> None:
-    """Wait until something holds."""
     ends = time.monotonic() + WAIT_S
     while not condition():
         assert time.monotonic() < ends, what

@@ -36,7 +36,6 @@ ALLOWED = 4
 
 @pytest.fixture(scope="module")
 def bounded(service: ServiceProcess) -> Iterator[GatewayProcess]:
-    """A gateway that allows few calls and connections."""
     environment = {"OPTIPMB_GRPC_CALLS": "2", "OPTIPMB_GRPC_CONNECTIONS": str(ALLOWED)}
     with GatewayProcess(service.endpoint, environment=environment) as process:
         process.wait_ready()
@@ -44,12 +43,10 @@ def bounded(service: ServiceProcess) -> Iterator[GatewayProcess]:
 
 
 def files(pid: int) -> int:
-    """Open files of a process."""
     return len(list(Path(f"/proc/{pid}/fd").iterdir()))
 
 
 def served(gateway: GatewayProcess, stream: str) -> None:
-    """Frames are tracked."""
     responses = list(gateway.stub().Track((detections(frame(seq, stream)) for seq in range(5)), timeout=30))
     assert [one.tracks.seq for one in responses] == list(range(5))
 
@@ -240,7 +237,6 @@ def test_more_connections_than_allowed(bounded: GatewayProcess, stream: str) -> 
 
 
 def wait_served(stub: Any, stream: str) -> None:
-    """Wait until a question is answered."""
     ends = time.monotonic() + 60
     while True:
         try:

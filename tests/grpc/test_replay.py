@@ -28,7 +28,6 @@ SCENE = ("--dataset", "scene", *(f"--option={one}" for one in ("vehicles=6", "pe
 
 @pytest.fixture(scope="module")
 def gateways(service: ServiceProcess, gateway: GatewayProcess) -> Iterator[list[GatewayProcess]]:
-    """Three gateways of one network."""
     with GatewayProcess(service.endpoint) as second, GatewayProcess(service.endpoint) as third:
         for process in (second, third):
             process.wait_ready()
@@ -36,12 +35,10 @@ def gateways(service: ServiceProcess, gateway: GatewayProcess) -> Iterator[list[
 
 
 def connect(*gateways: GatewayProcess) -> list[str]:
-    """The options that name gateways."""
     return [part for gateway in gateways for part in ("--connect", f"grpc://{gateway.address}")]
 
 
 def compare(out: Path, folders: tuple[str, ...], names: list[str]) -> None:
-    """Result files of several folders are byte-equal."""
     for name in names:
         first, *others = ((out / folder / f"{name}.txt").read_bytes() for folder in folders)
         assert len(first.splitlines()) > 100
@@ -103,7 +100,6 @@ def test_a_gateway_that_is_killed_loses_nothing(
 
 
 def wait_for_frames(gateway: GatewayProcess, frames: int) -> None:
-    """Wait until a replay has come so far."""
     stub, ends = gateway.stub(), time.monotonic() + 60
     while time.monotonic() < ends:
         listed = stub.ListStreams(pb.ListStreamsRequest(pattern="replay/*/*"), wait_for_ready=True).streams

@@ -46,7 +46,6 @@ class Heard:
         self.session.close()  # type: ignore[no-untyped-call]  # zenoh's stubs leave it untyped
 
     def take(self, number: int, at: int = 0) -> list[bytes]:
-        """The next payloads."""
         ends, payloads = time.monotonic() + DEADLINE_S, []
         while len(payloads) < number:
             sample = self._samples[at].try_recv()
@@ -57,7 +56,6 @@ class Heard:
 
 
 def violation(raised: pytest.ExceptionInfo[grpc.RpcError]) -> Any:
-    """The field at fault, from the details of a status."""
     status = rpc_status.from_call(raised.value)
     details = error_details_pb2.BadRequest()
     assert status is not None

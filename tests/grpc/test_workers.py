@@ -21,7 +21,6 @@ STREAMS = tuple(f"garage/robot-{number}/lidar" for number in range(4))
 
 @pytest.fixture(scope="module")
 def workers() -> Iterator[tuple[ServiceProcess, str]]:
-    """A service of two workers and its address for gRPC."""
     address = f"127.0.0.1:{free_endpoint().rpartition(':')[2]}"
     with ServiceProcess("--workers", "2", "--grpc", address, "--instance", "garage") as process:
         process.wait_ready()

@@ -19,7 +19,6 @@ Row = tuple[int, int, "NDArray[np.float64]", "NDArray[np.float64]", float, float
 
 
 def table_of(clip: Clip, name: str, rows: list[Row]) -> ResultTable:
-    """Return the table, with image boxes where there is a camera."""
     frame, identity, center, size, yaw, score = zip(*rows, strict=True) if rows else ([],) * 6
     when = np.array(frame, dtype=np.int64)
     centers, sizes = np.array(center, dtype=np.float64).reshape(-1, 3), np.array(size, dtype=np.float64).reshape(-1, 3)

@@ -18,5 +18,4 @@ def class_rows(count: int, **columns: Any) -> Any:
 
 
 def class_row(**values: Any) -> Any:
-    """Return one row of it."""
     return class_rows(1, **{name: [value] for name, value in values.items()})[0]

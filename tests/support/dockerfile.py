@@ -36,8 +36,6 @@ class Instruction:
 
 @dataclass
 class Stage:
-    """A stage: its base, its name, its instructions."""
-
     base: str
     name: str
     instructions: list[Instruction] = field(default_factory=list)

@@ -39,7 +39,6 @@ def truth_of(rows: Sequence[TruthRow], names: Sequence[str] | str = "Car", ignor
 
 
 def tracks_of(rows: Sequence[TrackRow], names: Sequence[str] | str = "Car") -> ResultTable:
-    """Give tracks of one size, in any order."""
     count = len(rows)
     labels = (names,) if isinstance(names, str) else tuple(dict.fromkeys(names))
     table = ResultTable(
@@ -57,7 +56,6 @@ def tracks_of(rows: Sequence[TrackRow], names: Sequence[str] | str = "Car") -> R
 
 
 def parked(objects: int, frames: int, apart: float = 10.0) -> list[TruthRow]:
-    """Give objects that stand in a row, each in all frames."""
     return [(frame, one, apart * one, 0.0) for frame in range(frames) for one in range(objects)]
 
 
@@ -86,7 +84,7 @@ def write_kitti(root: Path, results: Path, seed: int, sequences: Sequence[str] =
     """Write a small benchmark with all that its rules name but no detections, and disturbed tracks; return its root.
 
     Objects drive ahead of a camera that drives along a bend; some are vans, some hidden or cut by the image for a
-    while, some so near to others that a track could be either's. Tracks are inaccurate, lost and taken up under another
+    while, some so near to others that a track could be either's. Tracks are inaccurate, lost and resumed under another
     id, twice on one object, false, small, or in regions without annotations. Their scores say a little about all that.
     """
     chance = np.random.default_rng(seed)
@@ -114,7 +112,6 @@ def _pose(frame: int) -> str:
 
 
 def _drive(chance: np.random.Generator, frames: int) -> tuple[list[str], list[str]]:
-    """Give the lines of a label file and of a result file."""
     labels, tracks = [], []
     following = 100
     for one in range(28):

@@ -41,8 +41,6 @@ class Behaviour:
 
 @dataclass
 class Seen:
-    """Messages received, in their order."""
-
     detections: list[Detections] = field(default_factory=list)
     points: list[Points] = field(default_factory=list)
     parameters: list[tuple[str, SessionParameters]] = field(default_factory=list)

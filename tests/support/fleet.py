@@ -56,7 +56,6 @@ class RouterProcess:
         self.kill()
 
     def start(self) -> None:
-        """Start it, and wait until it listens."""
         self._process = subprocess.Popen(
             [sys.executable, "-c", _ROUTER, os.path.dirname(__file__), self.endpoint, *self._others],  # noqa: PTH120 - a text is needed
             stdout=subprocess.PIPE,
@@ -66,7 +65,6 @@ class RouterProcess:
         assert self._process.stdout.readline() == "up\n"
 
     def kill(self) -> None:
-        """SIGKILL."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
@@ -106,7 +104,6 @@ class Fleet:
 
     @property
     def endpoint(self) -> str:
-        """Where the router listens."""
         return self.router.endpoint
 
     def service(
@@ -126,12 +123,10 @@ class Fleet:
         return process
 
     def client(self) -> zenoh.Session:
-        """A plain Zenoh client of the router, closed at the end."""
         return self._context.enter_context(open_client(self.endpoint))
 
 
 def freeze(service: ServiceProcess) -> None:
-    """SIGSTOP, and wait until it has stopped."""
     service.process.send_signal(signal.SIGSTOP)
     deadline = time.monotonic() + START_S
     while _state(service.process.pid) != "T":
@@ -140,7 +135,6 @@ def freeze(service: ServiceProcess) -> None:
 
 
 def thaw(service: ServiceProcess) -> None:
-    """SIGCONT."""
     service.process.send_signal(signal.SIGCONT)
 
 

@@ -48,12 +48,10 @@ class GatewayProcess(ServiceProcess):
         )
 
     def stub(self, options: Sequence[tuple[str, int]] = ()) -> Any:
-        """The generated stub on a channel of its own."""
         return rpc.TrackingServiceStub(grpc.insecure_channel(self.address, options=options))
 
 
 def connected(gateway: GatewayProcess) -> socket.socket:
-    """A connection without calls."""
     host, _, port = gateway.address.rpartition(":")
     one = socket.create_connection((host, int(port)), timeout=10)
     one.sendall(PREFACE)
@@ -61,7 +59,6 @@ def connected(gateway: GatewayProcess) -> socket.socket:
 
 
 def resident(pid: int) -> int:
-    """Bytes of memory of a process."""
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * 4096
 
 
@@ -84,10 +81,8 @@ def frame(seq: int, stream: str = STREAM, epoch: bytes = EPOCH, **changes: Any) 
 
 
 def detections(message: Detections, kind: Any = pb.TrackRequest) -> Any:
-    """A request with detections."""
     return kind(detections=convert.to_proto(message))
 
 
 def points(message: Points, kind: Any = pb.TrackRequest) -> Any:
-    """A request with a cloud."""
     return kind(points=convert.to_proto(message))

@@ -45,7 +45,6 @@ class _Track:
 
 
 def greedy_tracks(clip: Clip, name: str) -> ResultTable:
-    """Track the detections of one class, in the world frame."""
     tracks: list[_Track] = []
     rows: list[Row] = []
     before, count = None, 0

@@ -71,7 +71,7 @@ def odd(rng: np.random.Generator, shape: tuple[int, ...]) -> Any:
 
 
 def odd_frames(seed: int) -> None:
-    """`make_frame` with numbers of any kind; what it takes is tracked over any time."""
+    """`make_frame` with numbers of any kind; accepted frames are tracked over any time."""
     rng = np.random.default_rng(seed)
     parameters = PROFILES[seed % 2]
     tracker = optipmb.Tracker(parameters)

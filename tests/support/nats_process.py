@@ -43,12 +43,10 @@ class NatsProcess:
         self.kill()
 
     def start(self) -> None:
-        """Start it, and wait until it takes connections."""
         command = [sys.executable, "-m", "optipmb_service", "nats", "--listen", self.address, "--store", self._folder]
         self.process = started(command, self.address, self._folder / "nats.log")
 
     def kill(self) -> None:
-        """SIGKILL."""
         if self.process is not None:
             self.process.kill()
             self.process.wait()
@@ -80,7 +78,6 @@ class NatsTrio:
             self.kill(index)
 
     def start(self, index: int) -> None:
-        """Start one of them, and wait until it takes connections."""
         routes = ", ".join(f'"nats://{address}"' for address in self._addresses[3:])
         file = self._folder / f"{index}.conf"
         file.write_text(f"""
@@ -96,14 +93,12 @@ class NatsTrio:
         self._processes[index] = started(command, self._addresses[index], self._folder / f"{index}.log")
 
     def kill(self, index: int) -> None:
-        """SIGKILL."""
         process = self._processes.pop(index)
         process.kill()
         process.wait()
 
 
 def started(command: Sequence[str | Path], address: str, log: Path) -> subprocess.Popen[bytes]:
-    """Start a server, and wait until it takes connections."""
     with log.open("ab") as file:
         process = subprocess.Popen(
             command,

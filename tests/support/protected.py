@@ -28,7 +28,6 @@ REFUSAL_MS = 1500
 
 
 def make(out: Path, *options: str) -> subprocess.CompletedProcess[str]:
-    """Run the command that makes certificates and configurations."""
     command = [sys.executable, str(MAKE), "--out", str(out), "--router", "localhost", "--router", "127.0.0.1", *options]
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
@@ -65,17 +64,14 @@ class Network:
         self.router.__exit__(kind, error, trace)
 
     def make(self, *more: str) -> str:
-        """Create missing certificates; return the command's output."""
         done = make(self.folder, *self.options, *more)
         assert done.returncode == 0, done.stderr
         return done.stdout
 
     def config(self, role: str) -> Path:
-        """The configuration of a role, as `node/garage/robot-1`."""
         return self.folder / role / "zenoh.json5"
 
     def service(self, name: str = "tracker") -> ServiceProcess:
-        """A service that links to the router with its certificate."""
         config = str(self.config(f"service/{name}"))
         return ServiceProcess(
             "--instance", name, "--connect", self.endpoint, "--zenoh-config", config, listen=False
@@ -112,8 +108,6 @@ class Party:
         self.session.close()  # type: ignore[no-untyped-call]  # zenoh's stubs leave it untyped
 
     def read(self, *patterns: str) -> Self:
-        """Collect the messages under patterns."""
-
         def take(sample: zenoh.Sample) -> None:
             with self._changed:
                 self.seen.append((str(sample.key_expr), sample.payload.to_bytes()))
@@ -148,16 +142,13 @@ class Party:
         return False
 
     def token(self, key: str) -> None:
-        """Declare that something is alive."""
         self._kept.append(self.session.liveliness().declare_token(key))
 
     def tokens(self, pattern: str) -> set[str]:
-        """The liveliness tokens that it sees."""
         replies = self.session.liveliness().get(pattern, timeout=DEADLINE_S)
         return {str(sample.key_expr) for reply in replies if (sample := reply.ok) is not None}
 
     def ask(self, key: str, timeout: float = 3.0) -> list[bytes]:
-        """Ask, and return the good replies."""
         replies = self.session.get(
             key, timeout=timeout, consolidation=zenoh.ConsolidationMode.NONE, allowed_destination=zenoh.Locality.REMOTE
         )

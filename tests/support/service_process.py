@@ -76,7 +76,6 @@ class ServiceProcess:
             error.add_note(f"the end of its log:\n{self.errors[-3000:]}")
 
     def wait_ready(self) -> str:
-        """Return the ready line."""
         line = self._lines.get(timeout=READY_S)
         assert line is not None, f"ended without a ready line: {self.errors}"
         return line
@@ -107,12 +106,10 @@ class ServiceProcess:
 
     @property
     def errors(self) -> str:
-        """Its stderr so far."""
         return "".join(self._errors)
 
     @property
     def output(self) -> list[str]:
-        """The lines on stdout that were not read yet."""
         lines = []
         while not self._lines.empty():
             if (line := self._lines.get()) is not None:

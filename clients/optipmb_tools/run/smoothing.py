@@ -130,7 +130,7 @@ def smooth(
     """
     order = np.argsort(identity, kind="stable")
     before, after = order[:-1], order[1:]
-    known = covariance[:, OMEGA, OMEGA] != 0.0  # those of unknown heading stay (`optipmb.unknown_heading`)
+    known = covariance[:, OMEGA, OMEGA] != 0.0  # states of unknown heading stay (`optipmb.unknown_heading`)
     follows = (identity[before] == identity[after]) & known[before] & known[after]
     before, after = before[follows], after[follows]
     predicted, spread, gain = _predictions(

@@ -242,7 +242,6 @@ def test_json_logs_and_an_own_profile(tmp_path: Path) -> None:
 
 
 def config(capsys: pytest.CaptureFixture[str], *options: str) -> str:
-    """Run `config` in this process; return its output."""
     with pytest.raises(SystemExit) as ended:
         cli.main(("config", *options))
     shown = capsys.readouterr()

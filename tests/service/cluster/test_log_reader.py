@@ -37,7 +37,6 @@ LAST_TRACKED = Missed((STREAM,), "", lambda _: False, {STREAM: Position(frozense
 
 @pytest.fixture
 def filled(tmp_path: Path) -> Iterator[MessageLog]:
-    """A log with frames of one stream."""
     with NatsProcess(tmp_path) as nats:
         one = MessageLog([nats.url], "optipmb/v1")
 

@@ -24,13 +24,11 @@ KEEP = {"detections": Retention(60, 2**25)}
 
 
 def message(seq: int, size: int) -> LogMessage:
-    """Detections of so many bytes."""
     return LogMessage("detections", "a/b/c", bytes(16), seq, seq, "", (0, 0), bytes(size), "")
 
 
 @pytest.fixture
 def log(tmp_path: Path) -> Iterator[MessageLog]:
-    """A log with a server."""
     with NatsProcess(tmp_path) as nats:
         one = MessageLog([nats.url], "optipmb/v1")
         until(lambda: not one.connection.failure, "it is connected")

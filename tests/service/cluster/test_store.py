@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 @pytest.fixture(params=["memory", "file"])
 def store(request: pytest.FixtureRequest, tmp_path: Path) -> SqliteStore:
-    """A store in memory, or in a file."""
     return SqliteStore(tmp_path / "sessions.db" if request.param == "file" else None)
 
 

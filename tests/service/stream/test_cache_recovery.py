@@ -1,4 +1,4 @@
-"""Which caches a session waits for, and how much of those that have answered is remembered."""
+"""Caches that a session waits for, and the bound on remembered answers."""
 
 from __future__ import annotations
 
@@ -27,7 +27,6 @@ class Publishers:
         self.asked: list[str] = []
 
     def set(self, stream: str, *, present: bool) -> None:
-        """Have a publisher come or go."""
         assert self._directory.published(stream, "token", self.now_ns, present=present)
 
     def awaited(self, session: str, sensors: Iterable[str]) -> dict[str, bool]:
@@ -36,7 +35,6 @@ class Publishers:
         return self._directory.awaited("site/node", lambda _: True, sensors, self.now_ns)
 
     def ask_cache(self, stream: str, then: Callable[[list[Packet], bool], None]) -> None:
-        """Note it, without an answer."""
         del then
         self.asked.append(stream)
 

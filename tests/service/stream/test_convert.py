@@ -63,7 +63,7 @@ def messages(draw: st.DrawFn) -> schemas.Detections:
 
 
 def made(function: Any, *arguments: Any, **named: Any) -> Any:
-    """Return all values of a frame and how many objects were left out, or what is wrong."""
+    """Return all values of a frame and the number of omitted objects, or the error."""
     try:
         frame, left_out = function(*arguments, **named)
     except optipmb.FrameError as error:

@@ -1,4 +1,4 @@
-"""Tracks on their way out: the bytes that are put together without a message are those of the message."""
+"""Output tracks: bytes composed without a message equal the encoded message."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ PARAMETERS = optipmb.load_profile("generic")
 
 
 def sound_tracks(count: int) -> optipmb.Tracks:
-    """Tracks whose numbers a message may hold."""
     rng = np.random.default_rng(count)
     columns: dict[str, Any] = {}
     for name, one in optipmb.Tracks.described.items():
@@ -37,7 +36,6 @@ def made(tracks: optipmb.Tracks, *parts: Any, frame_id: FrameId = FRAME, **field
 
 
 def delivery(run: int) -> dict[str, Any]:
-    """The values of a delivery part."""
     times = {"queue_ms": 0.5, "decode_ms": 0.0, "step_ms": 1e-3}
     return {"instance": "one", "received_ns": 2**60, "published_ns": 2**61, **times, "run": run}
 

@@ -24,11 +24,9 @@ class Log:
         self.asked: list[tuple[str, Callable[[list[Any]], None]]] = []
 
     def fetch(self, _: str, __: object, first: Callable[[list[Any]], None], ___: object) -> None:
-        """Have nothing at the start."""
         first([])
 
     def look(self, checkpoint: Checkpoint, then: Callable[[list[Any]], None]) -> None:
-        """Take a question."""
         self.asked.append((checkpoint.stream, then))
 
 

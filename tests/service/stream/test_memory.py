@@ -41,7 +41,6 @@ def resident_mb(process: int) -> float:
 
 @pytest.fixture(scope="module")
 def busy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceProcess]:
-    """A service with its own router and a store, 50 streams of 40 objects in it."""
     optipmb.warm_up()  # a process that compiles keeps the compiler's memory
     sensors = [replace(SENSOR, stream=f"site/node{k}/lidar", objects=40) for k in range(STREAMS)]
     environment = {"OPTIPMB_STORE": str(tmp_path_factory.mktemp("store"))}
@@ -82,7 +81,7 @@ def test_a_cloud_counts_once() -> None:
 
 
 def test_sessions_that_keep_little_are_not_closed_for_memory() -> None:
-    """Beyond the memory sessions are closed, the least recently used first, but for those that keep next to nothing."""
+    """Beyond the memory, the least recently used sessions are closed, except sessions of hardly any size."""
     kept_mb = [0.0, 0.01, 6.0, 0.2, 4.0, 9.0]  # the least recently used first; 10 MB may be kept
     named = zip(map(str, range(6)), kept_mb, strict=True)
     streams: Any = [

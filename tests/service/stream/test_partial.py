@@ -1,4 +1,4 @@
-"""Sessions of detections without heading, size or height: what is known of a track goes with it."""
+"""Sessions of detections without heading, size or height: tracks carry the known part."""
 
 from __future__ import annotations
 

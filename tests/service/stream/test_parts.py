@@ -32,7 +32,7 @@ SENSOR = Sensor()
 
 
 def test_workers_take_turns() -> None:
-    """With one thread, what has more to do waits until the others had their turn."""
+    """With one thread, further work of one part waits until the others had their turn."""
     turns: list[str] = []
     done = threading.Event()
 
@@ -64,7 +64,7 @@ def test_workers_take_turns() -> None:
 
 
 def test_an_error_does_not_end_the_tracking_thread() -> None:
-    """What raises is not called again for what it had; others have their turns."""
+    """A part that raises is not called again for the same work; others have their turns."""
     gate = threading.Event()
 
     class Broken:
@@ -103,14 +103,13 @@ def test_a_step_that_does_not_end_does_not_keep_the_scheduler() -> None:
 
 
 def problem(stream: str = "a/b/c", code: str = "late", count: int = 1) -> Problem:
-    """Some problem."""
     return problem_of(code, stream=stream, instance="x", message="m", count=count)
 
 
 @settings(deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, SECOND)), max_size=80))
 def test_no_problem_is_lost_and_few_are_published(steps: list[tuple[int, int]]) -> None:
-    """Counts on the key and in the log add up to what was reported, each kind at most once a second, once in ten."""
+    """Counts on the key and in the log add up to the reports, each kind at most once a second, once in ten."""
     published: list[Problem] = []
     one = ProblemReporter(published.append)
     now, last = 0, dict[str, int]()
@@ -156,7 +155,7 @@ def test_elements_of_an_array_are_one_kind() -> None:
 @settings(deadline=None)
 @given(st.text(max_size=2000))
 def test_a_problem_takes_any_text(text: str) -> None:
-    """Whatever was received, the problem can be made and its texts are printable."""
+    """For any input, the problem can be made and its texts are printable."""
     made = problem_of("x", stream="", instance="x", message=text, received=text, expected=text, path=text)
     assert made.message.isprintable()
 
@@ -278,7 +277,7 @@ def test_router_or_client() -> None:
 
 
 def test_streams_of_a_profile_share_a_tracker() -> None:
-    """A tracker keeps nothing of a stream: those of one profile have the same, other parameters have their own."""
+    """A tracker keeps nothing of a stream: sessions of one profile share it, other parameters have their own."""
     profiles = Profiles.read("kitti", {})
     tracker = profiles.trackers(optipmb.Tracker)
     known = profiles.of("a/b/c")

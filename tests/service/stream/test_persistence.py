@@ -1,4 +1,4 @@
-"""The checkpoint writer: what it is given, what it keeps in memory while the store fails, whom it keeps waiting."""
+"""The checkpoint writer: its input, its memory while the store fails, and its effect on frames."""
 
 from __future__ import annotations
 
@@ -27,7 +27,6 @@ FIRST, SECOND = Sensor("site/first/lidar"), Sensor("site/second/lidar")
 
 
 def snapshot(sensor: Sensor) -> Checkpoint:
-    """The state of a session without a frame."""
     return Session(sensor.stream, optipmb.load_profile("nuscenes")).snapshot()
 
 
@@ -41,7 +40,6 @@ class Full(SqliteStore):
         self.may_fail = threading.Semaphore(0)
 
     def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
-        """Save, or fail."""
         if not self.full:
             return super().save(checkpoints)
         self.tries.release()
@@ -168,7 +166,7 @@ def test_what_waits_for_its_lease_grows_older() -> None:
 
 
 def test_the_end_says_whether_all_is_written() -> None:
-    """What a store refuses, and what has lost its write lease, is not written when the writer ends; else all is."""
+    """At its end the writer skips refused checkpoints and lost leases, and writes all others."""
 
     def end(store: SqliteStore, *, lapsed: bool = False) -> bool:
         leases = Alone(store)
@@ -205,7 +203,7 @@ def test_the_end_says_when_a_state_cannot_be_written() -> None:
 
 
 def test_states_are_given_for_a_few_streams_at_a_time() -> None:
-    """Those of the sessions that changed, in pieces between which a frame that comes has its turn."""
+    """Checkpoints of changed sessions, in pieces between which a new frame has its turn."""
     around = Around()
     streams = streams_of(around)
     sensors = [replace(FIRST, stream=f"site/node{number:02d}/lidar") for number in range(2 * KEPT_AT_ONCE + 3)]

@@ -1,4 +1,4 @@
-"""Recorded sequences, disturbed: the state and the tracks are those of the recording in order, byte for byte."""
+"""Recorded sequences, disturbed: state and tracks equal the recording in order, byte for byte."""
 
 from __future__ import annotations
 

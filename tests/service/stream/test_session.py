@@ -25,12 +25,10 @@ LOST = 10
 
 
 def session(**changes: Any) -> Session:
-    """A session of the sensor's stream."""
     return Session(SENSOR.stream, NUSCENES, instance="test", **changes)
 
 
 def feed(one: Session, seqs: Any, sensor: Sensor = SENSOR, **changes: Any) -> list[Output]:
-    """Give frames to a session at time zero."""
     return sessions.feed(one, seqs, sensor, **changes)
 
 
@@ -133,7 +131,7 @@ def test_a_restarted_publisher_continues() -> None:
 
 @pytest.mark.parametrize("shift_s", [-3600.0, -0.5, 3600.0])
 def test_a_jump_begins_a_new_session_without_reusing_ids(shift_s: float) -> None:
-    """A replay or a clock set anew starts over: new session id, higher track ids."""
+    """A replay or a reset clock starts over: new session id, higher track ids."""
     one = session()
     before = tracks(feed(one, range(5)))[-1]
     again = replace(SENSOR, epoch=b"b" * 16, start_s=SENSOR.start_s + shift_s)

@@ -22,7 +22,6 @@ A, B, C = (bytes([letter]) * 16 for letter in b"abc")
 
 
 def mark(seq: int, seconds: float, epoch: bytes = A) -> FrameId:
-    """A frame by number and seconds."""
     return FrameId(epoch, seq, round(seconds * SECOND))
 
 
@@ -46,7 +45,6 @@ def judge_all(marks: list[FrameId], *, window: bool = False) -> tuple[list[Decis
 
 
 def verdicts(marks: list[FrameId], *, window: bool = False) -> list[Verdict]:
-    """The verdicts on frames."""
     return [decision.verdict for decision in judge_all(marks, window=window)[0]]
 
 
@@ -61,7 +59,7 @@ marks = st.builds(
 @settings(deadline=None)
 @given(st.lists(marks, max_size=60), st.booleans())
 def test_no_frame_is_admitted_twice(arrived: list[FrameId], window: bool) -> None:  # noqa: FBT001 - drawn
-    """Whatever arrives in whatever order, an (epoch, seq) is admitted at most once."""
+    """For any arrivals in any order, an (epoch, seq) is admitted at most once."""
     decisions, _ = judge_all(arrived, window=window)
     admitted = [(m.epoch, m.seq) for m, d in zip(arrived, decisions, strict=True) if d.verdict.admitted]
     assert len(admitted) == len(set(admitted))
@@ -86,7 +84,7 @@ def test_time_never_goes_back_in_a_generation(arrived: list[FrameId]) -> None:
 @settings(deadline=None)
 @given(st.lists(marks, max_size=60))
 def test_time_never_goes_back_in_the_window(arrived: list[FrameId]) -> None:
-    """In the order of processing, whatever came when, stamps never fall in one life of a density."""
+    """In the order of processing, for any order of arrival, stamps never fall within one session."""
     _, timeline = judge_all(arrived, window=True)
     placed = sorted((place.order(one), place.generation) for one, place in timeline.places().items())
     for (before, first), (after, second) in itertools.pairwise(placed):
@@ -181,7 +179,7 @@ def test_frames_further_apart_than_the_limit_go_on() -> None:
 
 
 def test_an_old_frame_is_no_jump() -> None:
-    """A frame held up for a minute somewhere is late, not a reason to begin anew; so is what was sent before a jump."""
+    """A frame delayed by a minute is late, no reason to restart; so are frames sent before a jump."""
     after = [mark(2, 60), mark(3, 60.1), mark(4, 60.2)]
     assert verdicts([mark(0, 0), *after, mark(1, 0.1), mark(5, 60.3)])[3:] == [
         Verdict.RESTART,

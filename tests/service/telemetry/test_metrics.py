@@ -14,7 +14,6 @@ NAMES = ("latency", "queue", "decode", "step")
 
 
 def filled() -> Metrics:
-    """Metrics in which something was counted."""
     metrics = Metrics()
     for number, seconds in enumerate(DURATIONS):
         metrics.received("detections", 100 + number)

@@ -23,19 +23,16 @@ SENSOR = Sensor()
 
 
 def said(node: Node, code: str, stream: str = SENSOR.stream) -> list[Problem]:
-    """The problems of a kind that came so far."""
     key = KEYS.problems(stream)
     found = [decode(payload, Problem) for at, payload, _ in node.problems_seen.items if at == key]
     return [one for one in found if one.code == code]
 
 
 def state(node: Node) -> SessionState:
-    """The state of the sensor's session."""
     return node.ask(KEYS.query(SENSOR.stream, "state"), SessionState)
 
 
 def send(node: Node, stamps: Iterable[int], sensor: Sensor = SENSOR, first: int = 0) -> None:
-    """Publish frames with these stamps; the objects move as if nothing was wrong with them."""
     for seq, stamp_ns in enumerate(stamps, first):
         node.send(sensor.detections(seq, stamp_ns=stamp_ns))
 

@@ -28,7 +28,6 @@ ECHO = "echo"
 
 @pytest.fixture
 def endpoint() -> Iterator[str]:
-    """Endpoint of a router that lists its declarations."""
     endpoint = free_endpoint()
     with open_router(endpoint, adminspace=True) as router:
         router.declare_queryable(ECHO, lambda query: query.reply(ECHO, b""))
@@ -37,7 +36,6 @@ def endpoint() -> Iterator[str]:
 
 @contextlib.contextmanager
 def connected(endpoint: str, file: Path | None = None) -> Iterator[Client]:
-    """The session of a member."""
     given = {"connect": [endpoint], "instance": "member", "store": "none"}
     client = Client(load(None, given | ({} if file is None else {"zenoh_config": str(file)})).settings)
     yield client
@@ -45,7 +43,6 @@ def connected(endpoint: str, file: Path | None = None) -> Iterator[Client]:
 
 
 def opened_publisher(member: Client, stream: str) -> Sender:
-    """The publisher of a stream's tracks."""
     return member.cached_sender(KEYS.tracks(stream), encoding_of(Tracks), cache=8, detected=False)
 
 

@@ -38,11 +38,9 @@ class Network:
         self.topic = Topic("detections", self.link, self.receive, self.answered.append)
 
     def receive(self, sample: zenoh.Sample) -> None:
-        """Take a message."""
         self.received.add(str(sample.key_expr), sample.payload.to_bytes(), "")
 
     def publish(self, *payloads: bytes) -> None:
-        """Send messages."""
         for payload in payloads:
             self.publisher.put(payload)
 
@@ -54,7 +52,6 @@ class Network:
 
 @pytest.fixture
 def network() -> Iterator[Network]:
-    """A publisher that has sent two messages before anybody subscribed."""
     with open_router(free_endpoint()) as session:
         one = Network(session)
         one.publish(b"0", b"1")

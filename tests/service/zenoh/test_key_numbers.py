@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 @pytest.fixture
 def session() -> Iterator[Session]:
-    """A session alone."""
     config = zenoh.Config()
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("listen/endpoints", "[]")

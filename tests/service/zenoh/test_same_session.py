@@ -30,13 +30,11 @@ HANGS_S: Final = 60.0
 
 @pytest.fixture
 def session() -> Iterator[Session]:
-    """A session that is a router itself."""
     with open_router(free_endpoint()) as session:
         yield Session(session)
 
 
 def ends(work: Callable[[], object]) -> None:
-    """Do something that could wait for ever."""
     thread = threading.Thread(target=work, daemon=True)
     thread.start()
     thread.join(HANGS_S)
