@@ -193,7 +193,7 @@ class Process(Around):
         """Restore a kept state."""
         then(restore(decode_checkpoint(self._saved[stream])) if stream in self._saved else None)
 
-    def publish(self, payload: bytes) -> None:
+    def publish(self, payload: bytes, _: bytes | None = None) -> None:
         """Record tracks."""
         self._out.message(schemas.decode(payload, schemas.Tracks))
 

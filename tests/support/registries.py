@@ -88,7 +88,7 @@ class Around:
 
     release = look
 
-    def publish(self, _: bytes) -> None:
+    def publish(self, *_: bytes | None) -> None:
         """Tracks go nowhere."""
 
     publish_events = publish
@@ -101,6 +101,7 @@ def streams_of(
     profiles: Profiles | None = None,
     reporter: Any = None,
     tracker: Any = chained,
+    traces: Any = None,
     **settings: Any,
 ) -> Streams:
     """Return the streams of a process with these around it."""
@@ -118,6 +119,7 @@ def streams_of(
         metrics=Metrics(),
         tracker=tracker,
     )
+    streams.traces = traces
     streams.caches = parts
     return streams
 
