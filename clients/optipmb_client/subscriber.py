@@ -27,12 +27,14 @@ MISSED = 1024  # ranges of lost frames that are kept
 class Received:
     """Tracks, and the monotonic time (`time.monotonic_ns`) at which they arrived on this machine.
 
-    `corrects` says whether they replace earlier tracks of the same frame.
+    `corrects` says whether they replace earlier tracks of the same frame. `traceparent` is the W3C trace context in
+    which the service published them; empty where it records no traces, and over gRPC.
     """
 
     tracks: Tracks
     monotonic_ns: int
     corrects: bool = False
+    traceparent: str = ""
 
 
 @dataclass(frozen=True)
@@ -242,7 +244,8 @@ class Subscriber(_Subscription):
                 self._corrected += novelty is Novelty.CORRECTION
                 if novelty is Novelty.NEW or (novelty is Novelty.CORRECTION and self._corrections):
                     self._delivered += 1
-                    return Received(tracks, arrival.monotonic_ns, corrects=novelty is Novelty.CORRECTION)
+                    corrects = novelty is Novelty.CORRECTION
+                    return Received(tracks, arrival.monotonic_ns, corrects, arrival.traceparent)
 
     @property
     def statistics(self) -> Statistics:

@@ -496,6 +496,8 @@ class Settings(BaseSettings):
     """form of the log lines on stderr"""
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     """lowest level that is logged"""
+    traces: bool = False
+    """record spans of every frame with OpenTelemetry, configured by the variables `OTEL_…`; needs the extra `traces`"""
     sites: dict[str, SiteSettings] = Field(default_factory=dict)
     """place of each site's world frame, by which the live page shows latitude, longitude and true heading"""
     zones: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")], ZoneSettings] = Field(default_factory=dict)

@@ -78,7 +78,7 @@ class Around:
 
     release = look
 
-    def publish(self, _: bytes) -> None:
+    def publish(self, *_: bytes | None) -> None:
         """Tracks go nowhere."""
 
     publish_events = publish
@@ -91,6 +91,7 @@ def streams_of(
     profiles: Profiles | None = None,
     reporter: Any = None,
     tracker: Any = chained,
+    traces: Any = None,
     **settings: Any,
 ) -> Streams:
     parts: Any = around  # in the place of several
@@ -107,6 +108,7 @@ def streams_of(
         metrics=Metrics(),
         tracker=tracker,
     )
+    streams.traces = traces
     streams.caches = parts
     return streams
 

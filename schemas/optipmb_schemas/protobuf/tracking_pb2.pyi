@@ -458,12 +458,14 @@ class SessionSummary(_message.Message):
     def __init__(self, stream: _Optional[str] = ..., profile: _Optional[str] = ..., state: _Optional[str] = ..., rate_hz: _Optional[float] = ..., latency_p50_ms: _Optional[float] = ..., latency_p99_ms: _Optional[float] = ..., frames: _Optional[int] = ..., refused: _Optional[int] = ..., shed: _Optional[int] = ..., gaps: _Optional[int] = ..., tracks: _Optional[int] = ..., queue: _Optional[int] = ..., age_s: _Optional[float] = ..., worker: _Optional[int] = ..., sensors: _Optional[_Iterable[str]] = ..., silent: _Optional[_Iterable[str]] = ..., late: _Optional[int] = ..., duplicates: _Optional[int] = ..., configured: _Optional[str] = ...) -> None: ...
 
 class TrackRequest(_message.Message):
-    __slots__ = ("detections", "points")
+    __slots__ = ("detections", "points", "traceparent")
     DETECTIONS_FIELD_NUMBER: _ClassVar[int]
     POINTS_FIELD_NUMBER: _ClassVar[int]
+    TRACEPARENT_FIELD_NUMBER: _ClassVar[int]
     detections: Detections
     points: Points
-    def __init__(self, detections: _Optional[_Union[Detections, _Mapping]] = ..., points: _Optional[_Union[Points, _Mapping]] = ...) -> None: ...
+    traceparent: str
+    def __init__(self, detections: _Optional[_Union[Detections, _Mapping]] = ..., points: _Optional[_Union[Points, _Mapping]] = ..., traceparent: _Optional[str] = ...) -> None: ...
 
 class TrackResponse(_message.Message):
     __slots__ = ("tracks", "problem", "skipped")
@@ -486,14 +488,16 @@ class PublishOptions(_message.Message):
     def __init__(self, stream: _Optional[str] = ..., cache: _Optional[int] = ..., cache_clouds: _Optional[int] = ...) -> None: ...
 
 class PublishRequest(_message.Message):
-    __slots__ = ("options", "detections", "points")
+    __slots__ = ("options", "detections", "points", "traceparent")
     OPTIONS_FIELD_NUMBER: _ClassVar[int]
     DETECTIONS_FIELD_NUMBER: _ClassVar[int]
     POINTS_FIELD_NUMBER: _ClassVar[int]
+    TRACEPARENT_FIELD_NUMBER: _ClassVar[int]
     options: PublishOptions
     detections: Detections
     points: Points
-    def __init__(self, options: _Optional[_Union[PublishOptions, _Mapping]] = ..., detections: _Optional[_Union[Detections, _Mapping]] = ..., points: _Optional[_Union[Points, _Mapping]] = ...) -> None: ...
+    traceparent: str
+    def __init__(self, options: _Optional[_Union[PublishOptions, _Mapping]] = ..., detections: _Optional[_Union[Detections, _Mapping]] = ..., points: _Optional[_Union[Points, _Mapping]] = ..., traceparent: _Optional[str] = ...) -> None: ...
 
 class Acknowledgement(_message.Message):
     __slots__ = ("detections", "points", "points_wanted")

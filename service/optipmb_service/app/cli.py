@@ -147,6 +147,8 @@ def run_command(**given: Unpack[Options]) -> None:
         _needed("optipmb_service.cluster.jetstream", "cluster")
     if settings.grpc:
         _needed("grpc", "grpc")
+    if settings.traces:
+        _needed("optipmb_service.stream.traces", "traces")
     if settings.workers > 1:
         from optipmb_service.app.workers import supervise  # noqa: PLC0415 - a process that tracks needs none
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import optipmb_schemas as schemas
 import structlog
 from optipmb_client.errors import ConnectionFailed as TransportError
+from optipmb_client.trace_context import attachment_of
 
 from optipmb_service.stream.checkpoint import CheckpointError, forgotten
 from optipmb_service.stream.persistence import save_dump
@@ -31,10 +32,13 @@ from optipmb_service.zenoh.inputs import Packet
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from opentelemetry.context import Context
+
     from optipmb_service.stream.backlog import Backlog, Shed
     from optipmb_service.stream.checkpoint import Checkpoint
     from optipmb_service.stream.fixed_rate import FixedRate
     from optipmb_service.stream.streams import Streams
+    from optipmb_service.stream.traces import FrameTrace, Traces
     from optipmb_service.stream.values import Output, Reached
     from optipmb_service.zenoh.transport import StreamPublisher
 
@@ -56,11 +60,12 @@ CLOUD_REFUSED: Final = {"invalid_value", "refused"}
 
 
 class Arrival(NamedTuple):
-    """Times of a frame's arrival, and of its decoding."""
+    """Times of a frame's arrival, and of its decoding; its trace, where traces are recorded."""
 
     wall_ns: int
     now_ns: int
     decode_ns: int
+    trace: FrameTrace | None = None
 
 
 class Stream:
@@ -89,7 +94,8 @@ class Stream:
         self._step_limit_ns = streams.step_limit_ns
         self._publisher: StreamPublisher | None = None
         self._fixed_rate: FixedRate | None = None
-        self._unpublished: list[tuple[bytes, bytes | None, Tracked, int]] = []
+        self._traces: Traces | None = streams.traces
+        self._unpublished: list[tuple[bytes, bytes | None, Tracked, int, Context | None]] = []
         """Encoded tracks and events that wait for the write lease, each with the time that its frame waited, ns."""
         self._ids = b""
         """Ids of the newest tracks, as the bytes of int64."""
@@ -250,7 +256,9 @@ class Stream:
             return
         now_ns = time.monotonic_ns()
         self.sensors.arrived(packet, message.stream)
-        ticket = Arrival(packet.wall_ns, packet.now_ns, time.perf_counter_ns() - began_ns)
+        decode_ns = time.perf_counter_ns() - began_ns
+        trace = self._traces.received(packet, message) if self._traces else None
+        ticket = Arrival(packet.wall_ns, packet.now_ns, decode_ns, trace)
         if isinstance(message, schemas.Points):
             outputs = session.on_points(message, now_ns, ticket=ticket)
             if any(getattr(one, "code", "") in CLOUD_REFUSED for one in outputs):
@@ -336,7 +344,8 @@ class Stream:
         events = tracked.encoded_events(delivery, self.durable)
         if not again:
             self._count_tracks(tracked.estimates.id.tobytes())
-        self._unpublished.append((b"" if again else tracked.encoded(delivery), events, tracked, waited_ns))
+        span = self._traces.tracked(ticket.trace, tracked) if self._traces and ticket.trace else None
+        self._unpublished.append((b"" if again else tracked.encoded(delivery), events, tracked, waited_ns, span))
         self._publish()
 
     def _delivery(self, tracked: Tracked, waited_ns: int) -> dict[str, Any]:
@@ -366,16 +375,19 @@ class Stream:
         if not self._unpublished or not self._member.may_write(self.name, self._fence):
             return
         waiting, self._unpublished = self._unpublished, []
-        for payload, events, tracked, waited_ns in waiting:
+        for payload, events, tracked, waited_ns, span in waiting:
+            attachment = attachment_of(self._traces.traceparent(span)) if self._traces and span else None
             try:
                 if self._publisher is not None:
                     if payload:
-                        self._publisher.publish(payload)
+                        self._publisher.publish(payload, attachment)
                     if events is not None:
                         self._publisher.publish_events(events)
             except TransportError as error:
                 log.warning("publish_failed", stream=self.name, error=str(error))
                 continue
+            if self._traces and span:
+                self._traces.published(span)
             if payload:
                 latency_ns = time.monotonic_ns() - tracked.ticket.now_ns
                 self.meter.published(latency_ns)
@@ -658,8 +670,12 @@ class Stream:
         for message, ticket in session.unprocessed():
             key = (keys.detections if isinstance(message, schemas.Detections) else keys.points)(message.stream)
             payload = schemas.encode(message)
-            came = (ticket.wall_ns, ticket.now_ns) if isinstance(ticket, Arrival) else (wall_ns, now_ns)
-            self.backlog.push(Packet(key, payload, len(payload), schemas.encoding_of(message), *came))
+            came, parent = (wall_ns, now_ns), ""
+            if isinstance(ticket, Arrival):
+                came = ticket.wall_ns, ticket.now_ns
+                if self._traces and ticket.trace:
+                    parent = self._traces.traceparent(ticket.trace.context)
+            self.backlog.push(Packet(key, payload, len(payload), schemas.encoding_of(message), *came, parent))
 
     def keep(self) -> None:
         """Give the state to the checkpoint writer, if it changed."""

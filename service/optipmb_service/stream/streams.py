@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from optipmb_service.stream.persistence import CheckpointWriter
     from optipmb_service.stream.profiles import Profiles
     from optipmb_service.stream.recovery import Log
+    from optipmb_service.stream.traces import Traces
     from optipmb_service.stream.values import Incarnation
     from optipmb_service.telemetry.metrics import Metrics
     from optipmb_service.telemetry.problem_reporter import ProblemReporter
@@ -101,6 +102,7 @@ class Streams:
         arm: calls a function at a monotonic time (ns).
         metrics: counts messages.
         tracker: makes the trackers of sessions.
+        traces: records spans of frames, where it is asked for.
     """
 
     caches: Intake
@@ -120,6 +122,7 @@ class Streams:
         arm: Callable[[Callable[[], None], int], None],
         metrics: Metrics,
         tracker: Callable[[optipmb.Parameters], Any] = optipmb.Tracker,
+        traces: Traces | None = None,
     ) -> None:
         self.profiles = profiles
         self.open_publisher = open_publisher
@@ -131,6 +134,7 @@ class Streams:
         self.arm = arm
         self.metrics = metrics
         self.tracker = tracker
+        self.traces = traces
         self.instance = settings.instance
         self.keys = schemas.Keys(settings.prefix)
         self.fusion = Fusion(settings.fuse)

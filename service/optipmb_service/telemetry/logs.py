@@ -78,6 +78,8 @@ EVENTS: Final = {
     "log_back": "The log can be written.",
     "log_unread": "The log could not be read for the session of `streams`: frames may be missing.",
     "log_cut": "A session missed more of the log than it takes at once: the oldest frames are left out.",
+    "traceparent_invalid": "A publisher sends the invalid trace context `received`: its frames begin new traces.",
+    "traces_failed": "A `text` of OpenTelemetry: spans could not be sent, or there were too many; some are lost.",
     "stream_stale": "No frame for `stale_s`: check the publisher.",
     "stream_back": "Frames arrive again.",
     "problem": "`count` messages were refused or lost since the last line: see the table of problems.",
@@ -271,11 +273,15 @@ def configure(form: Literal["console", "json"], level: str, worker: int | None =
         logger_factory=structlog.WriteLoggerFactory(file=cast("TextIO", _writer)),
     )
     logging.getLogger("optipmb").handlers = [_Library()]
+    logging.getLogger("opentelemetry").handlers = [_Library()]
 
 
 class _Library(logging.Handler):
-    """Logs the warnings of the tracker, which uses Python's own logging."""
+    """Logs the warnings of libraries, which use Python's own logging."""
 
     def emit(self, record: logging.LogRecord) -> None:
         """Log one of them."""
-        structlog.get_logger("optipmb_service").warning("tracker_message", text=record.getMessage())
+        ours = record.name.startswith("optipmb")
+        structlog.get_logger("optipmb_service").warning(
+            "tracker_message" if ours else "traces_failed", text=record.getMessage()
+        )

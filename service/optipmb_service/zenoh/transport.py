@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 import optipmb_schemas as schemas
 import structlog
 from optipmb_client.errors import ConnectionFailed as TransportError
+from optipmb_client.trace_context import attached
 
 from optipmb_service.zenoh.client import Client
 from optipmb_service.zenoh.inputs import Packet, ReturnedPublishers, Topic
@@ -107,6 +108,7 @@ class Transport:
         self._prefix = settings.prefix
         self._instance = settings.instance
         self._max_bytes = settings.limits.max_bytes
+        self._traces = settings.traces
         self._client = Client(settings)
         self._topics: dict[str, Topic] = {}
         self._discover: Callable[[Sample], None] = lambda _: None
@@ -222,7 +224,8 @@ class Transport:
         for answer in self._client.query(self._keys.recent(), payload, timeout=RECENT_S, background=True):
             if answer.ok and answer.about:
                 now = time.time_ns(), time.monotonic_ns()
-                found.append(Packet(answer.about, answer.payload, len(answer.payload), answer.encoding, *now))
+                key, _, parent = answer.about.partition("\n")
+                found.append(Packet(key, answer.payload, len(answer.payload), answer.encoding, *now, parent))
         return found
 
     def ask_cache(self, stream: str, then: Callable[[list[Packet], bool], None]) -> None:
@@ -299,7 +302,9 @@ class Transport:
         payload = sample.payload
         size = len(payload)
         data = payload.to_bytes() if size <= self._max_bytes else None
-        receive(Packet(key, data, size, str(sample.encoding), wall_ns, now_ns))
+        attachment = sample.attachment if self._traces else None
+        parent = "" if attachment is None else attached(attachment.to_bytes())
+        receive(Packet(key, data, size, str(sample.encoding), wall_ns, now_ns, parent))
 
     # Sending
 
