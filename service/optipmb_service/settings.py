@@ -455,8 +455,8 @@ class Settings(BaseSettings):
     is replaced"""
     restart_keys: int = Field(default=50_000, ge=100, le=60_000)
     """keys declared on the network after which a process restarts, its sessions continue from the store: Zenoh has
-    65,535 for the life of a process, and each stream that opens takes up to 5, with zones 2 and with
-    `outputs` 1 more"""
+    65,535 for the life of a process, and each stream that opens needs up to 5, 2 more with zones, 1
+    more with `outputs`"""
     grace_s: float = Field(default=1.0, ge=0, le=60)
     """at shutdown, time for frames already received"""
     http: Address = ""
