@@ -126,21 +126,15 @@ def tracks_ahead(tracks: Tracks, seconds: float, table: ClassTable) -> Tracks:
     Boxes, scores and `confirmed` stay; no track has a detection.
     """
     paths = paths_of(tracks, np.array([seconds]), table)
-    mean = paths.mean[:, 0]
-    speed, yaw = mean[:, V], mean[:, PHI]
-    survival = table["survival"][tracks.label] ** (seconds / table.period)
-    return tracks.replaced(
-        center=np.column_stack((mean[:, :2], tracks.center[:, 2])),
-        yaw=yaw,
-        velocity=np.column_stack((speed * np.cos(yaw), speed * np.sin(yaw))),
-        yaw_rate=mean[:, OMEGA],
-        acceleration=mean[:, A],
-        existence=tracks.existence * survival,
-        covariance=paths.covariance[:, 0],
-        age=tracks.age + seconds,
-        time_since_detection=tracks.time_since_detection + seconds,
-        detection=np.full(len(tracks), -1),
-    )
+    mean, later = paths.mean[:, 0], type(tracks).of(tracks.words.copy())
+    later.center[:, :2], later.yaw[:], later.yaw_rate[:], later.acceleration[:] = mean[:, :2], *mean[:, PHI:].T
+    later.velocity[:, 0], later.velocity[:, 1] = mean[:, V] * np.cos(later.yaw), mean[:, V] * np.sin(later.yaw)
+    later.covariance[:] = paths.covariance[:, 0]
+    later.existence[:] *= table["survival"][tracks.label] ** (seconds / table.period)
+    later.age[:] += seconds
+    later.time_since_detection[:] += seconds
+    later.detection[:] = -1
+    return later
 
 
 def _horizons(values: Sequence[float] | Array) -> Array:

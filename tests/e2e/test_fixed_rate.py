@@ -62,7 +62,7 @@ def check(messages: list[Tracks]) -> None:
 
 @pytest.mark.parametrize("edge", ["zenoh", "grpc"])
 def test_python_reads_predicted_tracks(edge: str) -> None:
-    """A subscriber gets each message, also those of one frame."""
+    """A subscriber gets each message, also several of one frame."""
     with ServiceProcess(environment=OUTPUTS) as service:
         service.wait_ready()
         with GatewayProcess(service.endpoint) as gateway, driving(service.endpoint):

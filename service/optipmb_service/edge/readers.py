@@ -163,7 +163,7 @@ class Pace:
 
     Args:
         max_rate_hz: highest rate; 0: all frames.
-        predict: whether the stamps are those of predicted states, which nothing corrects.
+        predict: whether the stamps are times of predicted states, which nothing corrects.
 
     Raises:
         MessageError: it is no rate.

@@ -58,7 +58,7 @@ class FixedRate:
             self.due_ns = now_ns
         stamp_ns, ticket = newest.header["stamp_ns"], newest.ticket
         if before is not None and before.header["stamp_ns"] == stamp_ns:
-            return ""  # corrected: the ticket is that of a late frame
+            return ""  # corrected, with the ticket of a late frame
         self._arrived_ns = ticket.now_ns
         behind_ns = ticket.wall_ns - stamp_ns
         if self._by_arrival or abs(behind_ns) <= self._longest_ns:

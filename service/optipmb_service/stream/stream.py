@@ -196,7 +196,7 @@ class Stream:
             self.report("internal", "", "a message handled without an error", f"{type(error).__name__}: {error}")
 
     def _settle(self) -> None:
-        """Process frames whose wait is over, send what is due, and ask for a turn for the rest."""
+        """Process frames whose wait is over, send predicted tracks that are due, and ask for the next turn."""
         for origin, shed in self.backlog.shed_since().items():
             expected, received = f"at most {self._streams.queue_frames} frames waiting", "more; the oldest were dropped"
             self.report("shed", "", expected, f"{shed} {received}", count=shed, stream=self._stream_of(origin))

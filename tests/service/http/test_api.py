@@ -192,6 +192,12 @@ def test_a_bad_parameter_is_refused_with_its_path(address: str, query: str, path
     assert (status, json.loads(body)["path"]) == (http.client.BAD_REQUEST, path)
 
 
+def test_the_newest_tracks_are_not_predicted(address: str) -> None:
+    """Nothing of a fixed rate is kept to be asked for."""
+    status, answer = get(address, f"tracks?stream={ALL}&predict=1")
+    assert (status, answer["path"]) == (http.client.BAD_REQUEST, "predict")
+
+
 def test_tokens_decide_who_reads_what(guarded: str, session: Session) -> None:
     """No token or a wrong one: 401; a node reads its own streams: 403 for others. Health asks for none."""
     viewer, node = {"authorization": "Bearer secret"}, {"authorization": "bearer rig"}
