@@ -33,7 +33,6 @@ import optipmb
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from types import TracebackType
 
     from optipmb_schemas import SessionState
     from service_process import ServiceProcess
@@ -185,9 +184,7 @@ class Sending:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._enough.set()
         self._thread.join()
 

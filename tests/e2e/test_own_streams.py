@@ -24,7 +24,6 @@ import optipmb
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
-    from types import TracebackType
 
     from optipmb_schemas import Detections, Points
     from service_process import ServiceProcess
@@ -60,9 +59,7 @@ class Pair:
         self.settle()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._context.close()
 
     def settle(self) -> None:

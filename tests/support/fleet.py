@@ -15,7 +15,6 @@ from service_process import ServiceProcess
 
 if TYPE_CHECKING:
     from pathlib import Path
-    from types import TracebackType
 
     import zenoh
 
@@ -50,9 +49,7 @@ class RouterProcess:
         self.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.kill()
 
     def start(self) -> None:
@@ -97,9 +94,7 @@ class Fleet:
         self._context.enter_context(self.router)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._context.close()
 
     @property

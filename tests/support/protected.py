@@ -102,9 +102,7 @@ class Party:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.session.close()  # type: ignore[no-untyped-call]  # zenoh's stubs leave it untyped
 
     def read(self, *patterns: str) -> Self:

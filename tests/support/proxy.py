@@ -7,12 +7,9 @@ import queue
 import socket
 import threading
 import time
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 from routers import free_endpoint
-
-if TYPE_CHECKING:
-    from types import TracebackType
 
 CHUNK = 1 << 16
 
@@ -49,9 +46,7 @@ class Proxy:
         self._start(self._accept, listener)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._whole.set()
         for way in self._ways:
             way.set()

@@ -75,10 +75,6 @@ def samples(text: str) -> Samples:
     return {(one.name, tuple(sorted(one.labels.items()))): one.value for family in families for one in family.samples}
 
 
-def free_address() -> str:
-    return free_endpoint().removeprefix("tcp/")
-
-
 def test_health_follows_the_heartbeat() -> None:
     """`/healthz` says 200 while the control loop turns and 503 when it has not for ten seconds."""
     source = Watched()

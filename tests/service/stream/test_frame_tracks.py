@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import optipmb_schemas as schemas
@@ -10,9 +10,11 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from optipmb_service.stream.convert import tracks_of
 from optipmb_service.stream.timeline import FrameId
-from optipmb_service.stream.values import COLUMNS, Tracked
 
 import optipmb
+
+if TYPE_CHECKING:
+    from optipmb_service.stream.values import Tracked
 
 FRAME = FrameId(b"0" * 16, 1, 2)
 PARAMETERS = optipmb.load_profile("generic")
@@ -38,16 +40,6 @@ def made(tracks: optipmb.Tracks, *parts: Any, frame_id: FrameId = FRAME, **field
 def delivery(run: int) -> dict[str, Any]:
     times = {"queue_ms": 0.5, "decode_ms": 0.0, "step_ms": 1e-3}
     return {"instance": "one", "received_ns": 2**60, "published_ns": 2**61, **times, "run": run}
-
-
-def test_the_columns_are_those_of_the_message_in_its_order() -> None:
-    """All that are there in every message, one behind the other and nothing between them; all of 8 bytes."""
-    names = [*schemas.Tracks.names]
-    assert [one for one in names if one in COLUMNS] == [*COLUMNS]
-    assert names[names.index("id") :][: len(COLUMNS)] == [*COLUMNS]
-    for name, one in optipmb.Tracks.described.items():
-        described = schemas.Tracks.arrays[name]
-        assert (described.dtype[1], described.shape) == ("8", ("N", *one.shape))
 
 
 @given(

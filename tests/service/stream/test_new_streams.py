@@ -10,7 +10,6 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_schemas import Keys
 from optipmb_service.cluster.leases import PARTITIONS, Change, partition_of
 from optipmb_service.stream import directory, streams
@@ -146,32 +145,6 @@ def run(network: Network, intake: Intake, done: Callable[[], bool]) -> None:
             time.sleep(0.01)
     finally:
         intake.close(WAIT_S)
-
-
-def test_an_error_of_the_network_does_not_end_the_intake() -> None:
-    """A subscription that fails is tried again in the next step."""
-
-    class Failing(Network):
-        fails = True
-
-        def subscribe(self, kind: str, stream: str, *, cached: bool) -> None:
-            if stream and self.fails:
-                self.fails = False
-                raise TransportError("no")
-            super().subscribe(kind, stream, cached=cached)
-
-    network, held = Failing(announced=STREAMS[:1]), set[int]()
-    intake, _ = member_of(network, held)
-
-    def subscribed() -> bool:
-        if not held:  # in the first call, when the intake has started
-            held.update(range(1, PARTITIONS))
-            for partition in tuple(held):
-                intake.changed(partition, Change.HELD)
-        return any(stream == STREAMS[0] for _, stream, _ in network.subscribed)
-
-    run(network, intake, subscribed)
-    assert not network.fails
 
 
 def test_new_streams_are_asked_for_a_few_at_a_time() -> None:
