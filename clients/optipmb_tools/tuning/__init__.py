@@ -1,6 +1,5 @@
 """Tuning: from a detector's results and labels to a parameter profile; ablation and parameter sweeps."""
 
-from optipmb_tools.tuning.display import TrialDisplay
 from optipmb_tools.tuning.estimate import Estimate
 from optipmb_tools.tuning.refine import Plan, Refined
 from optipmb_tools.tuning.run import Curves, Source, calibrate_scores, estimate_all, tune_all
@@ -17,7 +16,6 @@ __all__ = [
     "Refined",
     "Row",
     "Source",
-    "TrialDisplay",
     "Variant",
     "ablation",
     "calibrate_scores",
