@@ -6,7 +6,7 @@ import resource
 import shutil
 import time
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from fleet import Fleet
@@ -16,9 +16,6 @@ from router import Node, until
 from takeovers import KEYS, SENSOR, check, published_by, send
 
 import optipmb
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.fixture(scope="module", autouse=True)

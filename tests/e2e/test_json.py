@@ -8,9 +8,9 @@ import json
 import re
 import threading
 import urllib.request
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from broker import Broker
@@ -19,9 +19,6 @@ from optipmb_schemas.json_form import Selection, tracks_json
 from router import Node, Sensor
 from service_process import ServiceProcess
 from websocket import create_connection
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 PAGE = Path(__file__).parents[2] / "examples/json/index.html"
 SENSOR = Sensor()

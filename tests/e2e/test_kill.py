@@ -7,8 +7,9 @@ import os
 import random
 import threading
 import time
+from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from fleet import Fleet
@@ -21,9 +22,6 @@ from recorded import KEYS, Replay, kitti
 from sessions import undisturbed
 
 import optipmb
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 KILLS = int(os.environ.get("OPTIPMB_TEST_KILLS", "3"))
 FEW = 10

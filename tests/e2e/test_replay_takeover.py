@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING
+from pathlib import Path
 
+import pytest
 from commands import run_here
 from fleet import Fleet, freeze
 from router import Node, until
 from takeovers import KEYS
 
 import optipmb
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    import pytest
 
 SCENE = ("--dataset", "scene", "--profile", "kitti", "--option", "frames=70", "--option", "vehicles=6")
 

@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import signal
 import sqlite3
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from optipmb_schemas import Keys, ResetRequest
@@ -14,9 +14,6 @@ from optipmb_service.stream.checkpoint import DIGEST, HEAD, MAGIC, VERSION
 from router import Node, Sensor, plain
 from service_process import ServiceProcess
 from takeovers import expected
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 KEYS = Keys()
 NUMBERS = 100

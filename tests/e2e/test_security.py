@@ -10,8 +10,9 @@ import itertools
 import json
 import re
 import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 import zenoh
@@ -24,11 +25,7 @@ from optipmb_service.cluster.store import StoreError
 from protected import MAKE, REFUSAL_MS, Network, Party, make
 from router import until
 from routers import free_endpoint
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from service_process import ServiceProcess
+from service_process import ServiceProcess
 
 KEYS = Keys()
 ROBOT, OTHER = "garage/robot-1", "garage/robot-2"

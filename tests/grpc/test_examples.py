@@ -6,12 +6,9 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
-
-if TYPE_CHECKING:
-    from gateway import GatewayProcess
+from gateway import GatewayProcess
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples" / "grpc"

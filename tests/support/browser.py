@@ -6,15 +6,12 @@ import contextlib
 import json
 import shutil
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
-    from selenium.webdriver import Chrome
+from selenium.webdriver import Chrome
 
 DEADLINE_S = 90.0
 

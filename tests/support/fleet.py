@@ -8,15 +8,12 @@ import signal
 import subprocess
 import sys
 import time
-from typing import TYPE_CHECKING, Self
+from pathlib import Path
+from typing import Self
 
+import zenoh
 from routers import free_endpoint, open_client
 from service_process import ServiceProcess
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    import zenoh
 
 START_S = 60.0
 

@@ -6,14 +6,10 @@ import json
 import re
 import urllib.error
 import urllib.request
-from typing import TYPE_CHECKING
 
-from router import Sensor, until
+from router import Node, Sensor, until
 from routers import free_endpoint
 from service_process import ServiceProcess
-
-if TYPE_CHECKING:
-    from router import Node
 
 PROBE = Sensor(stream="probe/probe/probe")
 

@@ -7,14 +7,12 @@ import socket
 import subprocess
 import sys
 import time
-from typing import TYPE_CHECKING, Self
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Self
 
 from optipmb_service.app.cli import NATS_PAYLOAD_MB, nats_server
 from routers import free_endpoint
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
 
 START_S = 60.0
 

@@ -7,17 +7,15 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from types import TracebackType
+from typing import Any, Self
 
 import zenoh
 from optipmb_schemas import Keys, ServiceStatus, decode
 from routers import free_endpoint
 from service_process import ServiceProcess
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from types import TracebackType
 
 MAKE = Path(__file__).parents[2] / "docker" / "security" / "make.py"
 DEADLINE_S = 60.0

@@ -8,12 +8,14 @@ from __future__ import annotations
 import json
 import threading
 import time
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import zenoh
 import zenoh.ext
+from optipmb_client.incoming import Arrival
 from optipmb_client.zenoh.session import Session
 from optipmb_schemas import (
     Detections,
@@ -28,11 +30,6 @@ from optipmb_schemas import (
     encode,
     encoding_of,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
-    from optipmb_client.incoming import Arrival
 
 SECOND = 1_000_000_000
 DEADLINE_S = 60.0

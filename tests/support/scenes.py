@@ -8,16 +8,14 @@ z up, radians.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from optipmb import Frame, Parameters
+from optipmb import Frame, Parameters
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ import resource
 import signal
 import socket
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from optipmb_schemas import Keys, ServiceStatus, SessionParameters, decode
@@ -19,9 +19,6 @@ from routers import free_endpoint, open_router
 from service_process import ServiceProcess
 
 import optipmb
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 KEYS = Keys()
 SENSOR = Sensor()

@@ -6,12 +6,9 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import pytest
 from optipmb_service.app.workers import HELD, private_folder
-
-if TYPE_CHECKING:
-    import pytest
 
 HOLDS = """
 import sys

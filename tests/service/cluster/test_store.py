@@ -8,7 +8,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from lease_log import Alone
@@ -24,9 +24,6 @@ from optipmb_service.cluster.sqlite import (
     SqliteStore,
 )
 from optipmb_service.cluster.store import ENDED, StoreError, Write, load_newest
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.fixture(params=["memory", "file"])

@@ -12,10 +12,11 @@ import socket
 import subprocess
 import sys
 import threading
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
+from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from optipmb_client.errors import ClientError
@@ -31,11 +32,6 @@ from router import Node, Sensor, until
 from routers import free_endpoint, open_router
 from service_process import ServiceProcess
 from watched import Watched, served
-
-if TYPE_CHECKING:
-    from concurrent.futures import Future
-    from pathlib import Path
-
 
 KEYS = Keys()
 SENSOR = Sensor()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import optipmb_schemas as schemas
@@ -10,11 +10,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from optipmb_service.stream.convert import tracks_of
 from optipmb_service.stream.timeline import FrameId
+from optipmb_service.stream.values import Tracked
 
 import optipmb
-
-if TYPE_CHECKING:
-    from optipmb_service.stream.values import Tracked
 
 FRAME = FrameId(b"0" * 16, 1, 2)
 PARAMETERS = optipmb.load_profile("generic")

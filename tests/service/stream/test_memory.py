@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import optipmb_schemas as schemas
 import pytest
@@ -19,9 +20,6 @@ from router import Node, Sensor
 from service_process import ServiceProcess
 
 import optipmb
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 SENSOR = Sensor()
 STREAMS = 50

@@ -5,9 +5,10 @@ from __future__ import annotations
 import random
 import time
 from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from optipmb_schemas import Keys
@@ -20,9 +21,6 @@ from optipmb_service.stream.values import SECOND
 from optipmb_service.zenoh.inputs import ALL, Packet
 from registries import Around, packet_of, streams_of
 from router import Sensor, until
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
 
 KEYS = Keys()
 STREAMS = [f"site/n{number:04}/lidar" for number in range(3 * NEW_STREAMS)]

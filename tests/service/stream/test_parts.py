@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from optipmb_schemas import Problem
 from optipmb_service.settings import SettingsInvalidError, load
 from optipmb_service.stream.pending import CloudBuffer
 from optipmb_service.stream.problems import problem_of
@@ -21,9 +21,6 @@ from router import SECOND, Sensor
 from structlog.testing import capture_logs
 
 import optipmb
-
-if TYPE_CHECKING:
-    from optipmb_schemas import Problem
 
 SENSOR = Sensor()
 
