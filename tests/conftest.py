@@ -1,7 +1,5 @@
 """What all tests share: interrupts as in a terminal, and which tests run by a command of their own."""
 
-from __future__ import annotations
-
 import gc
 import signal
 from collections.abc import Generator

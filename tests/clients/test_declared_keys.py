@@ -1,7 +1,5 @@
 """Keys that one connection can declare in its life: more are refused, and nothing is lost."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final

@@ -1,7 +1,5 @@
 """A load: its frames, its search, and its counts, against a service that is queried too."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The scan of an image finds what must not be in one."""
 
-from __future__ import annotations
-
 import io
 import json
 import tarfile

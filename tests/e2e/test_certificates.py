@@ -1,7 +1,5 @@
 """Certificates that expire: who reports it, and where; a renewed one is used."""
 
-from __future__ import annotations
-
 import re
 import urllib.error
 import urllib.request

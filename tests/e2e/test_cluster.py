@@ -1,7 +1,5 @@
 """Services that share streams, by a folder or by nothing but a NATS server: killed, frozen, ended, cut off."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

@@ -1,7 +1,5 @@
 """A service process and a router: ended, cut off, without room on its disk."""
 
-from __future__ import annotations
-
 import resource
 import shutil
 import time

@@ -1,7 +1,5 @@
 """SIGKILL while several sensors feed one session: no trace of it is left."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """JSON of a real service: the same texts over HTTP, WebSocket and MQTT, and a page of another origin draws them."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

@@ -1,7 +1,5 @@
 """SIGKILL at random moments while recorded sequences are replayed: no trace is left but the outage."""
 
-from __future__ import annotations
-
 import json
 import os
 import random

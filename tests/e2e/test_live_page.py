@@ -1,7 +1,5 @@
 """The page of a real service, seen by a real browser while detections come in."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

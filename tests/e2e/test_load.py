@@ -1,7 +1,5 @@
 """`optipmb load` against a real service: both count the same."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

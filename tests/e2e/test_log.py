@@ -1,7 +1,5 @@
 """The log of detections: a successor elsewhere tracks the frames of an outage, also of publishers without a cache."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from functools import partial

@@ -1,7 +1,5 @@
 """Members receive their own streams: two services on two linked routers that share a folder, and what goes to each."""
 
-from __future__ import annotations
-
 import operator
 import re
 import threading

@@ -1,7 +1,5 @@
 """A profile that changes in the settings, for a stream that has a checkpoint."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

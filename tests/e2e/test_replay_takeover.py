@@ -1,7 +1,5 @@
 """A replay with clouds at the recorded rate, while the service that tracks it freezes and another one takes over."""
 
-from __future__ import annotations
-
 import threading
 from pathlib import Path
 

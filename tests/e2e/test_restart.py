@@ -1,7 +1,5 @@
 """A process restarts before its network session runs out of numbers for keys, and its sessions continue."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import signal

@@ -4,8 +4,6 @@ The router drops forbidden messages silently. So each forbidden message is follo
 same link and to the same receiver: when that has come, the first would have come too.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import re

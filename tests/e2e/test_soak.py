@@ -1,7 +1,5 @@
 """A service under load for a time: nothing grows, nothing is lost, and every message is accounted for."""
 
-from __future__ import annotations
-
 import os
 import resource
 import time

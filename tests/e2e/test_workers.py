@@ -1,7 +1,5 @@
 """A service of several worker processes: one instance to the network, and none of them is missed for long."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

@@ -1,7 +1,5 @@
 """A service with its own router and a gateway, as processes, for all tests; each test has its own stream."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Who may do what over gRPC: by the name in the certificate, on a protected network with real processes."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import time

@@ -1,7 +1,5 @@
 """How calls end: by their callers, by deadlines, by silence; the metrics say how, and nothing is left of them."""
 
-from __future__ import annotations
-
 import re
 import socket
 import time

@@ -1,7 +1,5 @@
 """`SubscribeEvents`: events of zones by request; events that can still change are held back by default."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import grpc

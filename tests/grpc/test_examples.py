@@ -1,7 +1,5 @@
 """Independent clients: Python with the generated stubs alone, and Node from the .proto file alone."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """What a gateway stands: broken, huge and idle callers, while the others are served."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import threading

@@ -1,7 +1,5 @@
 """`GetState`, `Reset`, `SetParameters`, `ListStreams`, health and reflection."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import grpc

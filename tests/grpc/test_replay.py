@@ -1,7 +1,5 @@
 """`optipmb replay --connect grpc://…`: the same files as over Zenoh and offline, also when a gateway goes."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess

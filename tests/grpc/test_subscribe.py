@@ -1,7 +1,5 @@
 """`Subscribe` and `QueryTracks`: the selected tracks, in order; a slow reader delays no other."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """gRPC served by a service of several worker processes: its parent is the gateway of them all."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import grpc

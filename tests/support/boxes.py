@@ -1,7 +1,5 @@
 """Rows of a simple tracker as a table of results, and the points in a box."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from optipmb_tools.geometry import Bools, Floats, to_sensor

@@ -1,7 +1,5 @@
 """Brokers of MQTT: one that a test speaks for, and Mosquitto, where it is installed."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import shutil

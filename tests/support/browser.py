@@ -1,7 +1,5 @@
 """Chromium without a screen, for tests of pages; they are skipped where it is not installed."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import shutil

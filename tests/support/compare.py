@@ -1,7 +1,5 @@
 """Comparison of the tracker's density and tracks with the oracle's, and of bytes with bytes."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from typing import Any

@@ -6,8 +6,6 @@ checkpoint and the publishers' caches. The same messages go, once and in order, 
 must have the same state and have published the same tracks.
 """
 
-from __future__ import annotations
-
 import heapq
 import random
 from collections.abc import Callable

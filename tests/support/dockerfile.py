@@ -1,7 +1,5 @@
 """Reads a Dockerfile: instructions in order, variables put in, stages apart. What this one uses, nothing more."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

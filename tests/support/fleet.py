@@ -1,7 +1,5 @@
 """A router process and service processes that share a store: started, frozen, killed, and always ended."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

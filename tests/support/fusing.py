@@ -1,7 +1,5 @@
 """Sensors of one node that share a session, and a drive past them."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A real gateway in a process of its own, and what tests say to it with the generated stubs alone."""
 
-from __future__ import annotations
-
 import socket
 from collections.abc import Mapping, Sequence
 from pathlib import Path

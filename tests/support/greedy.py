@@ -6,8 +6,6 @@ is not found stays where its velocity takes it and ends after three frames. A bo
 the score of its detection.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

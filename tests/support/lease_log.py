@@ -1,7 +1,5 @@
 """What all members share, in memory, and members that are moved by hand: no thread, and a clock that tests set."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field

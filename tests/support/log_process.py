@@ -1,7 +1,5 @@
 """A bridge into the log in a process of its own, asked for its figures as Prometheus asks."""
 
-from __future__ import annotations
-
 import json
 import re
 import urllib.error

@@ -1,7 +1,5 @@
 """A real NATS server in a process of its own, started as users start one; it can be killed and started again."""
 
-from __future__ import annotations
-
 import os
 import socket
 import subprocess

@@ -1,7 +1,5 @@
 """A protected network as `docker/security/make.py` sets it up: a real router process, sessions with certificates."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -128,7 +126,7 @@ class Party:
         """Publish; who may not is not told."""
         self.session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
 
-    def deliver(self, key: str, payload: bytes, receiver: Party) -> bool:
+    def deliver(self, key: str, payload: bytes, receiver: Self) -> bool:
         """Publish until another has received it: the router may take two messages close together for a flood."""
         ends = time.monotonic() + DEADLINE_S
         while time.monotonic() < ends:

@@ -1,7 +1,5 @@
 """A network between processes that takes its time, and can be cut: bytes on their way wait until it is whole again."""
 
-from __future__ import annotations
-
 import contextlib
 import queue
 import socket

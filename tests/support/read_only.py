@@ -1,7 +1,5 @@
 """Arrays as a frame holds them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from numpy.typing import NDArray

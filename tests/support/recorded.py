@@ -1,7 +1,5 @@
 """Recorded sequences as the messages that a sensor would send, and a replay of them through a service."""
 
-from __future__ import annotations
-
 import hashlib
 import threading
 import time

@@ -3,8 +3,6 @@
 Nothing here sleeps: a wait ends with a message, or fails at a deadline.
 """
 
-from __future__ import annotations
-
 import json
 import threading
 import time

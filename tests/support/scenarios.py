@@ -3,8 +3,6 @@
 A step is a message that arrives, a group of steps that arrive before any is processed, a wait in seconds, or a command.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections import Counter, defaultdict
 from collections.abc import Iterable

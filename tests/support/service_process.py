@@ -1,7 +1,5 @@
 """The real command in a process of its own, forked or fresh: started, awaited by its ready line, always ended."""
 
-from __future__ import annotations
-
 import os
 import queue
 import signal

@@ -1,7 +1,5 @@
 """What tests of sessions share: a cheap tracker, outputs merged as a user sees them, trackers that fail."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import threading

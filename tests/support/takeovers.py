@@ -1,7 +1,5 @@
 """A stream that several services take over from each other: the result equals an undisturbed session."""
 
-from __future__ import annotations
-
 import itertools
 import time
 from collections.abc import Sequence

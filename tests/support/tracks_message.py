@@ -1,7 +1,5 @@
 """Tracks of one frame as a service publishes them, for tests in which most of their numbers do not matter."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The command: starting, stopping, wrong use, settings."""
 
-from __future__ import annotations
-
 import json
 import resource
 import signal

@@ -1,7 +1,5 @@
 """The end of every process has a bound: where a step of it hangs, the process ends, and says where."""
 
-from __future__ import annotations
-
 import contextlib
 import faulthandler
 import os

@@ -1,7 +1,5 @@
 """The bridge to MQTT: topics and payloads, the queue, and repetition when the broker goes and comes."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

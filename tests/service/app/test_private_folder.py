@@ -1,7 +1,5 @@
 """Folders of processes: removed at their end, or at the next start after a kill."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tempfile

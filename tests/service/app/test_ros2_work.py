@@ -1,7 +1,5 @@
 """The thread of the bridge to ROS 2: messages, and timers."""
 
-from __future__ import annotations
-
 import time
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """What the parent of worker processes does with one that gives no sign of life."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import time

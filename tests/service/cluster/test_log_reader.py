@@ -1,7 +1,5 @@
 """Reading the log for a session is bounded; it gets the newest frames."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """The queue of the log is bounded in bytes; dropped messages are reported."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Iterator
 from pathlib import Path

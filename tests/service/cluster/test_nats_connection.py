@@ -1,7 +1,5 @@
 """The connection to NATS servers that go and come."""
 
-from __future__ import annotations
-
 import gc
 from pathlib import Path
 

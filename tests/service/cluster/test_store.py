@@ -1,7 +1,5 @@
 """Where checkpoints are kept: whole batches, the last two of each, torn ones aside."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

@@ -1,7 +1,5 @@
 """Health, readiness and metrics over HTTP, and the same metrics over Zenoh."""
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 import itertools

@@ -1,7 +1,5 @@
 """Caches that a session waits for, and the bound on remembered answers."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from types import SimpleNamespace
 from typing import Any

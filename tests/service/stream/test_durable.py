@@ -1,7 +1,5 @@
 """Durability and reports of a service: checkpoints, eviction, limits, the balance of its counters."""
 
-from __future__ import annotations
-
 import gc
 import os
 import resource

@@ -1,7 +1,5 @@
 """Covariances that have lost their rank, weights next to nothing, long silences: finite, repaired, counted, shown."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

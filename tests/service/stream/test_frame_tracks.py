@@ -1,7 +1,5 @@
 """Output tracks: bytes composed without a message equal the encoded message."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

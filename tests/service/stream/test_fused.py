@@ -1,7 +1,5 @@
 """Several sensors feed one session by turns: the results depend on their frames alone, and none harms another."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

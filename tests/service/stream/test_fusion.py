@@ -1,7 +1,5 @@
 """Sensors of one node in the service: one session, tracks on one key; problems go to the faulty sensor alone."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable
 from functools import partial

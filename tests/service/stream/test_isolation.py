@@ -1,7 +1,5 @@
 """Streams do not affect each other: each test runs a careless node next to a careful one."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

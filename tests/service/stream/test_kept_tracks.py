@@ -1,7 +1,5 @@
 """Tracks that are asked for later: a range of stamps, each frame once, in bounded answers."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import queue

@@ -1,7 +1,5 @@
 """Reads of the log for sessions whose frames do not arrive."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import Any

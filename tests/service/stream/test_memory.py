@@ -1,7 +1,5 @@
 """What a process that tracks takes; what a session holds is free at its end, not when a garbage collection comes by."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What streams cost that begin at once, and what becomes of their first frames: counted, without a network."""
 
-from __future__ import annotations
-
 import random
 import time
 from collections import Counter

@@ -1,7 +1,5 @@
 """The small parts: turns, problems, figures, profiles, settings, and what imports what."""
 
-from __future__ import annotations
-
 import re
 import threading
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The checkpoint writer: its input, its memory while the store fails, and its effect on frames."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Mapping
 from dataclasses import replace

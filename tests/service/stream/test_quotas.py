@@ -1,7 +1,5 @@
 """What one node and one site may have: sessions, messages, bytes; and whose session goes when there is no room."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import Any

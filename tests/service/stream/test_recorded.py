@@ -1,7 +1,5 @@
 """Recorded sequences, disturbed: state and tracks equal the recording in order, byte for byte."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Worlds that move under a session, as publishers announce it: tracks, poses and zones move with them."""
 
-from __future__ import annotations
-
 import math
 import random
 from collections.abc import Iterable, Sequence

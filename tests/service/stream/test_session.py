@@ -1,7 +1,5 @@
 """A session as a function of its messages: order, clouds, restarts, failures, commands."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import count
 from typing import Any

@@ -1,7 +1,5 @@
 """A session passes from member to member: each of its frames is tracked once, through all faults."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What becomes of frames in time: order, duplicates, late ones, gaps, jumps, restarted publishers, waiting."""
 
-from __future__ import annotations
-
 import itertools
 
 from hypothesis import given, settings

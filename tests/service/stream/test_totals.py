@@ -1,7 +1,5 @@
 """The counts of messages over all streams, as the metrics show them: they only grow, and each message counts once."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import fields, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A stream's queue: other streams have their turn while it is processed, and dropped messages count."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Events of zones in sessions: the same with late frames, after a restore, and with further zones."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Log lines: not too many of one event, and none lost without a word."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import http.client

@@ -1,7 +1,5 @@
 """Clocks and identities of publishers over real Zenoh: faults are reported, and nothing is lost by them."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace

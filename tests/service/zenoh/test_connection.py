@@ -1,7 +1,5 @@
 """The Zenoh session of a service: what its configuration makes of publishers and subscribers."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 from collections.abc import Iterator

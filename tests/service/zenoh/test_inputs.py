@@ -1,7 +1,5 @@
 """Subscriptions of a topic that come and go, and queries of publishers' caches meanwhile."""
 
-from __future__ import annotations
-
 import threading
 from collections import Counter
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The numbers that a Zenoh session has for keys: counted as Zenoh takes them, and never given twice."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 import pytest

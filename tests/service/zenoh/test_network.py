@@ -1,7 +1,5 @@
 """The service over real Zenoh: streams in, tracks out, questions answered, faults contained."""
 
-from __future__ import annotations
-
 import json
 import os
 import threading

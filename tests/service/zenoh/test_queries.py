@@ -1,7 +1,5 @@
 """Queries that come faster than they are answered."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

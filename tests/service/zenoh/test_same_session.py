@@ -3,8 +3,6 @@
 Each of these is tried on a thread of its own, for a test that fails would wait for ever.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """The threads of Zenoh: how many a message wakes, and their states in the interpreter."""
 
-from __future__ import annotations
-
 import ctypes
 import threading
 from pathlib import Path

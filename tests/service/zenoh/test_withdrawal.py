@@ -1,7 +1,5 @@
 """Withdrawal of declarations, while the threads of the network call into Python."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from typing import Any
