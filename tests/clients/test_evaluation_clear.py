@@ -6,16 +6,11 @@ from dataclasses import replace
 import evaluation_cases
 import numpy as np
 import pytest
+from evaluation_cases import evaluate_clear
 from optipmb_tools.datasets import Regions, Truth
-from optipmb_tools.evaluation import (
-    ClearResult,
-    Rules,
-    Switch,
-    combine,
-    evaluate_clear,
-    prepare,
-    sweep,
-)
+from optipmb_tools.evaluation import Rules, combine
+from optipmb_tools.evaluation.cases import prepare
+from optipmb_tools.evaluation.clear import ClearResult, Switch, sweep
 from optipmb_tools.results import ResultTable
 
 Row = tuple[int, int, float]

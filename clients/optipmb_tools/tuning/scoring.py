@@ -22,9 +22,10 @@ import numpy as np
 from optipmb import Parameters, warm_up
 from optipmb_tools.datasets import DataSequence, Truth
 from optipmb_tools.datasets.nuscenes import NuScenesSequence
-from optipmb_tools.evaluation import Case, Counts, Rules, clear, combine, default_rules
+from optipmb_tools.evaluation import Rules, combine, default_rules
 from optipmb_tools.evaluation.ab3dmot import evaluate_ab3dmot
-from optipmb_tools.evaluation.cases import ab3dmot_rules, prepare
+from optipmb_tools.evaluation.cases import Case, ab3dmot_rules, prepare
+from optipmb_tools.evaluation.clear import Counts, clear
 from optipmb_tools.evaluation.figures import defined
 from optipmb_tools.evaluation.hota import HotaResult, evaluate_hota
 from optipmb_tools.evaluation.nuscenes import (
