@@ -1,18 +1,13 @@
 """What all tests share: interrupts as in a terminal, and which tests run by a command of their own."""
 
-from __future__ import annotations
-
 import gc
 import signal
+from collections.abc import Generator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import forked
 import hypothesis
 import pytest
-
-if TYPE_CHECKING:
-    from collections.abc import Generator
 
 HERE = Path(__file__).parent
 

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import zenoh
 import zenoh.ext
-from optipmb_client.errors import ConnectionFailed
+from optipmb_client import ConnectionFailed, Publisher, Subscriber
 from optipmb_client.incoming import Arrival, Inbox
 from optipmb_client.links import linked
 from optipmb_client.zenoh import DEFAULT_ENDPOINT, Connection
@@ -21,11 +21,20 @@ from optipmb_client.zenoh import connection as connecting
 from routers import free_endpoint, open_client, open_router
 
 
-def test_unreachable_router_is_one_error_within_the_timeout() -> None:
+@pytest.mark.parametrize(
+    "opened",
+    [
+        lambda address: Connection(address, timeout=0.5),
+        lambda address: Publisher("a/b/c", address, timeout=0.5),
+        lambda address: Subscriber("a/b/c", address, connect_timeout=0.5),
+    ],
+    ids=["connection", "publisher", "subscriber"],
+)
+def test_unreachable_router_is_one_error_within_the_timeout(opened: Callable[[str], object]) -> None:
     """Without a listener, ConnectionFailed names the endpoint after the timeout."""
     address = free_endpoint()
     with pytest.raises(ConnectionFailed, match=address) as caught:
-        Connection(address, timeout=0.5)
+        opened(address)
     assert caught.value.endpoints == (address,)
     assert "\n" not in str(caught.value)
 

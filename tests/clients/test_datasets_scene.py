@@ -9,12 +9,14 @@ from typing import TypeAlias
 import numpy as np
 import pytest
 from boxes import points_in_box
+from evaluation_cases import evaluate_clear
 from optipmb_tools.datasets import DatasetError, Truth, open_dataset
 from optipmb_tools.datasets.scene.dataset import MIN_POINTS, RADIUS, SceneSequence, visits
 from optipmb_tools.datasets.scene.detector import CLASSES, FALSE, MIN_SCORE, Found
 from optipmb_tools.datasets.scene.lidar import GROUND, cast
 from optipmb_tools.datasets.scene.traffic import HALF_WIDTH, fixed_boxes
-from optipmb_tools.evaluation import Rules, evaluate_clear, iou_bev
+from optipmb_tools.evaluation import Rules
+from optipmb_tools.evaluation.overlap import intersection_area
 from optipmb_tools.geometry import rotation_of, wrap_angle
 from optipmb_tools.results import ResultTable
 
@@ -211,7 +213,8 @@ def test_vehicles_do_not_drive_through_each_other(scenes: list[SceneSequence]) -
             pole_first, pole = np.divmod(np.arange((len(wheels) + 1) * len(place)), len(place))
             first = np.concatenate([first, pole_first])
             second = np.concatenate([second, pole + len(wheels) + 1])
-            overlap = iou_bev((center[first], size[first], yaw[first]), (center[second], size[second], yaw[second]))
+            rows = [(center[one], size[one], yaw[one]) for one in (first, second)]
+            overlap = intersection_area(*rows) / np.minimum(*(one[:, 0] * one[:, 1] for _, one, _ in rows))
             assert overlap.max(initial=0.0) < 0.02, (sequence._options.seed, frame, first[overlap.argmax()])
 
 

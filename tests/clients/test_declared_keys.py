@@ -1,21 +1,16 @@
 """Keys that one connection can declare in its life: more are refused, and nothing is lost."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Final
 
 import pytest
 from optipmb_client import Publisher, Subscriber
 from optipmb_client.errors import ConnectionFailed
 from optipmb_client.incoming import Inbox
 from optipmb_client.zenoh import Connection
+from optipmb_client.zenoh.handles import Reading, Sender
 from optipmb_client.zenoh.session import MOST_KEYS
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
-    from optipmb_client.zenoh.handles import Reading, Sender
 
 ALONE: Final = '{mode: "peer", scouting: {delay: 0, multicast: {enabled: false}}, listen: {endpoints: []}}'
 

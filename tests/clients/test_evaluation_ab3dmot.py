@@ -10,13 +10,13 @@ from evaluation_cases import TrackRow, TruthRow, followed, parked, shuffled, tra
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_tools.datasets import open_dataset
-from optipmb_tools.evaluation import Counts
 from optipmb_tools.evaluation.ab3dmot import (
     POINTS,
     Ab3dmotResult,
     evaluate_ab3dmot,
 )
 from optipmb_tools.evaluation.cases import Case, ab3dmot_rules, prepare
+from optipmb_tools.evaluation.clear import Counts
 from optipmb_tools.evaluation.evaluate import evaluate_figures, load_recordings
 from scipy.optimize import linear_sum_assignment
 

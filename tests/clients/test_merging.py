@@ -1,7 +1,5 @@
 """Messages that come at least once, in any order of their revisions: what the user has in the end."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import pytest

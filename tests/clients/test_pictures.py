@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import run_here
+from evaluation_cases import evaluate_clear
 from optipmb_client.errors import ClientError
 from optipmb_tools.cli import run
 from optipmb_tools.datasets import DataSequence, Truth, open_dataset
-from optipmb_tools.evaluation import ClearResult, Rules, evaluate_clear
+from optipmb_tools.evaluation import Rules
+from optipmb_tools.evaluation.clear import ClearResult
 from optipmb_tools.results import ResultTable, full_table
 from optipmb_tools.views import pictures
 from optipmb_tools.views.pictures import WIDTH_PX, Panel, animate_tracks, draw_tracks

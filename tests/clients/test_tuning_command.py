@@ -85,14 +85,3 @@ def test_wrong_wishes_are_told_in_one_line(
     error = capsys.readouterr().err.strip()
     assert text in error
     assert "\n" not in error
-
-
-def test_the_page_uses_options_that_there_are(capsys: pytest.CaptureFixture[str]) -> None:
-    """Every command of docs/tuning.md has a help, and every option in it is named there."""
-    lines = [line for line in PAGE.read_text().splitlines() if line.startswith("optipmb ")]
-    assert len(lines) >= 6
-    for line in lines:
-        command, *words = line.split()[1:]
-        assert run([command, "--help"]) == 0
-        text = capsys.readouterr().out
-        assert all(word in text for word in words if word.startswith("--")), line

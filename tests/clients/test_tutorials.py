@@ -1,7 +1,5 @@
 """The commands and programs of the tutorials run as they stand on the pages."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """The files of a deployment are what their tools accept, and say what the code does."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

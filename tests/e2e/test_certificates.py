@@ -1,11 +1,9 @@
 """Certificates that expire: who reports it, and where; a renewed one is used."""
 
-from __future__ import annotations
-
 import re
 import urllib.error
 import urllib.request
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import pytest
 from optipmb_client import Publisher
@@ -15,9 +13,6 @@ from protected import Network, Party
 from router import until
 from routers import free_endpoint
 from service_process import ServiceProcess
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 KEYS = Keys()
 NAMES = ("--node", "garage/robot", "--service", "tracker", "--viewer", "ops")

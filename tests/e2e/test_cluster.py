@@ -1,7 +1,5 @@
 """Services that share streams, by a folder or by nothing but a NATS server: killed, frozen, ended, cut off."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal
@@ -11,32 +9,26 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from collections.abc import Iterator
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import pytest
 from commands import run_here
 from fleet import Fleet, RouterProcess, freeze, thaw
 from log_process import LogProcess
 from nats_process import NatsProcess
-from optipmb_schemas import Problem, ServiceStatus, decode
+from optipmb_schemas import Problem, ServiceStatus, SessionState, decode
 from optipmb_service.cluster.leases import PARTITIONS
 from optipmb_service.cluster.nats_connection import NatsConnection, token
 from proxy import Proxy
 from router import Node, Sensor, until
 from routers import free_endpoint
-from service_process import READY_S
+from service_process import READY_S, ServiceProcess
 from takeovers import KEYS, check, distinct, longest_silence_s, outage_s, published_by, send
 
 import optipmb
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from types import TracebackType
-
-    from optipmb_schemas import SessionState
-    from service_process import ServiceProcess
 
 SENSORS = [Sensor(stream=f"site/node-{number}/lidar") for number in range(6)]
 FREEZE_S = 5.0
@@ -185,9 +177,7 @@ class Sending:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._enough.set()
         self._thread.join()
 

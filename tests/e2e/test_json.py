@@ -1,16 +1,14 @@
 """JSON of a real service: the same texts over HTTP, WebSocket and MQTT, and a page of another origin draws them."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json
 import re
 import threading
 import urllib.request
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from broker import Broker
@@ -19,9 +17,6 @@ from optipmb_schemas.json_form import Selection, tracks_json
 from router import Node, Sensor
 from service_process import ServiceProcess
 from websocket import create_connection
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 PAGE = Path(__file__).parents[2] / "examples/json/index.html"
 SENSOR = Sensor()

@@ -1,14 +1,13 @@
 """SIGKILL at random moments while recorded sequences are replayed: no trace is left but the outage."""
 
-from __future__ import annotations
-
 import json
 import os
 import random
 import threading
 import time
+from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from fleet import Fleet
@@ -21,9 +20,6 @@ from recorded import KEYS, Replay, kitti
 from sessions import undisturbed
 
 import optipmb
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 KILLS = int(os.environ.get("OPTIPMB_TEST_KILLS", "3"))
 FEW = 10

@@ -1,27 +1,21 @@
 """The page of a real service, seen by a real browser while detections come in."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math
 import threading
 import time
 import urllib.request
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from browser import browser, console, requested, size, wait
 from optipmb_client import Publisher
 from processes import descendants, wait_until_ended
 from routers import free_endpoint
+from selenium.webdriver import Chrome
 from service_process import ServiceProcess
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from selenium.webdriver import Chrome
 
 ENDPOINT, HTTP = free_endpoint(), free_endpoint().removeprefix("tcp/")
 BASE = f"http://{HTTP}"

@@ -1,10 +1,9 @@
 """The log of detections: a successor elsewhere tracks the frames of an outage, also of publishers without a cache."""
 
-from __future__ import annotations
-
 import time
+from collections.abc import Iterator
 from functools import partial
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from fleet import Fleet
@@ -19,15 +18,10 @@ from optipmb_service.cluster.message_log import MessageLog
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.zenoh.transport import TRACKS_CACHE
 from router import Node, Sensor, plain, until
+from service_process import ServiceProcess
 from takeovers import KEYS, check, expected
 
 import optipmb
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from service_process import ServiceProcess
 
 SENSORS = [Sensor(stream=f"site/node-{number}/lidar") for number in range(3)]
 

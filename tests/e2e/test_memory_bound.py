@@ -1,7 +1,5 @@
 """A service stays within its memory under any input: real processes, their peak read from the system."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

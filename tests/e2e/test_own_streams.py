@@ -1,33 +1,26 @@
 """Members receive their own streams: two services on two linked routers that share a folder, and what goes to each."""
 
-from __future__ import annotations
-
 import operator
 import re
 import threading
 import time
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Self
+from pathlib import Path
+from typing import Self
 
 import pytest
 from fleet import PROFILE, Fleet, RouterProcess
-from optipmb_schemas import ServiceStatus, SessionState, encode, encoding_of
+from optipmb_schemas import Detections, Points, ServiceStatus, SessionState, encode, encoding_of
 from optipmb_service.cluster.leases import PARTITIONS
 from optipmb_service.stream.session import Session
 from optipmb_service.stream.values import Tracked
 from proxy import Proxy
 from router import Node, Sensor, plain, until
+from service_process import ServiceProcess
 from takeovers import KEYS, check, distinct, expected
 
 import optipmb
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-    from types import TracebackType
-
-    from optipmb_schemas import Detections, Points
-    from service_process import ServiceProcess
 
 SENSORS = [Sensor(stream=f"site/node-{number}/lidar") for number in range(8)]
 POINTS = 30_000
@@ -60,9 +53,7 @@ class Pair:
         self.settle()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._context.close()
 
     def settle(self) -> None:

@@ -4,14 +4,13 @@ The router drops forbidden messages silently. So each forbidden message is follo
 same link and to the same receiver: when that has come, the first would have come too.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import re
 import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 import zenoh
@@ -24,11 +23,7 @@ from optipmb_service.cluster.store import StoreError
 from protected import MAKE, REFUSAL_MS, Network, Party, make
 from router import until
 from routers import free_endpoint
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from service_process import ServiceProcess
+from service_process import ServiceProcess
 
 KEYS = Keys()
 ROBOT, OTHER = "garage/robot-1", "garage/robot-2"

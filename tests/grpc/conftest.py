@@ -1,17 +1,13 @@
 """A service with its own router and a gateway, as processes, for all tests; each test has its own stream."""
 
-from __future__ import annotations
-
 import itertools
 import json
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import Any
 
 import pytest
 from gateway import GatewayProcess
 from service_process import ServiceProcess
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 NUMBERS = itertools.count()
 

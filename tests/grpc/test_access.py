@@ -1,11 +1,11 @@
 """Who may do what over gRPC: by the name in the certificate, on a protected network with real processes."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import grpc
 import pytest
@@ -14,10 +14,6 @@ from optipmb_client import Publisher, Subscriber
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
 from protected import Network, make
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 ROBOT, OTHER = "garage/robot-1", "garage/robot-2"
 LIDAR, FOREIGN = f"{ROBOT}/lidar", f"{OTHER}/lidar"

@@ -1,19 +1,14 @@
 """`SubscribeEvents`: events of zones by request; events that can still change are held back by default."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import grpc
 import pytest
-from gateway import detections, frame
+from gateway import GatewayProcess, detections, frame
 from optipmb_client import Connection, EventSubscriber
 from optipmb_schemas import Events, Keys, decode
 from optipmb_schemas.protobuf import tracking_pb2 as pb
-
-if TYPE_CHECKING:
-    from gateway import GatewayProcess
-    from service_process import ServiceProcess
+from service_process import ServiceProcess
 
 EVENTS = [("yard", "entered"), ("gate", "crossed"), ("yard", "left")]
 FRAMES = 60

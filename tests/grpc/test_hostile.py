@@ -1,14 +1,13 @@
 """What a gateway stands: broken, huge and idle callers, while the others are served."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import threading
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import grpc
 import numpy as np
@@ -18,11 +17,7 @@ from optipmb_schemas import Points
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
 from optipmb_service.grpc.calls import varint
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from service_process import ServiceProcess
+from service_process import ServiceProcess
 
 CONNECTIONS = 2_000
 """Idle connections of the test; each end of one takes a file."""

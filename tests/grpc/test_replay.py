@@ -1,12 +1,12 @@
 """`optipmb replay --connect grpc://…`: the same files as over Zenoh and offline, also when a gateway goes."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 from commands import result_of, run_here, start
@@ -16,12 +16,7 @@ from optipmb_client.errors import ConnectionFailed
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from real_data import kitti_root
 from routers import free_endpoint
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from service_process import ServiceProcess
+from service_process import ServiceProcess
 
 SCENE = ("--dataset", "scene", *(f"--option={one}" for one in ("vehicles=6", "pedestrians=3", "cyclists=1")))
 

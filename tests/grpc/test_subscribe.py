@@ -1,26 +1,19 @@
 """`Subscribe` and `QueryTracks`: the selected tracks, in order; a slow reader delays no other."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable
+from typing import Any
 
 import grpc
 import numpy as np
 import pytest
-from gateway import detections, frame, resident
+from gateway import GatewayProcess, detections, frame, resident
 from grpc_status import rpc_status
 from optipmb_schemas import Tracks, encode
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from gateway import GatewayProcess
-
 
 SUBSCRIBERS = 200
 FRAMES = 20

@@ -1,8 +1,6 @@
 """gRPC served by a service of several worker processes: its parent is the gateway of them all."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import grpc
 import pytest
@@ -12,9 +10,6 @@ from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
 from router import Node
 from routers import free_endpoint
 from service_process import ServiceProcess
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 STREAMS = tuple(f"garage/robot-{number}/lidar" for number in range(4))
 

@@ -1,7 +1,5 @@
 """Messages decoded by msgspec equal those by the models; payloads that these refuse are left to them."""
 
-from __future__ import annotations
-
 import copy
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """What docstrings of the service name is there."""
 
-from __future__ import annotations
-
 import ast
 import re
 from pathlib import Path

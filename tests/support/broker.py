@@ -1,20 +1,16 @@
 """Brokers of MQTT: one that a test speaks for, and Mosquitto, where it is installed."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import shutil
 import subprocess
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Self
+from pathlib import Path
+from typing import Self
 
 import pytest
 from routers import free_endpoint
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 CONNECT, CONNACK, PUBLISH, PUBACK, DISCONNECT = 0x10, 0x20, 0x30, 0x40, 0xE0
 

@@ -1,20 +1,15 @@
 """Chromium without a screen, for tests of pages; they are skipped where it is not installed."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import shutil
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
-    from selenium.webdriver import Chrome
+from selenium.webdriver import Chrome
 
 DEADLINE_S = 90.0
 

@@ -1,7 +1,5 @@
 """Tables of classes for kernels, of which a test names the columns that count."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,18 +1,13 @@
 """Comparison of the tracker's density and tracks with the oracle's, and of bytes with bytes."""
 
-from __future__ import annotations
-
 import hashlib
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from oracle import Oracle, OracleTracks
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from oracle import Oracle, OracleTracks
-
-    from optipmb import Density, Tracks
+from optipmb import Density, Tracks
 
 TOLERANCE = 1e-9
 BERNOULLI = ["mean", "covariance", "existence", "label", "auxiliary", "id", "born_ns", "seen_ns", "score", "evidence"]

@@ -6,12 +6,11 @@ checkpoint and the publishers' caches. The same messages go, once and in order, 
 must have the same state and have published the same tracks.
 """
 
-from __future__ import annotations
-
 import heapq
 import random
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import optipmb_schemas as schemas
 from lease_log import Alone
@@ -24,9 +23,6 @@ from router import SECOND, Sensor
 from sessions import Merged, chained
 
 import optipmb
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 NUSCENES = optipmb.load_profile("nuscenes")
 PERIOD_NS = SECOND // 10

@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 from optipmb_tools.camera import Camera, alpha_of, kitti_from_sensor
 from optipmb_tools.datasets import Truth
+from optipmb_tools.evaluation.cases import Rules, prepare
+from optipmb_tools.evaluation.clear import ClearResult, clear
 from optipmb_tools.results import ResultTable
 
 LABELS = ("Car", "Van", "Pedestrian", "Person", "Cyclist")
@@ -16,6 +18,13 @@ TruthRow = tuple[int, int, float, float]
 """Frame, id, x, y."""
 TrackRow = tuple[int, int, float, float, float]
 """Frame, id, x, y, score."""
+
+
+def evaluate_clear(
+    truth: Truth, tracks: ResultTable, name: str, rules: Rules | None = None, *, sequence: str = ""
+) -> ClearResult:
+    rules = rules or Rules()
+    return clear(prepare(truth, tracks, name, rules, sequence), rules)
 
 
 def truth_of(rows: Sequence[TruthRow], names: Sequence[str] | str = "Car", ignored: Sequence[int] = ()) -> Truth:

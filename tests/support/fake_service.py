@@ -3,7 +3,6 @@
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import Self
 
 import zenoh
@@ -72,9 +71,7 @@ class FakeService:
         self._opened.append(session.liveliness().declare_token(KEYS.alive(self.instance)))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._session.close()
 
     def _work(self, source: object, take: Callable[..., None]) -> None:

@@ -1,23 +1,17 @@
 """A router process and service processes that share a store: started, frozen, killed, and always ended."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal
 import subprocess
 import sys
 import time
-from typing import TYPE_CHECKING, Self
+from pathlib import Path
+from typing import Self
 
+import zenoh
 from routers import free_endpoint, open_client
 from service_process import ServiceProcess
-
-if TYPE_CHECKING:
-    from pathlib import Path
-    from types import TracebackType
-
-    import zenoh
 
 START_S = 60.0
 
@@ -50,9 +44,7 @@ class RouterProcess:
         self.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.kill()
 
     def start(self) -> None:
@@ -97,9 +89,7 @@ class Fleet:
         self._context.enter_context(self.router)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._context.close()
 
     @property

@@ -1,10 +1,9 @@
 """A real gateway in a process of its own, and what tests say to it with the generated stubs alone."""
 
-from __future__ import annotations
-
 import socket
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import grpc
 import numpy as np
@@ -14,9 +13,6 @@ from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
 from routers import free_endpoint
 from service_process import ServiceProcess
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
 
 EPOCH = bytes(range(16))
 STREAM = "garage/robot-1/lidar"

@@ -3,8 +3,6 @@
 With any input a call returns or raises an `OptipmbError`. Everything is drawn from fixed seeds.
 """
 
-from __future__ import annotations
-
 import sys
 from contextlib import suppress
 from dataclasses import replace

@@ -1,19 +1,12 @@
 """What all members share, in memory, and members that are moved by hand: no thread, and a clock that tests set."""
 
-from __future__ import annotations
-
 import threading
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 from optipmb_service.cluster.leases import PARTITIONS, Change, partition_key, partition_of
 from optipmb_service.cluster.member import Member
-from optipmb_service.cluster.store import KEPT, Fenced, Record, StoreError, Write
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from optipmb_service.cluster.store import LeaseStore
+from optipmb_service.cluster.store import KEPT, Fenced, LeaseStore, Record, StoreError, Write
 
 SECOND = 1_000_000_000
 LEASE_S = 2.0

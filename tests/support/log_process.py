@@ -1,19 +1,13 @@
 """A bridge into the log in a process of its own, asked for its figures as Prometheus asks."""
 
-from __future__ import annotations
-
 import json
 import re
 import urllib.error
 import urllib.request
-from typing import TYPE_CHECKING
 
-from router import Sensor, until
+from router import Node, Sensor, until
 from routers import free_endpoint
 from service_process import ServiceProcess
-
-if TYPE_CHECKING:
-    from router import Node
 
 PROBE = Sensor(stream="probe/probe/probe")
 

@@ -1,21 +1,16 @@
 """A real NATS server in a process of its own, started as users start one; it can be killed and started again."""
 
-from __future__ import annotations
-
 import os
 import socket
 import subprocess
 import sys
 import time
-from typing import TYPE_CHECKING, Self
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Self
 
 from optipmb_service.app.cli import NATS_PAYLOAD_MB, nats_server
 from routers import free_endpoint
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-    from types import TracebackType
 
 START_S = 60.0
 
@@ -37,9 +32,7 @@ class NatsProcess:
         self.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.kill()
 
     def start(self) -> None:
@@ -71,9 +64,7 @@ class NatsTrio:
             self.start(index)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for index in tuple(self._processes):
             self.kill(index)
 

@@ -6,8 +6,6 @@ formula can be proof-read against it. Nothing here imports the tracker.
 """
 # ruff: noqa: N803, N806 - P, S, K, R, C and the like are the names that the formulas of the paper use
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import lru_cache

@@ -1,23 +1,19 @@
 """A protected network as `docker/security/make.py` sets it up: a real router process, sessions with certificates."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from types import TracebackType
+from typing import Any, Self
 
 import zenoh
 from optipmb_schemas import Keys, ServiceStatus, decode
 from routers import free_endpoint
 from service_process import ServiceProcess
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from types import TracebackType
 
 MAKE = Path(__file__).parents[2] / "docker" / "security" / "make.py"
 DEADLINE_S = 60.0
@@ -102,9 +98,7 @@ class Party:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.session.close()  # type: ignore[no-untyped-call]  # zenoh's stubs leave it untyped
 
     def read(self, *patterns: str) -> Self:
@@ -132,7 +126,7 @@ class Party:
         """Publish; who may not is not told."""
         self.session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
 
-    def deliver(self, key: str, payload: bytes, receiver: Party) -> bool:
+    def deliver(self, key: str, payload: bytes, receiver: Self) -> bool:
         """Publish until another has received it: the router may take two messages close together for a flood."""
         ends = time.monotonic() + DEADLINE_S
         while time.monotonic() < ends:

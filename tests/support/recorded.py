@@ -1,24 +1,18 @@
 """Recorded sequences as the messages that a sensor would send, and a replay of them through a service."""
 
-from __future__ import annotations
-
 import hashlib
 import threading
 import time
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from optipmb_client.merging import FinalEvents
+from optipmb_client.zenoh import Connection
 from optipmb_schemas import Detections, Events, Keys, Points, Pose, SessionState, Tracks, decode, encode, encoding_of
 from optipmb_tools.datasets import open_dataset
 from router import plain
 from sessions import bare_events
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from optipmb_client.zenoh import Connection
 
 KEYS = Keys()
 WINDOW = 8

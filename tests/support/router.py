@@ -3,17 +3,17 @@
 Nothing here sleeps: a wait ends with a message, or fails at a deadline.
 """
 
-from __future__ import annotations
-
 import json
 import threading
 import time
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import zenoh
 import zenoh.ext
+from optipmb_client.incoming import Arrival
 from optipmb_client.zenoh.session import Session
 from optipmb_schemas import (
     Detections,
@@ -28,12 +28,6 @@ from optipmb_schemas import (
     encode,
     encoding_of,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-    from types import TracebackType
-
-    from optipmb_client.incoming import Arrival
 
 SECOND = 1_000_000_000
 DEADLINE_S = 60.0
@@ -126,9 +120,7 @@ class Node:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

@@ -1,21 +1,17 @@
 """The real command in a process of its own, forked or fresh: started, awaited by its ready line, always ended."""
 
-from __future__ import annotations
-
 import os
 import queue
 import signal
 import subprocess
 import threading
 import time
-from typing import TYPE_CHECKING, Self
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Self
 
 from forked import start
 from routers import free_endpoint
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from types import TracebackType
 
 READY_S = 240.0
 """The first start after an installation compiles the kernels."""

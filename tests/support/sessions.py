@@ -1,28 +1,21 @@
 """What tests of sessions share: a cheap tracker, outputs merged as a user sees them, trackers that fail."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import threading
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from optipmb_schemas import Detections, Events, Problem, Tracks, encode
+from optipmb_schemas import Detections, Events, Points, Problem, Tracks, encode
 from optipmb_service.stream.checkpoint import digest_of
 from optipmb_service.stream.session import Session
-from optipmb_service.stream.values import Begun, Output, Quarantined, Tracked, events_of
+from optipmb_service.stream.values import Begun, Output, Policy, Quarantined, Tracked, events_of
+from router import Sensor
 
 import optipmb
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from optipmb_schemas import Points
-    from optipmb_service.stream.values import Policy
-    from router import Sensor
 
 
 def tracks(outputs: Iterable[Output]) -> list[Tracks]:

@@ -1,21 +1,14 @@
 """A stream that several services take over from each other: the result equals an undisturbed session."""
 
-from __future__ import annotations
-
 import itertools
 import time
+from collections.abc import Sequence
 from functools import cache
-from typing import TYPE_CHECKING
 
 from fleet import PROFILE
 from optipmb_schemas import Keys, SessionState, Tracks, decode
-from router import Sensor, plain, until
+from router import Node, Sensor, plain, until
 from sessions import undisturbed
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from router import Node
 
 KEYS = Keys()
 SENSOR = Sensor()

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import fnmatch
+import http.client
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -158,6 +159,15 @@ def served(source: Any, places: Any = None, **settings: Any) -> Iterator[str]:
         yield server.address
     finally:
         server.close()
+
+
+@contextmanager
+def asked(address: str, path: str, **headers: str) -> Iterator[http.client.HTTPResponse]:
+    host, _, port = address.rpartition(":")
+    with closing(http.client.HTTPConnection(host, int(port), timeout=DEADLINE_S)) as connection:
+        connection.request("GET", path, headers={"connection": "close", **headers})
+        with connection.getresponse() as response:
+            yield response
 
 
 def tracks(seq: int, stream: str = STREAM, run: int = 0, count: int = 2) -> Tracks:

@@ -1,7 +1,5 @@
 """What the parent of worker processes answers for them."""
 
-from __future__ import annotations
-
 import threading
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """When a process restarts for the keys that it has declared, and when it does not."""
 
-from __future__ import annotations
-
 import asyncio
 
 import pytest

@@ -1,11 +1,11 @@
 """The bridge to MQTT: topics and payloads, the queue, and repetition when the broker goes and comes."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json
-from typing import TYPE_CHECKING, Any
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
 from broker import Broker, mosquitto
@@ -16,10 +16,6 @@ from watched import PROBLEM, STREAM, Session, events, settled, tracks
 
 aiomqtt = pytest.importorskip("aiomqtt")
 mqtt = pytest.importorskip("optipmb_service.app.mqtt")
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-    from pathlib import Path
 
 TOPIC = f"optipmb/v1/{STREAM}"
 ALIVE = "optipmb/v1/mqtt/one/alive"

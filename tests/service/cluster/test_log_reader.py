@@ -1,10 +1,10 @@
 """Reading the log for a session is bounded; it gets the newest frames."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
 from unittest.mock import AsyncMock, Mock
 
 import pytest
@@ -18,15 +18,10 @@ from optipmb_service.stream.profiles import Fusion
 from optipmb_service.stream.recovery import Log
 from optipmb_service.stream.session import Session
 from optipmb_service.stream.values import Policy
+from optipmb_service.zenoh.inputs import Packet
 from router import until
 
 import optipmb
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-    from pathlib import Path
-
-    from optipmb_service.zenoh.inputs import Packet
 
 STREAM = "a/b/c"
 EPOCH = bytes(16)

@@ -1,9 +1,9 @@
 """The queue of the log is bounded in bytes; dropped messages are reported."""
 
-from __future__ import annotations
-
 import asyncio
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 import structlog
@@ -13,11 +13,6 @@ from optipmb_service.cluster.message_log import ALONE_TRIES, OVERHEAD, LogMessag
 from optipmb_service.cluster.nats_connection import RefusedError
 from router import until
 from routers import free_endpoint
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-    from typing import Any
 
 ROOM = 5
 KEEP = {"detections": Retention(60, 2**25)}

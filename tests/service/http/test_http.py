@@ -1,7 +1,5 @@
 """Health, readiness and metrics over HTTP, and the same metrics over Zenoh."""
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 import itertools
@@ -12,10 +10,11 @@ import socket
 import subprocess
 import sys
 import threading
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
+from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from optipmb_client.errors import ClientError
@@ -31,11 +30,6 @@ from router import Node, Sensor, until
 from routers import free_endpoint, open_router
 from service_process import ServiceProcess
 from watched import Watched, served
-
-if TYPE_CHECKING:
-    from concurrent.futures import Future
-    from pathlib import Path
-
 
 KEYS = Keys()
 SENSOR = Sensor()
@@ -73,10 +67,6 @@ def address_of(service: ServiceProcess) -> str:
 def samples(text: str) -> Samples:
     families = text_string_to_metric_families(text)
     return {(one.name, tuple(sorted(one.labels.items()))): one.value for family in families for one in family.samples}
-
-
-def free_address() -> str:
-    return free_endpoint().removeprefix("tcp/")
 
 
 def test_health_follows_the_heartbeat() -> None:

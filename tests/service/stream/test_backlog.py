@@ -1,7 +1,5 @@
 """The backlog of a session: what waits there is bounded, in order, and in one place; what leaves unprocessed counts."""
 
-from __future__ import annotations
-
 import threading
 from dataclasses import replace
 from typing import Any

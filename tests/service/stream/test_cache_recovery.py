@@ -1,21 +1,16 @@
 """Caches that a session waits for, and the bound on remembered answers."""
 
-from __future__ import annotations
-
+from collections.abc import Callable, Iterable
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from fusing import FUSED
 from optipmb_service.stream.directory import BACK_NS, StreamDirectory
 from optipmb_service.stream.recovery import MOST, CacheRecovery
 from optipmb_service.stream.session import Session
+from optipmb_service.zenoh.inputs import Packet
 
 import optipmb
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
-    from optipmb_service.zenoh.inputs import Packet
 
 
 class Publishers:

@@ -1,7 +1,5 @@
 """A session saved and restored: nothing is lost, nothing partial is accepted."""
 
-from __future__ import annotations
-
 import hashlib
 import struct
 from dataclasses import replace

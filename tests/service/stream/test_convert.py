@@ -1,7 +1,5 @@
 """Messages that were checked once become frames without a second check: the same frames, and the same refusals."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from typing import Any
 

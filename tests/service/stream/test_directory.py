@@ -1,7 +1,5 @@
 """Which streams a discoverer announces that have no session."""
 
-from __future__ import annotations
-
 from optipmb_service.stream.directory import BACK_NS, MAX_UNPROVEN_ANNOUNCED, QUEUED_NS, UNPROVEN_NS, StreamDirectory
 from optipmb_service.stream.values import SECOND
 

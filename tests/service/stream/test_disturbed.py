@@ -1,7 +1,5 @@
 """Disturbed messages and sessions end like undisturbed ones: by search, and by simulation."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 

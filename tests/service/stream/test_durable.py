@@ -1,15 +1,14 @@
 """Durability and reports of a service: checkpoints, eviction, limits, the balance of its counters."""
 
-from __future__ import annotations
-
 import gc
 import os
 import resource
 import threading
 import time
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 import zenoh.ext
@@ -19,18 +18,13 @@ from optipmb_service.app.lifecycle import longest_end_s
 from optipmb_service.app.storage import STORE_FILE
 from optipmb_service.cluster.leases import ALIVE, member_key
 from optipmb_service.cluster.sqlite import SqliteStore
-from optipmb_service.cluster.store import StoreError, Write
+from optipmb_service.cluster.store import Fenced, StoreError, Write
 from optipmb_service.stream.persistence import CheckpointWriter
 from optipmb_service.stream.session import Session
 from optipmb_service.stream.stream import Stream
 from router import Node, Sensor, plain, until
 
 import optipmb
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from optipmb_service.cluster.store import Fenced
 
 KEYS = Keys()
 SENSOR = Sensor()

@@ -1,9 +1,6 @@
 """Covariances that have lost their rank, weights next to nothing, long silences: finite, repaired, counted, shown."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import optipmb_schemas as schemas
@@ -12,16 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from optipmb_service.stream import convert
-from optipmb_service.stream.checkpoint import decode_checkpoint, encode_checkpoint
+from optipmb_service.stream.checkpoint import Checkpoint, decode_checkpoint, encode_checkpoint
 from optipmb_service.stream.session import Session
 from optipmb_service.stream.timeline import FrameId
 from router import Sensor
 from sessions import feed, tracks
 
 import optipmb
-
-if TYPE_CHECKING:
-    from optipmb_service.stream.checkpoint import Checkpoint
 
 NUSCENES = optipmb.load_profile("nuscenes")
 SENSOR = Sensor()

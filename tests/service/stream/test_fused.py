@@ -1,29 +1,23 @@
 """Several sensors feed one session by turns: the results depend on their frames alone, and none harms another."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
 from fusing import FRONT, FUSED, REAR, SIDE, drive
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_schemas import Pose
+from optipmb_schemas import Detections, Pose
 from optipmb_service.stream.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
 from optipmb_service.stream.pending import SensorQueue
 from optipmb_service.stream.session import Session
-from optipmb_service.stream.timeline import FusedTimeline
+from optipmb_service.stream.timeline import FrameId, FusedTimeline
 from optipmb_service.stream.values import MAX_SENSORS, Policy
 from router import SECOND, Sensor
 from sessions import Failing, Merged, begun, chained, delayed, feed, problems, tracks
 
 import optipmb
-
-if TYPE_CHECKING:
-    from optipmb_schemas import Detections
-    from optipmb_service.stream.timeline import FrameId
 
 NUSCENES = optipmb.load_profile("nuscenes")
 

@@ -1,17 +1,17 @@
 """Sensors of one node in the service: one session, tracks on one key; problems go to the faulty sensor alone."""
 
-from __future__ import annotations
-
 import contextlib
+from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import optipmb_service.stream.directory
 import optipmb_service.stream.recovery
 import pytest
 from fusing import FRONT, FUSED, REAR, drive
-from optipmb_schemas import Keys, SessionParameters, SessionState, Tracks, decode
+from optipmb_schemas import Detections, Keys, SessionParameters, SessionState, Tracks, decode
 from optipmb_service.cluster.leases import partition_of
 from optipmb_service.settings import SettingsInvalidError, load
 from optipmb_service.stream.checkpoint import digest_of
@@ -22,12 +22,6 @@ from router import Node, Sensor, until
 from sessions import Merged, tracks
 
 import optipmb
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from optipmb_schemas import Detections
 
 KEYS = Keys()
 OTHER = Sensor("site/other/lidar", b"o" * 16)

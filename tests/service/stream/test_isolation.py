@@ -1,12 +1,12 @@
 """Streams do not affect each other: each test runs a careless node next to a careful one."""
 
-from __future__ import annotations
-
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,13 +39,6 @@ from router import Node, Sensor, until
 from sessions import Gated
 
 import optipmb
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from optipmb_service.stream.recovery import Take
-
 
 KEYS = Keys()
 CAREFUL = Sensor("site/careful/lidar")
@@ -155,7 +148,7 @@ def test_catching_up_from_the_log_keeps_no_other_waiting(
     gated = Gated(missed // 10)
 
     class Log:
-        def fetch(self, session: str, checkpoint: object, first: Take, later: Take) -> None:
+        def fetch(self, session: str, checkpoint: object, first: Callable[[list[Packet]], None], later: object) -> None:
             del checkpoint, later
             frames = [CARELESS.detections(seq) for seq in range(missed if session == CARELESS.stream else 0)]
             key, now_ns = KEYS.detections(session), time.monotonic_ns()

@@ -1,16 +1,17 @@
 """Tracks that are asked for later: a range of stamps, each frame once, in bounded answers."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import queue
 import threading
+from collections.abc import Callable, Iterable
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 from unittest.mock import Mock
 
 import pytest
+import zenoh
 from commands import run_here
 from fake_service import tracks_of
 from nats_process import NatsProcess
@@ -24,12 +25,6 @@ from optipmb_service.stream.recovery import Log
 from optipmb_tools.table_files import read_table
 from router import Node, Sensor, plain, until
 from routers import free_endpoint, open_client, open_router
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-    from pathlib import Path
-
-    import zenoh
 
 KEYS = Keys()
 SENSOR = Sensor()

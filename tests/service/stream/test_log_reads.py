@@ -1,17 +1,12 @@
 """Reads of the log for sessions whose frames do not arrive."""
 
-from __future__ import annotations
-
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
+from optipmb_service.stream.checkpoint import Checkpoint
 from registries import Around, packet_of, streams_of
 from router import Sensor
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from optipmb_service.stream.checkpoint import Checkpoint
 
 SENSORS = [Sensor(stream=f"yard/{number}/lidar") for number in range(100)]
 LEASE_NS = 2 * 10**9

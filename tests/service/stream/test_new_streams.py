@@ -1,16 +1,14 @@
 """What streams cost that begin at once, and what becomes of their first frames: counted, without a network."""
 
-from __future__ import annotations
-
 import random
 import time
 from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
-from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_schemas import Keys
 from optipmb_service.cluster.leases import PARTITIONS, Change, partition_of
 from optipmb_service.stream import directory, streams
@@ -21,9 +19,6 @@ from optipmb_service.stream.values import SECOND
 from optipmb_service.zenoh.inputs import ALL, Packet
 from registries import Around, packet_of, streams_of
 from router import Sensor, until
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
 
 KEYS = Keys()
 STREAMS = [f"site/n{number:04}/lidar" for number in range(3 * NEW_STREAMS)]
@@ -146,32 +141,6 @@ def run(network: Network, intake: Intake, done: Callable[[], bool]) -> None:
             time.sleep(0.01)
     finally:
         intake.close(WAIT_S)
-
-
-def test_an_error_of_the_network_does_not_end_the_intake() -> None:
-    """A subscription that fails is tried again in the next step."""
-
-    class Failing(Network):
-        fails = True
-
-        def subscribe(self, kind: str, stream: str, *, cached: bool) -> None:
-            if stream and self.fails:
-                self.fails = False
-                raise TransportError("no")
-            super().subscribe(kind, stream, cached=cached)
-
-    network, held = Failing(announced=STREAMS[:1]), set[int]()
-    intake, _ = member_of(network, held)
-
-    def subscribed() -> bool:
-        if not held:  # in the first call, when the intake has started
-            held.update(range(1, PARTITIONS))
-            for partition in tuple(held):
-                intake.changed(partition, Change.HELD)
-        return any(stream == STREAMS[0] for _, stream, _ in network.subscribed)
-
-    run(network, intake, subscribed)
-    assert not network.fails
 
 
 def test_new_streams_are_asked_for_a_few_at_a_time() -> None:

@@ -1,7 +1,5 @@
 """Sessions of detections without heading, size or height: tracks carry the known part."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

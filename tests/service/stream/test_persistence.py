@@ -1,14 +1,13 @@
 """The checkpoint writer: its input, its memory while the store fails, and its effect on frames."""
 
-from __future__ import annotations
-
 import threading
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from lease_log import Alone
 from optipmb_service.cluster.sqlite import SqliteStore
-from optipmb_service.cluster.store import StoreError
+from optipmb_service.cluster.store import Fenced, StoreError
+from optipmb_service.stream.checkpoint import Checkpoint
 from optipmb_service.stream.persistence import CheckpointWriter
 from optipmb_service.stream.session import Session
 from optipmb_service.stream.streams import KEPT_AT_ONCE
@@ -16,12 +15,6 @@ from registries import Around, packet_of, streams_of
 from router import Sensor, until
 
 import optipmb
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from optipmb_service.cluster.store import Fenced
-    from optipmb_service.stream.checkpoint import Checkpoint
 
 FIRST, SECOND = Sensor("site/first/lidar"), Sensor("site/second/lidar")
 

@@ -1,7 +1,5 @@
 """Poses that no sensor can have: refused with the reason, until they are many that agree."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

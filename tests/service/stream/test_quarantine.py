@@ -1,7 +1,5 @@
 """A step that raises costs its session alone; its input is saved and can be replayed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,11 +1,10 @@
 """Worlds that move under a session, as publishers announce it: tracks, poses and zones move with them."""
 
-from __future__ import annotations
-
 import math
 import random
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,9 +20,6 @@ from sessions import Merged, begun, dumps, plain, problems, tracks
 
 import optipmb
 from optipmb.zones import Zone
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
 
 SENSOR = Sensor()
 PROFILE = optipmb.load_profile("nuscenes")

@@ -1,7 +1,5 @@
 """Late, repeated and disordered messages: the session ends where it would have ended had all come once and in order."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

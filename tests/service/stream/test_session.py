@@ -1,7 +1,5 @@
 """A session as a function of its messages: order, clouds, restarts, failures, commands."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import count
 from typing import Any
@@ -501,10 +499,11 @@ def test_a_stamp_ahead_ends_no_track() -> None:
     assert (one.counters.refused, one.counters.new_epochs) == (2, 0)
 
 
-def test_a_jump_that_frames_agree_on_is_reported() -> None:
-    """Three frames in a row an hour ahead begin a new session, which is a problem of its own kind."""
+@pytest.mark.parametrize("shift_s", [-3600.0, 3600.0])
+def test_a_jump_that_frames_agree_on_is_reported(shift_s: float) -> None:
+    """Three frames in a row an hour ahead or back begin a new session, which is a problem of its own kind."""
     one = session()
     feed(one, range(5))
-    outputs = feed(one, range(5, 9), replace(SENSOR, start_s=SENSOR.start_s + 3600))
+    outputs = feed(one, range(5, 9), replace(SENSOR, start_s=SENSOR.start_s + shift_s))
     assert [problem.code for problem in problems(outputs)] == ["time_jump", "time_jump", "restarted"]
     assert (begun(outputs), len(tracks(outputs))) == (["jump"], 2)

@@ -1,19 +1,14 @@
 """A session passes from member to member: each of its frames is tracked once, through all faults."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_service.cluster.leases import Change, partition_of
+from optipmb_service.stream.checkpoint import Checkpoint
 from registries import Around, packet_of, streams_of
 from router import Sensor
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from optipmb_service.stream.checkpoint import Checkpoint
 
 SENSOR = Sensor()
 NAME = SENSOR.stream

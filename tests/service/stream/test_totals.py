@@ -1,12 +1,12 @@
 """The counts of messages over all streams, as the metrics show them: they only grow, and each message counts once."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import FrameType
+from typing import Any
 
+import pytest
 from optipmb_service.stream import backlog, stream
 from optipmb_service.stream import streams as table
 from optipmb_service.stream.values import MAX_SENSORS
@@ -14,11 +14,6 @@ from optipmb_service.telemetry.stream_meter import MessageCounters
 from optipmb_service.zenoh.inputs import Packet
 from registries import Around, packet_of, streams_of
 from router import Sensor
-
-if TYPE_CHECKING:
-    from types import FrameType
-
-    import pytest
 
 SENSOR = Sensor()
 TRACED = {str(Path(module.__file__)) for module in (stream, backlog)}

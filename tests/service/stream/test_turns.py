@@ -1,21 +1,16 @@
 """A stream's queue: other streams have their turn while it is processed, and dropped messages count."""
 
-from __future__ import annotations
-
 import threading
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
+import pytest
 from optipmb_schemas import Keys, SessionState
 from optipmb_service.cluster.sqlite import SqliteStore
 from router import Node, Sensor, until
 from sessions import Gated
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    import pytest
 
 KEYS = Keys()
 CAREFUL = Sensor("site/careful/lidar")

@@ -1,9 +1,9 @@
 """Events of zones in sessions: the same with late frames, after a restore, and with further zones."""
 
-from __future__ import annotations
-
+from collections.abc import Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 from optipmb_client.merging import FinalEvents
@@ -12,6 +12,7 @@ from optipmb_service.settings import SettingsInvalidError, ZoneSettings, load
 from optipmb_service.stream.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
 from optipmb_service.stream.profiles import Profiles
 from optipmb_service.stream.session import Session
+from optipmb_service.stream.streams import Streams
 from optipmb_service.stream.values import Output, Policy, Tracked
 from registries import Around, packet_of, streams_of
 from router import SECOND, Sensor
@@ -19,12 +20,6 @@ from sessions import feed
 
 import optipmb
 from optipmb.zones import Event, Zone
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from pathlib import Path
-
-    from optipmb_service.stream.streams import Streams
 
 SENSOR = Sensor()
 PROFILE = optipmb.load_profile("nuscenes")

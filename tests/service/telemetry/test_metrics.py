@@ -1,7 +1,5 @@
 """What a process measures: as Prometheus' own client would count it, and the same for the parent of workers."""
 
-from __future__ import annotations
-
 import re
 from types import SimpleNamespace
 

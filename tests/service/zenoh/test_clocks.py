@@ -1,22 +1,17 @@
 """Clocks and identities of publishers over real Zenoh: faults are reported, and nothing is lost by them."""
 
-from __future__ import annotations
-
 import time
+from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from optipmb_schemas import Detections, Keys, Pose, Problem, ServiceStatus, SessionState, Tracks, decode
+from optipmb_service.app.service import Service
 from router import DEADLINE_S, SECOND, Node, Sensor, until
 from routers import free_endpoint
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-    from pathlib import Path
-
-    from optipmb_service.app.service import Service
 
 KEYS = Keys()
 SENSOR = Sensor()

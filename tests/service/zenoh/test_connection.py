@@ -1,25 +1,19 @@
 """The Zenoh session of a service: what its configuration makes of publishers and subscribers."""
 
-from __future__ import annotations
-
 import contextlib
 import json
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+import zenoh
+from optipmb_client.zenoh.handles import Sender
 from optipmb_client.zenoh.session import Session
 from optipmb_schemas import Keys, Tracks, encoding_of
 from optipmb_service.settings import load
 from optipmb_service.zenoh.client import Client
 from router import until
 from routers import free_endpoint, open_client, open_router
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    import zenoh
-    from optipmb_client.zenoh.handles import Sender
 
 KEYS = Keys()
 ECHO = "echo"

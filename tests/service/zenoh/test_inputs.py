@@ -1,12 +1,11 @@
 """Subscriptions of a topic that come and go, and queries of publishers' caches meanwhile."""
 
-from __future__ import annotations
-
 import threading
 from collections import Counter
+from collections.abc import Iterator
 from functools import partial
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import Any, Final, cast
 
 import optipmb_service.zenoh.inputs
 import pytest
@@ -16,9 +15,6 @@ from optipmb_schemas import Keys
 from optipmb_service.zenoh.inputs import ALL, Topic
 from router import Collected
 from routers import free_endpoint, open_router
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 KEYS: Final = Keys()
 STREAM: Final = "site/node/lidar"

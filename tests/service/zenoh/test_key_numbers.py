@@ -1,17 +1,12 @@
 """The numbers that a Zenoh session has for keys: counted as Zenoh takes them, and never given twice."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator
 
 import pytest
 import zenoh
 from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_client.zenoh.session import CACHED, MOST_KEYS, PLAIN, Session
 from optipmb_service.zenoh.inputs import Topic
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
 
 
 @pytest.fixture
