@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
-    from optipmb import Frame, Parameters
+    from optipmb import Frame, Modules, Parameters, StepResult
 
 Array = NDArray[np.float64]
 
@@ -357,3 +357,15 @@ def boxes(  # noqa: PLR0913 - a detection has this many columns
         field_of_view=field_of_view,
     )
     return frame
+
+
+def steps(parameters: Parameters, frames: Iterable[Frame], modules: Modules | None = None) -> list[StepResult]:
+    """The results of a tracker for frames, one after the other."""
+    import optipmb  # noqa: PLC0415 - as above
+
+    tracker, results = optipmb.Tracker(parameters, modules), []
+    density = tracker.initial()
+    for frame in frames:
+        results.append(tracker.step(density, frame))
+        density = results[-1].density
+    return results
