@@ -32,13 +32,11 @@ from optipmb.predict import heading_unknown
 from optipmb.table import known_length
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from optipmb.density import Bernoullis, Moment
     from optipmb.hypotheses import Hypotheses
     from optipmb.preprocess import Measurements
     from optipmb.rows import Array, Index
-    from optipmb.table import ClassRow
+    from optipmb.table import Classes
 
 
 UNASSIGNED: Final = -1
@@ -133,7 +131,7 @@ def forbid_births(
     measurements: Measurements,
     missed_from_ns: Index,
     moment: Moment,
-    classes: Sequence[ClassRow],
+    classes: Classes,
 ) -> None:
     """Turn first-time detections on missed objects into clutter: writes `first_kind` and `first_existence`.
 
@@ -199,7 +197,7 @@ def surviving_objects(
     measured_label: Index,
     missed_from_ns: Index,
     moment: Moment,
-    classes: Sequence[ClassRow],
+    classes: Classes,
 ) -> Survivors:
     """Select the objects of the posterior: likely enough (`min_existence`), not missed too long (`max_misses`).
 

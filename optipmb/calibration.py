@@ -36,10 +36,8 @@ from optipmb.density import OMEGA, PHI, STATE, V, X, Y
 from optipmb.predict import wrap
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from optipmb.rows import Array, Index
-    from optipmb.table import ClassRow
+    from optipmb.table import Classes
 
     Box = tuple[float, float, float]
 
@@ -62,7 +60,7 @@ def calibrate_rows(
     label: Index,
     evidence: Array,
     yaw: Array,
-    classes: Sequence[ClassRow],
+    classes: Classes,
     existence: Array,
     score: Array,
     velocity: Array,

@@ -29,13 +29,11 @@ from optipmb.compiled import kernel
 from optipmb.errors import DensityError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from optipmb.association import Survivors
     from optipmb.density import Density
     from optipmb.preprocess import Measurements
     from optipmb.rows import Array, Index
-    from optipmb.table import ClassRow, ClassTable
+    from optipmb.table import Classes, ClassTable
 
 
 CHANGE_ODDS: Final = 3.0
@@ -85,7 +83,7 @@ def predict_classes(density: Density, kept: Index | None, dt: float, table: Clas
 
 
 @kernel
-def label_probability(pi: Array, d: int, s: float, confusion: Array, classes: Sequence[ClassRow]) -> float:
+def label_probability(pi: Array, d: int, s: float, confusion: Array, classes: Classes) -> float:
     """Compute p(d) of an object with posterior `pi` (C,) and a label `d` of its group with score `s`."""
     meant = 0.0
     for c in range(pi.shape[0]):
@@ -95,12 +93,7 @@ def label_probability(pi: Array, d: int, s: float, confusion: Array, classes: Se
 
 @kernel
 def weigh_by_class(
-    row: Index,
-    measurement: Index,
-    log_likelihood: Array,
-    measurements: Measurements,
-    groups: Groups,
-    classes: Sequence[ClassRow],
+    row: Index, measurement: Index, log_likelihood: Array, measurements: Measurements, groups: Groups, classes: Classes
 ) -> None:
     """Add ln p(d) to the log-likelihoods of pairs; classes without a group stay as they are."""
     for k in range(row.shape[0]):
@@ -113,12 +106,7 @@ def weigh_by_class(
 
 @kernel
 def update_classes(
-    survivors: Survivors,
-    label: Index,
-    label_out: Index,
-    measurements: Measurements,
-    groups: Groups,
-    classes: Sequence[ClassRow],
+    survivors: Survivors, label: Index, label_out: Index, measurements: Measurements, groups: Groups, classes: Classes
 ) -> Array:
     """Compute the class that each object of the posterior reports, and return pi (K, C); (K, 0) without groups."""
     class_probability, confusion = groups.probability, groups.confusion

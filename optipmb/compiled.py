@@ -204,7 +204,7 @@ class _Index(IndexDataCacheFile):
 
 
 class _PackageIndex(_Index):
-    """An index of the package: where one kernel has no machine code, none has, and helper processes compile them all."""
+    """An index of the package: where one kernel has no machine code, helper processes compile all of them."""
 
     def load(self, key: Any) -> Any:
         """Return the machine code of one kernel, None where it has to be compiled here."""
@@ -220,8 +220,12 @@ class _PackageIndex(_Index):
 
 
 def _processes() -> int:
-    """Return how many processes compile; none where Python is part of another program, which would start again."""
-    if not sys.executable or hasattr(sys, "frozen"):
+    """Return how many processes compile; none where Python is part of another program, which would start again.
+
+    None either without optimization: numba then keeps calls by address, which it does not cache.
+    """
+    options: Any = config
+    if not sys.executable or hasattr(sys, "frozen") or options.OPT == 0:
         return 0
     available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     wanted = os.environ.get(PROCESSES, "")

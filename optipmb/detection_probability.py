@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from optipmb.density import Density, Moment
     from optipmb.field_of_view import Looks
     from optipmb.frame import PointCloud
-    from optipmb.rows import Array
+    from optipmb.rows import Array, Index
     from optipmb.table import ClassTable
 
     Coordinates = NDArray[np.float32]
@@ -125,7 +125,7 @@ BLOCK: Final = 512
 """Points per block: their notes stay in the fastest cache."""
 
 
-def points_in_boxes(cloud: PointCloud, center: Array, size: Array, yaw: Array) -> NDArray[np.int64]:
+def points_in_boxes(cloud: PointCloud, center: Array, size: Array, yaw: Array) -> Index:
     """Count the points of a cloud in each box.
 
     Args:
@@ -152,9 +152,7 @@ def points_in_boxes(cloud: PointCloud, center: Array, size: Array, yaw: Array) -
 
 
 @long_kernel
-def count_points(
-    xyz: Coordinates, center: Array, half: Array, yaw: Array, rotation: Array, counts: NDArray[np.int64]
-) -> None:
+def count_points(xyz: Coordinates, center: Array, half: Array, yaw: Array, rotation: Array, counts: Index) -> None:
     """Add to `counts` (N,) the points in each box.
 
     Args:

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from optipmb.parameters import Parameters, ScoreCalibration
-    from optipmb.rows import Array
+    from optipmb.rows import Array, Index
 
 UNIT_TOLERANCE = 1e-3
 """How far the norm of a quaternion may be from one; it is normalised afterwards."""
@@ -66,8 +66,8 @@ class Pose:
         FrameError: wrong shape, not finite, or no unit quaternion.
     """
 
-    translation: NDArray[np.float64]
-    quaternion: NDArray[np.float64]
+    translation: Array
+    quaternion: Array
 
     def __post_init__(self) -> None:
         translation = _shaped("pose.translation", self.translation, (3,))
@@ -89,7 +89,7 @@ class Pose:
         return self.translation.tolist() == [0.0] * 3 and self.quaternion.tolist() in _UNTURNED
 
     @cached_property
-    def rotation(self) -> NDArray[np.float64]:
+    def rotation(self) -> Array:
         """Rotation matrix (3, 3) of the quaternion."""
         w, x, y, z = self.quaternion.tolist()
         rows = [
@@ -157,17 +157,17 @@ class Frame:
     """
 
     stamp_ns: int
-    center: NDArray[np.float64]
-    size: NDArray[np.float64]
-    yaw: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    score: NDArray[np.float64]
-    label: NDArray[np.int64]
-    source: NDArray[np.int64]
+    center: Array
+    size: Array
+    yaw: Array
+    velocity: Array
+    score: Array
+    label: Index
+    source: Index
     labels: tuple[str, ...]
     cloud: PointCloud | None = None
     field_of_view: FieldOfView | None = None
-    position_covariance: NDArray[np.float64] | None = None
+    position_covariance: Array | None = None
     pose: Pose | None = None
 
     def __post_init__(self) -> None:
@@ -272,7 +272,7 @@ def frame_of_checked(
     pose: Pose | None,
     cloud: PointCloud | None,
     field_of_view: FieldOfView | None,
-    position_covariance: NDArray[np.float64] | None,
+    position_covariance: Array | None,
 ) -> tuple[Frame, int]:
     """Make a frame as `make_frame` does, of arrays that the caller has checked: only covariances are checked here.
 
@@ -323,20 +323,20 @@ def frame_of_checked(
 
 
 @lru_cache(64)
-def _every_row(count: int) -> NDArray[np.int64]:
+def _every_row(count: int) -> Index:
     """Return the rows of so many objects of which none is left out."""
     return read_only(np.arange(count))
 
 
 @lru_cache(64)
-def _unknown(count: int, *shape: int) -> NDArray[np.float64]:
+def _unknown(count: int, *shape: int) -> Array:
     """Return a column of so many objects whose detector does not give it."""
     return read_only(np.full((count, *shape), np.nan))
 
 
-def _to_world(center: NDArray[np.float64], rotation: NDArray[np.float64], translation: Array) -> NDArray[np.float64]:
+def _to_world(center: Array, rotation: Array, translation: Array) -> Array:
     """Return centres in the world. A centre without z is at the height of the sensor, and has no z in the world."""
-    moved: NDArray[np.float64] = center @ rotation.T + translation
+    moved: Array = center @ rotation.T + translation
     if np.isnan(moved.sum()):
         flat = np.isnan(center[:, 2])
         moved[flat] = np.column_stack((center[flat, :2], np.zeros(flat.sum()))) @ rotation.T + translation
@@ -345,15 +345,7 @@ def _to_world(center: NDArray[np.float64], rotation: NDArray[np.float64], transl
 
 
 @kernel
-def allowed(
-    label: NDArray[np.int64],
-    n_labels: int,
-    center: NDArray[np.float64],
-    size: NDArray[np.float64],
-    yaw: NDArray[np.float64],
-    score: NDArray[np.float64],
-    velocity: NDArray[np.float64],
-) -> bool:
+def allowed(label: Index, n_labels: int, center: Array, size: Array, yaw: Array, score: Array, velocity: Array) -> bool:
     """Tell whether all values are allowed; `_refuse` says which one is not."""
     good = True
     for m in range(label.shape[0]):  # NaN compares as not good
@@ -368,15 +360,7 @@ def allowed(
     return good
 
 
-def _refuse(
-    label: NDArray[np.int64],
-    n_labels: int,
-    center: NDArray[np.float64],
-    size: NDArray[np.float64],
-    yaw: NDArray[np.float64],
-    score: NDArray[np.float64],
-    velocity: NDArray[np.float64],
-) -> None:
+def _refuse(label: Index, n_labels: int, center: Array, size: Array, yaw: Array, score: Array, velocity: Array) -> None:
     """Raise for the first value that is not allowed."""
     _all("label", (label >= 0) & (label < n_labels), f"an index below {n_labels}", label)
     z_known = np.where(np.isnan(center) & (np.arange(3) == 2), 0.0, center)  # noqa: PLR2004 - z may be unknown
@@ -391,9 +375,9 @@ def _refuse(
     _all("velocity", (np.abs(velocity) <= MAX_SPEED) | unknown, expected, velocity)
 
 
-def _shaped(path: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def _shaped(path: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
     """Return a copy as float64 of exactly `shape`; an empty list stands for any shape with no rows."""
-    array: NDArray[np.float64] = _array(path, values, np.float64)
+    array: Array = _array(path, values, np.float64)
     if array.shape != shape:
         if array.size or 0 not in shape:
             raise FrameError(path, f"shape {shape}", str(array.shape))
@@ -401,7 +385,7 @@ def _shaped(path: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.
     return array
 
 
-def _integers(path: str, values: ArrayLike) -> NDArray[np.int64]:
+def _integers(path: str, values: ArrayLike) -> Index:
     """Return a copy as int64 of one dimension."""
     array = _array(path, values, None)
     if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
@@ -409,7 +393,7 @@ def _integers(path: str, values: ArrayLike) -> NDArray[np.int64]:
     return read_only(array.astype(np.int64))
 
 
-def _bounded(path: str, values: NDArray[np.float64], bound: float) -> None:
+def _bounded(path: str, values: Array, bound: float) -> None:
     _all(path, np.abs(values) <= bound, f"a finite number of size at most {bound:g}", values)
 
 
@@ -429,15 +413,13 @@ def _all(path: str, good: NDArray[np.bool_], expected: str, values: NDArray[np.g
         raise FrameError(path + element, expected, str(values[where]))
 
 
-def calibrated(curve: ScoreCalibration, score: NDArray[np.float64]) -> NDArray[np.float64]:
+def calibrated(curve: ScoreCalibration, score: Array) -> Array:
     """Return c(z_s) of scores (M,) in [0, 1]."""
     given, meant = (0.0, *curve.detector, 1.0), (0.0, *curve.calibrated, 1.0)
     return np.minimum(np.interp(score, given, meant), 1.0)  # rounding may not pass one
 
 
-def calibrate_scores(
-    parameters: Parameters, label: NDArray[np.int64], score: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def calibrate_scores(parameters: Parameters, label: Index, score: Array) -> Array:
     """Return scores (M,) in [0, 1], calibrated where their class has a curve; without curves the same array."""
     for index, table in enumerate(parameters.classes.values()):
         if table.score_calibration is not None:

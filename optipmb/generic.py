@@ -1,8 +1,8 @@
 """Parameters without tuning, for any detector: careful values from the classes and the rate.
 
 Counts of frames follow from durations and the period. The noise fits an average LiDAR detector and is rather too wide.
-The tracker calibrates scores itself (`optipmb.self_calibration`), so that thresholds and the curve of existence hold for
-any detector.
+The tracker calibrates scores itself (`optipmb.self_calibration`): thresholds and the curve of existence hold for any
+detector.
 """
 
 from __future__ import annotations

@@ -75,7 +75,7 @@ class OnlineTracks:
         class_probability: (N, C) probability of each class of the profile; None where it has no groups of classes.
         sensor_motion: (3,) velocity, m/s, and turn rate, rad/s, with which what stands passes the sensor, where the
             motion of the sensor is estimated; None elsewhere.
-        measured: (N,) what is known of each track, as in `optipmb.StepResult`; None: everything of all.
+        measured: (N,) uint8, the known parts of each track: 1 the heading, 2 the size, 4 the height, added up.
 
     The other attributes are the columns of `optipmb.Tracks`.
     """
@@ -100,10 +100,10 @@ class OnlineTracks:
     time_since_detection: Array
     detection: Index
     confirmed: NDArray[np.bool_]
+    measured: NDArray[np.uint8]
     paths: PredictedPaths | None = None
     class_probability: Array | None = None
     sensor_motion: Array | None = None
-    measured: NDArray[np.uint8] | None = None
 
     def __len__(self) -> int:
         return len(self.tracks)
@@ -350,7 +350,7 @@ class OnlineTracker:
             paths=result.paths,
             class_probability=result.class_probability,
             sensor_motion=result.density.sensor_motion,
-            measured=result.measured,
+            measured=np.full(len(tracks), 7, np.uint8) if result.measured is None else result.measured,
         )
 
     def _classes(self, values: ArrayLike) -> tuple[tuple[str, ...], NDArray[np.int64], int]:

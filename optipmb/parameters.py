@@ -150,9 +150,7 @@ class Calibration(_Table):
     speed: Positive = Field(
         default=1.0, exclude_if=(1.0).__eq__, description="factor on the standard deviation of their speed"
     )
-    turn_rate: Positive = Field(
-        default=1.0, exclude_if=(1.0).__eq__, description="factor on the deviation of their turn rate"
-    )
+    turn_rate: Positive = Field(default=1.0, exclude_if=(1.0).__eq__, description="the same for their turn rate")
 
     @model_validator(mode="after")
     def _columns(self) -> Calibration:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from optipmb.extract import Tracks
     from optipmb.parameters import Parameters
     from optipmb.rows import Array, Index
-    from optipmb.table import ClassRow
+    from optipmb.table import Classes
 
 
 MAX_STEPS: Final = 1000
@@ -154,12 +154,8 @@ def _horizons(values: Sequence[float] | Array) -> Array:
 def _predict(
     identity: Index, label: Index, mean: Array, covariance: Array, times: Array, table: ClassTable
 ) -> PredictedPaths:
-    shape = label.shape[0], times.shape[0]
-    paths = PredictedPaths(
-        identity.copy(), label.copy(), times, np.empty((*shape, STATE)), np.empty((*shape, STATE, STATE))
-    )
-    predict_paths(mean, covariance, paths.label, times, table.period, table.classes, paths.mean, paths.covariance)
-    return paths
+    found = predict_paths(mean, covariance, label, times, table.period, table.classes)
+    return PredictedPaths(identity.copy(), label.copy(), times, *found)
 
 
 @kernel
@@ -172,17 +168,12 @@ def _doubts(heading_confidence: Array) -> Array:
 
 @kernel
 def predict_paths(
-    mean: Array,
-    covariance: Array,
-    label: Index,
-    horizons: Array,
-    period: float,
-    classes: Sequence[ClassRow],
-    mean_out: Array,
-    covariance_out: Array,
-) -> None:
-    """Predict states (N) to each of the horizons (H), in equal steps of at most a nominal period between them."""
-    root, points = np.empty((STATE, STATE)), np.empty((2 * STATE, STATE))
+    mean: Array, covariance: Array, label: Index, horizons: Array, period: float, classes: Classes
+) -> tuple[Array, Array]:
+    """Predict states to the horizons, in equal steps of at most a nominal period; return (N, H, 6) and (N, H, 6, 6)."""
+    buffers = np.empty((STATE, STATE)), np.empty((2 * STATE, STATE))
+    shape = label.shape[0], horizons.shape[0]
+    mean_out, covariance_out = np.empty((*shape, STATE)), np.empty((*shape, STATE, STATE))
     state, spread = np.empty((2, STATE)), np.empty((2, STATE, STATE))
     for n in range(mean.shape[0]):
         own = classes[label[n]]
@@ -198,19 +189,15 @@ def predict_paths(
             ahead = horizons[h] - before
             steps = max(1, math.ceil(min(ahead / period - ROUNDING, MAX_STEPS * ahead / horizons[-1])))
             for _ in range(steps):
-                predict_state(state[0], spread[0], ahead / steps, own, root, points, state[1], spread[1])
-                move(state[0], ahead / steps, own.acceleration_time, state[1])
+                dt, v, phi, omega, a = ahead / steps, state[0, V], state[0, PHI], state[0, OMEGA], state[0, A]
+                predict_state(state[0], spread[0], dt, own, buffers, state[1], spread[1])
+                decay = decay_and_turn(omega, dt, own.acceleration_time)
+                dx, dy, v, a = displacement(v, phi, omega, a, dt, own.acceleration_time, decay)
+                state[1, X], state[1, Y], state[1, V], state[1, A] = state[0, X] + dx, state[0, Y] + dy, v, a
+                state[1, PHI], state[1, OMEGA] = wrap(phi + omega * dt), omega
                 copy_state(state, spread, 1, state, spread, 0)
             copy_state(state, spread, 0, mean_out[n], covariance_out[n], h)
             if straight:
                 show_heading(state[0, V], covariance_out[n, h])
             before = horizons[h]
-
-
-@kernel
-def move(mean: Array, dt: float, tau: float, mean_out: Array) -> None:
-    """Move a state (6,) over dt, s, under an acceleration with time constant tau, s."""
-    kept, turn = decay_and_turn(mean[OMEGA], dt, tau)
-    dx, dy, v, a = displacement(mean[V], mean[PHI], mean[OMEGA], mean[A], dt, tau, kept, turn)
-    mean_out[X], mean_out[Y], mean_out[V], mean_out[A] = mean[X] + dx, mean[Y] + dy, v, a
-    mean_out[PHI], mean_out[OMEGA] = wrap(mean[PHI] + mean[OMEGA] * dt), mean[OMEGA]
+    return mean_out, covariance_out

@@ -50,10 +50,8 @@ from optipmb.density import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from optipmb.rows import Array, Columns, Index
-    from optipmb.table import ClassRow, ClassTable
+    from optipmb.table import Classes, ClassRow, ClassTable
 
     Turn = tuple[float, float, float, float]
 
@@ -120,16 +118,12 @@ def ctra_displacement(v: float, omega: float, a: float, dt: float) -> tuple[floa
         ``along = int (v + a t) cos(omega t) dt``, ``across = int (v + a t) sin(omega t) dt``.
     """
     u = omega * dt
+    cos_u, sin_u, sinc, cosc = turn_integrals(u)
     if abs(u) < SMALL_TURN:
         u2 = u * u
-        sinc, cosc = small_turn(u)
         ramp_cos = 0.5 - u2 / 8.0 + u2 * u2 / 144.0 - u2 * u2 * u2 / 5760.0
         ramp_sin = u / 3.0 - u * u2 / 30.0 + u * u2 * u2 / 840.0 - u * u2 * u2 * u2 / 45360.0
     else:
-        sin_u = math.sin(u)
-        cos_u = math.cos(u)
-        sinc = sin_u / u
-        cosc = (1.0 - cos_u) / u
         ramp_cos = (cos_u + u * sin_u - 1.0) / (u * u)
         ramp_sin = (sin_u - u * cos_u) / (u * u)
     along = dt * (v * sinc + a * dt * ramp_cos)
@@ -183,14 +177,14 @@ def decay_and_turn(omega: float, dt: float, tau: float) -> tuple[float, Turn]:
 
 @kernel
 def displacement(
-    v: float, phi: float, omega: float, a: float, dt: float, tau: float, kept: float, turn: Turn
+    v: float, phi: float, omega: float, a: float, dt: float, tau: float, decay: tuple[float, Turn]
 ) -> tuple[float, float, float, float]:
-    """Move one state, arguments as in `travel`: return the ways along x and y, the speed and the acceleration."""
+    """Move one state, `decay` as of `decay_and_turn`: return the ways along x and y, the speed and the acceleration."""
     if tau == math.inf:
         along, across = ctra_displacement(v, omega, a, dt)
         v += a * dt
     else:
-        along, across, v, a = travel(v, omega, a, dt, tau, kept, turn)
+        along, across, v, a = travel(v, omega, a, dt, tau, *decay)
     cos_phi, sin_phi = math.cos(phi), math.sin(phi)
     return cos_phi * along - sin_phi * across, sin_phi * along + cos_phi * across, v, a
 
@@ -261,20 +255,14 @@ def predict_state(
     covariance: Array,
     dt: float,
     own: ClassRow,
-    root: Array,
-    points: Array,
+    buffers: tuple[Array, Array],
     mean_out: Array,
     covariance_out: Array,
 ) -> int:
     """Predict one state by the unscented transform of its motion model (eq. Motion Predict).
 
-    Arguments of its own:
-        own: parameters of its class: the motion model and its time constant tau, q of ``Q = diag(q^2) dt``.
-        root: (6, 6) buffer for the square root.
-        points: (12, 6) buffer for the transformed points, as deviations from the transformed centre; the mean is
-            added last, so that large world coordinates cost no digits.
-        mean_out: (6,) receives m_+.
-        covariance_out: (6, 6) receives P_+.
+    The buffers receive the square root (6, 6), and the transformed points (12, 6) as deviations from the transformed
+    centre: the mean is added last, so that large world coordinates cost no digits.
 
     Returns:
         Number of pivots that had to be repaired.
@@ -283,11 +271,12 @@ def predict_state(
         predict_without_heading(mean, covariance, dt, own, mean_out, covariance_out)
         return 0
     straight, tau, process_noise = own.constant_velocity, own.acceleration_time, own.process_noise
+    root, points = buffers
     repaired = square_root(covariance, root)
     v, phi = mean[V], mean[PHI]
     omega, a = (0.0, 0.0) if straight else (mean[OMEGA], mean[A])
     kept, turn0 = decay_and_turn(omega, dt, tau)
-    dx0, dy0, v0, a0 = displacement(v, phi, omega, a, dt, tau, kept, turn0)
+    dx0, dy0, v0, a0 = displacement(v, phi, omega, a, dt, tau, (kept, turn0))
     cos_phi, sin_phi = math.cos(phi), math.sin(phi)
     for column in range(STATE):
         for side in range(2):
@@ -392,7 +381,7 @@ def predict(density: Density, moment: Moment, table: ClassTable) -> tuple[Densit
 
 @kernel
 def predict_density(
-    object_words: Array, missed_from_ns: Index, component_words: Array, moment: Columns, classes: Sequence[ClassRow]
+    object_words: Array, missed_from_ns: Index, component_words: Array, moment: Columns, classes: Classes
 ) -> tuple[Index, Array, Array, int]:
     """Predict the objects and components that are within the limit of their class (eq. PPP_prediction, MB_prediction).
 
@@ -436,7 +425,7 @@ def predict_density(
 
 @kernel
 def rows_within(
-    label: Index, since_ns: Index, seen_from_ns: int, undetected: bool, moment: Moment, classes: Sequence[ClassRow]
+    label: Index, since_ns: Index, seen_from_ns: int, undetected: bool, moment: Moment, classes: Classes
 ) -> Index:
     """Return the rows within `poisson_steps` of their class, if `undetected`, else `max_misses`.
 
@@ -456,19 +445,19 @@ def rows_within(
 
 @kernel
 def predict_rows(
-    rows: Index, old: Bernoullis | Poissons, new: Bernoullis | Poissons, dt: float, classes: Sequence[ClassRow]
+    rows: Index, old: Bernoullis | Poissons, new: Bernoullis | Poissons, dt: float, classes: Classes
 ) -> int:
     """Predict m_+ and P_+ of some rows (K,) of objects or components over dt, s, positive; `new` receives them.
 
     Returns:
         How many covariances had to be repaired.
     """
-    root, points = np.empty((STATE, STATE)), np.empty((2 * STATE, STATE))
+    buffers = np.empty((STATE, STATE)), np.empty((2 * STATE, STATE))
     repaired = 0
     for k in range(rows.shape[0]):
         n = rows[k]
         own = classes[old.label[n]]
-        if predict_state(old.mean[n], old.covariance[n], dt, own, root, points, new.mean[k], new.covariance[k]):
+        if predict_state(old.mean[n], old.covariance[n], dt, own, buffers, new.mean[k], new.covariance[k]):
             repaired += 1
         new.label[k], new.born_ns[k] = old.label[n], old.born_ns[n]
         for s in range(4):

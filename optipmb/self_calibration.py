@@ -38,14 +38,12 @@ from optipmb.rows import read_only
 from optipmb.undetected import AGED, MARKED
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
     from optipmb.density import Density, Moment
     from optipmb.frame import Frame
     from optipmb.rows import Array, Index
-    from optipmb.table import ClassRow, ClassTable
+    from optipmb.table import Classes, ClassTable
     from optipmb.tracker import Update
 
     Slots = NDArray[np.uint16]
@@ -122,7 +120,7 @@ def on_curve(odds: float, curve: Array) -> float:
 
 
 @kernel
-def calibrate(classes: Array, score: Array, label: Index, table: Sequence[ClassRow]) -> Array:
+def calibrate(classes: Array, score: Array, label: Index, table: Classes) -> Array:
     """Return calibrated scores (M,), and bound the thresholds in `table` by the lower edge of the median of the scores.
 
     `classes` are the counts, (C, `COUNTS`, `BINS`).

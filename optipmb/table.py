@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias
 
 import numpy as np
 
@@ -19,10 +19,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from optipmb.parameters import ClassParameters, Parameters
+    from optipmb.rows import Array, Index
 
-    Size = NDArray[np.float64]
-    Spread = NDArray[np.float64]
-    Curve = NDArray[np.float64]
+    Size = Array
+    Spread = Array
+    Curve = Array
 
 
 class ClassRow(Protocol):
@@ -120,6 +121,9 @@ class ClassRow(Protocol):
     knot_across: Curve
 
 
+Classes: TypeAlias = "Sequence[ClassRow]"
+"""(C,) rows of a table, for kernels."""
+
 _TYPES: Final = MappingProxyType(
     {
         "float": np.float64,
@@ -149,19 +153,19 @@ class ClassTable:
     classes: Sequence[ClassRow]
     period: float
     detection_time: float
-    confusion: NDArray[np.float64]
+    confusion: Array
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         column: NDArray[Any] = np.asarray(self.classes)[name]
         return column
 
-    def known_boxes(self, label: NDArray[np.int64], auxiliary: NDArray[np.float64]) -> NDArray[np.float64]:
+    def known_boxes(self, label: Index, auxiliary: Array) -> Array:
         """Return x_A of objects (N, 4), with the usual values of their classes in place of unknown ones."""
         unknown = np.isnan(auxiliary)
         if not unknown.any():
             return auxiliary
         usual = self["default_size"][label]
-        size: NDArray[np.float64] = np.where(unknown[:, :3], usual, auxiliary[:, :3])
+        size: Array = np.where(unknown[:, :3], usual, auxiliary[:, :3])
         return np.column_stack((size, np.where(unknown[:, 3], 0.5 * size[:, 2], auxiliary[:, 3])))
 
     def copy(self) -> ClassTable:
@@ -205,7 +209,7 @@ def usual_size(name: str) -> tuple[float, float, float]:
     return _USUAL.get(common_name(name) or "", (1.5, 1.5, 1.5))
 
 
-def _confusion(classes: Any, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
+def _confusion(classes: Any, kappa: Array) -> Array:
     """Return Lambda: 1 - kappa_c on the diagonal, kappa_c / (G - 1) for the other classes of the group of c."""
     group, size = classes["group"], classes["group_size"]
     if not (size > 1).any():

@@ -23,7 +23,7 @@ from optipmb.density import (
 )
 from optipmb.detection_probability import detection_probability
 from optipmb.errors import FrameError, ParameterError
-from optipmb.extract import extract
+from optipmb.extract import Tracks, extract
 from optipmb.field_of_view import follow_looks, look
 from optipmb.hypotheses import UNLIMITED, check_effort, local_hypotheses
 from optipmb.lightweight import light_weight_filter
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from optipmb.extract import Tracks
     from optipmb.frame import Frame
     from optipmb.paths import PredictedPaths
     from optipmb.rows import Array, Columns, Index
@@ -188,8 +187,8 @@ class StepResult:
         diagnostics: counts.
         paths: predicted paths of the tracks, where the profile has horizons.
         class_probability: (N, C) of each track and class, where classes have a group in common.
-        measured: (N,) uint8, what of each track is known: 1 the heading, by a detection or by its motion, 2 the size,
-            4 the height, added up; the rest are stand-ins. None: everything of all.
+        measured: (N,) uint8, the known parts of each track: 1 the heading, by a detection or by its motion, 2 the size,
+            4 the height, added up; defaults stand for the others. None: everything of all tracks is known.
     """
 
     density: Density
@@ -309,7 +308,8 @@ class Tracker:
             posterior = replace(posterior, sensor=density.sensor)
 
         # Track extraction
-        tracks = extract(posterior, after.measurement, z, moment, table, two_thresholds=modules.ote)
+        shown = objects.words, posterior.missed_from_ns, after.measurement, tuple(z), tuple(moment)
+        tracks = Tracks.of(extract(*shown, modules.ote, table.classes))
         paths = paths_of(tracks, self._horizons, table) if self._horizons.size else None
         pi = None if pi is None else pi[np.searchsorted(objects.id, tracks.id)]
         removed, repaired = (frame.score.shape[0], below_score, suppressed), repaired + after.repaired

@@ -30,13 +30,11 @@ from optipmb.predict import ORDER, SPREAD, WEIGHT, heading_unknown, square_root,
 from optipmb.unknown_heading import LOST, face_along, find_heading, lose_heading, take_heading
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from optipmb.density import Poissons
     from optipmb.hypotheses import Hypotheses
     from optipmb.preprocess import Measurements
     from optipmb.rows import Array, Index
-    from optipmb.table import ClassRow
+    from optipmb.table import Classes
 
     Buffers = tuple[Array, Array, Array, Array, Array, Array]
 
@@ -64,7 +62,7 @@ def ukf_updates(
     mean: Array,
     covariance: Array,
     measurements: Measurements,
-    classes: Sequence[ClassRow],
+    classes: Classes,
     mean_out: Array,
     covariance_out: Array,
 ) -> int:
@@ -225,7 +223,7 @@ def ukf_update(
 
 @kernel
 def birth_states(
-    rows: Index, measurements: Measurements, classes: Sequence[ClassRow], mean_out: Array, covariance_out: Array
+    rows: Index, measurements: Measurements, classes: Classes, mean_out: Array, covariance_out: Array
 ) -> None:
     """Compute m^0 and P^0 of the measurements in `rows` (K,) (eq. Newborn Hypothesis).
 
@@ -249,12 +247,8 @@ def birth_states(
             else:
                 speed = velocity[m, 0] * math.cos(heading) + velocity[m, 1] * math.sin(heading)
         mean_out[k] = 0.0
-        mean_out[k, 0], mean_out[k, 1], mean_out[k, 2], mean_out[k, 3] = (
-            position[m, 0],
-            position[m, 1],
-            speed,
-            wrap(heading),
-        )
+        mean_out[k, 0], mean_out[k, 1] = position[m, 0], position[m, 1]
+        mean_out[k, 2], mean_out[k, 3] = speed, wrap(heading)
         covariance_out[k] = 0.0
         for s in range(STATE):
             covariance_out[k, s, s] = spread[s] * spread[s]
@@ -274,7 +268,7 @@ def first_detected_states(
     hypotheses: Hypotheses,
     components: Poissons,
     measurements: Measurements,
-    classes: Sequence[ClassRow],
+    classes: Classes,
     mean_out: Array,
     covariance_out: Array,
 ) -> int:
@@ -289,102 +283,65 @@ def first_detected_states(
     """
     first_kind, announced, log_e = hypotheses.first_kind, hypotheses.announced, hypotheses.log_e
     birth_states(rows, measurements, classes, mean_out, covariance_out)
-    wanted, count = np.empty(rows.shape[0], np.int64), 0
-    for k in range(rows.shape[0]):
-        if first_kind[rows[k]] == FROM_POISSON:
-            wanted[count] = k
-            count += 1
-    if count == 0:
-        return 0
-    wanted = wanted[:count]
     # The pairs of each measurement, one measurement after the other.
     first = np.zeros(first_kind.shape[0] + 1, np.int64)
     for m in announced:
         first[m + 1] += 1
     for m in range(first_kind.shape[0]):
         first[m + 1] += first[m]
-    fill = first.copy()
-    of_measurement = np.empty(announced.shape[0], np.int64)
+    fill, of_measurement = first.copy(), np.empty(announced.shape[0], np.int64)
     for pair in range(announced.shape[0]):
         of_measurement[fill[announced[pair]]] = pair
         fill[announced[pair]] += 1
 
-    # The mixtures, one after the other, with weights e^j / e; the largest e^j of each is taken out first.
-    start = np.zeros(wanted.shape[0] + 1, np.int64)
-    pairs = np.empty(announced.shape[0], np.int64)
-    weight = np.empty(announced.shape[0])
-    for i in range(wanted.shape[0]):
-        m = rows[wanted[i]]
-        begin, end = start[i], start[i] + first[m + 1] - first[m]
-        start[i + 1] = end
-        largest, others = -math.inf, 0.0
-        for k in range(begin, end):
-            pairs[k] = of_measurement[first[m] + k - begin]
-            largest = max(largest, log_e[pairs[k]])
-        for k in range(begin, end):
-            weight[k] = math.exp(log_e[pairs[k]] - largest)
-            if k > begin:
-                others += weight[k]
-        total = weight[begin] + others  # in the order in which numpy adds a few numbers
-        for k in range(begin, end):
-            weight[k] /= total
-
-    pairs = pairs[: start[-1]]
-    parts, spreads = np.empty((pairs.shape[0], STATE)), np.empty((pairs.shape[0], STATE, STATE))
-    repaired = ukf_updates(
-        hypotheses.component[pairs],
-        announced[pairs],
-        components.mean,
-        components.covariance,
-        measurements,
-        classes,
-        parts,
-        spreads,
-    )
-    matched, matched_spread = np.empty((wanted.shape[0], STATE)), np.empty((wanted.shape[0], STATE, STATE))
-    moment_match(start, weight, parts, spreads, matched, matched_spread)
-    for i in range(wanted.shape[0]):
-        copy_state(matched, matched_spread, i, mean_out, covariance_out, wanted[i])
+    repaired = 0
+    for k in range(rows.shape[0]):
+        m = rows[k]
+        if first_kind[m] != FROM_POISSON:
+            continue
+        pairs = of_measurement[first[m] : first[m + 1]]
+        parts, spreads = np.empty((pairs.shape[0], STATE)), np.empty((pairs.shape[0], STATE, STATE))
+        given = hypotheses.component[pairs], announced[pairs], components.mean, components.covariance
+        repaired += ukf_updates(*given, measurements, classes, parts, spreads)
+        moment_match(log_e[pairs], parts, spreads, mean_out[k], covariance_out[k])
     return repaired
 
 
 @kernel
-def moment_match(
-    start: Index, weight: Array, mean: Array, covariance: Array, mean_out: Array, covariance_out: Array
-) -> None:
-    """Replace Gaussian mixtures by single Gaussians of the same mean and covariance.
+def moment_match(log_weight: Array, mean: Array, covariance: Array, mean_out: Array, covariance_out: Array) -> None:
+    """Replace a Gaussian mixture (L,) by one Gaussian of the same mean and covariance.
 
     Headings are averaged as differences from the heading of the heaviest component, taken in (-pi, pi]. Where one of
-    them is unknown, the heaviest component stands for all. Mixture k has the components from `start[k]` to
-    `start[k + 1]`, whose weights sum to one.
+    them is unknown, the heaviest component stands for all. Weights need not sum to one.
     """
-    for k in range(start.shape[0] - 1):
-        first, last = start[k], start[k + 1]
-        heaviest = first
-        for j in range(first, last):
-            if weight[j] > weight[heaviest]:
-                heaviest = j
-        straight = False
-        for j in range(first, last):
-            straight |= heading_unknown(covariance[j])
-        if straight:
-            copy_state(mean, covariance, heaviest, mean_out, covariance_out, k)
-            continue
-        deviation = np.empty((last - first, STATE))
-        shift = np.zeros(STATE)
-        for j in range(first, last):
-            for s in range(STATE):
-                deviation[j - first, s] = mean[j, s] - mean[heaviest, s]
-            deviation[j - first, PHI] = wrap(deviation[j - first, PHI])
-            for s in range(STATE):
-                shift[s] += weight[j] * deviation[j - first, s]
+    count, largest, others, straight = log_weight.shape[0], log_weight.max(), 0.0, False
+    weight = np.empty(count)
+    for j in range(count):
+        weight[j] = math.exp(log_weight[j] - largest)
+        straight |= heading_unknown(covariance[j])
+        if j > 0:
+            others += weight[j]
+    total, heaviest = weight[0] + others, 0  # in the order in which numpy adds a few numbers
+    for j in range(count):
+        weight[j] /= total
+        if weight[j] > weight[heaviest]:
+            heaviest = j
+    if straight:
+        mean_out[:], covariance_out[:] = mean[heaviest], covariance[heaviest]
+        return
+    deviation, shift = np.empty((count, STATE)), np.zeros(STATE)
+    for j in range(count):
         for s in range(STATE):
-            mean_out[k, s] = mean[heaviest, s] + shift[s]
-            for t in range(s + 1):
-                value = 0.0
-                for j in range(first, last):
-                    spread = (deviation[j - first, s] - shift[s]) * (deviation[j - first, t] - shift[t])
-                    value += weight[j] * (covariance[j, s, t] + spread)
-                covariance_out[k, s, t] = value
-                covariance_out[k, t, s] = value
-        mean_out[k, PHI] = wrap(mean_out[k, PHI])
+            deviation[j, s] = mean[j, s] - mean[heaviest, s]
+        deviation[j, PHI] = wrap(deviation[j, PHI])
+        for s in range(STATE):
+            shift[s] += weight[j] * deviation[j, s]
+    for s in range(STATE):
+        mean_out[s] = mean[heaviest, s] + shift[s]
+        for t in range(s + 1):
+            value = 0.0
+            for j in range(count):
+                spread = (deviation[j, s] - shift[s]) * (deviation[j, t] - shift[t])
+                value += weight[j] * (covariance[j, s, t] + spread)
+            covariance_out[s, t] = covariance_out[t, s] = value
+    mean_out[PHI] = wrap(mean_out[PHI])
