@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import fnmatch
+import http.client
 import threading
 import time
-from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -169,7 +170,7 @@ class Watched:
         return stream
 
 
-@contextmanager
+@contextlib.contextmanager
 def served(source: Any, places: Any = None, **settings: Any) -> Iterator[str]:
     """The application on a free port; gives its address."""
     server = Server(application(source, Settings(**settings), places), "127.0.0.1:0")
@@ -256,3 +257,13 @@ PROBLEM = Problem(stream=STREAM, instance="one", code="late", message="Late.")
 def publication(message: Message) -> Publication:
     """Return a message as it comes in."""
     return Publication(key_of(message), encode(message), encoding_of(message), {})
+
+
+@contextlib.contextmanager
+def asked(address: str, path: str, **headers: str) -> Iterator[http.client.HTTPResponse]:
+    """Ask for something; the answer's body is still to be read."""
+    host, _, port = address.rpartition(":")
+    with contextlib.closing(http.client.HTTPConnection(host, int(port), timeout=DEADLINE_S)) as connection:
+        connection.request("GET", path, headers={"connection": "close", **headers})
+        with connection.getresponse() as response:
+            yield response

@@ -20,7 +20,7 @@ from optipmb_service.edge.readers import EVENTS, Reader, Wish
 from optipmb_service.http import application
 from optipmb_service.settings import Settings
 from router import until
-from watched import KEYS, PROBLEM, STREAM, Session, Watched, events, key_of, publication, served, tracks
+from watched import KEYS, PROBLEM, STREAM, Session, Watched, asked, events, key_of, publication, served, tracks
 from websocket import (
     ABNF,
     WebSocket,
@@ -40,19 +40,6 @@ OK = http.client.OK
 
 
 @pytest.fixture
-def watched() -> Watched:
-    """A service."""
-    return Watched()
-
-
-@pytest.fixture
-def session(watched: Watched) -> Session:
-    """Its session."""
-    assert watched.network is not None
-    return watched.network
-
-
-@pytest.fixture
 def address(watched: Watched) -> Iterator[str]:
     """Where it answers."""
     with served(watched, http_clients=4, http_origins=["https://map.example"]) as address:
@@ -66,16 +53,6 @@ def guarded(watched: Watched, tmp_path: Path) -> Iterator[str]:
     file.write_text(json.dumps({hashlib.sha256(token.encode()).hexdigest(): name for token, name in TOKENS.items()}))
     with served(watched, http_tokens=str(file)) as address:
         yield address
-
-
-@contextlib.contextmanager
-def asked(address: str, path: str, **headers: str) -> Iterator[http.client.HTTPResponse]:
-    """Ask for something; the answer's body is still to be read."""
-    host, _, port = address.rpartition(":")
-    with contextlib.closing(http.client.HTTPConnection(host, int(port), timeout=DEADLINE_S)) as connection:
-        connection.request("GET", path, headers={"connection": "close", **headers})
-        with connection.getresponse() as response:
-            yield response
 
 
 def get(address: str, path: str, **headers: str) -> tuple[int, Any]:

@@ -20,7 +20,7 @@ from optipmb_service.settings import Settings
 from optipmb_service.zenoh import client
 from router import until
 from tracks_message import tracks_message
-from watched import KEYS, Session, Watched, key_of, publication, served
+from watched import KEYS, Session, Watched, asked, key_of, publication, served
 
 from optipmb import Georeference
 
@@ -70,37 +70,10 @@ DETECTIONS = Detections(
 
 
 @pytest.fixture
-def watched() -> Watched:
-    """A service."""
-    return Watched()
-
-
-@pytest.fixture
-def session(watched: Watched) -> Session:
-    """Its session."""
-    assert watched.network is not None
-    return watched.network
-
-
-@pytest.fixture
 def address(watched: Watched) -> Iterator[str]:
     """Where its page is."""
     with served(watched, http_clients=VIEWERS) as address:
         yield address
-
-
-@contextlib.contextmanager
-def asked(address: str, path: str) -> Iterator[http.client.HTTPResponse]:
-    """Ask for something; the answer's body is still to be read."""
-    host, _, port = address.rpartition(":")
-    connection = http.client.HTTPConnection(host, int(port), timeout=DEADLINE_S)
-    connection.request("GET", path, headers={"connection": "close"})
-    response = connection.getresponse()
-    try:
-        yield response
-    finally:
-        response.close()
-        connection.close()
 
 
 def get(address: str, path: str) -> tuple[int, bytes]:
