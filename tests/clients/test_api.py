@@ -155,7 +155,7 @@ class Recorder:
 
     def __init__(self, sent: list[bytes], *, wanted: bool) -> None:
         self.wanted = wanted
-        self.put = sent.append
+        self.put = lambda payload, _: sent.append(payload)
 
     def senders(self, *_: object, **__: object) -> tuple["Recorder", "Recorder"]:
         """Give what sends the detections and the clouds of any stream."""
