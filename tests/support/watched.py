@@ -46,7 +46,7 @@ class Session:
         self.subscriptions: list[tuple[str, Callable[[Message], None]]] = []
         self.cache: list[tuple[str, Message]] = []
         self.instances: list[str] = ["one"]
-        self.statuses: list[ServiceStatus] = []
+        self.statuses: list[Message] = []
         self.gate = threading.Event()
         self.gate.set()
         self.arrived: Callable[[], object] = lambda: None

@@ -53,7 +53,7 @@ LAST_S: Final = 1.0
 QOS: Final = {"tracks": 0, "problems": 0, "events": 1, "zones": 1}
 RETAINED: Final = "zones"
 KEPT: Final = frozenset({"events"})  # topics of the network that wait for the broker
-OLD: Final = frozenset({1, 132})  # how brokers refuse the version of the protocol: those of 3.1.1, and of 5
+OLD: Final = frozenset({1, 132})  # how brokers of 3.1.1, and of 5, refuse the version of the protocol
 
 
 class Bridge(Reporter):
@@ -94,6 +94,11 @@ class Bridge(Reporter):
     def lost(self) -> int:
         """Events that were lost while the broker was away."""
         return self._reader.lost_events
+
+    @property
+    def skipped(self) -> int:
+        """Messages that newer ones replaced before the broker took them."""
+        return self._reader.outbox.left_out - self._reader.lost_events
 
     @property
     def state(self) -> str:
@@ -168,7 +173,7 @@ class Bridge(Reporter):
             self._reader.receive(one)
 
     async def _publish(self, broker: aiomqtt.Client) -> None:
-        """Publish what comes; a few messages at once, and again what the broker has not confirmed."""
+        """Publish waiting messages, a few at once; repeat unconfirmed ones."""
         outbox, properties = self._reader.outbox, None
         if self._version is aiomqtt.ProtocolVersion.V5:
             properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
@@ -194,7 +199,7 @@ async def _until_lost(broker: aiomqtt.Client) -> None:
 
 
 def _tls(settings: Settings) -> ssl.SSLContext | None:
-    """Return the certificates for the broker: the system's authorities, or those of the folder.
+    """Return the certificates for the broker: of the system's authorities, or of the folder.
 
     Raises:
         OSError: a file cannot be used.

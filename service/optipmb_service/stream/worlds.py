@@ -122,7 +122,7 @@ def _announced(
     worlds: Worlds, last: SensorWorld, world: int, motion: optipmb.Relocation, *, same_publisher: bool
 ) -> SensorWorld:
     """Return the world of a sensor whose publisher counts it as `world`, and reached it by a motion."""
-    if not same_publisher:  # it counts anew
+    if not same_publisher:  # it counts from 1 again
         if _leads_to(worlds, last.number, motion):
             return SensorWorld(last.number, last.number - world)
         if world == 1:

@@ -1,6 +1,6 @@
 """State of the process, for those who ask from outside: from before the service exists until after its end.
 
-The age of the control loop's last beat is reported. States: `starting`, then that of the service
+The age of the control loop's last beat is reported. States: `starting`, then the state of the service
 (`ready`, `degraded` when it works with a part missing, `paused` when it may not publish, `unlinked` without a router,
 or `draining` when others track its streams), then `stopping`.
 """
