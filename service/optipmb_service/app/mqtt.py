@@ -101,14 +101,9 @@ class Bridge(Reporter):
         return self._reader.outbox.left_out - self._reader.lost_events
 
     @property
-    def state(self) -> str:
-        """Ready while it has a router and the broker."""
-        return "unlinked" if super().failure else "degraded" if self.failure else "ready"
-
-    @property
     def failure(self) -> str:
         """Why nothing can be received or published; empty while it can."""
-        return super().failure or ("" if self.connected else f"mqtt: {self._why}")
+        return self.unlinked or ("" if self.connected else f"mqtt: {self._why}")
 
     async def run(self) -> None:
         """Publish until it is cancelled; connect again and again."""
