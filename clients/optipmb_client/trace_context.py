@@ -21,7 +21,7 @@ def current_traceparent() -> str:
 
 
 def attachment_of(traceparent: str) -> bytes | None:
-    """Return the attachment with a `traceparent`; None without one, or with one that nobody would read."""
+    """Return the attachment with a `traceparent`; None without one, or with one that is too long."""
     attachment = _NAME + traceparent.encode()
     return attachment if traceparent and len(attachment) <= _MOST_BYTES else None
 

@@ -201,7 +201,7 @@ class Ros2Settings(BaseModel):
 
 
 class MqttSettings(BaseModel):
-    """An MQTT broker and what it gets; used by `optipmb-service mqtt`."""
+    """An MQTT broker and its messages; used by `optipmb-service mqtt`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 

@@ -98,7 +98,8 @@ class Service(Reporter):
         except TransportError:
             store.close(JOIN_S)
             raise
-        self._reporter = ProblemReporter(self._transport.publish_problem)
+        super().__init__(self.client())
+        self._reporter = ProblemReporter(self.client().publish_problem)
         self._scheduler = Scheduler()
         self._member = Member(settings.instance, store, settings.lease_s)
         self._checkpoints = CheckpointWriter(
@@ -255,10 +256,6 @@ class Service(Reporter):
             clouds_refused=totals.clouds_refused,
             problems=self._reporter.newest(),
         )
-
-    def session(self) -> Client:
-        """Return the session for readers."""
-        return self.client()
 
     def detections_of(self, stream: str) -> str:
         """Return the pattern of the streams whose detections belong to the tracks of a stream."""

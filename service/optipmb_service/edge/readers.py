@@ -16,6 +16,7 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
 
 import optipmb_schemas as schemas
+import structlog
 from optipmb_client.merging import FinalEvents
 from optipmb_schemas import json_form
 from optipmb_schemas.json_form import EVERYTHING, Selection
@@ -25,6 +26,7 @@ from optipmb_service.zenoh.client import SharedSubscriptions, Turns
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
+    from optipmb_client.incoming import Answer
     from optipmb_client.zenoh.handles import Reading
     from optipmb_client.zenoh.session import Session
     from optipmb_schemas.json_form import Place
@@ -69,6 +71,9 @@ KINDS: Final[dict[str, type[schemas.Message]]] = {
 }
 
 T = TypeVar("T")
+M = TypeVar("M", bound=schemas.Message)
+
+log = structlog.get_logger("optipmb_service")
 
 
 class Outbox(Generic[T]):
@@ -207,10 +212,7 @@ class Publication:
     @cached_property
     def message(self) -> Any:
         """The message; None where it is not valid."""
-        try:
-            return schemas.decode(self.payload, KINDS[self.topic], encoding=self.encoding)
-        except schemas.MessageError:
-            return None
+        return _valid(KINDS[self.topic], self)
 
     @property
     def place(self) -> Place | None:
@@ -232,6 +234,15 @@ class Publication:
     def zones(self) -> bytes | None:
         """Its counts of zones as JSON; None without any."""
         return json_form.zones_json(self.message)
+
+
+def _valid(kind: type[M], one: Publication | Answer) -> M | None:
+    """Return the message that came; None for one that is not valid, which is logged."""
+    try:
+        return schemas.decode(one.payload, kind, encoding=one.encoding)
+    except schemas.MessageError as error:
+        log.warning("edge_invalid", reason=str(error))
+        return None
 
 
 class Text(NamedTuple):
@@ -270,7 +281,7 @@ class Reader:
     """Queue of the texts for one reader. To be made and read on its loop.
 
     Args:
-        wish: what it wants.
+        wish: its streams and topics.
         events: how many events may wait; beyond, the oldest are lost.
     """
 
@@ -282,7 +293,7 @@ class Reader:
         self.want(wish)
 
     def want(self, wish: Wish) -> None:
-        """Change what it wants."""
+        """Change its streams and topics."""
         self._wish, self._pace = wish, Pace(wish.max_rate_hz, predict=wish.predict)
 
     async def take(self, seconds: float | None = None) -> bytes | None:
@@ -349,7 +360,7 @@ class Feeds:
             return joined.pop_all().close
 
     def _subscribe(self, key: str, receive: Callable[[Publication], None]) -> Reading:
-        """Subscribe: to events with what was lost, and was published just before; to others as they come."""
+        """Subscribe: to events with recovery and history, to other topics without."""
         self._turns.take()
         if key.endswith("/events"):
             return self.session.subscribe(
@@ -386,10 +397,9 @@ async def listed(session: Session, keys: schemas.Keys, pattern: str) -> list[tup
     services = {keys.instance_of(key) for key in alive}
     found = []
     for answer in answers:
-        if answer.ok:
-            status = schemas.decode(answer.payload, schemas.ServiceStatus, encoding=answer.encoding)
-            if status.instance in services:
-                found += [(status.instance, one) for one in status.sessions if _matches(one.stream, pattern)]
+        status = _valid(schemas.ServiceStatus, answer) if answer.ok else None
+        if status is not None and status.instance in services:
+            found += [(status.instance, one) for one in status.sessions if _matches(one.stream, pattern)]
     return sorted(found, key=lambda entry: (entry[1].stream, entry[0]))
 
 

@@ -115,7 +115,8 @@ class Transport:
         self._all = False
         self._run = secrets.token_hex(8)
         """Tells this process from all others, also from others of its name."""
-        self._announcements = Announcements(self._client, self._keys, self._instance, self._run)
+        self.discover = Announcements(self._client, self._keys, self._instance, self._run).announce
+        """Announces streams, and no others."""
         self._returned = ReturnedPublishers(self._client, lambda *_: 0)
         self._alive: Declared | None = None
         self._owners: Reading | None = None
@@ -209,10 +210,6 @@ class Transport:
 
         self._client.watch(self._keys.all_publishers(), returned)
         self._client.watch(self._keys.all_discovered(), announced)
-
-    def discover(self, streams: set[str]) -> None:
-        """Announce these streams, and no others."""
-        self._announcements.announce(streams)
 
     def ask_recent(self, sessions: Sequence[str]) -> list[Packet]:
         """Return what other instances have received lately of sessions, as packets.
@@ -330,10 +327,6 @@ class Transport:
         token = self._client.token(self._keys.owner(stream, self._instance))
         inputs = (self._keys.detections(stream), self._keys.points(stream)) if self._all else ()
         return StreamPublisher(tracks, other, latest, (token, *map(self._client.declare_key, inputs)))
-
-    def publish_problem(self, problem: schemas.Problem) -> None:
-        """Send a problem on its stream's key; one without a stream has no key and is not sent."""
-        self._client.publish_problem(problem)
 
     def watch_owners(self, on_owner: Callable[[str, str, bool], None] | None) -> None:
         """Tell which instance tracks which stream, or does so no longer (False), from now on; None: stop telling."""
