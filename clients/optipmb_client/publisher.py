@@ -151,7 +151,7 @@ class Publisher:
             position_covariance: (M, 3, 3), of the errors of the centres; NaN for an object for which the noise of the
                 profile holds. None: it holds for all.
             relocation: With the first frame after a loop closure or a change of map: the motion (translation (3,),
-                quaternion of a turn about z) from the world frame before to the one of this message and all later ones.
+                quaternion of a turn about z) from the world frame before to the frame of this and all later messages.
                 The service moves its tracks so, and they keep their ids.
 
         Returns:

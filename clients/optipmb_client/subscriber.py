@@ -194,6 +194,8 @@ class Subscriber(_Subscription):
         on_problem: Called with each `Problem` that the service reports for these streams (refused messages and the
             like), by the thread that iterates.
         corrections: Whether messages that replace earlier ones are given out too.
+        predict: Receive tracks predicted to now, at a fixed rate, of the streams in the setting `outputs`: each
+            message replaces the one before, and none is kept for late subscribers.
         queue: Number of messages that may wait.
         config: A Zenoh configuration file, for TLS, passwords and the like; for gRPC the folder of the certificates.
         connection: Share an open connection (it stays open) in the place of `connect` and `config`.
@@ -213,6 +215,7 @@ class Subscriber(_Subscription):
         timeout: float | None = None,
         on_problem: Callable[[Problem], None] | None = None,
         corrections: bool = True,
+        predict: bool = False,
         queue: int = 1024,
         config: str | Path | None = None,
         connection: "Link | None" = None,
@@ -225,7 +228,8 @@ class Subscriber(_Subscription):
         self._corrections = corrections
         self._newest: dict[tuple[str, str | None], tuple[bytes, int, int]] = {}
         self._missed: collections.deque[Missed] = collections.deque(maxlen=MISSED)
-        topics: tuple[Topic, ...] = ("tracks",) if on_problem is None else ("tracks", "problems")
+        tracks: Topic = "now" if predict else "tracks"
+        topics: tuple[Topic, ...] = (tracks,) if on_problem is None else (tracks, "problems")
         opened = partial(linked, connect, config=config, timeout=connect_timeout)
         super().__init__(pattern, topics, queue, prefix, connection, opened)
 
@@ -246,6 +250,9 @@ class Subscriber(_Subscription):
                 if (problem := self._read(arrival, Problem)) is not None and self._on_problem is not None:
                     self._on_problem(problem)
             elif (tracks := self._read(arrival, Tracks)) is not None:
+                if tracks.predicted_to_ns is not None:
+                    self._counts["delivered"] += 1
+                    return Received(tracks, arrival.monotonic_ns)
                 self._look_for_missed(tracks, after_loss=arrival.after_loss)
                 novelty = self._merging.take(tracks)
                 corrects = novelty is Novelty.CORRECTION

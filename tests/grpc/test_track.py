@@ -49,7 +49,6 @@ class Heard:
         self.session.close()  # type: ignore[no-untyped-call]  # zenoh's stubs leave it untyped
 
     def take(self, number: int, at: int = 0, what: Any = lambda sample: sample.payload.to_bytes()) -> list[bytes]:
-        """The next payloads, or another part of the messages."""
         ends, payloads = time.monotonic() + DEADLINE_S, []
         while len(payloads) < number:
             sample = self._samples[at].try_recv()
@@ -84,7 +83,6 @@ def test_trace_contexts_go_on_to_the_network(
 
 
 def violation(raised: pytest.ExceptionInfo[grpc.RpcError]) -> Any:
-    """The field at fault, from the details of a status."""
     status = rpc_status.from_call(raised.value)
     details = error_details_pb2.BadRequest()
     assert status is not None

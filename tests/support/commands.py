@@ -12,7 +12,6 @@ from optipmb_tools.cli import run
 
 
 def optipmb(*arguments: object, timeout: float = 240.0) -> "subprocess.CompletedProcess[str]":
-    """Run the client's command in a process of its own."""
     command = [sys.executable, "-m", "optipmb_tools", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
 
@@ -33,12 +32,10 @@ def start(*arguments: object, fresh: bool = False, **how: Any) -> "subprocess.Po
 
 
 def result_of(done: "subprocess.CompletedProcess[str]") -> Any:
-    """Give the JSON that a command printed; it must have ended well."""
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
 
 def kill(process: "subprocess.Popen[str]") -> None:
-    """End a process as a crash would, and clear away its pipes."""
     process.send_signal(signal.SIGKILL)
     process.communicate(timeout=120)

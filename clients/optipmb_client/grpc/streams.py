@@ -223,7 +223,7 @@ class GrpcSubscription(ResumedCall):
         pattern: of streams.
         inbox: for the messages.
         keys: of the network, for the names of arrivals.
-        topics: tracks, perhaps with problems, or events.
+        topics: tracks or tracks predicted to now, perhaps with problems, or events.
         timeout: seconds to wait until it is in force.
 
     Raises:
@@ -236,7 +236,9 @@ class GrpcSubscription(ResumedCall):
     ) -> None:
         self._events = "events" in topics
         super().__init__(channels, "SubscribeEvents" if self._events else "Subscribe", f"subscribe {pattern}")
-        request: Any = pb.SubscribeRequest(pattern=pattern, queue=QUEUE, history=True, problems="problems" in topics)
+        request: Any = pb.SubscribeRequest(
+            pattern=pattern, queue=QUEUE, history=True, problems="problems" in topics, predict="now" in topics
+        )
         if self._events:
             request = pb.SubscribeEventsRequest(pattern=pattern, final=False, history=True)
         self._request = request.SerializeToString()

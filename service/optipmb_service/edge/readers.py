@@ -57,11 +57,15 @@ QUERY_S: Final = 2.0
 TOLERANCE: Final = 0.999
 """Part of a period that counts as a whole one: stamps of real sensors jitter."""
 
+PREDICTED_TOLERANCE: Final = 0.95
+"""The same of predicted states: the time of an output jitters by milliseconds."""
+
 REMEMBERED: Final = 64
 
 KINDS: Final[dict[str, type[schemas.Message]]] = {
     "detections": schemas.Detections,
     "tracks": schemas.Tracks,
+    "now": schemas.Tracks,
     "events": schemas.Events,
     "problems": schemas.Problem,
 }
@@ -164,15 +168,18 @@ class Pace:
 
     Args:
         max_rate_hz: highest rate; 0: all frames.
+        predict: whether the stamps are times of predicted states, which nothing corrects.
 
     Raises:
         MessageError: it is no rate.
     """
 
-    def __init__(self, max_rate_hz: float) -> None:
+    def __init__(self, max_rate_hz: float, *, predict: bool = False) -> None:
         if not 0 <= max_rate_hz < float("inf"):
             raise schemas.MessageError("invalid_value", "max_rate_hz", "a rate in Hz, or 0", f"{max_rate_hz:g}")
-        self._period_ns = TOLERANCE * 1e9 / max_rate_hz if max_rate_hz else 0.0
+        tolerance = PREDICTED_TOLERANCE if predict else TOLERANCE
+        self._period_ns = tolerance * 1e9 / max_rate_hz if max_rate_hz else 0.0
+        self._predict = predict
         self._passed: dict[str, collections.deque[int]] = {}
 
     def passes(self, stream: str, stamp_ns: int) -> bool:
@@ -181,7 +188,7 @@ class Pace:
             return True
         passed = self._passed.setdefault(stream, collections.deque(maxlen=REMEMBERED))
         if stamp_ns in passed:
-            return True
+            return not self._predict
         if passed and abs(stamp_ns - passed[-1]) < self._period_ns:
             return False
         passed.append(stamp_ns)
@@ -256,6 +263,8 @@ class Wish:
     max_rate_hz: float = 0.0
     final: bool = True
     """Whether it gets events when they do not change any more, each once, or as they are published."""
+    predict: bool = False
+    """Whether it gets tracks at a fixed rate, predicted to now."""
 
     def keys(self, keys: schemas.Keys) -> list[str]:
         """Return the keys to subscribe to.
@@ -263,7 +272,8 @@ class Wish:
         Raises:
             MessageError: a pattern is none.
         """
-        topics = {"events" if topic == "zones" else topic for topic in self.topics}
+        named = {"zones": "events", "tracks": "now" if self.predict else "tracks"}
+        topics = {named.get(topic, topic) for topic in self.topics}
         return [keys.matching(one, topic) for topic in sorted(topics) for one in self.streams]  # type: ignore[arg-type]
 
 
@@ -284,7 +294,7 @@ class Reader:
 
     def want(self, wish: Wish) -> None:
         """Change its streams and topics."""
-        self._wish, self._pace = wish, Pace(wish.max_rate_hz)
+        self._wish, self._pace = wish, Pace(wish.max_rate_hz, predict=wish.predict)
 
     async def take(self, seconds: float | None = None) -> bytes | None:
         """Return the next text; None when events were lost, and the reader is to come again.
@@ -303,8 +313,9 @@ class Reader:
         if message is None:
             return
         stream, size, put = message.stream, len(one.payload), self.outbox.put
-        if one.topic == "tracks" and self._pace.passes(stream, message.stamp_ns):
-            put(f"tracks {stream}", Text("tracks", stream, partial(one.tracks, self._wish.selection)), size)
+        if one.topic in {"tracks", "now"}:
+            if self._pace.passes(stream, message.predicted_to_ns or message.stamp_ns):
+                put(f"tracks {stream}", Text("tracks", stream, partial(one.tracks, self._wish.selection)), size)
         elif one.topic == "problems":
             text = Text("problems", stream, partial(json_form.problem_json, message))
             put(f"problems {stream}", text, size, PROBLEMS)

@@ -235,6 +235,7 @@ class _Asked(Struct, frozen=True):
     max_rate_hz: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
     fields: Names = frozenset()
     events: Literal["final", "now"] = "final"
+    predict: bool = False
 
 
 class _Incoming(Struct, forbid_unknown_fields=True):
@@ -268,7 +269,7 @@ def wish_of(parameters: Mapping[str, Any]) -> Wish:
     if wrong := asked.fields - FIELDS:
         raise schemas.MessageError("invalid_value", "fields", f"of {', '.join(sorted(FIELDS))}", ascii(min(wrong))[:80])
     selection = Selection(asked.classes, asked.confirmed, asked.min_existence, asked.fields)
-    return Wish((asked.stream,), asked.topics, selection, asked.max_rate_hz, asked.events == "final")
+    return Wish((asked.stream,), asked.topics, selection, asked.max_rate_hz, asked.events == "final", asked.predict)
 
 
 class Api:
@@ -296,6 +297,8 @@ class Api:
     async def tracks(self, request: Request) -> Response:
         """Answer with the newest frame of each stream."""
         _, wish = await self._asked(request)
+        if wish.predict:
+            raise schemas.MessageError("invalid_value", "predict", "0 here: `stream` and `ws` predict", "1")
         (key,) = wish.keys(self._readers.keys)
         return _array([one.tracks(wish.selection) for one in await self._newest(key)])
 

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
     from optipmb_service.stream.backlog import Backlog, Shed
     from optipmb_service.stream.checkpoint import Checkpoint
+    from optipmb_service.stream.fixed_rate import FixedRate
     from optipmb_service.stream.streams import Streams
     from optipmb_service.stream.traces import FrameTrace, Traces
     from optipmb_service.stream.values import Output, Reached
@@ -92,6 +93,7 @@ class Stream:
         self._prefix = f"{streams.keys.prefix}/"
         self._step_limit_ns = streams.step_limit_ns
         self._publisher: StreamPublisher | None = None
+        self._fixed_rate: FixedRate | None = None
         self._traces: Traces | None = streams.traces
         self._unpublished: list[tuple[bytes, bytes | None, Tracked, int, Context | None]] = []
         """Encoded tracks and events that wait for the write lease, each with the time that its frame waited, ns."""
@@ -194,17 +196,21 @@ class Stream:
             self.report("internal", "", "a message handled without an error", f"{type(error).__name__}: {error}")
 
     def _settle(self) -> None:
-        """Process frames whose wait is over, and ask for a turn for the others."""
+        """Process frames whose wait is over, send predicted tracks that are due, and ask for the next turn."""
         for origin, shed in self.backlog.shed_since().items():
             expected, received = f"at most {self._streams.queue_frames} frames waiting", "more; the oldest were dropped"
             self.report("shed", "", expected, f"{shed} {received}", count=shed, stream=self._stream_of(origin))
         session = self.session
-        if session is None or (deadline_ns := session.deadline_ns) is None:
+        if session is None:
             return
-        now_ns = time.monotonic_ns()
-        if deadline_ns <= now_ns and not self.backlog.clouds_waiting:
+        now_ns, deadline_ns = time.monotonic_ns(), session.deadline_ns
+        if deadline_ns is not None and deadline_ns <= now_ns and not self.backlog.clouds_waiting:
             self.deliver(session.on_tick(now_ns))
             deadline_ns = session.deadline_ns
+        if self._fixed_rate is not None:
+            self._send_predicted(session, self._fixed_rate)
+            due = [one for one in (deadline_ns, self._fixed_rate.due_ns) if one is not None]
+            deadline_ns = min(due, default=None)
         if deadline_ns == 0:
             self.backlog.wake()  # more is ready: after the other streams
         elif deadline_ns is not None and deadline_ns != self._armed_ns:
@@ -311,10 +317,14 @@ class Stream:
                 log.error("session_quarantined", stream=self.name, error=output.error, file=file)
             else:
                 self._streams.reporter.report(output, time.monotonic_ns())
+        if self._fixed_rate is not None and (wrong := self._fixed_rate.take(outputs, time.monotonic_ns())):
+            self.report("clock", "stamp_ns", 'system time, or `clock = "arrival"` in `outputs`', wrong)
 
     def _open_publisher(self) -> None:
+        self._fixed_rate = self._streams.fixed_rate_for(self.name)
+        kinds = {"events": bool(self._policy.zones), "now": self._fixed_rate is not None}
         try:
-            self._publisher = self._streams.open_publisher(self.name, bool(self._policy.zones))
+            self._publisher = self._streams.open_publisher(self.name, **kinds)
         except TransportError as error:
             log.warning("publisher_failed", stream=self.name, error=str(error))
 
@@ -330,21 +340,35 @@ class Stream:
         ticket: Arrival = tracked.ticket
         passed_ns = time.monotonic_ns() - ticket.now_ns
         waited_ns = max(0, passed_ns - ticket.decode_ns - tracked.step_ns)
-        delivery = {
-            "instance": self._streams.instance,
-            "received_ns": ticket.wall_ns,
-            "published_ns": time.time_ns(),
-            "queue_ms": waited_ns / MILLISECOND,
-            "decode_ms": ticket.decode_ns / MILLISECOND,
-            "step_ms": tracked.step_ns / MILLISECOND,
-            "run": tracked.run,
-        }
+        delivery = self._delivery(tracked, waited_ns)
         events = tracked.encoded_events(delivery, self.durable)
         if not again:
             self._count_tracks(tracked.estimates.id.tobytes())
         span = self._traces.tracked(ticket.trace, tracked) if self._traces and ticket.trace else None
         self._unpublished.append((b"" if again else tracked.encoded(delivery), events, tracked, waited_ns, span))
         self._publish()
+
+    def _delivery(self, tracked: Tracked, waited_ns: int) -> dict[str, Any]:
+        return {
+            "instance": self._streams.instance,
+            "received_ns": tracked.ticket.wall_ns,
+            "published_ns": time.time_ns(),
+            "queue_ms": waited_ns / MILLISECOND,
+            "decode_ms": tracked.ticket.decode_ns / MILLISECOND,
+            "step_ms": tracked.step_ns / MILLISECOND,
+            "run": tracked.run,
+        }
+
+    def _send_predicted(self, session: Session, fixed_rate: FixedRate) -> None:
+        """Send the tracks predicted to now, if they are due."""
+        due_ns, now_ns = fixed_rate.due_ns, time.monotonic_ns()
+        tracked = fixed_rate.due(now_ns, time.time_ns(), session.parameters)
+        if tracked is None or due_ns is None or self._publisher is None:
+            return
+        try:
+            self._publisher.publish_now(tracked.encoded(self._delivery(tracked, now_ns - due_ns)))
+        except TransportError as error:
+            log.warning("publish_failed", stream=self.name, error=str(error))
 
     def _publish(self) -> None:
         """Publish what waits, if the write lease holds."""
@@ -671,7 +695,7 @@ class Stream:
     def _drop_session(self, reason: str) -> None:
         if (session := self.session) is None:
             return
-        self.session, self._armed_ns = None, None
+        self.session, self._armed_ns, self._fixed_rate = None, None, None
         self._caches.forget()
         self._unpublished.clear()  # another owner publishes it
         self._count_tracks(b"")

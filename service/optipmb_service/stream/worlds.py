@@ -48,7 +48,7 @@ class Worlds:
 
     Attributes:
         number: of the density.
-        motions: into the newest worlds, the last one into that of the density; `optipmb.Relocation`.
+        motions: into the newest worlds, the last one into the density's; `optipmb.Relocation`.
         sensors: of each sensor.
     """
 

@@ -50,10 +50,11 @@ log = structlog.get_logger("optipmb_service")
 class StreamPublisher:
     """The publishers of a stream's tracks and events, and what else is declared while it is there."""
 
-    def __init__(self, sender: Sender, events: Sender | None, others: Sequence[Declared]) -> None:
-        self._declared = (*others, *([events] if events else []), sender)
+    def __init__(self, sender: Sender, events: Sender | None, now: Sender | None, others: Sequence[Declared]) -> None:
+        self._declared = (*others, *(one for one in (events, now, sender) if one is not None))
         self.publish = sender.put
         self.publish_events = (events or sender).put
+        self.publish_now = (now or sender).put
 
     def release(self) -> None:
         """Withdraw all of it."""
@@ -308,8 +309,8 @@ class Transport:
         """Say that this instance is alive; to be called when it is ready."""
         self._alive = self._client.token(self._keys.alive(self._instance))
 
-    def open_publisher(self, stream: str, events: bool = False) -> StreamPublisher:  # noqa: FBT001, FBT002 - as `Streams` calls it
-        """Open the publishers of a stream: of its tracks, and with `events` of those.
+    def open_publisher(self, stream: str, *, events: bool = False, now: bool = False) -> StreamPublisher:
+        """Open the publishers of a stream: of its tracks, and with `events` and `now` of those.
 
         Say that this instance tracks it, and declare its inputs' keys.
         """
@@ -321,9 +322,11 @@ class Transport:
 
         tracks = sender(self._keys.tracks(stream), schemas.Tracks)
         other = sender(self._keys.events(stream), schemas.Events) if events else None
+        encoding = schemas.encoding_of(schemas.Tracks)
+        latest = self._client.sender(self._keys.now(stream), encoding, express=True) if now else None
         token = self._client.token(self._keys.owner(stream, self._instance))
         inputs = (self._keys.detections(stream), self._keys.points(stream)) if self._all else ()
-        return StreamPublisher(tracks, other, (token, *map(self._client.declare_key, inputs)))
+        return StreamPublisher(tracks, other, latest, (token, *map(self._client.declare_key, inputs)))
 
     def watch_owners(self, on_owner: Callable[[str, str, bool], None] | None) -> None:
         """Tell which instance tracks which stream, or does so no longer (False), from now on; None: stop telling."""

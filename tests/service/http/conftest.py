@@ -8,12 +8,10 @@ from watched import Session, Watched
 
 @pytest.fixture
 def watched() -> Watched:
-    """A service."""
     return Watched()
 
 
 @pytest.fixture
 def session(watched: Watched) -> Session:
-    """Its session."""
     assert watched.network is not None
     return watched.network

@@ -33,7 +33,6 @@ DEADLINE_S = 60.0
 
 
 def tracks(seq: int) -> Tracks:
-    """One track, a long way from the origin, and one that is not confirmed."""
     return tracks_message(
         STREAM,
         seq,
@@ -71,20 +70,17 @@ DETECTIONS = Detections(
 
 @pytest.fixture
 def address(watched: Watched) -> Iterator[str]:
-    """Where its page is."""
     with served(watched, http_clients=VIEWERS) as address:
         yield address
 
 
 def get(address: str, path: str) -> tuple[int, bytes]:
-    """Status and body of an answer."""
     with asked(address, path) as response:
         return response.status, response.read()
 
 
 @contextlib.contextmanager
 def looking(address: str) -> Iterator[Iterator[dict[str, object]]]:
-    """Look at the stream; gives the frames as they come."""
     with asked(address, f"/live?stream={STREAM}") as response:
         assert response.status == http.client.OK
         assert response.getheader("content-type", "").startswith("text/event-stream")
@@ -132,7 +128,7 @@ def test_viewers_get_the_newest_frame_and_not_too_often(session: Session, addres
         began = time.monotonic()
         for seq in range(200):
             session.publish(tracks(seq))
-            time.sleep(0.005)  # the pace is what is tested
+            time.sleep(0.005)  # the pace is the claim
         took = time.monotonic() - began
         times = []
         for frame in frames:
@@ -213,7 +209,7 @@ def test_wrong_streams_and_a_service_that_starts_are_shown(watched: Watched, add
 
 
 def test_a_frame_holds_what_is_drawn() -> None:
-    """Tracks by column; detections and the sensor in the world frame, whatever frame they came in."""
+    """Tracks by column; detections and the sensor in the world frame, for either input frame."""
     detections = DETECTIONS
     text = live_frame(publication(tracks(1)), publication(detections))
     assert text is not None
@@ -241,7 +237,7 @@ def test_a_frame_holds_what_is_drawn() -> None:
 
 
 async def test_only_the_newest_is_kept() -> None:
-    """What nobody took in time is replaced; of detections the newest eight are kept, or one that is large."""
+    """Unread frames are replaced; of detections the newest eight are kept, or one that is large."""
     live = Live(None)
     for number in range(10):
         live.receive(publication(DETECTIONS.model_copy(update={"stream": f"site/node/sensor-{number}"})))
