@@ -67,8 +67,7 @@ def bare(
             covariance[n],
             dt,
             classes[label[n]],
-            root,
-            points,
+            (root, points),
             mean_predicted[n],
             covariance_predicted[n],
         )

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, get_args, get_origin
 from optipmb_service.settings import (
     LimitSettings,
     MqttSettings,
+    OutputSettings,
     Ros2Settings,
     Ros2Stream,
     Settings,
@@ -49,7 +50,7 @@ def settings() -> str:
     """Return the table of all settings."""
     tables: tuple[tuple[str, type[BaseModel]], ...] = (
         *(("", Settings), ("limits.", LimitSettings), ("sites.NAME.", SiteSettings)),
-        ("zones.NAME.", ZoneSettings),
+        *(("zones.NAME.", ZoneSettings), ("outputs.PATTERN.", OutputSettings)),
         *(("ros2.", Ros2Settings), ("ros2.streams.NAME.", Ros2Stream), ("mqtt.", MqttSettings)),
     )
     rows = []

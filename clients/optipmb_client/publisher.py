@@ -21,6 +21,7 @@ from optipmb_schemas import PREFIX, Detections, FieldOfView, Keys, MessageError,
 from optipmb_schemas.arrays import ArrayLike, numeric
 
 from optipmb_client.links import Link, linked
+from optipmb_client.trace_context import attachment_of, current_traceparent
 
 if TYPE_CHECKING:
     from optipmb_client.grpc.streams import GrpcSender
@@ -38,7 +39,8 @@ class Publisher:
 
     Messages are checked first: a wrong shape or value raises `MessageError`, with the path of the field, before
     anything is sent. Detections are kept for some 20 s, so that a service that restarts or loses its link gets them
-    still. Publishing does not wait. One publisher may be used from several threads.
+    still. Publishing does not wait. One publisher may be used from several threads. Messages carry the trace context of
+    the OpenTelemetry span that is active where they are published, if there is one.
 
     Args:
         stream: Name of the stream, `site/node/sensor`. One publisher per stream at a time.
@@ -190,11 +192,12 @@ class Publisher:
                 else _array("position_covariance", position_covariance, 3, 3),
             )
             payload = self._detections.pack(message)
+            attachment = attachment_of(current_traceparent())
             if cloud is not None:
-                self._points.put(cloud)
+                self._points.put(cloud, attachment)
                 self._points_seq += 1
             self.last_put_ns = time.monotonic_ns()
-            self._detections.put(payload)
+            self._detections.put(payload, attachment)
             self._seq += 1
             self._relocation = world
             return message.seq
@@ -213,7 +216,8 @@ class Publisher:
         with self._order:
             if not self.points_wanted:
                 return None
-            self._points.put(self._encode_points(stamp_ns, points, pose))
+            cloud = self._encode_points(stamp_ns, points, pose)
+            self._points.put(cloud, attachment_of(current_traceparent()))
             self._points_seq += 1
             return self._points_seq - 1
 

@@ -53,7 +53,7 @@ class Role:
     receives: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...]
 
 
-OUTPUTS = ("tracks", "events", "problems")
+OUTPUTS = ("tracks", "now", "events", "problems")
 
 
 def recoverable(*keys: str) -> tuple[str, ...]:

@@ -252,6 +252,11 @@ class Tracks(ResultMessage):
         default=None, description="Number of the world frame, which grows with each `relocation`. Absent: 0."
     )
     labels: Labels = Field(description="Names of the classes that `label` counts.")
+    predicted_to_ns: Stamp | None = Field(
+        default=None,
+        description="Time of the states in output at a fixed rate, by the clock of `stamp_ns`; `detection` is -1 where "
+        "it is later. Absent: `stamp_ns`.",
+    )
     id: Annotated[Integers, Array("i8", ("N",), 0, INT64)] = Field(
         description="Identity: unique in the stream, never used again. Ascending."
     )

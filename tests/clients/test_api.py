@@ -13,10 +13,11 @@ import pytest
 import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_client import Connection, ConnectionFailed, Publisher, Subscriber
+from optipmb_client import Connection, ConnectionFailed, EventSubscriber, Publisher, Subscriber
 from optipmb_client.incoming import Inbox
 from optipmb_schemas import (
     Detections,
+    Events,
     Message,
     MessageError,
     Points,
@@ -27,6 +28,7 @@ from optipmb_schemas import (
     encode,
     encoding_of,
 )
+from router import until
 from routers import free_endpoint, open_client
 from tracks_message import SESSION, tracks_message
 from without_numpy import command, publish_everything
@@ -146,7 +148,7 @@ class Recorder:
 
     def __init__(self, sent: list[bytes], *, wanted: bool) -> None:
         self.wanted = wanted
-        self.put = sent.append
+        self.put = lambda payload, _: sent.append(payload)
 
     def senders(self, *_: object, **__: object) -> tuple["Recorder", "Recorder"]:
         return self, self
@@ -420,6 +422,22 @@ def test_garbage_between_tracks_is_counted_and_passed_over(link: Connection, ser
         service.tracks(tracks(1))
         assert [message.seq for message in received(subscriber, 1)] == [1]
         assert subscriber.statistics.invalid == 3
+
+
+def test_what_is_no_event_is_counted_and_passed_over(link: Connection, service: Service) -> None:
+    """An `EventSubscriber` has the counts of a `Subscriber`."""
+    with EventSubscriber(STREAM, connection=link, final=False, timeout=0.05) as subscriber:
+
+        def counted() -> bool:
+            service.put("events", b"garbage", encoding_of(Events))
+            return not list(subscriber) and subscriber.statistics.invalid > 0
+
+        until(counted, "garbage is counted")
+        fields = tracks(1).model_dump(include={"stream", "epoch", "seq", "stamp_ns", "session", "labels"})
+        service.put("events", encode(Events(**fields, events=())), encoding_of(Events))
+        subscriber.timeout = DEADLINE_S
+        assert next(iter(subscriber)).seq == 1
+        assert subscriber.statistics.delivered == 1
 
 
 def test_problems_go_to_the_callback(link: Connection, service: Service) -> None:

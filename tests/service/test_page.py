@@ -115,3 +115,13 @@ def test_the_zones_of_the_example_are_valid(tmp_path: Path) -> None:
     file.write_text("\n".join(re.findall(r"```toml\n(.*?)```", text, re.DOTALL)), encoding="utf-8")
     settings = load(file).settings
     assert [settings.zone(name, "garage").name for name in settings.zones] == ["yard", "gate", "exit"]
+
+
+def test_the_outputs_of_the_example_are_valid(tmp_path: Path) -> None:
+    """The settings on the page of output at a fixed rate are accepted as they stand."""
+    text = OPERATION.with_name("fixed-rate.md").read_text(encoding="utf-8")
+    file = tmp_path / "outputs.toml"
+    file.write_text("\n".join(re.findall(r"```toml\n(.*?)```", text, re.DOTALL)), encoding="utf-8")
+    output = load(file).settings.output_of("garage/robot-1/lidar")
+    assert output is not None
+    assert output.rate_hz == 20

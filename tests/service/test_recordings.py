@@ -183,7 +183,7 @@ class Process(Around):
     def recall(self, stream: str, restore: Any, then: Any, _: object = None) -> None:
         then(restore(decode_checkpoint(self._saved[stream])) if stream in self._saved else None)
 
-    def publish(self, payload: bytes) -> None:
+    def publish(self, payload: bytes, _: bytes | None = None) -> None:
         self._out.message(schemas.decode(payload, schemas.Tracks))
 
     def report(self, problem: schemas.Problem, _: int) -> None:

@@ -25,10 +25,10 @@ def run_here(capsys: pytest.CaptureFixture[str], *arguments: object) -> "subproc
     return subprocess.CompletedProcess(words, status, shown.out, shown.err)
 
 
-def start(*arguments: object, fresh: bool = False) -> "subprocess.Popen[str]":
+def start(*arguments: object, fresh: bool = False, **how: Any) -> "subprocess.Popen[str]":
     """Start the client's command and return the running process; a new interpreter where a start is the claim."""
     command = ("optipmb_tools", *map(str, arguments))
-    return forked.start(*command, fresh=fresh, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    return forked.start(*command, fresh=fresh, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **how)
 
 
 def result_of(done: "subprocess.CompletedProcess[str]") -> Any:

@@ -70,7 +70,7 @@ class Around:
     def may_write(self, *_: object) -> bool:
         return True
 
-    def open_publisher(self, _: str, events: bool = False) -> Around:  # noqa: ARG002, FBT001, FBT002 - as the service calls it
+    def open_publisher(self, _: str, **kinds: bool) -> Around:  # noqa: ARG002 - as the service calls it
         return self
 
     def look(self) -> None:
@@ -78,7 +78,7 @@ class Around:
 
     release = look
 
-    def publish(self, _: bytes) -> None:
+    def publish(self, *_: bytes | None) -> None:
         """Tracks go nowhere."""
 
     publish_events = publish
@@ -91,6 +91,7 @@ def streams_of(
     profiles: Profiles | None = None,
     reporter: Any = None,
     tracker: Any = chained,
+    traces: Any = None,
     **settings: Any,
 ) -> Streams:
     parts: Any = around  # in the place of several
@@ -107,6 +108,7 @@ def streams_of(
         metrics=Metrics(),
         tracker=tracker,
     )
+    streams.traces = traces
     streams.caches = parts
     return streams
 

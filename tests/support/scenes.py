@@ -6,14 +6,14 @@ z up, radians.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from optipmb import Frame, Parameters
+from optipmb import Frame, Modules, Parameters, StepResult
 
 Array = NDArray[np.float64]
 
@@ -353,3 +353,15 @@ def boxes(  # noqa: PLR0913 - a detection has this many columns
         field_of_view=field_of_view,
     )
     return frame
+
+
+def steps(parameters: Parameters, frames: Iterable[Frame], modules: Modules | None = None) -> list[StepResult]:
+    """The results of a tracker for frames, one after the other."""
+    import optipmb  # noqa: PLC0415 - as above
+
+    tracker, results = optipmb.Tracker(parameters, modules), []
+    density = tracker.initial()
+    for frame in frames:
+        results.append(tracker.step(density, frame))
+        density = results[-1].density
+    return results

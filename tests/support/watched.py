@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import fnmatch
 import http.client
 import threading
 import time
-from contextlib import closing, contextmanager
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -46,7 +46,7 @@ class Session:
         self.subscriptions: list[tuple[str, Callable[[Message], None]]] = []
         self.cache: list[tuple[str, Message]] = []
         self.instances: list[str] = ["one"]
-        self.statuses: list[ServiceStatus] = []
+        self.statuses: list[Message] = []
         self.gate = threading.Event()
         self.gate.set()
         self.arrived: Callable[[], object] = lambda: None
@@ -152,22 +152,13 @@ class Watched:
         return stream
 
 
-@contextmanager
+@contextlib.contextmanager
 def served(source: Any, places: Any = None, **settings: Any) -> Iterator[str]:
     server = Server(application(source, Settings(**settings), places), "127.0.0.1:0")
     try:
         yield server.address
     finally:
         server.close()
-
-
-@contextmanager
-def asked(address: str, path: str, **headers: str) -> Iterator[http.client.HTTPResponse]:
-    host, _, port = address.rpartition(":")
-    with closing(http.client.HTTPConnection(host, int(port), timeout=DEADLINE_S)) as connection:
-        connection.request("GET", path, headers={"connection": "close", **headers})
-        with connection.getresponse() as response:
-            yield response
 
 
 def tracks(seq: int, stream: str = STREAM, run: int = 0, count: int = 2) -> Tracks:
@@ -242,3 +233,13 @@ PROBLEM = Problem(stream=STREAM, instance="one", code="late", message="Late.")
 
 def publication(message: Message) -> Publication:
     return Publication(key_of(message), encode(message), encoding_of(message), {})
+
+
+@contextlib.contextmanager
+def asked(address: str, path: str, **headers: str) -> Iterator[http.client.HTTPResponse]:
+    """Ask for something; the answer's body is still to be read."""
+    host, _, port = address.rpartition(":")
+    with contextlib.closing(http.client.HTTPConnection(host, int(port), timeout=DEADLINE_S)) as connection:
+        connection.request("GET", path, headers={"connection": "close", **headers})
+        with connection.getresponse() as response:
+            yield response

@@ -11,8 +11,8 @@ import pytest
 from nats_process import NatsProcess
 from optipmb_schemas import Keys
 from optipmb_service.cluster import message_log
-from optipmb_service.cluster.log_position import Missed, Position
 from optipmb_service.cluster.message_log import LogMessage, LogReader, MessageLog, Retention
+from optipmb_service.cluster.store import Missed, Position
 from optipmb_service.stream.checkpoint import forgotten
 from optipmb_service.stream.profiles import Fusion
 from optipmb_service.stream.recovery import Log

@@ -1,4 +1,4 @@
-"""A service without a network, as the HTTP edge sees it."""
+"""A service as the HTTP server sees it."""
 
 from __future__ import annotations
 

@@ -10,13 +10,14 @@ from socket import SO_RCVBUF, SOL_SOCKET
 from typing import TYPE_CHECKING, Any
 
 import pytest
+import structlog
 from optipmb_client.errors import ClientError
 from optipmb_schemas import (
     ServiceStatus,
     SessionSummary,
 )
 from optipmb_schemas.json_form import event_json, problem_json, tracks_json, with_skipped, zones_json
-from optipmb_service.edge.readers import EVENTS, Reader, Wish
+from optipmb_service.edge.readers import EVENTS, Publication, Reader, Wish
 from optipmb_service.http import application
 from optipmb_service.settings import Settings
 from router import until
@@ -133,8 +134,17 @@ def test_the_newest_frame_is_that_of_the_latest_run(session: Session, address: s
     ]
 
 
+def test_what_is_not_valid_is_logged() -> None:
+    """A message that no reader gets is in the log of the process, once."""
+    with structlog.testing.capture_logs() as logged:
+        one = Publication(KEYS.tracks(STREAM), b"garbage", "", {})
+        assert (one.message, one.message) == (None, None)
+    assert [line["event"] for line in logged] == ["edge_invalid"]
+
+
 def test_streams_are_those_of_all_services(session: Session, address: str) -> None:
-    """Each with its instance; workers, which answer too, are left out."""
+    """Each with its instance; workers, which answer too, are left out, and so is an answer that is not valid."""
+    session.statuses.append(PROBLEM)
     for name in ("one", "one-w0"):
         summaries = [SessionSummary(stream=one, profile="kitti", state="running") for one in (STREAM, "x/y/z")]
         status = ServiceStatus(
@@ -170,6 +180,12 @@ def test_a_bad_parameter_is_refused_with_its_path(address: str, query: str, path
         assert answer["error"].startswith(f"{path}: expected ")
     status, body = refused(address, query)
     assert (status, json.loads(body)["path"]) == (http.client.BAD_REQUEST, path)
+
+
+def test_the_newest_tracks_are_not_predicted(address: str) -> None:
+    """Nothing of a fixed rate is kept to be asked for."""
+    status, answer = get(address, f"tracks?stream={ALL}&predict=1")
+    assert (status, answer["path"]) == (http.client.BAD_REQUEST, "predict")
 
 
 def test_tokens_decide_who_reads_what(guarded: str, session: Session) -> None:
