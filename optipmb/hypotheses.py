@@ -319,12 +319,7 @@ def gate(
         row, measurement = pairs_of_few(mean, kind, radius, targets, len(classes))
     else:
         row, measurement = pairs_of_many(mean, kind, radius, targets, len(classes), UNLIMITED)
-        for k in range(row.shape[0]):  # measurements of an object in ascending order
-            m, slot = measurement[k], k
-            while slot > 0 and row[slot - 1] == row[k] and measurement[slot - 1] > m:
-                measurement[slot] = measurement[slot - 1]
-                slot -= 1
-            measurement[slot] = m
+        sort_measurements(row, measurement)
     log_likelihood = np.empty(row.shape[0])
     own_noise = position.shape[1] > PLAIN
     rho_xx, rho_xy, rho_yy = 1.0, 0.0, 1.0
@@ -345,6 +340,20 @@ def gate(
         squared = (s_yy * dx * dx - 2.0 * s_xy * dx * dy + s_xx * dy * dy) / determinant
         log_likelihood[k] = constant - 0.5 * squared
     return row, measurement, log_likelihood
+
+
+@kernel
+def sort_measurements(row: Index, measurement: Index) -> None:
+    """Sort the measurements of each object."""
+    begin = 0
+    for k in range(row.shape[0]):
+        if row[k] != row[begin]:
+            begin = k
+        m, slot = measurement[k], k
+        while slot > begin and measurement[slot - 1] > m:
+            measurement[slot] = measurement[slot - 1]
+            slot -= 1
+        measurement[slot] = m
 
 
 @kernel
@@ -397,7 +406,7 @@ def pairs_of_few(mean: Array, label: Index, radius: Array, targets: Targets, cla
 def pairs_of_many(
     mean: Array, label: Index, radius: Array, targets: Targets, classes: int, most: int
 ) -> tuple[Index, Index]:
-    """Find the pairs within the gates by looking at neighbours, up to `most` + 1; ordered by object alone.
+    """Find the pairs within the gates by looking at neighbours, until there are more than `most`; ordered by object.
 
     The measurements stand in a torus of cells twice as wide as the widest gate of their class, so that a gate touches
     at most three cells along each axis.
@@ -416,7 +425,7 @@ def pairs_of_many(
     count = 0
     for n in range(mean.shape[0]):
         eta = radius[n]
-        if eta < 0.0:
+        if eta < 0.0 or count > most:
             continue
         eta_2 = eta * eta
         reach = math.sqrt(eta_2 + wider[label[n]])
@@ -432,8 +441,6 @@ def pairs_of_many(
                             row, measurement = _grown(row, capacity), _grown(measurement, capacity)
                         row[count], measurement[count] = n, m
                         count += 1
-                        if count > most:
-                            return row[:count], measurement[:count]
                     m = following[m]
     return row[:count], measurement[:count]
 
