@@ -1,14 +1,14 @@
 """Traces: spans of frames by OpenTelemetry, from the context that a publisher sends to the context of the tracks."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
 import threading
 from collections import defaultdict
+from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final
 
 import pytest
 import structlog
@@ -16,21 +16,15 @@ from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTrace
 from opentelemetry.sdk.trace import ReadableSpan, TracerProvider
 from opentelemetry.sdk.trace.export import SimpleSpanProcessor
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
+from opentelemetry.trace import SpanContext
 from optipmb_client import Publisher, Subscriber
 from optipmb_client.trace_context import attached, attachment_of
-from optipmb_schemas import Tracks, decode
+from optipmb_schemas import Detections, Points, Tracks, decode
 from optipmb_service.stream.checkpoint import encode_checkpoint
 from optipmb_service.stream.traces import Traces
 from registries import Around, packet_of, streams_of
 from router import Sensor, plain, until
 from service_process import ServiceProcess
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from opentelemetry.trace import SpanContext
-    from optipmb_schemas import Detections, Points
 
 SENSOR = Sensor()
 PARENT = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"
