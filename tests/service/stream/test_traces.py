@@ -36,7 +36,7 @@ def traceparent(context: SpanContext) -> str:
 
 
 class Traced(Around):
-    """The streams of a process that records spans, and what it publishes."""
+    """The streams of a process that records spans, and its published tracks."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -48,7 +48,6 @@ class Traced(Around):
         self.streams = streams_of(self, traces=self.traces)
 
     def publish(self, payload: bytes, attachment: bytes | None = None) -> None:  # type: ignore[override]
-        """Keep what is published."""
         self.published.append((payload, attached(attachment)))
 
     def send(self, message: Detections | Points, parent: str = "") -> None:
@@ -253,7 +252,7 @@ def collector() -> Iterator[Collector]:
 
 @pytest.mark.parametrize("options", [(), ("--workers", "2")])
 def test_a_trace_goes_through_processes(collector: Collector, options: tuple[str, ...]) -> None:
-    """The span of a node is the parent of those that a service exports, and those of the tracks' reader."""
+    """The span of a node is the parent of the service's spans, which are parents of the tracks' reader."""
     variables = {
         "OPTIPMB_TRACES": "true",
         "OTEL_EXPORTER_OTLP_ENDPOINT": f"http://127.0.0.1:{collector.server_port}",
@@ -308,7 +307,7 @@ def test_a_collector_that_fails_is_logged_and_harms_nothing(collector: Collector
 
 
 def test_the_missing_extra_is_named(tmp_path: Path) -> None:
-    """A service that is to record traces says at its start what is missing."""
+    """A service that is to record traces names the missing extra at its start."""
     (tmp_path / "opentelemetry").mkdir()
     (tmp_path / "opentelemetry" / "__init__.py").write_text("")  # in the place of the real one
     variables = {"OPTIPMB_TRACES": "true", "PYTHONPATH": os.pathsep.join((str(tmp_path), *sys.path))}
