@@ -19,6 +19,7 @@ from optipmb_service.settings import (
     MqttSettings,
     Ros2Settings,
     Ros2Stream,
+    SensorSettings,
     Settings,
     SiteSettings,
     ZoneSettings,
@@ -49,7 +50,7 @@ def settings() -> str:
     """Return the table of all settings."""
     tables: tuple[tuple[str, type[BaseModel]], ...] = (
         *(("", Settings), ("limits.", LimitSettings), ("sites.NAME.", SiteSettings)),
-        ("zones.NAME.", ZoneSettings),
+        *(("sensors.PATTERN.", SensorSettings), ("zones.NAME.", ZoneSettings)),
         *(("ros2.", Ros2Settings), ("ros2.streams.NAME.", Ros2Stream), ("mqtt.", MqttSettings)),
     )
     rows = []

@@ -43,6 +43,7 @@ from optipmb.parameters import (
 )
 from optipmb.paths import PredictedPaths, predict_tracks
 from optipmb.relocation import Relocation
+from optipmb.sensors import Sensor, Sensors
 from optipmb.tracker import Diagnostics, Modules, StepResult, Tracker
 from optipmb.warm import warm_up
 
@@ -74,6 +75,8 @@ __all__ = [
     "PredictedPaths",
     "Relocation",
     "ScoreCalibration",
+    "Sensor",
+    "Sensors",
     "StepResult",
     "Tracker",
     "Tracks",

@@ -243,6 +243,12 @@ class ClassParameters(_Table):
         default=None,
         description="time constant, s, with which the acceleration decays; none: it stays constant (the paper)",
     )
+    attention: Probability = Field(
+        default=1.0,
+        exclude_if=(1.0).__eq__,
+        description="part of its time that a miss counts for, less than 1 for a sensor that detects less than others; "
+        "0: it does not show the class (`optipmb.sensors`)",
+    )
     gate_deviations: NonNegative = Field(
         default=0.0,
         description="the gate holds the way of so many standard deviations of the speed, or eta_dist where that is "
@@ -314,6 +320,15 @@ class Parameters(_Table):
     )
     self_calibration: bool = Field(
         default=False, exclude_if=not_, description="true: scores are calibrated by `optipmb.self_calibration`"
+    )
+    starts_tracks: bool = Field(
+        default=True, exclude_if=bool, description="false: detections continue tracks, and start and announce none"
+    )
+    trust_size: bool = Field(
+        default=True, exclude_if=bool, description="false: sizes and heights of detections count as unknown"
+    )
+    trust_heading: bool = Field(
+        default=True, exclude_if=bool, description="false: headings of detections count as unknown"
     )
     sensor_motion: bool = Field(
         default=False,

@@ -241,6 +241,22 @@ class SiteSettings(BaseModel):
     """direction of the world's x axis, degrees clockwise from true north; 90: x is east, y is north"""
 
 
+class SensorSettings(BaseModel):
+    """How the frames of a sensor of a fused session are used, where it differs from the others."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    profile: str = ""
+    """profile name or TOML file, of which the measurement side holds for its frames: thresholds, detection, noise,
+    clutter, births, `score_calibration`; default: the session's"""
+    starts_tracks: bool = True
+    """its detections start tracks; `false`: they only continue those of other sensors"""
+    trust_size: bool = True
+    """use the sizes and heights of its boxes; `false`: as if it did not measure them"""
+    trust_heading: bool = True
+    """use the headings of its boxes; `false`: as if it did not measure them"""
+
+
 Shape = tuple[tuple[float, float], ...]
 FARTHEST: Final = 100_000.0
 """Distance of a zone from the origin of its site, m, beyond which latitude and longitude are likely exchanged."""
@@ -355,6 +371,9 @@ class Settings(BaseSettings):
     """profiles by stream pattern (as `site/*/lidar*`); the first match applies"""
     fuse: Patterns = ()
     """patterns of streams (as `site/*/lidar*`) that feed one session per node, `site/node/fused`"""
+    sensors: dict[Pattern, SensorSettings] = Field(default_factory=dict)
+    """sensors of fused sessions that differ, by stream pattern; the first match applies; equal on all members of a
+    cluster"""
     cloud_wait_s: float = Field(default=0.1, ge=0, le=60)
     """longest wait of a frame for its cloud"""
     cloud_memory_s: float = Field(default=2.0, ge=0, le=3600)
@@ -628,6 +647,7 @@ def missing_files(settings: Settings) -> list[str]:
     """Return a text for each file and folder that the settings name and that is not there."""
     named: dict[str, Any] = {name: getattr(settings, name) for name in FILES}
     named |= {"profile": settings.profile} | {f"profiles.{key}": value for key, value in settings.profiles.items()}
+    named |= {f"sensors.{key}.profile": one.profile for key, one in settings.sensors.items()}
     return [
         f"setting {name}: {value}: no such file"
         for name, value in named.items()

@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING, Final
 import optipmb_schemas as schemas
 
 import optipmb
+from optipmb.sensors import ALIKE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from optipmb_service.settings import ZoneSettings
+    from optipmb_service.settings import SensorSettings, ZoneSettings
 
 
 @dataclass(frozen=True)
@@ -31,14 +32,18 @@ class Profiles:
         default: name of the profile of streams that no pattern names, as the settings give it.
         patterns: pairs of stream pattern and profile name, the first that matches holds.
         known: all profiles by the name that the settings give, and by the name inside the file.
+        sensors: those of fused sessions that differ.
     """
 
     default: str
     patterns: tuple[tuple[str, str], ...]
     known: Mapping[str, optipmb.Parameters]
+    sensors: optipmb.Sensors = ALIKE
 
     @classmethod
-    def read(cls, default: str, patterns: Mapping[str, str]) -> Profiles:
+    def read(
+        cls, default: str, patterns: Mapping[str, str], sensors: Mapping[str, SensorSettings] | None = None
+    ) -> Profiles:
         """Load every profile named, and the tracker's own.
 
         Raises:
@@ -50,7 +55,8 @@ class Profiles:
                 known[name] = _loaded(name)
         for parameters in tuple(known.values()):
             known.setdefault(parameters.name, parameters)
-        return cls(default, tuple(patterns.items()), known)
+        tables = {pattern: one.model_dump() for pattern, one in (sensors or {}).items()}
+        return cls(default, tuple(patterns.items()), known, optipmb.Sensors.read(tables))
 
     def check_zones(self, zones: Mapping[str, ZoneSettings]) -> None:
         """Check the classes of zones.
@@ -135,6 +141,13 @@ class Fusion:
         """Return whether a name is of a fused session; no sensor may have it."""
         site, node, sensor = name.split("/")
         return sensor == FUSED and any(_matches((site, node), pattern) for pattern in self.patterns)
+
+    def sensors_of(self, name: str, sensors: optipmb.Sensors) -> optipmb.Sensors:
+        """Return what settings say of the sensors that may feed a session."""
+        if not (sensors.uses and self.is_session(name)):
+            return ALIKE
+        parts = tuple(name.split("/")[:2])
+        return optipmb.Sensors(tuple(one for one in sensors.uses if _matches(parts, one[0])))
 
     def seen_by(self, name: str) -> str:
         """Return the pattern of the streams whose detections belong to the tracks of a session, in Zenoh's words."""

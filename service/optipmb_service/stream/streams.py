@@ -278,14 +278,15 @@ class Streams:
     # Present streams
 
     def policy_for(self, session: str) -> Policy:
-        """Return the policy of a session, with its zones."""
+        """Return the policy of a session, with its zones and sensors."""
         names = self._settings.zones_of(session)
         if len(names) > MOST:
             expected, received = f"at most {MOST} zones and lines for a session", f"{len(names)}; the last are left out"
             self._report("refused", session, expected, received, path="zones")
         site, known = session.partition("/")[0], self._settings.zones
         zones = (self._zone(name, site if known[name].geo else "") for name in names[:MOST])
-        return replace(self.policy, zones=tuple(zones))
+        sensors = self.fusion.sensors_of(session, self.profiles.sensors)
+        return replace(self.policy, zones=tuple(zones), sensors=sensors, needs_view=bool(sensors.uses))
 
     def tracking(self) -> list[Stream]:
         """Return the streams that have a session, by name."""
