@@ -36,6 +36,8 @@ from optipmb.parameters import (
     HeadingSign,
     Parameters,
     ScoreCalibration,
+    Sensor,
+    Sensors,
     load_profile,
     parse_parameters,
     profile_source,
@@ -43,7 +45,6 @@ from optipmb.parameters import (
 )
 from optipmb.paths import PredictedPaths, predict_tracks
 from optipmb.relocation import Relocation
-from optipmb.sensors import Sensor, Sensors
 from optipmb.tracker import Diagnostics, Modules, StepResult, Tracker
 from optipmb.warm import warm_up
 

@@ -206,7 +206,7 @@ def look(view: FieldOfView | None, prior: Density, moment: Moment, table: ClassT
     missed, and of a component whose gate no longer holds one standard deviation of its position. With p_s = 1 nothing
     else would end them.
 
-    A sensor looks at a class with its attention (`optipmb.sensors`): a miss counts for that part of the time, and the
+    A sensor looks at a class with its attention (`optipmb.Sensor`): a miss counts for that part of the time, and the
     rest is left for the next look.
 
     Arguments of its own:

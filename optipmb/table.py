@@ -148,7 +148,7 @@ class ClassTable:
         period: nominal period, s.
         detection_time: s that p_d holds for, zero per frame (`optipmb.detection_probability.over_time`).
         confusion: (C, C) Lambda of `optipmb.class_posterior`; (0, 0) where no two classes have a group in common.
-        attention: (C,) of `optipmb.sensors`; None where all are 1.
+        attention: (C,) of `optipmb.Sensor`; None where all are 1.
     """
 
     classes: Sequence[ClassRow]

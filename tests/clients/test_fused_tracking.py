@@ -21,7 +21,7 @@ from optipmb_tools.run.tracking import track_whole
 from sessions import Merged
 
 import optipmb
-from optipmb.sensors import ALIKE
+from optipmb.parameters import ALIKE
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -35,7 +35,7 @@ from optipmb import (
     predict_tracks,
     warm_up,
 )
-from optipmb.sensors import ALIKE
+from optipmb.parameters import ALIKE
 from optipmb_tools.datasets import DataSequence, Dataset, DatasetArguments, DetectionFrame, selected_frames
 from optipmb_tools.files import remove_unfinished
 from optipmb_tools.results.output import Latency, Results, horizons_for, latency

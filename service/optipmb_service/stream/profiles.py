@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 import optipmb_schemas as schemas
 
 import optipmb
-from optipmb.sensors import ALIKE
+from optipmb.parameters import ALIKE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

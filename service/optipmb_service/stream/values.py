@@ -11,7 +11,7 @@ import optipmb_schemas as schemas
 from pydantic import AfterValidator, Field
 
 import optipmb
-from optipmb.sensors import ALIKE
+from optipmb.parameters import ALIKE
 from optipmb.zones import COUNTS, Event, Zone
 from optipmb_service.telemetry.stream_meter import MAX_COUNT
 
