@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args, get_origin
 
 from optipmb_service.settings import (
+    FusedSettings,
     LimitSettings,
     MqttSettings,
     Ros2Settings,
@@ -50,7 +51,7 @@ def settings() -> str:
     """Return the table of all settings."""
     tables: tuple[tuple[str, type[BaseModel]], ...] = (
         *(("", Settings), ("limits.", LimitSettings), ("sites.NAME.", SiteSettings)),
-        *(("sensors.PATTERN.", SensorSettings), ("zones.NAME.", ZoneSettings)),
+        *(("fused.NAME.", FusedSettings), ("sensors.PATTERN.", SensorSettings), ("zones.NAME.", ZoneSettings)),
         *(("ros2.", Ros2Settings), ("ros2.streams.NAME.", Ros2Stream), ("mqtt.", MqttSettings)),
     )
     rows = []

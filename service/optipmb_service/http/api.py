@@ -101,6 +101,7 @@ class Readers:
         self._places = places
         self._most = settings.http_clients
         self._names = token_names("http_tokens", settings.http_tokens) if settings.http_tokens else None
+        self._reads = settings.readable_by
         self.count = 0
         self._feeds: Feeds | None = None
 
@@ -133,7 +134,7 @@ class Readers:
         name = await found if inspect.isawaitable(found) else found
         if not name:
             raise NoTokenError("the token is missing or not valid")
-        return Caller(name)
+        return Caller(name, self._reads(name))
 
     def enter(self) -> Callable[[], None]:
         """Count a reader until the result is called.

@@ -132,7 +132,7 @@ class Streams:
         self.tracker = tracker
         self.instance = settings.instance
         self.keys = schemas.Keys(settings.prefix)
-        self.fusion = Fusion(settings.fuse)
+        self.fusion = Fusion.of(settings)
         self.limits = settings.limits.limits()
         self.policy = policy_of(settings)
         self._zone = cache(settings.zone)
@@ -286,7 +286,8 @@ class Streams:
         site, known = session.partition("/")[0], self._settings.zones
         zones = (self._zone(name, site if known[name].geo else "") for name in names[:MOST])
         sensors = self.fusion.sensors_of(session, self.profiles.sensors)
-        return replace(self.policy, zones=tuple(zones), sensors=sensors, needs_view=bool(sensors.uses))
+        needs_view = bool(sensors.uses) or session in self.fusion.sites
+        return replace(self.policy, zones=tuple(zones), sensors=sensors, needs_view=needs_view)
 
     def tracking(self) -> list[Stream]:
         """Return the streams that have a session, by name."""
@@ -592,7 +593,8 @@ class Streams:
     def _parsed(self, key: str) -> tuple[str, str]:
         stream = self.keys.stream_of(key)
         if self.fusion.is_session(stream):
-            raise schemas.MessageError("invalid_value", "key", f"a sensor not named {FUSED}, as its tracks", key)
+            part = "sensor" if stream.endswith(f"/{FUSED}") else "node"
+            raise schemas.MessageError("invalid_value", "key", f"a {part} not named {FUSED}, as its tracks", key)
         return stream, self.fusion.session_of(stream)
 
     def _backlog(self, session: str, now_ns: int) -> Backlog:
