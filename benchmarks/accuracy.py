@@ -1,6 +1,6 @@
 """The profiles with every detector, and two simple trackers: `python benchmarks/accuracy.py --root data`.
 
-Prints docs/tuning/detectors.csv: the profiles with each detector and class, and beside them, for some of
+Prints docs/tuning/detectors.csv: the profiles with each detector and class, and for comparison, for some of
 these, a greedy tracker of nearest centres and AB3DMOT's Kalman filters (`tests/support/greedy.py`, `kalman.py`) with
 their published parameters. The same detections and evaluator; KITTI counts at a 3D overlap of 0.25, ten sequences.
 """

@@ -1,4 +1,4 @@
-"""The step of this checkout compared with another one: `python benchmarks/beside.py OTHER [--profile FILE]`.
+"""Compare the step of this checkout with another one: `python benchmarks/beside.py OTHER [--profile FILE]`.
 
 Each has a process of its own; they measure in turns, a few hundredths of a second each, so that what else the machine
 does meets both. Processor time of the thread; the ratio is the median over single turns.

@@ -105,7 +105,7 @@ def measured(objects: int, points: int) -> dict[str, float]:
     class Counting(Around):
         published = 0
 
-        def publish(self, _: bytes) -> None:
+        def publish(self, *_: bytes | None) -> None:
             self.published += 1
 
     configure("console", "error")

@@ -2,7 +2,7 @@
 
 Prints CSV, a row for each cell and profile. All classes of a detector are tracked together, as users do. `auto` is
 made from the first frames of each recording, as `optipmb track --profile auto` does. Slower rates take every second
-and every fifth frame of KITTI. Columns beyond those of `optipmb evaluate`:
+and every fifth frame of KITTI. Columns in addition to `optipmb evaluate`:
 
 - sure: HOTA of the confirmed tracks alone, without a threshold on scores.
 - confirmed: share of all tracks that are confirmed.

@@ -1,7 +1,7 @@
 """The bare arithmetic of a frame in one compiled loop: what no tracker with these formulas can be faster than.
 
 Everything that has to be found out is given: which pairs lie in the gate, which pairs win. Nothing is allocated,
-checked, sorted, searched, assigned, suppressed, pruned or put together. What is left are the numbers themselves: every
+checked, sorted, searched, assigned, suppressed, pruned or put together. The rest are the numbers themselves: every
 object and component is predicted by the unscented transform, every gated pair gets its likelihood and its cost, every
 winning pair is updated by the unscented Kalman filter. The formulas are the tracker's, by its own scalar
 kernels, inlined into one loop; faster formulas would lower this bound and the tracker's time alike.
@@ -67,8 +67,7 @@ def bare(
             covariance[n],
             dt,
             classes[label[n]],
-            root,
-            points,
+            (root, points),
             mean_predicted[n],
             covariance_predicted[n],
         )

@@ -1,7 +1,7 @@
 """Shares of a step: arithmetic, calls of kernels, interpreter and numpy.
 
 Each dispatcher of a kernel that the tracker calls is replaced by a function that reads a clock before and after. A
-kernel's time is that of its call less what calling a kernel with the same arguments costs, measured with one that does
+kernel's time is its call less the cost of calling a kernel with the same arguments, measured with one that does
 nothing.
 """
 
@@ -30,7 +30,7 @@ def nothing(*arrays: Any) -> int:
 
 
 def cost_of_a_call(arguments: tuple[Any, ...]) -> float:
-    """Nanoseconds to call a kernel with such arguments; what it returns is not in it."""
+    """Nanoseconds to call a kernel with such arguments, without its return value."""
     spent = []
     nothing(*arguments)
     for _ in range(300):

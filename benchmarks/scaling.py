@@ -7,7 +7,7 @@ Starts a NATS server, a router and members of one process each, and measures one
 streams of few objects that send, from publishers with a cache as the client has them, or without (`--plain`); the same
 streams silent; one member more, which comes and goes; many streams that have sent one frame, from publishers that have
 gone, or stay and have caches (`--cached`); one member more again. Processor time is the system's count for each
-process, so what else the machine does disturbs it little; times until something has happened are those of the clock on
+process, so other processes disturb it little; times until something has happened are read from the clock on
 the wall.
 """
 
@@ -190,7 +190,7 @@ class Owners:
 def named(kind: str, number: int) -> str:
     """Return the name of a stream.
 
-    A site has a hundred nodes: what Zenoh takes to declare something grows with the names beside it on each level.
+    A site has a hundred nodes: the cost of a declaration in Zenoh grows with the number of names on each level.
     """
     return f"{kind}{number // NODES:04}/n{number % NODES:02}/lidar"
 

@@ -1,4 +1,4 @@
-"""A container engine: Docker or Podman, and what it needs where there is no registry, no systemd, no full root."""
+"""A container engine, Docker or Podman, with workarounds for no registry, no systemd and no full root."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class EngineError(Exception):
 
 
 class NoEngineError(EngineError):
-    """This machine has no engine that runs containers; the text says what was tried."""
+    """This machine has no engine that runs containers; the text lists the attempts."""
 
 
 class Engine:
@@ -69,14 +69,14 @@ class Engine:
 
     Args:
         program: `docker` or `podman`.
-        environment: what its commands get beside this process's own environment.
+        environment: variables of its commands in addition to this process's own environment.
     """
 
     def __init__(self, program: str, environment: dict[str, str]) -> None:
         self.program = program
         self.environment = os.environ | environment
         self.restricted = "CONTAINERS_CONF" in environment
-        self.quiet = ["--log-level", "error"]  # Podman warns at every call of what is missing without systemd
+        self.quiet = ["--log-level", "error"]  # Podman warns at every call about missing systemd
         provider = [str(Path(sys.executable).with_name("podman-compose")), "--podman-args=--log-level=fatal"]
         self.compose = ["docker", "compose"] if program == "docker" else provider
 
@@ -86,7 +86,7 @@ class Engine:
         Args:
             words: the command.
             timeout_s: longest duration.
-            stdin: what it reads.
+            stdin: its standard input.
 
         Raises:
             EngineError: it fails.
@@ -197,7 +197,7 @@ def _try(engine: Engine) -> None:
 def call(
     command: list[str], environment: dict[str, str], timeout_s: float = COMMAND_S, stdin: str = ""
 ) -> subprocess.CompletedProcess[str]:
-    """Run a command and keep what it prints; one that takes too long is ended, with status 124."""
+    """Run a command and keep its output; one that takes too long is ended, with status 124."""
     try:
         return subprocess.run(  # noqa: S603 - fixed commands
             command, input=stdin, env=environment, capture_output=True, text=True, timeout=timeout_s, check=False

@@ -1,4 +1,4 @@
-"""The containers of the compose file under a project name of their own, and a client beside them."""
+"""The containers of the compose file under a project name of their own, with a client container."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CLIENT: Final = "client"
 
 
 class CheckError(Exception):
-    """Something does not do what it should; the text says what."""
+    """A check failed; the text says which."""
 
 
 class Stack:
@@ -36,8 +36,8 @@ class Stack:
 
     Attributes:
         services: what the file says of each; those whose images are not to be had are taken out.
-        ours: those of our image.
-        checked: those of them that have a health check.
+        ours: services with our image.
+        checked: services of ours with a health check.
     """
 
     def __init__(self, found: Engine) -> None:
@@ -55,7 +55,7 @@ class Stack:
         self.engine.run(*f"run --detach {labels} {confined} --entrypoint sleep {OURS} 1800".split())
 
     def remove(self) -> None:
-        """Remove containers, networks and volumes of this project, whatever state they are in."""
+        """Remove containers, networks and volumes of this project in any state."""
         mine = f"label={LABEL}.project={PROJECT}"
         for name in self.engine.run("ps", "--all", "--quiet", "--filter", mine).split():
             self.engine.run("rm", "--force", "--volumes", name)

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Builds the image, runs the compose file's stack in containers, and shows that it does what it says; prints a table.
+"""Builds the image, runs the compose file's stack in containers, and checks its behaviour; prints a table.
 
 make containers
 
@@ -60,7 +60,7 @@ class Check:
 
     Args:
         found: the engine.
-        work: folder for logs and what is made on the way.
+        work: folder for logs and intermediate files.
     """
 
     def __init__(self, found: Engine, work: Path) -> None:
@@ -80,7 +80,7 @@ class Check:
         return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
     def images(self) -> None:
-        """Build ours as the Dockerfile has it, and get those of others."""
+        """Build our image as the Dockerfile has it, and pull the others."""
         settings, hosts = container_engine.index_settings()
         began = time.monotonic()
         with tempfile.TemporaryDirectory() as secret:
@@ -112,7 +112,7 @@ class Check:
                 del self.stack.services[name]
 
     def start(self) -> None:
-        """Start the stack and a client beside it, and wait until all that have a health check are healthy."""
+        """Start the stack and a client, and wait until all containers with a health check are healthy."""
         began = time.monotonic()
         self.stack.start()
         waiting = set(self.stack.checked)

@@ -42,7 +42,7 @@ SETTING: Final = re.compile(r"(?i)(password|passwd|secret|token|api_?key|credent
 
 @dataclass
 class Findings:
-    """What was looked through, and what is wrong with it.
+    """Scanned files and the problems found.
 
     Attributes:
         files: files and folders of the image.
@@ -112,7 +112,7 @@ def _apply(seen: dict[str, tarfile.TarInfo], entry: tarfile.TarInfo, path: str) 
 
 
 def _rights(path: str, entry: tarfile.TarInfo) -> Iterator[str]:
-    """What is wrong with the owner and the mode of a file: all but the volume is root's, and only root writes it."""
+    """Return the problem with owner and mode of a file: all but the volume is root's, and only root writes it."""
     if entry.issym():
         return
     mode = entry.mode

@@ -18,6 +18,7 @@ from optipmb_service.settings import (
     FusedSettings,
     LimitSettings,
     MqttSettings,
+    OutputSettings,
     Ros2Settings,
     Ros2Stream,
     SensorSettings,
@@ -51,7 +52,8 @@ def settings() -> str:
     """Return the table of all settings."""
     tables: tuple[tuple[str, type[BaseModel]], ...] = (
         *(("", Settings), ("limits.", LimitSettings), ("sites.NAME.", SiteSettings)),
-        *(("fused.NAME.", FusedSettings), ("sensors.PATTERN.", SensorSettings), ("zones.NAME.", ZoneSettings)),
+        *(("fused.NAME.", FusedSettings), ("sensors.PATTERN.", SensorSettings)),
+        *(("zones.NAME.", ZoneSettings), ("outputs.PATTERN.", OutputSettings)),
         *(("ros2.", Ros2Settings), ("ros2.streams.NAME.", Ros2Stream), ("mqtt.", MqttSettings)),
     )
     rows = []

@@ -5,7 +5,7 @@ is cheaper than the first-time detection of its measurement. Of those pairs, the
 shortest augmenting paths, after Jonker and Volgenant (1987): objects come in one after the other, and each comes by the
 cheapest chain of moves, which ends at a free measurement or at an object that is then missed. Prices on objects and
 measurements keep all lengths non-negative, so that Dijkstra's algorithm finds the chain. A search goes along pairs and
-never leaves the cluster that shares gates with its object. The total cost is that of the Hungarian algorithm on the
+never leaves the cluster that shares gates with its object. The Hungarian algorithm finds the same total cost on the
 whole matrix of the paper's Fig. 3. Where several hypotheses have the least cost, the order of objects (by id) and
 measurements (by score) decides: the older track gets the better detection.
 
@@ -32,13 +32,11 @@ from optipmb.predict import heading_unknown
 from optipmb.table import known_length
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from optipmb.density import Bernoullis, Moment
     from optipmb.hypotheses import Hypotheses
     from optipmb.preprocess import Measurements
     from optipmb.rows import Array, Index
-    from optipmb.table import ClassRow
+    from optipmb.table import Classes
 
 
 UNASSIGNED: Final = -1
@@ -49,18 +47,12 @@ UNASSIGNED: Final = -1
 def associate(row: Index, measurement: Index, cost: Array, first_cost: Array, n_objects: int) -> Index:
     """Find the global hypothesis of least cost, by shortest augmenting paths over the pairs.
 
-    The gain of a pair is what it costs more than the first-time detection of its measurement; a missed object gains
-    zero. Prices u of objects and v of measurements keep ``gain - u - v >= 0`` on every pair that lowers the total, with
-    equality on those assigned, ``u <= 0``, and ``v = 0`` on free measurements.
-
-    Arguments of its own:
-        row: (K,) object of each pair, ascending.
-        cost: (K,) w of each pair.
-        first_cost: (M,) w of the first-time detection of each measurement.
-        n_objects: number N of predicted objects.
+    The gain of a pair is its cost less the first-time cost of its measurement; a missed object gains zero. Prices u of
+    objects and v of measurements keep ``gain - u - v >= 0`` on every pair that lowers the total, with equality on
+    assigned pairs, ``u <= 0``, and ``v = 0`` on free measurements.
 
     Returns:
-        (N,) the measurement of each object, `UNASSIGNED` for the missed ones.
+        (N,) the measurement of each object, `UNASSIGNED` where it is missed.
     """
     n_measurements = first_cost.shape[0]
     assigned = np.full(n_objects, UNASSIGNED)
@@ -139,14 +131,11 @@ def forbid_births(
     measurements: Measurements,
     missed_from_ns: Index,
     moment: Moment,
-    classes: Sequence[ClassRow],
+    classes: Classes,
 ) -> None:
-    """Turn first-time detections on objects that are missed into clutter, in `hypotheses`.
+    """Turn first-time detections on missed objects into clutter: writes `first_kind` and `first_existence`.
 
-    Arguments of its own:
-        objects: predicted objects; those that were never extracted forbid nothing.
-        assigned: (N,) measurement of each, or `UNASSIGNED`.
-        hypotheses: of this frame; `first_kind` and `first_existence` are written.
+    Objects that were never extracted forbid nothing.
     """
     used = np.zeros(len(measurements.yaw), np.bool_)
     for m in assigned:
@@ -208,16 +197,13 @@ def surviving_objects(
     measured_label: Index,
     missed_from_ns: Index,
     moment: Moment,
-    classes: Sequence[ClassRow],
+    classes: Classes,
 ) -> Survivors:
     """Select the objects of the posterior: likely enough (`min_existence`), not missed too long (`max_misses`).
 
     The second limit is ours: with p_s = 1, as the paper sets it for KITTI, r stays 1 through any number of misses.
     A detected object has r = 1; a missed one ``r (1 - p_d) / [1 - r + r (1 - p_d)]`` (eq. Misdetect Hypothesis
-    Update); of the measurements that no object took, those that are not clutter make one.
-
-    Arguments of its own:
-        assigned: (N,) the measurement of each, `UNASSIGNED` for the missed ones.
+    Update); a free measurement makes an object unless it is clutter.
     """
     capacity = assigned.shape[0] + measured_label.shape[0]
     row, measurement, existence = np.empty(capacity, np.int64), np.empty(capacity, np.int64), np.empty(capacity)

@@ -1,9 +1,9 @@
 """What a track publishes of itself: its box, its existence probability and its covariance (not in the paper).
 
 The recursion is right where its model is. Two assumptions fail with real detectors. A detection is given to one object
-for certain, which makes r one, although imagined boxes follow each other too; and errors of detections are taken as
-independent, although those of neighbouring frames are nearly the same, which makes P too small. Both are mended where
-tracks leave the tracker, so that the recursion stays the paper's:
+for certain, which makes r one, although false boxes follow each other too; and errors of detections are taken as
+independent, although they are nearly the same in neighbouring frames, which makes P too small. Both are corrected in
+the published tracks, so that the recursion stays the paper's:
 
     evidence    e_k = lambda e_{k-1} + (1 - lambda) l_k,     l_k = ln[z_s / (1 - z_s)], or -l_miss where missed
     existence   f(e_k)
@@ -36,15 +36,13 @@ from optipmb.density import OMEGA, PHI, STATE, V, X, Y
 from optipmb.predict import wrap
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from optipmb.rows import Array, Index
-    from optipmb.table import ClassRow
+    from optipmb.table import Classes
 
     Box = tuple[float, float, float]
 
 SURE: Final = 14.0
-"""Log odds of the surest detection, and minus those of the least sure one: a score of one in a million from certain."""
+"""Bound of the log odds of a detection, either sign: a score of one in a million from certain."""
 
 UNSURE: Final = 3.0
 """Variances of a speed at whose square half of the velocity is published: parked cars hardly move."""
@@ -62,20 +60,15 @@ def calibrate_rows(
     label: Index,
     evidence: Array,
     yaw: Array,
-    classes: Sequence[ClassRow],
+    classes: Classes,
     existence: Array,
     score: Array,
     velocity: Array,
     covariance: Array,
 ) -> None:
-    """Overwrite existence, score, velocity and covariance of the rows whose class has a calibration.
+    """Replace existence, score, velocity and covariance of the state by the published ones, by `evidence` e_k (K,).
 
-    Arguments of its own:
-        evidence: (K,) e_k.
-        existence: (K,) in: r, out: f(e_k).
-        score: (K,) in: x_s, out: the published score.
-        velocity: (K, 2) in: of the state, out: the published one.
-        covariance: (K, 6, 6) in: P, out: with the factors and the lasting error.
+    Rows whose class has no calibration stay.
     """
     for row in range(existence.shape[0]):
         own = classes[label[row]]

@@ -1,8 +1,8 @@
 """What an object of a group of classes is, as a posterior over the classes of the group.
 
 Detectors call one object a car in one frame and a truck in the next. An object of a class with a `group` therefore has
-probabilities pi over the G classes of the group. What it is stays; what a detector calls it depends on how it is seen,
-so the labels of neighbouring frames err together, and old ones lose weight by lambda per nominal period T:
+probabilities pi over the G classes of the group. Its class stays, but its label depends on the view of it: labels of
+neighbouring frames err together. So old labels lose weight by lambda per nominal period T:
 
     predicted               pi_+ = lambda^(dt/T) pi + (1 - lambda^(dt/T)) / G
     detected as d, score s  p(d | c) = s Lambda_cd + (1 - s) / G
@@ -11,9 +11,9 @@ so the labels of neighbouring frames err together, and old ones lose weight by l
     first detected as d     pi_c = p(d | c) / sum_c' p(d | c')
 
 Lambda_cd is the probability that the label of an object of class c is d: 1 - kappa_c for d = c, kappa_c / (G - 1) for
-the others of the group. A score of s says that with probability s the label is of the object, and else of chance. p(d)
-is the factor of the class in the likelihood of a detection hypothesis, beside that of the position. The paper's class
-gate is the case of a group of one: pi = p(d) = 1.
+the others of the group. With a score of s the label is of the object with probability s, and else of chance. The
+likelihood of a detection hypothesis is p(d) times the likelihood of the position. The paper's class gate is the case
+of a group of one: pi = p(d) = 1.
 
 The class that a track reports, and whose parameters it has, is its last one until another of the group is
 `CHANGE_ODDS` times as probable: alternating labels do not make it alternate.
@@ -29,13 +29,11 @@ from optipmb.compiled import kernel
 from optipmb.errors import DensityError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from optipmb.association import Survivors
     from optipmb.density import Density
     from optipmb.preprocess import Measurements
     from optipmb.rows import Array, Index
-    from optipmb.table import ClassRow, ClassTable
+    from optipmb.table import Classes, ClassTable
 
 
 CHANGE_ODDS: Final = 3.0
@@ -43,7 +41,7 @@ CHANGE_ODDS: Final = 3.0
 
 
 class Groups(NamedTuple):
-    """What is known of classes that have a group in common.
+    """Posteriors and confusion of classes that have a group in common.
 
     Attributes:
         probability: (N, C) pi_+ of the predicted objects; (N, 0) where the profile has no groups.
@@ -68,7 +66,7 @@ def predict_classes(density: Density, kept: Index | None, dt: float, table: Clas
         kept: (K,) objects that stay; None: all.
 
     Raises:
-        DensityError: the probabilities are not those of the classes of a group.
+        DensityError: an object has probabilities of classes outside its group.
     """
     confusion = table.confusion
     if not len(confusion):
@@ -85,7 +83,7 @@ def predict_classes(density: Density, kept: Index | None, dt: float, table: Clas
 
 
 @kernel
-def label_probability(pi: Array, d: int, s: float, confusion: Array, classes: Sequence[ClassRow]) -> float:
+def label_probability(pi: Array, d: int, s: float, confusion: Array, classes: Classes) -> float:
     """Compute p(d) of an object with posterior `pi` (C,) and a label `d` of its group with score `s`."""
     meant = 0.0
     for c in range(pi.shape[0]):
@@ -95,18 +93,9 @@ def label_probability(pi: Array, d: int, s: float, confusion: Array, classes: Se
 
 @kernel
 def weigh_by_class(
-    row: Index,
-    measurement: Index,
-    log_likelihood: Array,
-    measurements: Measurements,
-    groups: Groups,
-    classes: Sequence[ClassRow],
+    row: Index, measurement: Index, log_likelihood: Array, measurements: Measurements, groups: Groups, classes: Classes
 ) -> None:
-    """Add ln p(d) to the log-likelihoods of pairs; classes without a group stay as they are.
-
-    Arguments of its own:
-        log_likelihood: (K,) is written.
-    """
+    """Add ln p(d) to the log-likelihoods of pairs; classes without a group stay as they are."""
     for k in range(row.shape[0]):
         m = measurement[k]
         d = measurements.label[m]
@@ -117,22 +106,9 @@ def weigh_by_class(
 
 @kernel
 def update_classes(
-    survivors: Survivors,
-    label: Index,
-    label_out: Index,
-    measurements: Measurements,
-    groups: Groups,
-    classes: Sequence[ClassRow],
+    survivors: Survivors, label: Index, label_out: Index, measurements: Measurements, groups: Groups, classes: Classes
 ) -> Array:
-    """Compute the class that each object of the posterior reports, and return its posterior over the classes.
-
-    Arguments of its own:
-        survivors: which objects the posterior has; a row below zero is a first-time detection.
-        label_out: (K,) receives the classes.
-
-    Returns:
-        (K, C) pi, (K, 0) where the profile has no groups.
-    """
+    """Compute the class that each object of the posterior reports, and return pi (K, C); (K, 0) without groups."""
     class_probability, confusion = groups.probability, groups.confusion
     count, grouped = survivors.row.shape[0], confusion.shape[0]
     pi = np.zeros((count, grouped))

@@ -66,7 +66,7 @@ PROGRESS_S: Final = 5.0
 PROCESSES: Final = "OPTIPMB_COMPILE_PROCESSES"
 """Environment variable: how many processes compile; 0 compiles each kernel at its first call, in its own process."""
 MOST_PROCESSES: Final = 4
-"""More are not faster: a third of the time is that of one kernel."""
+"""More are not faster: one kernel takes a third of the time."""
 
 
 class _Progress(event.Listener):
@@ -80,7 +80,7 @@ class _Progress(event.Listener):
         """All kernels of the modules imported so far."""
         self.compiled: set[str] = set()
         self.built: set[str] | None = None
-        """Those that other processes compiled for this one; None while nothing was missing."""
+        """Kernels that helper processes compiled; None until one was missing."""
         self.said_at: float | None = None
         self.is_helper = False
         """Whether this process compiles for another one, which reads the names of the kernels."""
@@ -154,7 +154,7 @@ calls: Final = _Calls()
 
 
 def kernel(function: F) -> F:
-    """Compile `function` with numba at its first call; later processes load the machine code from beside the source.
+    """Compile `function` with numba at its first call; later processes load the machine code from the package's folder.
 
     It keeps the lock of the interpreter. A step of 40 objects spends 0.1 ms in five kernels: to give the lock to
     another thread in each of them, and to wait for it afterwards, takes longer than the kernel.
@@ -194,7 +194,7 @@ def _compiled(function: F, *, nogil: bool) -> F:
 
 
 class _Index(IndexDataCacheFile):
-    """An index of machine code that names what an earlier version of the package had is as good as none."""
+    """An index of machine code; one that refers to names of an earlier version of the package counts as empty."""
 
     def _load_index(self) -> Any:
         try:
@@ -204,7 +204,7 @@ class _Index(IndexDataCacheFile):
 
 
 class _PackageIndex(_Index):
-    """An index of the package: when machine code is missing, that of all kernels is, and processes compile it."""
+    """An index of the package: where one kernel has no machine code, helper processes compile all of them."""
 
     def load(self, key: Any) -> Any:
         """Return the machine code of one kernel, None where it has to be compiled here."""
@@ -220,8 +220,12 @@ class _PackageIndex(_Index):
 
 
 def _processes() -> int:
-    """Return how many processes compile; none where Python is part of another program, which would start anew."""
-    if not sys.executable or hasattr(sys, "frozen"):
+    """Return how many processes compile; none where Python is part of another program, which would start again.
+
+    None either without optimization: numba then keeps calls by address, which it does not cache.
+    """
+    options: Any = config
+    if not sys.executable or hasattr(sys, "frozen") or options.OPT == 0:
         return 0
     available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     wanted = os.environ.get(PROCESSES, "")
@@ -244,7 +248,7 @@ def _one_at_a_time(folder: Path) -> Iterator[bool]:
 
 
 def _compile_all(count: int, built: set[str]) -> None:
-    """Compile all kernels in so many processes, and add their names; what is missing afterwards is compiled here.
+    """Compile all kernels in `count` processes, and add their names to `built`; this process compiles the others.
 
     One process, which compiles nothing, runs the tracker to find out the types of arguments. It writes them to a file,
     and their numbers to a pipe, from which each of the others takes the next.

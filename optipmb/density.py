@@ -6,9 +6,9 @@ compared, hashed and stored as it is. It is never written after it is made.
 Motion state x_M = [x, y, v, phi, omega, a]: position on the ground plane (m), speed along the heading (m/s, negative
 when reversing), heading (rad, in (-pi, pi]), turn rate (rad/s), acceleration (m/s^2).
 Auxiliary state x_A = [length, width, height, z]: box size and height of the box's centre, m; NaN where no detection
-gave it. States without a heading are those of `optipmb.unknown_heading`.
+gave it. `optipmb.unknown_heading` describes states without a heading.
 
-It is stored as named arrays (`bernoulli.mean`, `poisson.weight`) or as bytes; what is read back is checked.
+It is stored as named arrays (`bernoulli.mean`, `poisson.weight`) or as bytes, and checked when it is read back.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from optipmb.rows import Array
+    from optipmb.rows import Array, Index
 
 
 X: Final = 0
@@ -170,7 +170,7 @@ def objects_in(words: Array) -> Bernoullis:
 
 
 @kernel
-def misses_counted_from(objects: Bernoullis, missed_from_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+def misses_counted_from(objects: Bernoullis, missed_from_ns: Index) -> Index:
     """Return the stamps (N,) from which the misses of objects count; x_cnt is their distance to now.
 
     Args:
@@ -223,7 +223,7 @@ class SelfCalibration:
 
     classes: Array
     objects: NDArray[np.uint16]
-    components: NDArray[np.int64]
+    components: Index
 
     @classmethod
     def of(cls, density: Density) -> SelfCalibration:
@@ -246,7 +246,7 @@ class Density:
         next_id: the id of the next new track; ids are never reused.
         bernoulli: detected potential objects.
         poisson: undetected potential objects.
-        labels: names of the classes that the labels point into, those of the parameters.
+        labels: names of the classes of the parameters, which the labels point into.
         misses: of the detected objects; None while no frame has had a field of view: every frame looks at all of them.
         class_probability: (N, C) posterior of each detected object over the classes (`optipmb.class_posterior`); None
             where the profile has no groups.
@@ -262,12 +262,12 @@ class Density:
     poisson: Poissons
     labels: tuple[str, ...]
     misses: Misses | None = None
-    class_probability: NDArray[np.float64] | None = None
+    class_probability: Array | None = None
     self_calibration: SelfCalibration | None = None
-    sensor: NDArray[np.float64] | None = None
+    sensor: Array | None = None
 
     @property
-    def sensor_motion(self) -> NDArray[np.float64] | None:
+    def sensor_motion(self) -> Array | None:
         """Velocity, m/s, and turn rate, rad/s, (3,) of `sensor`; None where the evidence is not enough to use them."""
         sensor = self.sensor
         if sensor is None or sensor[3] < ENOUGH or sensor[4] < LEAST_MOVED_S:
@@ -275,7 +275,7 @@ class Density:
         return sensor[:3]
 
     @property
-    def missed_from_ns(self) -> NDArray[np.int64]:
+    def missed_from_ns(self) -> Index:
         """Stamps (N,) from which the misses of the objects count; (0,) where that is their last detection."""
         return FROM_LAST_DETECTION if self.misses is None else self.misses.missed_from_ns
 
@@ -292,14 +292,7 @@ def whole_periods(since_ns: int, now_ns: int, period: float) -> int:
 
 
 @kernel
-def copy_state(
-    mean: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    n: int,
-    mean_out: NDArray[np.float64],
-    covariance_out: NDArray[np.float64],
-    k: int,
-) -> None:
+def copy_state(mean: Array, covariance: Array, n: int, mean_out: Array, covariance_out: Array, k: int) -> None:
     """Write the mean and the covariance of row `n` to row `k`: entry by entry, which is four times as fast as rows."""
     for s in range(STATE):
         mean_out[k, s] = mean[n, s]
@@ -317,31 +310,12 @@ SENSOR: Final = "sensor"
 """Name of `Density.sensor` among the columns."""
 
 MOST_COUNTED: Final = 1e9
-"""Bound of counts of scores, and of numbers of the sensor's motion; those of the tracker are far below."""
+"""Bound of stored counts of scores and of the sensor's motion, far above all that the tracker makes."""
 
 ROUNDING: Final = 1e-6
 """By how much the sum of probabilities may differ from 1."""
 
 _Rows = TypeVar("_Rows", bound=Rows)
-
-
-def fitting(density: Density, classes: int) -> bool:
-    """Tell whether the parts of a density fit together and its classes exist, so that kernels stay within its arrays.
-
-    What `density_of` and the tracker make does; what others put together, or wrote into a column, may not.
-    """
-    misses, objects, pi = density.misses, density.bernoulli, density.class_probability
-    if pi is not None and not (isinstance(pi, np.ndarray) and pi.shape == (len(objects), classes)):
-        return False
-    if misses is not None and len(misses) != len(objects):
-        return False
-    own = density.self_calibration
-    if own is not None:
-        for name, (shape, kind) in _shapes(classes, len(objects), len(density.poisson)).items():
-            column = getattr(own, name)
-            if not isinstance(column, np.ndarray) or column.shape != shape or column.dtype != kind:
-                return False
-    return bool(labels_within(objects.words, density.poisson.words, classes))
 
 
 @kernel
@@ -356,12 +330,21 @@ def labels_within(object_words: Array, component_words: Array, classes: int) -> 
 
 
 def check_fitting(density: Density, labels: tuple[str, ...]) -> None:
-    """Refuse a density whose parts do not fit together.
+    """Refuse a density whose parts do not fit together, for which kernels would read beyond its arrays.
+
+    `density_of` and the tracker make fitting ones; one that a caller assembled or wrote to may not fit.
 
     Raises:
-        DensityError: names the column, with what was expected and received.
+        DensityError: names the column, what it should hold and what it holds.
     """
-    if fitting(density, len(labels)):
+    misses, objects, pi, own = density.misses, density.bernoulli, density.class_probability, density.self_calibration
+    good = pi is None or (isinstance(pi, np.ndarray) and pi.shape == (len(objects), len(labels)))
+    good &= misses is None or len(misses) == len(objects)
+    if own is not None:
+        for name, (shape, kind) in _shapes(len(labels), len(objects), len(density.poisson)).items():
+            column = getattr(own, name)
+            good &= isinstance(column, np.ndarray) and column.shape == shape and column.dtype == kind
+    if good and labels_within(objects.words, density.poisson.words, len(labels)):
         return
     columns = columns_of(density)
     density_of(density.stamp_ns, density.next_id, columns, labels)  # names the column
@@ -371,18 +354,20 @@ def check_fitting(density: Density, labels: tuple[str, ...]) -> None:
 
 def columns_of(density: Density) -> dict[str, NDArray[Any]]:
     """Return the arrays of a density by name, always in the same order."""
-    parts: tuple[tuple[str, Bernoullis | Misses | Poissons], ...]
-    parts = (("bernoulli", density.bernoulli), ("poisson", density.poisson))
-    if density.misses is not None:
-        parts = (*parts, ("misses", density.misses))
-    columns: dict[str, NDArray[Any]] = {
-        f"{part}.{name}": column for part, rows in parts for name, column in rows.columns()
-    }
-    if density.self_calibration is not None:
-        columns |= {f"{COUNTED}.{name}": getattr(density.self_calibration, name) for name in _shapes(0, 0, 0)}
-    if density.sensor is not None:
-        columns |= {SENSOR: density.sensor}
-    return columns if density.class_probability is None else columns | {CLASSES: density.class_probability}
+    columns = {f"{rows.part}.{name}": column for rows in _records(density) for name, column in rows.columns()}
+    return columns | _others(density)
+
+
+def _records(density: Density) -> list[Bernoullis | Poissons | Misses]:
+    return [rows for rows in (density.bernoulli, density.poisson, density.misses) if rows is not None]
+
+
+def _others(density: Density) -> dict[str, NDArray[Any]]:
+    """Return the arrays that are in no record, by name."""
+    own = density.self_calibration
+    counts = {} if own is None else {f"{COUNTED}.{name}": getattr(own, name) for name in _shapes(0, 0, 0)}
+    others = {CLASSES: density.class_probability, **counts, SENSOR: density.sensor}
+    return {name: array for name, array in others.items() if array is not None}
 
 
 def _shapes(classes: int, objects: int, components: int) -> dict[str, tuple[tuple[int, ...], Any]]:
@@ -401,25 +386,18 @@ def bytes_of(density: Density) -> dict[str, bytes]:
     lie one behind the other in the order of `columns_of`, and a flag is the integer 0 or 1. Equal densities give equal
     bytes.
     """
-    parts = {"bernoulli": density.bernoulli.words, "poisson": density.poisson.words}
-    if density.misses is not None:
-        parts["misses"] = density.misses.words
-    if density.class_probability is not None:
-        parts["classes"] = density.class_probability
-    if density.self_calibration is not None:
-        parts |= {
-            f"{COUNTED}.{name}": getattr(density.self_calibration, name).view(np.float64) for name in _shapes(0, 0, 0)
-        }
-    if density.sensor is not None:
-        parts[SENSOR] = density.sensor
+    parts = {rows.part: rows.words for rows in _records(density)}
+    parts |= {
+        "classes" if name == CLASSES else name: array.view(np.float64) for name, array in _others(density).items()
+    }
     return {part: words.astype("<f8", copy=False).tobytes() for part, words in parts.items()}
 
 
 def columns_in(parts: Mapping[str, bytes], classes: int) -> dict[str, NDArray[Any]]:
-    """Return the named arrays that bytes hold: what `columns_of` gives for the density of which `bytes_of` made them.
+    """Return the named arrays that bytes hold: inverse of `bytes_of`, with the names of `columns_of`.
 
     Args:
-        parts: `bernoulli` and `poisson`; `misses`, `classes` and those of `COUNTED` where the density has them.
+        parts: `bernoulli` and `poisson`; `misses`, `classes`, `sensor` and `calibration.…` where the density has them.
         classes: of the parameters that the density belongs to.
 
     Raises:
@@ -532,7 +510,7 @@ def _self_calibration(columns: Mapping[str, Any], shapes: Mapping[str, tuple[tup
     return SelfCalibration(**found)
 
 
-def _class_probability(column: Any, count: int, classes: int) -> NDArray[np.float64]:
+def _class_probability(column: Any, count: int, classes: int) -> Array:
     """Return the posteriors over the classes, each of which sums to 1."""
     if not isinstance(column, np.ndarray) or column.dtype != np.float64 or column.shape != (count, classes):
         raise DensityError(CLASSES, f"({count}, {classes}) float64", shown(column))

@@ -1,9 +1,9 @@
 """Adaptive detection probability (ADP, Section IV.G): an object without LiDAR points in its box is hidden, not gone.
 
 To count the points PTS(x), each box is turned into the sensor frame once, and put into the cells of a grid that it
-touches. The points are read where they lie, block by block. A first loop computes the cells of a block in single
-precision, eight points at a time; a second one notes those that fall into cells of boxes, which most do not. A third
-one tests these in double precision.
+touches. The points are read in place, block by block. A first loop computes the cells of a block in single precision,
+eight points at a time. A second one notes the few points in cells of boxes, which a third one tests in double
+precision.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from optipmb.density import Density, Moment
     from optipmb.field_of_view import Looks
     from optipmb.frame import PointCloud
-    from optipmb.rows import Array
+    from optipmb.rows import Array, Index
     from optipmb.table import ClassTable
 
     Coordinates = NDArray[np.float32]
@@ -44,11 +44,7 @@ def detection_probability(
     bottom of the box are returns of the ground and do not count. Without a cloud p_d = p_d0, and so where heading, size
     or height are unknown.
 
-    It holds for the time of the look, and for what is in view.
-
-    Arguments of its own:
-        cloud: the scan of the frame, or None.
-        looks: what the frame looks at; None: everything.
+    It holds for the time of the look (`over_time`) and for the part in view; `looks` None: everything is in view.
     """
     objects, components = prior.bernoulli, prior.poisson
     share = moment.dt / table.detection_time if table.detection_time > 0.0 else 1.0
@@ -114,7 +110,7 @@ def over_time(p_d: Array, share: float | Array) -> Array:
 
 
 CELLS: Final = 128
-"""Cells along one side of the grid; around it lies a border, for what is outside."""
+"""Cells along one side of the grid; a border around it collects the points outside."""
 
 SIDE: Final = CELLS + 2
 
@@ -126,10 +122,10 @@ RANGE: Final = 250.0
 are rare, and a box far away must not make the cells so wide that every point falls into one of boxes."""
 
 BLOCK: Final = 512
-"""Points that are looked at together; what is noted of them stays in the fastest cache."""
+"""Points per block: their notes stay in the fastest cache."""
 
 
-def points_in_boxes(cloud: PointCloud, center: Array, size: Array, yaw: Array) -> NDArray[np.int64]:
+def points_in_boxes(cloud: PointCloud, center: Array, size: Array, yaw: Array) -> Index:
     """Count the points of a cloud in each box.
 
     Args:
@@ -156,9 +152,7 @@ def points_in_boxes(cloud: PointCloud, center: Array, size: Array, yaw: Array) -
 
 
 @long_kernel
-def count_points(
-    xyz: Coordinates, center: Array, half: Array, yaw: Array, rotation: Array, counts: NDArray[np.int64]
-) -> None:
+def count_points(xyz: Coordinates, center: Array, half: Array, yaw: Array, rotation: Array, counts: Index) -> None:
     """Add to `counts` (N,) the points in each box.
 
     Args:

@@ -1,4 +1,4 @@
-"""The errors of the tracker: all are `ValueError`, all name what was wrong by the path of the field.
+"""The errors of the tracker: all are `ValueError`, all name the path of the wrong field.
 
 OptipmbError
 ├── FrameError       a frame's arrays have a wrong shape, dtype or value, or its stamp goes back
@@ -16,7 +16,7 @@ class OptipmbError(ValueError):
     Attributes:
         path: the field, as ``center[3]`` or ``classes.Car.survival``.
         expected: what would have been accepted.
-        received: what was found, shortened to be printable.
+        received: the value given, shortened to be printable.
     """
 
     def __init__(self, path: str, expected: str, received: str) -> None:

@@ -33,13 +33,11 @@ from optipmb.table import known_length
 from optipmb.unknown_heading import show_heading
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
-    from optipmb.density import Bernoullis, Density
+    from optipmb.density import Bernoullis
     from optipmb.rows import Array, Columns, Index
-    from optipmb.table import ClassRow, ClassTable
+    from optipmb.table import Classes
 
     Flags = NDArray[np.bool_]
 
@@ -121,40 +119,19 @@ def tracks_in(words: Array) -> Tracks:
     return columns
 
 
-def extract(
-    posterior: Density,
-    measurement: Index,
-    measurements: Measurements,
-    moment: Moment,
-    table: ClassTable,
-    *,
-    two_thresholds: bool,
-) -> Tracks:
-    """Extract the tracks, and mark the objects that were extracted, and those that are confirmed.
-
-    Arguments of its own:
-        posterior: not yet given away.
-        measurement: (N,) measurement of each object, negative where missed.
-        two_thresholds: whether OTE is on.
-    """
-    given = tuple(measurements), tuple(moment)
-    objects, missed_from_ns = posterior.bernoulli.words, posterior.missed_from_ns
-    return Tracks.of(extract_tracks(objects, missed_from_ns, measurement, *given, two_thresholds, table.classes))
-
-
 @kernel
-def extract_tracks(
+def extract(
     object_words: Array,
     missed_from_ns: Index,
     measurement: Index,
     measurements: Columns,
     moment: Columns,
     two_thresholds: bool,
-    classes: Sequence[ClassRow],
+    classes: Classes,
 ) -> Array:
-    """Return the array of `Tracks`, calibrated where there is a calibration; `extracted` and `confirmed` are written.
+    """Return the array of `Tracks`, and mark extracted and confirmed objects in the array of the new posterior.
 
-    Arguments as in `extract`; `object_words` is the array of the posterior.
+    `measurement` (N,) is negative where an object is missed; `two_thresholds` tells whether OTE is on.
     """
     objects, z, now = objects_in(object_words), Measurements(*measurements), Moment(*moment)
     rows = select_tracks(objects, misses_counted_from(objects, missed_from_ns), now, two_thresholds, classes)
@@ -204,7 +181,7 @@ def extract_tracks(
 
 @kernel
 def select_tracks(
-    objects: Bernoullis, missed_from_ns: Index, moment: Moment, two_thresholds: bool, classes: Sequence[ClassRow]
+    objects: Bernoullis, missed_from_ns: Index, moment: Moment, two_thresholds: bool, classes: Classes
 ) -> Index:
     """Return the rows that are extracted, and mark them in `extracted`.
 
@@ -227,17 +204,8 @@ def select_tracks(
 
 
 @kernel
-def confirm(
-    rows: Index, label: Index, existence: Array, classes: Sequence[ClassRow], confirmed: Flags, now: Flags
-) -> None:
-    """Confirm tracks with hysteresis: from one existence on, and until it falls below another.
-
-    Arguments of its own:
-        rows: (K,) objects.
-        existence: (K,) of the tracks, as published.
-        confirmed: (N,) whether they were, the integers 0 and 1; is written.
-        now: (K,) receives whether they are.
-    """
+def confirm(rows: Index, label: Index, existence: Array, classes: Classes, confirmed: Flags, now: Flags) -> None:
+    """Confirm tracks with hysteresis: write `now` (K,) by the published existence, and `confirmed` of their objects."""
     for k in range(rows.shape[0]):
         own = classes[label[k]]
         now[k] = existence[k] >= (own.confirm_until if confirmed[rows[k]] else own.confirm_from)
@@ -282,7 +250,7 @@ def sound(tracks: Tracks) -> bool:
 
 
 def unsound(tracks: Tracks) -> tuple[str, str, str]:
-    """Return what is wrong with tracks that are not `sound`: path of the first value, expected, received."""
+    """Return the first fault of tracks that are not `sound`: path, expected, received."""
     for name, low, high in _BOUNDS:
         values = getattr(tracks, name)
         for place in np.argwhere(~((low <= values) & (values <= high)))[:1]:
@@ -292,29 +260,28 @@ def unsound(tracks: Tracks) -> tuple[str, str, str]:
     return f"tracks.id[{row}]", "ids that ascend, from 0", str(tracks.id[row])
 
 
+def _bounds() -> Array:
+    bounds = np.full((TRACK, 2), np.nan)
+    for name, low, high in _BOUNDS:
+        bounds[Tracks.described[name].begin : Tracks.described[name].end] = low, high
+    return bounds
+
+
+_BOUNDS_OF_WORDS: Final = _bounds()
+"""(`TRACK`, 2) bounds of each word of a row, NaN where it is an integer."""
+
+
 @kernel
 def all_within(words: Array) -> bool:
     """Tell whether the columns of the array of `Tracks` are within the bounds of `sound`; NaN is in none."""
-    tracks = tracks_in(words)
-    center, size, velocity, covariance = tracks.center, tracks.size, tracks.velocity, tracks.covariance
-    good = True
-    before = -1
-    for n in range(tracks.id.shape[0]):
-        good &= tracks.id[n] > before
-        before = tracks.id[n]
-        for s in range(3):
-            good &= abs(center[n, s]) <= MAX_PLACE
-            good &= 0.0 < size[n, s] <= MAX_VALUE
-        good &= abs(tracks.yaw[n]) <= MAX_VALUE
-        good &= 0.0 <= tracks.heading_confidence[n] <= 1.0
-        good &= abs(velocity[n, 0]) <= MAX_VALUE and abs(velocity[n, 1]) <= MAX_VALUE
-        good &= abs(tracks.yaw_rate[n]) <= MAX_VALUE
-        good &= abs(tracks.acceleration[n]) <= MAX_VALUE
-        good &= 0.0 <= tracks.existence[n] <= 1.0
-        good &= 0.0 <= tracks.score[n] <= 1.0
-        good &= 0.0 <= tracks.age[n] <= MAX_AGE
-        good &= 0.0 <= tracks.time_since_detection[n] <= MAX_AGE
-        for s in range(covariance.shape[1]):
-            for t in range(covariance.shape[2]):
-                good &= abs(covariance[n, s, t]) <= MAX_COVARIANCE
-    return good
+    count = words.shape[0] // TRACK
+    good, before = True, -1
+    for identity in tracks_in(words).id:
+        good &= identity > before
+        before = identity
+    for k in range(TRACK):
+        low, high = _BOUNDS_OF_WORDS[k]
+        if low <= high:
+            for value in words[k * count : (k + 1) * count]:
+                good &= low <= value <= high
+    return bool(good)

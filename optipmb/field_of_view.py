@@ -77,7 +77,7 @@ class FieldOfView:
             (2.5, -2.5) looks backwards. (-pi, pi), the default, is the full circle.
         elevation: from, to, rad in [-pi/2, pi/2].
         range: from, to, m in [0, 1e9].
-        pose: world from sensor; None: that of the boxes that `make_frame` gets it with, else the axes of the world.
+        pose: world from sensor; None: the `pose` given to `make_frame`, else the axes of the world.
 
     Raises:
         FrameError: an interval is none, not finite, beyond its bounds, or narrower than a milliradian.
@@ -154,11 +154,7 @@ class FieldOfView:
 
 
 def check_view(view: object) -> None:
-    """Refuse what is no field of view.
-
-    Raises:
-        FrameError: it is neither that nor None.
-    """
+    """Raise a `FrameError` unless it is a field of view or None."""
     if view is not None and not isinstance(view, FieldOfView):
         raise FrameError("field_of_view", "a FieldOfView or None", type(view).__name__)
 
@@ -178,11 +174,11 @@ def _interval(name: str, values: object, low: float, high: float) -> tuple[float
 
 @record
 class Looks:
-    """What a frame looks at.
+    """View of one frame.
 
     Attributes:
         in_view: (N,) share of each object that is in view, in [0, 1].
-        poisson_in_view: (J,) that of each Poisson component.
+        poisson_in_view: (J,) share of each Poisson component.
         counted: (N,) share of a miss of each object that counts: `in_view` times the attention of the sensor.
         time: (N,) s since each object was last looked at.
         misses: of the objects, if this frame misses them.
@@ -196,25 +192,22 @@ class Looks:
 
 
 def look(view: FieldOfView | None, prior: Density, moment: Moment, table: ClassTable) -> tuple[Looks | None, Density]:
-    """Find out what of the predicted density is in view, and let the counters of the rest stand still.
+    """Compute which part of the predicted density is in view, and stop the counters of the rest.
 
     A look covers the time since the last frame that looked at the object, but where other frames came in between at
-    most a nominal period (or the time since the last frame): an object that nobody could see for long has not been
+    most a nominal period (or the time since the last frame): an object that no sensor could see for long has not been
     missed for long. A Poisson component that is out of view ages no further.
 
-    They stand still for a while only. Of an object that was not detected for `LONGEST_UNSEEN_S` all time counts as
-    missed, and of a component whose gate no longer holds one standard deviation of its position. With p_s = 1 nothing
-    else would end them.
+    With p_s = 1 nothing else would end them, so this holds for a while only: all time counts as missed for an object
+    that was not detected for `LONGEST_UNSEEN_S`, and for a component whose gate no longer holds one standard deviation
+    of its position.
 
     A sensor looks at a class with its attention (`optipmb.Sensor`): a miss counts for that part of the time, and the
     rest is left for the next look.
 
-    Arguments of its own:
-        view: of the frame, with its pose; None: it looks at everything.
-
     Returns:
-        What the frame looks at, None while no frame has had a field of view; and the prediction, whose Poisson
-        components have the stamps that their age counts from.
+        The looks, None while no frame has had a field of view; and the prediction, with later stamps of Poisson
+        components out of view.
     """
     bernoulli, poisson, misses = prior.bernoulli, prior.poisson, prior.misses
     before_ns, now_ns = moment.before_ns, moment.stamp_ns
@@ -259,16 +252,10 @@ def follow_looks(
     moment: Moment,
     table: ClassTable,
 ) -> Misses:
-    """Correct score and evidence of the posterior by what the frame looked at, and return its misses.
+    """Correct score and evidence of the posterior `objects` by the looks of the frame, and return its misses.
 
-    What is out of view keeps its score and its evidence; what is partly in view is missed for that part of the time
-    since it was last looked at.
-
-    Arguments of its own:
-        looks: of the frame.
-        update: what the posterior was made of.
-        before: the predicted objects.
-        objects: the posterior, not yet given away; its scores and evidence are written.
+    Objects out of view keep their score and evidence as `before`, in the prediction; objects partly in view are missed
+    for that part of the time since the last look.
     """
     count, known, stamp_ns = len(objects), update.known, moment.stamp_ns
     row, hit = update.row[:known], update.measurement[:known] >= 0
@@ -293,17 +280,11 @@ def shares_in_view(
 ) -> None:
     """Compute how much of each object is in view, in the mean over its position.
 
-    The footprint of a box is that of points spread evenly over length and width; with the position of the object they
+    The footprint of a box stands for points spread evenly over length and width; with the position of the object they
     have covariance ``C = diag(l^2, w^2) / 12 + R' P_xy R`` in the axes R of the box. It is replaced by the 3 x 3 points
     of the Gauss-Hermite rule, ``L (i, j) sqrt(3)`` with ``L L' = C``, weights 2/3 and 1/6; where the position is
     known these are the centre, the corners and the middles of the edges. Along the height: bottom, centre and top, with
-    the same weights (Simpson's rule).
-
-    Arguments of its own:
-        rotation: (3, 3) world from sensor.
-        translation: (3,) of the sensor in the world.
-        limits: (7,) of `FieldOfView.limits`.
-        share: (N,) receives the shares, in [0, 1]; 0 and 1 are exact.
+    the same weights (Simpson's rule). Shares of 0 and 1 are exact.
     """
     for n in range(mean.shape[0]):
         cos_phi, sin_phi = math.cos(mean[n, PHI]), math.sin(mean[n, PHI])
@@ -348,14 +329,9 @@ def in_view(dx: float, dy: float, dz: float, rotation: Array, limits: Array) -> 
 def count_looks(in_view: Array, looked_ns: Index, missed_from_ns: Index, moment: Columns) -> tuple[Array, Index]:
     """Compute the time that the look at each object covers, and from when its misses count if it is missed.
 
-    Arguments of its own:
-        in_view: (N,) shares.
-        looked_ns: (N,) stamp of the last look.
-        missed_from_ns: (N,) stamp from which misses count.
-
     Returns:
         (N,) seconds since the last look, at most a period where frames in between did not look; (N,) the stamp from
-        which misses count then: later by what was not looked at.
+        which misses count then: later by the time without a look.
     """
     now = Moment(*moment)
     time, missed_from_out = np.empty(in_view.shape[0]), np.empty(in_view.shape[0], np.int64)

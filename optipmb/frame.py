@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from optipmb.parameters import Parameters, ScoreCalibration
-    from optipmb.rows import Array
+    from optipmb.rows import Array, Index
 
 UNIT_TOLERANCE = 1e-3
 """How far the norm of a quaternion may be from one; it is normalised afterwards."""
@@ -49,7 +49,7 @@ MAX_COORDINATE = 1e8
 """Coordinates beyond this (metres) are not positions on Earth; the limit keeps squares far from overflow."""
 
 MAX_SPEED = 1e3
-"""Velocities beyond this (m/s) are not those of objects on a road; squared, they would drown a covariance."""
+"""No object on a road is faster (m/s); squared, such a velocity would drown a covariance."""
 
 
 @dataclass(frozen=True)
@@ -66,13 +66,13 @@ class Pose:
         FrameError: wrong shape, not finite, or no unit quaternion.
     """
 
-    translation: NDArray[np.float64]
-    quaternion: NDArray[np.float64]
+    translation: Array
+    quaternion: Array
 
     def __post_init__(self) -> None:
         translation = _shaped("pose.translation", self.translation, (3,))
         quaternion = _shaped("pose.quaternion", self.quaternion, (4,))
-        # A few numbers are looked at one by one faster than as an array; the arrays are for naming what is wrong.
+        # Comparing a few numbers one by one is faster than as an array; the array names the wrong one.
         w, x, y, z = quaternion.tolist()
         if not all(abs(value) <= MAX_COORDINATE for value in translation.tolist()):
             _bounded("pose.translation", translation, MAX_COORDINATE)
@@ -85,11 +85,11 @@ class Pose:
 
     @property
     def is_identity(self) -> bool:
-        """Whether the sensor's coordinates are those of the world, exactly."""
+        """Whether sensor and world have the same coordinates, exactly."""
         return self.translation.tolist() == [0.0] * 3 and self.quaternion.tolist() in _UNTURNED
 
     @cached_property
-    def rotation(self) -> NDArray[np.float64]:
+    def rotation(self) -> Array:
         """Rotation matrix (3, 3) of the quaternion."""
         w, x, y, z = self.quaternion.tolist()
         rows = [
@@ -144,30 +144,30 @@ class Frame:
         score: (M,) in (0, 1]; what the thresholds of the class mean by it (`optipmb.frame`).
         label: (M,) int64, index into the classes of the parameters.
         source: (M,) int64, index of the object in the arrays that the caller gave.
-        labels: names of the classes that `label` points into, those of the parameters.
+        labels: names of the classes of the parameters, which `label` points into.
         cloud: the scan of the same stamp, or None.
         field_of_view: of the sensor, with its pose; None: it sees everything.
-        position_covariance: (M, 3) R_xx, R_xy and R_yy of each position, m^2; NaN, or None: those of the class.
+        position_covariance: (M, 3) R_xx, R_xy and R_yy of each position, m^2; NaN, or None: R of the class.
         pose: world from sensor; None: the sensor stands at the origin of the world.
 
-    The arrays cannot be written to, so that what was checked stays as it was.
+    The arrays cannot be written to, so that they stay as they were checked.
 
     Raises:
         FrameError: wrong shapes, types or values.
     """
 
     stamp_ns: int
-    center: NDArray[np.float64]
-    size: NDArray[np.float64]
-    yaw: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    score: NDArray[np.float64]
-    label: NDArray[np.int64]
-    source: NDArray[np.int64]
+    center: Array
+    size: Array
+    yaw: Array
+    velocity: Array
+    score: Array
+    label: Index
+    source: Index
     labels: tuple[str, ...]
     cloud: PointCloud | None = None
     field_of_view: FieldOfView | None = None
-    position_covariance: NDArray[np.float64] | None = None
+    position_covariance: Array | None = None
     pose: Pose | None = None
 
     def __post_init__(self) -> None:
@@ -254,7 +254,7 @@ def make_frame(
     size = _unknown(m, 3) if size is None else _shaped("size", size, (m, 3))
     yaw = _unknown(m) if yaw is None else _shaped("yaw", yaw, (m,))
     velocity = _unknown(m, 2) if velocity is None else _shaped("velocity", velocity, (m, 2))
-    scored = read_only(np.where(score == 0.0, 1.0, score))  # those are left out, whatever they are
+    scored = read_only(np.where(score == 0.0, 1.0, score))  # objects of score 0 are left out
     given = which, len(labels), center, size, yaw, scored, velocity
     if not allowed(*given):
         _refuse(*given)
@@ -272,13 +272,13 @@ def frame_of_checked(
     pose: Pose | None,
     cloud: PointCloud | None,
     field_of_view: FieldOfView | None,
-    position_covariance: NDArray[np.float64] | None,
+    position_covariance: Array | None,
 ) -> tuple[Frame, int]:
-    """Make a frame as `make_frame` does of what its caller has checked: only covariances are checked here.
+    """Make a frame as `make_frame` does, of arrays that the caller has checked: only covariances are checked here.
 
     Every value is one that `make_frame` allows, and every array has the type, the shape and the order of one in a
-    frame. They are not copied but become read-only, so nobody may change them. `columns` are label, center, size, yaw,
-    score and velocity; size, yaw and velocity may be None.
+    frame. The arrays are not copied but become read-only. `columns` are label, center, size, yaw, score and velocity;
+    size, yaw and velocity may be None.
 
     Raises:
         FrameError: a covariance is none, or an object is too far in the world frame.
@@ -315,7 +315,7 @@ def frame_of_checked(
     for column in columns if spread is None else (*columns, spread):
         column.flags.writeable = False
     if rotation is not None and not allowed(known, len(names), center, size, yaw, score, velocity):
-        # What is too far only in the world: the constructor names it.
+        # Too far in the world only: the constructor names the object.
         return Frame(stamp_ns, *columns, *rest), m - source.shape[0]
     frame = object.__new__(Frame)
     frame.__dict__.update(zip(Frame.__dataclass_fields__, (stamp_ns, *columns, *rest), strict=True))
@@ -323,20 +323,20 @@ def frame_of_checked(
 
 
 @lru_cache(64)
-def _every_row(count: int) -> NDArray[np.int64]:
+def _every_row(count: int) -> Index:
     """Return the rows of so many objects of which none is left out."""
     return read_only(np.arange(count))
 
 
 @lru_cache(64)
-def _unknown(count: int, *shape: int) -> NDArray[np.float64]:
+def _unknown(count: int, *shape: int) -> Array:
     """Return a column of so many objects whose detector does not give it."""
     return read_only(np.full((count, *shape), np.nan))
 
 
-def _to_world(center: NDArray[np.float64], rotation: NDArray[np.float64], translation: Array) -> NDArray[np.float64]:
+def _to_world(center: Array, rotation: Array, translation: Array) -> Array:
     """Return centres in the world. A centre without z is at the height of the sensor, and has no z in the world."""
-    moved: NDArray[np.float64] = center @ rotation.T + translation
+    moved: Array = center @ rotation.T + translation
     if np.isnan(moved.sum()):
         flat = np.isnan(center[:, 2])
         moved[flat] = np.column_stack((center[flat, :2], np.zeros(flat.sum()))) @ rotation.T + translation
@@ -345,15 +345,7 @@ def _to_world(center: NDArray[np.float64], rotation: NDArray[np.float64], transl
 
 
 @kernel
-def allowed(
-    label: NDArray[np.int64],
-    n_labels: int,
-    center: NDArray[np.float64],
-    size: NDArray[np.float64],
-    yaw: NDArray[np.float64],
-    score: NDArray[np.float64],
-    velocity: NDArray[np.float64],
-) -> bool:
+def allowed(label: Index, n_labels: int, center: Array, size: Array, yaw: Array, score: Array, velocity: Array) -> bool:
     """Tell whether all values are allowed; `_refuse` says which one is not."""
     good = True
     for m in range(label.shape[0]):  # NaN compares as not good
@@ -368,15 +360,7 @@ def allowed(
     return good
 
 
-def _refuse(
-    label: NDArray[np.int64],
-    n_labels: int,
-    center: NDArray[np.float64],
-    size: NDArray[np.float64],
-    yaw: NDArray[np.float64],
-    score: NDArray[np.float64],
-    velocity: NDArray[np.float64],
-) -> None:
+def _refuse(label: Index, n_labels: int, center: Array, size: Array, yaw: Array, score: Array, velocity: Array) -> None:
     """Raise for the first value that is not allowed."""
     _all("label", (label >= 0) & (label < n_labels), f"an index below {n_labels}", label)
     z_known = np.where(np.isnan(center) & (np.arange(3) == 2), 0.0, center)  # noqa: PLR2004 - z may be unknown
@@ -391,9 +375,9 @@ def _refuse(
     _all("velocity", (np.abs(velocity) <= MAX_SPEED) | unknown, expected, velocity)
 
 
-def _shaped(path: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def _shaped(path: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
     """Return a copy as float64 of exactly `shape`; an empty list stands for any shape with no rows."""
-    array: NDArray[np.float64] = _array(path, values, np.float64)
+    array: Array = _array(path, values, np.float64)
     if array.shape != shape:
         if array.size or 0 not in shape:
             raise FrameError(path, f"shape {shape}", str(array.shape))
@@ -401,7 +385,7 @@ def _shaped(path: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.
     return array
 
 
-def _integers(path: str, values: ArrayLike) -> NDArray[np.int64]:
+def _integers(path: str, values: ArrayLike) -> Index:
     """Return a copy as int64 of one dimension."""
     array = _array(path, values, None)
     if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
@@ -409,13 +393,13 @@ def _integers(path: str, values: ArrayLike) -> NDArray[np.int64]:
     return read_only(array.astype(np.int64))
 
 
-def _bounded(path: str, values: NDArray[np.float64], bound: float) -> None:
+def _bounded(path: str, values: Array, bound: float) -> None:
     _all(path, np.abs(values) <= bound, f"a finite number of size at most {bound:g}", values)
 
 
 def _array(path: str, values: ArrayLike, dtype: type[np.float64] | None) -> NDArray[Any]:
     try:
-        # A copy in one piece: a frame is its own, wherever the arrays come from.
+        # A copy in one piece: a frame shares no memory with the caller.
         return read_only(np.array(values, dtype=dtype, order="C"))
     except (TypeError, ValueError) as error:
         raise FrameError(path, "an array of numbers", repr(values)[:80]) from error
@@ -429,22 +413,14 @@ def _all(path: str, good: NDArray[np.bool_], expected: str, values: NDArray[np.g
         raise FrameError(path + element, expected, str(values[where]))
 
 
-def calibrated(curve: ScoreCalibration, score: NDArray[np.float64]) -> NDArray[np.float64]:
+def calibrated(curve: ScoreCalibration, score: Array) -> Array:
     """Return c(z_s) of scores (M,) in [0, 1]."""
     given, meant = (0.0, *curve.detector, 1.0), (0.0, *curve.calibrated, 1.0)
     return np.minimum(np.interp(score, given, meant), 1.0)  # rounding may not pass one
 
 
-def calibrate_scores(
-    parameters: Parameters, label: NDArray[np.int64], score: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return scores, those of the classes that have a curve gone through it.
-
-    Args:
-        parameters: the profile.
-        label: (M,) index into its classes; -1 for a class that it lacks.
-        score: (M,) in [0, 1]; the same array comes back where no class has a curve.
-    """
+def calibrate_scores(parameters: Parameters, label: Index, score: Array) -> Array:
+    """Return scores (M,) in [0, 1], calibrated where their class has a curve; without curves the same array."""
     for index, table in enumerate(parameters.classes.values()):
         if table.score_calibration is not None:
             score = np.where(label == index, calibrated(table.score_calibration, score), score)
@@ -461,15 +437,15 @@ LARGEST_VARIANCE: Final = 1e8
 """Largest variance, m^2."""
 
 SYMMETRY: Final = 1e-6
-"""Share of the largest variance by which opposite entries may differ: those of float32 do."""
+"""Share of the largest variance by which opposite entries may differ, as float32 rounds them."""
 
 
 def horizontal_covariance(covariance: Array, rotation: Array | None) -> Array:
-    """Check covariances of positions and return those of x and y in the world.
+    """Check covariances of positions and return their part of x and y in the world.
 
     Args:
         covariance: (M, 3, 3) of x, y and z along the axes of the arrays, m^2; of NaN where unknown.
-        rotation: (3, 3) from these axes to the world; None: they are those of the world.
+        rotation: (3, 3) from these axes to the world; None: they are the same.
 
     Returns:
         (M, 3) variance of x, covariance of x and y, variance of y; NaN where unknown.
@@ -500,7 +476,7 @@ def horizontal_covariance(covariance: Array, rotation: Array | None) -> Array:
 
 
 def semidefinite(horizontal: Array) -> NDArray[np.bool_]:
-    """Tell which rows (M, 3) of R_xx, R_xy and R_yy can be those of a covariance, up to rounding, or are of NaN."""
+    """Tell which rows (M, 3) of R_xx, R_xy and R_yy are a covariance, up to rounding, or NaN."""
     xx, xy, yy = horizontal.T
     good = (xx > 0.0) & (yy > 0.0) & (xy * xy <= (1.0 + SYMMETRY) * xx * yy) & (np.maximum(xx, yy) < np.inf)
     return np.asarray(good | np.isnan(horizontal).all(axis=1), np.bool_)

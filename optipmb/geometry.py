@@ -4,7 +4,7 @@ A bird's-eye box is a row [x, y, length, width, yaw]. What circles or parallel r
 clipped.
 
 The plane is cut into square cells and wrapped around a torus of `side` by `side` of them: cells far apart may share a
-slot, and their contents are told apart by distance. Each slot heads a chain through `following`. A search reaches at
+slot, and distance separates their contents. Each slot heads a chain through `following`. A search reaches at
 most one cell size, so it visits at most four cells along each axis, and the torus has at least so many.
 """
 
@@ -180,7 +180,7 @@ SMALLEST_CELL: Final = 1e-3
 """Cells are not smaller than this, m: their numbers stay far from overflow."""
 
 SLACK: Final = 1e-12
-"""Searches reach so much farther, relative to the coordinate, that rounding loses nobody; less than half a cell."""
+"""Searches reach so much farther, relative to the coordinate, that rounding loses no point; less than half a cell."""
 
 
 @kernel
@@ -208,7 +208,7 @@ def insert(head: Index, following: Index, side: int, number: int, x: float, y: f
 
 @kernel
 def block(x: float, y: float, reach: float, size: float) -> tuple[int, int, int, int]:
-    """Return the first and the last cell along x, then along y, of what is within `reach` <= `size` of (x, y)."""
+    """Return the first and the last cell along x, then along y, within `reach` <= `size` of (x, y)."""
     widest = max(size, SMALLEST_CELL)  # however far out, a search visits a few cells
     x_reach, y_reach = reach + min(SLACK * (1.0 + abs(x)), widest), reach + min(SLACK * (1.0 + abs(y)), widest)
     return cell(x - x_reach, size), cell(x + x_reach, size), cell(y - y_reach, size), cell(y + y_reach, size)

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from optipmb.rows import Array, Index
     from optipmb.table import ClassRow, ClassTable
 
+    Targets = tuple[Array, Index, Array]  # positions, classes or groups, and widening of measurements
+
 FROM_POISSON: Final = 0
 """First-time detection of what a Poisson component announced."""
 CLUTTER: Final = 1
@@ -79,7 +81,7 @@ def local_hypotheses(
     """Enumerate the hypotheses that pass the class gate and the distance gate, with their costs.
 
     Resolutions: a likelihood outside the gate counts as zero in p_a, as its cost is infinite; mu_+ in e^j already
-    contains the survival probability that Algorithm 1 writes beside it. Where classes have groups, the gate of an
+    contains the survival probability, which Algorithm 1 writes out. Where classes have groups, the gate of an
     object is open to its group, and the likelihood has the factor p(d) of `optipmb.class_posterior`.
     """
     grouped, count = groups.confusion.shape[0] > 0, objects.label.shape[0]
@@ -108,11 +110,7 @@ def local_hypotheses(
 
 @kernel
 def close_gates(p_d: Array, radius: Array) -> None:
-    """Write a negative radius, in which nothing lies, for what cannot be detected: no cost is that of p_d = 0.
-
-    Arguments of its own:
-        radius: (N,) gating distances, m; some are replaced.
-    """
+    """Write a negative radius, in which nothing lies, for objects that cannot be detected: p_d = 0 has no cost."""
     for n in range(p_d.shape[0]):
         if p_d[n] == 0.0:
             radius[n] = -1.0
@@ -133,8 +131,8 @@ def exclude_turned(
 ) -> None:
     """Write a likelihood of zero for pairs outside eta_dist whose headings do not agree, modulo pi.
 
-    A gate that is wide for an unknown speed holds the neighbours of a parked car that is missed. An object that went
-    so far in a frame kept to its heading.
+    This is not in the paper. A gate that is wide for an unknown speed holds the neighbours of a parked car that is
+    missed. An object that went so far in a frame kept to its heading. Unknown headings exclude nothing.
     """
     widening = gate_widening(measurements.position, measurements.label, classes)
     for k in range(row.shape[0]):
@@ -239,6 +237,9 @@ DEVIATIONS_2: Final = 9.21
 MAX_RADIUS: Final = 1e6
 """No gate is wider, m, however uncertain a speed and however long a silence."""
 
+UNLIMITED: Final = 2**62
+"""More pairs than any frame has."""
+
 FEW: Final = 256
 """Up to so many measurements it is faster to look at all of them than to find the neighbours among them."""
 
@@ -313,10 +314,17 @@ def gate(
     kind, measured_kind = label, measured_label
     if by_group:
         kind, measured_kind = groups(label, classes), groups(measured_label, classes)
+    targets = position, measured_kind, widening
     if position.shape[0] <= FEW:
-        row, measurement = pairs_of_few(mean, kind, radius, position, measured_kind, widening, len(classes))
+        row, measurement = pairs_of_few(mean, kind, radius, targets, len(classes))
     else:
-        row, measurement = pairs_of_many(mean, kind, radius, position, measured_kind, widening, len(classes))
+        row, measurement = pairs_of_many(mean, kind, radius, targets, len(classes), UNLIMITED)
+        for k in range(row.shape[0]):  # measurements of an object in ascending order
+            m, slot = measurement[k], k
+            while slot > 0 and row[slot - 1] == row[k] and measurement[slot - 1] > m:
+                measurement[slot] = measurement[slot - 1]
+                slot -= 1
+            measurement[slot] = m
     log_likelihood = np.empty(row.shape[0])
     own_noise = position.shape[1] > PLAIN
     rho_xx, rho_xy, rho_yy = 1.0, 0.0, 1.0
@@ -349,10 +357,9 @@ def groups(label: Index, classes: Sequence[ClassRow]) -> Index:
 
 
 @kernel
-def pairs_of_few(
-    mean: Array, label: Index, radius: Array, position: Array, measured_label: Index, widening: Array, classes: int
-) -> tuple[Index, Index]:
+def pairs_of_few(mean: Array, label: Index, radius: Array, targets: Targets, classes: int) -> tuple[Index, Index]:
     """Find the pairs within the gates by looking at every measurement of a class; arguments and order as in `gate`."""
+    position, measured_label, widening = targets
     n_measurements = position.shape[0]
     capacity = 2 * (mean.shape[0] + n_measurements) + 16 if mean.shape[0] else 0
     row, measurement = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
@@ -388,20 +395,21 @@ def pairs_of_few(
 
 @kernel
 def pairs_of_many(
-    mean: Array, label: Index, radius: Array, position: Array, measured_label: Index, widening: Array, classes: int
+    mean: Array, label: Index, radius: Array, targets: Targets, classes: int, most: int
 ) -> tuple[Index, Index]:
-    """Find the pairs within the gates by looking at neighbours; arguments and order as in `gate`.
+    """Find the pairs within the gates by looking at neighbours, up to `most` + 1; ordered by object alone.
 
     The measurements stand in a torus of cells twice as wide as the widest gate of their class, so that a gate touches
     at most three cells along each axis.
     """
+    position, measured_label, widening = targets
     capacity = 2 * (mean.shape[0] + position.shape[0]) + 16 if mean.shape[0] else 0
     row, measurement = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
-    widest, most = np.zeros(classes), np.zeros(classes)
+    widest, wider = np.zeros(classes), np.zeros(classes)
     for m in range(position.shape[0]):
-        most[measured_label[m]] = max(most[measured_label[m]], widening[m])
+        wider[measured_label[m]] = max(wider[measured_label[m]], widening[m])
     for n in range(mean.shape[0]):
-        widest[label[n]] = max(widest[label[n]], math.sqrt(radius[n] * radius[n] + most[label[n]]))
+        widest[label[n]] = max(widest[label[n]], math.sqrt(radius[n] * radius[n] + wider[label[n]]))
     head, following, side = empty_torus(position.shape[0])
     for m in range(position.shape[0]):
         insert(head, following, side, m, position[m, 0], position[m, 1], 2.0 * widest[measured_label[m]])
@@ -410,8 +418,8 @@ def pairs_of_many(
         eta = radius[n]
         if eta < 0.0:
             continue
-        begin, eta_2 = count, eta * eta
-        reach = math.sqrt(eta_2 + most[label[n]])
+        eta_2 = eta * eta
+        reach = math.sqrt(eta_2 + wider[label[n]])
         first_x, last_x, first_y, last_y = block(mean[n, 0], mean[n, 1], reach, 2.0 * widest[label[n]])
         for i in range(first_x, last_x + 1):
             for j in range(first_y, last_y + 1):
@@ -422,13 +430,10 @@ def pairs_of_many(
                         if count == capacity:
                             capacity *= 2
                             row, measurement = _grown(row, capacity), _grown(measurement, capacity)
-                        slot = count  # keep the measurements of this object in ascending order
-                        while slot > begin and measurement[slot - 1] > m:
-                            measurement[slot] = measurement[slot - 1]
-                            slot -= 1
-                        measurement[slot] = m
-                        row[count] = n
+                        row[count], measurement[count] = n, m
                         count += 1
+                        if count > most:
+                            return row[:count], measurement[:count]
                     m = following[m]
     return row[:count], measurement[:count]
 
@@ -441,20 +446,14 @@ def _grown(array: Index, capacity: int) -> Index:
     return larger
 
 
-UNLIMITED: Final = 2**62
-
-
 def check_effort(prior: Density, measurements: Measurements, dt: float, table: ClassTable, most: int) -> None:
     """Refuse a frame with too many pairs in the gates.
 
-    Counted are the measurements in the gate of each predicted object and Poisson component, and in that of each
-    measurement, which may be an object of the next step.
-
-    Arguments of its own:
-        most: pairs that are allowed.
+    Measurements count that lie in the gate of a predicted object or Poisson component, or of a measurement, which may
+    be an object of the next step.
 
     Raises:
-        EffortError: there are more.
+        EffortError: there are more than `most`.
     """
     bernoulli, poisson, count = prior.bernoulli, prior.poisson, measurements.score.shape[0]
     if (len(bernoulli) + len(poisson) + count) * count <= most:
@@ -470,52 +469,6 @@ def check_effort(prior: Density, measurements: Measurements, dt: float, table: C
     )
     widening = gate_widening(measurements.position, measurements.label, table.classes)
     group = table["group"]
-    measured = measurements.position, group[measurements.label], widening
-    if count_pairs(positions, group[labels], radius, *measured, len(table.classes), most) > most:
+    targets = measurements.position, group[measurements.label], widening
+    if len(pairs_of_many(positions, group[labels], radius, targets, len(table.classes), most)[0]) > most:
         raise EffortError("center", f"at most {most} pairs of an object and a detection in its gate", "more")
-
-
-@kernel
-def count_pairs(
-    center: Array,
-    label: Index,
-    radius: Array,
-    position: Array,
-    measured_label: Index,
-    widening: Array,
-    classes: int,
-    most: int,
-) -> int:
-    """Count the measurements of an object's class within its gate, over all objects; no further than `most` + 1.
-
-    Arguments of its own:
-        center: (N, 2) positions of the objects, m.
-        radius: (N,) gating distances, m.
-        widening: (M,) of the gates, m^2.
-        classes: C.
-        most: where counting ends.
-    """
-    widest, wider = np.zeros(classes), np.zeros(classes)
-    for m in range(position.shape[0]):
-        wider[measured_label[m]] = max(wider[measured_label[m]], widening[m])
-    for n in range(center.shape[0]):
-        widest[label[n]] = max(widest[label[n]], math.sqrt(radius[n] ** 2 + wider[label[n]]))
-    head, following, side = empty_torus(position.shape[0])
-    for m in range(position.shape[0]):
-        insert(head, following, side, m, position[m, 0], position[m, 1], 2.0 * widest[measured_label[m]])
-    count = 0
-    for n in range(center.shape[0]):
-        eta_2 = radius[n] ** 2
-        reach = math.sqrt(eta_2 + wider[label[n]])
-        first_x, last_x, first_y, last_y = block(center[n, 0], center[n, 1], reach, 2.0 * widest[label[n]])
-        for i in range(first_x, last_x + 1):
-            for j in range(first_y, last_y + 1):
-                m = head[(i & (side - 1)) * side + (j & (side - 1))]
-                while m != NOBODY:
-                    dx, dy = position[m, 0] - center[n, 0], position[m, 1] - center[n, 1]
-                    if dx * dx + dy * dy <= eta_2 + widening[m] and measured_label[m] == label[n]:
-                        count += 1
-                        if count > most:
-                            return count
-                    m = following[m]
-    return count

@@ -9,9 +9,9 @@ With lambda the memory over one nominal period,
 
 where the object is detected. Where h falls below zero the state is turned: phi + pi, -v, -a and -h, and P -> T P T with
 T = diag(1, 1, -1, 1, 1, -1). Both states describe the same motion. A track publishes the probability 1 / (1 + e^-h)
-that its heading is right, and in the variance of the heading what the doubt adds to it. Without `heading_sign` in the
-profile the sign stays that of the birth. A detection without heading has no vote; a heading that motion has shown
-begins with b_v, and h stays while nothing votes.
+that its heading is right, and adds the doubt to the variance of the heading. Without `heading_sign` in the profile the
+sign of the birth stays. A detection without heading has no vote; a heading that motion has shown begins with b_v, and
+h stays without votes.
 """
 
 from __future__ import annotations

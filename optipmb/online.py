@@ -67,7 +67,7 @@ class OnlineTracks:
     Attributes:
         stamp_ns: of the frame, nanoseconds.
         tracks: the columns as `optipmb.Tracks`, for `optipmb.predict_tracks`.
-        name: (N,) class names as the detections gave them, those of the profile elsewhere.
+        name: (N,) class names as the detections gave them, else as the profile does.
         velocity: (N, 2) over ground, m/s; NaN while it is unknown: before the second detection, where the detector
             gives none.
         left_out: detections of classes that the profile lacks.
@@ -75,7 +75,7 @@ class OnlineTracks:
         class_probability: (N, C) probability of each class of the profile; None where it has no groups of classes.
         sensor_motion: (3,) velocity, m/s, and turn rate, rad/s, with which what stands passes the sensor, where the
             motion of the sensor is estimated; None elsewhere.
-        measured: (N,) what is known of each track, as in `optipmb.StepResult`; None: everything of all.
+        measured: (N,) uint8, the known parts of each track: 1 the heading, 2 the size, 4 the height, added up.
 
     The other attributes are the columns of `optipmb.Tracks`.
     """
@@ -100,10 +100,10 @@ class OnlineTracks:
     time_since_detection: Array
     detection: Index
     confirmed: NDArray[np.bool_]
+    measured: NDArray[np.uint8]
     paths: PredictedPaths | None = None
     class_probability: Array | None = None
     sensor_motion: Array | None = None
-    measured: NDArray[np.uint8] | None = None
 
     def __len__(self) -> int:
         return len(self.tracks)
@@ -134,7 +134,7 @@ class OnlineTracks:
         }
 
     def to_arrow(self) -> pa.Table:
-        """Return the columns as a table of pyarrow; what is unknown is null.
+        """Return the columns as a table of pyarrow, with null where unknown.
 
         Raises:
             ImportError: pyarrow is not installed.
@@ -148,7 +148,7 @@ class OnlineTracks:
         )
 
     def to_dataframe(self) -> pd.DataFrame:
-        """Return the columns as a data frame of pandas; what is unknown is NaN.
+        """Return the columns as a data frame of pandas, with NaN where unknown.
 
         Raises:
             ImportError: pandas is not installed.
@@ -164,7 +164,7 @@ class OnlineTracks:
 
         Args:
             frame: number of the frame.
-            pose: world from sensor; None when the world frame is that of the sensor. The camera looks along its x axis.
+            pose: world from sensor; None when both frames are the same. The camera looks along the sensor's x axis.
         """
         center, yaw = self.center, self.yaw
         if pose is not None:
@@ -309,8 +309,8 @@ class OnlineTracker:
                 `width`, `height`; `yaw` or `heading` (M,) rad; `score` or `confidence` (M,) in (0, 1]; `class`,
                 `label`, `name`, `category` or `type` (M,): class names, or their places in the profile; `velocity`
                 (M, 2) or `vx`, `vy`, m/s, NaN where unknown; `position_covariance` (M, 3, 3), m^2, likewise. Sizes,
-                headings and `z` may be NaN or absent, unknown; but beside a size `z` is 0 and `h` 1.5 m where there is
-                no such column. Without `score` it is 1. None: nothing was detected.
+                headings and `z` may be NaN or absent, unknown; but with a size a missing column `z` is 0 and `h`
+                1.5 m. Without `score` it is 1. None: nothing was detected.
             t: time of the frame: seconds, or a date (of pandas too; UTC where it has no zone); or
             stamp_ns: nanoseconds.
             pose: world from sensor, or None when the boxes are in the world frame.
@@ -350,7 +350,7 @@ class OnlineTracker:
             paths=result.paths,
             class_probability=result.class_probability,
             sensor_motion=result.density.sensor_motion,
-            measured=result.measured,
+            measured=np.full(len(tracks), 7, np.uint8) if result.measured is None else result.measured,
         )
 
     def _classes(self, values: ArrayLike) -> tuple[tuple[str, ...], NDArray[np.int64], int]:
@@ -376,7 +376,7 @@ def _stamp(t: Any) -> int:
     """Return the nanoseconds of a time in seconds, or of a date."""
     if isinstance(t, datetime | np.datetime64) and str(t) == "NaT":
         raise FrameError("t", "seconds or a date", "NaT")
-    if isinstance(t, datetime):  # pandas' own has nanoseconds, and those of datetime are exact
+    if isinstance(t, datetime):  # exact, with the nanoseconds of pandas
         since = t - datetime(1970, 1, 1, tzinfo=None if t.tzinfo is None else UTC)
         return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000 + getattr(t, "nanosecond", 0)
     if isinstance(t, np.datetime64):

@@ -1,8 +1,8 @@
 """The parameters of the tracker: one table per class, as the paper's (Section V.A) has one column per class.
 
 A profile is a TOML file: ``name``, ``nominal_period`` and a table ``[classes.NAME]`` per class; the order of the
-tables is the order of the class indices. `profiles` names those that come with the package; own files load the same
-way (`load_profile`).
+tables is the order of the class indices. `profiles` names the profiles of the package; own files load the same way
+(`load_profile`).
 
 Beyond the paper's table there are the quantities that the paper uses and does not give (Q, R, P0, A) and two that a
 filter with survival probability one needs to forget objects (`max_misses`, `min_existence`).
@@ -100,7 +100,7 @@ class MeasurementNoise(_Table):
 class ReportedNoise(_Table):
     """Noise of the detector for the boxes that tracks report (`optipmb.calibration`).
 
-    An entry that is not below that of `measurement_noise` reports the state as it is.
+    An entry that is not below its counterpart in `measurement_noise` reports the state as it is.
     """
 
     position: Positive = Field(description="standard deviation of x and of y, m")
@@ -155,7 +155,7 @@ class Calibration(_Table):
     speed: Positive = Field(
         default=1.0, exclude_if=(1.0).__eq__, description="factor on the standard deviation of their speed"
     )
-    turn_rate: Positive = Field(default=1.0, exclude_if=(1.0).__eq__, description="factor on that of their turn rate")
+    turn_rate: Positive = Field(default=1.0, exclude_if=(1.0).__eq__, description="the same for their turn rate")
 
     @model_validator(mode="after")
     def _columns(self) -> Calibration:
@@ -174,14 +174,14 @@ Knots = Annotated[tuple[OpenProbability, ...], Field(min_length=2, max_length=MA
 
 
 class ScoreCalibration(_Table):
-    """What the scores of a detector mean to the thresholds of the class (`optipmb.frame`).
+    """Curve from the scores of a detector to the scale of the thresholds (`optipmb.frame`).
 
     The fields are columns of one table, a row for each knot; the curve is straight from knot to knot, from (0, 0) to
     the first and from the last to (1, 1).
     """
 
     detector: Knots = Field(description="scores of the detector, ascending")
-    calibrated: Knots = Field(description="the scores that the thresholds mean by them, ascending")
+    calibrated: Knots = Field(description="the same on the scale of the thresholds, ascending")
 
     @model_validator(mode="after")
     def _columns(self) -> ScoreCalibration:
@@ -203,7 +203,7 @@ class ClassParameters(_Table):
     gate: Positive = Field(description="eta_dist: gating distance on the ground plane, m")
     detection: OpenProbability = Field(description="p_d0: baseline detection probability")
     expected_points: Positive = Field(description="PTS_0: number of LiDAR points in the box of an object in full view")
-    detection_floor: NonZeroProbability = Field(description="s_d: what is left of p_d0 without points")
+    detection_floor: NonZeroProbability = Field(description="s_d: remaining share of p_d0 without points")
     birth_score: Probability = Field(description="eta_score: unused detections from this score on start a track")
     announce_score: Probability = Field(
         default=0.0, exclude_if=not_, description="lower scores continue tracks and announce none; the paper: 0"
@@ -226,12 +226,12 @@ class ClassParameters(_Table):
         description="measured speed, m/s, from which a birth heads along its velocity (the paper: 0), else as its box",
     )
     heading_sign: HeadingSign | None = Field(
-        default=None, description="how the sign of the heading is found; without it, it stays that of the birth"
+        default=None, description="how the sign of the heading is found; without it the sign of the birth stays"
     )
     process_noise: ProcessNoise = Field(description="Q")
     measurement_noise: MeasurementNoise = Field(description="R")
     reported_noise: ReportedNoise | None = Field(
-        default=None, description="R' of the boxes that tracks report; without it they are those of the state"
+        default=None, description="R' of the boxes that tracks report; without it they report the state"
     )
     birth: BirthSpread = Field(description="P^0")
     default_size: tuple[Positive, Positive, Positive] | None = Field(
@@ -296,7 +296,7 @@ class ClassParameters(_Table):
     )
     score_calibration: ScoreCalibration | None = Field(
         default=None,
-        description="curve that brings the detector's scores to those that the thresholds mean; none: they stay",
+        description="curve from the detector's scores to the scale of the thresholds; none: they stay",
     )
     calibration: Calibration | None = Field(
         default=None, description="what tracks say of themselves; without it existence is r and the covariance is P"
@@ -551,7 +551,7 @@ def _sensor_profile(path: str, name: str) -> Parameters:
 
 
 def _explained(problem: ErrorDetails) -> tuple[str, str]:
-    """Return what was expected and what was received, without the words of the library that checks."""
+    """Return the expected and the received value, without the words of the library that checks."""
     if problem["type"] == "missing":
         return "a value", "none"
     if problem["type"] == "extra_forbidden":

@@ -1,10 +1,10 @@
 """Where tracks are going: their states at times ahead, by the motion model of their class (eq. Motion Predict).
 
 Between two horizons the state is predicted in equal steps of at most one nominal period, each as in `optipmb.predict`.
-One long step would be another motion: its noise of speed and heading would reach no position. The covariance is that of
-the filter. The mean is the motion of the state itself and not the mean of the sigma points: where the heading may turn
-far in the time ahead, the latter hardly moves at all, and no object goes that way. A turn rate and an acceleration of
-which little is known move it little: each counts by ``x^2 / (x^2 + P_xx)``, the weight of least mean square error.
+One long step would be another motion: its noise of speed and heading would reach no position. The covariance is the
+filter's. The mean is the motion of the state itself and not the mean of the sigma points: where the heading may turn
+far in the time ahead, the latter hardly moves at all, and no object goes that way. Uncertain turn rates and
+accelerations count less: each has the weight ``x^2 / (x^2 + P_xx)`` of least mean square error.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ if TYPE_CHECKING:
     from optipmb.extract import Tracks
     from optipmb.parameters import Parameters
     from optipmb.rows import Array, Index
-    from optipmb.table import ClassRow
+    from optipmb.table import Classes
 
 
 MAX_STEPS: Final = 1000
-"""Most steps of a path, whatever the nominal period."""
+"""Most steps of a path, however short the nominal period."""
 
 ROUNDING: Final = 1e-6
 """Share of a period by which a step may be longer, so that rounding of a horizon costs no step more."""
@@ -50,8 +50,7 @@ class PredictedPaths:
         label: (N,) int64, index into the classes of the parameters.
         horizons: (H,) s after the stamp of the tracks.
         mean: (N, H, 6) [x, y, v, phi, omega, a]: m, m/s along the heading, rad in (-pi, pi], rad/s, m/s^2.
-        covariance: (N, H, 6, 6) of those; that of the heading with the doubt which way the object faces, as tracks
-            have it.
+        covariance: (N, H, 6, 6) of those, with the doubt which way the object faces, as in `Tracks`.
     """
 
     id: Index
@@ -121,6 +120,23 @@ def paths_of(tracks: Tracks, times: Array, table: ClassTable) -> PredictedPaths:
     return paths
 
 
+def tracks_ahead(tracks: Tracks, seconds: float, table: ClassTable) -> Tracks:
+    """Predict tracks that are known to be of the classes of the table by a time: motion, ages and existence.
+
+    Boxes, scores and `confirmed` stay; no track has a detection.
+    """
+    paths = paths_of(tracks, np.array([seconds]), table)
+    mean, later = paths.mean[:, 0], type(tracks).of(tracks.words.copy())
+    later.center[:, :2], later.yaw[:], later.yaw_rate[:], later.acceleration[:] = mean[:, :2], *mean[:, PHI:].T
+    later.velocity[:, 0], later.velocity[:, 1] = mean[:, V] * np.cos(later.yaw), mean[:, V] * np.sin(later.yaw)
+    later.covariance[:] = paths.covariance[:, 0]
+    later.existence[:] *= table["survival"][tracks.label] ** (seconds / table.period)
+    later.age[:] += seconds
+    later.time_since_detection[:] += seconds
+    later.detection[:] = -1
+    return later
+
+
 def _horizons(values: Sequence[float] | Array) -> Array:
     try:
         times = np.array(values, dtype=np.float64)
@@ -138,12 +154,8 @@ def _horizons(values: Sequence[float] | Array) -> Array:
 def _predict(
     identity: Index, label: Index, mean: Array, covariance: Array, times: Array, table: ClassTable
 ) -> PredictedPaths:
-    shape = label.shape[0], times.shape[0]
-    paths = PredictedPaths(
-        identity.copy(), label.copy(), times, np.empty((*shape, STATE)), np.empty((*shape, STATE, STATE))
-    )
-    predict_paths(mean, covariance, paths.label, times, table.period, table.classes, paths.mean, paths.covariance)
-    return paths
+    found = predict_paths(mean, covariance, label, times, table.period, table.classes)
+    return PredictedPaths(identity.copy(), label.copy(), times, *found)
 
 
 @kernel
@@ -156,25 +168,12 @@ def _doubts(heading_confidence: Array) -> Array:
 
 @kernel
 def predict_paths(
-    mean: Array,
-    covariance: Array,
-    label: Index,
-    horizons: Array,
-    period: float,
-    classes: Sequence[ClassRow],
-    mean_out: Array,
-    covariance_out: Array,
-) -> None:
-    """Predict states to each of the horizons, in equal steps of at most a nominal period between them.
-
-    Arguments of its own:
-        mean: (N, 6) states now.
-        covariance: (N, 6, 6) their covariances.
-        horizons: (H,) ascending times ahead, s.
-        mean_out: (N, H, 6) receives the states at the horizons.
-        covariance_out: (N, H, 6, 6) receives their covariances.
-    """
-    root, points = np.empty((STATE, STATE)), np.empty((2 * STATE, STATE))
+    mean: Array, covariance: Array, label: Index, horizons: Array, period: float, classes: Classes
+) -> tuple[Array, Array]:
+    """Predict states to the horizons, in equal steps of at most a nominal period; return (N, H, 6) and (N, H, 6, 6)."""
+    buffers = np.empty((STATE, STATE)), np.empty((2 * STATE, STATE))
+    shape = label.shape[0], horizons.shape[0]
+    mean_out, covariance_out = np.empty((*shape, STATE)), np.empty((*shape, STATE, STATE))
     state, spread = np.empty((2, STATE)), np.empty((2, STATE, STATE))
     for n in range(mean.shape[0]):
         own = classes[label[n]]
@@ -190,19 +189,15 @@ def predict_paths(
             ahead = horizons[h] - before
             steps = max(1, math.ceil(min(ahead / period - ROUNDING, MAX_STEPS * ahead / horizons[-1])))
             for _ in range(steps):
-                predict_state(state[0], spread[0], ahead / steps, own, root, points, state[1], spread[1])
-                move(state[0], ahead / steps, own.acceleration_time, state[1])
+                dt, v, phi, omega, a = ahead / steps, state[0, V], state[0, PHI], state[0, OMEGA], state[0, A]
+                predict_state(state[0], spread[0], dt, own, buffers, state[1], spread[1])
+                decay = decay_and_turn(omega, dt, own.acceleration_time)
+                dx, dy, v, a = displacement(v, phi, omega, a, dt, own.acceleration_time, decay)
+                state[1, X], state[1, Y], state[1, V], state[1, A] = state[0, X] + dx, state[0, Y] + dy, v, a
+                state[1, PHI], state[1, OMEGA] = wrap(phi + omega * dt), omega
                 copy_state(state, spread, 1, state, spread, 0)
             copy_state(state, spread, 0, mean_out[n], covariance_out[n], h)
             if straight:
                 show_heading(state[0, V], covariance_out[n, h])
             before = horizons[h]
-
-
-@kernel
-def move(mean: Array, dt: float, tau: float, mean_out: Array) -> None:
-    """Move a state (6,) over dt, s, under an acceleration with time constant tau, s, and write where it is then."""
-    kept, turn = decay_and_turn(mean[OMEGA], dt, tau)
-    dx, dy, v, a = displacement(mean[V], mean[PHI], mean[OMEGA], mean[A], dt, tau, kept, turn)
-    mean_out[X], mean_out[Y], mean_out[V], mean_out[A] = mean[X] + dx, mean[Y] + dy, v, a
-    mean_out[PHI], mean_out[OMEGA] = wrap(mean[PHI] + mean[OMEGA] * dt), mean[OMEGA]
+    return mean_out, covariance_out

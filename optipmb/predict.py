@@ -6,7 +6,7 @@ ever, and not through a standstill. Without decay (tau infinite) the acceleratio
 
 The unscented transform uses the symmetric set of 2n = 12 points at distance sqrt(n) along the columns of a matrix
 square root, all of weight 1/12 (kappa = 0): no weight is negative, so the transformed covariance is positive
-semi-definite whatever the function.
+semi-definite for any function.
 
 The square root is the Cholesky factor of the covariance with the state REORDERED as [v, phi, omega, a, x, y],
 position last. Then the columns that bend (v, phi, omega, a) do not depend on the axes of the world, and the columns
@@ -50,10 +50,8 @@ from optipmb.density import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from optipmb.rows import Array, Columns, Index
-    from optipmb.table import ClassRow, ClassTable
+    from optipmb.table import Classes, ClassRow, ClassTable
 
     Turn = tuple[float, float, float, float]
 
@@ -71,13 +69,13 @@ SMALL_TURN = 0.1
 square."""
 
 START = 5.0
-"""Where the acceleration decays, it carries a speed to at most so many times its own beyond it (`travel`)."""
+"""Where the acceleration decays, it raises a speed by at most so many times itself (`travel`)."""
 
 BRAKING = 3.0
-"""And braking that would end at minus so many times the speed, less one, ends at a standstill."""
+"""Braking is limited to so many times ``|v| / tau`` (`travel`)."""
 
 ACCELERATIONS = 3.0
-"""Standard deviations of an acceleration that objects of unknown heading are allowed, for nothing follows theirs."""
+"""Standard deviations of the acceleration of objects of unknown heading, which no state follows."""
 
 TINY_PIVOT = 1e-12
 """A pivot of the square root is lifted to this: a covariance that lost rank in rounding is repaired, and counted."""
@@ -120,16 +118,12 @@ def ctra_displacement(v: float, omega: float, a: float, dt: float) -> tuple[floa
         ``along = int (v + a t) cos(omega t) dt``, ``across = int (v + a t) sin(omega t) dt``.
     """
     u = omega * dt
+    cos_u, sin_u, sinc, cosc = turn_integrals(u)
     if abs(u) < SMALL_TURN:
         u2 = u * u
-        sinc, cosc = small_turn(u)
         ramp_cos = 0.5 - u2 / 8.0 + u2 * u2 / 144.0 - u2 * u2 * u2 / 5760.0
         ramp_sin = u / 3.0 - u * u2 / 30.0 + u * u2 * u2 / 840.0 - u * u2 * u2 * u2 / 45360.0
     else:
-        sin_u = math.sin(u)
-        cos_u = math.cos(u)
-        sinc = sin_u / u
-        cosc = (1.0 - cos_u) / u
         ramp_cos = (cos_u + u * sin_u - 1.0) / (u * u)
         ramp_sin = (sin_u - u * cos_u) / (u * u)
     along = dt * (v * sinc + a * dt * ramp_cos)
@@ -175,7 +169,7 @@ def travel(
 
 @kernel
 def decay_and_turn(omega: float, dt: float, tau: float) -> tuple[float, Turn]:
-    """Return `kept` and `turn` of `travel`; of an acceleration that does not decay, values that nothing reads."""
+    """Return `kept` and `turn` of `travel`; unused values where the acceleration does not decay."""
     if tau == math.inf:
         return 1.0, (1.0, 0.0, 1.0, 0.0)
     return math.exp(-dt / tau), turn_integrals(omega * dt)
@@ -183,14 +177,14 @@ def decay_and_turn(omega: float, dt: float, tau: float) -> tuple[float, Turn]:
 
 @kernel
 def displacement(
-    v: float, phi: float, omega: float, a: float, dt: float, tau: float, kept: float, turn: Turn
+    v: float, phi: float, omega: float, a: float, dt: float, tau: float, decay: tuple[float, Turn]
 ) -> tuple[float, float, float, float]:
-    """Move one state, arguments as in `travel`: return the ways along x and y, the speed and the acceleration."""
+    """Move one state, `decay` as of `decay_and_turn`: return the ways along x and y, the speed and the acceleration."""
     if tau == math.inf:
         along, across = ctra_displacement(v, omega, a, dt)
         v += a * dt
     else:
-        along, across, v, a = travel(v, omega, a, dt, tau, kept, turn)
+        along, across, v, a = travel(v, omega, a, dt, tau, *decay)
     cos_phi, sin_phi = math.cos(phi), math.sin(phi)
     return cos_phi * along - sin_phi * across, sin_phi * along + cos_phi * across, v, a
 
@@ -261,20 +255,14 @@ def predict_state(
     covariance: Array,
     dt: float,
     own: ClassRow,
-    root: Array,
-    points: Array,
+    buffers: tuple[Array, Array],
     mean_out: Array,
     covariance_out: Array,
 ) -> int:
     """Predict one state by the unscented transform of its motion model (eq. Motion Predict).
 
-    Arguments of its own:
-        own: parameters of its class: the motion model and its time constant tau, q of ``Q = diag(q^2) dt``.
-        root: (6, 6) buffer for the square root.
-        points: (12, 6) buffer for the transformed points, as deviations from the transformed centre; the mean is
-            added last, so that large world coordinates cost no digits.
-        mean_out: (6,) receives m_+.
-        covariance_out: (6, 6) receives P_+.
+    The buffers receive the square root (6, 6), and the transformed points (12, 6) as deviations from the transformed
+    centre: the mean is added last, so that large world coordinates cost no digits.
 
     Returns:
         Number of pivots that had to be repaired.
@@ -283,11 +271,12 @@ def predict_state(
         predict_without_heading(mean, covariance, dt, own, mean_out, covariance_out)
         return 0
     straight, tau, process_noise = own.constant_velocity, own.acceleration_time, own.process_noise
+    root, points = buffers
     repaired = square_root(covariance, root)
     v, phi = mean[V], mean[PHI]
     omega, a = (0.0, 0.0) if straight else (mean[OMEGA], mean[A])
     kept, turn0 = decay_and_turn(omega, dt, tau)
-    dx0, dy0, v0, a0 = displacement(v, phi, omega, a, dt, tau, kept, turn0)
+    dx0, dy0, v0, a0 = displacement(v, phi, omega, a, dt, tau, (kept, turn0))
     cos_phi, sin_phi = math.cos(phi), math.sin(phi)
     for column in range(STATE):
         for side in range(2):
@@ -340,7 +329,7 @@ def predict_state(
 
 @kernel
 def centred(points: Array, s: int) -> float:
-    """Take the mean of the points (12, 6) out of their entry s, and return it."""
+    """Subtract the mean of the points (12, 6) from their entry s, and return it."""
     shift = 0.0
     for i in range(2 * STATE):
         shift += WEIGHT * points[i, s]
@@ -354,14 +343,14 @@ LONGEST_STEP_S: Final = 6.0
 
 
 def predict(density: Density, moment: Moment, table: ClassTable) -> tuple[Density, int]:
-    """Carry the density from its stamp to that of a frame.
+    """Carry the density from its stamp to the stamp of a frame.
 
     Means and covariances follow the motion model of the class. The survival probability p_s holds for one nominal
     period of the stream: over dt it is ``p_s ** (dt / period)``, so that a stream at twice the rate does not forget
     twice as fast.
-    Components that a silent stream has carried past their limits (`max_misses`, `poisson_steps`) are removed before
-    they could be associated, but for what the last frame has seen: in a slow stream it lives until the next look. That
-    holds for components whatever the time, for objects up to `LONGEST_STEP_S`.
+    Objects and components that a silent stream has carried past their limits (`max_misses`, `poisson_steps`) are
+    removed before they could be associated. Those seen in the last frame live until the next look, as in a slow stream:
+    components always, objects up to `LONGEST_STEP_S`.
 
     Returns:
         The predicted density and how many covariances had to be repaired.
@@ -392,21 +381,16 @@ def predict(density: Density, moment: Moment, table: ClassTable) -> tuple[Densit
 
 @kernel
 def predict_density(
-    object_words: Array, missed_from_ns: Index, component_words: Array, moment: Columns, classes: Sequence[ClassRow]
+    object_words: Array, missed_from_ns: Index, component_words: Array, moment: Columns, classes: Classes
 ) -> tuple[Index, Array, Array, int]:
     """Predict the objects and components that are within the limit of their class (eq. PPP_prediction, MB_prediction).
-
-    Arguments of its own:
-        object_words: array of `Bernoullis`.
-        missed_from_ns: `Density.missed_from_ns`.
-        component_words: array of `Poissons`.
 
     Returns:
         The (K,) objects that stay, the arrays of the predicted objects and components, and how many covariances had to
         be repaired.
 
     Raises:
-        ValueError: a label is none, and reading its parameters would leave their array.
+        ValueError: a label is of no class; its parameters would be read beyond their array.
     """
     if not labels_within(object_words, component_words, len(classes)):
         raise ValueError("labels of classes that there are not")
@@ -441,14 +425,11 @@ def predict_density(
 
 @kernel
 def rows_within(
-    label: Index, since_ns: Index, seen_from_ns: int, undetected: bool, moment: Moment, classes: Sequence[ClassRow]
+    label: Index, since_ns: Index, seen_from_ns: int, undetected: bool, moment: Moment, classes: Classes
 ) -> Index:
-    """Return the rows that are within the limit of their class.
+    """Return the rows within `poisson_steps` of their class, if `undetected`, else `max_misses`.
 
-    Arguments of its own:
-        since_ns: (N,) stamp from which periods are counted.
-        seen_from_ns: rows counted from this stamp on stay, whatever the limit.
-        undetected: whether the limit is `poisson_steps`; else `max_misses`.
+    Periods count from `since_ns` (N,); rows with a stamp from `seen_from_ns` on stay.
     """
     kept, count = np.empty(label.shape[0], np.int64), 0
     for n in range(label.shape[0]):
@@ -464,18 +445,19 @@ def rows_within(
 
 @kernel
 def predict_rows(
-    rows: Index, old: Bernoullis | Poissons, new: Bernoullis | Poissons, dt: float, classes: Sequence[ClassRow]
+    rows: Index, old: Bernoullis | Poissons, new: Bernoullis | Poissons, dt: float, classes: Classes
 ) -> int:
-    """Predict m_+ and P_+ of some rows (K,) of objects or components over dt, s, positive; their boxes stay.
+    """Predict m_+ and P_+ of some rows (K,) of objects or components over dt, s, positive; `new` receives them.
 
-    `new` receives what both have but for the weight. Returns how many covariances had to be repaired.
+    Returns:
+        How many covariances had to be repaired.
     """
-    root, points = np.empty((STATE, STATE)), np.empty((2 * STATE, STATE))
+    buffers = np.empty((STATE, STATE)), np.empty((2 * STATE, STATE))
     repaired = 0
     for k in range(rows.shape[0]):
         n = rows[k]
         own = classes[old.label[n]]
-        if predict_state(old.mean[n], old.covariance[n], dt, own, root, points, new.mean[k], new.covariance[k]):
+        if predict_state(old.mean[n], old.covariance[n], dt, own, buffers, new.mean[k], new.covariance[k]):
             repaired += 1
         new.label[k], new.born_ns[k] = old.label[n], old.born_ns[n]
         for s in range(4):

@@ -1,7 +1,7 @@
 """Lets kernels that were compiled at installation be loaded where nothing may be written, as in an image.
 
 Numba looks for its cache only where it could also write. With
-``NUMBA_CACHE_LOCATOR_CLASSES=optipmb.prepared.PreparedCacheLocator`` it takes what lies beside the source as it is.
+``NUMBA_CACHE_LOCATOR_CLASSES=optipmb.prepared.PreparedCacheLocator`` it reads the cache in the package's folder.
 """
 
 from pathlib import Path
@@ -10,12 +10,8 @@ from numba.core.caching import InTreeCacheLocator
 
 
 class PreparedCacheLocator(InTreeCacheLocator):  # numba ships no types
-    """The cache beside the source, whether or not it can be written to."""
+    """The cache in the package's folder, read-only or not."""
 
     def ensure_cache_path(self) -> None:
-        """Make the folder if need be, and ask for nothing more.
-
-        Raises:
-            OSError: it is not there and cannot be made; numba then knows no cache.
-        """
+        """Make the folder where it is missing; an `OSError` tells numba that there is no cache."""
         Path(self.get_cache_path()).mkdir(exist_ok=True)  # type: ignore[no-untyped-call]  # the same

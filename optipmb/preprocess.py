@@ -1,7 +1,7 @@
 """From detections to measurements: canonical order, score filter and non-maximum suppression (Section IV.A).
 
-Measurements are put in an order of their own (best score first, then by coordinates), so that nothing that follows
-depends on the order in which a detector lists its boxes.
+Measurements are sorted (best score first, then by coordinates), so that no result depends on the order in which a
+detector lists its boxes.
 """
 
 from __future__ import annotations
@@ -19,13 +19,11 @@ from optipmb.hypotheses import UNLIMITED
 from optipmb.table import known_length
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
     from optipmb.frame import Frame
     from optipmb.rows import Array, Columns, Index
-    from optipmb.table import ClassRow, ClassTable
+    from optipmb.table import Classes, ClassTable
 
 
 class Measurements(NamedTuple):
@@ -54,11 +52,10 @@ class Measurements(NamedTuple):
 def preprocess(
     frame: Frame, table: ClassTable, most: int = UNLIMITED, score: Array | None = None
 ) -> tuple[Measurements, Index, int, int]:
-    """Remove detections scored below eta_sf, then those that overlap a better one by more than eta_iou.
+    """Remove detections scored below eta_sf, then detections that overlap a better one by more than eta_iou.
 
-    They are compared with detections of their class, and of the other classes of its group unless it has none or
-    `suppress_in_group` is off.
-    `score` (M,) stands for the scores of the frame.
+    They are compared within their class, or within its group where `suppress_in_group` is on. `score` (M,) replaces the
+    scores of the frame.
 
     Returns:
         The measurements, their rows in the frame, the number below the score filter and the number suppressed.
@@ -81,15 +78,15 @@ def preprocess(
 
 
 @kernel
-def select(detections: Columns, width: int, classes: Sequence[ClassRow], most: int) -> tuple[int, Index, Columns]:
+def select(detections: Columns, width: int, classes: Classes, most: int) -> tuple[int, Index, Columns]:
     """Choose the detections that are measurements, of center, size, yaw, velocity, score, label and source of all.
 
     Returns:
-        How many detections pass the score filter, or -1 when more than `most` pairs of boxes had to be looked at; the
-        rows of those that pass the suppression too, in their order; their columns of `Measurements`, `width` of them
-        for the position.
+        How many detections pass the score filter, or -1 when more than `most` pairs of boxes had to be compared; the
+        rows that pass the suppression too, in their order; their columns of `Measurements`, of which the position has
+        `width`: those behind y are not written.
     """
-    center, size, yaw, _, score, label, source = detections
+    center, size, yaw, velocity, score, label, source = detections
     chosen = np.empty(score.shape[0], np.int64)
     above = 0
     for m in range(score.shape[0]):
@@ -114,13 +111,23 @@ def select(detections: Columns, width: int, classes: Sequence[ClassRow], most: i
         if keep[k]:
             chosen[kept] = chosen[k]
             kept += 1
-    chosen = chosen[:kept]
-    return above, chosen, gather(chosen, detections, width)
+    position, velocity_out, auxiliary = np.empty((kept, width)), np.empty((kept, 2)), np.empty((kept, 4))
+    yaw_out, score_out = np.empty(kept), np.empty(kept)
+    label_out, source_out = np.empty(kept, np.int64), np.empty(kept, np.int64)
+    for k in range(kept):
+        m = chosen[k]
+        for s in range(2):
+            position[k, s], velocity_out[k, s] = center[m, s], velocity[m, s]
+        for s in range(3):
+            auxiliary[k, s] = size[m, s]
+        auxiliary[k, 3] = center[m, 2]
+        yaw_out[k], score_out[k], label_out[k], source_out[k] = yaw[m], score[m], label[m], source[m]
+    return above, chosen[:kept], (position, yaw_out, velocity_out, auxiliary, score_out, label_out, source_out)
 
 
 @kernel
 def precedes(m: int, n: int, score: Array, center: Array, size: Array, yaw: Array, source: Index) -> bool:
-    """Tell whether detection m stands before n: by falling score, then by coordinates, size, yaw and place."""
+    """Tell whether detection m comes before n: by falling score, then by coordinates, size, yaw and place."""
     if score[m] != score[n]:
         return bool(score[m] > score[n])
     for s in range(3):
@@ -171,7 +178,7 @@ def sort_canonically(order: Index, score: Array, center: Array, size: Array, yaw
 
 
 @kernel
-def non_maximum_suppression(boxes: Array, label: Index, classes: Sequence[ClassRow], most: int) -> NDArray[np.bool_]:
+def non_maximum_suppression(boxes: Array, label: Index, classes: Classes, most: int) -> NDArray[np.bool_]:
     """Keep each box unless a kept box of its group before it overlaps it by more than the threshold of its class.
 
     Arguments of its own:
@@ -210,23 +217,3 @@ def non_maximum_suppression(boxes: Array, label: Index, classes: Sequence[ClassR
         if keep[m]:
             insert(head, following, side, m, boxes[m, 0], boxes[m, 1], cell_size)
     return keep
-
-
-@kernel
-def gather(chosen: Index, detections: Columns, width: int) -> Columns:
-    """Copy the chosen detections to the columns of `Measurements`; columns of the position behind y stay unwritten."""
-    center, size, yaw, velocity, score, label, source = detections
-    count = chosen.shape[0]
-    position, velocity_out, auxiliary = np.empty((count, width)), np.empty((count, 2)), np.empty((count, 4))
-    yaw_out, score_out = np.empty(count), np.empty(count)
-    label_out, source_out = np.empty(count, np.int64), np.empty(count, np.int64)
-    for k in range(count):
-        m = chosen[k]
-        for s in range(2):
-            position[k, s] = center[m, s]
-            velocity_out[k, s] = velocity[m, s]
-        for s in range(3):
-            auxiliary[k, s] = size[m, s]
-        auxiliary[k, 3] = center[m, 2]
-        yaw_out[k], score_out[k], label_out[k], source_out[k] = yaw[m], score[m], label[m], source[m]
-    return position, yaw_out, velocity_out, auxiliary, score_out, label_out, source_out

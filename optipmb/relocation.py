@@ -1,12 +1,12 @@
 """A world that moves under its objects: the same density in other coordinates (not in the paper).
 
-After a loop closure, a fix of a satellite receiver or a change of map, a localisation says that what was at p is at
+After a loop closure, a fix of a satellite receiver or a change of map, a localisation moves each point p to
 
     p' = R(theta) p + t
 
-in the new world, R a turn about z. Means and covariances are moved, speeds, turn rates and all that has no place stay.
-The motion model has no preferred place or direction, so that tracks go on as if the world had always been so. Nothing
-is added to covariances: the motion is exact.
+in the new world, R a turn about z. Means and covariances move; speeds, turn rates and all without a place stay. The
+motion model prefers no place or direction, so that tracks go on as if the world had always been so. The motion is
+exact: it adds nothing to covariances.
 """
 
 from __future__ import annotations

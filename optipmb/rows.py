@@ -1,8 +1,8 @@
-"""Records: what a step takes, hands from stage to stage and gives away. Nobody assigns to their fields.
+"""Records that a step takes, passes from stage to stage and returns. Their fields are never assigned to.
 
 The columns of `Rows` lie one behind the other in one array, which kernels take and return. Each array that a kernel
-returns is an object of numpy; to make the 19 columns of a density and to let them go took a tenth of the time of a
-frame of 40 objects. A column is a view of the array, made when it is read.
+returns is an object of numpy; creating and releasing the 19 columns of a density took a tenth of the time of a frame of
+40 objects. A column is a view of the array, made when it is read.
 
 A `record` is a dataclass that the type checker freezes. At run time a frozen one stores each field through
 `object.__setattr__`: a step of ten objects, which fills about ninety fields, would spend a fifth of its time there.
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 _N = TypeVar("_N", bound=np.generic)
 
 _LOWEST: Final = 0 if sys.byteorder == "little" else 7
-"""Which byte of an integer is that of a flag."""
+"""Byte of an integer that holds a flag."""
 
 
 class Column(Generic[_N]):
@@ -117,7 +117,7 @@ class Rows:
 
     @classmethod
     def of(cls, words: NDArray[np.float64]) -> Self:
-        """Return the record of an array that a kernel has made of it."""
+        """Return the record of an array that a kernel has made."""
         rows = object.__new__(cls)
         rows.words = words
         return rows
@@ -154,7 +154,7 @@ def arrays_of(record: type[Rows], name: str, module: str) -> Any:
 
 
 def shown(column: object) -> str:
-    """Return what a column is, for the message of an error."""
+    """Describe a column for the message of an error."""
     return f"{column.shape} {column.dtype}" if isinstance(column, np.ndarray) else type(column).__name__
 
 

@@ -2,7 +2,7 @@
 
 A score of 0.4 is a sure object for one detector and a doubtful one for another. Where a profile has `self_calibration`,
 every score becomes the share of the detections with such a score that were of a lasting object, before thresholds,
-births and the evidence of tracks use it. The scores that tracks publish remain those of the detector.
+births and the evidence of tracks use it. Tracks still publish the scores of the detector.
 
 Without a truth, a detection counts as one of an object when its track is detected again and again. Each object has
 three slots of about a second: one is being filled, the one before it is evaluated when that ends. Its detections are
@@ -16,7 +16,7 @@ objects is not taken for one that imagines them. A detection that no object uses
 `poisson_steps`, does not last.
 
 The curve of a class is the isotonic regression of the shares over the log odds of the scores, with `PRIOR` detections
-in each bin whose scores mean what they say. Its largest value is `MOST`. It depends on frames of the past alone, and
+in each bin whose scores are right. Its largest value is `MOST`. It depends on frames of the past alone, and
 the state is part of the density. Counts fade from `MASS` detections on.
 
 A threshold never excludes the upper half of the scores of a class. Detections that are filtered out teach nothing, so
@@ -38,14 +38,12 @@ from optipmb.rows import read_only
 from optipmb.undetected import AGED, MARKED
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
     from optipmb.density import Density, Moment
     from optipmb.frame import Frame
     from optipmb.rows import Array, Index
-    from optipmb.table import ClassRow, ClassTable
+    from optipmb.table import Classes, ClassTable
     from optipmb.tracker import Update
 
     Slots = NDArray[np.uint16]
@@ -55,8 +53,8 @@ LOWEST: Final = -0.5 * BIN * BINS
 """Width of a bin of log odds, and the lower edge of the first."""
 
 DETECTIONS, LASTING, GIVEN, HITS, LOOKS = range(5)
-"""Counts of a class by bin: evaluated detections, those that lasted, all scores of the detector, and hits and looks of
-inner slots by the mean bin of the slot."""
+"""Counts of a class by bin: evaluated detections, lasting ones, all scores of the detector, and hits and looks of inner
+slots by the mean bin of the slot."""
 SLOT_TICKS: Final = 9900
 """Shortest time of a slot: a second, less the jitter of stamps, in ticks of 0.1 ms."""
 OF_LOOKS, TICKS = BINS, BINS + 1
@@ -122,13 +120,10 @@ def on_curve(odds: float, curve: Array) -> float:
 
 
 @kernel
-def calibrate(classes: Array, score: Array, label: Index, table: Sequence[ClassRow]) -> Array:
-    """Return the calibrated scores (M,), and bound the thresholds by the lower edge of the median of the scores.
+def calibrate(classes: Array, score: Array, label: Index, table: Classes) -> Array:
+    """Return calibrated scores (M,), and bound the thresholds in `table` by the lower edge of the median of the scores.
 
-    Arguments of its own:
-        classes: (C, `COUNTS`, `BINS`) counts of the classes.
-        score: (M,) of the detector.
-        table: (C,) parameters; thresholds on scores are written.
+    `classes` are the counts, (C, `COUNTS`, `BINS`).
     """
     curve, out = curves(classes), np.empty(score.shape[0])
     for m in range(score.shape[0]):
@@ -215,7 +210,7 @@ def learn(
     """Return the counts after a frame.
 
     Arguments of its own:
-        counts: of classes, objects and components, as `SelfCalibration` has them; those of the classes are written.
+        counts: of classes, objects and components, as in `SelfCalibration`; the classes' are written.
         before: ids, ascending, and classes of the objects of the frame before, (N,).
         after: ids, ascending, and classes of the objects of the posterior, the measurement of each, negative where
             missed, and whether it was in view, (K,).
@@ -232,7 +227,7 @@ def learn(
     used, share = np.zeros(rows.shape[0], np.bool_), min(FULL_SLOT * dt, 1.0)
     lasting = needed_shares(classes)
 
-    # Objects: those that are gone are evaluated at once
+    # Objects; their slots are evaluated at once when they end
     kept_slots = np.zeros((objects_id.shape[0], SLOTS, SLOT), np.uint16)
     n = 0
     for k in range(objects_id.shape[0] + 1):
@@ -310,13 +305,9 @@ def calibrated(density: Density, frame: Frame, table: ClassTable) -> tuple[Score
 def followed(
     scores: Scores, prior: Density, posterior: Density, update: Update, rows: Index, moment: Moment, table: ClassTable
 ) -> SelfCalibration:
-    """Return the counts after a frame, and give the objects of the posterior the scores of the detector.
+    """Return the counts after a frame, and write the scores of the detector to the objects of the new posterior.
 
-    Arguments of its own:
-        scores: of the frame.
-        posterior: not yet given away.
-        update: what it was made of.
-        rows: (M,) detection of each measurement.
+    `rows` (M,) is the detection of each measurement.
     """
     density, objects, hit = scores.before, posterior.bernoulli, update.measurement
     own, old, poisson, fate = SelfCalibration.of(density), density.bernoulli, density.poisson, update.fate

@@ -11,9 +11,9 @@ least squares over the pairs that it brings together. The guess is the motion of
 Cars that approach a standing sensor together look like a sensor that drives towards parked cars: relative motion alone
 does not tell them apart, nor does the sign of headings, which detectors turn around. But a vehicle moves along its
 axis. Boxes that slip sideways stand, and the sensor moves. A motion is therefore weighed against none: each object
-drives along its axis, whichever way and up to the speed of its class, in the axes of the sensor or in those that the
-motion takes away. With c_0 and c_1 how far the nearest detection is from there, in squared standard deviations, a frame
-gives the evidence
+drives along its axis, either way and up to the speed of its class, in the axes of the sensor (0) or in the axes that
+the motion leads to (1). With c_0 and c_1 the distances of the nearest detection, in squared standard deviations, a
+frame gives the evidence
 
     sum_n (c_0 - c_1) / 2 - max_n (c_0 - c_1) / 2 - `FITTED`
 
@@ -59,7 +59,7 @@ ANGLE: Final = 0.0125
 """Distance of the angles that are tried, rad."""
 MOST_CELLS: Final = 64
 MOST_ANGLES: Final = 32
-"""Cells along an axis and angles to either side: what is beyond them is not found."""
+"""Cells along an axis and angles to either side: no motion beyond them is found."""
 STILL: Final = 0.15
 """Mean distance of the objects to detections, from 0 to 1, below which a sensor stands: nothing is looked for."""
 LEAST_MOTION: Final = (0.25, 1.0)
@@ -67,7 +67,7 @@ LEAST_MOTION: Final = (0.25, 1.0)
 FASTEST: Final = (30.0, 0.6)
 """Speed, m/s, and turn rate, rad/s, that a motion is looked for up to."""
 CHANGE: Final = (6.0, 1.5)
-"""Acceleration, m/s^2, and that of the turn, rad/s^2, by which a motion may differ from the guess."""
+"""Acceleration, m/s^2, and angular acceleration, rad/s^2, by which a motion may differ from the guess."""
 TWO: Final = 2.0
 """Weight, in points, from which a motion is fitted."""
 SHORTEST_S: Final = 0.005
@@ -79,7 +79,7 @@ UNKNOWN: Final = 3.0
 APART: Final = 0.35
 """Standard deviation of the distance between an object and its next detection, m."""
 TURNED: Final = 0.1
-"""That of the axis of a box, rad."""
+"""Standard deviation of the axis of a box, rad."""
 MOST_SIDEWAYS: Final = 2.0
 """Evidence that an object gives at most."""
 FITTED: Final = 1.5
@@ -113,13 +113,9 @@ class Pairs(NamedTuple):
 
 
 def follow_sensor(density: Density, frame: Frame, table: ClassTable) -> Density:
-    """Carry a density into the axes of a frame without a pose, with the motion of the sensor found on the way.
+    """Find the motion of the sensor and carry a density into the axes of the frame.
 
-    Arguments of its own:
-        frame: with boxes in the axes of the sensor; a frame with a pose ends what was known of the motion.
-
-    Returns:
-        The density, the same where the sensor stands.
+    The density stays where the sensor stands. A frame with a pose ends the estimate.
     """
     dt = (frame.stamp_ns - density.stamp_ns) * 1e-9
     if density.stamp_ns == NO_FRAME or dt < SHORTEST_S:
@@ -146,12 +142,12 @@ def follow_sensor(density: Density, frame: Frame, table: ClassTable) -> Density:
     if found is not None and after.sensor_motion is not None:
         return _carried(after if before is not None else _over_ground(after, found, dt, frame), found, dt)
     if before is not None and together(pairs, np.zeros(3)).sum() < SHARE * len(rows):
-        return _carried(density, before, dt)  # neither gone on nor stopped: the next frame may tell
+        return _carried(density, before, dt)  # neither continued nor stopped: left to the next frame
     return after
 
 
 def _continued(pairs: Pairs, driven: Array, guess: Array, dt: float) -> Array | None:
-    """Return the motion near that of the frame before, which stays where there are few objects; None if it is gone."""
+    """Return the motion near the guess, the guess itself where there are few objects; None without any."""
     start = pairs.start + np.where(np.hypot(*driven.T)[:, None] > MOVING * dt, driven, 0.0)
     reach, turn, trust = 1.0 + CHANGE[0] * dt * dt, 0.02 + CHANGE[1] * dt * dt, (0.15 / (0.05 + dt * dt)) ** 2
     found, count, _ = common_motion(pairs._replace(start=start), guess, reach, turn, trust)
@@ -161,7 +157,7 @@ def _continued(pairs: Pairs, driven: Array, guess: Array, dt: float) -> Array | 
 
 
 def _begun(pairs: Pairs, dt: float) -> Array | None:
-    """Return a motion that a sensor may have begun; None where it stands, for all that can be told."""
+    """Return a motion that a sensor may have begun; None where it seems to stand."""
     start, few = pairs.start, len(pairs.start) < CREW
     apart = 1.0 - together(pairs, np.zeros(3))
     if few or apart.sum() < STILL * len(start) or np.hypot(*start.T).mean() > FARTHEST:
@@ -177,7 +173,7 @@ def _begun(pairs: Pairs, dt: float) -> Array | None:
 def _weighed(
     density: Density, pairs: Pairs, ahead: Array, free: NDArray[np.bool_], motion: Array, dt: float, table: ClassTable
 ) -> Density:
-    """Return a density with a motion and the evidence for it, which goes on from one that is alike."""
+    """Return a density with a motion and its evidence, which adds to the evidence of a similar motion before."""
     cos, sin = math.cos(motion[2]), math.sin(motion[2])
     turned = ahead @ np.array([[cos, sin], [-sin, cos]])
     reach = (UNKNOWN * dt * table["birth_unknown"][:, V])[pairs.label]
@@ -195,7 +191,7 @@ def _weighed(
 
 
 def _drives(motion: Array, dt: float) -> bool:
-    """Tell whether a vehicle can have made a motion: forwards along an axis of the sensor, not too fast for a bend."""
+    """Tell whether a vehicle can have made a motion: forwards along an axis of the sensor, not too fast in a bend."""
     way, half = math.hypot(motion[0], motion[1]), 0.5 * motion[2]
     x = math.cos(half) * motion[0] + math.sin(half) * motion[1]
     y = math.cos(half) * motion[1] - math.sin(half) * motion[0]
@@ -203,7 +199,7 @@ def _drives(motion: Array, dt: float) -> bool:
 
 
 def _over_ground(density: Density, motion: Array, dt: float, frame: Frame) -> Density:
-    """Return a density whose speeds, learnt as those in the axes of the sensor, are those over ground."""
+    """Return a density whose speeds, learnt in the axes of the sensor, are over ground."""
     objects = density.bernoulli
     if np.isfinite(frame.velocity).any():
         return density
@@ -212,7 +208,7 @@ def _over_ground(density: Density, motion: Array, dt: float, frame: Frame) -> De
     along = apparent[:, 0] * np.cos(mean[:, PHI]) + apparent[:, 1] * np.sin(mean[:, PHI])
     mean[:, V] -= np.where(objects.seen_ns > objects.born_ns, along, 0.0)
     free = (objects.covariance[:, OMEGA, OMEGA] == 0.0) & (objects.seen_ns > objects.born_ns)
-    if free.any():  # those of unknown heading: their whole velocity
+    if free.any():  # the whole velocity of objects of unknown heading
         v, phi = objects.mean[free, V, None], objects.mean[free, PHI]
         over = v * np.column_stack((np.cos(phi), np.sin(phi))) - apparent[free]
         mean[free, V], mean[free, PHI] = np.hypot(*over.T), np.arctan2(over[:, 1], over[:, 0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias
 
 import numpy as np
 
@@ -19,23 +19,24 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from optipmb.parameters import ClassParameters, Parameters
+    from optipmb.rows import Array, Index
 
-    Size = NDArray[np.float64]
-    Spread = NDArray[np.float64]
-    Curve = NDArray[np.float64]
+    Size = Array
+    Spread = Array
+    Curve = Array
 
 
 class ClassRow(Protocol):
-    """What kernels read of a class; names as in `optipmb.parameters.ClassParameters`, where they are described.
+    """Parameters of a class for kernels; names as in `optipmb.parameters.ClassParameters`, where they are described.
 
     Attributes:
         group: the first class of the group, the class itself without one.
         group_size: G, how many classes the group has.
-        suppressed_with: the first class of those that eta_iou compares with it.
+        suppressed_with: the first of the classes that eta_iou compares with it.
         clutter_intensity: lambda_c = mu_c / A, 1/m^2.
         birth_intensity: mu_b0 / A, 1/m^2.
         acceleration_time: time constant of the acceleration, s, infinite where it is constant.
-        constant_velocity: whether the motion model is that of constant velocity.
+        constant_velocity: whether the motion model is constant velocity.
         default_size: (3,) length, width and height of an object of which they are unknown, m.
         process_noise: (6,) standard deviations in state order, per square root of a second.
         noise_position: standard deviation of z_x and z_y.
@@ -54,7 +55,7 @@ class ClassRow(Protocol):
         missed_evidence: l_miss.
         score_of_evidence: weight of the evidence in the score.
         factor_speed: on the standard deviation of the published speed.
-        factor_turn_rate: on that of the published turn rate.
+        factor_turn_rate: on the standard deviation of the published turn rate.
         knots: number of knots of the calibration, zero without one.
         knot_evidence: (`MAX_KNOTS`,) where its curves bend, ascending; this and the next are zero from `knots` on.
         knot_existence: (`MAX_KNOTS`,) existence probability there.
@@ -120,6 +121,9 @@ class ClassRow(Protocol):
     knot_across: Curve
 
 
+Classes: TypeAlias = "Sequence[ClassRow]"
+"""(C,) rows of a table, for kernels."""
+
 _TYPES: Final = MappingProxyType(
     {
         "float": np.float64,
@@ -141,7 +145,7 @@ OUT_OF_REACH: Final = 2.0
 
 @dataclass(frozen=True, slots=True)
 class ClassTable:
-    """The classes of a profile, and what it says of all of them.
+    """The classes of a profile and the parameters common to them.
 
     Attributes:
         classes: (C,) array of `CLASS`, for kernels; `table["gate"]` is a column of it.
@@ -154,20 +158,20 @@ class ClassTable:
     classes: Sequence[ClassRow]
     period: float
     detection_time: float
-    confusion: NDArray[np.float64]
-    attention: NDArray[np.float64] | None
+    confusion: Array
+    attention: Array | None
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         column: NDArray[Any] = np.asarray(self.classes)[name]
         return column
 
-    def known_boxes(self, label: NDArray[np.int64], auxiliary: NDArray[np.float64]) -> NDArray[np.float64]:
+    def known_boxes(self, label: Index, auxiliary: Array) -> Array:
         """Return x_A of objects (N, 4), with the usual values of their classes in place of unknown ones."""
         unknown = np.isnan(auxiliary)
         if not unknown.any():
             return auxiliary
         usual = self["default_size"][label]
-        size: NDArray[np.float64] = np.where(unknown[:, :3], usual, auxiliary[:, :3])
+        size: Array = np.where(unknown[:, :3], usual, auxiliary[:, :3])
         return np.column_stack((size, np.where(unknown[:, 3], 0.5 * size[:, 2], auxiliary[:, 3])))
 
     def copy(self) -> ClassTable:
@@ -222,7 +226,7 @@ def usual_size(name: str) -> tuple[float, float, float]:
     return _USUAL.get(common_name(name) or "", (1.5, 1.5, 1.5))
 
 
-def _confusion(classes: Any, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
+def _confusion(classes: Any, kappa: Array) -> Array:
     """Return Lambda: 1 - kappa_c on the diagonal, kappa_c / (G - 1) for the other classes of the group of c."""
     group, size = classes["group"], classes["group_size"]
     if not (size > 1).any():

@@ -23,7 +23,7 @@ from optipmb.density import (
 )
 from optipmb.detection_probability import detection_probability
 from optipmb.errors import FrameError, ParameterError
-from optipmb.extract import extract
+from optipmb.extract import Tracks, extract
 from optipmb.field_of_view import follow_looks, look
 from optipmb.hypotheses import UNLIMITED, check_effort, local_hypotheses
 from optipmb.lightweight import light_weight_filter
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from optipmb.extract import Tracks
     from optipmb.frame import Frame
     from optipmb.paths import PredictedPaths
     from optipmb.rows import Array, Columns, Index
@@ -52,13 +51,13 @@ if TYPE_CHECKING:
 
 
 class Prior(NamedTuple):
-    """The prediction as kernels take it.
+    """Prediction in the form of kernels.
 
     Attributes:
         objects: array of the predicted objects.
         missed_from_ns: `Density.missed_from_ns` of them.
         class_probability: (N, C) their class posteriors, (N, 0) where no classes have a group in common.
-        components: array of the predicted Poisson components; behind them, without HABM, are those of the measurements.
+        components: array of the predicted Poisson components; without HABM the measurements' are behind them.
         n_predicted: how many of them were predicted.
         next_id: id of the first new object.
     """
@@ -101,14 +100,9 @@ class Update(NamedTuple):
 def update(
     prior: Columns, p_d: Array, measurements: Columns, moment: Columns, confusion: Array, classes: Sequence[ClassRow]
 ) -> Columns:
-    """Update the prediction with the measurements, and return the fields of `Update`.
+    """Update the prediction with the measurements: from the fields of the named tuples to the fields of `Update`.
 
-    Arguments of its own:
-        prior: the fields of `Prior`.
-        p_d: (N + J,) detection probabilities of the objects and, behind them, of the components.
-        measurements: those of `Measurements`.
-        moment: those of `Moment`.
-        confusion: (C, C) Lambda of `optipmb.class_posterior`, (0, 0) where no classes have a group in common.
+    `p_d` (N + J,) is of the objects and, behind them, of the components; `confusion` as in `optipmb.table.ClassTable`.
     """
     given, z, now = Prior(*prior), Measurements(*measurements), Moment(*moment)
     objects, components = objects_in(given.objects), components_in(given.components)
@@ -118,7 +112,7 @@ def update(
     # Local hypotheses: missed, detected, first-time detected; HABM
     hypotheses = local_hypotheses(objects, components, p_d, z, groups, now.dt, classes)
 
-    # Data association: the best global hypothesis, and what of it outlives the pruning of the MB
+    # Data association: the best global hypothesis, and the objects that outlive the pruning of the MB
     row, measurement, cost = hypotheses.row, hypotheses.measurement, hypotheses.detection_cost
     assigned = associate(row, measurement, cost, hypotheses.first_cost, count)
     forbid_births(objects, assigned, hypotheses, z, since_ns, now, classes)
@@ -162,7 +156,7 @@ class Modules:
 
 @record
 class Diagnostics:
-    """What happened in a step, beside the tracks.
+    """Counts of one step.
 
     Attributes:
         cloud_used: whether a point cloud took part in p_d.
@@ -185,16 +179,16 @@ class Diagnostics:
 
 @record
 class StepResult:
-    """What a step gives.
+    """Result of a step.
 
     Attributes:
         density: the posterior.
         tracks: the extracted tracks.
-        diagnostics: what happened.
+        diagnostics: counts.
         paths: predicted paths of the tracks, where the profile has horizons.
         class_probability: (N, C) of each track and class, where classes have a group in common.
-        measured: (N,) uint8, what of each track is known: 1 the heading, by a detection or by its motion, 2 the size,
-            4 the height, added up; the rest are stand-ins. None: everything of all.
+        measured: (N,) uint8, the known parts of each track: 1 the heading, by a detection or by its motion, 2 the size,
+            4 the height, added up; defaults stand for the others. None: everything of all tracks is known.
     """
 
     density: Density
@@ -263,8 +257,8 @@ class Tracker:
             The posterior, the tracks and diagnostics. The same arguments give the same bytes.
 
         Raises:
-            FrameError: the stamp of the frame is before that of the density, or the classes of the frame or of the
-                density are not those of the parameters.
+            FrameError: the frame is older than the density, or the classes of the frame or of the density differ from
+                those in the parameters.
             DensityError: the parts of the density do not fit together, or a label is of no class.
             EffortError: the frame needs more than `max_pairs` pairs looked at; nothing costly was done yet.
         """
@@ -289,7 +283,7 @@ class Tracker:
             z.yaw[:] = np.nan
         check_effort(predicted, z, moment.dt, table, self._max_pairs)
 
-        # Detection probabilities p_d(x_+) of what is in view
+        # Detection probabilities p_d(x_+), zero out of view
         announces = not modules.habm and self.parameters.starts_tracks
         prior = with_measurement_births(predicted, z, table) if announces else predicted
         looks, prior = look(frame.field_of_view, prior, moment, table)
@@ -320,7 +314,8 @@ class Tracker:
             posterior = replace(posterior, sensor=density.sensor)
 
         # Track extraction
-        tracks = extract(posterior, after.measurement, z, moment, table, two_thresholds=modules.ote)
+        shown = objects.words, posterior.missed_from_ns, after.measurement, tuple(z), tuple(moment)
+        tracks = Tracks.of(extract(*shown, modules.ote, table.classes))
         paths = paths_of(tracks, self._horizons, table) if self._horizons.size else None
         pi = None if pi is None else pi[np.searchsorted(objects.id, tracks.id)]
         removed, repaired = (frame.score.shape[0], below_score, suppressed), repaired + after.repaired

@@ -1,4 +1,4 @@
-"""The Poisson intensity of undetected objects after a frame: what stays of it, and what is born (eq. PPP Update).
+"""The Poisson intensity of undetected objects after a frame: surviving components and births (eq. PPP Update).
 
 Redundant components go (RPP, Section IV.H), and measurements that were taken for clutter announce objects that later
 frames may find (hybrid adaptive birth model, HABM, Section IV.G).
@@ -97,13 +97,9 @@ def with_births(
     stamp_ns: int,
     classes: Sequence[ClassRow],
 ) -> Array:
-    """Return the array of the components that stay and, behind them, of those that are born.
+    """Return the array of the components in `kept` (K,) and, behind them, of births by measurements (L,).
 
-    Arguments of its own:
-        components: the components.
-        kept: (K,) which of them stay.
-        born: (L,) measurements that make a component each.
-        weight: (K + L,) weights of all.
+    `weight` (K + L,) has the weights of all.
     """
     old, count = kept.shape[0], weight.shape[0]
     words = np.empty(count * COMPONENT)

@@ -2,13 +2,13 @@
 
 The update runs for the pairs of the best global hypothesis only: costs need the position alone. z_M = [x, y, v_x, v_y,
 phi] = H(x_M) + w (eq. Single Object Measurement Model); a detection without velocity leaves the two velocity rows out,
-and H is then linear. Sigma points and square root are those of `optipmb.predict`. The innovation of phi is taken modulo
+and H is then linear. Sigma points and square root are as in `optipmb.predict`. The innovation of phi is taken modulo
 pi, in (-pi/2, pi/2]; the sign of the heading is followed apart (`optipmb.lightweight`).
 
 A birth starts at the measurement: m^0 = [z_x, z_y, speed, heading, 0, 0] under P^0 of its class, with speed and heading
 of the measured velocity. Two cases that the paper leaves open: without a velocity the object starts with the detected
 heading and v = 0 under a wide prior; and the direction of a velocity slower than `birth_heading_speed` is mostly noise,
-so the heading is that of the box and the speed is the velocity along it.
+so the box gives the heading, and the speed is the velocity along it.
 
 A detection without heading (NaN) leaves the last row out. An object is born without heading then, and stays so until
 one is known (`optipmb.unknown_heading`).
@@ -30,13 +30,11 @@ from optipmb.predict import ORDER, SPREAD, WEIGHT, heading_unknown, square_root,
 from optipmb.unknown_heading import LOST, face_along, find_heading, lose_heading, take_heading
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from optipmb.density import Poissons
     from optipmb.hypotheses import Hypotheses
     from optipmb.preprocess import Measurements
     from optipmb.rows import Array, Index
-    from optipmb.table import ClassRow
+    from optipmb.table import Classes
 
     Buffers = tuple[Array, Array, Array, Array, Array, Array]
 
@@ -64,17 +62,13 @@ def ukf_updates(
     mean: Array,
     covariance: Array,
     measurements: Measurements,
-    classes: Sequence[ClassRow],
+    classes: Classes,
     mean_out: Array,
     covariance_out: Array,
 ) -> int:
-    """Update states with the measurement of each; a negative measurement leaves the state as predicted.
+    """Update the states `row` (K,) with their measurements; a negative measurement leaves the state as predicted.
 
-    Arguments of its own:
-        row: (K,) state that each result is made of; where it is `NEW`, there is none, and nothing is written.
-        measurement: (K,) index of the associated measurement, or negative.
-        mean_out: (K, 6) receives the posterior means.
-        covariance_out: (K, 6, 6) receives the posterior covariances.
+    Nothing is written where `row` is `NEW`.
 
     Returns:
         How many covariances had to be repaired.
@@ -129,9 +123,7 @@ def ukf_update(
         z: (5,) z_M; NaN at 2 and 3 where the velocity is unknown, at 4 where the heading is.
         sigma: (6,) standard deviations of the measurement noise, ``R = diag(sigma^2)``, and last the covariance of z_x
             and z_y in R.
-        buffers: of `workspace`; what they hold does not matter.
-        mean_out: (6,) receives m.
-        covariance_out: (6, 6) receives P.
+        buffers: of `workspace`, with any content.
 
     Returns:
         Number of pivots that had to be repaired.
@@ -231,15 +223,11 @@ def ukf_update(
 
 @kernel
 def birth_states(
-    rows: Index, measurements: Measurements, classes: Sequence[ClassRow], mean_out: Array, covariance_out: Array
+    rows: Index, measurements: Measurements, classes: Classes, mean_out: Array, covariance_out: Array
 ) -> None:
-    """Compute m^0 and P^0 of the measurements in `rows` (eq. Newborn Hypothesis).
+    """Compute m^0 and P^0 of the measurements in `rows` (K,) (eq. Newborn Hypothesis).
 
-    Arguments of its own:
-        rows: (K,) measurements.
-        measurements: Z_k; where it has rho of `optipmb.frame`, P^0_xy is that of the class times rho.
-        mean_out: (K, 6) receives the means.
-        covariance_out: (K, 6, 6) receives the covariances, diagonal but for x and y.
+    P^0 is diagonal, but rho of `optipmb.frame` scales its part of x and y.
     """
     position, velocity, yaw = measurements.position, measurements.velocity, measurements.yaw
     own_noise = position.shape[1] > PLAIN
@@ -259,12 +247,8 @@ def birth_states(
             else:
                 speed = velocity[m, 0] * math.cos(heading) + velocity[m, 1] * math.sin(heading)
         mean_out[k] = 0.0
-        mean_out[k, 0], mean_out[k, 1], mean_out[k, 2], mean_out[k, 3] = (
-            position[m, 0],
-            position[m, 1],
-            speed,
-            wrap(heading),
-        )
+        mean_out[k, 0], mean_out[k, 1] = position[m, 0], position[m, 1]
+        mean_out[k, 2], mean_out[k, 3] = speed, wrap(heading)
         covariance_out[k] = 0.0
         for s in range(STATE):
             covariance_out[k, s, s] = spread[s] * spread[s]
@@ -284,127 +268,80 @@ def first_detected_states(
     hypotheses: Hypotheses,
     components: Poissons,
     measurements: Measurements,
-    classes: Sequence[ClassRow],
+    classes: Classes,
     mean_out: Array,
     covariance_out: Array,
 ) -> int:
-    """Compute the states of the objects that the measurements in `rows` detect for the first time.
+    """Compute the states of the objects that the measurements in `rows` (K,), none of them clutter, detect first.
 
     A newborn is N(m^0, P^0) (eq. Newborn Hypothesis). An announced object is the mixture of its components J^m, each
     updated by the measurement, with weights ``e^j / e``, matched by one Gaussian (eq. First-Time Detection Hypothesis
     Update 1).
-
-    Arguments of its own:
-        rows: (K,) measurements, none of them clutter.
-        mean_out: (K, 6) receives the means.
-        covariance_out: (K, 6, 6) receives the covariances.
 
     Returns:
         How many covariances had to be repaired.
     """
     first_kind, announced, log_e = hypotheses.first_kind, hypotheses.announced, hypotheses.log_e
     birth_states(rows, measurements, classes, mean_out, covariance_out)
-    wanted, count = np.empty(rows.shape[0], np.int64), 0
-    for k in range(rows.shape[0]):
-        if first_kind[rows[k]] == FROM_POISSON:
-            wanted[count] = k
-            count += 1
-    if count == 0:
-        return 0
-    wanted = wanted[:count]
     # The pairs of each measurement, one measurement after the other.
     first = np.zeros(first_kind.shape[0] + 1, np.int64)
     for m in announced:
         first[m + 1] += 1
     for m in range(first_kind.shape[0]):
         first[m + 1] += first[m]
-    fill = first.copy()
-    of_measurement = np.empty(announced.shape[0], np.int64)
+    fill, of_measurement = first.copy(), np.empty(announced.shape[0], np.int64)
     for pair in range(announced.shape[0]):
         of_measurement[fill[announced[pair]]] = pair
         fill[announced[pair]] += 1
 
-    # The mixtures, one after the other, with weights e^j / e; the largest e^j of each is taken out first.
-    start = np.zeros(wanted.shape[0] + 1, np.int64)
-    pairs = np.empty(announced.shape[0], np.int64)
-    weight = np.empty(announced.shape[0])
-    for i in range(wanted.shape[0]):
-        m = rows[wanted[i]]
-        begin, end = start[i], start[i] + first[m + 1] - first[m]
-        start[i + 1] = end
-        largest, others = -math.inf, 0.0
-        for k in range(begin, end):
-            pairs[k] = of_measurement[first[m] + k - begin]
-            largest = max(largest, log_e[pairs[k]])
-        for k in range(begin, end):
-            weight[k] = math.exp(log_e[pairs[k]] - largest)
-            if k > begin:
-                others += weight[k]
-        total = weight[begin] + others  # in the order in which numpy adds a few numbers
-        for k in range(begin, end):
-            weight[k] /= total
-
-    pairs = pairs[: start[-1]]
-    parts, spreads = np.empty((pairs.shape[0], STATE)), np.empty((pairs.shape[0], STATE, STATE))
-    repaired = ukf_updates(
-        hypotheses.component[pairs],
-        announced[pairs],
-        components.mean,
-        components.covariance,
-        measurements,
-        classes,
-        parts,
-        spreads,
-    )
-    matched, matched_spread = np.empty((wanted.shape[0], STATE)), np.empty((wanted.shape[0], STATE, STATE))
-    moment_match(start, weight, parts, spreads, matched, matched_spread)
-    for i in range(wanted.shape[0]):
-        copy_state(matched, matched_spread, i, mean_out, covariance_out, wanted[i])
+    repaired = 0
+    for k in range(rows.shape[0]):
+        m = rows[k]
+        if first_kind[m] != FROM_POISSON:
+            continue
+        pairs = of_measurement[first[m] : first[m + 1]]
+        parts, spreads = np.empty((pairs.shape[0], STATE)), np.empty((pairs.shape[0], STATE, STATE))
+        given = hypotheses.component[pairs], announced[pairs], components.mean, components.covariance
+        repaired += ukf_updates(*given, measurements, classes, parts, spreads)
+        moment_match(log_e[pairs], parts, spreads, mean_out[k], covariance_out[k])
     return repaired
 
 
 @kernel
-def moment_match(
-    start: Index, weight: Array, mean: Array, covariance: Array, mean_out: Array, covariance_out: Array
-) -> None:
-    """Replace Gaussian mixtures by single Gaussians of the same mean and covariance.
+def moment_match(log_weight: Array, mean: Array, covariance: Array, mean_out: Array, covariance_out: Array) -> None:
+    """Replace a Gaussian mixture (L,) by one Gaussian of the same mean and covariance.
 
     Headings are averaged as differences from the heading of the heaviest component, taken in (-pi, pi]. Where one of
-    them is unknown, the heaviest component stands for all.
-
-    Arguments of its own:
-        start: (K + 1,) where the components of each mixture start.
-        weight: (L,) weights, summing to one within each mixture.
-        mean_out: (K, 6) receives the means.
-        covariance_out: (K, 6, 6) receives the covariances.
+    them is unknown, the heaviest component stands for all. Weights need not sum to one.
     """
-    for k in range(start.shape[0] - 1):
-        first, last = start[k], start[k + 1]
-        heaviest = first
-        for j in range(first, last):
-            if weight[j] > weight[heaviest]:
-                heaviest = j
-        straight = False
-        for j in range(first, last):
-            straight |= heading_unknown(covariance[j])
-        if straight:
-            copy_state(mean, covariance, heaviest, mean_out, covariance_out, k)
-            continue
-        deviation = np.empty((last - first, STATE))
-        shift = np.zeros(STATE)
-        for j in range(first, last):
-            for s in range(STATE):
-                deviation[j - first, s] = mean[j, s] - mean[heaviest, s]
-            deviation[j - first, PHI] = wrap(deviation[j - first, PHI])
-            for s in range(STATE):
-                shift[s] += weight[j] * deviation[j - first, s]
+    count, largest, others, straight = log_weight.shape[0], log_weight.max(), 0.0, False
+    weight = np.empty(count)
+    for j in range(count):
+        weight[j] = math.exp(log_weight[j] - largest)
+        straight |= heading_unknown(covariance[j])
+        if j > 0:
+            others += weight[j]
+    total, heaviest = weight[0] + others, 0  # in the order in which numpy adds a few numbers
+    for j in range(count):
+        weight[j] /= total
+        if weight[j] > weight[heaviest]:
+            heaviest = j
+    if straight:
+        mean_out[:], covariance_out[:] = mean[heaviest], covariance[heaviest]
+        return
+    deviation, shift = np.empty((count, STATE)), np.zeros(STATE)
+    for j in range(count):
         for s in range(STATE):
-            mean_out[k, s] = mean[heaviest, s] + shift[s]
-            for t in range(s + 1):
-                value = 0.0
-                for j in range(first, last):
-                    spread = (deviation[j - first, s] - shift[s]) * (deviation[j - first, t] - shift[t])
-                    value += weight[j] * (covariance[j, s, t] + spread)
-                covariance_out[k, s, t] = value
-                covariance_out[k, t, s] = value
-        mean_out[k, PHI] = wrap(mean_out[k, PHI])
+            deviation[j, s] = mean[j, s] - mean[heaviest, s]
+        deviation[j, PHI] = wrap(deviation[j, PHI])
+        for s in range(STATE):
+            shift[s] += weight[j] * deviation[j, s]
+    for s in range(STATE):
+        mean_out[s] = mean[heaviest, s] + shift[s]
+        for t in range(s + 1):
+            value = 0.0
+            for j in range(count):
+                spread = (deviation[j, s] - shift[s]) * (deviation[j, t] - shift[t])
+                value += weight[j] * (covariance[j, s, t] + spread)
+            covariance_out[s, t] = covariance_out[t, s] = value
+    mean_out[PHI] = wrap(mean_out[PHI])

@@ -27,7 +27,7 @@ from optipmb.zones import Shapes, Zone, crossings, locate
 
 
 def kernels() -> dict[str, Any]:
-    """Return the kernels by name: numba's dispatchers, whose `stats` and `signatures` say what was compiled."""
+    """Return the kernels by name, as numba's dispatchers."""
     loaded = sys.modules.copy()  # not the dictionary itself: other threads may import meanwhile
     return {
         f"{module}.{name}": value
@@ -39,7 +39,7 @@ def kernels() -> dict[str, Any]:
 
 
 def compilations() -> int:
-    """Count what was compiled so far, by this process or for it, because it was not in the cache."""
+    """Count the kernels that were missing in the cache and compiled so far, by this process or for it."""
     here = sum(sum(kernel.stats.cache_misses.values()) for kernel in kernels().values())
     return here + len(compiled.progress.built or ())
 
@@ -59,9 +59,9 @@ def warm_up() -> int:
 
 
 def plan() -> None:
-    """Find out, without compiling, which kernels Python calls with which types of arguments.
+    """Write the kernels that Python calls, with the types of their arguments, to the file that is the argument.
 
-    They go to the file that is the argument, their numbers to the output.
+    Their numbers go to the output. Nothing is compiled.
     """
     _run()
     largest = f"{update.__module__}.{update.__name__}"
@@ -94,7 +94,7 @@ def _run() -> None:
     posterior = tracker.initial()
     pose = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
     cloud = PointCloud(np.zeros((8, 3), np.float32), pose)
-    # A low score announces, a second detection then starts a track from what was announced; two close objects make a
+    # A low score announces, a second detection then starts a track from the announcement; two close objects make a
     # cluster.
     for k, score in enumerate((0.21, 0.21, 0.9, 0.9, 0.9)):
         given, _ = make_frame(

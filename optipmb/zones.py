@@ -192,7 +192,7 @@ def locate(
             x, y, z = center[i]
             p, q = before[i]
             if not closed[k] and not (
-                max(x, p) < left or min(x, p) > right or max(y, q) < low or min(y, q) > high or p != p  # noqa: PLR0124
+                max(x, p) < left or min(x, p) > right or max(y, q) < low or min(y, q) > high or math.isnan(p)
             ):
                 net[i, k] = crossings(shape, p, q, x, y)[0]
             if x < left or x > right or y < low or y > high:

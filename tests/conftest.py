@@ -1,22 +1,17 @@
 """What all tests share: interrupts as in a terminal, and which tests run by a command of their own."""
 
-from __future__ import annotations
-
 import gc
 import signal
+from collections.abc import Generator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import forked
 import hypothesis
 import pytest
 
-if TYPE_CHECKING:
-    from collections.abc import Generator
-
 HERE = Path(__file__).parent
 
-# What a shell starts in the background ignores it, and hands that on to what it starts.
+# Background processes of a shell ignore it, and their children inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 forked.ALLOWED = True
@@ -45,7 +40,6 @@ def pytest_collection() -> Generator[None, object, object]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that run by a command of their own."""
     marker_of = {HERE / name: marker for marker, names in OTHERS.items() for name in names}
     for item in items:
         if item.path in marker_of:

@@ -9,7 +9,7 @@ LOWEST = re.compile(r"(?P<name>[A-Za-z0-9_.-]+)>=(?P<version>[0-9.]+)")
 
 project = tomllib.loads(PROJECT.read_text(encoding="utf-8"))["project"]
 extras = project["optional-dependencies"]
-# What is needed for development alone is no user's.
+# Packages for development alone are not installed by users.
 for requirement in (*project["dependencies"], *(one for name in extras if name != "dev" for one in extras[name])):
     if found := LOWEST.match(requirement):
         print(f"{found['name']}=={found['version']}")

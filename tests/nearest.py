@@ -1,6 +1,6 @@
 """Runs the tests nearest to what changed: `python tests/nearest.py COMMIT`, which may be a branch.
 
-A test file is near when it imports a module that changed; when no test does, those that import a module that imports
+A test file is near when it imports a module that changed; when no test does, tests that import a module that imports
 one, and so on. Of many that are equally near, the namesakes run: a package that imports all its parts brings them all
 near. Tests that changed run too. Files are compared with where the branch left COMMIT; files that are not
 committed count. (Tools that watch which lines a test runs cannot see into compiled kernels.)
@@ -23,7 +23,6 @@ MANY = 8
 
 
 def main(since: str) -> int:
-    """Choose the tests and run them; returns the exit status."""
     tests = sorted(ROOT.glob("tests/*/**/test_*.py"))
     changed = _changed(since)
     imports = {path: _imports(path) for path in _modules() | set(tests)}
@@ -55,7 +54,6 @@ def _modules() -> set[Path]:
 
 
 def _imports(path: Path) -> set[Path]:
-    """Return the files that a file imports."""
     found: set[Path] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -89,7 +87,7 @@ def _nearest(changed: set[Path], imports: dict[Path, set[Path]], tests: set[Path
 
 
 def _namesakes(tests: set[Path], changed: set[Path]) -> set[Path]:
-    """Return the tests with a word in their name that a changed module has in its own, or in that of its folder."""
+    """Return the tests that share a word of their name with a changed module or its folder."""
     words = {word for path in changed for part in (path.parent.name, path.stem) for word in part.split("_")} - {""}
     return {path for path in tests if words & set(path.stem.split("_"))}
 

@@ -1,6 +1,6 @@
 """The first ten minutes of four people: from an empty environment and the wheels to tracks, with what each of it took.
 
-What they type is taken from README.md and docs/messages.md. Nothing of the source tree can be imported.
+The commands come from README.md and docs/messages.md. Nothing of the source tree can be imported.
 Called as: python tests/paths.py DIST [PATH...]
     DIST  folder with the two wheels
     PATH  those to walk: csv python node kitti; default: all
@@ -69,7 +69,6 @@ class Environment:
 
     @staticmethod
     def copy_kernels(source: Path, target: Path) -> None:
-        """Copy machine code, which is kept by the digest of the package's sources, where both folders exist."""
         if source.is_dir() and target.is_dir():
             for file in source.glob("*.nb[ci]"):
                 shutil.copy(file, target)
@@ -88,7 +87,7 @@ class Environment:
         return sum(file.stat().st_blocks for file in files) * 512 / 2**20
 
     def run(self, program: str, *arguments: object, folder: Path | None = None, status: int = 0) -> str:
-        """Run a program of the environment and return what it printed; it must end with the status."""
+        """Run a program of the environment and return its output; it must end with the status."""
         command = [str(self.folder / "bin" / program), *map(str, arguments)]
         done = subprocess.run(
             command,
@@ -104,7 +103,7 @@ class Environment:
         return done.stdout if status == 0 else done.stderr
 
     def start(self, program: str, *arguments: object) -> "subprocess.Popen[str]":
-        """Start a program of the environment; what it says on standard error goes into a file."""
+        """Start a program of the environment; its standard error goes into a file."""
         command = [str(self.folder / "bin" / program), *map(str, arguments)]
         with (self.work / f"{program}.log").open("w") as log:
             return subprocess.Popen(
@@ -119,12 +118,10 @@ class Environment:
 
 
 def said(text: str) -> None:
-    """Print a line, at once."""
     print(text, flush=True)
 
 
 def timed(what: str, call: Callable[[], str]) -> str:
-    """Return what a call returns, and print how long it took."""
     began = time.monotonic()
     result = call()
     said(f"  {what}: {time.monotonic() - began:.1f} s")
@@ -132,7 +129,6 @@ def timed(what: str, call: Callable[[], str]) -> str:
 
 
 def blocks(text: str, language: str, mark: str) -> str:
-    """Return the one code block of a page that contains a text."""
     (found,) = (one for one in re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE) if mark in one)
     return found
 
@@ -144,7 +140,6 @@ def checked(claim: object, text: str) -> None:
 
 
 def write_cars(path: Path) -> None:
-    """Write the detections of two cars at 10 Hz, as a user's own program would."""
     with path.open("w", newline="") as file:
         out = csv.writer(file)
         out.writerow(["time", "x", "y", "z", "length", "width", "height", "heading", "confidence", "category"])
@@ -251,7 +246,6 @@ PATHS = {"csv": csv_in_and_out, "python": python, "node": node, "kitti": kitti}
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Walk the paths."""
     folder, *names = arguments
     (wheel,) = Path(folder).resolve().glob("optipmb-*.whl")
     (node_wheel,) = Path(folder).resolve().glob("optipmb_node-*.whl")

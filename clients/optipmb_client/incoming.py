@@ -19,7 +19,8 @@ _Message = TypeVar("_Message", bound=Message)
 class Arrival:
     """A message as it came in: key, payload, Zenoh encoding, and the monotonic time of its arrival in nanoseconds.
 
-    `after_loss` says whether messages of this key before it are lost.
+    `after_loss` says whether messages of this key before it are lost. `traceparent` is the trace context that came
+    along, unchecked.
     """
 
     key: str
@@ -27,6 +28,7 @@ class Arrival:
     encoding: str
     monotonic_ns: int
     after_loss: bool = field(default=False, kw_only=True)
+    traceparent: str = field(default="", kw_only=True)
 
     def read(self, kind: type[_Message]) -> _Message:
         """Return the message, checked.

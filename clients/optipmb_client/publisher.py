@@ -21,6 +21,7 @@ from optipmb_schemas import PREFIX, Detections, FieldOfView, Keys, MessageError,
 from optipmb_schemas.arrays import ArrayLike, numeric
 
 from optipmb_client.links import Link, linked
+from optipmb_client.trace_context import attachment_of, current_traceparent
 
 if TYPE_CHECKING:
     from optipmb_client.grpc.streams import GrpcSender
@@ -38,7 +39,8 @@ class Publisher:
 
     Messages are checked first: a wrong shape or value raises `MessageError`, with the path of the field, before
     anything is sent. Detections are kept for some 20 s, so that a service that restarts or loses its link gets them
-    still. Publishing does not wait. One publisher may be used from several threads.
+    still. Publishing does not wait. One publisher may be used from several threads. Messages carry the trace context of
+    the OpenTelemetry span that is active where they are published, if there is one.
 
     Args:
         stream: Name of the stream, `site/node/sensor`. One publisher per stream at a time.
@@ -149,7 +151,7 @@ class Publisher:
             position_covariance: (M, 3, 3), of the errors of the centres; NaN for an object for which the noise of the
                 profile holds. None: it holds for all.
             relocation: With the first frame after a loop closure or a change of map: the motion (translation (3,),
-                quaternion of a turn about z) from the world frame before to that of this message and of all later ones.
+                quaternion of a turn about z) from the world frame before to the frame of this and all later messages.
                 The service moves its tracks so, and they keep their ids.
 
         Returns:
@@ -190,11 +192,12 @@ class Publisher:
                 else _array("position_covariance", position_covariance, 3, 3),
             )
             payload = self._detections.pack(message)
+            attachment = attachment_of(current_traceparent())
             if cloud is not None:
-                self._points.put(cloud)
+                self._points.put(cloud, attachment)
                 self._points_seq += 1
             self.last_put_ns = time.monotonic_ns()
-            self._detections.put(payload)
+            self._detections.put(payload, attachment)
             self._seq += 1
             self._relocation = world
             return message.seq
@@ -213,7 +216,8 @@ class Publisher:
         with self._order:
             if not self.points_wanted:
                 return None
-            self._points.put(self._encode_points(stamp_ns, points, pose))
+            cloud = self._encode_points(stamp_ns, points, pose)
+            self._points.put(cloud, attachment_of(current_traceparent()))
             self._points_seq += 1
             return self._points_seq - 1
 

@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Self
+from typing import Self, TypeVar
 
-from optipmb_schemas import PREFIX, Events, Keys, MessageError, Problem, Topic, Tracks
+from optipmb_schemas import PREFIX, Events, Keys, Message, MessageError, Problem, Topic, Tracks
 
 from optipmb_client.incoming import Arrival, Inbox
 from optipmb_client.links import Link, linked
@@ -22,17 +22,21 @@ __all__ = ["EventSubscriber", "Missed", "Received", "Statistics", "Subscriber"]
 REMEMBERED = 65_536  # frames whose repetition is recognised
 MISSED = 1024  # ranges of lost frames that are kept
 
+_Message = TypeVar("_Message", bound=Message)
+
 
 @dataclass(frozen=True)
 class Received:
     """Tracks, and the monotonic time (`time.monotonic_ns`) at which they arrived on this machine.
 
-    `corrects` says whether they replace earlier tracks of the same frame.
+    `corrects` says whether they replace earlier tracks of the same frame. `traceparent` is the W3C trace context in
+    which the service published them; empty where it records no traces, and over gRPC.
     """
 
     tracks: Tracks
     monotonic_ns: int
     corrects: bool = False
+    traceparent: str = ""
 
 
 @dataclass(frozen=True)
@@ -63,7 +67,7 @@ class Missed:
 
 @dataclass(frozen=True)
 class Statistics:
-    """What a subscriber has seen: messages given out, dropped (the program was too slow), repeated, unreadable.
+    """Messages of a subscriber: given out, dropped (the program was too slow), repeated, not valid, waiting.
 
     `corrected` counts the messages that replaced an earlier one, whether they were given out or not, `missed` the
     ranges of frames whose tracks were lost (`Subscriber.missed`).
@@ -91,6 +95,7 @@ class _Subscription:
         opened: Callable[[], Link],
     ) -> None:
         Keys(prefix).matching(pattern, "tracks")  # checks both
+        self._counts = collections.Counter[str]()
         self._inbox = Inbox(queue)
         self._own = opened() if connection is None else None
         link = connection or self._own
@@ -109,6 +114,21 @@ class _Subscription:
         self._inbox.close()
         if self._own is not None:
             self._own.close()
+
+    @property
+    def statistics(self) -> Statistics:
+        """Counts since the subscriber was made."""
+        names = ("delivered", "repeated", "invalid", "corrected", "missed")
+        counts = {name: self._counts[name] for name in names}
+        return Statistics(dropped=self._inbox.dropped, pending=self._inbox.pending, **counts)
+
+    def _read(self, arrival: Arrival, kind: type[_Message]) -> _Message | None:
+        """Return the message that arrived; None for one that is not valid, which is counted."""
+        try:
+            return arrival.read(kind)
+        except MessageError:
+            self._counts["invalid"] += 1
+            return None
 
 
 class EventSubscriber(_Subscription):
@@ -148,11 +168,10 @@ class EventSubscriber(_Subscription):
     def __iter__(self) -> Iterator[Events]:
         """Iterate over the messages until `timeout` or `close`."""
         while (arrival := self._inbox.get(self.timeout)) is not None:
-            try:
-                message = arrival.read(Events)
-            except MessageError:  # of somebody else
-                continue
-            yield from self._streams[message.stream].take(message) if self._final else (message,)
+            if (message := self._read(arrival, Events)) is not None:
+                for one in self._streams[message.stream].take(message) if self._final else (message,):
+                    self._counts["delivered"] += 1
+                    yield one
 
 
 class Subscriber(_Subscription):
@@ -175,6 +194,8 @@ class Subscriber(_Subscription):
         on_problem: Called with each `Problem` that the service reports for these streams (refused messages and the
             like), by the thread that iterates.
         corrections: Whether messages that replace earlier ones are given out too.
+        predict: Receive tracks predicted to now, at a fixed rate, of the streams in the setting `outputs`: each
+            message replaces the one before, and none is kept for late subscribers.
         queue: Number of messages that may wait.
         config: A Zenoh configuration file, for TLS, passwords and the like; for gRPC the folder of the certificates.
         connection: Share an open connection (it stays open) in the place of `connect` and `config`.
@@ -194,6 +215,7 @@ class Subscriber(_Subscription):
         timeout: float | None = None,
         on_problem: Callable[[Problem], None] | None = None,
         corrections: bool = True,
+        predict: bool = False,
         queue: int = 1024,
         config: str | Path | None = None,
         connection: "Link | None" = None,
@@ -204,14 +226,10 @@ class Subscriber(_Subscription):
         self._on_problem = on_problem
         self._merging = Merging(REMEMBERED)
         self._corrections = corrections
-        self._corrected = 0
-        self._delivered = 0
-        self._repeated = 0
-        self._invalid = 0
         self._newest: dict[tuple[str, str | None], tuple[bytes, int, int]] = {}
         self._missed: collections.deque[Missed] = collections.deque(maxlen=MISSED)
-        self._missed_count = 0
-        topics: tuple[Topic, ...] = ("tracks",) if on_problem is None else ("tracks", "problems")
+        tracks: Topic = "now" if predict else "tracks"
+        topics: tuple[Topic, ...] = (tracks,) if on_problem is None else (tracks, "problems")
         opened = partial(linked, connect, config=config, timeout=connect_timeout)
         super().__init__(pattern, topics, queue, prefix, connection, opened)
 
@@ -228,27 +246,21 @@ class Subscriber(_Subscription):
             arrival = self._inbox.get(left)
             if arrival is None:
                 return None
-            if (tracks := self._read(arrival)) is not None:
+            if arrival.key.endswith("/problems"):
+                if (problem := self._read(arrival, Problem)) is not None and self._on_problem is not None:
+                    self._on_problem(problem)
+            elif (tracks := self._read(arrival, Tracks)) is not None:
+                if tracks.predicted_to_ns is not None:
+                    self._counts["delivered"] += 1
+                    return Received(tracks, arrival.monotonic_ns)
                 self._look_for_missed(tracks, after_loss=arrival.after_loss)
                 novelty = self._merging.take(tracks)
-                self._repeated += novelty is Novelty.REPEATED
-                self._corrected += novelty is Novelty.CORRECTION
-                if novelty is Novelty.NEW or (novelty is Novelty.CORRECTION and self._corrections):
-                    self._delivered += 1
-                    return Received(tracks, arrival.monotonic_ns, corrects=novelty is Novelty.CORRECTION)
-
-    @property
-    def statistics(self) -> Statistics:
-        """Counts since the subscriber was made."""
-        return Statistics(
-            delivered=self._delivered,
-            dropped=self._inbox.dropped,
-            repeated=self._repeated,
-            invalid=self._invalid,
-            pending=self._inbox.pending,
-            corrected=self._corrected,
-            missed=self._missed_count,
-        )
+                corrects = novelty is Novelty.CORRECTION
+                self._counts["repeated"] += novelty is Novelty.REPEATED
+                self._counts["corrected"] += corrects
+                if novelty is Novelty.NEW or (corrects and self._corrections):
+                    self._counts["delivered"] += 1
+                    return Received(tracks, arrival.monotonic_ns, corrects, arrival.traceparent)
 
     @property
     def missed(self) -> tuple[Missed, ...]:
@@ -270,17 +282,4 @@ class Subscriber(_Subscription):
         for run, first, last in ranges:
             if last is None or first <= last:
                 self._missed.append(Missed(*sensor, run, first, last, stamp_ns, tracks.stamp_ns))
-                self._missed_count += 1
-
-    def _read(self, arrival: Arrival) -> Tracks | None:
-        """Return the tracks that arrived; None for problems and other messages."""
-        try:
-            if arrival.key.endswith("/problems"):
-                problem = arrival.read(Problem)
-                if self._on_problem is not None:
-                    self._on_problem(problem)
-                return None
-            return arrival.read(Tracks)
-        except MessageError:
-            self._invalid += 1
-            return None
+                self._counts["missed"] += 1

@@ -119,7 +119,7 @@ def to_world(rotation: Floats, translation: Floats, center: Floats, yaw: Floats)
     """
     heading = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=-1)
     forward = np.einsum("...ij,...j->...i", rotation, heading)
-    flat = np.isnan(center[..., 2])  # of unknown height: at that of the sensor
+    flat = np.isnan(center[..., 2])  # of unknown height: at the sensor's
     moved = np.einsum("...ij,...j->...i", rotation, np.nan_to_num(center) if flat.any() else center) + translation
     moved[flat, 2] = np.nan
     return moved, wrap_angle(np.arctan2(forward[..., 1], forward[..., 0]))

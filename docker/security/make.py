@@ -7,7 +7,7 @@ python3 docker/security/make.py --out tls --router router.local --router 10.0.0.
 A folder for each machine, to be copied there as it is: its key, its certificate, the authority's certificate and a
 `zenoh.json5`. The router's has the access control: who may do what follows from the name (CN) in the certificate.
 Run again, it keeps the authority and every certificate that still holds, and adds what is new; `--renew` makes all
-certificates but the authority's anew. Needs Python and the `openssl` command, nothing else.
+certificates but the authority's again. Needs Python and the `openssl` command, nothing else.
 
 The authority made here is for trials and small fleets: its key lies in `authority/ca.key`, unencrypted. A company's
 own authority can take its place as long as the names in the certificates are the same.
@@ -29,7 +29,7 @@ from typing import Any, Final
 
 CHUNK: Final = re.compile(r"[A-Za-z0-9_.-]+")
 MAX_NAME: Final = 64  # characters of a CN
-SOON_S: Final = 7 * 24 * 3600  # a certificate that ends within a week is made anew
+SOON_S: Final = 7 * 24 * 3600  # a certificate that ends within a week is renewed
 PORT: Final = 7447
 NODE_CHUNKS: Final = 2
 
@@ -46,7 +46,7 @@ class MakeError(Exception):
 
 @dataclass(frozen=True)
 class Role:
-    """One who may link to the router: the name in its certificate, its folder, and what it may send and be sent."""
+    """A party at the router: the name in its certificate, its folder, and the messages it may send and receive."""
 
     name: str
     folder: str
@@ -54,7 +54,7 @@ class Role:
     receives: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...]
 
 
-OUTPUTS = ("tracks", "events", "problems")
+OUTPUTS = ("tracks", "now", "events", "problems")
 
 
 def recoverable(*keys: str) -> tuple[str, ...]:
@@ -63,7 +63,7 @@ def recoverable(*keys: str) -> tuple[str, ...]:
 
 
 def node(prefix: str, name: str, reads: tuple[str, ...] = ()) -> Role:
-    """Give a perception node `site/node`: it publishes for its own sensors, reads what comes of that, and `reads`."""
+    """Give a perception node `site/node`: it publishes for its own sensors, and reads their results, and `reads`."""
     inputs = recoverable(f"{prefix}/{name}/*/detections", f"{prefix}/{name}/*/points")
     outputs = recoverable(*(f"{prefix}/{one}/{topic}" for one in (f"{name}/*", *reads) for topic in OUTPUTS))
     questions = (f"{prefix}/{name}/*/q/*",)
@@ -124,7 +124,7 @@ def viewer(prefix: str, name: str) -> Role:
 
 
 def gateway(prefix: str, name: str) -> Role:
-    """Give a gRPC gateway: it does for its callers what they may do, and looks at their certificates itself."""
+    """Give a gRPC gateway: it acts with its callers' rights, and checks their certificates itself."""
     inputs = recoverable(f"{prefix}/*/*/*/detections", f"{prefix}/*/*/*/points")
     outputs = recoverable(*(f"{prefix}/*/*/*/{topic}" for topic in OUTPUTS))
     questions = (f"{prefix}/*/*/*/q/*", f"{prefix}/service/*/q/status")
@@ -148,7 +148,7 @@ def gateway(prefix: str, name: str) -> Role:
 
 
 def access_control(roles: list[Role]) -> dict[str, Any]:
-    """Give the router's table of who may do what; whoever is not in it may do nothing."""
+    """Give the router's table of permissions; unlisted parties may do nothing."""
     rules, subjects, policies = [], [], []
     for role in roles:
         names = []
@@ -178,7 +178,7 @@ def access_control(roles: list[Role]) -> dict[str, Any]:
 def limits(prefix: str, megabytes: float, rate: float) -> dict[str, Any]:
     """Give the router's limits on what one link sends: bytes of a message, and messages a second of each topic.
 
-    The router has no memory of quiet times: it drops what comes closer than 1 / rate after the message before, from
+    The router has no memory of quiet times: it drops messages closer than 1 / rate after the message before, from
     whichever sensor of the link. So the rate must be far above the sum of the sensors' rates.
     """
     inputs = {topic: f"{prefix}/*/*/*/{topic}" for topic in ("detections", "points")}

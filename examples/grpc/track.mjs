@@ -1,5 +1,5 @@
 // Track over gRPC from the .proto file alone, in Node: a car that drives along x at 10 m/s, seen ten times a second.
-// npm ci --ignore-scripts; node track.mjs tracking.proto
+// npm ci --ignore-scripts; node track.mjs ../../schemas/proto/optipmb/v1/tracking.proto
 import { randomBytes } from "node:crypto";
 import grpc from "@grpc/grpc-js";
 import loader from "@grpc/proto-loader";

@@ -37,6 +37,9 @@ def frame(seq: int) -> pb.TrackRequest:
 
 with grpc.insecure_channel("127.0.0.1:50051") as channel:
     for response in TrackingServiceStub(channel).Track(map(frame, range(50))):
+        if response.HasField("problem"):
+            print("problem", response.problem.message)
+            continue
         tracks = response.tracks
         numbers = struct.unpack(f"<{tracks.id.shape[0]}q", tracks.id.data)
         centers = list(struct.iter_unpack("<3d", tracks.center.data))

@@ -31,6 +31,8 @@ _STREAM: Final = "site/node/sensor"
 EDGE: Final = tuple(json_form.schemas())  # texts of WebSocket and MQTT, in JSON alone
 _CACHED: Final = "Zenoh's advanced publisher: reliable, with a cache for subscribers that come late or miss a message."
 
+_AT_RATE: Final = "Put by the service at the rate of `outputs`, without a cache; dropped under congestion."
+
 
 @dataclass(frozen=True)
 class Channel:
@@ -62,6 +64,7 @@ CHANNELS: Final = {
     "detections": Channel("detections", (_STREAM,), ("Detections",), about=f"Put by the publisher. {_CACHED}"),
     "points": Channel("points", (_STREAM,), ("Points",), about="Put by the publisher; dropped under congestion."),
     "tracks": Channel("tracks", (_STREAM,), ("Tracks",), (), f"Put by the service. {_CACHED}", "send"),
+    "now": Channel("now", (_STREAM,), ("Tracks",), (), _AT_RATE, "send"),
     "events": Channel("events", (_STREAM,), ("Events",), (), f"Put by the service. {_CACHED}", "send"),
     "problems": Channel("problems", (_STREAM,), ("Problem",), (), "Put by the service.", "send"),
     "state": _query("state", (QUERY,), "SessionState"),

@@ -1,6 +1,6 @@
 """JSON of the edges: one object per track, event and problem, for browsers, city platforms and Node-RED.
 
-A text is one frame of a WebSocket, one server-sent event, or the payload of one MQTT message. Numbers are those of the
+A text is one frame of a WebSocket, one server-sent event, or the payload of one MQTT message. Numbers equal the
 messages, rounded; stamps are texts, because 2^63 does not fit a number of JavaScript.
 """
 
@@ -94,6 +94,7 @@ class EdgeTracks(_Frame, frozen=True, tag="tracks", kw_only=True):
     """The tracks of one frame, also when there are none."""
 
     objects: Annotated[list[EdgeTrack], Meta(description="The tracks, ordered by id.")]
+    predicted_to_ns: Annotated[str, Meta(description="Time of the states with `predict`, as text.")] | UnsetType = UNSET
 
 
 class EdgeEvent(_Frame, frozen=True, tag="event", kw_only=True, rename={"name": "class"}):
@@ -151,7 +152,7 @@ EVERYTHING: Final = Selection()
 
 
 def is_confirmed(tracks: Tracks) -> NDArray[np.bool_]:
-    """Return which tracks (N,) are confirmed; without such a column, those that probably exist and were seen twice."""
+    """Return which tracks (N,) are confirmed; without such a column, probable tracks that were seen twice."""
     if tracks.confirmed is not None:
         return np.asarray(tracks.confirmed > 0)
     return np.asarray((tracks.existence > CONFIRMED_EXISTENCE) & (tracks.age > 0.0))
@@ -184,9 +185,9 @@ def tracks_json(tracks: Tracks, selection: Selection = EVERYTHING, place: Place 
     }
     if selection.fields:
         columns |= dict.fromkeys(columns.keys() - selection.fields - {"id"}, repeat(UNSET))
-    return msgspec.json.encode(
-        EdgeTracks(**_about(tracks), objects=[EdgeTrack(*row) for row in zip(*columns.values(), strict=False)])
-    )
+    objects = [EdgeTrack(*row) for row in zip(*columns.values(), strict=False)]
+    time_ns = UNSET if tracks.predicted_to_ns is None else str(tracks.predicted_to_ns)
+    return msgspec.json.encode(EdgeTracks(**_about(tracks), objects=objects, predicted_to_ns=time_ns))
 
 
 def event_json(events: Events, place: Place | None = None) -> list[bytes]:

@@ -1,6 +1,6 @@
 """Zenoh keys: where each message goes. A stream is `site/node/sensor`; chunks are letters, digits and `_ . -`.
 
-<prefix>/<stream>/detections | points | tracks | events | problems     publications
+<prefix>/<stream>/detections | points | tracks | now | events | problems     publications
 <prefix>/<stream>/q/state | q/density | q/tracks | q/zones | q/reset | q/parameters    queries
 <prefix>/owner/<stream>/<instance>                            liveliness: who tracks this stream
 <prefix>/service/<instance>/alive                             liveliness: which services are there
@@ -15,7 +15,7 @@ from typing import Final, Literal, get_args
 from optipmb_schemas.errors import MessageError, invalid
 from optipmb_schemas.model import check_chunk, check_stream
 
-Topic = Literal["detections", "points", "tracks", "events", "problems"]
+Topic = Literal["detections", "points", "tracks", "now", "events", "problems"]
 Query = Literal["state", "density", "tracks", "zones", "reset", "parameters"]
 
 PREFIX: Final = "optipmb/v1"
@@ -42,6 +42,10 @@ class Keys:
     def tracks(self, stream: str) -> str:
         """Return the key of a stream's tracks."""
         return self._topic(stream, "tracks")
+
+    def now(self, stream: str) -> str:
+        """Return the key of a stream's tracks predicted to now, at a fixed rate."""
+        return self._topic(stream, "now")
 
     def events(self, stream: str) -> str:
         """Return the key of the events of a stream's zones and lines."""

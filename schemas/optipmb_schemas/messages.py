@@ -252,6 +252,11 @@ class Tracks(ResultMessage):
         default=None, description="Number of the world frame, which grows with each `relocation`. Absent: 0."
     )
     labels: Labels = Field(description="Names of the classes that `label` counts.")
+    predicted_to_ns: Stamp | None = Field(
+        default=None,
+        description="Time of the states in output at a fixed rate, by the clock of `stamp_ns`; `detection` is -1 where "
+        "it is later. Absent: `stamp_ns`.",
+    )
     id: Annotated[Integers, Array("i8", ("N",), 0, INT64)] = Field(
         description="Identity: unique in the stream, never used again. Ascending."
     )
@@ -364,7 +369,7 @@ def path_fields(horizons: Reals, mean: Reals, covariance: Reals) -> dict[str, Nu
 
 
 def track_fields(**columns: Numeric | None) -> dict[str, Numeric]:
-    """Return further columns of `Tracks`, but for those that are None, as fields.
+    """Return the further columns of `Tracks` that are not None, as fields.
 
     Raises:
         MessageError: they hold numbers that no message may.
@@ -509,7 +514,7 @@ def _is_covariance(matrix: Any) -> Any:
 def _semidefinite(xx: Any, yy: Any, zz: Any, xy: Any, xz: Any, yz: Any) -> Any:
     """Return whether no eigenvalue of a symmetric matrix is negative.
 
-    Cholesky's steps without the divisions: its errors of rounding are in proportion to the largest eigenvalue. Those of
+    Cholesky's steps without the divisions: its rounding errors are in proportion to the largest eigenvalue. Errors of
     a determinant as one sum are in proportion to its cube, and exceed the smallest eigenvalues of a long ellipsoid.
     """
     second, third, mixed = xx * yy - xy * xy, xx * zz - xz * xz, xx * yz - xy * xz

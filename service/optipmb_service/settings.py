@@ -202,7 +202,7 @@ class Ros2Settings(BaseModel):
 
 
 class MqttSettings(BaseModel):
-    """An MQTT broker and what it gets; used by `optipmb-service mqtt`."""
+    """An MQTT broker and its messages; used by `optipmb-service mqtt`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -352,6 +352,21 @@ class ZoneSettings(BaseModel):
         return Zone(name, **values | {"dwell_s": tuple(sorted(self.dwell_s))})
 
 
+class OutputSettings(BaseModel):
+    """Output of the tracks of a stream at a fixed rate, predicted to now."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    rate_hz: float = Field(default=20.0, gt=0, le=50)
+    """messages a second"""
+    delay_s: float = Field(default=0.0, ge=0, le=10)
+    """tracks are predicted to the present minus this"""
+    longest_s: float = Field(default=0.5, gt=0, le=30)
+    """no output while the newest frame is older"""
+    clock: Literal["system", "arrival"] = "system"
+    """what the present is: the system's time (UTC), or the newest stamp plus the time since it arrived"""
+
+
 def _default_instance() -> str:
     """Return a name that two services do not share."""
     host = re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname()[:HOST_CHARACTERS]) or "host"
@@ -491,7 +506,8 @@ class Settings(BaseSettings):
     is replaced"""
     restart_keys: int = Field(default=50_000, ge=100, le=60_000)
     """keys declared on the network after which a process restarts, its sessions continue from the store: Zenoh has
-    65,535 for the life of a process, and each stream that opens takes up to 5, with zones 7"""
+    65,535 for the life of a process, and each stream that opens needs up to 5, 2 more with zones, 1
+    more with `outputs`"""
     grace_s: float = Field(default=1.0, ge=0, le=60)
     """at shutdown, time for frames already received"""
     http: Address = ""
@@ -524,11 +540,15 @@ class Settings(BaseSettings):
     """form of the log lines on stderr"""
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     """lowest level that is logged"""
+    traces: bool = False
+    """record spans of every frame with OpenTelemetry, configured by the variables `OTEL_…`; needs the extra `traces`"""
     sites: dict[str, SiteSettings] = Field(default_factory=dict)
     """place of each site's world frame, by which the live page shows latitude, longitude and true heading"""
     zones: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")], ZoneSettings] = Field(default_factory=dict)
     """polygons and lines whose events are published, by name, at most 256 for a session; equal on all members of a
     cluster"""
+    outputs: dict[Pattern, OutputSettings] = Field(default_factory=dict)
+    """tracks predicted to now, at a fixed rate, by stream pattern (as `garage/*/fused`); the first match applies"""
     ros2: Ros2Settings = Ros2Settings()
     """topics of ROS 2, for `optipmb-service ros2`"""
     mqtt: MqttSettings = MqttSettings()
@@ -553,6 +573,10 @@ class Settings(BaseSettings):
     def readable_by(self, node: str) -> frozenset[str]:
         """Return the sessions of `fused` that a node may read."""
         return frozenset(session for session, one in self.fused_sessions.items() if node in one.read)
+
+    def output_of(self, session: str) -> OutputSettings | None:
+        """Return the output at a fixed rate of a session; None: it has none."""
+        return next((one for pattern, one in self.outputs.items() if fnmatchcase(session, pattern)), None)
 
     def zone(self, name: str, site: str) -> Zone:
         """Return a zone as it is in the world of a site."""

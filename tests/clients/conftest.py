@@ -8,7 +8,6 @@ from routers import free_endpoint, open_router
 
 @pytest.fixture
 def endpoint() -> Iterator[str]:
-    """The endpoint of a router without any service."""
     address = free_endpoint()
     with open_router(address):
         yield address

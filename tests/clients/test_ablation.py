@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from optipmb_tools.cli import run
-from optipmb_tools.tuning import ROWS
+from optipmb_tools.tuning.variants import ROWS
 
 DOCS = Path(__file__).parents[2] / "docs"
 SCENE = ["--dataset", "scene", "--option", "frames=16", "--option", "clouds=0", "--sequences", "0000", "0001"]

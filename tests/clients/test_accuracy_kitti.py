@@ -32,7 +32,7 @@ def calibration(profile: str, detections: str, name: str) -> CalibrationResult:
 
 @pytest.mark.parametrize(("name", "lead"), [("Car", 0.02), ("Pedestrian", 0.04), ("Cyclist", 0.1)])
 def test_kitti_is_tracked_better_than_by_simple_trackers(name: str, lead: float) -> None:
-    """The same detections, the same evaluator: sAMOTA and MOTA lead those of the greedy and of AB3DMOT's tracker."""
+    """With equal detections and evaluator, sAMOTA and MOTA exceed the greedy tracker's and AB3DMOT's."""
     scorers, clips = material("kitti", "pointrcnn")
     own = figures("kitti", "pointrcnn", name)
     for simple in (greedy_tracks, kalman_tracks):
@@ -100,8 +100,6 @@ def test_cars_keep_their_ids_in_slow_streams(name: str, every: int, most: int) -
 
 
 def thinned(clip: Clip, every: int) -> Clip:
-    """Return a clip with each so many frames."""
-
     def rows_of(truth: Truth) -> Truth:
         kept, shown = truth.take(truth.frame % every == 0), truth.regions.frame % every == 0
         regions = Regions(truth.regions.frame[shown] // every, truth.regions.box2d[shown])
@@ -122,7 +120,7 @@ def thinned(clip: Clip, every: int) -> Clip:
     [("pointrcnn", 0.7617), ("second_iou", 0.7765), ("pvrcnn", 0.7686), ("casa", 0.7887), ("virconv", 0.8273)],
 )
 def test_boxes_of_cars_lie_nearer_than_those_of_their_detector(detections: str, motp: float) -> None:
-    """In no direction is the error above that of the detections; MOTP is 0.015 above that of the state's own boxes.
+    """In no direction is the error above the detections' error; MOTP is 0.015 above the boxes of the state.
 
     Headings are backward at most 1.2 times as often as the detector's, and 90 to 98 % of their errors lie within the
     interval of 95 %.

@@ -100,7 +100,7 @@ def test_the_profile_for_megvii_is_what_its_command_gives(tmp_path: Path) -> Non
 def test_calibrated_scores_hold_where_they_were_not_measured(
     name: str, amota: float, before: float, tmp_path: Path
 ) -> None:
-    """AMOTA of Megvii on the six scenes that gave no curve: with its profile, and with that of CenterPoint."""
+    """AMOTA of Megvii on the six scenes not used for its curve, with its own profile and with CenterPoint's."""
     dataset, rules = open_dataset("nuscenes", all_nuscenes(tmp_path), "megvii", clouds=False), rules_of("nuscenes")
     provenance = optipmb.load_profile("nuscenes-megvii").provenance
     sequences = [one for one in dataset.sequences(["all"]) if one.name not in provenance]

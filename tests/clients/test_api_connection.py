@@ -1,4 +1,4 @@
-"""Connections and what is opened on them, against a real router in the same process."""
+"""Connections, publishers and subscribers against a real router in the same process."""
 
 import math
 import re
@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import zenoh
 import zenoh.ext
-from optipmb_client.errors import ConnectionFailed
+from optipmb_client import ConnectionFailed, Publisher, Subscriber
 from optipmb_client.incoming import Arrival, Inbox
 from optipmb_client.links import linked
 from optipmb_client.zenoh import DEFAULT_ENDPOINT, Connection
@@ -21,11 +21,20 @@ from optipmb_client.zenoh import connection as connecting
 from routers import free_endpoint, open_client, open_router
 
 
-def test_unreachable_router_is_one_error_within_the_timeout() -> None:
-    """Nobody listening gives ConnectionFailed naming the endpoint, after the timeout."""
+@pytest.mark.parametrize(
+    "opened",
+    [
+        lambda address: Connection(address, timeout=0.5),
+        lambda address: Publisher("a/b/c", address, timeout=0.5),
+        lambda address: Subscriber("a/b/c", address, connect_timeout=0.5),
+    ],
+    ids=["connection", "publisher", "subscriber"],
+)
+def test_unreachable_router_is_one_error_within_the_timeout(opened: Callable[[str], object]) -> None:
+    """Without a listener, ConnectionFailed names the endpoint after the timeout."""
     address = free_endpoint()
     with pytest.raises(ConnectionFailed, match=address) as caught:
-        Connection(address, timeout=0.5)
+        opened(address)
     assert caught.value.endpoints == (address,)
     assert "\n" not in str(caught.value)
 
@@ -54,7 +63,7 @@ def test_a_configuration_with_an_id_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("timeout", [math.nan, -1.0])
 @pytest.mark.parametrize("scheme", ["tcp/", "grpc://"])
 def test_a_timeout_that_is_none_is_one_error(timeout: float, scheme: str) -> None:
-    """What is no time gives ConnectionFailed with what was expected, over Zenoh and over gRPC."""
+    """An invalid timeout raises ConnectionFailed with the expected values, over Zenoh and over gRPC."""
     with pytest.raises(ConnectionFailed, match=f"timeout: expected seconds, 0 or more, received {timeout}"):
         linked(f"{scheme}127.0.0.1:1", timeout=timeout)
 
@@ -122,7 +131,7 @@ def test_a_late_subscriber_gets_the_history_of_the_cache(endpoint: str) -> None:
 def test_what_a_publisher_sent_before_its_first_sample_came_is_not_lost(
     endpoint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A subscription that gets nothing but what is sent from now on brings the publisher's earlier messages first."""
+    """A subscription to live messages only still receives the publisher's earlier messages first."""
     monkeypatch.setattr(zenoh.ext, "declare_advanced_subscriber", plain_subscriber)
     inbox = Inbox(10_000)
     with Connection(endpoint) as sender, Connection(endpoint) as receiver:
@@ -140,7 +149,6 @@ def test_what_a_publisher_sent_before_its_first_sample_came_is_not_lost(
 
 
 def plain_subscriber(session: zenoh.Session, key: str, handler: Any, **_: object) -> Any:
-    """Subscribe without asking any cache."""
     return session.declare_subscriber(key, handler)
 
 
@@ -161,7 +169,7 @@ def test_an_unread_inbox_neither_blocks_the_publisher_nor_the_closing(endpoint: 
 
 
 def test_nothing_arrives_after_closing(endpoint: str) -> None:
-    """Whatever is still under way when a connection is closed, its inboxes stay as they are from then on."""
+    """Closing a connection leaves its inboxes unchanged, also while queries are pending."""
     for _ in range(5):
         inbox = Inbox(100_000)
         with Connection(endpoint) as sender:
@@ -177,7 +185,7 @@ def test_nothing_arrives_after_closing(endpoint: str) -> None:
 
 
 def test_a_closed_connection_is_one_clear_error(endpoint: str) -> None:
-    """Whatever is asked of a closed connection raises ConnectionFailed in one line; closing again does nothing."""
+    """Every call on a closed connection raises ConnectionFailed in one line; closing again does nothing."""
     connection = Connection(endpoint)
     sender = connection.cached_sender("a/b", "zenoh/bytes", cache=1)
     connection.close()
@@ -263,7 +271,6 @@ def test_replies_of_two_services_are_both_kept(endpoint: str) -> None:
 
 
 def answer_with(questions: Iterable[zenoh.Query], text: bytes) -> None:
-    """Answer every query with a text."""
     for query in questions:
         with query:
             query.reply(query.key_expr, text)

@@ -26,13 +26,11 @@ SCENE = ("--dataset", "scene", "--option", "frames=12", "--option", "clouds=0", 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two hundred small recordings."""
     return recordings(tmp_path_factory.mktemp("recordings"))
 
 
 @pytest.fixture(scope="module")
 def plain(data: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """The result files of one process."""
     return tracked_plainly(data, tmp_path_factory.mktemp("plain"))
 
 
@@ -65,7 +63,6 @@ def cluster() -> Iterator[Any]:
 
 
 def with_word(word: str) -> list[str]:
-    """Give the command lines of all processes that have a word in them."""
     found = []
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         try:
@@ -78,7 +75,6 @@ def with_word(word: str) -> list[str]:
 
 
 def gone(word: str) -> bool:
-    """Wait until no process has a word in its command line."""
     until = time.monotonic() + WAIT_S
     while with_word(word):
         if time.monotonic() > until:
@@ -88,7 +84,6 @@ def gone(word: str) -> bool:
 
 
 def tracked(data: Path, out: Path, executor: Executor) -> list[TrackedSequence]:
-    """Track all recordings."""
     asked = DatasetArguments("table", data)
     opened = asked.open()
     sequences = opened.sequences(["all"])
@@ -113,7 +108,7 @@ def test_killed_workers_of_a_local_cluster_lose_nothing(data: Path, plain: dict[
 
 
 def test_commands_give_what_one_process_gives(cluster: Any, tmp_path: Path) -> None:
-    """`track`, `evaluate` and `tune` with `--ray ADDRESS` write and print what they do in one process."""
+    """`track`, `evaluate` and `tune` with `--ray ADDRESS` write and print the same as in one process."""
     few = ("--trials", "2", "--folds", "0", "--profile", "kitti-paper", "--classes", "Car")
     for name, options in (("plain", ()), ("ray", ("--ray", cluster.address))):
         for out in (tmp_path / name / "files", tmp_path / name / "t.csv"):
@@ -131,7 +126,7 @@ def test_commands_give_what_one_process_gives(cluster: Any, tmp_path: Path) -> N
 
 
 def test_a_killed_node_loses_nothing(cluster: Any, data: Path, plain: dict[str, bytes], tmp_path: Path) -> None:
-    """A node is killed in the middle of a recording, a worker in the middle of another: the bytes are those of one."""
+    """With a node and a worker killed during recordings, results equal one process byte for byte."""
     mark = tmp_path / "r050.begun"
     victims: list[str] = []
 

@@ -15,7 +15,7 @@ Table = dict[str, np.ndarray]
 
 
 def street(frames: int = FRAMES, direction: float = 0.0, yaw: float | None = None) -> Table:
-    """Give two cars that drive beside each other at 10 m/s for some frames, in the world frame."""
+    """Give two cars side by side at 10 m/s for some frames, in the world frame."""
     rng = np.random.default_rng(7)
     t = np.repeat(np.arange(frames) * PERIOD, 2)
     along, across = 10.0 * t, np.tile([0.0, 8.0], frames)
@@ -36,7 +36,6 @@ def street(frames: int = FRAMES, direction: float = 0.0, yaw: float | None = Non
 
 
 def tracked(capsys: pytest.CaptureFixture[str], data: Path, *options: str, name: str = "t.csv") -> tuple[Table, str]:
-    """Track a table; give the tracks and what was said."""
     out = data.parent / "out" / name
     done = run_here(capsys, "track", data, "--out", out, *options)
     assert done.returncode == 0, done.stderr
@@ -52,7 +51,6 @@ def refused(capsys: pytest.CaptureFixture[str], data: Path, *options: str) -> st
 
 
 def write(path: Path, columns: Table, **changed: np.ndarray | None) -> Path:
-    """Write a table with some columns changed, or left out, and give its path."""
     write_table(path, {name: one for name, one in {**columns, **changed}.items() if one is not None})
     return path
 
@@ -101,7 +99,7 @@ def test_the_unit_of_time_is_that_with_a_plausible_rate(
 
 
 def test_frame_numbers_of_the_table_stay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Tracks have the numbers of the frames that the detections have, with stamps beside them or without."""
+    """Tracks have the frame numbers of the detections, with and without stamps."""
     for name, columns in (("a", street()), ("b", {**street(), "t": None})):
         data = write(tmp_path / name / "d.csv", columns, frame=371 + 5 * INDEX)
         tracks, _ = tracked(capsys, data)
@@ -175,7 +173,7 @@ def test_headings_of_another_convention_are_refused_by_its_name(
 
 
 def test_quaternions_of_both_orders_are_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A list x y z w is told from w x y z by boxes that stand upright; boxes of one heading are refused."""
+    """The order x y z w or w x y z is found from upright boxes; boxes of one heading are refused."""
     course = np.pi / 3
     columns = street(direction=course)
     half = columns["yaw"] / 2
@@ -197,7 +195,7 @@ def test_quaternions_of_both_orders_are_read(tmp_path: Path, capsys: pytest.Capt
 
 @pytest.mark.parametrize("name", ["car", "Vehicle", "vehicle.bus.rigid", "TRUCK"])
 def test_the_order_of_sizes_is_told_by_vehicles(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
-    """Sizes without names are in the order in which vehicles are longer than wide, whatever their class is called."""
+    """Sizes without names get the order in which vehicles are longer than wide, whichever name the class has."""
     columns = street()
     sizes = {"size_0": columns["w"], "size_1": columns["l"], "size_2": columns["h"]}
     data = write(tmp_path / "d.csv", columns, l=None, w=None, h=None, **sizes, **{"class": np.full(2 * FRAMES, name)})
@@ -390,7 +388,7 @@ def test_numbers_of_classes_are_names(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 def test_check_prints_the_findings_without_tracking(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """`optipmb check` names units, columns, classes and what is wrong with its option, and ends with status 1 then."""
+    """`optipmb check` names units, columns, classes and wrong options; a wrong option ends with status 1."""
     right = result_of(run_here(capsys, "check", write(tmp_path / "a.csv", street()), "--json"))
     topics = {one["topic"]: one["text"] for one in right["findings"]}
     assert topics["time"] == "stamps are in seconds: frames at 10 Hz"

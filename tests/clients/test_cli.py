@@ -111,7 +111,7 @@ def test_what_is_wrong_is_said_in_one_line(
 
 @pytest.mark.parametrize("command", ["replay", "status"])
 def test_no_router_is_status_1(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """Nobody listening: one line that names the endpoint, status 1."""
+    """Without a listener, one line names the endpoint, and the status is 1."""
     address = free_endpoint()
     options = [*SMALL, "--wait", "0.3"] if command == "replay" else ["--timeout", "0.3"]
     assert run([command, *options, "--connect", address]) == 1
@@ -162,7 +162,7 @@ def test_version_and_help(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_warm_installation_has_nothing_to_compile(capsys: pytest.CaptureFixture[str]) -> None:
-    """`optipmb warm-up` compiles what is missing; after it, it finds all kernels in their cache."""
+    """`optipmb warm-up` compiles missing kernels; afterwards it finds all kernels in their cache."""
     assert run_here(capsys, "warm-up").returncode == 0
     done = optipmb("warm-up", "--json")
     result = json.loads(done.stdout)

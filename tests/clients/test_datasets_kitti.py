@@ -30,7 +30,6 @@ Tr_imu_to_velo: 1 0 0 -0.8 0 1 0 0.3 0 0 1 -0.8
 
 
 def write_root(base: Path, *, name: str = "0000", scores: tuple[str, ...] = ("2.0",), frames: int = 3) -> None:
-    """Write the smallest KITTI root with one sequence."""
     rows = "".join(ROW.format(score=score) + "\n" for score in scores)
     for place, text in {
         f"training/calib/{name}.txt": CALIBRATION,
@@ -42,20 +41,18 @@ def write_root(base: Path, *, name: str = "0000", scores: tuple[str, ...] = ("2.
 
 
 def read_all(root: Path) -> None:
-    """Read whatever frames and camera of the one sequence need."""
     sequence = only_sequence(root)
     list(sequence.frames())
     _ = sequence.camera
 
 
 def only_sequence(root: Path) -> KittiSequence:
-    """Open the one sequence of a written root."""
     return KittiDataset(root).sequences(["all"])[0]
 
 
 @pytest.mark.parametrize("below", ["", "training"])
 def test_the_root_may_be_the_training_folder_itself(tmp_path: Path, below: str) -> None:
-    """Both roots give the same frames; detections are found in the root or beside it."""
+    """Both roots give the same frames; detections are found inside the root and next to it."""
     write_root(tmp_path)
     sequence = KittiDataset(tmp_path / below).sequences(["0000"])[0]
     frames = list(sequence.frames())
@@ -141,7 +138,7 @@ def test_names_are_taken_once_and_in_order(tmp_path: Path) -> None:
 def test_what_is_wrong_in_a_file_is_named_with_its_line(
     tmp_path: Path, file: str, text: str, line: int, received: str
 ) -> None:
-    """Whatever the file, the error names it, the line and what stood there."""
+    """For every kind of file, the error names it, the line and the wrong text."""
     write_root(tmp_path)
     (tmp_path / file).write_text(text)
     with pytest.raises(DatasetError) as caught:
@@ -190,7 +187,7 @@ def test_without_poses_the_sensor_can_be_taken_to_stand_still(
 
 
 def test_the_testing_half_is_read_on_its_own_and_when_asked(tmp_path: Path) -> None:
-    """`testing/` is read without `training/`, and by `split=testing` beside it, then with its own detections only."""
+    """`testing/` is read without `training/`; with both, `split=testing` reads only its own detections."""
     write_root(tmp_path, frames=3)
     (tmp_path / "training").rename(tmp_path / "testing")
     assert len(only_sequence(tmp_path)) == 3
@@ -221,7 +218,7 @@ def test_class_folders_are_matched_without_case(tmp_path: Path, capsys: pytest.C
 
 
 def test_unknown_datasets_and_options_are_reported() -> None:
-    """The error lists what is known."""
+    """The error lists the known names."""
     with pytest.raises(DatasetError, match="kitti or nuscenes or scene"):
         open_dataset("waymo")
     with pytest.raises(DatasetError, match="option colour: expected one of clouds"):
@@ -246,7 +243,6 @@ def test_both_spellings_of_calibration_files_are_read(tmp_path: Path) -> None:
 
 
 def oxts_packet(latitude: float, longitude: float, altitude: float, yaw: float) -> str:
-    """Give a line of an oxts file."""
     fields = [latitude, longitude, altitude, 0.0, 0.0, yaw, *[0.0] * 24]
     return " ".join(f"{value:.12f}" for value in fields)
 
@@ -289,7 +285,7 @@ def test_a_sequence_with_oxts_needs_no_pose_file(tmp_path: Path) -> None:
 
 
 def test_clouds_are_read_when_they_are_asked_for(tmp_path: Path) -> None:
-    """A broken scan hurts nobody who does not look at it, and option clouds=0 leaves all of them out."""
+    """A broken scan fails only a reader of clouds; option clouds=0 leaves all clouds out."""
     write_root(tmp_path)
     folder = tmp_path / "training/velodyne/0000"
     folder.mkdir(parents=True)
@@ -311,7 +307,6 @@ def test_clouds_are_read_when_they_are_asked_for(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def real() -> KittiDataset:
-    """The real data with the PointRCNN detections."""
     return KittiDataset(kitti_root(), "pointrcnn")
 
 
@@ -398,7 +393,7 @@ def test_real_scans_have_their_points_in_the_real_boxes(real: KittiDataset) -> N
 
 
 def test_real_truth_has_types_and_regions(real: KittiDataset) -> None:
-    """Vans are told from cars, DontCare is no object but a region, and what is cut or hidden is ignored."""
+    """Vans differ from cars, DontCare is a region, and truncated or occluded objects are ignored."""
     (sequence,) = real.sequences(["0000"])
     truth = sequence.truth()
     assert truth is not None

@@ -9,12 +9,14 @@ from typing import TypeAlias
 import numpy as np
 import pytest
 from boxes import points_in_box
+from evaluation_cases import evaluate_clear
 from optipmb_tools.datasets import DatasetError, Truth, open_dataset
 from optipmb_tools.datasets.scene.dataset import MIN_POINTS, RADIUS, SceneSequence, visits
 from optipmb_tools.datasets.scene.detector import CLASSES, FALSE, MIN_SCORE, Found
 from optipmb_tools.datasets.scene.lidar import GROUND, cast
 from optipmb_tools.datasets.scene.traffic import HALF_WIDTH, fixed_boxes
-from optipmb_tools.evaluation import Rules, evaluate_clear, iou_bev
+from optipmb_tools.evaluation import Rules
+from optipmb_tools.evaluation.overlap import intersection_area
 from optipmb_tools.geometry import rotation_of, wrap_angle
 from optipmb_tools.results import ResultTable
 
@@ -26,7 +28,6 @@ CAR, PEDESTRIAN, CYCLIST = range(3)
 
 
 def scene(seed: int = 0, frames: int = 150, **options: float) -> SceneSequence:
-    """Give one generated scene."""
     sequence = open_dataset("scene", seed=seed, frames=frames, **options).sequences(["all"])[0]
     assert isinstance(sequence, SceneSequence)
     return sequence
@@ -34,13 +35,12 @@ def scene(seed: int = 0, frames: int = 150, **options: float) -> SceneSequence:
 
 @pytest.fixture(scope="module")
 def scenes() -> list[SceneSequence]:
-    """Four scenes of half a minute."""
     return [scene(seed, 300) for seed in range(4)]
 
 
 @pytest.fixture(scope="module")
 def observed(scenes: list[SceneSequence]) -> Observed:
-    """For each frame of two scenes, the points of the boxes and what was detected; truth needs no more scans."""
+    """For each frame of two scenes, the points of the boxes and the detections; truth needs no further scans."""
     kept = []
     for sequence in scenes[:2]:
         seen = (sequence.observe(frame) for frame in range(len(sequence)))
@@ -49,7 +49,6 @@ def observed(scenes: list[SceneSequence]) -> Observed:
 
 
 def digest(sequence: SceneSequence) -> str:
-    """Give a digest of all that a scene offers."""
     total = hashlib.sha256()
     for frame in sequence.frames():
         assert frame.cloud is not None
@@ -63,7 +62,7 @@ def digest(sequence: SceneSequence) -> str:
 
 
 def test_the_same_seed_gives_the_same_bytes_in_another_process() -> None:
-    """Detections, clouds, poses and truth, whatever was asked first; another seed or scene gives others."""
+    """Detections, clouds, poses and truth do not depend on the order of access; another seed or scene differs."""
     here = scene(5, 4)
     here.truth()
     program = (
@@ -80,7 +79,7 @@ def test_the_same_seed_gives_the_same_bytes_in_another_process() -> None:
 
 
 def test_clouds_and_velocities_are_options() -> None:
-    """Without them everything else is the same; velocities are near those of the truth."""
+    """Without velocities all else is equal; with them, they are near the true ones."""
     plain, rich = scene(2, 5), scene(2, 5, clouds=0, velocity=1)
     assert plain.has_clouds
     assert not rich.has_clouds
@@ -93,7 +92,7 @@ def test_clouds_and_velocities_are_options() -> None:
 
 
 def test_detected_velocities_are_over_ground_along_the_axes_of_the_sensor() -> None:
-    """Turned by the sensor's pose, detected velocities agree with the true ones, whatever way the sensor drives."""
+    """Turned by the sensor's pose, detected velocities agree with the true ones in every driving direction."""
     sequence = scene(1, 60, velocity=1)
     error = []
     for frame in sequence.frames():
@@ -214,7 +213,8 @@ def test_vehicles_do_not_drive_through_each_other(scenes: list[SceneSequence]) -
             pole_first, pole = np.divmod(np.arange((len(wheels) + 1) * len(place)), len(place))
             first = np.concatenate([first, pole_first])
             second = np.concatenate([second, pole + len(wheels) + 1])
-            overlap = iou_bev((center[first], size[first], yaw[first]), (center[second], size[second], yaw[second]))
+            rows = [(center[one], size[one], yaw[one]) for one in (first, second)]
+            overlap = intersection_area(*rows) / np.minimum(*(one[:, 0] * one[:, 1] for _, one, _ in rows))
             assert overlap.max(initial=0.0) < 0.02, (sequence._options.seed, frame, first[overlap.argmax()])
 
 
@@ -244,7 +244,7 @@ def test_pedestrians_do_not_walk_through_each_other(scenes: list[SceneSequence])
 
 
 def test_returned_points_lie_on_boxes_or_on_the_ground() -> None:
-    """Each point is within 15 cm of the surface of its box, or of the ground, whoever else stands near."""
+    """Each point is within 15 cm of the surface of its box or of the ground, also with neighbours."""
     sequence = scene(3, 40)
     place, extent = fixed_boxes()
     for frame in (0, 20, 39):

@@ -1,21 +1,16 @@
-"""The keys that one connection can declare in its life: what is opened beyond is refused, and nothing is lost."""
+"""Keys that one connection can declare in its life: more are refused, and nothing is lost."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Final
 
 import pytest
 from optipmb_client import Publisher, Subscriber
 from optipmb_client.errors import ConnectionFailed
 from optipmb_client.incoming import Inbox
 from optipmb_client.zenoh import Connection
+from optipmb_client.zenoh.handles import Reading, Sender
 from optipmb_client.zenoh.session import MOST_KEYS
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
-    from optipmb_client.zenoh.handles import Reading, Sender
 
 ALONE: Final = '{mode: "peer", scouting: {delay: 0, multicast: {enabled: false}}, listen: {endpoints: []}}'
 
@@ -38,7 +33,6 @@ def _subscribed(connection: Connection, key: str) -> Reading:
 
 @pytest.fixture
 def connection(tmp_path: Path) -> Iterator[Connection]:
-    """A connection alone."""
     file = tmp_path / "alone.json5"
     file.write_text(ALONE, encoding="utf-8")
     with Connection(config=file) as connection:

@@ -34,24 +34,19 @@ def cars(stamps: Any = None, scale: float = 1.0, **changed: Any) -> dict[str, np
 
 
 def take(columns: Mapping[str, np.ndarray], rows: Any) -> dict[str, np.ndarray]:
-    """Give some rows of a table."""
     return {name: values[rows] for name, values in columns.items()}
 
 
 class Bench:
-    """Runs `optipmb evaluate` on tables in a folder."""
-
     def __init__(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
         self.folder, self._capsys = folder, capsys
 
     def table(self, name: str, columns: Mapping[str, np.ndarray]) -> Path:
-        """Write a table and give its path."""
         path = self.folder / name
         write_table(path, columns)
         return path
 
     def run(self, *arguments: object, options: Sequence[str] = ()) -> Any:
-        """Run a command with options of the dataset."""
         return run_here(self._capsys, *arguments, *(word for one in options for word in ("--option", one)))
 
     def evaluate(
@@ -62,7 +57,7 @@ class Bench:
         detections: Mapping[str, np.ndarray] | None = None,
         options: Sequence[str] = (),
     ) -> Any:
-        """Evaluate tracks; detections are those of the two cars unless others are given."""
+        """Evaluate tracks; the default detections are the two cars."""
         found = detections or cars(id=None, score=np.full(FRAMES * CARS, 0.9))
         paths = [self.table(f"{name}.csv", one) for name, one in (("d", found), ("truth", truth), ("tracks", tracks))]
         asked = (paths[0], "--truth", paths[1], "--tracks", paths[2], *arguments)
@@ -71,7 +66,6 @@ class Bench:
 
 @pytest.fixture
 def bench(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Bench:
-    """A folder for tables."""
     return Bench(tmp_path, capsys)
 
 
@@ -107,7 +101,7 @@ NORTH = {"x": cars()["y"], "y": cars()["x"]}
     ],
 )
 def test_own_tracks_keep_their_units(bench: Bench, changed: dict[str, np.ndarray], options: list[str]) -> None:
-    """Options of headings and of the order of sizes are those of detections and truth, not of a table of OptiPMB."""
+    """Options of headings and of size order apply to detections and truth, not to a table of OptiPMB."""
     scores = np.full(FRAMES * CARS, 90.0 if "score=percent" in options else 0.9)
     data = bench.table("d.csv", cars(id=None, score=scores, **NORTH, **changed))
     truth, out = bench.table("truth.csv", cars(**NORTH, **changed)), bench.folder / "t.csv"
@@ -281,7 +275,7 @@ def test_classes_that_mean_the_same_are_one(bench: Bench) -> None:
 
 
 def test_classes_that_are_compared_with_nothing_are_named(bench: Bench) -> None:
-    """A van beside a car of the same table is another class; where no class is in both, one line says so."""
+    """A van close to a car of the same table is another class; without a common class, one line says so."""
     mixed = cars(**{"class": np.tile(["car", "van"], FRAMES)})
     done = bench.evaluate(mixed, cars())
     assert counts(done)[1:] == (50, 50, 0)
@@ -293,7 +287,7 @@ def test_classes_that_are_compared_with_nothing_are_named(bench: Bench) -> None:
 
 @pytest.mark.parametrize("stamped", [False, True])
 def test_tables_without_stamps_are_matched_by_the_numbers_of_frames(bench: Bench, *, stamped: bool) -> None:
-    """Numbers of any origin and step, also of a sparse truth, are those of detections with or without stamps."""
+    """Frame numbers of any origin and step, also of a sparse truth, match detections with or without stamps."""
     frames = np.repeat(371 + 5 * np.arange(FRAMES), CARS)
     numbered = cars(t=None, frame=frames)
     detections = cars(id=None, frame=frames, score=np.full(FRAMES * CARS, 0.9))
@@ -312,7 +306,7 @@ def test_tables_without_stamps_are_matched_by_the_numbers_of_frames(bench: Bench
 
 
 def test_own_tracks_of_a_table_in_another_encoding_are_read(bench: Bench) -> None:
-    """Options of encoding and decimals are those of the tables of the user, not of a table of OptiPMB."""
+    """Options of encoding and decimals apply to the user's tables, not to a table of OptiPMB."""
     paths = []
     for name, columns in (("d", cars(id=None, score=np.full(FRAMES * CARS, 0.9))), ("truth", cars())):
         text = bench.table(f"{name}.csv", columns).read_text().replace(",", ";").replace(".", ",")

@@ -10,13 +10,13 @@ from evaluation_cases import TrackRow, TruthRow, followed, parked, shuffled, tra
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_tools.datasets import open_dataset
-from optipmb_tools.evaluation import Counts
 from optipmb_tools.evaluation.ab3dmot import (
     POINTS,
     Ab3dmotResult,
     evaluate_ab3dmot,
 )
 from optipmb_tools.evaluation.cases import Case, ab3dmot_rules, prepare
+from optipmb_tools.evaluation.clear import Counts
 from optipmb_tools.evaluation.evaluate import evaluate_figures, load_recordings
 from scipy.optimize import linear_sum_assignment
 
@@ -25,12 +25,10 @@ AGREED = json.loads((Path(__file__).with_name("devkit") / "ab3dmot.json").read_t
 
 
 def case_of(truth: list[TruthRow], tracks: list[TrackRow], ignored: tuple[int, ...] = ()) -> Case:
-    """Prepare cars."""
     return prepare(truth_of(truth, ignored=ignored), tracks_of(tracks), "Car", ab3dmot_rules())
 
 
 def result_of(truth: list[TruthRow], tracks: list[TrackRow], ignored: tuple[int, ...] = ()) -> Ab3dmotResult:
-    """Evaluate cars."""
     return evaluate_ab3dmot([case_of(truth, tracks, ignored)])
 
 
@@ -186,7 +184,7 @@ def naive(case: Case, threshold: float) -> Counts:
 @PATIENT
 @given(st.integers(0, 2**32 - 1))
 def test_counts_are_those_of_a_naive_twin(seed: int) -> None:
-    """At every threshold the counts equal those of counting frame by frame and object by object."""
+    """At every threshold the counts equal a count frame by frame and object by object."""
     chance = np.random.default_rng(seed)
     frames = range(8)
     truth = [(f, one, float(chance.uniform(0, 12)), 0.0) for f in frames for one in range(4) if chance.random() < 0.8]
@@ -214,7 +212,7 @@ def test_counts_are_those_of_a_naive_twin(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", AGREED)
 def test_figures_are_those_of_the_published_evaluation(seed: str, tmp_path: Path) -> None:
-    """On generated benchmarks with all that the rules name, figures are still those of the published code (devkit/)."""
+    """On generated benchmarks with all cases of the rules, figures still equal the published code (devkit/)."""
     write_kitti(tmp_path, tmp_path / "results", int(seed))
     recordings = load_recordings("kitti", open_dataset("kitti", tmp_path).sequences(["all"]), tmp_path / "results")
     figures = evaluate_figures("kitti", recordings, ("Car", "Pedestrian", "Cyclist"))

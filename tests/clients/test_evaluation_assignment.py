@@ -21,7 +21,7 @@ PATIENT = settings(deadline=None, max_examples=100)  # other work on the machine
 
 
 def made(seed: int) -> Case:
-    """Prepare a crowd in which most pairs are contested; rows of the truth are those of objects that come and go."""
+    """Prepare a crowd in which most pairs are contested; objects of the truth come and go."""
     chance = np.random.default_rng(seed)
     wide = float(chance.choice([3.0, 8.0, 20.0]))
     truth = [(f, i, float(chance.uniform(0, wide)), 0.0) for f in range(6) for i in range(4) if chance.random() < 0.8]
@@ -76,7 +76,7 @@ def naive(case: Case) -> dict[int, int]:
 @PATIENT
 @given(st.integers(0, 2**32 - 1))
 def test_objects_stay_with_their_tracks(seed: int) -> None:
-    """With continuity the matches are those of going through the frames with a memory; no track is used twice."""
+    """With continuity, matches equal a loop over frames that remembers pairs; no track is used twice."""
     case = made(seed)
     match = match_frames(case, continuity="latest")
     hit = np.flatnonzero(match >= 0)

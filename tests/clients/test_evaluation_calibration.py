@@ -1,4 +1,4 @@
-"""Calibration: a consistent tracker passes, others do not, and what it needs is kept beside the results."""
+"""Calibration: a consistent tracker passes, others do not; a file next to the results holds its input."""
 
 from pathlib import Path
 
@@ -20,7 +20,6 @@ COVARIANCE = np.array([[0.09, 0.03], [0.03, 0.04]])
 
 
 def full_of(center: Floats, existence: Floats, covariance: Floats, frames: int, objects: int) -> FullTable:
-    """Give tracks with all columns, in the order of `parked`."""
     count = frames * objects
     whole = np.zeros((count, 6, 6))
     whole[:] = np.eye(6)
@@ -48,7 +47,7 @@ def full_of(center: Floats, existence: Floats, covariance: Floats, frames: int, 
 
 
 def made(scale: float = 1.0, existence: Floats | None = None, exists: np.ndarray | None = None) -> CalibrationResult:
-    """Evaluate Gaussian errors; `scale` is by how much the covariances that are told are too large."""
+    """Evaluate Gaussian errors; `scale` is the factor by which the reported covariances are too large."""
     frames, objects = 100, 40
     rows = parked(objects, frames)
     chance = np.random.default_rng(7)
@@ -62,7 +61,7 @@ def made(scale: float = 1.0, existence: Floats | None = None, exists: np.ndarray
 
 
 def test_a_consistent_tracker_has_a_nees_of_two() -> None:
-    """Errors drawn from the covariances that are told: the mean is 2, in the band, and 95 % lie in the ellipse."""
+    """Errors drawn from the reported covariances: the mean is 2, in the band, and 95 % lie in the ellipse."""
     found = made()
     assert found.mean == pytest.approx(2.0, abs=0.1)
     assert found.band[0] < found.mean < found.band[1]
@@ -103,7 +102,7 @@ def test_the_interval_takes_objects_as_samples() -> None:
 
 
 def test_existence_is_compared_with_what_is_there() -> None:
-    """Objects that exist as often as is told have deciles on the diagonal, with all tracks counted."""
+    """Objects that exist as often as reported have deciles on the diagonal, with all tracks counted."""
     chance = np.random.default_rng(3)
     told = chance.random(4000)
     deciles = made(existence=told, exists=np.asarray(chance.random(4000) < told)).deciles
@@ -129,7 +128,7 @@ def test_nothing_to_compare_is_no_error() -> None:
 
 
 def test_tracks_of_another_run_are_refused() -> None:
-    """When the result file has tracks that the file beside it lacks, the two are not of one run."""
+    """Results with tracks that the full file lacks belong to another run."""
     full = full_of(np.zeros((4, 3)), np.ones(4), COVARIANCE, 2, 2)
     other = tracks_of([(0, 7, 0.0, 0.0, 0.9)])
     with pytest.raises(DatasetError, match="the same tracks as in the result file"):
@@ -137,7 +136,7 @@ def test_tracks_of_another_run_are_refused() -> None:
 
 
 def test_track_keeps_everything_on_demand(tmp_path: Path) -> None:
-    """With `full` a file beside the results holds all columns of the same tracks, in the same bytes; without, none."""
+    """With `full`, a second file holds all columns of the same tracks, and the results keep their bytes."""
     dataset = open_dataset("scene", frames=20, vehicles=6, pedestrians=3, cyclists=2)
     sequences, scene = list(dataset.sequences(["0000"])), optipmb.load_profile("scene")
     (result,) = track(dataset, sequences, tmp_path, Tracking(scene, full=True))

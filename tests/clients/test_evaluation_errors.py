@@ -1,4 +1,4 @@
-"""Errors of boxes: tracks beside their own detections, in every direction, and headings against their variance."""
+"""Errors of boxes: tracks against their own detections, in every direction, and headings against their variance."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -72,7 +72,6 @@ class Shifted:
         return getattr(self._given, name)
 
     def frames(self) -> list[DetectionFrame]:
-        """The frames with every box raised."""
         return [replace(frame, center=frame.center + np.array([0.0, 0.0, self._by])) for frame in self._given.frames()]
 
 
@@ -96,7 +95,7 @@ def test_detections_are_those_of_the_tracks(tmp_path: Path) -> None:
 
 
 def test_other_detections_are_noticed(tmp_path: Path) -> None:
-    """Tracks of some classes, compared with the detections of all: headings are judged, and the reason is told."""
+    """With tracks of some classes and detections of all, headings are judged, and the reason is given."""
     dataset = open_dataset("scene", frames=80)
     sequences = dataset.sequences(["all"])[:1]
     list(track(dataset, sequences, tmp_path, Tracking(optipmb.load_profile("scene"), ["Car"], full=True)))

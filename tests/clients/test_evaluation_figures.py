@@ -23,7 +23,6 @@ CLASSES = ("Car", "Pedestrian", "Cyclist")
 
 @pytest.fixture(scope="module")
 def kitti(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """The root of a generated benchmark and a folder of results."""
     root = tmp_path_factory.mktemp("kitti")
     return write_kitti(root, root / "results", 1), root / "results"
 
@@ -126,7 +125,6 @@ def test_the_command_shows_and_prints_the_figures_of_kitti(
 
 
 def rewritten(kitti: tuple[Path, Path], folder: Path, change: Callable[[list[str]], list[str]]) -> Path:
-    """Write the results anew with changed fields, and give their folder."""
     folder.mkdir()
     for path in kitti[1].glob("*.txt"):
         lines = [" ".join(change(line.split())) for line in path.read_text().splitlines()]
@@ -135,7 +133,6 @@ def rewritten(kitti: tuple[Path, Path], folder: Path, change: Callable[[list[str
 
 
 def figures_of(kitti: tuple[Path, Path], results: Path, capsys: pytest.CaptureFixture[str]) -> tuple[Any, str]:
-    """Give the figures by class, without the thresholds, and what was said."""
     asked = ("evaluate", "--dataset", "kitti", "--root", kitti[0], "--tracks", results, "--class", *CLASSES, "--json")
     done = run_here(capsys, *asked)
     classes = result_of(done)["classes"]
@@ -149,7 +146,7 @@ def figures_of(kitti: tuple[Path, Path], results: Path, capsys: pytest.CaptureFi
 def test_results_without_image_boxes_are_projected(
     kitti: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """With -1 or 0 in the place of all image boxes the figures are those of projected boxes, and a line says so."""
+    """With -1 or 0 in place of all image boxes, figures use projected boxes, and a line says so."""
     shown = tmp_path / "shown"
     shown.mkdir()
     for one in open_dataset("kitti", kitti[0]).sequences(["all"]):
@@ -177,7 +174,6 @@ def test_results_without_image_boxes_are_projected(
 
 
 def as_table(kitti: tuple[Path, Path], path: Path) -> Path:
-    """Write the results as a table of tracks, and give its path."""
     parts: list[dict[str, Any]] = []
     for one in open_dataset("kitti", kitti[0]).sequences(["all"]):
         boxes = read_kitti_results(kitti[1] / f"{one.name}.txt").to_world(one.poses)

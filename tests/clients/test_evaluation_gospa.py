@@ -16,7 +16,6 @@ PATIENT = settings(deadline=None, max_examples=60)  # other work on the machine 
 def gospa_of(
     truth: list[TruthRow], tracks: list[TrackRow], frames: int = 1, cutoff: float = 2.0, order: float = 2.0
 ) -> GospaResult:
-    """Evaluate cars."""
     rules = Rules("distance", cutoff)
     return evaluate_gospa([(prepare(truth_of(truth), tracks_of(tracks), "Car", rules), frames)], rules, order)
 
@@ -36,13 +35,13 @@ ONE = parked(1, 1)
     ],
 )
 def test_single_frames(truth: list[TruthRow], tracks: list[TrackRow], expected: list[float]) -> None:
-    """A pair costs its distance, what is missed or false c / 2^(1/p) in GOSPA and c in OSPA, nothing costs nothing."""
+    """A pair costs its distance, a missed or false object c / 2^(1/p) in GOSPA and c in OSPA, nothing costs nothing."""
     names = ("GOSPA", "localisation", "missed", "false", "OSPA")
     assert gospa_of(truth, tracks).summary() == pytest.approx(dict(zip(names, expected, strict=True)))
 
 
 def test_figures_are_means_over_all_frames() -> None:
-    """An object missed in one frame of four costs a quarter of what it costs in one; frames with nothing count."""
+    """An object missed in one frame of four costs a quarter of the cost in one; empty frames count."""
     found = gospa_of(parked(1, 2), followed(parked(1, 1)), frames=4).summary()
     assert found["GOSPA"] == pytest.approx(2**0.5 / 4)
     assert found["OSPA"] == pytest.approx(2.0 / 4)

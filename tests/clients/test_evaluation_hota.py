@@ -21,7 +21,6 @@ NEAR = Rules("distance", 2.0)
 
 
 def hota_of(truth: list[TruthRow], tracks: list[TrackRow], ignored: tuple[int, ...] = ()) -> HotaResult:
-    """Evaluate centres of cars."""
     return evaluate_hota([prepare(truth_of(truth, ignored=ignored), tracks_of(tracks), "Car", NEAR)], NEAR)
 
 
@@ -49,7 +48,7 @@ def test_one_switch_halves_the_association() -> None:
 
 
 def test_half_of_what_is_there() -> None:
-    """One of two objects followed: DetA 1/2, AssA 1; with a false track beside it DetA 1/3."""
+    """One of two objects followed: DetA 1/2, AssA 1; with a further false track DetA 1/3."""
     truth = parked(2, 10)
     found = hota_of(truth, [row for row in followed(truth) if row[1] == 0])
     assert (found.deta, found.assa) == (0.5, 1.0)
@@ -113,7 +112,7 @@ def image_case(seed: int) -> Case:
 @PATIENT
 @given(st.lists(st.integers(0, 2**32 - 1), min_size=1, max_size=3))
 def test_figures_are_those_of_trackeval(seeds: list[int]) -> None:
-    """On boxes at random places, over several sequences, our figures equal those of TrackEval's metric."""
+    """On boxes at random places, over several sequences, our figures equal TrackEval's metric."""
     metric = pytest.importorskip("trackeval").metrics.HOTA()
     cases = [image_case(seed) for seed in seeds]
     ours, theirs = evaluate_hota(cases, hota_2d_rules()), NOTHING

@@ -8,7 +8,7 @@ from optipmb_tools.files import DatasetError, numbers, read_rows, write_whole
 
 
 def test_a_number_that_is_none_is_named_with_its_line(tmp_path: Path) -> None:
-    """The error carries path, line, what was expected and what stood there."""
+    """The error carries path, line, the expected form and the found text."""
     path = tmp_path / "a.txt"
     path.write_text("1 2\n\n3 four\n")
     with pytest.raises(DatasetError) as caught:
@@ -64,7 +64,7 @@ def test_a_file_appears_whole_or_not_at_all(tmp_path: Path) -> None:
 
 
 def test_a_finished_file_is_as_readable_as_any_other(tmp_path: Path) -> None:
-    """Its permissions are those of an ordinary new file, not those of a private temporary one."""
+    """Its permissions equal an ordinary new file, not a private temporary one."""
     (tmp_path / "ordinary").touch()
     write_whole(tmp_path / "ours", b"")
     assert (tmp_path / "ours").stat().st_mode == (tmp_path / "ordinary").stat().st_mode

@@ -53,7 +53,6 @@ def served(frames: list[Detections], sensors: optipmb.Sensors = ALIKE) -> list[T
 
 
 def recorded(path: Path, frames: list[Detections]) -> Path:
-    """Write frames as they are recorded."""
     with RecordingWriter(path) as writer:
         for number, frame in enumerate(frames):
             writer.add(Keys().detections(frame.stream), encode(frame), encoding_of(frame), number)
@@ -61,7 +60,7 @@ def recorded(path: Path, frames: list[Detections]) -> Path:
 
 
 def tabled(path: Path, frames: list[Detections]) -> Path:
-    """Write frames as rows with a column of the sensor, those of one sensor below those of another."""
+    """Write frames as rows with a column of the sensor, one sensor below the other."""
     with path.open("w", encoding="utf-8", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(["log", "sensor", "stamp_ns", "x", "y", "z", "l", "w", "h", "yaw", "score", "class", "vx", "vy"])
@@ -85,7 +84,7 @@ def same(sequence: FusedSequence, wanted: list[Tracks], sensors: optipmb.Sensors
 
 
 def test_a_recording_gives_the_bytes_of_the_service(tmp_path: Path) -> None:
-    """Fields of view and frames of two sensors in whatever order they were received."""
+    """Fields of view and frames of two sensors, received in any order."""
     frames = drive(40)
     by_sensor = sorted(frames, key=lambda one: one.stream)
     dataset = open_dataset("mcap", recorded(tmp_path / "a.mcap", by_sensor), fuse="1")
@@ -180,7 +179,7 @@ def test_data_without_sensors_are_not_fused(tmp_path: Path, name: str) -> None:
 
 
 def test_a_table_without_the_column_is_not_fused(tmp_path: Path) -> None:
-    """The line names what is missing."""
+    """The line names the missing part."""
     path = tabled(tmp_path / "a.csv", [FRONT.detections(0)])
     path.write_text(path.read_text(encoding="utf-8").replace("sensor", "other"), encoding="utf-8")
     with pytest.raises(DatasetError, match="--fuse: expected frames that name their sensor"):

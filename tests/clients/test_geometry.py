@@ -22,7 +22,6 @@ TILTS = st.floats(-0.6, 0.6)
 
 
 def tilted(yaw: float, pitch: float, roll: float) -> np.ndarray:
-    """Give Rz(yaw) Ry(pitch) Rx(roll)."""
     cy, sy, cp, sp, cr, sr = (f(a) for a in (yaw, pitch, roll) for f in (np.cos, np.sin))
     about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
     about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
@@ -103,7 +102,6 @@ def test_the_z_up_frame_looks_forward() -> None:
 
 
 def image_box(center: tuple[float, float, float], camera: Camera | None = None) -> tuple[np.ndarray, bool]:
-    """Give the image box of a cube of 2 m."""
     boxes, seen = (camera or synthetic_camera()).boxes(np.array([center]), np.full((1, 3), 2.0), np.zeros(1))
     return boxes[0], bool(seen[0])
 
@@ -117,7 +115,7 @@ def test_a_box_ahead_is_projected_by_its_near_face() -> None:
 
 @pytest.mark.parametrize("center", [(-11.0, 0.0, 0.0), (11.0, 40.0, 0.0), (11.0, 0.0, 30.0)])
 def test_a_box_that_no_image_shows_is_without_height(center: tuple[float, float, float]) -> None:
-    """Behind the camera, beside its view and above it: 0 0 0 0."""
+    """Behind the camera, outside its view and above it: 0 0 0 0."""
     box, seen = image_box(center)
     assert not seen
     np.testing.assert_array_equal(box, np.zeros(4))

@@ -15,7 +15,6 @@ PACKAGES = (optipmb, optipmb_schemas, optipmb_client, optipmb_tools, optipmb_ser
 
 
 def imported(source: Path) -> Iterator[str]:
-    """Give the top packages that a module imports, anywhere in it."""
     for node in ast.walk(ast.parse(source.read_text())):
         if isinstance(node, ast.Import):
             yield from (name.name.partition(".")[0] for name in node.names)
@@ -25,7 +24,6 @@ def imported(source: Path) -> Iterator[str]:
 
 
 def importers(package: str, name: str) -> set[str]:
-    """Give the modules of one of our packages that import another."""
     root = Path(next(each for each in PACKAGES if each.__name__ == package).__path__[0])
     sources = sorted(root.rglob("*.py"))
     assert len(sources) > 10

@@ -13,24 +13,18 @@ from optipmb_client.zenoh.late_join import CacheQueries, LateJoin
 
 @dataclass(frozen=True)
 class Entity:
-    """Who publishes."""
-
     zid: str = "abc"
     eid: int = 7
 
 
 @dataclass(frozen=True)
 class Info:
-    """The publisher of a sample, and its number there."""
-
     source_id: Entity
     source_sn: int
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What is read of Zenoh's samples."""
-
     source_info: Info | None
     key_expr: str = "a/b"
     payload: bytes = bytes(10)
@@ -38,7 +32,7 @@ class Sample:
 
 @dataclass
 class Joined:
-    """A subscription with its caches: what was handed over, and the queries that wait to be answered."""
+    """A subscription with its caches: delivered samples and pending queries."""
 
     received: list[object] = field(default_factory=list)
     asked: list[tuple[str, Callable[[Sample], None], Callable[[bool], None]]] = field(default_factory=list)
@@ -51,7 +45,6 @@ class Joined:
         )
 
     def take(self, *numbers: int, source: Entity = Entity()) -> None:
-        """Samples that come live."""
         for number in numbers:
             self.join.take(sample(number, source))
 
@@ -64,7 +57,6 @@ class Joined:
 
 
 def sample(number: int, source: Entity = Entity()) -> Sample:
-    """A sample of a publisher."""
     return Sample(Info(source, number))
 
 
@@ -117,7 +109,7 @@ def test_what_no_cache_holds_is_said_to_be_lost() -> None:
 
 
 def test_a_cache_that_does_not_answer_is_not_said_to_have_answered() -> None:
-    """What waited for it is handed over all the same, and so is what came of the answer."""
+    """Samples held for a query are delivered when it fails, and so are its answers."""
     one = Joined()
     one.take(0, 3)
     one.answer(2, complete=False)
@@ -126,7 +118,7 @@ def test_a_cache_that_does_not_answer_is_not_said_to_have_answered() -> None:
 
 
 def test_one_publisher_does_not_wait_for_another() -> None:
-    """While the cache of one is asked, what comes of the others is handed over."""
+    """While one publisher's cache is queried, samples of others are delivered."""
     one = Joined()
     one.take(3)
     one.take(0, 1, source=Entity("def"))
@@ -136,7 +128,7 @@ def test_one_publisher_does_not_wait_for_another() -> None:
 
 
 def test_closing_hands_over_what_waits_and_nothing_afterwards() -> None:
-    """What has come is not lost when the subscription ends; answers and samples that come later are."""
+    """Received samples survive the end of the subscription; later answers and samples do not."""
     one = Joined()
     one.take(3, 4)
     one.join.close()
@@ -212,7 +204,6 @@ class LostQueries:
         self.ended: queue.SimpleQueue[bool] = queue.SimpleQueue()
 
     def ask(self) -> bool:
-        """Ask, and return how it ended."""
         self.queries.ask("a/b", self.replied.append, self.ended.put)
         return self.ended.get(timeout=60)
 

@@ -1,9 +1,7 @@
-"""A load: its frames, its search, and what it counts, against a service that is asked too."""
-
-from __future__ import annotations
+"""A load: its frames, its search, and its counts, against a service that is queried too."""
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,9 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from optipmb_schemas import Detections, Points, decode
 from optipmb_tools.run.load import FIRST, Run, chain, draw_runs, find_limit, generated, head, message, table_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 RUN = Run(
     streams=2, rate=10.0, objects=40.0, points=0.0, seconds=10.0, sent=200, received=200, repeated=0, cloudless=0,

@@ -1,4 +1,4 @@
-"""Recordings: what is in the file, what is left of it after a cut, and what is played of it."""
+"""Recordings: content of the file, content after a cut, and messages played."""
 
 import concurrent.futures
 import json
@@ -45,7 +45,6 @@ SESSION = "0" * 32
 
 
 def detections(seq: int, *, stamp: int | None = None, has_points: bool | None = None) -> Detections:
-    """Two cars at frame `seq`."""
     return Detections(
         stream=STREAM,
         epoch=EPOCH,
@@ -63,7 +62,6 @@ def detections(seq: int, *, stamp: int | None = None, has_points: bool | None = 
 
 
 def points(seq: int, stamp: int) -> Points:
-    """A small cloud."""
     return Points(stream=STREAM, epoch=EPOCH, seq=seq, stamp_ns=stamp, frame="world", xyz=np.ones((3, 3), np.float32))
 
 
@@ -89,7 +87,6 @@ def tracks(seq: int, ids: list[int], *, cloud_used: bool = False, revision: int 
 
 
 def put(writer: RecordingWriter, message: Message, received_ns: int, *, json: bool = False) -> bytes:
-    """Add a message under its own key; give its bytes."""
     topics = {Detections: "detections", Points: "points", Tracks: "tracks", Problem: "problems"}
     topic = topics[type(message)]
     payload = encode_json(message) if json else encode(message)
@@ -176,7 +173,7 @@ def test_foxglove_finds_boxes_plots_and_logs_beside_our_messages(tmp_path: Path)
 
 @pytest.mark.parametrize("frame", ["world", "sensor"])
 def test_points_without_boxes_are_shown_and_read_again(frame: str, tmp_path: Path) -> None:
-    """Foxglove has half a metre of each, at the height of the sensor; a reader knows what is not known."""
+    """Foxglove has half a metre of each, at the height of the sensor; a reader sees unknown values."""
     pose = Pose(translation=np.array([1.0, 0.0, 2.0]), quaternion=np.array([1.0, 0.0, 0.0, 0.0]))
     center = np.array([[3.0, 4.0, np.nan], [5.0, 6.0, 0.5]])
     unknown = {"size": None, "yaw": None, "center": center, "frame": frame, "pose": pose}
@@ -329,7 +326,6 @@ def test_a_recording_is_never_written_over(tmp_path: Path) -> None:
 
 
 def recorded(message: Message, received_ns: int) -> Recorded:
-    """A message as a recording gives it."""
     topic = type(message).__name__.lower()
     return Recorded(
         STREAM, topic, encode(message), encoding_of(message), received_ns, getattr(message, "stamp_ns", received_ns)
@@ -337,7 +333,7 @@ def recorded(message: Message, received_ns: int) -> Recorded:
 
 
 def played(messages: list[Recorded]) -> Iterator[tuple[int, bool, bool | None]]:
-    """What is played: number, whether a cloud goes before it, and what the frame says about it."""
+    """Played frames: number, whether a cloud precedes it, and whether the frame announces one."""
     for step in steps(messages, plan(messages)):
         frame = decode(step.detections.payload, Detections)
         yield frame.seq, step.cloud is not None, frame.has_points
@@ -358,7 +354,7 @@ def test_a_frame_is_played_with_the_cloud_that_took_part() -> None:
 
 
 def test_repeated_frames_are_played_once_and_bytes_are_kept() -> None:
-    """What came again from a cache is left out; without clouds the payloads are those of the recording."""
+    """Messages repeated from a cache are left out; without clouds the payloads equal the recording."""
     messages = [recorded(detections(number, has_points=False), at) for at, number in enumerate([0, 1, 1, 0, 2])]
     found = [step.detections for step in steps(messages, plan(messages))]
     assert [one.payload for one in found] == [messages[0].payload, messages[1].payload, messages[4].payload]
@@ -391,7 +387,7 @@ def test_a_recording_that_begins_late_is_known() -> None:
 
 
 def test_a_recording_is_a_dataset(tmp_path: Path) -> None:
-    """Frames, poses, labels and clouds are those of the messages; the profile is the recorded one."""
+    """Frames, poses, labels and clouds equal the messages; the profile is the recorded one."""
     path = tmp_path / "a.mcap"
     with RecordingWriter(path) as writer:
         put(writer, detections(0, has_points=True), 1)
@@ -422,7 +418,7 @@ def test_a_dataset_needs_frames_in_order(tmp_path: Path) -> None:
 
 
 def test_a_folder_of_recordings_is_a_dataset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Streams of the same name in several files are told apart by the names of these, and tracked in processes too."""
+    """Streams of one name in several files are distinguished by file name, also in worker processes."""
     for number, name in enumerate(("monday", "monday.late")):
         with RecordingWriter(tmp_path / f"{name}.mcap") as writer:
             for frame in range(1 + number):

@@ -1,7 +1,5 @@
 """Messages that come at least once, in any order of their revisions: what the user has in the end."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import pytest
@@ -33,7 +31,7 @@ def test_a_repetition_brings_nothing() -> None:
 
 
 def test_what_is_later_holds() -> None:
-    """A higher revision corrects, and a later run whatever its revision."""
+    """A higher revision replaces, and a later run at any revision."""
     merging = Merging(10)
     merging.take(message(0, content=1, revision=3))
     assert merging.take(message(0, content=2, revision=4)) is Novelty.CORRECTION
@@ -68,7 +66,6 @@ class Sent:
 
     @property
     def tracks(self) -> Tracks:
-        """The message."""
         return message(self.seq, content=10 * self.run + self.revision, revision=self.revision, run=self.run)
 
 
@@ -77,7 +74,7 @@ sent = st.builds(Sent, st.integers(0, 3), st.integers(0, 2), st.integers(0, 3))
 
 @given(st.lists(sent, max_size=40))
 def test_the_end_does_not_depend_on_the_way(messages: list[Sent]) -> None:
-    """In whatever order and however often they come, the latest of each frame is what was given out last."""
+    """In any order and number of messages, the latest of each frame is given out last."""
     merging, last = Merging(100), {}
     for one in messages:
         if merging.take(one.tracks) is not Novelty.REPEATED:
@@ -129,7 +126,7 @@ def events(seq: int, n: int, *, run: int = 1, revision: int = 0, session: str = 
             ],
             [1, 2, 3],
         ),
-        # A later run goes on behind frame 2: later frames of the earlier one are void, wherever they come.
+        # A later run goes on behind frame 2: later frames of the earlier one are void at any position.
         (
             [
                 events(2, 1, final=(A, 2)),
@@ -140,7 +137,7 @@ def events(seq: int, n: int, *, run: int = 1, revision: int = 0, session: str = 
             ],
             [1, 2],
         ),
-        # All of earlier sessions is final, with those of a session that is heard of late.
+        # All of earlier sessions is final, also if a session is received late.
         (
             [events(5, 1, final=(A, 0)), events(2, 2, session=B, final=(B, 0)), events(4, 3, session=B, final=(B, 3))],
             [1, 2],

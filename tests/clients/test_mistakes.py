@@ -16,13 +16,11 @@ NOWHERE = "nowhere.csv"
 
 
 def camera_boxes() -> dict[str, np.ndarray]:
-    """Give boxes with the axes of a camera."""
     plain = boxes()
     return boxes(y=-plain["z"], z=np.linspace(2.0, 70.0, ROWS), x=plain["y"])
 
 
 def broken(column: str, row: int, value: float) -> dict[str, np.ndarray]:
-    """Give boxes with one wrong value."""
     columns = boxes()
     columns[column] = columns[column].astype(np.float64)
     columns[column][row] = value
@@ -30,7 +28,6 @@ def broken(column: str, row: int, value: float) -> dict[str, np.ndarray]:
 
 
 def classes(*names: str) -> dict[str, np.ndarray]:
-    """Give boxes of other classes."""
     return boxes(**{"class": np.array(names * FRAMES)})
 
 

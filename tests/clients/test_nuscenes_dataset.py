@@ -42,12 +42,10 @@ PATIENT = settings(deadline=None)  # other work on the machine may make any exam
 
 
 def one_scene(frames: int = 3, things: list[Thing] | None = None, name: str = SCENE) -> Scene:
-    """Give a scene in which the car stands at (100, 200)."""
     return Scene(name, [(100.0, 200.0)] * frames, things or [])
 
 
 def opened(root: Path, scene: Scene, boxes: dict[str, list[dict[str, Any]]] | None = None) -> NuScenesSequence:
-    """Write a root with one scene and give that scene."""
     write_root(root, [scene])
     write_detections(root, "made", [scene], boxes)
     (sequence,) = NuScenesDataset(root).sequences(["all"])
@@ -55,7 +53,7 @@ def opened(root: Path, scene: Scene, boxes: dict[str, list[dict[str, Any]]] | No
 
 
 def test_frames_are_samples_in_order_of_time(tmp_path: Path) -> None:
-    """Frames come in order of time, whatever the order of the table, at the stamp of the sample in nanoseconds."""
+    """Frames come in order of time, for any order of the table, at the stamp of the sample in nanoseconds."""
     scene = one_scene(4)
     sequence = opened(tmp_path, scene)
     frames = list(sequence.frames())
@@ -140,7 +138,7 @@ def test_boxes_beyond_500_in_a_sample_are_counted(tmp_path: Path, capsys: pytest
 
 
 def test_height_of_the_bottom_is_raised_when_the_caller_or_the_file_says_so(tmp_path: Path) -> None:
-    """Heights are those of centres by default; `z_bottom`, or the file's own word, adds half a height; options win."""
+    """Heights are centres by default; `z_bottom`, or the file's own word, adds half a height; options win."""
     scene = one_scene(1)
     write_root(tmp_path, [scene])
     path = write_detections(tmp_path, "plain", [scene], {scene.token(0): [box(scene.token(0))]})
@@ -276,7 +274,7 @@ def test_velocity_is_the_centred_difference(lives: list[list[int]], chance: Any)
 def test_tables_are_read_in_pieces(
     tmp_path_factory: pytest.TempPathFactory, records: list[dict[str, Any]], chunk: int, indent: int | None
 ) -> None:
-    """Reading record by record gives what reading the whole file gives, wherever the pieces end."""
+    """Reading record by record equals reading the whole file, for pieces of any length."""
     folder = tmp_path_factory.getbasetemp()
     (folder / "sample.json").write_text(json.dumps(records, indent=indent))
     with pytest.MonkeyPatch.context() as patch:
@@ -322,7 +320,7 @@ def test_splits_are_the_official_ones() -> None:
 
 
 def test_sequences_are_chosen_by_scene_split_or_own_split(tmp_path: Path) -> None:
-    """Names of scenes, official splits and those of splits.json are taken, each scene once; of splits what is there."""
+    """Names of scenes, official splits and splits.json are accepted; absent scenes of splits are skipped."""
     names = ["scene-0103", "scene-0757", "scene-0916", "scene-0061"]
     write_root(tmp_path, [one_scene(name=name) for name in names])
     (tmp_path / VERSION / "splits.json").write_text(json.dumps({"mine": ["scene-0061", "scene-0103"]}))
@@ -438,7 +436,7 @@ def test_wrong_roots_and_options_are_named(tmp_path: Path) -> None:
 
 
 def test_a_recorded_scene() -> None:
-    """The recorded scene: 40 keyframes at 2 Hz, the documented numbers of boxes, and truth beside the detections."""
+    """The recorded scene: 40 keyframes at 2 Hz, the documented numbers of boxes, with truth."""
     root = nuscenes_root()
     (sequence,) = NuScenesDataset(root, "centerpoint").sequences(["mini_val"])
     frames = list(sequence.frames())
@@ -460,7 +458,7 @@ def test_a_recorded_scene() -> None:
 
 
 def test_recorded_heights_of_bottoms() -> None:
-    """The heights in the PointPillars file are those of bottoms: raised by half a height they meet CenterPoint's."""
+    """The heights in the PointPillars file are bottoms: raised by half a height they meet CenterPoint's."""
     root = nuscenes_root()
 
     def cars(name: str, **options: bool) -> list[np.ndarray]:

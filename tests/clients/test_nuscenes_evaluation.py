@@ -46,7 +46,6 @@ Row = tuple[int, int, float, float]
 
 
 def boxes(rows: Sequence[Row], scores: Sequence[float] | float = math.nan, label: int = CAR) -> TrackBoxes:
-    """Give boxes of one class."""
     rows = sorted(rows, key=lambda row: row[0])
     count = len(rows)
     return TrackBoxes(
@@ -67,12 +66,10 @@ def scene_of(rows: Sequence[Row], frames: int = 10) -> NuScenesScene:
 def cars(
     truth: Sequence[Row], tracks: Sequence[tuple[int, int, float, float, float]], frames: int = 10
 ) -> NuScenesClass:
-    """Evaluate cars of one scene."""
     return evaluate_scenes([(scene_of(truth, frames), tracks_of(tracks, "car"))]).classes["car"]
 
 
 def still(identity: int, x: float, frames: Sequence[int] = range(10), y: float = 0.0) -> list[Row]:
-    """Give an object that stands."""
     return [(frame, identity, x, y) for frame in frames]
 
 
@@ -187,7 +184,7 @@ def test_unreached_recalls_count_as_the_worst() -> None:
 
 
 def test_no_tracks_give_the_worst_figures() -> None:
-    """Without any track nothing breaks: zero recall and accuracy, all missed and lost, what nobody knows undefined."""
+    """Without tracks: zero recall and accuracy, all missed and lost, undefined figures are NaN."""
     scores = cars(TWO, [])
     assert (scores.amota, scores.amotp) == (0.0, 2.0)
     best = scores.best
@@ -243,7 +240,6 @@ def test_several_scenes_are_one_evaluation() -> None:
 
 
 def pairing(truth: Sequence[Row], tracks: Sequence[Row], score: Sequence[float] | float = 0.5) -> Case:
-    """Give the pairs of cars."""
     return pair(boxes(truth), boxes(tracks, score), CAR, 2.0)
 
 
@@ -347,7 +343,6 @@ def test_interpolation_fills_every_hole_and_moves_nothing(
 
 
 def prepared(root: Path, things: list[Thing], frames: int = 3) -> NuScenesSequence:
-    """Write a scene around a car at (100, 200)."""
     write_root(root, [Scene("scene-0103", [(100.0, 200.0)] * frames, things)])
     (sequence,) = NuScenesDataset(root).sequences(["scene-0103"])
     return sequence
@@ -403,7 +398,6 @@ def test_tracks_are_filtered_as_the_truth_is(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two crowded scenes."""
     scenes = [crowd("scene-0103", 1), crowd("scene-0916", 2, 12, 1_538_984_233_000_000)]
     folder = write_root(tmp_path_factory.mktemp("nuscenes"), scenes)
     write_detections(folder, "made", scenes)
@@ -411,7 +405,6 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def evaluated(root: Path, out: Path, tracks: dict[str, list[Rows]]) -> NuScenesScores:
-    """Write tracks and evaluate the file."""
     dataset = NuScenesDataset(root)
     for sequence in dataset.sequences(sorted(tracks)):
         path = write(dataset, sequence, tracks[sequence.name], out)
@@ -451,7 +444,7 @@ def test_results_without_any_box_are_no_error(root: Path, tmp_path: Path) -> Non
 
 
 def test_scenes_to_evaluate_can_be_chosen(root: Path, tmp_path: Path) -> None:
-    """Scenes are those of the file, or those asked for; in memory and by files the figures are the same."""
+    """Scenes are taken from the file or from the argument; in memory and by files the figures are the same."""
     sequences = NuScenesDataset(root).sequences(["all"])
     tracks = {one.name: disturbed_tracks(one, 4) for one in sequences}
     both = evaluated(root, tmp_path, tracks)
@@ -484,7 +477,6 @@ AGREED = json.loads((Path(__file__).with_name("devkit") / "agreed.json").read_te
 
 
 def recorded(root: Path, name: str) -> tuple[NuScenesDataset, list[Rows]]:
-    """Give the tracks of one of the cases that were compared with the official tools."""
     kind, _, which = name.partition(" ")
     dataset = NuScenesDataset(root, which if kind == "greedy" else "centerpoint")
     (sequence,) = dataset.sequences(["mini_val"])
@@ -497,7 +489,7 @@ def recorded(root: Path, name: str) -> tuple[NuScenesDataset, list[Rows]]:
 
 @pytest.mark.parametrize("name", AGREED)
 def test_figures_are_those_of_the_official_tools(tmp_path: Path, name: str) -> None:
-    """On the recorded scene the figures are still those that the official tools agreed with (devkit/)."""
+    """On the recorded scene the figures still equal the official tools (devkit/)."""
     dataset, tracks = recorded(nuscenes_root(), name)
     (sequence,) = dataset.sequences(["mini_val"])
     shown = evaluate_nuscenes(nuscenes_root(), write(dataset, sequence, tracks, tmp_path)).to_json()

@@ -24,7 +24,6 @@ FILE = "tracking_results.json"
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two scenes."""
     folder = write_root(tmp_path_factory.mktemp("nuscenes"), SCENES)
     token = SCENES[0].token(2)
     write_detections(folder, "made", SCENES, {token: [box(token)]})
@@ -32,7 +31,6 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def rows(count: int, **changes: Any) -> Rows:
-    """Give some tracks of cars."""
     number = np.arange(count, dtype=np.int64)
     one = np.ones(count)
     made = Rows(
@@ -67,7 +65,7 @@ def test_what_is_written_is_read_again(root: Path, tmp_path: Path) -> None:
 
 
 def test_every_sample_is_there(root: Path, tmp_path: Path) -> None:
-    """Samples without tracks, and frames never added, have an empty list; the meta is that of the detections."""
+    """Samples without tracks, and frames never added, have an empty list; the meta comes from the detections."""
     dataset = NuScenesDataset(root)
     (sequence,) = dataset.sequences(["scene-0103"])
     dataset.write(tmp_path, sequence, {2: rows(3), 3: rows(0)})
@@ -183,13 +181,12 @@ def test_replaying_scenes_at_once_writes_the_same_file(endpoint: str, root: Path
 
 
 def track_box(**changes: Any) -> dict[str, Any]:
-    """Give one box of a result file."""
     base = {name: value for name, value in box("t").items() if not name.startswith("detection")}
     return base | {"tracking_id": "a", "tracking_name": "car", "tracking_score": 0.5} | changes
 
 
 def test_foreign_ids_are_numbered(tmp_path: Path) -> None:
-    """Ids of other trackers, whatever text or number they are, become numbers in order of appearance."""
+    """Ids of other trackers, text or number, become numbers in order of appearance."""
     path = tmp_path / "other.json"
     boxes = {"s0": [track_box(tracking_id="x9"), track_box(tracking_id=4)], "s1": [track_box(tracking_id="4")]}
     path.write_text(json.dumps({"meta": {}, "results": boxes}))

@@ -1,4 +1,4 @@
-"""Tracking in process: files that repeat, classes, profiles, and what is refused."""
+"""Tracking in process: repeatable files, classes, profiles, and refused input."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +14,6 @@ from optipmb_tools.run.tracking import Tracking, track, track_whole
 
 @pytest.fixture(scope="module")
 def dataset() -> Dataset:
-    """A small generated scene with clouds."""
     return open_dataset("scene", frames=20, vehicles=6, pedestrians=3, cyclists=2)
 
 
@@ -92,7 +91,7 @@ def test_chosen_classes_are_the_only_ones() -> None:
 
 
 def test_a_class_that_the_data_lack_is_refused(dataset: Dataset) -> None:
-    """The error names the class and those that there are."""
+    """The error names the class and the known ones."""
     (sequence,) = dataset.sequences(["0000"])
     with pytest.raises(UsageError, match=r"'Tram'.*Car"):
         next(selected_frames(sequence, ["Tram"]))

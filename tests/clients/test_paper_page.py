@@ -7,13 +7,13 @@ from pkgutil import resolve_name
 import pytest
 from optipmb_tools.cli import run
 
-PAGE = (Path(__file__).parents[2] / "docs" / "paper.md").read_text(encoding="utf-8")
+DOCS = Path(__file__).parents[2] / "docs"
+PAGE = (DOCS / "paper.md").read_text(encoding="utf-8")
 
 TABLES = ("Table I", "Table II", "Table III", "Table IV", "Table V", "Table VI")
 
 
 def section(title: str) -> str:
-    """Give a section of the page."""
     return PAGE[PAGE.index(f"## {title}") :].split("\n## ")[0]
 
 
@@ -39,10 +39,12 @@ def test_each_table_and_figure_has_its_row() -> None:
     assert items[2:] == ["Fig. 1, 2", "Fig. 3", "Fig. 4", "Fig. 5", *TABLES]
 
 
-def test_the_commands_of_the_page_exist(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(("page", "least"), [("paper.md", 8), ("tuning.md", 6)])
+def test_the_commands_of_a_page_exist(page: str, least: int, capsys: pytest.CaptureFixture[str]) -> None:
     """Every command has a help, and every option in it is named there."""
-    lines = [line for line in PAGE.replace("\\\n", "").splitlines() if line.startswith("optipmb ")]
-    assert len(lines) >= 8
+    text = (DOCS / page).read_text(encoding="utf-8")
+    lines = [line for line in text.replace("\\\n", "").splitlines() if line.startswith("optipmb ")]
+    assert len(lines) >= least
     for line in lines:
         command, *words = line.split()[1:]
         assert run([command, "--help"]) == 0

@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import run_here
+from evaluation_cases import evaluate_clear
 from optipmb_client.errors import ClientError
 from optipmb_tools.cli import run
 from optipmb_tools.datasets import DataSequence, Truth, open_dataset
-from optipmb_tools.evaluation import ClearResult, Rules, evaluate_clear
+from optipmb_tools.evaluation import Rules
+from optipmb_tools.evaluation.clear import ClearResult
 from optipmb_tools.results import ResultTable, full_table
 from optipmb_tools.views import pictures
 from optipmb_tools.views.pictures import WIDTH_PX, Panel, animate_tracks, draw_tracks
@@ -22,7 +24,6 @@ RULES = Rules(measure="distance", limit=2.0)
 
 
 def scene() -> tuple[DataSequence, Truth, ResultTable]:
-    """Give a short scene, its truth, and the truth as tracks with one change of identity and some misses."""
     sequence = open_dataset("scene", frames=20).sequences(["all"])[0]
     truth = sequence.truth()
     assert truth is not None
@@ -33,7 +34,6 @@ def scene() -> tuple[DataSequence, Truth, ResultTable]:
 
 
 def text_of(path: Path, monkeypatch: pytest.MonkeyPatch, *arguments: object) -> list[str]:
-    """Draw, and give all texts of the picture."""
     from matplotlib.figure import Figure  # noqa: PLC0415 - matplotlib is an extra
     from matplotlib.text import Text  # noqa: PLC0415 - matplotlib is an extra
 

@@ -29,7 +29,7 @@ UNKNOWN = dict.fromkeys(("l", "w", "h", "yaw", "z"))
 
 
 def test_the_page_prints_what_it_says() -> None:
-    """The first block of code and what is below it."""
+    """The first block of code of the page and the text below it."""
     blocks = re.findall(r"^```\w*\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
     code, wanted = blocks[:2]
     printed = io.StringIO()

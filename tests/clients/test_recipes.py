@@ -20,12 +20,10 @@ PAGE = REPOSITORY / "docs" / "own-data.md"
 
 
 def section() -> str:
-    """Give the section of the recipes."""
     return PAGE.read_text().partition("\n## Recipes\n")[2].partition("\n## ")[0]
 
 
 def recipes() -> dict[str, list[tuple[str, str]]]:
-    """Give the code blocks of each recipe with their languages."""
     parts = re.split(r"^### (.+)$", section(), flags=re.MULTILINE)[1:]
     found = zip(parts[::2], parts[1::2], strict=True)
     return {name: re.findall(r"^```(\w+)\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE) for name, text in found}
@@ -38,7 +36,6 @@ def lidar() -> np.ndarray:
 
 
 def open_pcdet(folder: Path) -> None:
-    """Write `result.pkl`, with a frame without boxes."""
     names, scores = np.array(["Car", "Car", "Pedestrian"]), np.array([0.9, 0.8, 0.7], dtype=np.float32)
     frames: list[dict[str, Any]] = [
         {
@@ -55,7 +52,6 @@ def open_pcdet(folder: Path) -> None:
 
 
 def mmdetection3d(folder: Path) -> None:
-    """Write `preds/*.json`."""
     (folder / "preds").mkdir()
     for i, rows in enumerate(lidar()):
         rows[:, 2] -= 0.5 * rows[:, 5]
@@ -64,7 +60,6 @@ def mmdetection3d(folder: Path) -> None:
 
 
 def kitti_object(folder: Path) -> None:
-    """Write `results/*.txt`, in camera axes."""
     (folder / "results").mkdir()
     for i, rows in enumerate(lidar()):
         lines = [
@@ -75,7 +70,6 @@ def kitti_object(folder: Path) -> None:
 
 
 def nuscenes(folder: Path) -> None:
-    """Write the tables of a scene, and a submission with a parked car."""
     scene = Scene("scene-0103", [(100.0, 200.0)] * 5, [])
     write_root(folder / "nuscenes", [scene])
     found = {scene.token(i): [box(scene.token(i), translation=[110.0, 200.0, 1.0])] for i in range(5)}

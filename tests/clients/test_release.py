@@ -27,19 +27,17 @@ def checkout(tmp_path: Path) -> Path:
 
 
 def git(work: Path, *arguments: str) -> None:
-    """Run git, with nobody's settings."""
     person = ["-c", "user.name=x", "-c", "user.email=x@example.org"]
     subprocess.run(["git", "-C", work, *person, *arguments], check=True, capture_output=True)  # noqa: S607
 
 
 def commit(work: Path) -> None:
-    """Commit everything."""
     git(work, "add", "-A")
     git(work, "commit", "-q", "-m", "state")
 
 
 def release(work: Path) -> "tuple[subprocess.CompletedProcess[str], list[str]]":
-    """Run the script; give its end, and what it called."""
+    """Run the script; return its end and the commands it called."""
     bin_ = work.parent / "bin"
     environment = {**os.environ, "PATH": f"{bin_}:{os.environ['PATH']}"}
     done = subprocess.run(
@@ -54,7 +52,7 @@ def release(work: Path) -> "tuple[subprocess.CompletedProcess[str], list[str]]":
 
 
 def test_it_tests_builds_checks_and_stops_before_publishing(checkout: Path) -> None:
-    """All tests, two wheels, the check of what is in them; tag and upload are printed for a person to run."""
+    """All tests, two wheels, the check of their content; tag and upload are printed for a person to run."""
     done, calls = release(checkout)
     assert done.returncode == 0, done.stderr
     assert calls[1:] == [

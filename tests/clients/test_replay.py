@@ -1,4 +1,4 @@
-"""Replaying through a stand-in for the service: pace, order, missing frames, errors, and what is left behind."""
+"""Replaying through a stand-in for the service: pace, order, missing frames, errors, and leftovers."""
 
 import threading
 import time
@@ -20,13 +20,11 @@ QUICK = Pace(patience_s=60.0, service_s=60.0)
 
 @pytest.fixture(scope="module")
 def dataset() -> Dataset:
-    """A small generated scene with clouds."""
     return open_dataset("scene", frames=FRAMES, vehicles=6, pedestrians=2, cyclists=1)
 
 
 @pytest.fixture
 def link(endpoint: str) -> Iterator[Connection]:
-    """A connection to the router."""
     with Connection(endpoint) as connection:
         yield connection
 
@@ -39,7 +37,6 @@ def run(
     on_frame: Callable[[], None] = lambda: None,
     **options: object,
 ) -> list[ReplayedSequence]:
-    """Replay sequences of the scene."""
     how = replace(Replaying("kitti", QUICK), **options)  # type: ignore[arg-type]  # given by the tests
     return replay(link, dataset, dataset.sequences(names or ["0000"]), out, how, on_frame)
 
@@ -97,7 +94,7 @@ def test_frames_without_clouds_say_that_none_comes(endpoint: str, link: Connecti
 def test_the_window_bounds_the_frames_under_way(
     endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path
 ) -> None:
-    """At full speed no more than a window of frames is sent ahead of those that came back."""
+    """At full speed, at most a window of frames is sent ahead of the returned ones."""
     gate = threading.Event()
     ahead: list[int] = []
 
@@ -181,7 +178,7 @@ def test_a_service_that_falls_silent_ends_the_replay(
 
 
 def test_the_newest_revision_is_written(endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path) -> None:
-    """Of several revisions of a frame, in whatever order they come, the highest is in the file."""
+    """Of several revisions of a frame, in any order, the highest is in the file."""
 
     def answer(message: Detections, tracks: Tracks) -> list[Tracks]:
         changed = tracks.model_copy(update={"revision": 1, "id": tracks.id + 1000})

@@ -24,8 +24,6 @@ COLUMNS = ("id", "label", "center", "size", "yaw", "score")
 
 @dataclass(frozen=True)
 class Rows:
-    """The tracks of one frame."""
-
     id: Ints
     label: Ints
     center: Floats
@@ -36,12 +34,10 @@ class Rows:
 
     @property
     def velocity(self) -> Floats:
-        """Unknown."""
         return np.full((len(self.id), 2), np.nan)
 
     @property
     def existence(self) -> Floats:
-        """Certain."""
         return np.ones(len(self.id))
 
 
@@ -58,7 +54,6 @@ def some_rows(rng: np.random.Generator, count: int) -> Rows:
 
 
 def write(path: Path, frames: list[tuple[int, Pose, Rows]]) -> Path:
-    """Write tracks and give the path of the file."""
     poses = {index: pose for index, pose, _ in frames}
     tracks = {index: rows for index, _, rows in frames}
     return write_kitti_results(

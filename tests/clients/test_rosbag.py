@@ -25,7 +25,6 @@ CLASSES = {"class.car": "Car", "class.bicycle": "Cyclist", "class.pedestrian": "
 
 @pytest.fixture(scope="module")
 def scene() -> DataSequence:
-    """A small generated scene with clouds and velocities."""
     (sequence,) = open_dataset("scene", frames=20, vehicles=6, pedestrians=3, cyclists=2, velocity=True).sequences(
         ["0000"]
     )
@@ -34,12 +33,10 @@ def scene() -> DataSequence:
 
 @pytest.fixture(scope="module")
 def bag(scene: DataSequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The scene as a bag."""
     return bags.write_mcap(tmp_path_factory.mktemp("bag") / "scene.mcap", [*bags.messages(scene)])
 
 
 def tracks_of(name: str, root: Path | None, out: Path, profile: str = "scene", **options: Any) -> FullTable:
-    """Give the tracks of the only sequence of a dataset."""
     dataset = open_dataset(name, root, **options)
     (result,) = track(dataset, dataset.sequences(["all"])[:1], out, Tracking(read_profile(profile), full=True))
     return read_full(full_path(result.file))
@@ -221,7 +218,6 @@ def test_an_unfinished_file_is_reported(bag: Path, tmp_path: Path) -> None:
 
 
 def changed(scene: DataSequence, path: Path, change: Callable[[bags.Sent], bags.Sent | None]) -> Path:
-    """Write the bag of the scene with messages changed or left out."""
     sent = [new for one in bags.messages(scene) if (new := change(one)) is not None]
     return bags.write_mcap(path, sent)
 
@@ -261,8 +257,6 @@ def of_detections(one: bags.Sent, change: Callable[[dict[str, Any]], None]) -> b
 
 
 def set_at(path: str, value: Any) -> Callable[[dict[str, Any]], None]:
-    """Give a change of one value."""
-
     def change(message: dict[str, Any]) -> None:
         at: Any = message
         *parts, last = path.split(".")
@@ -289,7 +283,7 @@ def set_at(path: str, value: Any) -> Callable[[dict[str, Any]], None]:
     ],
 )
 def test_a_wrong_value_is_named(scene: DataSequence, place: str, value: object, text: str, tmp_path: Path) -> None:
-    """A wrong value is told with topic, time and field; a message without a pose is left out with a note."""
+    """A wrong value is reported with topic, time and field; a message without a pose is left out with a note."""
     path = changed(scene, tmp_path / "wrong.mcap", lambda one: of_detections(one, set_at(place, value)))
     try:
         (sequence,) = open_dataset("rosbag", path).sequences(["all"])
@@ -323,7 +317,7 @@ def test_a_bag_without_detections_is_reported(scene: DataSequence, tmp_path: Pat
 def test_classes_of_any_name_are_tracked(
     scene: DataSequence, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Without a profile one is made for the bag; with one, classes are renamed to those that it has."""
+    """Without a profile one is made for the bag; with one, classes are renamed to its classes."""
     numbers = {"Car": "0", "Pedestrian": "1", "Cyclist": "2"}
 
     def change(one: bags.Sent) -> bags.Sent:

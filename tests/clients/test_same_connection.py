@@ -65,5 +65,5 @@ def test_a_question_has_as_many_answers_as_the_same_connection_gives(script: str
 
 
 def test_a_program_that_forgets_to_close_ends_after_such_a_subscription(endpoint: str) -> None:
-    """The thread that takes what comes keeps no program from ending."""
+    """The receiving thread does not keep a program from ending."""
     subprocess.run([sys.executable, "-c", SETTING + SUBSCRIBE, endpoint], timeout=HANGS_S, check=True)

@@ -27,14 +27,13 @@ FRAMES = 60
 
 @pytest.fixture(scope="module")
 def sequence() -> DataSequence:
-    """A generated scene without clouds."""
     (one,) = open_dataset("scene", frames=FRAMES, vehicles=10, clouds=False, seed=4).sequences(["0000"])
     return one
 
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_states_are_smoothed_as_the_article_has_it(*, turned: bool) -> None:
-    """Interleaved tracks, also where the filter turned a state by pi on the way, become those of the textbook."""
+    """Interleaved tracks, also with a state turned by pi on the way, equal the textbook smoother."""
     rng, table = np.random.default_rng(3), ClassTable.of(load_profile("kitti"))
     times = np.cumsum(rng.uniform(0.05, 0.3, 8) * 1e9).astype(np.int64)
     starts = rng.normal((50.0, -20.0, 6.0, 2.0, 0.1, 0.3), 1.0, (3, 6))
@@ -61,7 +60,6 @@ def test_states_are_smoothed_as_the_article_has_it(*, turned: bool) -> None:
 
 
 def tracked(sequence: DataSequence, *, smooth: bool) -> dict[int, Tracks]:
-    """Track the sequence."""
     return track_whole(read_profile("kitti"), sequence, smooth=smooth).tracks
 
 

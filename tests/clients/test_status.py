@@ -41,10 +41,9 @@ def test_json_holds_the_messages(endpoint: str, capsys: pytest.CaptureFixture[st
 
 
 def test_members_are_told_by_their_own_instance() -> None:
-    """Of a member, and of the workers of an instance, what it says itself counts; other names only begin alike."""
+    """A member's own report decides its age, also among workers of an instance with a common name prefix."""
 
     def member(name: str, age_s: float) -> MemberSummary:
-        """A member that was heard of so long ago."""
         return MemberSummary(member=name, state="alive", age_s=age_s, partitions=(), fences=())
 
     def service(instance: str, age_s: float) -> ServiceStatus:

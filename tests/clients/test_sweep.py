@@ -14,7 +14,7 @@ SCENE = ["--dataset", "scene", "--option", "frames=16", "--option", "clouds=0", 
 
 
 def test_a_value_gives_the_figures_of_a_profile_that_has_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Each value is that of all classes, for the time of its row; all else is as in the profile."""
+    """Each value applies to all classes, for the time of its row; all else stays as in the profile."""
     swept = result_of(run_here(capsys, "sweep", *SCENE, "--parameter", "birth_score=0.1,0.9", "--json"))["sweeps"][0]
     assert (swept["parameter"], swept["values"]) == ("birth_score", [0.1, 0.9])
     source = optipmb.profile_source("scene")
@@ -78,7 +78,7 @@ def test_the_parameters_of_the_papers_figure_are_swept_by_default(
     ],
 )
 def test_a_wrong_parameter_is_refused(asked: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """One line that names the parameter and what it can be, before anything is tracked."""
+    """One line names the parameter and its allowed values, before anything is tracked."""
     done = run_here(capsys, "sweep", *SCENE, "--parameter", asked)
     assert (done.returncode, done.stdout) == (2, "")
     assert len(done.stderr.splitlines()) == 1

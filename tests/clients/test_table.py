@@ -1,4 +1,4 @@
-"""Own data: tables of detections in four formats, what is found in them and said, and tables of tracks."""
+"""Own data: tables of detections in four formats, notes on their content, and tables of tracks."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,20 +20,17 @@ CLASSES = ("Car", "Pedestrian")
 
 
 def table(path: Path, columns: Mapping[str, np.ndarray]) -> Path:
-    """Write a table and give its path."""
     write_table(path, columns)
     return path
 
 
 def only(dataset: TableDataset) -> TableSequence:
-    """Give the one recording of a dataset."""
     (sequence,) = dataset.sequences(["all"])
     assert isinstance(sequence, TableSequence)
     return sequence
 
 
 def same(one: DataSequence, other: DataSequence) -> None:
-    """Check that two recordings have the same frames."""
     for a, b in zip(one.frames(), other.frames(), strict=True):
         assert a.stamp_ns == b.stamp_ns
         for name in ("center", "size", "yaw", "score"):
@@ -42,7 +39,6 @@ def same(one: DataSequence, other: DataSequence) -> None:
 
 
 def notes_and_frames(path: Path, columns: Mapping[str, np.ndarray], **options: str) -> tuple[str, TableSequence]:
-    """Give what is said about a table, and its recording."""
     dataset = TableDataset(table(path, columns), options)
     return " | ".join(dataset.notes), only(dataset)
 
@@ -82,7 +78,7 @@ def test_units_are_found_and_said(tmp_path: Path, changed: dict[str, Any], said:
 
 
 def test_sizes_in_another_order_are_found_where_no_name_says_the_order(tmp_path: Path) -> None:
-    """`size` as height, width, length is told from the cars; columns l, w, h that look so are read as named."""
+    """`size` as height, width, length is recognised by the cars; columns l, w, h of that look are read as named."""
     hwl = {"l": None, "w": None, "h": None, "size_0": boxes()["h"], "size_1": boxes()["w"], "size_2": boxes()["l"]}
     notes, sequence = notes_and_frames(tmp_path / "a.csv", boxes(**hwl))
     assert "sizes are height, width, length, as the Car boxes have them (--option sizes=" in notes
@@ -215,7 +211,7 @@ def test_columns_of_covariances_are_those_of_the_positions(tmp_path: Path) -> No
 def test_what_is_no_covariance_is_refused(
     tmp_path: Path, columns: dict[str, float], options: dict[str, str], error: str
 ) -> None:
-    """With the line and what was expected."""
+    """With the line and the expected value."""
     changed = boxes(**{name: np.full(3 * FRAMES, value) for name, value in columns.items()})
     with pytest.raises(DatasetError, match=error):
         TableDataset(table(tmp_path / "a.csv", changed), options)

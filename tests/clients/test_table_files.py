@@ -16,7 +16,6 @@ PLAIN = "t,x,class\n0.0,1.5,car\n0.1,-2.25,Fuß\n"
 
 
 def same(one: Columns, other: Columns) -> None:
-    """Check that two tables have the same columns."""
     assert list(one) == list(other)
     for name, values in one.items():
         np.testing.assert_array_equal(values, other[name])
@@ -153,7 +152,7 @@ def test_a_header_alone_gives_columns_without_rows(tmp_path: Path) -> None:
 
 
 def test_lines_are_counted_with_comments_and_blank_lines(tmp_path: Path) -> None:
-    """The line of a row is that of the file, whatever was left out before it."""
+    """The line of a row is the line in the file, also after rows left out."""
     (tmp_path / "d.csv").write_text("# made by hand\nt,x\n\n1,2\n# later\n3,4\n")
     assert [line_of(tmp_path / "d.csv", row) for row in (0, 1)] == [4, 6]
     (tmp_path / "d.txt").write_text("# t x\n1 2\n3 4\n")
@@ -161,7 +160,6 @@ def test_lines_are_counted_with_comments_and_blank_lines(tmp_path: Path) -> None
 
 
 def frames_of(path: Path, **options: str) -> list[tuple[Any, ...]]:
-    """Give what the frames of the one recording of a table have, rounded."""
     (sequence,) = open_dataset("table", path, **options).sequences(["all"])
     return [
         (
@@ -174,7 +172,6 @@ def frames_of(path: Path, **options: str) -> list[tuple[Any, ...]]:
 
 
 def lists() -> list[dict[str, Any]]:
-    """Give the boxes of each frame as lists, as detectors write them."""
     columns = boxes(vx=np.tile([8.0, -6.0, 1.0], FRAMES), vy=np.zeros(3 * FRAMES))
     rows = np.column_stack([columns[name] for name in ("x", "y", "z", "l", "w", "h", "yaw", "vx", "vy")])
     return [
@@ -188,7 +185,6 @@ def lists() -> list[dict[str, Any]]:
 
 
 def flat(tmp_path: Path, **changed: Any) -> list[tuple[Any, ...]]:
-    """Give the frames of the same boxes in a flat table."""
     velocity = {"vx": np.tile([8.0, -6.0, 1.0], FRAMES), "vy": np.zeros(3 * FRAMES)}
     write_table(tmp_path / "flat.parquet", boxes(**(velocity | changed)))
     return frames_of(tmp_path / "flat.parquet")
@@ -274,7 +270,7 @@ def test_a_folder_of_kitti_object_results_is_one_recording(tmp_path: Path, capsy
 
 
 def test_a_folder_reads_its_tables_and_no_notes(tmp_path: Path) -> None:
-    """A text or JSON file beside tables is no recording."""
+    """A text or JSON file next to tables is no recording."""
     (tmp_path / "many").mkdir()
     write_table(tmp_path / "many" / "a.csv", boxes())
     (tmp_path / "many" / "README.txt").write_text("Boxes of a car park.\n")

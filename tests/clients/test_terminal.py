@@ -13,19 +13,16 @@ HEIGHT = 40
 
 
 def session(stream: str, **changes: Any) -> SessionSummary:
-    """A stream that is well, but for changes."""
     fields = {"profile": "nuscenes", "state": "running", "rate_hz": 10.0, "latency_p50_ms": 2.0, "latency_p99_ms": 5.0}
     return SessionSummary(stream=stream, frames=100, tracks=7, age_s=0.1, **fields | changes)
 
 
 def service(instance: str = "one", *sessions: SessionSummary, **changes: Any) -> ServiceStatus:
-    """An instance that is well, but for changes."""
     fields = {"version": "1", "started_ns": 1, "uptime_s": 60.0, "state": "ready"}
     return ServiceStatus(instance=instance, sessions=sessions, **fields | changes)
 
 
 def text(view: StatusView, height: int = HEIGHT, width: int = 140) -> str:
-    """The view as a terminal would show it, without colours."""
     console = Console(width=width, record=True, file=io.StringIO())
     console.print(view.render(height, width))
     return console.export_text()
@@ -49,7 +46,7 @@ def test_a_restart_is_no_negative_rate() -> None:
 
 
 def test_the_worst_come_first_and_the_rest_is_counted() -> None:
-    """With more streams than lines those that lose frames, then the silent, then the late are shown."""
+    """With more streams than lines, streams that lose frames come first, then the silent, then the late."""
     well = [session(f"a/b/well-{number:02}") for number in range(50)]
     late, silent = session("z/z/late", latency_p99_ms=300.0), session("z/z/silent", state="stale")
     view = StatusView("here")

@@ -22,7 +22,6 @@ SCORER = scorer_of("scene", "Car", [])
 
 
 def clips_of(seeds: range, habits: Habits) -> list[Clip]:
-    """Recordings of cars 100 m apart."""
     recordings = [recorded(habits, seed, frames=60, objects=12, name=f"{seed:04d}") for seed in seeds]
     return [of_class(load(one, PAPER, RULES), "Car", RULES) for one in recordings]
 
@@ -83,7 +82,7 @@ def test_with_little_to_measure_nothing_is_said() -> None:
 @settings(max_examples=5, deadline=None)
 @given(seed=st.integers(0, 1000), found=st.floats(0.5, 0.95), false=st.floats(0.1, 3.0))
 def test_whatever_the_detector_a_calibration_is_valid(seed: int, found: float, false: float) -> None:
-    """Knots ascend, probabilities do not descend, and none is certain: the profile takes what was measured."""
+    """Knots ascend, probabilities do not descend, and none is certain: the profile accepts the measured curve."""
     clips = clips_of(range(seed, seed + 2), Habits(found=found, false=false))
     told = calibrate(clips, SCORER, CARS, 0.8)
     assert told is not None
@@ -92,7 +91,7 @@ def test_whatever_the_detector_a_calibration_is_valid(seed: int, found: float, f
 
 
 def test_tracks_are_ranked_by_the_score_that_the_tracker_gives() -> None:
-    """Paper's score, evidence and the mean of both: the figures are those of tracks so scored."""
+    """Paper's score, evidence and the mean of both: the figures match tracks with these scores."""
     clips = clips_of(range(3), Habits(false=2.0))
     told = with_calibration(CARS, "Car", calibrate(clips, SCORER, CARS, 0.8))
     rows = rank(clips, SCORER, told, "combination")

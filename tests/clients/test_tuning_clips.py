@@ -25,7 +25,6 @@ PARAMETERS = optipmb.load_profile("kitti")
 
 
 def clip_of(habits: Habits | None = None, seed: int = 0) -> Clip:
-    """Make a clip of cars."""
     return load(recorded(habits or Habits(), seed, frames=40), PARAMETERS, rules_of("scene"))
 
 
@@ -59,7 +58,6 @@ _COLUMNS = ("center", "size", "yaw", "velocity", "score", "label", "source")
 
 
 def tracked(dataset: Dataset, names: list[str], out: Path) -> None:
-    """Write the result files of some sequences."""
     list(track(dataset, dataset.sequences(names), out, Tracking(profiles.read_profile("kitti-paper"))))
 
 
@@ -96,7 +94,7 @@ def test_figures_of_kitti_are_those_of_its_result_files(tmp_path: Path) -> None:
 
 
 def test_figures_of_nuscenes_are_the_official_ones_of_its_result_file(tmp_path: Path) -> None:
-    """A trial's figures are those of the benchmark's evaluation in memory, and of the file up to its rounding."""
+    """A trial's figures equal the benchmark's evaluation in memory, and of the file up to its rounding."""
     dataset = open_dataset("nuscenes", nuscenes_root(), "centerpoint", clouds=False)
     sequences = dataset.sequences(["all"])
     list(track(dataset, sequences, tmp_path, Tracking(profiles.read_profile("nuscenes-paper"))))
@@ -130,7 +128,7 @@ def test_degraded_detections_are_a_matter_of_the_seed() -> None:
 
 
 def test_degraded_detections_are_as_much_worse_as_asked() -> None:
-    """A tenth is lost, places scatter by what was given, scores stay in (0, 1] and truth stays."""
+    """A tenth is lost, places scatter as given, scores stay in (0, 1] and truth stays."""
     clip = load(recorded(Habits(), frames=200), PARAMETERS, rules_of("scene"))
     worse = degrade(clip, Degradation(drop=0.1, position=0.3), 0)
     before, after = (sum(len(frame.score) for frame in one.frames) for one in (clip, worse))

@@ -15,7 +15,6 @@ FEW = ["--trials", "3", "--fold-trials", "1", "--folds", "2"]
 
 
 def tune(out: Path, *options: str) -> None:
-    """Tune cars."""
     assert run(["tune", *CARS, *FEW, "--out", str(out), *options]) == 0
 
 
@@ -81,19 +80,8 @@ def test_a_profile_is_matched_by_common_class_names(tmp_path: Path) -> None:
 def test_wrong_wishes_are_told_in_one_line(
     arguments: list[str], text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The status is 2, and the line says what is wrong."""
+    """The status is 2, and the line names the error."""
     assert run(["tune", *arguments, "--out", str(tmp_path)]) == 2
     error = capsys.readouterr().err.strip()
     assert text in error
     assert "\n" not in error
-
-
-def test_the_page_uses_options_that_there_are(capsys: pytest.CaptureFixture[str]) -> None:
-    """Every command of docs/tuning.md has a help, and every option in it is named there."""
-    lines = [line for line in PAGE.read_text().splitlines() if line.startswith("optipmb ")]
-    assert len(lines) >= 6
-    for line in lines:
-        command, *words = line.split()[1:]
-        assert run([command, "--help"]) == 0
-        text = capsys.readouterr().out
-        assert all(word in text for word in words if word.startswith("--")), line

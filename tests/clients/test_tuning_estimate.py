@@ -1,4 +1,4 @@
-"""What is estimated from data without tracking: known noise is found again."""
+"""Estimates from data without tracking: known noise is found again."""
 
 import math
 
@@ -17,7 +17,6 @@ PARAMETERS = optipmb.load_profile("kitti")
 
 
 def estimated(*sequences: Recorded) -> Estimate:
-    """Estimate cars."""
     rules = rules_of("scene")
     clips = [of_class(load(sequence, PARAMETERS, rules), "Car", rules) for sequence in sequences]
     return estimate(clips, "Car", only(PARAMETERS, "Car"), rules)
@@ -36,7 +35,7 @@ def test_measurement_noise_is_found_again(habits: Habits) -> None:
 
 
 def test_turned_boxes_are_counted_and_do_not_count_as_noise() -> None:
-    """Flips are a rate of their own; the spread of headings is that of the others."""
+    """Flips are a rate of their own; the spread of headings excludes them."""
     found = estimated(recorded(Habits(flips=0.1)))
     assert found.flip_rate == pytest.approx(0.1, abs=0.01)
     assert found.values["measurement_noise.heading"] == pytest.approx(0.08, rel=0.05)
@@ -54,7 +53,7 @@ def test_found_and_false_ones_are_counted() -> None:
 
 @pytest.mark.parametrize(("acceleration", "turn_rate"), [(1.0, 0.02), (0.4, 0.1)])
 def test_process_noise_is_found_again(acceleration: float, turn_rate: float) -> None:
-    """Q of acceleration and turn rate is that of the motion, within a third."""
+    """Q of acceleration and turn rate agrees with the motion within a third."""
     habits = Habits(acceleration=acceleration, turn_rate=turn_rate)
     found = estimated(*(recorded(habits, seed, name=f"{seed:04d}") for seed in range(3))).values
     assert found["process_noise.acceleration"] == pytest.approx(acceleration, rel=0.35)

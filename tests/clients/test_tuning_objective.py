@@ -12,7 +12,6 @@ import optipmb
 
 @pytest.fixture
 def objective() -> Objective:
-    """Three recordings of cars."""
     whole, rules = optipmb.load_profile("kitti-paper"), rules_of("scene")
     sequences = [recorded(Habits(), seed, frames=25, objects=10, name=f"{seed:04d}") for seed in range(3)]
     clips = [of_class(load(one, whole, rules), "Car", rules) for one in sequences]
@@ -20,7 +19,7 @@ def objective() -> Objective:
 
 
 def test_a_change_that_does_not_pay_is_taken_back(objective: Objective) -> None:
-    """Of two changed values, the one with a use is kept and the idle one is put back; the use is told."""
+    """Of two changed values, the useful one is kept and the idle one is put back; the gain is reported."""
     start = with_values(only(optipmb.load_profile("kitti-paper"), "Car"), "Car", {"gate": 0.1})
     candidates = Candidates(objective, range(3), start)
     chosen = candidates.prune({"gate": 4.0, "birth.acceleration": 1.1})
@@ -31,7 +30,7 @@ def test_a_change_that_does_not_pay_is_taken_back(objective: Objective) -> None:
 
 
 def test_a_margin_is_taken_off_all_but_the_start(objective: Objective) -> None:
-    """The start keeps its score; that of others is less by the standard error of their gain."""
+    """The start keeps its score; other candidates lose the standard error of their gain."""
     start = only(optipmb.load_profile("kitti-paper"), "Car")
     own = objective.gain(start, start, range(3))
     assert (own.gain, own.error, own.score) == (0.0, 0.0, own.value)

@@ -34,7 +34,6 @@ def cars(seed: int, power: float = 1.0, frames: int = 400) -> list[Clip]:
 
 
 def curve_of(own: list[Clip], reference: list[Clip]) -> optipmb.ScoreCalibration | None:
-    """The curve of cars."""
     return score_curve(*(pair_all(clips, "Car", CARS, RULES) for clips in (own, reference)))
 
 

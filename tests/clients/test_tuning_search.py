@@ -39,12 +39,10 @@ def guessed(values: Mapping[str, Value], guess: Callable[[float], None]) -> floa
 
 
 def search(path: Path, *, seed: int = 0, settings: dict[str, int] | None = None) -> Search:
-    """Open the search."""
     return Search(path, "valley", settings or {"a": 1}, SPACE, [START], seed)
 
 
 def tried(found: Search) -> list[tuple[dict[str, Any], list[float]]]:
-    """Give values and scores of all trials."""
     return [(trial.params, trial.values) for trial in found.trials]
 
 
@@ -53,7 +51,7 @@ class Stopped(Exception):  # noqa: N818 - nothing went wrong
 
 
 def test_an_interrupted_search_goes_on_as_if_it_had_not_been(tmp_path: Path) -> None:
-    """Ended in the middle of a trial and resumed, the trials are those of one go; another seed has others."""
+    """Stopped in the middle of a trial and resumed, trials equal an uninterrupted search; another seed differs."""
     whole = search(tmp_path / "whole.db")
     whole.run(14, guessed)
     count = 0
@@ -101,7 +99,7 @@ def test_the_first_trial_is_the_start_and_the_best_is_better(tmp_path: Path) -> 
 
 
 def test_a_trial_ends_where_its_first_score_is_bad(tmp_path: Path) -> None:
-    """Trials with an early score far below those of others are not scored, and are never the best."""
+    """Trials with an early score far below the others are not scored, and are never the best."""
     scored = 0
 
     def score(values: Mapping[str, Value], guess: Callable[[float], None]) -> float:
@@ -151,7 +149,7 @@ def test_every_choice_is_a_profile() -> None:
 
 
 def test_a_profile_is_written_as_it_is_read(tmp_path: Path) -> None:
-    """Writing a profile and reading it gives the same parameters, whatever its texts hold."""
+    """Writing a profile and reading it gives the same parameters, for any texts in it."""
     parameters = optipmb.load_profile("nuscenes-paper")
     odd = with_classes(parameters, {}, "odd", 'one "line"\nanother \\ line\tand a \x07 bell')
     calibrated = with_calibration(parameters, "car", optipmb.load_profile("nuscenes").classes["car"].calibration)

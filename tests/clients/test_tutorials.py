@@ -1,7 +1,5 @@
 """The commands and programs of the tutorials run as they stand on the pages."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess
@@ -28,7 +26,6 @@ def blocks(page: str, heading: str) -> str:
 
 
 def run(script: str, folder: Path) -> str:
-    """Run a script in a folder that has the examples, and return what it printed."""
     if not (folder / "examples").exists():
         (folder / "examples").symlink_to(ROOT / "examples")
     environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "COLUMNS": "80"}

@@ -1,4 +1,4 @@
-"""What is shown in Rerun of messages, and the command that shows it."""
+"""Messages shown in Rerun, and the command that shows them."""
 
 import subprocess
 import sys
@@ -28,7 +28,7 @@ DEADLINE_S = 60.0
 
 
 class Log:
-    """Stands for a Rerun recording: keeps what was logged last under each path."""
+    """A Rerun recording that keeps the newest entry of each path."""
 
     def __init__(self) -> None:
         self.entities: dict[str, tuple[Any, ...]] = {}
@@ -36,26 +36,21 @@ class Log:
         self.blueprints: list[Any] = []
 
     def log(self, path: str, *shown: Any, **_options: bool) -> None:
-        """Keep it."""
         self.entities[path] = shown
 
     def set_time(self, timeline: str, **when: Any) -> None:
-        """Keep it."""
         self.times.append((timeline, when))
 
     def send_blueprint(self, blueprint: Any) -> None:
-        """Keep it."""
         self.blueprints.append(blueprint)
 
     def column(self, path: str, name: str) -> Any:
-        """The values of a column of the first archetype at a path."""
         array = getattr(self.entities[path][0], name).as_arrow_array()
         assert isinstance(array, pa.Array)
         return array.to_pylist()
 
 
 def tracks(seq: int, ids: list[int], covariance: np.ndarray | None = None) -> Tracks:
-    """Tracks of these ids side by side, going along x."""
     return tracks_message(
         STREAM,
         seq,
@@ -107,13 +102,12 @@ def density() -> Density:
 
 
 def cloud() -> Points:
-    """Two points in the sensor's frame."""
     xyz = np.array([[1, 0, 0], [0, 1, 0]], np.float32)
     return Points(stream=STREAM, epoch=bytes(16), seq=0, stamp_ns=0, frame="sensor", pose=POSE, xyz=xyz)
 
 
 def test_tracks_are_boxes_of_their_colour_with_id_and_existence() -> None:
-    """Place, size, turn, velocity and colour are those of the message; only the surer ones have a label."""
+    """Place, size, turn, velocity and colour equal the message; only the surer tracks have a label."""
     log = Log()
     View(log).show(tracks(1, [3, 10, 11]))  # type: ignore[arg-type]  # stands for a recording
     path = f"{STREAM}/tracks"
@@ -131,7 +125,7 @@ def test_tracks_are_boxes_of_their_colour_with_id_and_existence() -> None:
 
 
 def test_ellipses_are_two_standard_deviations_long_and_turned() -> None:
-    """The covariance of the position is drawn along its own axes, whatever the other states are."""
+    """The covariance of the position is drawn along its own axes, for any other states."""
     turn, long, short = 0.6, 3.0, 0.5
     c, s = np.cos(turn), np.sin(turn)
     covariance = np.eye(6) * 100.0
@@ -157,7 +151,7 @@ def test_trails_are_the_last_five_seconds() -> None:
 
 
 def test_detections_and_clouds_are_shown_in_the_world() -> None:
-    """What comes in the sensor's frame is carried to where the sensor stood; the sensor is shown too."""
+    """Objects in the sensor's frame are moved to the sensor's pose; the sensor is shown too."""
     log = Log()
     view = View(log)  # type: ignore[arg-type]  # as above
     view.show(detections())
@@ -170,7 +164,7 @@ def test_detections_and_clouds_are_shown_in_the_world() -> None:
 
 
 def test_components_are_faint_ellipses_on_a_path_of_their_own() -> None:
-    """Place and covariance are those of the message; weight is the size of the point, and how dark both are."""
+    """Place and covariance equal the message; weight is the size of the point, and how dark both are."""
     log = Log()
     view = View(log)  # type: ignore[arg-type]  # as above
     view.show(density())
@@ -187,13 +181,10 @@ def test_components_are_faint_ellipses_on_a_path_of_their_own() -> None:
 
 
 class Answering:
-    """Stands for a connection: answers every question about a density, and says who asked."""
-
     def __init__(self) -> None:
         self.asked: list[tuple[str, str]] = []
 
     def query(self, key: str, **_options: float) -> tuple[Answer, ...]:
-        """Answer."""
         self.asked.append((key, threading.current_thread().name))
         encoding = encoding_of(Density)
         return (Answer(key, b"no", encoding, ok=False), Answer(key, encode(density()), encoding, ok=True))
@@ -215,7 +206,7 @@ def test_only_streams_with_new_tracks_are_asked() -> None:
 
 
 def test_the_layout_is_sent_once_and_axes_have_metres() -> None:
-    """One layout, for the first stream; numbered axes near the sensor; a legend that names what is drawn."""
+    """One layout, for the first stream; numbered axes near the sensor; a legend of the drawn items."""
     log = Log()
     view = View(log)  # type: ignore[arg-type]  # as above
     view.show(detections())
@@ -239,7 +230,7 @@ def test_stamps_since_1970_are_times_and_small_ones_seconds() -> None:
 
 
 def test_colours_can_be_told_apart() -> None:
-    """Seven colours, all different, and the eighth track has that of the first."""
+    """Seven colours, all different; the eighth track repeats the first."""
     assert len(set(COLOURS)) == 7
     assert colour_of(0) == colour_of(7) == "#0072B2"
     assert rgb_of(0) == (0, 0x72, 0xB2)
@@ -247,7 +238,6 @@ def test_colours_can_be_told_apart() -> None:
 
 @pytest.fixture
 def incident(tmp_path: Path) -> Path:
-    """A small recording."""
     path = tmp_path / "incident.mcap"
     keys = Keys()
     with RecordingWriter(path) as writer:

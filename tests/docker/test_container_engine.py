@@ -1,7 +1,5 @@
 """What `make containers` does before there is a container."""
 
-from __future__ import annotations
-
 import os
 import stat
 import subprocess

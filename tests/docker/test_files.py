@@ -1,7 +1,5 @@
 """The files of a deployment are what their tools accept, and say what the code does."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -37,18 +35,15 @@ SUFFIXES = ("_bucket", "_count", "_sum")
 
 
 def tool(name: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run a tool that is installed beside this Python."""
     command = [str(Path(sys.executable).parent / name), *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
 
 def pins(file: Path) -> dict[str, str]:
-    """Names and versions of a lock file."""
     return dict(re.findall(r"^([A-Za-z0-9_.-]+)==([^\s;]+)", file.read_text(), re.MULTILINE))
 
 
 def queries() -> list[str]:
-    """Every query of the dashboard and of the alerts."""
     alerts = yaml.safe_load((DOCKER / "prometheus" / "alerts.yml").read_text())
     shown = [target["expr"] for panel in DASHBOARD["panels"] for target in panel["targets"]]
     return shown + [rule["expr"] for group in alerts["groups"] for rule in group["rules"]]

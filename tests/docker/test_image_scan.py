@@ -1,17 +1,13 @@
 """The scan of an image finds what must not be in one."""
 
-from __future__ import annotations
-
 import io
 import json
 import tarfile
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 from image_scan import USER, Findings, scan
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 KEY = b"-----BEGIN RSA PRIVATE KEY-----\n" + b"A" * 64 + b"\n-----END RSA PRIVATE KEY-----\n"
 BASE = [("usr/bin/su", {"mode": 0o755}, b"program"), ("usr/lib/selftest", {}, KEY), ("tmp", {"mode": 0o1777}, None)]
@@ -37,7 +33,6 @@ def layer(entries: list[Entry]) -> bytes:
 
 
 def look(folder: Path, *layers: list[Entry], config: dict[str, Any] | None = None) -> Findings:
-    """Scan an image of these layers above the base."""
     files = {f"{number}.tar": layer(entries) for number, entries in enumerate([BASE, *layers])}
     manifest = [{"Config": "config.json", "Layers": list(files)}]
     files |= {

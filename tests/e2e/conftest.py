@@ -10,7 +10,6 @@ START_S = 240.0  # the first start on a machine compiles
 
 @pytest.fixture(scope="module")
 def service() -> Iterator[ServiceProcess]:
-    """A running service with its own router."""
     with ServiceProcess() as process:
         process.wait_until_ready(START_S)
         yield process

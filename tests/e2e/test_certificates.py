@@ -1,11 +1,9 @@
-"""Certificates that end: who says so, and where; what is renewed is used."""
-
-from __future__ import annotations
+"""Certificates that expire: who reports it, and where; a renewed one is used."""
 
 import re
 import urllib.error
 import urllib.request
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import pytest
 from optipmb_client import Publisher
@@ -16,29 +14,23 @@ from router import until
 from routers import free_endpoint
 from service_process import ServiceProcess
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
 KEYS = Keys()
 NAMES = ("--node", "garage/robot", "--service", "tracker", "--viewer", "ops")
 
 
 @pytest.fixture
 def network(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Network]:
-    """A protected network."""
     with Network(tmp_path_factory.mktemp("tls"), *NAMES) as one:
         yield one
 
 
 def started(network: Network, address: str) -> ServiceProcess:
-    """A service of the network that answers over HTTP."""
     config = str(network.config("service/tracker"))
     options = ("--instance", "tracker", "--connect", network.endpoint, "--zenoh-config", config, "--http", address)
     return ServiceProcess(*options, listen=False)
 
 
 def get(address: str, path: str) -> tuple[int, str]:
-    """Status and body of an answer."""
     try:
         with urllib.request.urlopen(f"http://{address}{path}", timeout=30) as answer:
             return answer.status, answer.read().decode()
@@ -48,7 +40,6 @@ def get(address: str, path: str) -> tuple[int, str]:
 
 
 def days(address: str) -> dict[str, float]:
-    """How long the certificates of a service hold."""
     text = get(address, "/metrics")[1]
     return {
         use: float(value)

@@ -1,7 +1,5 @@
 """Services that share streams, by a folder or by nothing but a NATS server: killed, frozen, ended, cut off."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal
@@ -11,32 +9,26 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from collections.abc import Iterator
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import pytest
 from commands import run_here
 from fleet import Fleet, RouterProcess, freeze, thaw
 from log_process import LogProcess
 from nats_process import NatsProcess
-from optipmb_schemas import Problem, ServiceStatus, decode
+from optipmb_schemas import Problem, ServiceStatus, SessionState, decode
 from optipmb_service.cluster.leases import PARTITIONS
 from optipmb_service.cluster.nats_connection import NatsConnection, token
 from proxy import Proxy
 from router import Node, Sensor, until
 from routers import free_endpoint
-from service_process import READY_S
+from service_process import READY_S, ServiceProcess
 from takeovers import KEYS, check, distinct, longest_silence_s, outage_s, published_by, send
 
 import optipmb
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from types import TracebackType
-
-    from optipmb_schemas import SessionState
-    from service_process import ServiceProcess
 
 SENSORS = [Sensor(stream=f"site/node-{number}/lidar") for number in range(6)]
 FREEZE_S = 5.0
@@ -64,7 +56,6 @@ class Cluster:
         self._fleet = fleet
 
     def member(self, instance: str, endpoint: str = "", **settings: object) -> ServiceProcess:
-        """Start a member, on the router of the node unless another one is named."""
         own: dict[str, object] = {"store": self._folder / "common"}
         if self.nats is not None:
             own = {"cluster": self.nats.url, "store": self._folder / instance}
@@ -75,13 +66,10 @@ class Cluster:
         return self._folder / ("common" if self.nats is None else f"own-{number}")
 
     def owners(self) -> dict[str, str]:
-        """The member of each stream, by the announcements."""
         keys = self.node.alive(KEYS.all_owners())
         return {KEYS.stream_of(key): KEYS.instance_of(key) for key in keys}
 
     def settled(self, *instances: str) -> dict[str, str]:
-        """Wait until each stream has one owner of these, and return them."""
-
         def reached() -> bool:
             tokens = self.node.alive(KEYS.all_owners())
             return len(tokens) == len(SENSORS) == len(self.owners()) and set(self.owners().values()) <= {*instances}
@@ -98,13 +86,11 @@ class Cluster:
         return {one.stream: check(self.node, frames, owner=owners[one.stream], sensor=one) for one in SENSORS}
 
     def outage_s(self, since_ns: int) -> float:
-        """The longest time that a stream was silent for."""
         return max(outage_s(self.node, since_ns, sensor) for sensor in SENSORS)
 
 
 @pytest.fixture(params=["folder", "nats"])
 def cluster(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Cluster]:
-    """A cluster without members."""
     (tmp_path / "nats").mkdir()
     with (
         NatsProcess(tmp_path / "nats") if request.param == "nats" else nullcontext() as nats,
@@ -116,7 +102,6 @@ def cluster(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Cluster]
 
 
 def holds(member: ServiceProcess, partitions: int) -> None:
-    """Wait until a member says that it holds so many partitions."""
     until(lambda: _held(member) == partitions, f"{partitions} partitions are held")
 
 
@@ -128,7 +113,7 @@ def _held(member: ServiceProcess) -> int:
 def test_members_take_over(cluster: Cluster, capsys: pytest.CaptureFixture[str]) -> None:
     """Fault 17: a member is killed, one on another router frozen and woken, a third ended: all goes on, to the byte.
 
-    The sessions stay the same ones, so no id is used twice. The frozen one publishes nothing of what it would have
+    The sessions stay the same ones, so no id is used twice. The frozen one publishes nothing that it would have
     tracked, says that it has lost its lease, and gets its share of the partitions again.
     """
     node = cluster.node
@@ -192,9 +177,7 @@ class Sending:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._enough.set()
         self._thread.join()
 
@@ -410,7 +393,6 @@ def test_a_cut_between_two_routers(tmp_path: Path) -> None:
 
 
 def purge(nats: NatsProcess) -> None:
-    """Have the server forget all leases and checkpoints."""
     connection = NatsConnection([nats.url], lambda: None)
     until(lambda: not connection.failure, "it is connected")
     assert connection.call(connection.ask(f"STREAM.PURGE.OPTIPMB_{token(KEYS.prefix)}", {}))["purged"] > 0
@@ -453,7 +435,7 @@ def test_a_member_that_dies_before_a_purge(cluster: Cluster) -> None:
 
 
 def test_a_member_that_was_cut_off_contests_nothing(tmp_path: Path) -> None:
-    """The member that looks at who tracks what is cut off for longer than links last: when all is whole, no problem."""
+    """The member that assigns streams is cut off for longer than links last: afterwards no problem remains."""
     (tmp_path / "nats").mkdir()
     names = ("a", "b", "c")
     with (
@@ -545,7 +527,7 @@ def test_the_server_is_gone_for_longer_than_a_lease(cluster: Cluster) -> None:
     """
     node, nats = cluster.node, cluster.nats
     assert nats is not None
-    service = cluster.member("pair", workers=2, lease_s=6.0)  # long, so that a busy machine costs nobody its lease
+    service = cluster.member("pair", workers=2, lease_s=6.0)  # long, so that no lease ends on a busy machine
     send(node, 0, 10, sensors=SENSORS)
     until(lambda: service.errors.count("held=32 ") == 2, "each worker holds half of the partitions")
     cluster.check(10, "pair-w0", "pair-w1")

@@ -1,7 +1,5 @@
 """Links that are dead and not closed, as behind a gateway that has forgotten them, and what a long outage costs."""
 
-from __future__ import annotations
-
 import time
 
 import pytest

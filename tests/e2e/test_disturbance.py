@@ -22,7 +22,6 @@ POSE = (np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
 @pytest.fixture(scope="module")
 def expected(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """The result file of the scene, tracked offline."""
     out = tmp_path_factory.mktemp("expected")
     assert run([str(one) for one in ("track", *SCENE, "--out", out, "--json")]) == 0
     return (out / "0000.txt").read_bytes()
@@ -65,7 +64,6 @@ class Disturbance:
 
 @pytest.fixture
 def link(service: ServiceProcess) -> Iterator[Connection]:
-    """A connection to the service's router."""
     with Connection(service.endpoint) as connection:
         yield connection
 

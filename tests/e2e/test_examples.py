@@ -94,7 +94,6 @@ def test_the_examples_are_short() -> None:
 
 
 def blocks() -> list[str]:
-    """Give the Python code blocks of the README."""
     return re.findall(r"^```python\n(.*?)^```", README.read_text(), flags=re.DOTALL | re.MULTILINE)
 
 

@@ -1,12 +1,10 @@
 """A service process and a router: ended, cut off, without room on its disk."""
 
-from __future__ import annotations
-
 import resource
 import shutil
 import time
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from fleet import Fleet
@@ -16,9 +14,6 @@ from router import Node, until
 from takeovers import KEYS, SENSOR, check, published_by, send
 
 import optipmb
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -1,25 +1,19 @@
 """SIGKILL while several sensors feed one session: no trace of it is left."""
 
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 from fleet import Fleet
 from fusing import FUSED, drive
-from optipmb_schemas import Keys, MoveRequest, ServiceStatus, SessionState, Tracks, decode
+from optipmb_schemas import Detections, Keys, MoveRequest, ServiceStatus, SessionState, Tracks, decode
 from optipmb_service.stream.session import Session
 from optipmb_service.stream.values import Policy
 from router import Node, until
 from sessions import Merged
 
 import optipmb
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from optipmb_schemas import Detections
 
 KEYS = Keys()
 RESTART_S = 240.0

@@ -1,16 +1,14 @@
 """JSON of a real service: the same texts over HTTP, WebSocket and MQTT, and a page of another origin draws them."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json
 import re
 import threading
 import urllib.request
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from broker import Broker
@@ -19,9 +17,6 @@ from optipmb_schemas.json_form import Selection, tracks_json
 from router import Node, Sensor
 from service_process import ServiceProcess
 from websocket import create_connection
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 PAGE = Path(__file__).parents[2] / "examples/json/index.html"
 SENSOR = Sensor()
@@ -37,7 +32,6 @@ min_s = 0
 
 @pytest.fixture
 def service(tmp_path: Path) -> Iterator[ServiceProcess]:
-    """A service that counts all objects."""
     file = tmp_path / "zones.toml"
     file.write_text(ZONES)
     options = ("--http", "127.0.0.1:0", "--log-format", "json", "--settings", str(file))
@@ -47,12 +41,10 @@ def service(tmp_path: Path) -> Iterator[ServiceProcess]:
 
 
 def address_of(service: ServiceProcess) -> str:
-    """Where a service answers."""
     return str(re.findall(r'"http", .*?"address": "([^"]+)"|"address": "([^"]+)"', service.errors)[0][1])
 
 
 def read(address: str, count: int, subscribed: threading.Event) -> list[bytes]:
-    """Read so many server-sent events."""
     with urllib.request.urlopen(f"http://{address}/api/v1/stream?stream={SENSOR.stream}", timeout=60) as response:
         assert response.readline() == b": hello\n"
         subscribed.set()
@@ -83,13 +75,11 @@ def frames(service: ServiceProcess, address: str) -> tuple[list[bytes], list[byt
 
 
 def get(url: str) -> bytes:
-    """Return the body of an answer."""
     with urllib.request.urlopen(url, timeout=60) as response:  # noqa: S310 - of the service
         return bytes(response.read())
 
 
 def of(texts: list[bytes], kind: str) -> list[bytes]:
-    """Return the texts of a type."""
     return [text for text in texts if json.loads(text)["type"] == kind]
 
 
@@ -114,7 +104,7 @@ async def test_every_edge_gives_the_text_of_the_published_tracks(service: Servic
 
 
 def test_the_example_page_draws_tracks(service: ServiceProcess, tmp_path: Path) -> None:
-    """Opened from a file, an origin that the settings name, it shows what is tracked; its console stays empty."""
+    """Opened from a file, an origin in the settings, it shows the tracks; its console stays empty."""
     over = threading.Event()
 
     def publish() -> None:

@@ -1,14 +1,13 @@
 """SIGKILL at random moments while recorded sequences are replayed: no trace is left but the outage."""
 
-from __future__ import annotations
-
 import json
 import os
 import random
 import threading
 import time
+from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from fleet import Fleet
@@ -21,9 +20,6 @@ from recorded import KEYS, Replay, kitti
 from sessions import undisturbed
 
 import optipmb
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 KILLS = int(os.environ.get("OPTIPMB_TEST_KILLS", "3"))
 FEW = 10
@@ -51,7 +47,7 @@ def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[
     """Fault 1: four recorded streams, SIGKILL in the middle, a new process: all is as without a kill.
 
     The tracks of every frame, repetitions set aside, the digest of the state and the events of zones are byte-equal to
-    those of a session that nothing happened to; events that were final did not change. Every round has a moment of its
+    an undisturbed session; events that were final did not change. Every round has a moment of its
     own.
     """
     root = kitti_root()
@@ -120,6 +116,5 @@ def _read(inbox: Inbox, replay: Replay) -> None:
 
 
 def _outage(replay: Replay, killed_ns: int) -> float:
-    """Seconds from the kill to the first new tracks after it."""
     after = [at for result in replay.results.values() for at in result.times_ns if at > killed_ns + 50_000_000]
     return (min(after) - killed_ns) / 1e9

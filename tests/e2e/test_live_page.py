@@ -1,27 +1,21 @@
 """The page of a real service, seen by a real browser while detections come in."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math
 import threading
 import time
 import urllib.request
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from browser import browser, console, requested, size, wait
 from optipmb_client import Publisher
 from processes import descendants, wait_until_ended
 from routers import free_endpoint
+from selenium.webdriver import Chrome
 from service_process import ServiceProcess
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from selenium.webdriver import Chrome
 
 ENDPOINT, HTTP = free_endpoint(), free_endpoint().removeprefix("tcp/")
 BASE = f"http://{HTTP}"
@@ -31,7 +25,6 @@ DEADLINE_S = 60.0
 
 
 def service(*options: str) -> ServiceProcess:
-    """The service, always at the same addresses."""
     return ServiceProcess("--listen", ENDPOINT, "--http", HTTP, "--profile", "nuscenes", *options, listen=False)
 
 
@@ -67,7 +60,6 @@ def publishing(stream: str, label: str, length: float) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def chrome(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chrome]:
-    """A browser, and two streams for it to see."""
     with browser(tmp_path_factory.mktemp("profile")) as found:
         yield found
 
@@ -116,7 +108,6 @@ def test_the_page_shows_live_tracks_and_survives_a_restart(chrome: Chrome, tmp_p
 
 
 def loading_s(chrome: Chrome) -> float:
-    """Load the page; how long that took by the browser's clock."""
     chrome.get(BASE)
     return float(wait(chrome, "performance.getEntriesByType('navigation')[0].loadEventEnd")) / 1000
 
@@ -140,7 +131,7 @@ def shown_moving(chrome: Chrome) -> None:
 
 
 def figures(chrome: Chrome) -> None:
-    """A tap on a track shows its existence and score; a tap beside hides them."""
+    """A tap on a track shows its existence and score; a tap elsewhere hides them."""
     for place, hidden in (("toScreen(frame.tracks[1][X], frame.tracks[1][Y])", False), ("[60, 20]", True)):
         chrome.execute_script(
             f"const [x, y] = {place}, box = canvas.getBoundingClientRect();"
@@ -167,7 +158,7 @@ def phone(chrome: Chrome) -> None:
 def test_streams_of_workers_are_shown_and_workers_end_with_their_parent() -> None:
     """With several processes the page of the whole gets the tracks of whichever worker has the stream.
 
-    And kill -9 of the parent, which can tell nobody, leaves no worker behind.
+    And kill -9 of the parent, without any notice, leaves no worker behind.
     """
     with service("--workers", "2") as whole:
         whole.wait_ready()

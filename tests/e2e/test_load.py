@@ -1,15 +1,10 @@
 """`optipmb load` against a real service: both count the same."""
 
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING
 
+import pytest
 from commands import optipmb, result_of, run_here
-
-if TYPE_CHECKING:
-    import pytest
-    from optipmb_tools.run.service_process import ServiceProcess
+from optipmb_tools.run.service_process import ServiceProcess
 
 STREAMS, RATE, SECONDS = 3, 20, 2
 

@@ -1,10 +1,9 @@
 """The log of detections: a successor elsewhere tracks the frames of an outage, also of publishers without a cache."""
 
-from __future__ import annotations
-
 import time
+from collections.abc import Iterator
 from functools import partial
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from fleet import Fleet
@@ -19,15 +18,10 @@ from optipmb_service.cluster.message_log import MessageLog
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.zenoh.transport import TRACKS_CACHE
 from router import Node, Sensor, plain, until
+from service_process import ServiceProcess
 from takeovers import KEYS, check, expected
 
 import optipmb
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from service_process import ServiceProcess
 
 SENSORS = [Sensor(stream=f"site/node-{number}/lidar") for number in range(3)]
 
@@ -47,7 +41,6 @@ class Logged:
         self._folder, self._fleet = folder, fleet
 
     def member(self, instance: str, **settings: object) -> ServiceProcess:
-        """Start a member with a folder of its own."""
         # Before its first checkpoint a stream is read as far back; a busy machine takes long to start a member.
         settings = {"standby_s": 300.0} | settings
         return self._fleet.service(instance, cluster=self.nats.url, store=self._folder / instance, **settings)
@@ -93,7 +86,6 @@ class Logged:
 
 @pytest.fixture
 def logged(tmp_path: Path) -> Iterator[Logged]:
-    """Without members."""
     (tmp_path / "nats").mkdir()
     with (
         NatsProcess(tmp_path / "nats") as nats,

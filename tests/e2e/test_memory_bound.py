@@ -1,7 +1,5 @@
 """A service stays within its memory under any input: real processes, their peak read from the system."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -23,7 +21,6 @@ BESIDE_MB = 400
 
 
 def peak_mb(pid: int) -> float:
-    """The most memory that a process has had."""
     (kilobytes,) = re.findall(r"^VmHWM:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text(), re.MULTILINE)
     return int(kilobytes) / 1024
 

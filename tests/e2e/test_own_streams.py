@@ -1,33 +1,26 @@
 """Members receive their own streams: two services on two linked routers that share a folder, and what goes to each."""
 
-from __future__ import annotations
-
 import operator
 import re
 import threading
 import time
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Self
+from pathlib import Path
+from typing import Self
 
 import pytest
 from fleet import PROFILE, Fleet, RouterProcess
-from optipmb_schemas import ServiceStatus, SessionState, encode, encoding_of
+from optipmb_schemas import Detections, Points, ServiceStatus, SessionState, encode, encoding_of
 from optipmb_service.cluster.leases import PARTITIONS
 from optipmb_service.stream.session import Session
 from optipmb_service.stream.values import Tracked
 from proxy import Proxy
 from router import Node, Sensor, plain, until
+from service_process import ServiceProcess
 from takeovers import KEYS, check, distinct, expected
 
 import optipmb
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-    from types import TracebackType
-
-    from optipmb_schemas import Detections, Points
-    from service_process import ServiceProcess
 
 SENSORS = [Sensor(stream=f"site/node-{number}/lidar") for number in range(8)]
 POINTS = 30_000
@@ -60,9 +53,7 @@ class Pair:
         self.settle()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._context.close()
 
     def settle(self) -> None:
@@ -71,25 +62,21 @@ class Pair:
         until(lambda: all(half in one.errors for one in self.services.values()), "each has half of the partitions")
 
     def owners(self) -> dict[str, str]:
-        """Which service tracks which stream."""
         keys = self.node.alive(KEYS.all_owners())
         return {KEYS.stream_of(key): KEYS.instance_of(key) for key in keys}
 
     def figure(self, instance: str, name: str, topic: str) -> float:
-        """A metric of a service."""
         text = self.node.query(KEYS.metrics(instance))[0][2].decode()
         found = re.search(rf'^optipmb_{name}{{topic="{topic}"}} (\S+)$', text, re.MULTILINE)
         assert found, text
         return float(found[1])
 
     def frames(self, instance: str) -> int:
-        """Frames that a service has tracked."""
         return self.node.ask(KEYS.status(instance), ServiceStatus).frames
 
 
 @pytest.fixture
 def pair(tmp_path: Path) -> Iterator[Pair]:
-    """Two services without streams."""
     with Pair(tmp_path) as one:
         yield one
 
@@ -114,7 +101,6 @@ def with_clouds(sensor: Sensor, frames: int) -> dict[int, set[bytes]]:
 
 
 def clouds(pair: Pair, name: str) -> list[float]:
-    """What both services have counted of clouds."""
     return [pair.figure(instance, name, "points") for instance in "ab"]
 
 
@@ -162,7 +148,7 @@ def test_a_member_receives_its_own_streams(pair: Pair, capsys: pytest.CaptureFix
 
 
 def test_a_publisher_without_a_token_is_tracked_from_its_first_frame(pair: Pair) -> None:
-    """Its frames are tracked wherever its partition is, and after a kill -9 of the discoverer, all of them."""
+    """All frames are tracked for any owner of the partition, and after a kill -9 of the discoverer."""
     node = pair.node
     for seq in range(20):
         raw(node, *(sensor.detections(seq) for sensor in SENSORS))

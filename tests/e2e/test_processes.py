@@ -73,7 +73,8 @@ def test_the_service_ends_when_its_parent_is_killed() -> None:
 @pytest.mark.parametrize("stage", ["starting", "replaying"])
 def test_an_interrupted_demo_leaves_nothing_behind(tmp_path: Path, stage: str, number: int, status: int) -> None:
     """However the demo ends, at any stage, the service ends too, and there is no traceback."""
-    process = start("demo", "--out", tmp_path, "--frames", 10, "--speed", 0.1, fresh=True)
+    environment = os.environ | {"PYTHONFAULTHANDLER": "1"}  # SIGABRT prints where each thread is
+    process = start("demo", "--out", tmp_path, "--frames", 10, "--speed", 0.1, fresh=True, env=environment)
     assert process.stderr is not None
     try:
         for line in process.stderr:
@@ -90,7 +91,7 @@ def test_an_interrupted_demo_leaves_nothing_behind(tmp_path: Path, stage: str, n
         try:
             out, err = process.communicate(timeout=120)
         except subprocess.TimeoutExpired:
-            process.send_signal(signal.SIGABRT)  # prints where each thread is
+            process.send_signal(signal.SIGABRT)
             out, err = process.communicate(timeout=120)
     finally:
         process.kill()

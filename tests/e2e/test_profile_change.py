@@ -1,18 +1,12 @@
 """A profile that changes in the settings, for a stream that has a checkpoint."""
 
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING
+from pathlib import Path
 
+import pytest
 from commands import run_here
 from router import Node, Sensor, until
 from service_process import ServiceProcess
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    import pytest
 
 SENSOR = Sensor()
 

@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from commands import kill, result_of, run_here, start
@@ -17,14 +16,11 @@ from mcap.reader import make_reader
 from optipmb_client import Connection, Subscriber
 from optipmb_schemas import Tracks, decode, encode
 from optipmb_tools.cli import run
-from optipmb_tools.datasets import DatasetError, open_dataset
+from optipmb_tools.datasets import Dataset, DatasetError, open_dataset
 from optipmb_tools.recordings.files import RecordingFile
 from optipmb_tools.run.replay import Pace, Replaying, replay
 from optipmb_tools.run.service_process import ServiceProcess
 from real_data import REPOSITORY, kitti_root
-
-if TYPE_CHECKING:
-    from optipmb_tools.datasets import Dataset
 
 FRAMES = 15
 VALUES = {"frames": FRAMES, "vehicles": 8, "pedestrians": 2}
@@ -59,7 +55,6 @@ def recording(service: ServiceProcess, path: Path) -> Iterator["subprocess.Popen
 
 
 def wait_for(condition: object, service: ServiceProcess) -> None:
-    """Wait until `condition()` holds."""
     assert callable(condition)
     deadline = time.monotonic() + DEADLINE_S
     while not condition():
@@ -170,7 +165,6 @@ def test_four_streams_played_into_a_fresh_service(
 
 @pytest.fixture(scope="module")
 def incident(service: ServiceProcess, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording of one stream."""
     return recorded_replay(service, tmp_path_factory.mktemp("incident"), open_dataset("scene", **VALUES), "0000")
 
 

@@ -3,8 +3,6 @@
 How often tracks are corrected depends on which frames wait when a late one arrives, and that on the machine.
 """
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -35,7 +35,6 @@ class Both:
         self._capsys = capsys
 
     def track(self, *data: object) -> Any:
-        """Track offline."""
         return result_of(run_here(self._capsys, "track", *data, "--out", self.out / "track", "--json"))
 
     def replay(self, *data: object) -> Any:
@@ -55,7 +54,6 @@ class Both:
 
 @pytest.fixture
 def both(service: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Both:
-    """Both ways, in a folder of its own."""
     return Both(service, tmp_path, capsys)
 
 
@@ -69,7 +67,7 @@ def test_scene_at_full_speed(both: Both) -> None:
 
 
 def test_three_streams_at_once(both: Both) -> None:
-    """Three scenes sent at the same time, as fast as can be: each file equals that of its scene alone."""
+    """Three scenes sent at the same time at full speed: each file equals its scene alone."""
     data = (*WITHOUT_CLOUDS, "--sequences", "0000", "0001", "0002")
     both.track(*data)
     assert len({(both.out / "track" / f"000{number}.txt").read_bytes() for number in range(3)}) == 3

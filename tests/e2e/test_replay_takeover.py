@@ -1,21 +1,15 @@
 """A replay with clouds at the recorded rate, while the service that tracks it freezes and another one takes over."""
 
-from __future__ import annotations
-
 import threading
-from typing import TYPE_CHECKING
+from pathlib import Path
 
+import pytest
 from commands import run_here
 from fleet import Fleet, freeze
 from router import Node, until
 from takeovers import KEYS
 
 import optipmb
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    import pytest
 
 SCENE = ("--dataset", "scene", "--profile", "kitti", "--option", "frames=70", "--option", "vehicles=6")
 

@@ -1,12 +1,10 @@
 """A process restarts before its network session runs out of numbers for keys, and its sessions continue."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import signal
 import sqlite3
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from optipmb_schemas import Keys, ResetRequest
@@ -14,9 +12,6 @@ from optipmb_service.stream.checkpoint import DIGEST, HEAD, MAGIC, VERSION
 from router import Node, Sensor, plain
 from service_process import ServiceProcess
 from takeovers import expected
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 KEYS = Keys()
 NUMBERS = 100

@@ -39,7 +39,6 @@ PATIENCE_S = 20.0
 
 @pytest.fixture(scope="module")
 def scene() -> DataSequence:
-    """A small generated scene with clouds."""
     (sequence,) = open_dataset("scene", frames=16, vehicles=6, pedestrians=3).sequences(["0000"])
     return sequence
 
@@ -53,7 +52,6 @@ class Robot:
 
     @property
     def stream(self) -> str:
-        """The stream."""
         return f"garage/robot-{self.domain}/lidar"
 
 
@@ -67,7 +65,6 @@ def service() -> Iterator[ServiceProcess]:
 
 @pytest.fixture
 def robot(service: ServiceProcess) -> Robot:
-    """A robot of a test's own."""
     return Robot(service.endpoint, next(DOMAINS))
 
 
@@ -93,7 +90,7 @@ def frames_of(sequence: DataSequence) -> list[list[bags.Sent]]:
 
 
 def publish_static(session: zenoh.Session, domain: int, message: dict[str, Any]) -> Any:
-    """Publish a static transform as rmw_zenoh does, with a cache for who comes late; keep what is returned."""
+    """Publish a static transform as rmw_zenoh does, with a cache for late subscribers; keep the result."""
     key = graph.TopicKey(domain, "/tf_static", TF, hash_by_sdk(TF)).key
     publisher = zenoh.ext.declare_advanced_publisher(
         session,
@@ -133,7 +130,6 @@ def play(client: Ros2Client, frames: list[list[bags.Sent]]) -> None:
 
 
 def ids(message: Any) -> list[int]:
-    """Give the track ids in a TrackedObjects."""
     return [int.from_bytes(bytes(one.object_id.uuid)[8:], "big") for one in message.objects]
 
 
@@ -145,13 +141,10 @@ def horizons_of(session: zenoh.Session, stream: str) -> list[float]:
 
 
 def paths_of(message: Any) -> list[Any]:
-    """Give the predicted paths in a PredictedObjects."""
     return [path for one in message.objects for path in one.kinematics.predicted_paths]
 
 
 def told(client: Ros2Client, text: str) -> str:
-    """Wait until a diagnostic says a text, and give it."""
-
     def texts(messages: list[Any]) -> list[str]:
         return [
             f"{status.message} {pair.value}"
@@ -308,7 +301,6 @@ def test_a_root_that_comes_late_starts_anew(robot: Robot, scene: DataSequence, t
 
 
 def _shift(message: Any, seconds: int) -> None:
-    """Move every stamp in a message."""
     if isinstance(message, dict):
         for name, value in message.items():
             if name == "stamp":

@@ -1,7 +1,5 @@
 """A service under load for a time: nothing grows, nothing is lost, and every message is accounted for."""
 
-from __future__ import annotations
-
 import os
 import resource
 import time
@@ -9,8 +7,8 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING
 
+import pytest
 from fleet import Fleet
 from optipmb_client import Connection
 from optipmb_client.sessions import find_services
@@ -19,9 +17,6 @@ from optipmb_tools.run.load import Load, Run, generated, run_load
 from router import Sensor
 
 import optipmb
-
-if TYPE_CHECKING:
-    import pytest
 
 SECONDS = float(os.environ.get("OPTIPMB_TEST_SOAK_S", "14"))
 STREAMS = int(os.environ.get("OPTIPMB_TEST_SOAK_STREAMS", "5"))
@@ -41,8 +36,6 @@ KEYS = Keys()
 
 @dataclass
 class Sample:
-    """Figures of the service at a moment."""
-
     at_s: float
     memory_kb: int
     waiting: int

@@ -1,11 +1,9 @@
 """A service of several worker processes: one instance to the network, and none of them is missed for long."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator
 
 import pytest
 from commands import run_here
@@ -14,9 +12,6 @@ from processes import descendants, wait_until_ended
 from router import Node, Sensor, plain, until
 from service_process import ServiceProcess
 from takeovers import expected
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
 
 KEYS = Keys()
 STREAMS = [f"yard/node-{number}/lidar" for number in range(6)]
@@ -45,7 +40,6 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceProcess
 
 
 def status_when(node: Node, reached: Callable[[ServiceStatus], bool], instance: str = "pair") -> ServiceStatus:
-    """The status, as soon as it is as wanted."""
     asked: list[ServiceStatus] = []
 
     def is_reached() -> bool:
@@ -57,7 +51,6 @@ def status_when(node: Node, reached: Callable[[ServiceStatus], bool], instance: 
 
 
 def arrived(node: Node, stream: str, seq: int) -> None:
-    """Wait for the tracks of a frame."""
     key = KEYS.tracks(stream)
     node.tracks_seen.wait(
         lambda items: any(at == key and decode(payload, Tracks).seq == seq for at, payload, _ in items),

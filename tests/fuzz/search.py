@@ -1,6 +1,6 @@
 """Coverage-guided search for bytes that a decoder neither reads nor refuses.
 
-Run it as `python search.py TARGET SECONDS [OPTION...]`; further options are those of libFuzzer. It goes on from the
+Run it as `python search.py TARGET SECONDS [OPTION...]`; further options go to libFuzzer. It goes on from the
 results of earlier searches (out/fuzz), and from the kept files in this folder. Its findings go to `found/TARGET`,
 where the tests take it up, and ends.
 """
@@ -23,7 +23,6 @@ with atheris.instrument_imports(include=["optipmb_schemas", "optipmb_service"]):
 
 
 def main(name: str, seconds: str, *options: str) -> None:
-    """Search; ends the process."""
     optipmb.warm_up()  # which may take longer than any bytes should
     learned, found, corpus = LEARNED / name, HERE / "found" / name, HERE / "corpus" / name
     for folder in (learned, found):

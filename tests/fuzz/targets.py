@@ -3,8 +3,6 @@
 Each takes what the search or a kept file gives, and returns nothing whether the bytes were read or refused.
 """
 
-from __future__ import annotations
-
 import contextlib
 
 import optipmb_schemas as schemas

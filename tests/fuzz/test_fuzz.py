@@ -1,7 +1,5 @@
 """The decoders stand every file of the corpora and everything that a search ever found (`make fuzz` searches on)."""
 
-from __future__ import annotations
-
 import importlib.util
 from pathlib import Path
 from typing import Any

@@ -1,24 +1,19 @@
 """A service with its own router and a gateway, as processes, for all tests; each test has its own stream."""
 
-from __future__ import annotations
-
 import itertools
 import json
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import Any
 
 import pytest
 from gateway import GatewayProcess
 from service_process import ServiceProcess
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 NUMBERS = itertools.count()
 
 
 @pytest.fixture(scope="session")
 def service() -> Iterator[ServiceProcess]:
-    """A service with its own router."""
     yard = {"streams": ["zoned/*/*"], "polygon": [[10, -5], [30, -5], [30, 5], [10, 5]]}
     zones = {"yard": yard, "gate": {"streams": ["zoned/*/*"], "line": [[20, -5], [20, 5]]}}
     with ServiceProcess(environment={"OPTIPMB_ZONES": json.dumps(zones)}) as process:
@@ -36,11 +31,9 @@ def gateway(service: ServiceProcess) -> Iterator[GatewayProcess]:
 
 @pytest.fixture
 def stub(gateway: GatewayProcess) -> Any:
-    """The generated stub on a channel of its own."""
     return gateway.stub()
 
 
 @pytest.fixture
 def stream() -> str:
-    """A stream that no other test uses."""
     return f"yard/robot-{next(NUMBERS)}/lidar"

@@ -1,12 +1,12 @@
 """Who may do what over gRPC: by the name in the certificate, on a protected network with real processes."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import grpc
 import pytest
@@ -15,10 +15,6 @@ from optipmb_client import Publisher, Subscriber
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
 from protected import Network, make
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 ROBOT, OTHER = "garage/robot-1", "garage/robot-2"
 LIDAR, FOREIGN = f"{ROBOT}/lidar", f"{OTHER}/lidar"
@@ -33,7 +29,6 @@ def caller(metadata, certificate):
 
 @pytest.fixture(scope="module")
 def network(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Network]:
-    """A protected network with a service."""
     with Network(tmp_path_factory.mktemp("tls"), *EVERYBODY) as one, one.service() as service:
         service.wait_ready()
         yield one
@@ -41,7 +36,6 @@ def network(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Network]:
 
 @pytest.fixture(scope="module")
 def secured(network: Network) -> Iterator[GatewayProcess]:
-    """Its gateway, with certificates."""
     folder = network.folder / "gateway" / "localhost"
     options = ("--zenoh-config", str(folder / "zenoh.json5"), "--grpc-tls", str(folder))
     fused = {name: {"streams": [f"garage/{name}/*"], "read": [ROBOT] * (name == "let")} for name in ("let", "other")}
@@ -52,19 +46,16 @@ def secured(network: Network) -> Iterator[GatewayProcess]:
 
 
 def channel(folder: Path, gateway: GatewayProcess) -> grpc.Channel:
-    """A channel with the certificate of a folder."""
     authority, key, certificate = ((folder / name).read_bytes() for name in ("ca.pem", "key.pem", "cert.pem"))
     port = gateway.address.rpartition(":")[2]
     return grpc.secure_channel(f"localhost:{port}", grpc.ssl_channel_credentials(authority, key, certificate))
 
 
 def stub(network: Network, role: str, gateway: GatewayProcess) -> Any:
-    """The generated stub with the certificate of a role."""
     return rpc.TrackingServiceStub(channel(network.folder / role, gateway))
 
 
 def denied(call: Any) -> grpc.StatusCode:
-    """The status that a call is refused with."""
     with pytest.raises(grpc.RpcError) as raised:
         list(call) if hasattr(call, "__iter__") else call()
     code: grpc.StatusCode = raised.value.code()

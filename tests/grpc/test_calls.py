@@ -1,24 +1,19 @@
 """How calls end: by their callers, by deadlines, by silence; the metrics say how, and nothing is left of them."""
 
-from __future__ import annotations
-
 import re
 import socket
 import time
 import urllib.request
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import grpc
 import pytest
 from gateway import GatewayProcess, detections, frame
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from routers import free_endpoint
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from service_process import ServiceProcess
+from service_process import ServiceProcess
 
 WAIT_S = 60.0
 CALLS = 50
@@ -51,7 +46,6 @@ def counts(address: str) -> dict[str, float]:
 
 
 def wait_for(condition: Callable[[], bool], what: str) -> None:
-    """Wait until something holds."""
     ends = time.monotonic() + WAIT_S
     while not condition():
         assert time.monotonic() < ends, what

@@ -1,26 +1,20 @@
-"""`SubscribeEvents`: events of zones as they were asked for; those that can still change are held back by default."""
+"""`SubscribeEvents`: events of zones by request; events that can still change are held back by default."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import grpc
 import pytest
-from gateway import detections, frame
+from gateway import GatewayProcess, detections, frame
 from optipmb_client import Connection, EventSubscriber
 from optipmb_schemas import Events, Keys, decode
 from optipmb_schemas.protobuf import tracking_pb2 as pb
-
-if TYPE_CHECKING:
-    from gateway import GatewayProcess
-    from service_process import ServiceProcess
+from service_process import ServiceProcess
 
 EVENTS = [("yard", "entered"), ("gate", "crossed"), ("yard", "left")]
 FRAMES = 60
 
 
 def events(stub: Any, stream: str, number: int, **asked: Any) -> list[tuple[str, str]]:
-    """Have a car drive through the yard; return the next events of a subscription."""
     call = stub.SubscribeEvents(pb.SubscribeEventsRequest(pattern=stream, **asked))
     call.initial_metadata()
     list(stub.Track(detections(frame(seq, stream)) for seq in range(FRAMES)))
@@ -47,7 +41,7 @@ def test_events_are_chosen(stub: Any, stream: str, asked: dict[str, Any], found:
 
 
 def test_history_comes_first_and_once(stub: Any, stream: str) -> None:
-    """A subscriber that comes late gets what is kept, a client of the library too, over either network."""
+    """A late subscriber gets the kept events, and so does a client of the library, over either network."""
     name = stream.replace("yard", "zoned")
     events(stub, name, 3)
     call = stub.SubscribeEvents(pb.SubscribeEventsRequest(pattern=name, final=False, history=True))

@@ -1,17 +1,12 @@
 """Independent clients: Python with the generated stubs alone, and Node from the .proto file alone."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
-
-if TYPE_CHECKING:
-    from gateway import GatewayProcess
+from gateway import GatewayProcess
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples" / "grpc"

@@ -1,14 +1,13 @@
 """What a gateway stands: broken, huge and idle callers, while the others are served."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import threading
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import grpc
 import numpy as np
@@ -18,11 +17,7 @@ from optipmb_schemas import Points
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
 from optipmb_service.grpc.calls import varint
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from service_process import ServiceProcess
+from service_process import ServiceProcess
 
 CONNECTIONS = 2_000
 """Idle connections of the test; each end of one takes a file."""
@@ -36,7 +31,6 @@ ALLOWED = 4
 
 @pytest.fixture(scope="module")
 def bounded(service: ServiceProcess) -> Iterator[GatewayProcess]:
-    """A gateway that allows few calls and connections."""
     environment = {"OPTIPMB_GRPC_CALLS": "2", "OPTIPMB_GRPC_CONNECTIONS": str(ALLOWED)}
     with GatewayProcess(service.endpoint, environment=environment) as process:
         process.wait_ready()
@@ -44,12 +38,10 @@ def bounded(service: ServiceProcess) -> Iterator[GatewayProcess]:
 
 
 def files(pid: int) -> int:
-    """Open files of a process."""
     return len(list(Path(f"/proc/{pid}/fd").iterdir()))
 
 
 def served(gateway: GatewayProcess, stream: str) -> None:
-    """Frames are tracked."""
     responses = list(gateway.stub().Track((detections(frame(seq, stream)) for seq in range(5)), timeout=30))
     assert [one.tracks.seq for one in responses] == list(range(5))
 
@@ -240,7 +232,6 @@ def test_more_connections_than_allowed(bounded: GatewayProcess, stream: str) -> 
 
 
 def wait_served(stub: Any, stream: str) -> None:
-    """Wait until a question is answered."""
     ends = time.monotonic() + 60
     while True:
         try:

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import itertools
 import signal
+import socket
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import Any
 
 import pytest
 from gateway import GatewayProcess, connected
 from optipmb_client import Publisher, Subscriber
-
-if TYPE_CHECKING:
-    import socket
-    from collections.abc import Iterator
-
-    from service_process import ServiceProcess
+from service_process import ServiceProcess
 
 DEADLINE_S = 50.0
 """Pings find it in 15 s on the client's side and in 30 s on the gateway's; all other limits are a minute and more."""

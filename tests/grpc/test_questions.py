@@ -1,12 +1,10 @@
 """`GetState`, `Reset`, `SetParameters`, `ListStreams`, health and reflection."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import grpc
 import pytest
-from gateway import detections, frame
+from gateway import GatewayProcess, detections, frame
 from google.protobuf import descriptor_pool
 from google.protobuf.message_factory import GetMessageClass
 from grpc_health.v1 import health_pb2, health_pb2_grpc
@@ -16,9 +14,6 @@ from optipmb_client.grpc import GrpcConnection
 from optipmb_schemas import Keys
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from routers import free_endpoint, open_router
-
-if TYPE_CHECKING:
-    from gateway import GatewayProcess
 
 SERVICE = "optipmb.v1.TrackingService"
 

@@ -1,12 +1,12 @@
 """`optipmb replay --connect grpc://…`: the same files as over Zenoh and offline, also when a gateway goes."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 from commands import result_of, run_here, start
@@ -16,19 +16,13 @@ from optipmb_client.errors import ConnectionFailed
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from real_data import kitti_root
 from routers import free_endpoint
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from service_process import ServiceProcess
+from service_process import ServiceProcess
 
 SCENE = ("--dataset", "scene", *(f"--option={one}" for one in ("vehicles=6", "pedestrians=3", "cyclists=1")))
 
 
 @pytest.fixture(scope="module")
 def gateways(service: ServiceProcess, gateway: GatewayProcess) -> Iterator[list[GatewayProcess]]:
-    """Three gateways of one network."""
     with GatewayProcess(service.endpoint) as second, GatewayProcess(service.endpoint) as third:
         for process in (second, third):
             process.wait_ready()
@@ -36,12 +30,10 @@ def gateways(service: ServiceProcess, gateway: GatewayProcess) -> Iterator[list[
 
 
 def connect(*gateways: GatewayProcess) -> list[str]:
-    """The options that name gateways."""
     return [part for gateway in gateways for part in ("--connect", f"grpc://{gateway.address}")]
 
 
 def compare(out: Path, folders: tuple[str, ...], names: list[str]) -> None:
-    """Result files of several folders are byte-equal."""
     for name in names:
         first, *others = ((out / folder / f"{name}.txt").read_bytes() for folder in folders)
         assert len(first.splitlines()) > 100
@@ -103,7 +95,6 @@ def test_a_gateway_that_is_killed_loses_nothing(
 
 
 def wait_for_frames(gateway: GatewayProcess, frames: int) -> None:
-    """Wait until a replay has come so far."""
     stub, ends = gateway.stub(), time.monotonic() + 60
     while time.monotonic() < ends:
         listed = stub.ListStreams(pb.ListStreamsRequest(pattern="replay/*/*"), wait_for_ready=True).streams

@@ -1,26 +1,19 @@
 """`Subscribe` and `QueryTracks`: the selected tracks, in order; a slow reader delays no other."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable
+from typing import Any
 
 import grpc
 import numpy as np
 import pytest
-from gateway import detections, frame, resident
+from gateway import GatewayProcess, detections, frame, resident
 from grpc_status import rpc_status
 from optipmb_schemas import Tracks, encode
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from gateway import GatewayProcess
-
 
 SUBSCRIBERS = 200
 FRAMES = 20
@@ -30,12 +23,10 @@ SUBSCRIBER_BYTES = 512 * 2**10
 
 
 def tracked(stub: Any, stream: str, frames: Iterable[int] = range(30)) -> list[Any]:
-    """Have frames tracked; return the tracks that came back."""
     return [one.tracks for one in stub.Track(detections(frame(seq, stream)) for seq in frames)]
 
 
 def subscribed(stub: Any, **asked: Any) -> Any:
-    """A subscription that is in force."""
     call = stub.Subscribe(pb.SubscribeRequest(**asked))
     call.initial_metadata()
     return call
@@ -121,7 +112,7 @@ def test_predicted_paths_are_asked_for_and_chosen(stub: Any, stream: str) -> Non
 
 def test_an_unlikely_object_is_not_confirmed(stub: Any, stream: str) -> None:
     """A track that the tracker does not confirm is left out of confirmed ones, as long as it does not."""
-    # The generic profile confirms at the second detection, that of nuScenes weighs scores.
+    # The generic profile confirms at the second detection, the nuScenes profile weighs scores.
     stub.SetParameters(pb.SetParametersRequest(stream=stream, parameters=pb.SessionParameters(profile="nuscenes")))
     call = subscribed(stub, pattern=stream, filter=pb.TrackFilter(confirmed_only=True))
     unlikely = [frame(seq, stream, score=np.array([0.9, 0.25 + 0.1 * seq])) for seq in range(5)]
@@ -222,7 +213,7 @@ def test_what_is_left_of_a_frame_is_a_message(stub: Any, stream: str) -> None:
 
 
 def test_200_subscribers_and_one_asleep(gateway: GatewayProcess, stream: str) -> None:
-    """All that read get every frame, the sleeping one is told how many it missed, and all take little memory."""
+    """Every reader gets every frame, a sleeping one the number of missed frames, and all take little memory."""
     # A connection of its own for each, whose window does not grow: unread responses wait in the gateway.
     options = [("grpc.use_local_subchannel_pool", 1), ("grpc.http2.bdp_probe", 0)]
     many = {"label": np.zeros(100, dtype=int), "center": np.random.default_rng(1).uniform(-90, 90, (100, 3))}

@@ -16,7 +16,9 @@ import zenoh.ext
 from gateway import detections, frame, points
 from google.rpc import error_details_pb2
 from grpc_status import rpc_status
+from opentelemetry.sdk.trace import TracerProvider
 from optipmb_client import Publisher
+from optipmb_client.trace_context import attached
 from optipmb_schemas import Detections, Keys, Points, Tracks, decode, encode
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
@@ -25,6 +27,7 @@ from routers import open_client
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from gateway import GatewayProcess
     from service_process import ServiceProcess
 
 KEYS = Keys()
@@ -45,19 +48,41 @@ class Heard:
     def __exit__(self, *_: object) -> None:
         self.session.close()  # type: ignore[no-untyped-call]  # zenoh's stubs leave it untyped
 
-    def take(self, number: int, at: int = 0) -> list[bytes]:
-        """The next payloads."""
+    def take(self, number: int, at: int = 0, what: Any = lambda sample: sample.payload.to_bytes()) -> list[bytes]:
         ends, payloads = time.monotonic() + DEADLINE_S, []
         while len(payloads) < number:
             sample = self._samples[at].try_recv()
             assert time.monotonic() < ends, f"{len(payloads)} of {number}"
-            payloads += [] if sample is None else [sample.payload.to_bytes()]
+            payloads += [] if sample is None else [what(sample)]
             time.sleep(0 if sample else 0.002)
         return payloads
 
 
+TRACE = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b716920333"
+
+
+def test_trace_contexts_go_on_to_the_network(
+    service: ServiceProcess, gateway: GatewayProcess, stub: Any, stream: str
+) -> None:
+    """The context of a request, or else of the call's metadata, is in the attachment; the client sends its span's."""
+    first = detections(frame(0, stream))
+    own = detections(frame(1, stream))
+    own.traceparent = f"{TRACE}1-01"
+    tracer = TracerProvider(shutdown_on_exit=False).get_tracer("node")
+    with Heard(service.endpoint, KEYS.detections(stream)) as heard:
+        list(stub.Track(iter((first, own)), metadata=(("traceparent", f"{TRACE}0-01"),)))
+        with (
+            Publisher(stream, f"grpc://{gateway.address}", frame="world") as publisher,
+            tracer.start_as_current_span("detect") as span,
+        ):
+            publisher.publish(stamp_ns=10**19 // 2, label=["car"], center=[[0, 0, 1]], score=[0.9])
+        attachments = heard.take(3, what=lambda sample: sample.attachment.to_bytes())
+    context = span.get_span_context()
+    said = f"00-{context.trace_id:032x}-{context.span_id:016x}-{context.trace_flags:02x}"
+    assert [attached(one) for one in attachments] == [f"{TRACE}0-01", f"{TRACE}1-01", said]
+
+
 def violation(raised: pytest.ExceptionInfo[grpc.RpcError]) -> Any:
-    """The field at fault, from the details of a status."""
     status = rpc_status.from_call(raised.value)
     details = error_details_pb2.BadRequest()
     assert status is not None

@@ -1,8 +1,6 @@
 """gRPC served by a service of several worker processes: its parent is the gateway of them all."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import grpc
 import pytest
@@ -13,15 +11,11 @@ from router import Node
 from routers import free_endpoint
 from service_process import ServiceProcess
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
 STREAMS = tuple(f"garage/robot-{number}/lidar" for number in range(4))
 
 
 @pytest.fixture(scope="module")
 def workers() -> Iterator[tuple[ServiceProcess, str]]:
-    """A service of two workers and its address for gRPC."""
     address = f"127.0.0.1:{free_endpoint().rpartition(':')[2]}"
     with ServiceProcess("--workers", "2", "--grpc", address, "--instance", "garage") as process:
         process.wait_ready()

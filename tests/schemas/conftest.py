@@ -182,13 +182,11 @@ def _examples() -> list[Message]:
 
 @pytest.fixture(scope="session")
 def examples() -> dict[str, Message]:
-    """A valid message of every type, by the name of the type."""
     return {type(message).__name__: message for message in _examples()}
 
 
 @pytest.fixture(scope="session")
 def example_of(examples: dict[str, Message]) -> Callable[[type[Message]], Message]:
-    """Gives the valid message of a type, also of nested ones."""
     tracks, status, events = examples["Tracks"], examples["ServiceStatus"], examples["Events"]
     assert isinstance(tracks, Tracks)
     assert isinstance(status, ServiceStatus)
@@ -209,7 +207,6 @@ def example_of(examples: dict[str, Message]) -> Callable[[type[Message]], Messag
 
 @pytest.fixture(scope="session")
 def detections(examples: dict[str, Message]) -> Detections:
-    """Three detections in the sensor frame."""
     message = examples["Detections"]
     assert isinstance(message, Detections)
     return message

@@ -20,7 +20,6 @@ DOCUMENT: dict[str, Any] = json.loads(document())
 
 
 def references(part: Any) -> Iterator[str]:
-    """Give every `$ref` of a part of the document."""
     if isinstance(part, dict):
         yield from ([part["$ref"]] if "$ref" in part else [])
     for one in part.values() if isinstance(part, dict) else part if isinstance(part, list) else ():
@@ -28,7 +27,6 @@ def references(part: Any) -> Iterator[str]:
 
 
 def resolved(reference: str) -> Any:
-    """Return what a reference leads to."""
     found: Any = DOCUMENT
     for name in reference.removeprefix("#/").split("/"):
         found = found[name]

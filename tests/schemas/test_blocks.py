@@ -13,12 +13,10 @@ HEADER: dict[str, Any] = {"stream": "a/b/c", "epoch": bytes(16), "seq": 0, "stam
 
 
 def block(array: np.ndarray[Any, Any], dtype: str | None = None) -> dict[str, Any]:
-    """Return the block of an array as another language would write it."""
     return {"dtype": dtype or array.dtype.str, "shape": list(array.shape), "data": array.tobytes()}
 
 
 def cloud(xyz: dict[str, Any]) -> bytes:
-    """Return a points message with a block."""
     packed: bytes = msgpack.packb({**HEADER, "xyz": xyz})
     return packed
 

@@ -20,7 +20,6 @@ from optipmb_schemas import (
 
 
 def code_of(payload: bytes, encoding: str = "", kind: type[Message] = Detections) -> str:
-    """Return the code that a payload is refused with."""
     with pytest.raises(MessageError) as caught:
         decode(payload, kind, encoding=encoding)
     return caught.value.code

@@ -1,7 +1,5 @@
 """Messages decoded by msgspec equal those by the models; payloads that these refuse are left to them."""
 
-from __future__ import annotations
-
 import copy
 import subprocess
 import sys
@@ -62,19 +60,16 @@ def taken(message: Message) -> bytes | None:
 
 
 def arrays(message: Message) -> list[Any]:
-    """Return the arrays of a message and of those in it."""
     inner = [one for _, value in message.present() if isinstance(value, Message) for one in arrays(value)]
     return [value for _, value in message.present() if isinstance(value, np.ndarray)] + inner
 
 
 def places(tree: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Return the paths of all values in a tree."""
     below = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
     return [path, *(one for key, value in below for one in places(value, (*path, key)))]
 
 
 def written(pairs: Any) -> bytes:
-    """Return a tree as msgpack."""
     packed: bytes = msgpack.packb(pairs)
     return packed
 
@@ -108,7 +103,6 @@ def test_detections_of_any_number_keep_their_bytes(examples: dict[str, Message],
 
 
 def many(example: Message, count: int, **changes: Any) -> Detections:
-    """Return the example with so many detections."""
     rows = {"label": np.zeros(count, int), "center": np.ones((count, 3)), "size": np.ones((count, 3))}
     rows |= {"yaw": np.ones(count), "score": np.ones(count), "velocity": np.full((count, 2), NAN)}
     covariance = {"position_covariance": np.broadcast_to(np.eye(3), (count, 3, 3))}
@@ -167,7 +161,7 @@ def test_limits_of_a_service_need_no_models(examples: dict[str, Message]) -> Non
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_value_replaced_by_every_other(examples: dict[str, Message], name: str) -> None:
-    """Any value of the message replaced, left out, or written twice: what is read equals the one by the models."""
+    """With any value of the message replaced, left out, or written twice, the result equals the models' result."""
     kind, tree, found = type(examples[name]), msgpack.unpackb(encode(examples[name])), 0
     for path in places(tree)[1:]:
         for value in (*SCALARS, ...):
@@ -219,7 +213,6 @@ def test_every_number(examples: dict[str, Message], data: st.DataObject) -> None
 
 
 def written_with(example: Message, data: st.DataObject) -> bytes:
-    """Return the example with a few other numbers in its arrays."""
     tree = msgpack.unpackb(encode(example))
     blocks = [tree[name] for name in ("center", "size", "yaw", "score", "velocity")]
     blocks += [tree["pose"]["translation"], tree["pose"]["quaternion"]]

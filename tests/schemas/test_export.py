@@ -41,7 +41,6 @@ def test_the_module_is_a_command(tmp_path: Path) -> None:
 
 
 def properties(schema: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
-    """Return the fields of a schema and of all that it holds."""
     holders = [schema, *schema.get("$defs", {}).values()]
     return [item for holder in holders for item in holder["properties"].items()]
 

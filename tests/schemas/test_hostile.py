@@ -40,7 +40,6 @@ def measured(payload: bytes, kind: type[Message], **options: Any) -> tuple[Messa
 
 
 def peak(payload: bytes, kind: type[Message], **options: Any) -> int:
-    """Return the bytes that an attempt to decode takes at most."""
     return measured(payload, kind, **options)[1]
 
 
@@ -108,13 +107,11 @@ odd_values = st.one_of(
 
 
 def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Return the paths of all values inside a plain structure."""
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     return [path, *(place for key, item in items for place in places(item, (*path, key)))]
 
 
 def put(value: Any, path: tuple[Any, ...], new: Any) -> Any:
-    """Return the structure with the value at a path replaced."""
     if not path:
         return new
     copy = dict(value) if isinstance(value, dict) else list(value)
@@ -151,7 +148,6 @@ def test_fields_left_out(examples: dict[str, Message], data: st.DataObject, kind
 
 
 def block(shape: list[Any], data: bytes = b"", dtype: Any = "f8") -> bytes:
-    """Return a message that is one array block."""
     return msgpack.packb({"center": {"dtype": dtype, "shape": shape, "data": data}})
 
 

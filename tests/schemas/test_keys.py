@@ -35,7 +35,7 @@ def test_the_key_expressions() -> None:
 def test_zenoh_agrees() -> None:
     """Zenoh takes every key as it is, and each expression matches its own topic and no other."""
     zenoh = pytest.importorskip("zenoh")
-    topics = {"detections", "points", "tracks", "events", "problems"}
+    topics = {"detections", "points", "tracks", "now", "events", "problems"}
     keys = {topic: getattr(KEYS, topic)(STREAM) for topic in topics}
     keys |= {"state": KEYS.query(STREAM, "state"), "owner": KEYS.owner(STREAM, "i"), "status": KEYS.status("i")}
     keys["discovered"] = KEYS.discovered([STREAM, "a/b/c"], "i", "7")

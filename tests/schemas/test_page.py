@@ -29,7 +29,6 @@ DUMP = (ROOT / "schemas" / "examples" / "detections.hex").read_text(encoding="as
 
 
 def fenced(language: str) -> list[str]:
-    """Return the fenced blocks of a language on the page."""
     return re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
 
 

@@ -26,7 +26,6 @@ def proto_of(message: Message) -> Any:
 
 
 def buf(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    """Run buf in the folder of the schemas."""
     return subprocess.run([BUF, *arguments], cwd=SCHEMAS / "proto", capture_output=True, text=True, check=False)
 
 
@@ -200,7 +199,6 @@ def test_tracks_after_a_motion_of_the_world_are_transcoded(example_of: Any) -> N
 
 
 def without_rows(fields: dict[str, Any]) -> None:
-    """Take all rows of one column away."""
     fields["yaw"] = {"dtype": "f8", "shape": [0], "data": b""}
 
 

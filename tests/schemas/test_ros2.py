@@ -21,12 +21,10 @@ UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def turned(yaw: float) -> np.ndarray:
-    """Give the quaternion of a turn about z."""
     return np.array([math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)])
 
 
 def as_fields(value: Any) -> Any:
-    """Give a message as maps, lists and plain values."""
     if dataclasses.is_dataclass(value):
         names = (one.name for one in dataclasses.fields(value) if one.name.islower() and one.name != "__msgtype__")
         return {name: as_fields(getattr(value, name)) for name in names}  # names of constants are in capitals

@@ -63,18 +63,15 @@ horizons = st.none() | st.lists(st.floats(0, 30, exclude_min=True), max_size=4, 
 
 
 def rows(shape: tuple[int, ...], low: float, high: float, *, above: bool = False) -> st.SearchStrategy[Any]:
-    """Return arrays of numbers."""
     return arrays("f8", shape, elements=st.floats(low, high, exclude_min=above, allow_nan=False))
 
 
 def whole(size: int, low: int, high: int) -> st.SearchStrategy[Any]:
-    """Return columns of integers."""
     return arrays("i8", (size,), elements=st.integers(low, high))
 
 
 @st.composite
 def covariances(draw: st.DrawFn, m: int) -> Any:
-    """Return covariances of positions, some of them unknown."""
     root = draw(rows((m, 3, 3), -1e3, 1e3))
     covariance = root @ root.transpose(0, 2, 1) + np.eye(3)
     covariance[draw(arrays(np.bool_, m))] = np.nan
@@ -83,20 +80,17 @@ def covariances(draw: st.DrawFn, m: int) -> Any:
 
 @st.composite
 def poses(draw: st.DrawFn) -> Pose:
-    """Return poses."""
     quaternion = draw(rows((4,), -1, 1).filter(lambda q: np.linalg.norm(q) > 0.1))
     return Pose(translation=draw(rows((3,), -FAR, FAR)), quaternion=quaternion / np.linalg.norm(quaternion))
 
 
 @st.composite
 def headers(draw: st.DrawFn) -> dict[str, Any]:
-    """Return the fields that all stream messages have."""
     return {"stream": draw(stream), "epoch": draw(epoch), "seq": draw(count), "stamp_ns": draw(count)}
 
 
 @st.composite
 def placed(draw: st.DrawFn) -> dict[str, Any]:
-    """Return the fields that all messages of a publisher have."""
     frame = draw(st.sampled_from(["world", "sensor"]))
     pose = draw(poses()) if frame == "sensor" else draw(st.none() | poses())
     return {**draw(headers()), "frame": frame, "pose": pose, "relocation": draw(st.none() | relocations())}
@@ -104,7 +98,6 @@ def placed(draw: st.DrawFn) -> dict[str, Any]:
 
 @st.composite
 def relocations(draw: st.DrawFn) -> Relocation:
-    """Return motions of the world."""
     turn = draw(st.floats(-7.0, 7.0))
     quaternion = np.array([np.cos(turn), 0.0, 0.0, np.sin(turn)])
     return Relocation(
@@ -114,7 +107,6 @@ def relocations(draw: st.DrawFn) -> Relocation:
 
 @st.composite
 def detections(draw: st.DrawFn) -> Detections:
-    """Return detections."""
     m, names = draw(st.integers(0, 9)), draw(labels)
     velocity = draw(st.none() | rows((m, 2), -1e3, 1e3))
     if velocity is not None:
@@ -144,7 +136,6 @@ def detections(draw: st.DrawFn) -> Detections:
 
 @st.composite
 def points(draw: st.DrawFn) -> Points:
-    """Return clouds, small and large."""
     shape = (draw(st.integers(0, 9) | st.just(700)), 3)  # 700 points are a large block, viewed instead of copied
     fill = st.floats(-FAR, FAR, width=32)
     return Points(**draw(placed()), xyz=draw(arrays("f4", shape, elements=fill, fill=fill)))
@@ -152,7 +143,6 @@ def points(draw: st.DrawFn) -> Points:
 
 @st.composite
 def tracks(draw: st.DrawFn) -> Tracks:
-    """Return tracks."""
     n, names = draw(st.integers(0, 5)), draw(labels)
     column = {
         name: draw(rows((n,), low, high))
@@ -203,7 +193,6 @@ def tracks(draw: st.DrawFn) -> Tracks:
 
 @st.composite
 def paths(draw: st.DrawFn, n: int) -> dict[str, Any]:
-    """Return the fields of predicted paths, or none."""
     given = draw(horizons)
     if given is None:
         return {}
@@ -218,7 +207,6 @@ def paths(draw: st.DrawFn, n: int) -> dict[str, Any]:
 
 @st.composite
 def densities(draw: st.DrawFn) -> Density:
-    """Return densities."""
     n, names = draw(st.integers(0, 5)), draw(labels)
     return Density(
         stream=draw(stream),
@@ -235,7 +223,6 @@ def densities(draw: st.DrawFn) -> Density:
 
 @st.composite
 def zone_events(draw: st.DrawFn) -> Events:
-    """Return events of zones."""
     names, number = draw(labels), st.floats(allow_nan=False, allow_infinity=False)
     event = st.builds(
         ZoneEvent,
@@ -383,7 +370,6 @@ def test_messages_that_differ_are_not_equal(detections: Detections) -> None:
 
 
 def validator(name: str) -> Draft202012Validator:
-    """The published schema of a text."""
     return Draft202012Validator(json.loads((SCHEMAS / f"{name}.v1.schema.json").read_text()))
 
 
@@ -425,7 +411,7 @@ def test_the_json_of_the_edges_has_the_numbers_of_the_columns(message: Tracks) -
 def test_a_selection_leaves_out_rows_and_fields(
     message: Tracks, fields: frozenset[str], least: float, confirmed: int
 ) -> None:
-    """The objects that are left are those of the whole text, with the fields that were asked for and `id`."""
+    """The remaining objects equal the whole text, with the requested fields and `id`."""
     selection = Selection(frozenset(message.labels[:1]), bool(confirmed), least, fields)
     whole = {one["id"]: one for one in json.loads(tracks_json(message))["objects"]}
     chosen = json.loads(tracks_json(message, selection))["objects"]

@@ -52,14 +52,12 @@ def start(_compiled: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
 
 @pytest.fixture
 def node(start: Start) -> Iterator[Node]:
-    """A node at a service with default settings."""
     _, endpoint = start()
     with Node(endpoint) as one:
         yield one
 
 
 def arm(wake: Callable[[], None], at_ns: int) -> None:
-    """Call a function in time, as the control loop does."""
     timer = threading.Timer(max(0.0, at_ns - time.monotonic_ns()) / 1e9, wake)
     timer.daemon = True
     timer.start()

@@ -1,7 +1,5 @@
 """What docstrings of the service name is there."""
 
-from __future__ import annotations
-
 import ast
 import re
 from pathlib import Path
@@ -20,7 +18,6 @@ def named(doc: str, section: str) -> list[str]:
 
 
 def arguments(function: ast.FunctionDef | ast.AsyncFunctionDef) -> set[str]:
-    """The names of what a function takes."""
     taken = function.args
     every = [*taken.posonlyargs, *taken.args, *taken.kwonlyargs, taken.vararg, taken.kwarg]
     return {one.arg for one in every if one is not None}

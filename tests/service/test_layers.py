@@ -15,7 +15,7 @@ SOURCES = sorted(ROOT.rglob("*.py"))
 MODULES = {".".join(("optipmb_service", *source.relative_to(ROOT).with_suffix("").parts)): source for source in SOURCES}
 PAGE = (Path(__file__).parents[2] / "docs/architecture.md").read_text()
 
-LINK = ("optipmb_client.zenoh.", "optipmb_client.incoming.", "optipmb_client.errors.", "optipmb_client.merging.")
+LINK = tuple(f"optipmb_client.{name}." for name in ("zenoh", "incoming", "errors", "merging", "trace_context"))
 """What the service may import of the client."""
 
 ARROWS = {
@@ -88,13 +88,14 @@ def test_arrows_run_one_way(source: Path) -> None:
 
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: f"{path.parent.name}/{path.stem}")
 def test_libraries_of_an_edge_stay_there(source: Path) -> None:
-    """HTTP, gRPC and NATS are imported by their folders alone, Zenoh by none; of the client, its link and merging."""
+    """HTTP, gRPC and NATS are imported by their folders alone, OpenTelemetry by a module; of the client, its link."""
     names = imported(source.read_text())
     first = {name.partition(".")[0] for name in names}
     place = place_of(source)
     assert all(name.startswith(LINK) for name in names if name.partition(".")[0] == "optipmb_client")
     assert "zenoh" not in first
     assert place == "cluster" or "nats" not in first
+    assert source.stem == "traces" or not {name for name in names if name.startswith("opentelemetry.sdk")}
     assert place == "http" or not first & {"starlette", "uvicorn"}
     assert place == "grpc" or not first & {"grpc", "google", "grpc_health", "grpc_reflection", "grpc_status"}
 

@@ -25,7 +25,6 @@ LEVELS = {"debug", "info", "warning", "error", "exception"}
 
 
 def calls(names: set[str]) -> list[ast.Call]:
-    """All calls of functions and methods of these names in the service."""
     found = []
     for source in SOURCES:
         for part in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
@@ -84,11 +83,11 @@ def test_every_problem_is_described() -> None:
 
 
 def test_the_exit_statuses_are_those_of_the_table(capsys: pytest.CaptureFixture[str]) -> None:
-    """The table has each status that a command ends with: a printed answer, nobody there, a wrong option."""
+    """The table has each exit status of a command: a printed answer, no service, a wrong option."""
     (table,) = re.findall(r"\| exit status \|.*?\n\n", OPERATION.read_text(encoding="utf-8"), re.DOTALL)
-    with socket.socket() as nobody:
-        nobody.bind(("127.0.0.1", 0))  # and does not listen
-        address = f"127.0.0.1:{nobody.getsockname()[1]}"
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))  # and does not listen
+        address = f"127.0.0.1:{silent.getsockname()[1]}"
         commands = {0: ["config"], 1: ["health", "--http", address], 2: ["--wrong"]}
         assert [int(status) for status in re.findall(r"^\| (\d+) \|", table, re.MULTILINE)] == list(commands)
         for status, command in commands.items():
@@ -116,3 +115,13 @@ def test_the_zones_of_the_example_are_valid(tmp_path: Path) -> None:
     file.write_text("\n".join(re.findall(r"```toml\n(.*?)```", text, re.DOTALL)), encoding="utf-8")
     settings = load(file).settings
     assert [settings.zone(name, "garage").name for name in settings.zones] == ["yard", "gate", "exit"]
+
+
+def test_the_outputs_of_the_example_are_valid(tmp_path: Path) -> None:
+    """The settings on the page of output at a fixed rate are accepted as they stand."""
+    text = OPERATION.with_name("fixed-rate.md").read_text(encoding="utf-8")
+    file = tmp_path / "outputs.toml"
+    file.write_text("\n".join(re.findall(r"```toml\n(.*?)```", text, re.DOTALL)), encoding="utf-8")
+    output = load(file).settings.output_of("garage/robot-1/lidar")
+    assert output is not None
+    assert output.rate_hz == 20

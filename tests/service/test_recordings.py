@@ -3,7 +3,7 @@
 `recordings.json` has, for each scenario, seam and tracker, how many outputs of each kind there were and the digest of
 their bytes. With the `chained` tracker, which hashes the frames in their order, they depend on the service alone. With
 the `filter` they depend on the tracker too, whose numbers may differ on another kind of processor. After a change that
-is meant to change bytes, `OPTIPMB_TEST_RECORD=1 pytest tests/service/test_recordings.py` writes the file anew.
+is meant to change bytes, `OPTIPMB_TEST_RECORD=1 pytest tests/service/test_recordings.py` rewrites the file.
 """
 
 from __future__ import annotations
@@ -48,13 +48,10 @@ KEYS: Final = schemas.Keys()
 
 
 class Failing:
-    """A tracker that raises for seven objects."""
-
     def __init__(self, tracker: Any) -> None:
         self._tracker = tracker
 
     def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
-        """Step, or raise."""
         if len(frame.score) == 7:
             raise ZeroDivisionError("seven")
         result: optipmb.StepResult = self._tracker.step(density, frame)
@@ -62,8 +59,6 @@ class Failing:
 
 
 class SessionSeam:
-    """The API of sessions: messages in, values out."""
-
     def __init__(self, stream: str, tracker: Callable[[optipmb.Parameters], Any], out: Recorded) -> None:
         self._options: dict[str, Any] = {
             "policy": Policy(late_clouds=True),
@@ -77,7 +72,6 @@ class SessionSeam:
         self._waiting: list[Step] | None = None
 
     def run(self, steps: Iterable[Step]) -> None:
-        """Take all steps."""
         for step in steps:
             self._now_ns += BETWEEN_NS
             self._step(step)
@@ -167,7 +161,7 @@ class SessionSeam:
 
 
 class Process(Around):
-    """The surroundings of a process that may hold the partitions, and records what it publishes."""
+    """The surroundings of a process that may hold the partitions; records published messages."""
 
     def __init__(self, out: Recorded, kept: dict[str, bytes]) -> None:
         super().__init__()
@@ -176,35 +170,27 @@ class Process(Around):
         self._saved = kept
 
     def holds(self, _: str) -> bool:
-        """Return whether this process has the streams."""
         return self.holding
 
     def fence(self, _: str) -> int | None:  # type: ignore[override]  # without a lease there is none
-        """Return the fence of all streams."""
         return 1 if self.holding else None
 
     def put(self, checkpoint: Any, _: int | None, then: Callable[[], None] | None = None) -> None:
-        """Keep the bytes of a state."""
         self._saved[checkpoint.stream] = encode_checkpoint(checkpoint)
         if then is not None:
             then()
 
     def recall(self, stream: str, restore: Any, then: Any, _: object = None) -> None:
-        """Restore a kept state."""
         then(restore(decode_checkpoint(self._saved[stream])) if stream in self._saved else None)
 
-    def publish(self, payload: bytes) -> None:
-        """Record tracks."""
+    def publish(self, payload: bytes, _: bytes | None = None) -> None:
         self._out.message(schemas.decode(payload, schemas.Tracks))
 
     def report(self, problem: schemas.Problem, _: int) -> None:
-        """Record a problem."""
         self._out.message(problem)
 
 
 class Question:
-    """A query of the recordings, whose replies are recorded."""
-
     def __init__(self, key: str, message: schemas.Message | None, out: Recorded) -> None:
         self.key = key
         self.payload = None if message is None else schemas.encode(message)
@@ -213,15 +199,12 @@ class Question:
         self._out = out
 
     def answer(self, _: str, message: schemas.Message) -> None:
-        """Record a reply."""
         self._out.message(message)
 
     def refuse(self, problem: schemas.Problem) -> None:
-        """Record a refusal."""
         self._out.message(problem)
 
     def finish(self) -> None:
-        """End."""
         self.finished.set()
 
 
@@ -236,7 +219,6 @@ class CoreSeam:
         self.now_ns = 1000 * SECOND
 
     def run(self, steps: Iterable[Step]) -> None:
-        """Take all steps."""
         self._begin()
         for step in steps:
             self.now_ns += BETWEEN_NS
@@ -307,7 +289,6 @@ SEAMS: Final = {"session": SessionSeam, "core": CoreSeam}
 
 
 def recorded(scenario: str, seam: str, tracker: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
-    """Return the outputs of a scenario."""
     out, stream = Recorded(), STREAM.get(scenario, SENSOR.stream)
     one = SEAMS[seam](stream, TRACKERS[tracker], out)
     if isinstance(one, CoreSeam):

@@ -20,7 +20,6 @@ LASTING = graph.Qos(transient_local=True, depth=100)
 
 
 def endpoint(kind: str = graph.PUBLISHER, qos: graph.Qos = graph.Qos(), name: str = "detector") -> graph.Endpoint:  # noqa: B008 - frozen
-    """Give an endpoint of a node in a namespace."""
     return graph.Endpoint(graph.Node(7, "a1b2c3", name, "/robot/front", 4), 9, kind, TOPIC, TYPE, HASH, qos)
 
 

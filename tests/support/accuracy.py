@@ -16,7 +16,6 @@ import optipmb
 
 @cache
 def sequences_of(dataset: str, detections: str) -> list[DataSequence]:
-    """All sequences with the detections of one detector."""
     root = kitti_root() if dataset == "kitti" else nuscenes_root()
     options = {"z_bottom": True} if detections == "pointpillars" else {}
     return list(open_dataset(dataset, root, detections, clouds=False, **options).sequences(["all"]))
@@ -24,7 +23,6 @@ def sequences_of(dataset: str, detections: str) -> list[DataSequence]:
 
 @cache
 def material(dataset: str, detections: str) -> tuple[dict[str, Scorer], dict[str, list[Clip]]]:
-    """Scorers and clips of each class that is labelled."""
     sequences = sequences_of(dataset, detections)
     rules = rules_of(dataset)
     clips = [load(one, optipmb.load_profile(dataset), rules) for one in sequences]
@@ -38,7 +36,6 @@ def material(dataset: str, detections: str) -> tuple[dict[str, Scorer], dict[str
 
 @cache
 def tracked(profile: str, detections: str, name: str) -> list[FullTable]:
-    """The tracks of one class by one profile, sequence by sequence."""
     _, clips = material(profile.removesuffix("-paper"), detections)
     parameters = only(optipmb.load_profile(profile), name)
     return [track_clip(clip, parameters) for clip in clips[name]]
@@ -46,7 +43,6 @@ def tracked(profile: str, detections: str, name: str) -> list[FullTable]:
 
 @cache
 def figures(profile: str, detections: str, name: str) -> Figures:
-    """The figures of one class by one profile."""
     scorers, clips = material(profile.removesuffix("-paper"), detections)
     tracks = zip(clips[name], tracked(profile, detections, name), strict=True)
     return scorers[name].figures([scorers[name].measure(clip, table) for clip, table in tracks])

@@ -25,8 +25,6 @@ NUMBERS = {name: number for number, name in CLASS_NAMES.items()} | {"cyclist": 6
 
 
 class Sent(NamedTuple):
-    """A message to write: fields as maps and lists."""
-
     topic: str
     kind: str
     received_ns: int
@@ -56,7 +54,6 @@ def messages(
 
 
 def write_mcap(path: Path, sent: Sequence[Sent]) -> Path:
-    """Write messages to an MCAP file."""
     schemas: dict[str, Any] = {}
     with path.open("wb") as file:
         writer = McapWriter(file)
@@ -84,29 +81,24 @@ def write_sqlite(path: Path, sent: Sequence[Sent]) -> Path:
 
 
 def header(stamp_ns: int, frame: str) -> dict[str, Any]:
-    """Give a header."""
     return {"stamp": {"sec": stamp_ns // 10**9, "nanosec": stamp_ns % 10**9}, "frame_id": frame}
 
 
 def vector(values: Sequence[float]) -> dict[str, float]:
-    """Give x, y, z."""
     x, y, z = (float(value) for value in values)
     return {"x": x, "y": y, "z": z}
 
 
 def pose(center: Sequence[float], quaternion: Sequence[float]) -> dict[str, Any]:
-    """Give a pose from a centre and w, x, y, z."""
     w, x, y, z = (float(value) for value in quaternion)
     return {"position": vector(center), "orientation": {"x": x, "y": y, "z": z, "w": w}}
 
 
 def turned(yaw: float) -> list[float]:
-    """Give the quaternion of a turn about z."""
     return [math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]
 
 
 def vision(stamp_ns: int, frame_id: str, frame: DetectionFrame) -> dict[str, Any]:
-    """Give the objects of a frame as Detection3DArray."""
     detections = []
     for row in range(len(frame)):
         box = pose(frame.center[row], turned(frame.yaw[row]))
@@ -188,7 +180,6 @@ def _odometry(stamp_ns: int, at: Pose) -> dict[str, Any]:
 
 
 def _between(parent: Pose, child: Pose) -> Pose:
-    """Give parent from child, both given in the world."""
     turn = rotation_of(parent.quaternion).T
     matrix = np.eye(4)
     matrix[:3, :3] = turn @ rotation_of(child.quaternion)

@@ -1,25 +1,17 @@
 """Rows of a simple tracker as a table of results, and the points in a box."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
-from optipmb_tools.geometry import to_sensor
+from numpy.typing import NDArray
+from optipmb_tools.geometry import Bools, Floats, to_sensor
 from optipmb_tools.results import ResultTable
 from optipmb_tools.results.kitti import LEAST_SHOWN
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-    from optipmb_tools.geometry import Bools, Floats
-    from optipmb_tools.tuning.clips import Clip
+from optipmb_tools.tuning.clips import Clip
 
 Row = tuple[int, int, "NDArray[np.float64]", "NDArray[np.float64]", float, float]
 """Frame, id, centre, size, yaw and score, in the world frame."""
 
 
 def table_of(clip: Clip, name: str, rows: list[Row]) -> ResultTable:
-    """Return the table, with image boxes where there is a camera."""
     frame, identity, center, size, yaw, score = zip(*rows, strict=True) if rows else ([],) * 6
     when = np.array(frame, dtype=np.int64)
     centers, sizes = np.array(center, dtype=np.float64).reshape(-1, 3), np.array(size, dtype=np.float64).reshape(-1, 3)

@@ -1,28 +1,22 @@
 """Brokers of MQTT: one that a test speaks for, and Mosquitto, where it is installed."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import shutil
 import subprocess
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Self
+from pathlib import Path
+from typing import Self
 
 import pytest
 from routers import free_endpoint
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 CONNECT, CONNACK, PUBLISH, PUBACK, DISCONNECT = 0x10, 0x20, 0x30, 0x40, 0xE0
 
 
 @dataclass(frozen=True)
 class Message:
-    """A message as the broker has it."""
-
     topic: str
     payload: bytes
     qos: int
@@ -31,7 +25,7 @@ class Message:
 
 @dataclass
 class Broker:
-    """Takes what is published, in the versions of the protocol that it knows; reads no subscriptions.
+    """Receives published messages, in the protocol versions that it knows; reads no subscriptions.
 
     Attributes:
         versions: the versions of the protocol that it knows: 4 is 3.1.1.
@@ -58,11 +52,9 @@ class Broker:
         await asyncio.sleep(0)
 
     def of(self, end: str) -> list[bytes]:
-        """Payloads of the topics that end so."""
         return [one.payload for one in self.messages if one.topic.endswith(end)]
 
     async def wait(self, count: int, end: str) -> list[bytes]:
-        """Wait for so many messages of the topics that end so."""
         async with asyncio.timeout(60):
             while len(self.of(end)) < count:  # noqa: ASYNC110 - it runs on the loop of the test
                 await asyncio.sleep(0.01)
@@ -108,7 +100,6 @@ async def _length(reader: asyncio.StreamReader) -> int:
 
 @contextlib.contextmanager
 def mosquitto(folder: Path) -> Iterator[str]:
-    """Debian's broker on a free port; gives its address."""
     program = shutil.which("mosquitto", path="/usr/sbin:/usr/local/sbin") or shutil.which("mosquitto")
     if program is None:
         pytest.skip("Debian's package mosquitto is not installed")

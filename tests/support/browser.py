@@ -1,27 +1,21 @@
 """Chromium without a screen, for tests of pages; they are skipped where it is not installed."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import shutil
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
-    from selenium.webdriver import Chrome
+from selenium.webdriver import Chrome
 
 DEADLINE_S = 90.0
 
 
 @contextlib.contextmanager
 def browser(profile: Path, *flags: str) -> Iterator[Chrome]:
-    """Chromium with an empty profile and no requests of its own."""
     chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
     if chromium is None or driver is None:
         pytest.skip("Debian's packages chromium and chromium-driver are not installed")
@@ -47,7 +41,6 @@ def size(chrome: Chrome, width: int, height: int) -> None:
 
 
 def wait(chrome: Chrome, condition: str, deadline_s: float = DEADLINE_S) -> Any:
-    """Wait until an expression of the page is true; return it."""
     ends = time.monotonic() + deadline_s
     while not (value := chrome.execute_script(f"return {condition}")):
         assert time.monotonic() < ends, f"never true in the page: {condition}"
@@ -56,18 +49,15 @@ def wait(chrome: Chrome, condition: str, deadline_s: float = DEADLINE_S) -> Any:
 
 
 def console(chrome: Chrome) -> list[str]:
-    """What the page's console says, errors and warnings of the browser among it."""
     return [entry["message"] for entry in chrome.get_log("browser")]
 
 
 def requested(chrome: Chrome) -> set[str]:
-    """The addresses that the page has asked for so far."""
     messages = [json.loads(entry["message"])["message"] for entry in chrome.get_log("performance")]
     return {one["params"]["request"]["url"] for one in messages if one["method"] == "Network.requestWillBeSent"}
 
 
 def wait_for(condition: Callable[[], bool], deadline_s: float = DEADLINE_S) -> None:
-    """Wait until something outside the page is so."""
     ends = time.monotonic() + deadline_s
     while not condition():
         assert time.monotonic() < ends

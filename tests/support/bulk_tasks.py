@@ -7,7 +7,6 @@ import time
 from collections.abc import Set as AbstractSet
 from concurrent.futures import Future
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -24,7 +23,6 @@ LONG = 5
 
 
 def recordings(folder: Path) -> Path:
-    """Write a table of recordings r000 to r199, no two alike; give its path."""
     rows = 3 * LONG
     table = {name: np.tile(values[:rows], RECORDINGS) for name, values in boxes().items()}
     number = np.repeat(np.arange(RECORDINGS), rows)
@@ -36,12 +34,10 @@ def recordings(folder: Path) -> Path:
 
 
 def bytes_of(folder: Path) -> dict[str, bytes]:
-    """Give the content of every file below a folder, hidden ones too."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def tracked_plainly(data: Path, out: Path) -> dict[str, bytes]:
-    """Track all recordings in this process; give the result files."""
     opened = DatasetArguments("table", data).open()
     sequences = opened.sequences(["all"])
     assert len(list(track(opened, sequences, out, Tracking(profile_for("kitti", sequences))))) == RECORDINGS
@@ -74,25 +70,19 @@ class Dying:
 
     @property
     def width(self) -> int:
-        """As many as the executor wants."""
         return self._executor.width
 
     def start(self, function: Any, shared: Any) -> None:
-        """Have the tasks run by `dying`."""
         self._executor.start(dying, (function, shared, *self._given))
 
     def submit(self, task: Any) -> Future[Any]:
-        """Start a task."""
         return self._executor.submit(task)
 
     def take(self, future: Future[Any]) -> Any:
-        """Give its result."""
         return self._executor.take(future)
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """The caller closes the executor."""

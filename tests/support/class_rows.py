@@ -1,7 +1,5 @@
 """Tables of classes for kernels, of which a test names the columns that count."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -18,5 +16,4 @@ def class_rows(count: int, **columns: Any) -> Any:
 
 
 def class_row(**values: Any) -> Any:
-    """Return one row of it."""
     return class_rows(1, **{name: [value] for name, value in values.items()})[0]

@@ -12,7 +12,6 @@ from optipmb_tools.cli import run
 
 
 def optipmb(*arguments: object, timeout: float = 240.0) -> "subprocess.CompletedProcess[str]":
-    """Run the client's command in a process of its own."""
     command = [sys.executable, "-m", "optipmb_tools", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
 
@@ -26,19 +25,17 @@ def run_here(capsys: pytest.CaptureFixture[str], *arguments: object) -> "subproc
     return subprocess.CompletedProcess(words, status, shown.out, shown.err)
 
 
-def start(*arguments: object, fresh: bool = False) -> "subprocess.Popen[str]":
+def start(*arguments: object, fresh: bool = False, **how: Any) -> "subprocess.Popen[str]":
     """Start the client's command and return the running process; a new interpreter where a start is the claim."""
     command = ("optipmb_tools", *map(str, arguments))
-    return forked.start(*command, fresh=fresh, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    return forked.start(*command, fresh=fresh, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **how)
 
 
 def result_of(done: "subprocess.CompletedProcess[str]") -> Any:
-    """Give the JSON that a command printed; it must have ended well."""
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
 
 def kill(process: "subprocess.Popen[str]") -> None:
-    """End a process as a crash would, and clear away its pipes."""
     process.send_signal(signal.SIGKILL)
     process.communicate(timeout=120)

@@ -1,18 +1,13 @@
 """Comparison of the tracker's density and tracks with the oracle's, and of bytes with bytes."""
 
-from __future__ import annotations
-
 import hashlib
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from oracle import Oracle, OracleTracks
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from oracle import Oracle, OracleTracks
-
-    from optipmb import Density, Tracks
+from optipmb import Density, Tracks
 
 TOLERANCE = 1e-9
 BERNOULLI = ["mean", "covariance", "existence", "label", "auxiliary", "id", "born_ns", "seen_ns", "score", "evidence"]
@@ -48,7 +43,6 @@ def _stacked(objects: Sequence[Any], name: str, like: np.ndarray[Any, Any]) -> n
 
 
 def assert_matches(oracle: Oracle, wanted: OracleTracks, density: Density, tracks: Tracks, when: str) -> None:
-    """The whole density and all tracks equal the oracle's."""
     assert density.stamp_ns == oracle.stamp_ns, when
     np.testing.assert_array_equal(density.bernoulli.id, [b.id for b in oracle.bernoulli], err_msg=f"{when} ids")
     assert density.next_id == oracle.next_id, when
@@ -78,13 +72,11 @@ def density_bytes(density: Density) -> bytes:
 
 
 def tracks_bytes(tracks: Tracks, without: tuple[str, ...] = ()) -> bytes:
-    """The columns of tracks as bytes, but for those left out."""
     columns = [np.ascontiguousarray(getattr(tracks, name)) for name in TRACKS if name not in without]
     return b"|".join(part for column in columns for part in (str(column.shape).encode(), column.tobytes()))
 
 
 def digest(densities: Sequence[Density]) -> str:
-    """One hash of the bytes of several densities."""
     state = hashlib.sha256()
     for density in densities:
         state.update(density_bytes(density))

@@ -1,17 +1,16 @@
 """A seeded world of sensors, a network that disturbs and a service that crashes, all in one loop without time passing.
 
 `World(seed).run()` lets streams send frames and clouds on a fake clock through a fake transport that delays, reorders,
-repeats and garbles them, to sessions that are written down now and then, crash, and are taken up again from their last
-whole checkpoint, with what the publishers' caches hold given again. Beside it the same messages go, once and in order,
-to sessions to which nothing happens. In the end both must be at the same state and have given out the same tracks.
+repeats and garbles them, to sessions that are saved now and then, crash, and are restored from their last whole
+checkpoint and the publishers' caches. The same messages go, once and in order, to undisturbed sessions. In the end both
+must have the same state and have published the same tracks.
 """
-
-from __future__ import annotations
 
 import heapq
 import random
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import optipmb_schemas as schemas
 from lease_log import Alone
@@ -24,9 +23,6 @@ from router import SECOND, Sensor
 from sessions import Merged, chained
 
 import optipmb
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 NUSCENES = optipmb.load_profile("nuscenes")
 PERIOD_NS = SECOND // 10
@@ -111,7 +107,6 @@ class World:
         self._ticket = 0
 
     def run(self) -> None:
-        """Let it happen, then compare."""
         frames = round(self.seconds * SECOND / PERIOD_NS)
         for _ in range(frames):
             for one in self.streams:
@@ -125,7 +120,6 @@ class World:
         self.compare()
 
     def compare(self) -> None:
-        """States and tracks equal the undisturbed sessions."""
         for stream, session in self.sessions.items():
             where = f"seed {self.seed}, stream {stream}"
             other = self.undisturbed[stream]
@@ -257,7 +251,6 @@ class World:
 
 
 def give(session: Session, message: schemas.Message, now_ns: int) -> list[Any]:
-    """Hand a session a frame or a cloud."""
     if isinstance(message, schemas.Points):
         return list(session.on_points(message, now_ns))
     assert isinstance(message, schemas.Detections)
@@ -265,7 +258,6 @@ def give(session: Session, message: schemas.Message, now_ns: int) -> list[Any]:
 
 
 def garbled(payload: bytes, chance: random.Random) -> bytes:
-    """Return bytes that are no message any more: cut short, or with a field of another name."""
     if chance.random() < 0.5:
         return payload[: chance.randrange(len(payload))]
     return payload.replace(b"stamp_ns", b"stamp_ms")

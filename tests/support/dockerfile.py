@@ -1,15 +1,10 @@
 """Reads a Dockerfile: instructions in order, variables put in, stages apart. What this one uses, nothing more."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from pathlib import Path
 
 
 @dataclass(frozen=True)
@@ -36,8 +31,6 @@ class Instruction:
 
 @dataclass
 class Stage:
-    """A stage: its base, its name, its instructions."""
-
     base: str
     name: str
     instructions: list[Instruction] = field(default_factory=list)

@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 from optipmb_tools.camera import Camera, alpha_of, kitti_from_sensor
 from optipmb_tools.datasets import Truth
+from optipmb_tools.evaluation.cases import Rules, prepare
+from optipmb_tools.evaluation.clear import ClearResult, clear
 from optipmb_tools.results import ResultTable
 
 LABELS = ("Car", "Van", "Pedestrian", "Person", "Cyclist")
@@ -16,6 +18,13 @@ TruthRow = tuple[int, int, float, float]
 """Frame, id, x, y."""
 TrackRow = tuple[int, int, float, float, float]
 """Frame, id, x, y, score."""
+
+
+def evaluate_clear(
+    truth: Truth, tracks: ResultTable, name: str, rules: Rules | None = None, *, sequence: str = ""
+) -> ClearResult:
+    rules = rules or Rules()
+    return clear(prepare(truth, tracks, name, rules, sequence), rules)
 
 
 def truth_of(rows: Sequence[TruthRow], names: Sequence[str] | str = "Car", ignored: Sequence[int] = ()) -> Truth:
@@ -39,7 +48,6 @@ def truth_of(rows: Sequence[TruthRow], names: Sequence[str] | str = "Car", ignor
 
 
 def tracks_of(rows: Sequence[TrackRow], names: Sequence[str] | str = "Car") -> ResultTable:
-    """Give tracks of one size, in any order."""
     count = len(rows)
     labels = (names,) if isinstance(names, str) else tuple(dict.fromkeys(names))
     table = ResultTable(
@@ -57,7 +65,6 @@ def tracks_of(rows: Sequence[TrackRow], names: Sequence[str] | str = "Car") -> R
 
 
 def parked(objects: int, frames: int, apart: float = 10.0) -> list[TruthRow]:
-    """Give objects that stand in a row, each in all frames."""
     return [(frame, one, apart * one, 0.0) for frame in range(frames) for one in range(objects)]
 
 
@@ -86,7 +93,7 @@ def write_kitti(root: Path, results: Path, seed: int, sequences: Sequence[str] =
     """Write a small benchmark with all that its rules name but no detections, and disturbed tracks; return its root.
 
     Objects drive ahead of a camera that drives along a bend; some are vans, some hidden or cut by the image for a
-    while, some so near to others that a track could be either's. Tracks are inaccurate, lost and taken up under another
+    while, some so near to others that a track could be either's. Tracks are inaccurate, lost and resumed under another
     id, twice on one object, false, small, or in regions without annotations. Their scores say a little about all that.
     """
     chance = np.random.default_rng(seed)
@@ -114,7 +121,6 @@ def _pose(frame: int) -> str:
 
 
 def _drive(chance: np.random.Generator, frames: int) -> tuple[list[str], list[str]]:
-    """Give the lines of a label file and of a result file."""
     labels, tracks = [], []
     following = 100
     for one in range(28):

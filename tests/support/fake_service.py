@@ -3,7 +3,6 @@
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import Self
 
 import zenoh
@@ -41,8 +40,6 @@ class Behaviour:
 
 @dataclass
 class Seen:
-    """Messages received, in their order."""
-
     detections: list[Detections] = field(default_factory=list)
     points: list[Points] = field(default_factory=list)
     parameters: list[tuple[str, SessionParameters]] = field(default_factory=list)
@@ -74,9 +71,7 @@ class FakeService:
         self._opened.append(session.liveliness().declare_token(KEYS.alive(self.instance)))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._session.close()
 
     def _work(self, source: object, take: Callable[..., None]) -> None:

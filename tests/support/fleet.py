@@ -1,23 +1,17 @@
 """A router process and service processes that share a store: started, frozen, killed, and always ended."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal
 import subprocess
 import sys
 import time
-from typing import TYPE_CHECKING, Self
+from pathlib import Path
+from typing import Self
 
+import zenoh
 from routers import free_endpoint, open_client
 from service_process import ServiceProcess
-
-if TYPE_CHECKING:
-    from pathlib import Path
-    from types import TracebackType
-
-    import zenoh
 
 START_S = 60.0
 
@@ -50,13 +44,10 @@ class RouterProcess:
         self.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.kill()
 
     def start(self) -> None:
-        """Start it, and wait until it listens."""
         self._process = subprocess.Popen(
             [sys.executable, "-c", _ROUTER, os.path.dirname(__file__), self.endpoint, *self._others],  # noqa: PTH120 - a text is needed
             stdout=subprocess.PIPE,
@@ -66,7 +57,6 @@ class RouterProcess:
         assert self._process.stdout.readline() == "up\n"
 
     def kill(self) -> None:
-        """SIGKILL."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
@@ -99,14 +89,11 @@ class Fleet:
         self._context.enter_context(self.router)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._context.close()
 
     @property
     def endpoint(self) -> str:
-        """Where the router listens."""
         return self.router.endpoint
 
     def service(
@@ -126,12 +113,10 @@ class Fleet:
         return process
 
     def client(self) -> zenoh.Session:
-        """A plain Zenoh client of the router, closed at the end."""
         return self._context.enter_context(open_client(self.endpoint))
 
 
 def freeze(service: ServiceProcess) -> None:
-    """SIGSTOP, and wait until it has stopped."""
     service.process.send_signal(signal.SIGSTOP)
     deadline = time.monotonic() + START_S
     while _state(service.process.pid) != "T":
@@ -140,7 +125,6 @@ def freeze(service: ServiceProcess) -> None:
 
 
 def thaw(service: ServiceProcess) -> None:
-    """SIGCONT."""
     service.process.send_signal(signal.SIGCONT)
 
 

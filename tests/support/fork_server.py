@@ -2,7 +2,7 @@
 
 Run by `forked`, as `fork_server.py FD`. A request comes as one packet with the three files that the new process is to
 have. The packet is JSON: the module that is run and its words, the environment, the folder. The answer is the number
-of the new process. That one is forked twice, so that it has no parent here; whoever asked takes it as a child of its
+of the new process. That one is forked twice, so that it has no parent here; the caller takes it as a child of its
 own.
 """
 

@@ -65,7 +65,7 @@ class Forked(subprocess.Popen[str]):
     """`python -m` with the module and the words given, as `subprocess.Popen` starts and ends it."""
 
     def _execute_child(self, args: Any, executable: Any, *given: Any) -> None:
-        """Fork where `Popen` forks and calls exec; what it gives here has been the same since Python 3.9."""
+        """Fork where `Popen` forks and calls exec; its interface has been the same since Python 3.9."""
         del executable
         _, _, _, folder, environment, _, _, _, *pipes = given[:14]
         stdin, _, _, stdout, _, stderr = pipes

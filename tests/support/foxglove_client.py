@@ -55,7 +55,6 @@ class FoxgloveClient:
         self.channels: dict[int, dict[str, Any]] = {}
 
     def close(self) -> None:
-        """Hang up."""
         self._socket.close()
 
 

@@ -1,16 +1,10 @@
 """Sensors of one node that share a session, and a drive past them."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
-from optipmb_schemas import FieldOfView
+from optipmb_schemas import Detections, FieldOfView
 from router import Sensor
-
-if TYPE_CHECKING:
-    from optipmb_schemas import Detections
 
 FUSED = "site/node/fused"
 FRONT = Sensor("site/node/front", b"f" * 16)

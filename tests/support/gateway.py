@@ -1,10 +1,9 @@
 """A real gateway in a process of its own, and what tests say to it with the generated stubs alone."""
 
-from __future__ import annotations
-
 import socket
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import grpc
 import numpy as np
@@ -14,9 +13,6 @@ from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
 from routers import free_endpoint
 from service_process import ServiceProcess
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
 
 EPOCH = bytes(range(16))
 STREAM = "garage/robot-1/lidar"
@@ -48,12 +44,10 @@ class GatewayProcess(ServiceProcess):
         )
 
     def stub(self, options: Sequence[tuple[str, int]] = ()) -> Any:
-        """The generated stub on a channel of its own."""
         return rpc.TrackingServiceStub(grpc.insecure_channel(self.address, options=options))
 
 
 def connected(gateway: GatewayProcess) -> socket.socket:
-    """A connection without calls."""
     host, _, port = gateway.address.rpartition(":")
     one = socket.create_connection((host, int(port)), timeout=10)
     one.sendall(PREFACE)
@@ -61,7 +55,6 @@ def connected(gateway: GatewayProcess) -> socket.socket:
 
 
 def resident(pid: int) -> int:
-    """Bytes of memory of a process."""
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * 4096
 
 
@@ -84,10 +77,8 @@ def frame(seq: int, stream: str = STREAM, epoch: bytes = EPOCH, **changes: Any) 
 
 
 def detections(message: Detections, kind: Any = pb.TrackRequest) -> Any:
-    """A request with detections."""
     return kind(detections=convert.to_proto(message))
 
 
 def points(message: Points, kind: Any = pb.TrackRequest) -> Any:
-    """A request with a cloud."""
     return kind(points=convert.to_proto(message))

@@ -6,18 +6,13 @@ is not found stays where its velocity takes it and ends after three frames. A bo
 the score of its detection.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from boxes import Row, table_of
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-    from optipmb_tools.results import ResultTable
-    from optipmb_tools.tuning.clips import Clip
+from numpy.typing import NDArray
+from optipmb_tools.results import ResultTable
+from optipmb_tools.tuning.clips import Clip
 
 REACH = {
     "car": 4.0,
@@ -45,7 +40,6 @@ class _Track:
 
 
 def greedy_tracks(clip: Clip, name: str) -> ResultTable:
-    """Track the detections of one class, in the world frame."""
     tracks: list[_Track] = []
     rows: list[Row] = []
     before, count = None, 0

@@ -3,8 +3,6 @@
 With any input a call returns or raises an `OptipmbError`. Everything is drawn from fixed seeds.
 """
 
-from __future__ import annotations
-
 import sys
 from contextlib import suppress
 from dataclasses import replace
@@ -71,7 +69,7 @@ def odd(rng: np.random.Generator, shape: tuple[int, ...]) -> Any:
 
 
 def odd_frames(seed: int) -> None:
-    """`make_frame` with numbers of any kind; what it takes is tracked over any time."""
+    """`make_frame` with numbers of any kind; accepted frames are tracked over any time."""
     rng = np.random.default_rng(seed)
     parameters = PROFILES[seed % 2]
     tracker = optipmb.Tracker(parameters)

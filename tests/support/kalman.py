@@ -3,8 +3,8 @@
 Written from the paper and its published parameters for PointRCNN. Each track is a box [x, y, z, yaw, length, width,
 height] with a constant velocity per frame; measured states start with variance 10 and gain 1 a frame, velocities start
 with 10000 and gain 0.01, detections have variance 1. Detections are assigned by generalised intersection over union or
-by the distance of centres, all at once or the best pair first. A box is written from the third detection on, that of a
-pedestrian from the first, and for a frame or three after the last one, with the log odds of its latest detection. It
+by the distance of centres, all at once or the best pair first. A box is written from the third detection on (a
+pedestrian from the first), and for a frame or three after the last one, with the log odds of its latest detection. It
 works in the world frame, which is what its compensation of the camera's own motion comes to.
 """
 
@@ -39,8 +39,6 @@ START = np.diag([10.0] * MEASURED + [10_000.0] * 3)
 
 @dataclass(frozen=True)
 class Habits:
-    """What differs between the classes."""
-
     at_once: bool
     """All detections are assigned together; else the best pair first."""
     by_overlap: bool
@@ -71,7 +69,6 @@ class _Track:
 
 
 def kalman_tracks(clip: Clip, name: str) -> ResultTable:
-    """Track the detections of one class, in the world frame."""
     habits = HABITS[name]
     tracks: list[_Track] = []
     rows: list[Row] = []
@@ -114,7 +111,6 @@ def _update(track: _Track, box: Array, score: float) -> None:
 
 
 def _assigned(boxes: Array, tracks: Array, habits: Habits) -> list[tuple[int, int]]:
-    """Return pairs of a detection and a track."""
     if not len(boxes) or not len(tracks):
         return []
     apart = np.linalg.norm(boxes[:, None, :3] - tracks[None, :, :3], axis=2)

@@ -1,19 +1,12 @@
 """What all members share, in memory, and members that are moved by hand: no thread, and a clock that tests set."""
 
-from __future__ import annotations
-
 import threading
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 from optipmb_service.cluster.leases import PARTITIONS, Change, partition_key, partition_of
 from optipmb_service.cluster.member import Member
-from optipmb_service.cluster.store import KEPT, Fenced, Record, StoreError, Write
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from optipmb_service.cluster.store import LeaseStore
+from optipmb_service.cluster.store import KEPT, Fenced, LeaseStore, Record, StoreError, Write
 
 SECOND = 1_000_000_000
 LEASE_S = 2.0
@@ -47,18 +40,15 @@ class MemoryLeases:
         """Whether answers arrive; without them what was asked is done nevertheless."""
 
     def follow(self, after: int) -> list[Record]:
-        """Return the changed records."""
         self._reach()
         changed = [record for record in self.shared.records.values() if record.revision > after]
         return sorted(changed, key=lambda record: record.revision)
 
     def get(self, key: str) -> Record | None:
-        """Return a record."""
         self._reach()
         return self.shared.records.get(key)
 
     def put(self, write: Write) -> int | None:
-        """Write over a revision."""
         self._reach(after=False)
         revision = None
         with self.shared.lock:
@@ -70,12 +60,10 @@ class MemoryLeases:
         return revision
 
     def gone(self, member: str) -> bool:
-        """Never say so."""
         del member
         return False
 
     def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
-        """Keep the checkpoints with the newest fence."""
         self._reach()
         refused = set()
         for stream, one in checkpoints.items():
@@ -88,18 +76,15 @@ class MemoryLeases:
         return frozenset(refused)
 
     def load(self, stream: str) -> bytes | None:
-        """Return the newest."""
         self._reach()
         kept = self.shared.checkpoints.get(stream)
         return kept[-1] if kept else None
 
     def expire(self, age_s: float) -> int:
-        """Keep all."""
         del age_s
         return 0
 
     def set_aside(self, stream: str, reason: str) -> None:
-        """Forget the newest."""
         del reason
         self._reach()
         if kept := self.shared.checkpoints.get(stream):
@@ -130,20 +115,16 @@ class Alone(Member):
         return self._store.put(Write(key, "alone", now.revision if now else 0))
 
     def leave(self) -> None:
-        """Hold nothing any more."""
         for number, fence in enumerate(self._fences):
             self._store.put(Write(partition_key(number), "", fence or 0))
 
     def fence(self, stream: str) -> int | None:
-        """Return the fence of a stream."""
         return self._fences[partition_of(stream)]
 
     def may_write(self, stream: str, fence: int | None) -> bool:
-        """Whether it is the newest, and the lease has not lapsed."""
         return fence == self.fence(stream) and not self.lapsed
 
     def save(self, checkpoints: Mapping[str, bytes]) -> frozenset[str]:
-        """Save under the leases."""
         return self._store.save(
             {
                 stream: Fenced(partition_key(partition_of(stream)), self.fence(stream) or 0, data)
@@ -163,7 +144,6 @@ class Clock:
         self.ns = round(ahead_s * SECOND)
 
     def __call__(self) -> int:
-        """Return the time, ns."""
         return self.ns
 
 
@@ -204,12 +184,10 @@ class HandMember:
 
     @property
     def held(self) -> set[int]:
-        """The partitions whose streams it would publish now."""
         valid = self.clock.ns < self.member._may_write_until_ns
         return set(self.member._table.held) if valid else set()
 
     def end(self) -> None:
-        """End in order."""
         self.member._end()
 
     def _resume(self) -> None:

@@ -1,19 +1,13 @@
 """A bridge into the log in a process of its own, asked for its figures as Prometheus asks."""
 
-from __future__ import annotations
-
 import json
 import re
 import urllib.error
 import urllib.request
-from typing import TYPE_CHECKING
 
-from router import Sensor, until
+from router import Node, Sensor, until
 from routers import free_endpoint
 from service_process import ServiceProcess
-
-if TYPE_CHECKING:
-    from router import Node
 
 PROBE = Sensor(stream="probe/probe/probe")
 
@@ -37,7 +31,6 @@ class LogProcess(ServiceProcess):
         )
 
     def ask(self, path: str) -> str:
-        """Its answer over HTTP; empty without one."""
         try:
             with urllib.request.urlopen(f"http://{self.http}{path}", timeout=10) as answer:
                 return str(answer.read().decode())
@@ -47,7 +40,6 @@ class LogProcess(ServiceProcess):
             return ""
 
     def figure(self, name: str) -> float:
-        """One of its figures, by its name without `optipmb_log_`."""
         found = re.search(rf"^optipmb_log_{name} (\S+)$", self.ask("/metrics"), re.MULTILINE)
         return float(found[1]) if found else 0.0
 
@@ -58,7 +50,6 @@ class LogProcess(ServiceProcess):
 
     @property
     def readiness(self) -> tuple[str, str]:
-        """Its state, and why it is so."""
         answer = json.loads(self.ask("/readyz") or "{}")
         return answer.get("state", ""), answer.get("failure", "")
 

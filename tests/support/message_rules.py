@@ -220,6 +220,5 @@ RULES: list[tuple[str, str, Any, str]] = [
 
 
 def plain(message: Message) -> dict[str, Any]:
-    """Return the message as JSON has it."""
     fields: dict[str, Any] = json.loads(encode_json(message))
     return fields

@@ -1,21 +1,16 @@
 """A real NATS server in a process of its own, started as users start one; it can be killed and started again."""
 
-from __future__ import annotations
-
 import os
 import socket
 import subprocess
 import sys
 import time
-from typing import TYPE_CHECKING, Self
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Self
 
 from optipmb_service.app.cli import NATS_PAYLOAD_MB, nats_server
 from routers import free_endpoint
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-    from types import TracebackType
 
 START_S = 60.0
 
@@ -37,18 +32,14 @@ class NatsProcess:
         self.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.kill()
 
     def start(self) -> None:
-        """Start it, and wait until it takes connections."""
         command = [sys.executable, "-m", "optipmb_service", "nats", "--listen", self.address, "--store", self._folder]
         self.process = started(command, self.address, self._folder / "nats.log")
 
     def kill(self) -> None:
-        """SIGKILL."""
         if self.process is not None:
             self.process.kill()
             self.process.wait()
@@ -73,14 +64,11 @@ class NatsTrio:
             self.start(index)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for index in tuple(self._processes):
             self.kill(index)
 
     def start(self, index: int) -> None:
-        """Start one of them, and wait until it takes connections."""
         routes = ", ".join(f'"nats://{address}"' for address in self._addresses[3:])
         file = self._folder / f"{index}.conf"
         file.write_text(f"""
@@ -96,14 +84,12 @@ class NatsTrio:
         self._processes[index] = started(command, self._addresses[index], self._folder / f"{index}.log")
 
     def kill(self, index: int) -> None:
-        """SIGKILL."""
         process = self._processes.pop(index)
         process.kill()
         process.wait()
 
 
 def started(command: Sequence[str | Path], address: str, log: Path) -> subprocess.Popen[bytes]:
-    """Start a server, and wait until it takes connections."""
     with log.open("ab") as file:
         process = subprocess.Popen(
             command,

@@ -25,8 +25,6 @@ REACH = {"bicycle": 3.0, "bus": 5.5, "car": 4.0, "motorcycle": 5.0, "pedestrian"
 
 @dataclass(frozen=True)
 class Rows:
-    """The tracks of one frame, as result writers take them."""
-
     id: Ints
     label: Ints
     center: Floats
@@ -38,12 +36,10 @@ class Rows:
 
     @property
     def existence(self) -> Floats:
-        """It is not read."""
         return self.score
 
 
 def write(dataset: NuScenesDataset, sequence: NuScenesSequence, frames: Sequence[Rows], out: Path) -> Path:
-    """Write the tracks of one scene; give the path of the file that holds all scenes written so far."""
     dataset.write(out, sequence, dict(enumerate(frames)))
     dataset.join(out, [one for one in dataset.sequences(["all"]) if scene_file(out, one.name).is_file()])
     return out / "tracking_results.json"
@@ -147,7 +143,6 @@ class GreedyTracker:
         self._next = 1
 
     def step(self, frame: DetectionFrame) -> Rows:
-        """Give the tracks that have a detection in this frame."""
         now = frame.stamp_ns * 1e-9
         parts = []
         for label, name in enumerate(frame.labels):
@@ -176,7 +171,6 @@ class GreedyTracker:
 
 
 def greedy_tracks(sequence: NuScenesSequence) -> list[Rows]:
-    """Give what the greedy tracker makes of the detections of a scene."""
     tracker = GreedyTracker()
     return [tracker.step(frame) for frame in sequence.frames()]
 

@@ -31,8 +31,6 @@ TILTED = [0.70, 0.01, -0.02, 0.71]
 
 @dataclass(frozen=True)
 class Thing:
-    """One annotation to be."""
-
     name: str
     category: str
     frame: int
@@ -56,11 +54,9 @@ class Scene:
     """Added to the stamps of the frames, which are half a second apart."""
 
     def stamp(self, frame: int) -> int:
-        """Give the stamp of a frame."""
         return self.start_us + frame * STEP_US + (self.jitter_us[frame] if self.jitter_us else 0)
 
     def token(self, frame: int) -> str:
-        """Give the token of a sample."""
         return f"sample-{self.name}-{frame}"
 
 
@@ -73,7 +69,6 @@ class _Tables:
 
 
 def rotation(yaw: float) -> list[float]:
-    """Give the quaternion of a heading."""
     return [math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]
 
 
@@ -205,7 +200,6 @@ def write_detections(
 
 
 def box(token: str, **changes: Any) -> dict[str, Any]:
-    """Give one detection."""
     values = {
         "sample_token": token,
         "translation": [10.0, 20.0, 1.0],
@@ -220,7 +214,6 @@ def box(token: str, **changes: Any) -> dict[str, Any]:
 
 
 def write_scan(root: Path, filename: str, points: NDArray[np.float32]) -> None:
-    """Write a scan (P, 5)."""
     path = root / filename
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(points.astype("<f4").tobytes())

@@ -5,8 +5,6 @@ by attribute. Where the paper is silent the tracker's docstrings decide.
 """
 # ruff: noqa: N806 - Q and W are the names that the paper uses
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import Any

@@ -6,8 +6,6 @@ formula can be proof-read against it. Nothing here imports the tracker.
 """
 # ruff: noqa: N803, N806 - P, S, K, R, C and the like are the names that the formulas of the paper use
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -243,7 +241,7 @@ def follow_evidence(c: Any, evidence: float, since: float, score: float | None) 
     return float(kept * evidence + (1.0 - kept) * odds)
 
 
-T = np.diag([1.0, 1.0, -1.0, 1.0, 1.0, -1.0])  # the motion with the opposite heading, beside the pi on phi
+T = np.diag([1.0, 1.0, -1.0, 1.0, 1.0, -1.0])  # the motion with the opposite heading, in addition to the pi on phi
 
 
 def follow_sign(c: Any, odds: float, since: float, z: Measurement, m: Array, P: Array) -> tuple[float, Array, Array]:
@@ -270,7 +268,7 @@ def confidence(c: Any, odds: float) -> tuple[float, float]:
 
 
 def report(c: Any, z: Measurement | None, m: Array, P: Array) -> tuple[Array, Array]:
-    """The state that is told: its box updated once more with the noise that is left between R and R'."""
+    """The reported state: its box updated once more with the noise that is left between R and R'."""
     if z is None or c.reported_noise is None:
         return m, P
     less, noise = c.reported_noise, c.measurement_noise
@@ -288,7 +286,7 @@ def report(c: Any, z: Measurement | None, m: Array, P: Array) -> tuple[Array, Ar
 
 
 def calibrate(c: Any, b: Any, m: Array, P: Array) -> tuple[float, float, Array]:
-    """Existence, score and covariance of a track as they are told: curves over the evidence, level at their ends."""
+    """Reported existence, score and covariance of a track: curves over the evidence, level at their ends."""
     if c.calibration is None:
         return b.existence, b.score, P
     known = c.calibration

@@ -8,7 +8,6 @@ FRAMES, PERIOD = 30, 0.1
 
 
 def boxes(**changed: Any) -> dict[str, np.ndarray]:
-    """Give the detections of two cars and a pedestrian at 10 Hz, as columns; some of them may be changed."""
     t = np.repeat(np.arange(FRAMES) * PERIOD, 3)
     columns: dict[str, Any] = {
         "t": t.round(6),

@@ -15,7 +15,6 @@ def running(pid: int) -> bool:
 
 
 def wait_until_ended(pids: set[int], timeout: float) -> set[int]:
-    """Wait until processes have ended; return the ones that still run after `timeout` seconds."""
     deadline = time.monotonic() + timeout
     while (left := {pid for pid in pids if running(pid)}) and time.monotonic() < deadline:
         time.sleep(0.02)  # they are no children of this process: there is nothing to wait on
@@ -23,7 +22,6 @@ def wait_until_ended(pids: set[int], timeout: float) -> set[int]:
 
 
 def descendants(pid: int) -> set[int]:
-    """Give all processes below a process."""
     parents: dict[int, int] = {}
     for folder in Path("/proc").iterdir():
         if folder.name.isdigit():

@@ -1,23 +1,19 @@
 """A protected network as `docker/security/make.py` sets it up: a real router process, sessions with certificates."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from types import TracebackType
+from typing import Any, Self
 
 import zenoh
 from optipmb_schemas import Keys, ServiceStatus, decode
 from routers import free_endpoint
 from service_process import ServiceProcess
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from types import TracebackType
 
 MAKE = Path(__file__).parents[2] / "docker" / "security" / "make.py"
 DEADLINE_S = 60.0
@@ -28,7 +24,6 @@ REFUSAL_MS = 1500
 
 
 def make(out: Path, *options: str) -> subprocess.CompletedProcess[str]:
-    """Run the command that makes certificates and configurations."""
     command = [sys.executable, str(MAKE), "--out", str(out), "--router", "localhost", "--router", "127.0.0.1", *options]
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
@@ -65,17 +60,14 @@ class Network:
         self.router.__exit__(kind, error, trace)
 
     def make(self, *more: str) -> str:
-        """Create missing certificates; return the command's output."""
         done = make(self.folder, *self.options, *more)
         assert done.returncode == 0, done.stderr
         return done.stdout
 
     def config(self, role: str) -> Path:
-        """The configuration of a role, as `node/garage/robot-1`."""
         return self.folder / role / "zenoh.json5"
 
     def service(self, name: str = "tracker") -> ServiceProcess:
-        """A service that links to the router with its certificate."""
         config = str(self.config(f"service/{name}"))
         return ServiceProcess(
             "--instance", name, "--connect", self.endpoint, "--zenoh-config", config, listen=False
@@ -106,14 +98,10 @@ class Party:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.session.close()  # type: ignore[no-untyped-call]  # zenoh's stubs leave it untyped
 
     def read(self, *patterns: str) -> Self:
-        """Collect the messages under patterns."""
-
         def take(sample: zenoh.Sample) -> None:
             with self._changed:
                 self.seen.append((str(sample.key_expr), sample.payload.to_bytes()))
@@ -138,7 +126,7 @@ class Party:
         """Publish; who may not is not told."""
         self.session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
 
-    def deliver(self, key: str, payload: bytes, receiver: Party) -> bool:
+    def deliver(self, key: str, payload: bytes, receiver: Self) -> bool:
         """Publish until another has received it: the router may take two messages close together for a flood."""
         ends = time.monotonic() + DEADLINE_S
         while time.monotonic() < ends:
@@ -148,16 +136,13 @@ class Party:
         return False
 
     def token(self, key: str) -> None:
-        """Declare that something is alive."""
         self._kept.append(self.session.liveliness().declare_token(key))
 
     def tokens(self, pattern: str) -> set[str]:
-        """The liveliness tokens that it sees."""
         replies = self.session.liveliness().get(pattern, timeout=DEADLINE_S)
         return {str(sample.key_expr) for reply in replies if (sample := reply.ok) is not None}
 
     def ask(self, key: str, timeout: float = 3.0) -> list[bytes]:
-        """Ask, and return the good replies."""
         replies = self.session.get(
             key, timeout=timeout, consolidation=zenoh.ConsolidationMode.NONE, allowed_destination=zenoh.Locality.REMOTE
         )

@@ -1,18 +1,13 @@
 """A network between processes that takes its time, and can be cut: bytes on their way wait until it is whole again."""
 
-from __future__ import annotations
-
 import contextlib
 import queue
 import socket
 import threading
 import time
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 from routers import free_endpoint
-
-if TYPE_CHECKING:
-    from types import TracebackType
 
 CHUNK = 1 << 16
 
@@ -49,9 +44,7 @@ class Proxy:
         self._start(self._accept, listener)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._whole.set()
         for way in self._ways:
             way.set()

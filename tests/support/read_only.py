@@ -1,11 +1,8 @@
 """Arrays as a frame holds them."""
 
-from __future__ import annotations
+from typing import Any
 
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from numpy.typing import NDArray
 
 
 def read_only(*arrays: NDArray[Any]) -> tuple[NDArray[Any], ...]:

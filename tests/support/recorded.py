@@ -1,24 +1,18 @@
 """Recorded sequences as the messages that a sensor would send, and a replay of them through a service."""
 
-from __future__ import annotations
-
 import hashlib
 import threading
 import time
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from optipmb_client.merging import FinalEvents
+from optipmb_client.zenoh import Connection
 from optipmb_schemas import Detections, Events, Keys, Points, Pose, SessionState, Tracks, decode, encode, encoding_of
 from optipmb_tools.datasets import open_dataset
 from router import plain
 from sessions import bare_events
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from optipmb_client.zenoh import Connection
 
 KEYS = Keys()
 WINDOW = 8
@@ -34,7 +28,6 @@ class Recording:
 
     @property
     def messages(self) -> list[Detections | Points]:
-        """The clouds and frames in order, each cloud before its frame."""
         return [one for detections, points in self.frames for one in (points, detections) if one is not None]
 
 
@@ -97,7 +90,6 @@ class Replayed:
 
     @property
     def events(self) -> list[bytes]:
-        """Events of all frames, final or not."""
         rest = sorted(self.merged.held.values(), key=lambda one: one.seq)
         return self.final + [bare_events(one) for one in rest if one.events]
 
@@ -128,7 +120,6 @@ class Replay:
         ]
 
     def take(self, payload: bytes) -> None:
-        """Take in a message of tracks."""
         tracks = decode(payload, Tracks)
         if (result := self.results.get(tracks.stream)) is None:
             return
@@ -141,7 +132,6 @@ class Replay:
             self.changed.notify_all()
 
     def take_events(self, payload: bytes) -> None:
-        """Take in a message of events."""
         events = decode(payload, Events)
         if (result := self.results.get(events.stream)) is not None:
             with self.changed:
@@ -149,40 +139,33 @@ class Replay:
                 self.changed.notify_all()
 
     def wait_events(self, stream: str, expected: list[bytes], deadline_s: float) -> bool:
-        """Wait until the events of a stream are those expected."""
         with self.changed:
             return self.changed.wait_for(lambda: self.results[stream].events == expected, deadline_s)
 
     def start(self) -> None:
-        """Begin to send."""
         for thread in self._threads:
             thread.start()
 
     @property
     def returned(self) -> int:
-        """Frames whose tracks have come."""
         return sum(len(result.tracks) for result in self.results.values())
 
     def wait(self, frames: int, deadline_s: float) -> None:
-        """Wait until the tracks of so many frames have come."""
         with self.changed:
             came = self.changed.wait_for(lambda: self.returned >= frames, deadline_s)
         assert came, f"{self.returned} of {frames} frames came back within {deadline_s:g} s"
 
     def finish(self, deadline_s: float) -> None:
-        """Wait for all tracks."""
         self.wait(sum(len(recording.frames) for recording in self.recordings), deadline_s)
         for thread in self._threads:
             thread.join(deadline_s)
 
     def close(self) -> None:
-        """Withdraw the publishers."""
         for senders in self._senders:
             for sender in senders:
                 sender.close()
 
     def state(self, stream: str) -> SessionState:
-        """Ask for the state of a stream."""
         (answer,) = self._connection.query(KEYS.query(stream, "state"), timeout=60.0)
         return decode(answer.payload, SessionState)
 

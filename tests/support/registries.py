@@ -31,16 +31,13 @@ class Around:
         self.kept: dict[str, Checkpoint] = {}
 
     def submit(self, work: Callable[[], bool]) -> None:
-        """Take work."""
         self._working.append(work)
 
     def run(self) -> None:
-        """Give turns until no stream has anything to do."""
         while self.turn():
             pass
 
     def turn(self) -> bool:
-        """Run the oldest work; False without any."""
         if not self._working:
             return False
         work = self._working.pop(0)
@@ -49,7 +46,6 @@ class Around:
         return True
 
     def put(self, checkpoint: Checkpoint, _: int | None, then: Callable[[], None] | None = None) -> None:
-        """Keep a state."""
         self.kept[checkpoint.stream] = checkpoint
         if then is not None:
             then()
@@ -57,30 +53,24 @@ class Around:
     def recall(
         self, stream: str, restore: Callable[[Checkpoint], Any], then: Callable[[Any], None], _: object = None
     ) -> None:
-        """Restore a kept state."""
         then(restore(self.kept[stream]) if stream in self.kept else None)
 
     def forget(self, _: str) -> None:
         """Nothing is still to be written."""
 
     def awaited(self, *_: object) -> dict[str, bool]:
-        """No publisher has a cache."""
         return {}
 
     def holds(self, _: str) -> bool:
-        """Every stream is tracked here."""
         return True
 
     def fence(self, _: str) -> int:
-        """Return the fence of all streams."""
         return 1
 
     def may_write(self, *_: object) -> bool:
-        """All may be published."""
         return True
 
-    def open_publisher(self, _: str, events: bool = False) -> Around:  # noqa: ARG002, FBT001, FBT002 - as the service calls it
-        """Be the publisher of a stream."""
+    def open_publisher(self, _: str, **kinds: bool) -> Around:  # noqa: ARG002 - as the service calls it
         return self
 
     def look(self) -> None:
@@ -88,7 +78,7 @@ class Around:
 
     release = look
 
-    def publish(self, _: bytes) -> None:
+    def publish(self, *_: bytes | None) -> None:
         """Tracks go nowhere."""
 
     publish_events = publish
@@ -101,9 +91,9 @@ def streams_of(
     profiles: Profiles | None = None,
     reporter: Any = None,
     tracker: Any = chained,
+    traces: Any = None,
     **settings: Any,
 ) -> Streams:
-    """Return the streams of a process with these around it."""
     parts: Any = around  # in the place of several
     streams = Streams(
         Settings(instance="test", store="none", step_limit_s=60, **settings),  # kernels may have to be compiled
@@ -118,12 +108,12 @@ def streams_of(
         metrics=Metrics(),
         tracker=tracker,
     )
+    streams.traces = traces
     streams.caches = parts
     return streams
 
 
 def packet_of(message: Detections | Points) -> Packet:
-    """Return a message as it comes."""
     payload, keys = encode(message), Keys()
     key = (keys.detections if isinstance(message, Detections) else keys.points)(message.stream)
     return Packet(key, payload, len(payload), encoding_of(type(message)), time.time_ns(), time.monotonic_ns())

@@ -1,6 +1,6 @@
 """A ROS 2 node by zenoh-ros2-sdk, a client of rmw_zenoh that is not ours; definitions and hashes are given to it.
 
-The SDK would fetch definitions of types from the network: it is given those of the product, and computes the hashes of
+The SDK would fetch definitions of types from the network: it gets the product's, and computes the hashes of
 types from them by its own rules.
 """
 
@@ -8,7 +8,6 @@ import os
 import threading
 import time
 from collections.abc import Callable, Mapping
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -21,7 +20,7 @@ from zenoh_ros2_sdk import discovery
 from zenoh_ros2_sdk.session import ZenohSession
 from zenoh_ros2_sdk.utils import get_type_hash
 
-# As patient as the product: by default what has waited for a millisecond on a busy machine is dropped, reliable or not.
+# As patient as the product: by default messages that wait for a millisecond are dropped, reliable or not.
 DROP = "transport/link/tx/queue/congestion_control/drop"
 os.environ["ZENOH_CONFIG_OVERRIDE"] = f"{DROP}/wait_before_drop=1000000;{DROP}/max_wait_before_drop_fragments=5000000"
 SEPARATOR = "=" * 80 + "\nMSG: "
@@ -57,7 +56,6 @@ class Ros2Client:
         self.received: dict[str, list[Any]] = {}
 
     def publish(self, topic: str, kind: str, fields: Mapping[str, Any], **options: Any) -> None:
-        """Publish a message given as maps and lists."""
         if topic not in self._publishers:
             about = {"msg_definition": own_types().definition(kind), "type_hash": hash_by_sdk(kind)}
             self._publishers[topic] = sdk.ROS2Publisher(topic, kind, **(self._where | about | options))
@@ -70,7 +68,6 @@ class Ros2Client:
         publisher.publish(**{name: getattr(message, name) for name in message.__dataclass_fields__})
 
     def subscribe(self, topic: str, kind: str, *, name: str = "", **options: Any) -> None:
-        """Collect the messages of a topic, under another name where one is given."""
         received = self.received[name or topic] = []
 
         def take(message: Any) -> None:
@@ -82,7 +79,6 @@ class Ros2Client:
         self._subscribers.append(sdk.ROS2Subscriber(topic, kind, take, **(self._where | about | options)))
 
     def wait(self, topic: str, true: Callable[[list[Any]], bool]) -> list[Any]:
-        """Wait until the messages of a topic are as wanted, and return them."""
         with self._changed:
             met = self._changed.wait_for(lambda: true(self.received[topic]), DEADLINE_S)
             assert met, f"{topic}: {len(self.received[topic])} messages; {self._diagnosis()}"
@@ -98,7 +94,6 @@ class Ros2Client:
         ]
 
     def _diagnosis(self) -> str:
-        """Give what the newest diagnostics say, for a failure."""
         newest = self.received.get("/diagnostics", [])[-1:]
         said = [(status.message, [(v.key, v.value) for v in status.values]) for one in newest for status in one.status]
         return f"diagnostics: {said}"
@@ -113,9 +108,7 @@ class Ros2Client:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

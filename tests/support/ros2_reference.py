@@ -1,7 +1,7 @@
 """Writes `tests/schemas/ros2_reference.json` by ROS 2's own code: run it with a Python that has rclpy.
 
 For each type that is read or published live: the hash that ROS 2 has given the type, one message with another value in
-every field, and its bytes by ROS 2's serialiser. Where ROS 2 pads it leaves whatever is in memory. Packages that an
+every field, and its bytes by ROS 2's serialiser. Padding of ROS 2 holds arbitrary memory. Packages that an
 installation lacks (vision_msgs, autoware_perception_msgs) are built with colcon from their sources.
 
     source /opt/ros/kilted/setup.bash && python3 tests/support/ros2_reference.py
@@ -38,7 +38,6 @@ class Values:
         self._count = 0
 
     def message(self, fields: dict[str, str], nested: Any) -> Fields:
-        """Give the fields of a message; `nested` has the fields of other types by name."""
         return {name: self._value(kind, nested) for name, kind in fields.items()}
 
     def _value(self, kind: str, nested: Any) -> Any:
@@ -62,7 +61,6 @@ def _class(name: str) -> Any:
 
 
 def _built(name: str, fields: Fields) -> Any:
-    """Give ROS 2's message of these fields."""
     message = _class(name)()
     for field, kind in message.get_fields_and_field_types().items():
         inner = re.sub(r"^sequence<(.+?)(?:, \d+)?>$|\[\d+\]$", r"\1", kind)
@@ -76,7 +74,6 @@ def _built(name: str, fields: Fields) -> Any:
 
 
 def main() -> None:
-    """Write the file."""
     from ament_index_python import get_package_share_directory  # type: ignore[import-not-found]  # noqa: PLC0415 - of ROS 2
     from rclpy.serialization import serialize_message  # type: ignore[import-not-found]  # noqa: PLC0415
 

@@ -3,17 +3,17 @@
 Nothing here sleeps: a wait ends with a message, or fails at a deadline.
 """
 
-from __future__ import annotations
-
 import json
 import threading
 import time
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import zenoh
 import zenoh.ext
+from optipmb_client.incoming import Arrival
 from optipmb_client.zenoh.session import Session
 from optipmb_schemas import (
     Detections,
@@ -28,12 +28,6 @@ from optipmb_schemas import (
     encode,
     encoding_of,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-    from types import TracebackType
-
-    from optipmb_client.incoming import Arrival
 
 SECOND = 1_000_000_000
 DEADLINE_S = 60.0
@@ -52,7 +46,6 @@ class Sensor:
     start_s: float = 10_000.0
 
     def stamp_ns(self, seq: int) -> int:
-        """Sensor time of a frame."""
         return round((self.start_s + seq * PERIOD_S) * SECOND)
 
     def detections(self, seq: int, **changes: Any) -> Detections:
@@ -77,7 +70,6 @@ class Sensor:
         return Detections(**(fields | changes))
 
     def points(self, seq: int, count: int = 500, **changes: Any) -> Points:
-        """The cloud of the frame `seq`, in the sensor frame."""
         xyz = np.random.default_rng(seq).uniform(-30, 30, (count, 3)).astype(np.float32)
         fields: dict[str, Any] = {
             "stream": self.stream,
@@ -98,21 +90,17 @@ def plain(tracks: Tracks) -> bytes:
 
 @dataclass
 class Collected:
-    """Messages received so far, and a way to wait for more."""
-
     items: list[tuple[str, bytes, str]] = field(default_factory=list)
     times_ns: list[int] = field(default_factory=list)
     changed: threading.Condition = field(default_factory=threading.Condition)
 
     def add(self, key: str, payload: bytes, encoding: str) -> None:
-        """Append one message and wake who waits."""
         with self.changed:
             self.items.append((key, payload, encoding))
             self.times_ns.append(time.monotonic_ns())
             self.changed.notify_all()
 
     def wait(self, enough: Callable[[list[tuple[str, bytes, str]]], bool], what: str) -> None:
-        """Wait until the messages are `enough`; fails at the deadline."""
         with self.changed:
             if not self.changed.wait_for(lambda: enough(self.items), DEADLINE_S):
                 raise AssertionError(f"{what} did not come within {DEADLINE_S:g} s; {len(self.items)} messages came")
@@ -132,20 +120,16 @@ class Node:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
-        """Leave the network in order."""
         for close in self._closing:
             close()
         self._publishers.clear()  # withdraws them; to undeclare them may stop the process for ten seconds
         self.session.close()  # type: ignore[no-untyped-call]  # zenoh's stubs leave it untyped
 
     def send(self, *messages: Detections | Points) -> None:
-        """Publish messages as a sensor would."""
         for message in messages:
             topic = "detections" if isinstance(message, Detections) else "points"
             key = getattr(self.keys, topic)(message.stream)
@@ -158,7 +142,6 @@ class Node:
             self.session.put(key, encode(message), encoding=encoding_of(message), express=True)
 
     def send_raw(self, key: str, payload: bytes, encoding: str = "") -> None:
-        """Publish any bytes on any key."""
         self.session.put(key, payload, encoding=encoding or None)
 
     def query(
@@ -183,13 +166,11 @@ class Node:
         return answers
 
     def ask(self, key: str, expected: type[_T], message: Message | bytes | None = None) -> _T:
-        """Ask and return the one good reply."""
         answers = self.query(key, message)
         assert [ok for ok, _, _ in answers] == [True], answers
         return decode(answers[0][2], expected)
 
     def refused(self, key: str, message: Message | bytes | None = None) -> Problem:
-        """Ask and return the one error reply."""
         answers = self.query(key, message)
         assert [ok for ok, _, _ in answers] == [False], answers
         return decode(answers[0][2], Problem)
@@ -204,7 +185,6 @@ class Node:
         until(moved, f"{stream} is moved to worker {worker} of {instance}")
 
     def alive(self, pattern: str) -> list[str]:
-        """Keys of the liveliness tokens under a pattern."""
         replies = self.session.liveliness().get(pattern, timeout=60.0)
         return sorted(str(sample.key_expr) for reply in replies if (sample := reply.ok) is not None)
 
@@ -221,15 +201,12 @@ class Node:
         return collected
 
     def tracks(self, stream: str, count: int) -> list[Tracks]:
-        """Wait for `count` messages of tracks of a stream."""
         return self._wait(self.tracks_seen, self.keys.tracks(stream), count, Tracks)
 
     def problems(self, stream: str, count: int = 1) -> list[Problem]:
-        """Wait for `count` problems of a stream."""
         return self._wait(self.problems_seen, self.keys.problems(stream), count, Problem)
 
     def problem(self, stream: str, code: str) -> Problem:
-        """Wait for a problem of a kind."""
         key = self.keys.problems(stream)
 
         def found(items: Iterable[tuple[str, bytes, str]]) -> list[Problem]:

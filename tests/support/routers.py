@@ -48,7 +48,6 @@ def open_router(endpoint: str, *others: str, adminspace: bool = False) -> zenoh.
 
 
 def open_client(endpoint: str) -> zenoh.Session:
-    """A plain Zenoh client of the router at `endpoint`; close it (it is a context manager)."""
     return _open({"mode": "client", "connect/endpoints": [endpoint]})
 
 

@@ -3,13 +3,12 @@
 A step is a message that arrives, a group of steps that arrive before any is processed, a wait in seconds, or a command.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections import Counter, defaultdict
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
+from typing import Any, Final, Literal, TypeAlias
 
 import numpy as np
 from fusing import FRONT, FUSED, REAR, SIDE, drive
@@ -29,9 +28,6 @@ from optipmb_schemas import (
 )
 from router import Sensor
 from sessions import Merged
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
 
 FILE: Final = Path(__file__).with_name("recordings.json")
 """The outputs as they were recorded, by scenario, seam and tracker."""

@@ -5,19 +5,15 @@ may flip; stamps may repeat, jitter or leave gaps; clouds come from a sensor wit
 z up, radians.
 """
 
-from __future__ import annotations
-
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from optipmb import Frame, Parameters
+from optipmb import Frame, Modules, Parameters, StepResult
 
 Array = NDArray[np.float64]
 
@@ -70,7 +66,7 @@ class SceneFrame:
         names = ("labels", "label", "center", "size", "yaw", "score", "velocity")
         return {"stamp_ns": self.stamp_ns} | {name: getattr(self, name) for name in names}
 
-    def taken(self, order: NDArray[np.int64]) -> SceneFrame:
+    def taken(self, order: NDArray[np.int64]) -> Self:
         """The same frame with the detections that `order` names, in that order."""
         names = ("label", "center", "size", "yaw", "score", "truth")
         columns = {name: getattr(self, name)[order] for name in names}
@@ -357,3 +353,15 @@ def boxes(  # noqa: PLR0913 - a detection has this many columns
         field_of_view=field_of_view,
     )
     return frame
+
+
+def steps(parameters: Parameters, frames: Iterable[Frame], modules: Modules | None = None) -> list[StepResult]:
+    """The results of a tracker for frames, one after the other."""
+    import optipmb  # noqa: PLC0415 - as above
+
+    tracker, results = optipmb.Tracker(parameters, modules), []
+    density = tracker.initial()
+    for frame in frames:
+        results.append(tracker.step(density, frame))
+        density = results[-1].density
+    return results

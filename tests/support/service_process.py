@@ -1,21 +1,17 @@
 """The real command in a process of its own, forked or fresh: started, awaited by its ready line, always ended."""
 
-from __future__ import annotations
-
 import os
 import queue
 import signal
 import subprocess
 import threading
 import time
-from typing import TYPE_CHECKING, Self
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Self
 
 from forked import start
 from routers import free_endpoint
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from types import TracebackType
 
 READY_S = 240.0
 """The first start after an installation compiles the kernels."""
@@ -76,7 +72,6 @@ class ServiceProcess:
             error.add_note(f"the end of its log:\n{self.errors[-3000:]}")
 
     def wait_ready(self) -> str:
-        """Return the ready line."""
         line = self._lines.get(timeout=READY_S)
         assert line is not None, f"ended without a ready line: {self.errors}"
         return line
@@ -107,12 +102,10 @@ class ServiceProcess:
 
     @property
     def errors(self) -> str:
-        """Its stderr so far."""
         return "".join(self._errors)
 
     @property
     def output(self) -> list[str]:
-        """The lines on stdout that were not read yet."""
         lines = []
         while not self._lines.empty():
             if (line := self._lines.get()) is not None:

@@ -1,52 +1,40 @@
 """What tests of sessions share: a cheap tracker, outputs merged as a user sees them, trackers that fail."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import threading
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from optipmb_schemas import Detections, Events, Problem, Tracks, encode
+from optipmb_schemas import Detections, Events, Points, Problem, Tracks, encode
 from optipmb_service.stream.checkpoint import digest_of
 from optipmb_service.stream.session import Session
-from optipmb_service.stream.values import Begun, Output, Quarantined, Tracked, events_of
+from optipmb_service.stream.values import Begun, Output, Policy, Quarantined, Tracked, events_of
+from router import Sensor
 
 import optipmb
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from optipmb_schemas import Points
-    from optipmb_service.stream.values import Policy
-    from router import Sensor
-
 
 def tracks(outputs: Iterable[Output]) -> list[Tracks]:
-    """The tracks among outputs."""
     return [output.tracks for output in outputs if isinstance(output, Tracked)]
 
 
 def problems(outputs: Iterable[Output]) -> list[Problem]:
-    """The problems among outputs."""
     return [output for output in outputs if isinstance(output, Problem)]
 
 
 def begun(outputs: Iterable[Output]) -> list[str]:
-    """Reasons of the restarts of sessions."""
     return [output.reason for output in outputs if isinstance(output, Begun)]
 
 
 def dumps(outputs: Iterable[Output]) -> list[Quarantined]:
-    """Dumps of failures."""
     return [output for output in outputs if isinstance(output, Quarantined)]
 
 
 def feed(one: Session, seqs: Iterable[int], sensor: Sensor, **changes: Any) -> list[Output]:
-    """Give frames to a session at time zero."""
     return [output for seq in seqs for output in one.on_detections(sensor.detections(seq, **changes), 0)]
 
 
@@ -57,14 +45,12 @@ class Merged:
         self.newest: dict[tuple[bytes, int], tuple[int, Tracks]] = {}
 
     def take(self, outputs: Iterable[Output], run: int = 0) -> None:
-        """Add what a session gave out in a run; it must not have failed."""
         outputs = list(outputs)
         assert not dumps(outputs), dumps(outputs)[0].error
         for message in tracks(outputs):
             self.add(message, run)
 
     def add(self, message: Tracks, run: int) -> None:
-        """Add tracks of a run."""
         key = message.epoch + (message.sensor or "").encode(), message.seq
         old_run, old = self.newest.get(key, (-1, message))
         if (old_run, old.revision) == (run, message.revision):
@@ -73,7 +59,6 @@ class Merged:
             self.newest[key] = run, message
 
     def plain(self) -> dict[tuple[bytes, int], bytes]:
-        """The bytes of the tracks but for revision and delivery."""
         return {key: plain(message) for key, (_, message) in self.newest.items()}
 
 
@@ -108,7 +93,6 @@ class Failing:
         self._count = count
 
     def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
-        """Step, or raise."""
         if len(frame.score) == self._count:
             raise ZeroDivisionError("seven")
         return self._tracker.step(density, frame)
@@ -129,7 +113,6 @@ class Gated:
         self._first = first
 
     def tracker(self, parameters: optipmb.Parameters) -> Any:
-        """Make the tracker of a session."""
         inner, made = optipmb.Tracker(parameters), SimpleNamespace()
 
         def step(density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
@@ -145,7 +128,6 @@ class Gated:
 
 @functools.cache
 def nothing() -> optipmb.Diagnostics:
-    """The diagnostics of a step without detections."""
     parameters = optipmb.load_profile("nuscenes")
     tracker = optipmb.Tracker(parameters)
     columns: Any = dict.fromkeys(("labels", "label", "center", "size", "yaw", "score"), ())
@@ -208,10 +190,8 @@ class Chained:
 
 
 def chained(parameters: optipmb.Parameters) -> Chained:
-    """Make the cheap tracker."""
     return Chained(parameters)
 
 
 def delayed(sensor: Sensor, seconds: float) -> Sensor:
-    """The sensor with its clock set."""
     return replace(sensor, start_s=sensor.start_s + seconds)

@@ -1,28 +1,20 @@
 """A stream that several services take over from each other: the result equals an undisturbed session."""
 
-from __future__ import annotations
-
 import itertools
 import time
+from collections.abc import Sequence
 from functools import cache
-from typing import TYPE_CHECKING
 
 from fleet import PROFILE
 from optipmb_schemas import Keys, SessionState, Tracks, decode
-from router import Sensor, plain, until
+from router import Node, Sensor, plain, until
 from sessions import undisturbed
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from router import Node
 
 KEYS = Keys()
 SENSOR = Sensor()
 
 
 def expected(frames: int, sensor: Sensor = SENSOR, profile: str = PROFILE) -> tuple[list[bytes], str]:
-    """Tracks and the digest of the state of a session that nothing happens to."""
     return undisturbed([sensor.detections(seq) for seq in range(frames)], profile)[:2]
 
 
@@ -38,13 +30,11 @@ def distinct(node: Node, sensor: Sensor = SENSOR) -> dict[int, set[bytes]]:
 
 @cache  # asked again and again while more is waited for
 def content_of(payload: bytes) -> tuple[int, bytes]:
-    """The number of a frame and its tracks without how they were delivered."""
     message = decode(payload, Tracks)
     return message.seq, plain(message)
 
 
 def send(node: Node, first: int, last: int, pace_s: float = 0.05, sensors: Sequence[Sensor] = (SENSOR,)) -> None:
-    """Publish frames at the rate of a sensor."""
     for seq in range(first, last):
         node.send(*(sensor.detections(seq) for sensor in sensors))
         time.sleep(pace_s)  # the rate of a sensor, not a wait for anything
@@ -63,12 +53,10 @@ def check(node: Node, frames: int, *, owner: str, sensor: Sensor = SENSOR) -> Se
 
 
 def published_by(node: Node, instance: str, sensor: Sensor = SENSOR) -> list[Tracks]:
-    """What an instance has published."""
     return [one for one in node.tracks(sensor.stream, 1) if one.delivery and one.delivery.instance == instance]
 
 
 def outage_s(node: Node, since_ns: int, sensor: Sensor = SENSOR) -> float:
-    """Seconds from a fault until the next tracks."""
     key = KEYS.tracks(sensor.stream)
     later = [
         at
@@ -79,7 +67,6 @@ def outage_s(node: Node, since_ns: int, sensor: Sensor = SENSOR) -> float:
 
 
 def longest_silence_s(node: Node, sensor: Sensor = SENSOR, since_ns: int = 0) -> float:
-    """Seconds between two tracks messages of a stream, at most, since a time."""
     key = KEYS.tracks(sensor.stream)
 
     def times() -> list[int]:

@@ -1,14 +1,10 @@
 """Tracks of one frame as a service publishes them, for tests in which most of their numbers do not matter."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from optipmb_schemas import Tracks
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 SESSION = "0123456789abcdef0123456789abcdef"
 

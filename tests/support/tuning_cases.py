@@ -13,8 +13,6 @@ HERE = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
 @dataclass(frozen=True)
 class Habits:
-    """What the detector does, and what the objects do."""
-
     position: float = 0.2
     heading: float = 0.08
     velocity: float | None = None
@@ -26,8 +24,6 @@ class Habits:
 
 
 class Recorded:
-    """A recording in memory."""
-
     has_clouds = False
 
     def __init__(self, name: str, frames: list[DetectionFrame], truth: Truth) -> None:
@@ -40,16 +36,13 @@ class Recorded:
         return len(self._frames)
 
     def frames(self) -> Iterator[DetectionFrame]:
-        """Iterate over the frames."""
         return iter(self._frames)
 
     def truth(self) -> Truth:
-        """Return the truth."""
         return self._truth
 
 
 def recorded(habits: Habits, seed: int = 0, frames: int = 200, objects: int = 30, name: str = "0000") -> Recorded:
-    """Make a recording of cars, 100 m apart, at 10 Hz."""
     rng = np.random.default_rng(seed)
     path = _paths(habits, frames, objects, rng)  # (frames, objects, 5): x y phi v omega
     count = frames * objects

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import fnmatch
+import http.client
 import threading
 import time
-from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -45,7 +46,7 @@ class Session:
         self.subscriptions: list[tuple[str, Callable[[Message], None]]] = []
         self.cache: list[tuple[str, Message]] = []
         self.instances: list[str] = ["one"]
-        self.statuses: list[ServiceStatus] = []
+        self.statuses: list[Message] = []
         self.gate = threading.Event()
         self.gate.set()
         self.arrived: Callable[[], object] = lambda: None
@@ -67,7 +68,6 @@ class Session:
         return SimpleNamespace(close=close)
 
     def subscribe(self, key: str, receive: Callable[[Any], object], *, history: bool) -> Any:
-        """Keep what is to be called."""
         assert history
 
         def put(message: Message) -> None:
@@ -76,7 +76,6 @@ class Session:
         return self._add(key, put)
 
     def read_newest(self, key: str, receive: Callable[[Any], None], *, most: int) -> Any:
-        """Keep what is to be called."""
         assert most > 0
 
         def put(message: Message) -> None:
@@ -86,7 +85,6 @@ class Session:
         return self._add(key, put)
 
     def query(self, selector: str, *, timeout: float) -> list[Answer]:
-        """Answer from the caches, or with the statuses."""
         assert timeout
         if selector == KEYS.all_status():
             return [Answer("status", encode(one), encoding_of(one), ok=True) for one in self.statuses]
@@ -96,22 +94,18 @@ class Session:
         return [Answer(at, encode(one), encoding_of(one), ok=True) for at, one in found]
 
     def alive(self, pattern: str, *, timeout: float) -> list[str]:
-        """Name the instances."""
         assert pattern == KEYS.all_alive()
         assert timeout
         return [KEYS.alive(one) for one in self.instances]
 
     def linked(self) -> bool:
-        """It is."""
         return True
 
     def wait(self, count: int) -> None:
-        """Wait until there are so many subscriptions."""
         with self._changed:
             assert self._changed.wait_for(lambda: len(self.subscriptions) == count, DEADLINE_S), self.subscriptions
 
     def publish(self, *messages: Message) -> None:
-        """Hand messages to all who subscribe to their keys."""
         for message in messages:
             for key, put in tuple(self.subscriptions):
                 if fnmatch.fnmatchcase(key_of(message), key):
@@ -119,14 +113,11 @@ class Session:
 
 
 def key_of(message: Any) -> str:
-    """Return the key of a message."""
     topics = {"Tracks": "tracks", "Events": "events", "Detections": "detections", "Problem": "problems"}
     return f"{KEYS.prefix}/{message.stream}/{topics[type(message).__name__]}"
 
 
 class Watched:
-    """The health of the service."""
-
     def __init__(self) -> None:
         self.network: Session | None = Session()
         self.now = "ready"
@@ -135,43 +126,34 @@ class Watched:
         self.metrics: Any = SimpleNamespace(text=lambda: b"one 1\n")
 
     def state(self) -> str:
-        """As told."""
         return self.now
 
     def failure(self) -> str:
-        """As told."""
         return self.why
 
     def beat_age_s(self) -> float:
-        """As told."""
         return self.age_s
 
     def alive(self) -> bool:
-        """Turns or not."""
         return self.age_s < 10
 
     def ready(self) -> bool:
-        """Follows the state."""
         return self.now == "ready"
 
     def status(self) -> ServiceStatus | None:
-        """Nothing while it starts."""
         if self.now == "starting":
             return None
         return ServiceStatus(instance="one", version="1", started_ns=0, uptime_s=1.0, state=self.now)
 
     def session(self) -> Any:
-        """The network; None while it starts."""
         return self.network
 
     def detections_of(self, stream: str) -> str:
-        """The stream itself."""
         return stream
 
 
-@contextmanager
+@contextlib.contextmanager
 def served(source: Any, places: Any = None, **settings: Any) -> Iterator[str]:
-    """The application on a free port; gives its address."""
     server = Server(application(source, Settings(**settings), places), "127.0.0.1:0")
     try:
         yield server.address
@@ -180,7 +162,6 @@ def served(source: Any, places: Any = None, **settings: Any) -> Iterator[str]:
 
 
 def tracks(seq: int, stream: str = STREAM, run: int = 0, count: int = 2) -> Tracks:
-    """Return tracks of a frame; the first is confirmed."""
     one = np.ones(count)
     return Tracks(
         stream=stream,
@@ -211,14 +192,12 @@ def tracks(seq: int, stream: str = STREAM, run: int = 0, count: int = 2) -> Trac
 
 
 def delivery(run: int, seq: int, final_ns: int | None = None) -> Delivery:
-    """Return how a message came about."""
     times = dict.fromkeys(("queue_ms", "decode_ms", "step_ms"), 0.0)
     final = {} if final_ns is None else {"final_session": "0" * 32, "final_ns": final_ns}
     return Delivery(instance="one", received_ns=0, published_ns=seq, run=run, **times, **final)
 
 
 def events(seq: int, count: int = 1, stream: str = STREAM, final_ns: int | None = None, **changes: Any) -> Events:
-    """Return events of a frame, and its counts; with `final_ns` those of frames before are final."""
     one = ZoneEvent(
         zone="gate",
         kind="crossed",
@@ -246,7 +225,6 @@ def events(seq: int, count: int = 1, stream: str = STREAM, final_ns: int | None 
 
 
 def settled(seq: int) -> Events:
-    """Return what makes the events of earlier frames final."""
     return events(seq, 0, final_ns=seq, zones=None)
 
 
@@ -254,5 +232,14 @@ PROBLEM = Problem(stream=STREAM, instance="one", code="late", message="Late.")
 
 
 def publication(message: Message) -> Publication:
-    """Return a message as it comes in."""
     return Publication(key_of(message), encode(message), encoding_of(message), {})
+
+
+@contextlib.contextmanager
+def asked(address: str, path: str, **headers: str) -> Iterator[http.client.HTTPResponse]:
+    """Ask for something; the answer's body is still to be read."""
+    host, _, port = address.rpartition(":")
+    with contextlib.closing(http.client.HTTPConnection(host, int(port), timeout=DEADLINE_S)) as connection:
+        connection.request("GET", path, headers={"connection": "close", **headers})
+        with connection.getresponse() as response:
+            yield response

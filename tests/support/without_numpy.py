@@ -20,7 +20,6 @@ def command(code: str) -> list[str]:
 
 
 def outcomes_without(cases: Sequence[Case]) -> list[Any]:
-    """Give the outcomes of cases in a process without numpy."""
     code = "from without_numpy import outcome\nimport pickle\ncases = pickle.load(sys.stdin.buffer)\n"
     code += "sys.stdout.buffer.write(pickle.dumps([outcome(*case) for case in cases]))"
     done = subprocess.run(command(code), input=pickle.dumps(cases), stdout=subprocess.PIPE, check=True, timeout=300)

@@ -30,7 +30,7 @@ DOES_IO = {"open", "print", "input", "exec", "eval", "__import__"}
 
 
 def imports(tree: ast.Module) -> set[str]:
-    """Top-level names of everything that a module imports, wherever in the file."""
+    """Top-level names of everything that a module imports, at any place in the file."""
     names = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -82,7 +82,7 @@ def test_no_state_outside_the_density() -> None:
 
 
 def test_modules_do_not_import_each_other_in_circles() -> None:
-    """Every module can be read with what it imports before it."""
+    """Modules can be read in an order in which every import comes first."""
     done: set[str] = set()
     left = {name: own_imports(tree) for name, tree in MODULES.items()}
     while left:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from scenes import boxes
+from scenes import boxes, steps
 
 import optipmb
 
@@ -20,18 +20,6 @@ if TYPE_CHECKING:
 KITTI = optipmb.load_profile("kitti-paper")
 NUSCENES = optipmb.load_profile("nuscenes-paper")
 HERE = optipmb.Pose(translation=np.zeros(3), quaternion=np.array([1.0, 0, 0, 0]))
-
-
-def follow(
-    frames: list[optipmb.Frame], parameters: optipmb.Parameters = KITTI, modules: optipmb.Modules | None = None
-) -> list[optipmb.StepResult]:
-    """All results of a list of frames."""
-    tracker = optipmb.Tracker(parameters, modules)
-    density, results = tracker.initial(), []
-    for frame in frames:
-        results.append(tracker.step(density, frame))
-        density = results[-1].density
-    return results
 
 
 def cloud(points: NDArray[np.float64]) -> optipmb.PointCloud:
@@ -72,7 +60,7 @@ def test_one_object_keeps_one_track(profile: str, velocity: str, manoeuvre: str)
         measured = (v * math.cos(phi), v * math.sin(phi)) if velocity == "known" else None
         seconds = k * parameters.nominal_period
         frames.append(boxes(parameters, seconds, (x, y), yaw=phi, velocity=measured, label=label))
-    results = follow(frames, parameters)
+    results = steps(parameters, frames)
     assert [result.tracks.id.tolist() for result in results] == [[1]] * len(rows)
     pairs = list(zip(results, rows, strict=True))
     error = [float(np.hypot(*(result.tracks.center[0, :2] - row[:2]))) for result, row in pairs]
@@ -94,7 +82,7 @@ def test_two_crossing_objects_keep_their_ids() -> None:
         one, other = (-24 + 8 * t, 0.0), (0.0, -29 + 8 * t)
         truth.append((one, other))
         frames.append(boxes(KITTI, t, [one, other], yaw=[0.0, math.pi / 2]))
-    for result, places in zip(follow(frames), truth, strict=True):
+    for result, places in zip(steps(KITTI, frames), truth, strict=True):
         np.testing.assert_array_equal(result.tracks.id, [1, 2])
         np.testing.assert_allclose(result.tracks.center[:, :2], places, atol=1.0)
 
@@ -105,7 +93,7 @@ def test_oncoming_objects_keep_their_ids() -> None:
     for k in range(50):
         t = 0.1 * k
         frames.append(boxes(KITTI, t, [(-20 + 8 * t, 0.0), (20 - 8 * t, 2.2)], yaw=[0.0, math.pi]))
-    results = follow(frames)
+    results = steps(KITTI, frames)
     first, last = results[0].tracks, results[-1].tracks
     assert [len(result.tracks) for result in results] == [2] * 50
     for i in range(2):
@@ -123,7 +111,7 @@ def occlusion(*, hidden: bool, parameters: optipmb.Parameters) -> list[optipmb.S
         xy = [(10.0, 0.0)] if seen else []
         label = "Car" if "Car" in parameters.labels else "car"
         frames.append(boxes(parameters, k * parameters.nominal_period, xy, cloud=scan, velocity=(0, 0), label=label))
-    return follow(frames, parameters)
+    return steps(parameters, frames)
 
 
 def test_an_occluded_object_is_believed_in_for_longer() -> None:
@@ -156,7 +144,7 @@ def test_a_flipped_heading_does_not_turn_the_track() -> None:
             yaw = 0.3 + rng.normal(0, 0.05) + math.pi * (k > 5 and rng.random() < 0.4)
             xy = (speed * 0.1 * k * math.cos(0.3), speed * 0.1 * k * math.sin(0.3))
             frames.append(boxes(KITTI, 0.1 * k, xy, yaw=yaw))
-        for result in follow(frames):
+        for result in steps(KITTI, frames):
             np.testing.assert_array_equal(result.tracks.id, [1])
             assert abs(math.remainder(result.tracks.yaw[0] - 0.3, 2 * math.pi)) < 0.5
 
@@ -164,7 +152,7 @@ def test_a_flipped_heading_does_not_turn_the_track() -> None:
 def test_a_track_born_backwards_drives_backwards() -> None:
     """A box that is always turned by pi: the velocity over ground is right, its sign along the yaw negative."""
     frames = [boxes(KITTI, 0.1 * k, (6.0 * 0.1 * k, 0.0), yaw=math.pi) for k in range(30)]
-    tracks = follow(frames)[-1].tracks
+    tracks = steps(KITTI, frames)[-1].tracks
     np.testing.assert_allclose(tracks.velocity, [[6.0, 0.0]], atol=0.3)
     assert abs(tracks.yaw[0]) > 3.0
 
@@ -172,7 +160,7 @@ def test_a_track_born_backwards_drives_backwards() -> None:
 def test_no_detections_at_all() -> None:
     """Empty frames, with and without cloud, are frames: nothing comes out, time goes on."""
     frames = [boxes(KITTI, 0.1 * k, cloud=cloud(np.zeros((0, 3))) if k % 2 else None) for k in range(5)]
-    results = follow(frames)
+    results = steps(KITTI, frames)
     assert [len(result.tracks) for result in results] == [0] * 5
     assert results[-1].density.stamp_ns == 400_000_000
     assert results[-1].density.next_id == 1
@@ -182,7 +170,7 @@ def test_a_thousand_detections() -> None:
     """A thousand objects at once: a thousand tracks, each following its own."""
     grid = np.stack(np.meshgrid(np.arange(40) * 6.0, np.arange(25) * 6.0), axis=-1).reshape(-1, 2)
     frames = [boxes(KITTI, 0.1 * k, grid + np.array([0.5 * k, 0.0]), velocity=(5.0, 0.0)) for k in range(4)]
-    for result in follow(frames):
+    for result in steps(KITTI, frames):
         np.testing.assert_array_equal(result.tracks.id, np.arange(1, 1001))
         assert len(set(result.tracks.detection.tolist())) == 1000
 
@@ -191,14 +179,14 @@ def test_a_thousand_detections() -> None:
 def test_ten_seconds_of_silence_end_every_track(label: str) -> None:
     """After a gap past the limit nothing old is left to be associated: the object gets a new id."""
     first = boxes(KITTI, 0, (0, 0), label=label)
-    gap = follow([first, boxes(KITTI, 10, (0, 0), label=label)])
+    gap = steps(KITTI, [first, boxes(KITTI, 10, (0, 0), label=label)])
     np.testing.assert_array_equal(gap[1].tracks.id, [2])
 
 
 def test_missed_frames_widen_and_weaken_a_track() -> None:
     """While an object is missed its covariance grows, its existence falls, and in the end it is gone."""
     frames = [boxes(NUSCENES, 0.5 * k, (0, 0) if k < 5 else (), label="car", velocity=(0, 0)) for k in range(30)]
-    results = follow(frames, NUSCENES)
+    results = steps(NUSCENES, frames)
     alive = [result.density.bernoulli for result in results if len(result.density.bernoulli.id)]
     missed = alive[4:]
     assert 3 <= len(missed) < 25
@@ -213,7 +201,7 @@ def test_an_irregular_stream_keeps_its_track() -> None:
     rng = np.random.default_rng(2)
     stamps = np.cumsum(rng.uniform(0.02, 0.3, 60))
     frames = [boxes(KITTI, t, (7.0 * t, 0.0)) for t in stamps]
-    results = follow(frames)
+    results = steps(KITTI, frames)
     assert {result.tracks.id.tolist()[0] for result in results} == {1}
     np.testing.assert_allclose(results[-1].tracks.velocity, [[7.0, 0.0]], atol=0.3)
 

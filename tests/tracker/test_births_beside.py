@@ -2,31 +2,16 @@
 
 from __future__ import annotations
 
-import numpy as np
+from scenes import boxes, steps
 
 import optipmb
 
 
-def follow(profile: str, beside: list[float]) -> list[list[int]]:
-    """Ids of a standing car whose box lies so far beside it, m, frame by frame."""
+def follow(profile: str, aside: list[float]) -> list[list[int]]:
+    """Ids of a standing car whose box is so far off to the side, m, frame by frame."""
     parameters = optipmb.load_profile(profile)
-    tracker = optipmb.Tracker(parameters)
-    density, ids = tracker.initial(), []
-    for k, off in enumerate(beside):
-        frame, _ = optipmb.make_frame(
-            parameters,
-            stamp_ns=k * 100_000_000,
-            labels=parameters.labels,
-            label=[parameters.labels.index("Car")],
-            center=np.array([[10.0, off, 0.0]]),
-            size=np.array([[4.0, 1.8, 1.5]]),
-            yaw=np.zeros(1),
-            score=np.array([0.9]),
-        )
-        result = tracker.step(density, frame)
-        density = result.density
-        ids.append(result.tracks.id.tolist())
-    return ids
+    frames = [boxes(parameters, 0.1 * k, (10.0, off)) for k, off in enumerate(aside)]
+    return [result.tracks.id.tolist() for result in steps(parameters, frames)]
 
 
 def test_a_box_beside_its_car_starts_no_second_track() -> None:
@@ -37,14 +22,14 @@ def test_a_box_beside_its_car_starts_no_second_track() -> None:
 
 
 def test_beside_a_short_track_what_is_there_is_born_a_frame_later() -> None:
-    """A box that stays beside a car of half a second, which is missed, is a track from the next frame on."""
+    """A box next to a missed car of half a second is a track from the next frame on."""
     ids = follow("kitti", [0.0] * 5 + [1.4] * 4)
     assert ids[5] == [1]
     assert 2 in ids[6]
 
 
 def test_a_lasting_track_stays_alone_as_long_as_it_is_extracted() -> None:
-    """Beside a car of two seconds the same box starts none while the car is extracted: `extract_misses` less one."""
+    """Next to a car of two seconds it starts none while the car is extracted: `extract_misses` less one."""
     assert optipmb.load_profile("kitti").classes["Car"].extract_misses == 5
     ids = follow("kitti", [0.0] * 20 + [1.4] * 12)
     assert not any(2 in now for now in ids[:24])

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenes import boxes
+from scenes import boxes, steps
 
 import optipmb
 
@@ -31,14 +31,11 @@ def with_calibration(**changes: Any) -> optipmb.Parameters:
 
 def follow(parameters: optipmb.Parameters, scores: list[float | None], period: float = 0.1) -> list[optipmb.Tracks]:
     """Tracks of a standing car that heads up and left, detected with these scores; None where it is missed."""
-    tracker = optipmb.Tracker(parameters)
-    density, found = tracker.initial(), []
-    for k, score in enumerate(scores):
-        xy = [(5.0, 1.0)] if score else []
-        result = tracker.step(density, boxes(parameters, k * period, xy, yaw=0.75 * math.pi, score=score or 1.0))
-        density = result.density
-        found.append(result.tracks)
-    return found
+    frames = (
+        boxes(parameters, k * period, [(5.0, 1.0)] if score else [], yaw=0.75 * math.pi, score=score or 1.0)
+        for k, score in enumerate(scores)
+    )
+    return [result.tracks for result in steps(parameters, frames)]
 
 
 def odds(score: float) -> float:
@@ -96,16 +93,11 @@ def test_a_parked_car_hardly_moves() -> None:
 
 def followed(parameters: optipmb.Parameters) -> optipmb.Tracks:
     """Tracks of a standing car whose detections are 0.1 m off in turn."""
-    tracker = optipmb.Tracker(parameters)
-    density = tracker.initial()
-    for k in range(6):
-        result = tracker.step(density, boxes(parameters, 0.1 * k, [(5.0 + 0.1 * (k % 2), 1.0)]))
-        density = result.density
-    return result.tracks
+    return steps(parameters, [boxes(parameters, 0.1 * k, [(5.0 + 0.1 * (k % 2), 1.0)]) for k in range(6)])[-1].tracks
 
 
 def test_a_calibration_leaves_the_recursion_alone() -> None:
-    """Positions, ids, scores and what is extracted are those without it; the score takes the weight of the evidence."""
+    """Positions, ids, scores and extraction stay the same; the score takes the weight of the evidence."""
     scores = [0.4, 0.9, None, 0.8, None, None, 0.7]
     plain, told = follow(PAPER, scores), follow(with_calibration(), scores)
     for one, other in zip(plain, told, strict=True):
@@ -131,7 +123,7 @@ def test_a_calibration_leaves_the_recursion_alone() -> None:
     ],
 )
 def test_a_calibration_that_cannot_be_is_refused(changes: dict[str, Any], text: str) -> None:
-    """The error names the field and says what is expected."""
+    """The error names the field and the expected value."""
     with pytest.raises(optipmb.ParameterError, match=text) as caught:
         with_calibration(**changes)
     assert caught.value.path.startswith("classes.Car.calibration")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from class_rows import class_rows
-from scenes import random_parameters
+from scenes import random_parameters, steps
 
 import optipmb
 from optipmb.association import NEW, Survivors
@@ -19,9 +19,7 @@ from optipmb.preprocess import Measurements
 from optipmb.table import ClassTable
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from optipmb import Frame, Parameters, StepResult
+    from optipmb import Frame, Parameters
 
 SEEDS = pytest.mark.parametrize("seed", range(4))
 LABELS = ("car", "walker", "truck", "bus")
@@ -52,16 +50,6 @@ def seen(parameters: Parameters, t: float, *objects: tuple[str, float, float]) -
         score=[score for _, _, score in objects],
     )
     return frame
-
-
-def run(parameters: Parameters, frames: Sequence[Frame]) -> list[StepResult]:
-    """Step through frames."""
-    tracker, results = optipmb.Tracker(parameters), []
-    density = tracker.initial()
-    for frame in frames:
-        results.append(tracker.step(density, frame))
-        density = results[-1].density
-    return results
 
 
 def likelihoods(confusion: np.ndarray, d: int, s: float) -> np.ndarray:
@@ -135,7 +123,7 @@ def test_a_truck_once_called_car_becomes_a_truck_under_its_id() -> None:
     """The id stays, the class follows the detections, and a single other label changes nothing."""
     parameters = motor()
     calls = ["car"] * 3 + ["truck"] * 6 + ["car"] + ["truck"] * 2
-    results = run(parameters, [seen(parameters, 0.1 * k, (name, 20.0, 0.8)) for k, name in enumerate(calls)])
+    results = steps(parameters, [seen(parameters, 0.1 * k, (name, 20.0, 0.8)) for k, name in enumerate(calls)])
     assert {tuple(one.tracks.id) for one in results} == {(1,)}
     reported = [LABELS[one.tracks.label[0]] for one in results]
     change = reported.index("truck")
@@ -152,7 +140,7 @@ def test_probabilities_are_those_of_the_tracks() -> None:
     """An object that is not extracted has no row; the rows follow the ids of the tracks."""
     parameters = motor(extract_new=0.9, extract_known=0.99, survival=0.95, max_misses=5, min_existence=0.01)
     frames = [("bus", 20.0, 0.8), ("truck", 60.0, 0.9)], [("truck", 60.0, 0.9)]
-    results = run(parameters, [seen(parameters, 0.1 * k, *objects) for k, objects in enumerate(frames)])
+    results = steps(parameters, [seen(parameters, 0.1 * k, *objects) for k, objects in enumerate(frames)])
     last = results[-1]
     assert last.class_probability is not None
     assert last.density.class_probability is not None
@@ -164,7 +152,7 @@ def test_probabilities_are_those_of_the_tracks() -> None:
 def test_a_walker_is_no_truck() -> None:
     """A detection of a class outside the group is another object."""
     parameters = motor()
-    results = run(
+    results = steps(
         parameters, [seen(parameters, 0.1 * k, (name, 20.0, 0.8)) for k, name in enumerate(["car", "walker"])]
     )
     assert results[-1].tracks.id.tolist() == [1, 2]
@@ -173,7 +161,9 @@ def test_a_walker_is_no_truck() -> None:
 def test_labels_are_forgotten() -> None:
     """Without detections a posterior goes towards the uniform one, and the class reported stays."""
     parameters = motor(max_misses=1000, survival=1.0, min_existence=1e-300)
-    results = run(parameters, [seen(parameters, 0.0, ("bus", 20.0, 0.9)), seen(parameters, 0.1), seen(parameters, 5.0)])
+    results = steps(
+        parameters, [seen(parameters, 0.0, ("bus", 20.0, 0.9)), seen(parameters, 0.1), seen(parameters, 5.0)]
+    )
     first, second, last = (one.density.class_probability for one in results)
     assert first is not None
     assert second is not None
@@ -186,7 +176,7 @@ def test_labels_are_forgotten() -> None:
 def test_a_density_is_stored_with_its_posterior() -> None:
     """Bytes make the same density again; wrong columns are refused by name; without groups there is no such column."""
     parameters = motor()
-    density = run(parameters, [seen(parameters, 0.0, ("bus", 20.0, 0.9), ("car", 60.0, 0.7))])[0].density
+    density = steps(parameters, [seen(parameters, 0.0, ("bus", 20.0, 0.9), ("car", 60.0, 0.7))])[0].density
     columns = optipmb.columns_in(optipmb.bytes_of(density), len(LABELS))
     for name, column in optipmb.columns_of(density).items():
         np.testing.assert_array_equal(columns[name], column, err_msg=name)
@@ -198,14 +188,14 @@ def test_a_density_is_stored_with_its_posterior() -> None:
             optipmb.density_of(density.stamp_ns, density.next_id, columns | {"classes.probability": wrong}, LABELS)
     plain = parse_parameters(random_parameters(0, LABELS))
     assert "classes.probability" not in optipmb.columns_of(
-        run(plain, [seen(plain, 0.0, ("bus", 20.0, 0.9))])[0].density
+        steps(plain, [seen(plain, 0.0, ("bus", 20.0, 0.9))])[0].density
     )
 
 
 def test_probabilities_of_another_group_are_refused() -> None:
     """A posterior that gives a class outside the object's group any weight is a DensityError of the step."""
     parameters = motor()
-    density = run(parameters, [seen(parameters, 0.0, ("bus", 20.0, 0.9))])[0].density
+    density = steps(parameters, [seen(parameters, 0.0, ("bus", 20.0, 0.9))])[0].density
     assert density.class_probability is not None
     tracker = optipmb.Tracker(parameters)
     others = np.full((2, 4), 0.25), SimpleNamespace(shape=(1, 4))
@@ -220,7 +210,7 @@ def test_probabilities_of_another_group_are_refused() -> None:
 def test_a_density_from_before_there_were_posteriors_goes_on() -> None:
     """Its objects begin as if first detected as their class."""
     parameters = motor()
-    density = run(parameters, [seen(parameters, 0.0, ("bus", 20.0, 1.0))])[0].density
+    density = steps(parameters, [seen(parameters, 0.0, ("bus", 20.0, 1.0))])[0].density
     columns = optipmb.columns_of(density)
     del columns["classes.probability"]
     earlier = optipmb.density_of(density.stamp_ns, density.next_id, columns, LABELS)
@@ -244,7 +234,7 @@ def test_the_outermost_values_keep_a_posterior(values: dict[str, float]) -> None
     """After a hundred labels of one class and two hundred of another the newest object is of the latter."""
     parameters = motor(**values)
     labels = ["car"] * 100 + ["truck"] * 200
-    for result in run(parameters, [seen(parameters, 0.1 * k, (name, 0.0, 1.0)) for k, name in enumerate(labels)]):
+    for result in steps(parameters, [seen(parameters, 0.1 * k, (name, 0.0, 1.0)) for k, name in enumerate(labels)]):
         posterior = result.density.class_probability
         assert posterior is not None
         np.testing.assert_allclose(posterior.sum(axis=1), 1.0)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from class_rows import class_rows
-from scenes import boxes, random_parameters
+from scenes import boxes, random_parameters, steps
 
 import optipmb
 from optipmb.extract import confirm
@@ -54,12 +54,11 @@ def test_a_track_is_confirmed_by_good_detections_and_stays_so_through_a_few_miss
     document = random_parameters(0, ("Car",))
     document["classes"]["Car"] |= SIMPLE
     parameters = optipmb.parse_parameters(document)
-    tracker = optipmb.Tracker(parameters)
-    density, flags, existence = tracker.initial(), [], []
+    flags, existence = [], []
     scores = [0.5, 0.5, 0.9, 0.9, 0.9, None, None, None, None, 0.6]
-    for k, score in enumerate(scores):
-        frame = boxes(parameters, 0.1 * k, () if score is None else (0, 0), score=score or 0.5)
-        result = tracker.step(density, frame)
+    places = [() if score is None else (0, 0) for score in scores]
+    frames = [boxes(parameters, 0.1 * k, places[k], score=score or 0.5) for k, score in enumerate(scores)]
+    for result in steps(parameters, frames):
         density = result.density
         np.testing.assert_array_equal(density.bernoulli.id, [1])
         flags.append(bool(result.tracks.confirmed[0]))
@@ -79,7 +78,7 @@ def test_a_track_is_confirmed_by_good_detections_and_stays_so_through_a_few_miss
 
 
 def test_every_track_is_confirmed_where_the_profile_asks_for_nothing() -> None:
-    """The paper knows no confirmation: under its profiles whatever is extracted is confirmed."""
+    """The paper knows no confirmation: under its profiles every extracted track is confirmed."""
     for name in ("kitti-paper", "nuscenes-paper"):
         for values in optipmb.load_profile(name).classes.values():
             assert values.confirm_from == values.confirm_until == 0.0

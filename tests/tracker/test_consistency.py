@@ -39,10 +39,10 @@ def nees(label: str, missed: float, seed: int) -> float:
         x = mean + own["birth_known"] * rng.normal(size=6)
         for k in range(FRAMES):
             after, spoiled = np.empty(6), np.empty((6, 6))
-            predict_state(x, 1e-12 * np.eye(6), dt, still, *buffers, after, spoiled)
+            predict_state(x, 1e-12 * np.eye(6), dt, still, buffers, after, spoiled)
             x = after + drift * math.sqrt(dt) * rng.normal(size=6)
             m, p = np.empty(6), np.empty((6, 6))
-            predict_state(mean, covariance, dt, own, *buffers, m, p)
+            predict_state(mean, covariance, dt, own, buffers, m, p)
             mean, covariance = m, p
             if rng.random() >= missed:
                 z = textbook.measure(x, with_velocity=True) + sigma[:5] * rng.normal(size=5)

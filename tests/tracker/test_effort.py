@@ -9,7 +9,7 @@ import pytest
 from class_rows import class_rows
 
 import optipmb
-from optipmb.hypotheses import count_pairs
+from optipmb.hypotheses import pairs_of_many
 from optipmb.preprocess import non_maximum_suppression
 
 PARAMETERS = optipmb.load_profile("nuscenes")
@@ -39,13 +39,14 @@ def test_pairs_are_counted_up_to_a_limit(seed: int) -> None:
     distance = np.linalg.norm(center[:, None] - position[None], axis=2)
     pairs = int(((distance <= gate[label][:, None]) & (label[:, None] == measured[None])).sum())
     assert pairs > 20
-    given = center, label, gate[label], position, measured
-    assert count_pairs(*given, np.zeros(50), 2, pairs) == pairs
-    assert count_pairs(*given, np.zeros(50), 2, pairs - 1) == pairs
-    assert count_pairs(*given, np.zeros(50), 2, 7) == 8
+
+    def count(widening: np.ndarray, most: int) -> int:
+        return len(pairs_of_many(center, label, gate[label], (position, measured, widening), 2, most)[0])
+
+    assert [count(np.zeros(50), most) for most in (pairs, pairs - 1, 7)] == [pairs, pairs, 8]
     widening = rng.choice([0.0, 16.0], 50)
     within = distance**2 <= gate[label][:, None] ** 2 + widening
-    assert count_pairs(*given, widening, 2, 2000) == (within & (label[:, None] == measured[None])).sum() > pairs
+    assert count(widening, 2000) == (within & (label[:, None] == measured[None])).sum() > pairs
 
 
 def test_a_crowd_beyond_the_bound_is_refused_before_it_costs_anything() -> None:

@@ -164,7 +164,7 @@ def test_a_frame_takes_nothing_else_for_a_field_of_view() -> None:
 
 
 def test_the_field_of_view_is_in_the_frame_of_the_boxes() -> None:
-    """Its pose is that of the frame unless it has its own."""
+    """It has the pose of the frame unless it has its own."""
     pose, other = turned(1.0), turned(2.0)
     assert boxes(KITTI, 0.0, (0, 0), pose=pose, field_of_view=FORWARD).field_of_view == replace(FORWARD, pose=pose)
     own = replace(FORWARD, pose=other)
@@ -201,7 +201,7 @@ def drive(
 
 @pytest.mark.parametrize("profile", CARS | HASTY)
 def test_a_car_that_leaves_the_front_view_for_the_rear_one_keeps_its_id(profile: str) -> None:
-    """It is seen ahead, then by nobody, then twice a second behind, while the front sensor streams on."""
+    """It is seen ahead, then by no sensor, then twice a second behind, while the front sensor streams on."""
     assert {tuple(ids) for _, ids in drive(profile, (FORWARD, BACKWARD), 0.5)} == {(1,)}
 
 
@@ -352,7 +352,7 @@ def test_a_sensor_that_sees_everything_may_say_so(profile: str) -> None:
 
 
 def test_the_online_tracker_takes_fields_of_view() -> None:
-    """They are those of the frame; nothing dies that lies outside."""
+    """They fit the frame; no object outside dies."""
     tracker = optipmb.OnlineTracker("kitti")
     given = {"x": [20.0], "y": [0.0], "z": [0.0], "l": [4.0], "w": [2.0], "h": [1.5], "yaw": [0.0], "score": [0.9]}
     tracker.update({**given, "class": ["Car"]}, t=0.0, field_of_view=FORWARD)
@@ -362,7 +362,7 @@ def test_the_online_tracker_takes_fields_of_view() -> None:
 
 
 def test_misses_are_stored_with_the_density() -> None:
-    """What was not looked at stays so over a store; stamps that cannot be are refused, and other lengths too."""
+    """Times without a look survive storage; impossible stamps and other lengths are refused."""
     tracker = optipmb.Tracker(KITTI)
     density = tracker.step(tracker.initial(), boxes(KITTI, 0.0, (20, 0))).density
     assert density.misses is None

@@ -183,7 +183,7 @@ def test_a_frame_does_not_share_the_callers_arrays() -> None:
 
 
 def test_a_pose_cannot_be_changed() -> None:
-    """Frames share poses: nobody can write to one, and it keeps no array of its caller's."""
+    """Frames share poses: they are read-only and copies of the caller's arrays."""
     translation, quaternion = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
     pose = optipmb.Pose(translation, quaternion)
     translation[0], quaternion[:] = 1.0, [0.0, 1.0, 0.0, 0.0]

@@ -71,7 +71,7 @@ def test_iou_is_symmetric_and_moves_with_the_world(
 def test_aligned_boxes_overlap_in_a_rectangle(
     x: float, y: float, a: tuple[float, float], b: tuple[float, float], angle: float
 ) -> None:
-    """For equal yaw the intersection is known exactly, whatever the yaw."""
+    """For equal yaws, of any size, the intersection is known exactly."""
     c, s = math.cos(angle), math.sin(angle)
     sides = [
         max(0.0, min(a[i] / 2, offset + b[i] / 2) - max(-a[i] / 2, offset - b[i] / 2))
@@ -100,7 +100,7 @@ def test_suppression_is_the_greedy_one_per_group(seed: int, *, mixed: bool, grou
     """A box goes when a better KEPT one of its group overlaps it by more than the threshold of its class."""
     rng = np.random.default_rng(seed)
     boxes = rng.uniform([0, 0, 1, 1, -3], [12, 12, 5, 2, 3], (60, 5))
-    if mixed:  # specks beside giants, many at the same x
+    if mixed:  # specks next to giants, many at the same x
         boxes[:, 0] = np.round(boxes[:, 0])
         boxes[:, 2:4] = 10 ** rng.uniform(-0.5, 1.2, (60, 2))
     label = rng.integers(0, 3, 60)
@@ -195,7 +195,7 @@ def test_points_that_are_not_finite_are_in_no_box() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_points_at_the_faces_of_boxes_fall_into_their_cells(seed: int) -> None:
-    """The cell of each point is that of plain numpy, and one of the box on whose face it lies, to the last bit."""
+    """Each point has the cell that plain numpy computes, a cell of the box on whose face it lies, to the last bit."""
     rng = np.random.default_rng(seed)
     center, half = rng.normal(0, 10.0 ** rng.uniform(-1, 3), (50, 3)), 10.0 ** rng.uniform(-3, 1, (50, 3))
     _, low, high = boxes_in_sensor(center, half, np.zeros(50), np.eye(3))

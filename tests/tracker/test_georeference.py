@@ -37,7 +37,7 @@ METRES = 111_320.0  # of a degree of latitude
 def test_positions_and_headings_are_those_of_proj(
     origin: tuple[float, float, float], x_heading: float, point: tuple[float, ...], yaw: float, expected: list[float]
 ) -> None:
-    """Within a micrometre and 0.01 degrees, up to 20 km away, over the date line and beside a pole; and back."""
+    """Within a micrometre and 0.01 degrees, up to 20 km away, over the date line and near a pole; and back."""
     place = Georeference(origin, x_heading)
     found = place.to_geographic([point], [yaw])
     lat, lon, alt, heading = (float(one[0]) for one in found)

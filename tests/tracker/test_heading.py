@@ -1,4 +1,4 @@
-"""Which way an object faces: turned boxes cost nothing, evidence turns a track, and its doubt is told."""
+"""Which way an object faces: turned boxes cost nothing, evidence turns a track, and it publishes its doubt."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from class_rows import class_row
 from numpy.typing import NDArray
-from scenes import boxes
+from scenes import boxes, steps
 
 import optipmb
 from optipmb.lightweight import follow_sign, turn_around
@@ -41,25 +41,15 @@ def seen(
     *,
     velocity: bool,
 ) -> list[optipmb.StepResult]:
-    """What the tracker says of these objects, detected with noise, each turned by pi in one frame."""
-    rng = np.random.default_rng(1)
-    tracker = optipmb.Tracker(parameters)
-    density, results = tracker.initial(), []
-    dt = parameters.nominal_period
+    """The results for these objects, detected with noise, each turned by pi in one frame."""
+    rng, frames, dt = np.random.default_rng(1), [], parameters.nominal_period
     for k, (place, yaw) in enumerate(path):
         after = path[min(k + 1, len(path) - 1)][0]
         moving = (after - place) / dt if velocity and k + 1 < len(path) else None
-        frame = boxes(
-            parameters,
-            k * dt,
-            place + rng.normal(0, 0.05, place.shape),
-            yaw=yaw + rng.normal(0, 0.03, len(yaw)) + np.pi * (turned == k),
-            velocity=moving,
-            label=label,
-        )
-        results.append(tracker.step(density, frame))
-        density = results[-1].density
-    return results
+        xy = place + rng.normal(0, 0.05, place.shape)
+        facing = yaw + rng.normal(0, 0.03, len(yaw)) + np.pi * (turned == k)
+        frames.append(boxes(parameters, k * dt, xy, yaw=facing, velocity=moving, label=label))
+    return steps(parameters, frames)
 
 
 @pytest.mark.parametrize("velocity", [True, False])
@@ -91,15 +81,11 @@ def one_class(**changes: float) -> optipmb.Parameters:
 
 
 def test_a_track_that_was_born_backwards_turns() -> None:
-    """A first box turned by pi is outvoted by the second and third, and the velocity over ground stays what it was."""
+    """A first box turned by pi is outvoted by the second and third, and the velocity over ground stays the same."""
     parameters = one_class(motion=0.0)
-    tracker = optipmb.Tracker(parameters)
-    density = tracker.initial()
     said = []
-    for k in range(12):
-        frame = boxes(parameters, 0.1 * k, (1.0 * k, 0.0), yaw=math.pi if k == 0 else 0.0)
-        result = tracker.step(density, frame)
-        density = result.density
+    frames = [boxes(parameters, 0.1 * k, (1.0 * k, 0.0), yaw=math.pi if k == 0 else 0.0) for k in range(12)]
+    for result in steps(parameters, frames):
         said.append((float(np.cos(result.tracks.yaw[0])), float(result.tracks.heading_confidence[0])))
     facing = [cos for cos, _ in said]
     assert facing[0] == pytest.approx(-1.0)
@@ -111,12 +97,8 @@ def test_a_track_that_was_born_backwards_turns() -> None:
 def test_driving_says_which_way_is_forward() -> None:
     """A car whose boxes all face backwards is turned by its motion, where motion counts for more."""
     parameters = one_class(motion=3.0)
-    tracker = optipmb.Tracker(parameters)
-    density = tracker.initial()
-    for k in range(15):
-        result = tracker.step(density, boxes(parameters, 0.1 * k, (1.0 * k, 0.0), yaw=math.pi))
-        density = result.density
-    assert abs(result.tracks.yaw[0]) < 0.1
+    frames = [boxes(parameters, 0.1 * k, (1.0 * k, 0.0), yaw=math.pi) for k in range(15)]
+    assert abs(steps(parameters, frames)[-1].tracks.yaw[0]) < 0.1
 
 
 def test_the_doubt_is_in_the_variance_and_ends() -> None:
@@ -124,10 +106,7 @@ def test_the_doubt_is_in_the_variance_and_ends() -> None:
     document = one_class().model_dump()
     document["classes"]["Car"]["reported_noise"] = None
     parameters = optipmb.parse_parameters(document)
-    tracker = optipmb.Tracker(parameters)
-    density = tracker.initial()
-    for k in range(20):
-        result = tracker.step(density, boxes(parameters, 0.1 * k, (1.0 * k, 0.0)))
+    for result in steps(parameters, [boxes(parameters, 0.1 * k, (1.0 * k, 0.0)) for k in range(20)]):
         density = result.density
         p = float(result.tracks.heading_confidence[0])
         added = result.tracks.covariance[0, 3, 3] - density.bernoulli.covariance[0, 3, 3]
@@ -142,11 +121,8 @@ def test_the_sign_fades_with_time_and_not_with_frames() -> None:
     parameters = one_class(motion=0.0)
     found = []
     for rate in (1, 4):
-        tracker = optipmb.Tracker(parameters)
-        density = tracker.initial()
-        for k in range(10 * rate + 1):
-            density = tracker.step(density, boxes(parameters, 0.1 * k / rate, (0.0, 0.0))).density
-        found.append(float(density.bernoulli.heading_odds[0]))
+        frames = [boxes(parameters, 0.1 * k / rate, (0.0, 0.0)) for k in range(10 * rate + 1)]
+        found.append(float(steps(parameters, frames)[-1].density.bernoulli.heading_odds[0]))
     assert found[0] == pytest.approx(found[1], rel=1e-6)
     assert found[0] == pytest.approx(0.9 * (1 - 0.9**11) / 0.1, rel=1e-6)
 
@@ -162,7 +138,7 @@ def test_a_turned_state_describes_the_same_motion(seed: int) -> None:
     def predicted(m: Array, p: Array) -> tuple[Array, Array]:
         out, spread = np.empty(6), np.empty((6, 6))
         own = class_row(process_noise=noise, acceleration_time=math.inf)
-        predict_state(m, p, 0.5, own, np.empty((6, 6)), np.empty((12, 6)), out, spread)
+        predict_state(m, p, 0.5, own, (np.empty((6, 6)), np.empty((12, 6))), out, spread)
         return out, spread
 
     straight = predicted(mean, covariance)

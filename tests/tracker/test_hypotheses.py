@@ -74,10 +74,11 @@ def test_the_gate_holds_every_pair_of_a_class_within_the_distance(seed: int, cou
     assert list(zip(found[0].tolist(), found[1].tolist(), strict=True)) == wanted
     likelihood = [textbook.log_likelihood(position[m], mean[n], covariance[n], noise[label[n]]) for n, m in wanted]
     np.testing.assert_allclose(found[2], likelihood, rtol=1e-10, atol=1e-10)
-    for search in (pairs_of_few, pairs_of_many):
-        for widening in (np.zeros(measurements), rng.choice([0.0, 1.0, 9.0], measurements)):
-            row, measurement = search(mean, label, radius, position, measured, widening, 2)
-            assert list(zip(row.tolist(), measurement.tolist(), strict=True)) == pairs(widening)
+    for widening in (np.zeros(measurements), rng.choice([0.0, 1.0, 9.0], measurements)):
+        targets = position, measured, widening
+        few, many = pairs_of_few(mean, label, radius, targets, 2), pairs_of_many(mean, label, radius, targets, 2, 2**62)
+        assert list(zip(*few, strict=True)) == sorted(zip(*many, strict=True)) == pairs(widening)
+        assert (np.diff(many[0]) >= 0).all()
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -311,7 +312,7 @@ def test_one_crowd_of_hundreds_has_the_total_of_the_hungarian_algorithm(seed: in
 
 
 def test_at_equal_cost_the_earlier_object_gets_the_earlier_measurement() -> None:
-    """Ties are settled by the order of objects and measurements, whatever the chains between them."""
+    """The order of objects and measurements settles ties, also along chains."""
     none = UNASSIGNED
     for cost, wanted in (
         ([[1, 1, 1]], [0]),
@@ -319,7 +320,7 @@ def test_at_equal_cost_the_earlier_object_gets_the_earlier_measurement() -> None
         ([[1, 1], [1, 1]], [0, 1]),
         ([[1, 1, 9], [1, 1, 9], [1, 1, 9]], [0, 1, none]),
         ([[1, 2], [2, 3]], [0, 1]),  # the other way round costs as much
-        ([[2, 1], [9, 1]], [0, 1]),  # a later object takes what is cheaper in total
+        ([[2, 1], [9, 1]], [0, 1]),  # a later object takes the cheaper total
         ([[9, 1, 9], [9, 1, 1]], [1, 2]),
     ):
         matrix = np.array(cost, np.float64)
@@ -330,7 +331,7 @@ def test_at_equal_cost_the_earlier_object_gets_the_earlier_measurement() -> None
 @given(cost=arrays(np.float64, (6, 6), elements=st.integers(-2, 2).map(float)))
 @settings(deadline=None)
 def test_ties_depend_on_the_matrix_alone(cost: Array) -> None:
-    """What came before, and what other clusters there are, changes no assignment."""
+    """Neither earlier calls nor other clusters change an assignment."""
     first = np.zeros(6)
     alone = associate(hypotheses(cost, first), 6)
     two = np.full((13, 12), np.inf)

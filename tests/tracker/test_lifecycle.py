@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenes import boxes, random_parameters
+from scenes import boxes, random_parameters, steps
 
 import optipmb
 from optipmb.parameters import parse_parameters
@@ -28,21 +28,9 @@ def car(**changes: Any) -> optipmb.Parameters:
     return parse_parameters(document)
 
 
-def run(
-    parameters: optipmb.Parameters, frames: list[optipmb.Frame], modules: optipmb.Modules | None = None
-) -> list[optipmb.StepResult]:
-    """All results of a list of frames."""
-    tracker = optipmb.Tracker(parameters, modules)
-    density, results = tracker.initial(), []
-    for frame in frames:
-        results.append(tracker.step(density, frame))
-        density = results[-1].density
-    return results
-
-
 def test_a_high_score_starts_a_track_at_once() -> None:
     """HABM, high score: r = 1, id 1, extracted in the first frame, confidence (1 - 1/e) z_s."""
-    result = run(car(), [boxes(car(), 0, (1, 2), score=0.5)])[0]
+    result = steps(car(), [boxes(car(), 0, (1, 2), score=0.5)])[0]
     np.testing.assert_array_equal(result.density.bernoulli.existence, [1.0])
     np.testing.assert_array_equal(result.tracks.id, [1])
     np.testing.assert_array_equal(result.tracks.detection, [0])
@@ -54,7 +42,7 @@ def test_a_high_score_starts_a_track_at_once() -> None:
 def test_a_low_score_announces_and_the_second_one_starts_the_track() -> None:
     """HABM, low score: a Poisson component first; detected again, a Bernoulli of r = e / (e + lambda_c)."""
     parameters = car()
-    first, second = run(parameters, [boxes(parameters, seconds, (1, 2), score=0.3) for seconds in (0, 0.1)])
+    first, second = steps(parameters, [boxes(parameters, seconds, (1, 2), score=0.3) for seconds in (0, 0.1)])
     assert len(first.density.bernoulli.id) == len(first.tracks.id) == 0
     np.testing.assert_array_equal(first.density.poisson.weight, [2.0])
     assert len(second.density.poisson.weight) == 0  # RPP: the marked component is used up
@@ -63,10 +51,10 @@ def test_a_low_score_announces_and_the_second_one_starts_the_track() -> None:
 
 
 def test_a_poisson_component_lives_for_its_steps() -> None:
-    """RPP: what is not detected again goes after eta_step periods; its weight falls by p_s (1 - p_d) per frame."""
+    """RPP: an undetected component goes after eta_step periods; its weight falls by p_s (1 - p_d) per frame."""
     parameters = car()
     frames = [boxes(parameters, 0, (0, 0), score=0.3), *[boxes(parameters, 0.1 * k) for k in (1, 2, 3)]]
-    weights = [result.density.poisson.weight.tolist() for result in run(parameters, frames)]
+    weights = [result.density.poisson.weight.tolist() for result in steps(parameters, frames)]
     assert weights == [[2.0], [pytest.approx(2 * 0.099)], [pytest.approx(2 * 0.099**2)], []]
 
 
@@ -74,7 +62,7 @@ def test_a_low_score_at_an_object_announces_less() -> None:
     """The weight is mu_ab (1 - p_a): next to a tracked object the component is lighter than in the open."""
     parameters = car(gate=20.0)
     frames = [boxes(parameters, 0, (0, 0)), boxes(parameters, 0.1, [(0.7, 0), (15, 0)], score=0.3, size=(0.4, 0.4, 1))]
-    weight = run(parameters, frames)[1].density.poisson
+    weight = steps(parameters, frames)[1].density.poisson
     order = np.argsort(weight.mean[:, 0])
     assert weight.weight[order[0]] < 2.0
     assert weight.weight[order[-1]] == pytest.approx(2.0, abs=1e-3)
@@ -84,7 +72,7 @@ def test_rpp_off_forgets_all_components() -> None:
     """Without RPP every Poisson component goes at the end of the step, as in GNN-PMB."""
     parameters = car()
     frames = [boxes(parameters, 0.1 * k, (0, 0), score=0.3) for k in range(3)]
-    for result in run(parameters, frames, optipmb.Modules(rpp=False)):
+    for result in steps(parameters, frames, optipmb.Modules(rpp=False)):
         assert len(result.density.poisson.weight) == len(result.density.bernoulli.id) == 0
 
 
@@ -92,7 +80,7 @@ def test_habm_off_starts_tracks_from_any_score() -> None:
     """Without HABM every measurement adds a component of the baseline's weight and may start a track at once."""
     for changes, weight in (({}, 0.1), ({"baseline_birth_rate": 0.4}, 0.4)):
         parameters = car(**changes)
-        result = run(parameters, [boxes(parameters, 0, (0, 0), score=0.2)], optipmb.Modules(habm=False))[0]
+        result = steps(parameters, [boxes(parameters, 0, (0, 0), score=0.2)], optipmb.Modules(habm=False))[0]
         np.testing.assert_array_equal(result.density.bernoulli.id, [1])
         assert result.density.bernoulli.existence[0] < 1.0
         np.testing.assert_allclose(result.density.poisson.weight, [weight * (1.0 - 0.9)])
@@ -101,7 +89,7 @@ def test_habm_off_starts_tracks_from_any_score() -> None:
 def test_a_missed_object_follows_the_misdetection_formula() -> None:
     """R = r+ (1 - p_d) / (1 - r+ + r+ (1 - p_d)) with r+ = r p_s, until it falls below min_existence."""
     parameters = car(extract_known=0.7)
-    results = run(parameters, [boxes(parameters, 0, (0, 0)), *[boxes(parameters, 0.1 * k) for k in range(1, 6)]])
+    results = steps(parameters, [boxes(parameters, 0, (0, 0)), *[boxes(parameters, 0.1 * k) for k in range(1, 6)]])
     r, expected = 1.0, []
     for _ in range(5):
         predicted = 0.99 * r
@@ -119,7 +107,7 @@ def test_a_certain_object_is_removed_after_its_misses(*, silent: bool) -> None:
     parameters = car(survival=1.0)
     seconds = [0.6, 0.7] if not silent else [0.7]
     first = [] if silent else [boxes(parameters, 0.1 * k) for k in range(1, 6)]
-    results = run(parameters, [boxes(parameters, 0, (0, 0)), *first, *[boxes(parameters, s) for s in seconds]])
+    results = steps(parameters, [boxes(parameters, 0, (0, 0)), *first, *[boxes(parameters, s) for s in seconds]])
     if not silent:
         np.testing.assert_array_equal(results[-2].density.bernoulli.id, [1])
         assert results[-2].tracks.id.size == 0  # no longer extracted, still there
@@ -132,7 +120,7 @@ def test_an_object_that_returns_in_time_keeps_its_id(*, silent: bool, periods: i
     """Missed for up to max_misses periods, the object is found again under its id in the period after."""
     parameters = car(survival=1.0)
     between = [] if silent else [boxes(parameters, 0.1 * k) for k in range(1, periods)]
-    results = run(parameters, [boxes(parameters, 0, (0, 0)), *between, boxes(parameters, 0.1 * periods, (0, 0))])
+    results = steps(parameters, [boxes(parameters, 0, (0, 0)), *between, boxes(parameters, 0.1 * periods, (0, 0))])
     np.testing.assert_array_equal(results[-1].tracks.id, [1])
     np.testing.assert_array_equal(results[-1].tracks.detection, [0])
     np.testing.assert_array_equal(results[-1].density.bernoulli.seen_ns, [results[-1].density.stamp_ns])
@@ -142,13 +130,13 @@ def test_two_thresholds_extract_early_and_drop_early() -> None:
     """A new track comes at eta_ext1, a known one goes below eta_ext2 although r is above eta_ext1."""
     parameters = car(extract_new=0.5, extract_known=0.95, detection=0.5)
     frames = [boxes(parameters, 0.1 * k, xy) for k, xy in enumerate([(0, 0), (), (), (0, 0)])]
-    results = run(parameters, frames)
+    results = steps(parameters, frames)
     r = [result.density.bernoulli.existence[0] for result in results]
     assert r[0] == r[3] == 1.0
     assert r[1] > 0.95
     assert 0.5 < r[2] < 0.95
     assert [result.tracks.id.tolist() for result in results] == [[1], [1], [], [1]]
-    single = run(parameters, frames, optipmb.Modules(ote=False))
+    single = steps(parameters, frames, optipmb.Modules(ote=False))
     assert [result.tracks.id.tolist() for result in single] == [[1]] * 4
 
 
@@ -156,15 +144,15 @@ def test_a_known_track_is_dropped_after_eta_cnt_misses() -> None:
     """However certain, a track is extracted only while its misses are fewer than eta_cnt; with OTE off, it stays."""
     parameters = car(survival=1.0)
     frames = [boxes(parameters, 0, (0, 0)), *[boxes(parameters, 0.1 * k) for k in range(1, 6)]]
-    assert [len(result.tracks) for result in run(parameters, frames)] == [1, 1, 1, 0, 0, 0]
-    assert [len(result.tracks) for result in run(parameters, frames, optipmb.Modules(ote=False))] == [1] * 6
+    assert [len(result.tracks) for result in steps(parameters, frames)] == [1, 1, 1, 0, 0, 0]
+    assert [len(result.tracks) for result in steps(parameters, frames, optipmb.Modules(ote=False))] == [1] * 6
 
 
 def test_size_and_height_are_filtered_by_the_score() -> None:
     """x_A = (1 - z_s) x_A + z_s z_A: a certain detection replaces, an uncertain one nudges."""
     parameters = car()
     frames = [boxes(parameters, 0, (0, 0), size=(4, 2, 1)), boxes(parameters, 0.1, (0, 0), size=(5, 3, 2), score=0.6)]
-    result = run(parameters, frames)[1]
+    result = steps(parameters, frames)[1]
     np.testing.assert_allclose(result.tracks.size, [[4.6, 2.6, 1.6]])
     np.testing.assert_allclose(result.tracks.score, [0.6 * (1 - math.exp(-2))])
 
@@ -172,8 +160,8 @@ def test_size_and_height_are_filtered_by_the_score() -> None:
 def test_confidence_counts_time_not_frames() -> None:
     """x_len is in nominal periods: the same second at twice the rate gives the same confidence."""
     parameters = car()
-    slow = run(parameters, [boxes(parameters, 0.1 * k, (0, 0)) for k in range(4)])
-    fast = run(parameters, [boxes(parameters, 0.05 * k, (0, 0)) for k in range(7)])
+    slow = steps(parameters, [boxes(parameters, 0.1 * k, (0, 0)) for k in range(4)])
+    fast = steps(parameters, [boxes(parameters, 0.05 * k, (0, 0)) for k in range(7)])
     np.testing.assert_allclose(slow[-1].tracks.score, fast[-1].tracks.score)
     np.testing.assert_allclose(slow[-1].tracks.age, [0.3])
     np.testing.assert_allclose(fast[-1].tracks.time_since_detection, [0.0])
@@ -182,8 +170,8 @@ def test_confidence_counts_time_not_frames() -> None:
 def test_survival_is_per_nominal_period() -> None:
     """Prediction over two periods at once forgets as much as two predictions of one: r+ = r p_s^2."""
     parameters = car(detection=0.001)
-    once = run(parameters, [boxes(parameters, 0, (0, 0)), boxes(parameters, 0.2)])[-1].density.bernoulli.existence
-    twice = run(parameters, [boxes(parameters, 0, (0, 0)), boxes(parameters, 0.1), boxes(parameters, 0.2)])
+    once = steps(parameters, [boxes(parameters, 0, (0, 0)), boxes(parameters, 0.2)])[-1].density.bernoulli.existence
+    twice = steps(parameters, [boxes(parameters, 0, (0, 0)), boxes(parameters, 0.1), boxes(parameters, 0.2)])
     np.testing.assert_allclose(once, 0.99**2, rtol=1e-4)
     np.testing.assert_allclose(twice[-1].density.bernoulli.existence, once, rtol=1e-4)
 
@@ -191,7 +179,7 @@ def test_survival_is_per_nominal_period() -> None:
 def test_a_repeated_stamp_predicts_nothing() -> None:
     """Dt = 0: a second frame of the same stamp without detections changes r by the misdetection alone."""
     parameters = car()
-    first, second = run(parameters, [boxes(parameters, 1, (0, 0)), boxes(parameters, 1)])
+    first, second = steps(parameters, [boxes(parameters, 1, (0, 0)), boxes(parameters, 1)])
     np.testing.assert_array_equal(second.density.bernoulli.mean, first.density.bernoulli.mean)
     np.testing.assert_array_equal(second.density.bernoulli.covariance, first.density.bernoulli.covariance)
     np.testing.assert_array_equal(second.density.bernoulli.existence, [1.0])
@@ -204,7 +192,7 @@ def test_classes_do_not_mix() -> None:
         values.update(SIMPLE)
     parameters = parse_parameters(document)
     frames = [boxes(parameters, 0, (0, 0)), boxes(parameters, 0.1, (0, 0), label="Van")]
-    result = run(parameters, frames)[1]
+    result = steps(parameters, frames)[1]
     np.testing.assert_array_equal(result.tracks.id, [1, 2])
     np.testing.assert_array_equal(result.tracks.label, [0, 1])
 
@@ -226,7 +214,7 @@ def test_classes_of_one_group_make_one_object(groups: tuple[str | None, str | No
         yaw=[0.1, 0.1],
         score=[0.7, 0.8],
     )
-    (result,) = run(parameters, [frame])
+    (result,) = steps(parameters, [frame])
     assert sorted(result.tracks.label) == [0, 1][-tracked:]
     assert result.diagnostics.suppressed == 2 - tracked
 
@@ -236,7 +224,7 @@ def test_diagnostics_count_what_happened() -> None:
     parameters = car()
     xy = [(0, 0), (0.2, 0), (20, 0), (30, 0)]
     frames = [boxes(parameters, 0, (0, 0)), boxes(parameters, 0.1, xy, score=[0.9, 0.8, 0.9, 0.05])]
-    found = run(parameters, frames)[1].diagnostics
+    found = steps(parameters, frames)[1].diagnostics
     counted = (found.detections, found.below_score, found.suppressed, found.associated, found.born, found.repaired)
     assert counted == (4, 1, 1, 1, 1, 0)
     assert not found.cloud_used

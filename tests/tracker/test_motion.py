@@ -131,7 +131,7 @@ def predicted(
     root, points = np.full((6, 6), np.nan), np.full((12, 6), np.nan)
     out, spread = np.full(6, np.nan), np.full((6, 6), np.nan)
     own = class_row(process_noise=noise, acceleration_time=tau, constant_velocity=straight)
-    assert predict_state(mean, covariance, dt, own, root, points, out, spread) == 0
+    assert predict_state(mean, covariance, dt, own, (root, points), out, spread) == 0
     return out, spread
 
 

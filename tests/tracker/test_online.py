@@ -1,4 +1,4 @@
-"""The tracker that keeps its density: what it takes, what it gives, and what it refuses."""
+"""The tracker that keeps its density: input, output and refusals."""
 
 from __future__ import annotations
 

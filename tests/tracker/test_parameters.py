@@ -1,4 +1,4 @@
-"""Profiles: those that ship, own files, and the refusal of values that are not allowed."""
+"""Profiles: shipped ones, own files, and the refusal of values that are not allowed."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_the_tuned_profiles_track_the_same_classes(profile: str) -> None:
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.__name__)
 def test_every_parameter_is_documented(table: type[BaseModel]) -> None:
-    """Each field says in its description what it is; the classes say it in their docstring."""
+    """Each field has a description, each class a docstring."""
     assert table.__doc__
     for name, field in table.model_fields.items():
         assert field.description, name
@@ -156,7 +156,7 @@ def test_parameters_cannot_be_changed() -> None:
 
 @pytest.mark.parametrize("content", [None, "name = ", b"\xff\xfe", "[classes]"])
 def test_what_is_no_profile_is_refused(tmp_path: Path, content: str | bytes | None) -> None:
-    """A missing file, broken TOML, no text, and a file without what is needed."""
+    """A missing file, broken TOML, no text, and a file without a required value."""
     file = tmp_path / "bad.toml"
     if content is not None:
         file.write_bytes(content.encode() if isinstance(content, str) else content)
@@ -253,6 +253,6 @@ def test_the_thresholds_of_extraction_are_ordered() -> None:
 )
 @settings(deadline=None, max_examples=30)  # documents of random texts are slow to make
 def test_any_document_is_refused_by_name(document: Any) -> None:
-    """Nothing but ParameterError comes out, whatever is read."""
+    """Any document is accepted or raises ParameterError."""
     error = refused(document)
     assert str(error).startswith(error.path)

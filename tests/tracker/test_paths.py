@@ -56,9 +56,8 @@ def test_states_are_predicted_as_numpy_does_step_by_step(tau: float) -> None:
     covariance = root @ root.transpose(0, 2, 1) + 0.01 * np.eye(6)
     label, noise = np.arange(6) % 2, rng.uniform(0.1, 1.0, (2, 6))
     horizons, straight = np.array([0.1, 0.25, 1.0, 1.001]), np.array([False, True])
-    means, covariances = np.empty((6, 4, 6)), np.empty((6, 4, 6, 6))
     classes = class_rows(2, process_noise=noise, acceleration_time=tau, constant_velocity=straight)
-    predict_paths(mean, covariance, label, horizons, 0.1, classes, means, covariances)
+    means, covariances = predict_paths(mean, covariance, label, horizons, 0.1, classes)
     for n in range(6):
         c, m, spread = label[n], mean[n].copy(), covariance[n]
         doubt = np.diag(spread)[4:]
@@ -83,13 +82,12 @@ def test_a_path_goes_where_an_object_of_unknown_turn_rate_does() -> None:
     """A walker at 1.4 m/s whose heading may turn far in 3 s is still predicted to go 4.2 m, not half a metre."""
     mean, covariance = np.array([[0.0, 0.0, 1.4, 0.3, 0.4, 0.0]]), np.diag([0.04, 0.04, 0.04, 0.1, 1.0, 0.1])[None]
     classes = class_rows(1, process_noise=[[0.05, 0.05, 0.8, 1.6, 0.5, 0.3]], acceleration_time=math.inf)
-    found, spread = np.empty((1, 1, 6)), np.empty((1, 1, 6, 6))
-    predict_paths(mean, covariance, np.zeros(1, np.int64), np.array([3.0]), 0.5, classes, found, spread)
+    found, _ = predict_paths(mean, covariance, np.zeros(1, np.int64), np.array([3.0]), 0.5, classes)
     assert np.hypot(*found[0, 0, :2]) > 4.0
 
 
 def test_tracks_are_predicted_from_what_they_report() -> None:
-    """A track's path is that of its box, speed and covariance."""
+    """A track's path follows from its box, speed and covariance."""
     _, result = followed()
     tracks = result.tracks
     paths = optipmb.predict_tracks(tracks, [0.001], KITTI)
@@ -115,7 +113,7 @@ def test_a_doubtful_heading_changes_no_motion() -> None:
 
 
 def test_a_step_gives_the_paths_that_the_profile_asks_for() -> None:
-    """With horizons in the profile they are those of `predict_tracks`; tracks and densities are the same bytes."""
+    """With horizons in the profile they equal `predict_tracks`; tracks and densities are the same bytes."""
     document = KITTI.model_dump()
     assert "horizons" not in document
     asking = optipmb.parse_parameters(document | {"horizons": [0.5, 1.0, 3.0]})
@@ -142,7 +140,7 @@ def test_a_step_gives_the_paths_that_the_profile_asks_for() -> None:
 
 @pytest.mark.parametrize("horizons", [[0.0], [1.0, 1.0], [30.1], [math.nan], np.linspace(0.1, 1, 101).tolist()])
 def test_a_profile_of_other_horizons_is_refused(horizons: list[float]) -> None:
-    """Bounds of the profile are those of `predict_tracks`, and the error names the field."""
+    """The profile has the bounds of `predict_tracks`, and the error names the field."""
     with pytest.raises(optipmb.ParameterError) as caught:
         optipmb.parse_parameters(KITTI.model_dump() | {"horizons": horizons})
     assert caught.value.path.startswith("horizons")
@@ -181,7 +179,7 @@ def test_other_horizons_are_refused_by_name(horizons: Any, path: str) -> None:
 def test_tracks_of_another_profile_are_refused() -> None:
     """Classes that the profile lacks, tracks that are not sound, a density of other classes or with other columns.
 
-    The error names the value and says what was expected and what was received.
+    The error names the value, the expected and the received.
     """
     _, result = followed()
     tracks, density = result.tracks, result.density

@@ -38,7 +38,7 @@ def test_hard_braking_is_followed() -> None:
 @pytest.mark.parametrize(("turn", "same"), [(0.0, True), (0.1, True), (0.9, False), (1.5, False)])
 @pytest.mark.parametrize(("profile", "label"), [("generic", "car"), ("kitti", "Car")])
 def test_a_missed_car_is_not_its_neighbour(profile: str, label: str, turn: float, *, same: bool) -> None:
-    """At 2 Hz what was seen once may be 8 m ahead in the next frame, unless the box there heads another way."""
+    """At 2 Hz an object seen once may be 8 m ahead in the next frame, unless the box there heads another way."""
     tracker = optipmb.OnlineTracker(profile)
     found = []
     for k, x in enumerate((0.0, 8.0)):

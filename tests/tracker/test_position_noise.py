@@ -192,7 +192,7 @@ def test_a_detection_outside_the_gate_keeps_its_id_where_its_covariance_allows(
 
 
 def test_a_birth_is_as_uncertain_as_its_detection() -> None:
-    """P^0 of x and y is that of the class times the covariance in units of R; the rest stays."""
+    """P^0 of x and y is the class's times the covariance in units of R; the rest stays."""
     _, _, spread = pair(np.random.default_rng(5))
     position = np.array([[1.0, 2.0, *(spread[[0, 0, 1], [0, 1, 1]] / 0.25)]])
     known = np.array([[0.9, 0.9, 3.0, 0.3, 0.2, 1.0]])

@@ -29,7 +29,7 @@ print(wrap(0.5))  # a small kernel
 
 
 def test_a_cache_that_cannot_be_written_is_still_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where numba finds no cache because it may not write, ours is found, and it is the one beside the source."""
+    """Where numba finds no cache because it may not write, ours is found in the package's folder."""
     function = next(kernel.py_func for name, kernel in kernels().items() if name.startswith(predict.__name__))
     usual = InTreeCacheLocator.from_function(function, predict.__file__)
 
@@ -62,7 +62,7 @@ def test_a_user_without_a_writable_cache_can_import(mode: int, tmp_path: Path) -
 
 
 def test_machine_code_of_a_version_with_other_modules_is_compiled_anew(tmp_path: Path) -> None:
-    """After an update in place, an index beside the source may name what the package has no more."""
+    """After an update in place, an index in the package's folder may refer to removed names."""
     source = tmp_path / "some_kernel.py"
     source.write_text("from optipmb.compiled import kernel\n\n\n@kernel\ndef double(x):\n    return 2 * x\n")
     program = "import some_kernel; print(some_kernel.double(21))"

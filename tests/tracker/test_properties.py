@@ -132,7 +132,7 @@ def test_a_density_may_start_with_a_later_id() -> None:
 
 
 def assert_same_known(one: optipmb.StepResult, other: optipmb.StepResult) -> None:
-    """What is known of the tracks is the same."""
+    """The known parts of the tracks are the same."""
     assert (one.measured is None) == (other.measured is None)
     if one.measured is not None and other.measured is not None:
         np.testing.assert_array_equal(one.measured, other.measured)
@@ -156,7 +156,7 @@ def moved(given: SceneFrame, angle: float, shift: np.ndarray) -> SceneFrame:
 @pytest.mark.parametrize("unknown", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_world_frame_does_not_matter(seed: int, unknown: float) -> None:
-    """Rotate and shift the world: the same tracks, rotated and shifted, to 1e-6, whatever headings are unknown."""
+    """Rotate and shift the world: the same tracks, rotated and shifted, to 1e-6, also with unknown headings."""
     rng = np.random.default_rng(seed)
     angle, shift = rng.uniform(-3, 3), rng.uniform(-500, 500, 3)
     frames = list(scene(seed, Options(frames=60, ties=False)))  # ties are broken by coordinates, which turn too
@@ -178,7 +178,7 @@ def test_the_world_frame_does_not_matter(seed: int, unknown: float) -> None:
         for name in ("size", "yaw_rate", "acceleration", "existence", "score", "age", "time_since_detection"):
             np.testing.assert_allclose(getattr(b, name), getattr(a, name), atol=1e-6, rtol=1e-6, err_msg=name)
         np.testing.assert_allclose(b.center[:, :2], a.center[:, :2] @ rotation.T + shift[:2], atol=1e-6)
-        raised = shift[2] * (1.0 if one.measured is None else one.measured >= 4)  # those of known height
+        raised = shift[2] * (1.0 if one.measured is None else one.measured >= 4)  # of known height
         np.testing.assert_allclose(b.center[:, 2], a.center[:, 2] + raised, atol=1e-6)
         assert_same_known(one, other)
         unknown_yet = (a.velocity == 0.0).all(axis=1) & (a.heading_confidence == 0.5)  # detected once
@@ -274,7 +274,7 @@ print(digest(densities))
 
 
 def test_two_processes_give_the_same_bytes() -> None:
-    """The density of every frame is the same to the byte in processes of their own, whatever their hash seed."""
+    """The density of every frame is the same to the byte in processes with other hash seeds."""
     found = set()
     for seed in ("1", "2"):
         environment = os.environ | {"PYTHONPATH": str(SUPPORT), "PYTHONHASHSEED": seed}

@@ -46,7 +46,7 @@ def frames(count: int = 12, moved_from: int = 99) -> list[optipmb.Frame]:
 
 @pytest.mark.parametrize("at", [0, 1, 6])
 def test_a_moved_run_is_the_run_moved(at: int) -> None:
-    """Whenever the world moves, the density and the tracks are those of the run without, moved."""
+    """Whenever the world moves, density and tracks equal the moved ones of a run without."""
     tracker = optipmb.Tracker(GENERIC)
     still = moved = tracker.initial()
     for k, (frame, later) in enumerate(zip(frames(), frames(moved_from=at), strict=True)):
@@ -66,7 +66,7 @@ def test_a_moved_run_is_the_run_moved(at: int) -> None:
 
 
 def test_motions_are_those_of_plain_formulas() -> None:
-    """Each row is moved by matrices; what has no place stays, and headings are within half a turn."""
+    """Matrices move each row; values without a place stay, and headings are within half a turn."""
     tracker, density = optipmb.Tracker(GENERIC), None
     for frame in frames():
         density = tracker.step(density or tracker.initial(), frame).density

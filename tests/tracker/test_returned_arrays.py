@@ -1,4 +1,4 @@
-"""Arrays that kernels return are those that plain Python makes, and live as long."""
+"""Arrays that kernels return equal arrays of plain Python, and live as long."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ def made(count: int) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np
 
 @kernel
 def returned(given: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return what was given."""
+    """Return the argument."""
     return given
 
 
 def test_arrays_are_what_plain_python_makes() -> None:
-    """Class, type, shape, strides, numbers and writability are those of the same arrays made without a kernel."""
+    """Class, type, shape, strides, numbers and writability equal those without a kernel."""
     plain: Any = made
     for ours, theirs in zip(made(5), plain.py_func(5), strict=True):
         assert type(ours) is np.ndarray
@@ -43,7 +43,7 @@ def test_an_array_that_was_given_comes_back() -> None:
 
 
 def test_an_array_lives_as_long_as_it_is_used_and_no_longer() -> None:
-    """A view keeps the memory that it shows, and the memory of arrays that nobody has any more is used again."""
+    """A view keeps the memory that it shows, and the memory of released arrays is used again."""
     view = made(1000)[3]
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for _ in range(2000):

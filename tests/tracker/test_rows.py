@@ -1,4 +1,4 @@
-"""Records in one array: the columns are those that were given, for numpy and for kernels, and nothing else fits."""
+"""Records in one array: numpy and kernels read the given columns, and nothing else fits."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_columns_are_those_that_were_given(record: type[Rows], count: int) -> No
 
 @RECORDS
 def test_a_column_is_a_view(record: type[Rows]) -> None:
-    """What is written to one is there when it is read again, and no other column changes."""
+    """A written column reads back, and no other column changes."""
     given = random_columns(record, 5)
     for name in given:
         rows = record(**given)

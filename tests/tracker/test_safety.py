@@ -14,7 +14,7 @@ import pytest
 from scenes import boxes
 
 import optipmb
-from optipmb.density import fitting, labels_within
+from optipmb.density import check_fitting, labels_within
 from optipmb.warm import compilations
 
 KITTI, NUSCENES = optipmb.load_profile("kitti"), optipmb.load_profile("nuscenes")
@@ -31,7 +31,7 @@ def settled() -> optipmb.Density:
 
 
 def test_a_frame_of_other_classes_is_refused() -> None:
-    """Seven labels of one profile do not go through a tracker of three, whatever is in the frame."""
+    """Seven labels of one profile do not go through a tracker of three, with any frame."""
     tracker = optipmb.Tracker(KITTI)
     for xy in ((), (0, 0)):
         with pytest.raises(optipmb.FrameError, match="labels"):
@@ -77,12 +77,12 @@ def test_labels_are_within_the_classes() -> None:
 
 
 def test_what_the_tracker_makes_fits() -> None:
-    """The check passes what comes out of a step."""
-    assert fitting(settled(), len(KITTI.classes))
+    """The check passes the result of a step."""
+    check_fitting(settled(), KITTI.labels)
 
 
 def test_a_frame_cannot_be_written_to() -> None:
-    """What was checked stays as it was."""
+    """Checked arrays cannot be written to."""
     frame = boxes(KITTI, 0.0, (0, 0))
     for field in fields(frame):
         value = getattr(frame, field.name)

@@ -1,4 +1,4 @@
-"""A detector's scores brought to those that a profile's thresholds mean: by a curve, and before anything reads them."""
+"""A curve brings a detector's scores to the scale of a profile's thresholds, before anything reads them."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_tracks_are_those_of_detections_whose_scores_were_brought_over() -> None
 
 @given(st.lists(st.floats(0.0, 1.0), min_size=2, max_size=20), st.integers(0, 10**6))
 def test_the_order_of_detections_stays(scores: list[float], seed: int) -> None:
-    """A higher score stays at least as high, 0 and 1 stay, and nothing leaves [0, 1], whatever the curve."""
+    """A higher score stays at least as high, 0 and 1 stay, and nothing leaves [0, 1], for any curve."""
     rng = np.random.default_rng(seed)
     count = int(rng.integers(2, 33))
     knots = {name: np.sort(rng.uniform(1e-6, 1.0 - 1e-6, count)).tolist() for name in ("detector", "calibrated")}
@@ -126,7 +126,7 @@ def test_a_score_of_zero_is_still_left_out() -> None:
     ],
 )
 def test_a_curve_that_cannot_be_is_refused(changes: dict[str, Any], path: str, text: str) -> None:
-    """With the path of the field, and what was expected."""
+    """With the path of the field and the expected value."""
     with pytest.raises(optipmb.ParameterError) as caught:
         with_curve(**changes)
     assert caught.value.path == f"classes.Car.score_calibration{path}"

@@ -97,7 +97,7 @@ def test_scores_go_through_the_isotonic_curve(seed: int) -> None:
 
 @pytest.mark.parametrize("recall", [0.7, 0.85, 0.99])
 def test_the_share_of_looks_follows_the_recall_of_the_best(recall: float) -> None:
-    """Rho is that of the bins with the best fifth of the detections, and 0.95 over five looks before there are any."""
+    """Rho is of the bins with the best fifth of the detections, and 0.95 over five looks before there are any."""
     state = np.zeros((2, COUNTS, BINS))
     state[0, DETECTIONS, [5, 20, 25]] = [80.0, 10.0, 10.0]
     state[0, LOOKS, [5, 20, 25]] = 1000.0
@@ -154,7 +154,7 @@ class Counting:
 
 @SEEDS
 def test_frames_are_counted_as_plain_python_counts(seed: int) -> None:
-    """Slots of objects that stay, come and go; components that age; detections that nobody uses; forgetting."""
+    """Slots of objects that stay, come and go; components that age; detections without use; forgetting."""
     rng = np.random.default_rng(seed)
     state = 2.0 * counts(rng)
     plain = Counting(state.copy())
@@ -233,7 +233,7 @@ def run(parameters: optipmb.Parameters, frames: Iterator[dict[str, Any]]) -> lis
 
 @pytest.mark.parametrize("scale", [1.0, 0.4, 0.1])
 def test_confirmed_tracks_are_the_objects_whatever_the_scale_of_the_scores(scale: float) -> None:
-    """After five seconds all cars are confirmed and nothing else is; published scores remain those of the detector."""
+    """After five seconds all cars are confirmed and nothing else is; published scores remain the detector's."""
     last = run(PARAMETERS, street(60, scale))[-1].tracks
     assert last.confirmed.sum() == 10
     assert (last.center[last.confirmed, 1] < 5.0).all()
@@ -276,7 +276,7 @@ def test_wrong_counts_are_refused_by_name() -> None:
     for part in ("classes", "objects", "components"):
         name = f"calibration.{part}"
         good = columns[name]
-        beyond = [] if part == "objects" else [-2 - good, np.full_like(good, 10**12)]  # those of a slot fit
+        beyond = [] if part == "objects" else [-2 - good, np.full_like(good, 10**12)]  # in slots it fits
         for wrong in (good[:-1], good.astype(np.float32), None, *beyond):
             with pytest.raises(optipmb.DensityError, match=name.replace(".", r"\.")):
                 optipmb.density_of(density.stamp_ns, density.next_id, columns | {name: wrong}, CLASSES)
@@ -303,7 +303,7 @@ def test_the_order_of_detections_changes_nothing() -> None:
 
 @pytest.mark.parametrize("modules", [optipmb.Modules(habm=False), optipmb.Modules(rpp=False)])
 def test_scores_are_calibrated_with_any_modules(modules: optipmb.Modules) -> None:
-    """The components that measurements made, and those that all went, leave counts that fit the density."""
+    """Components made by measurements, and removed ones, leave counts that fit the density."""
     tracker = optipmb.Tracker(optipmb.load_profile("generic"), modules)
     density, place = tracker.initial(), np.array([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0], [0.0, 30.0, 0.0]])
     for k in range(12):

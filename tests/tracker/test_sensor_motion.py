@@ -99,7 +99,7 @@ def test_parked_cars_keep_their_ids_and_stand(speed: float, turn: float, rate: f
 
 @pytest.mark.parametrize("moving", [0.0, 12.0], ids=["parked", "traffic"])
 def test_a_sensor_that_stands_changes_no_byte(moving: float) -> None:
-    """Neither beside parked cars nor beside traffic that all drives one way, along its headings."""
+    """Neither next to parked cars nor in traffic that all drives one way, along its headings."""
     frames = street(0.0, 10.0, moving=moving)
     found, fixed = tracked(GENERIC, frames)[0], tracked(FIXED, frames)[0]
     assert all(one.sensor_motion is None for one in found)
@@ -137,7 +137,7 @@ def crossing(rate: float, parked: int, crossing: int, flipped: str, lanes: Array
 @pytest.mark.parametrize("lanes", [[-3.5], [-3.5, 3.5]], ids=["one_lane", "both_sides"])
 @pytest.mark.parametrize("rate", [2.0, 10.0, 20.0])
 def test_traffic_that_approaches_a_standing_sensor_is_not_its_motion(rate: float, lanes: list[float]) -> None:
-    """Six cars that all move alike, whichever way detectors turn their boxes, beside parked and crossing cars."""
+    """Six cars that move alike, with boxes turned either way, among parked and crossing cars."""
     for parked, across, flipped in itertools.product((0, 2, 5), (0, 4), ("none", "random", "all")):
         found, _ = tracked(GENERIC, crossing(rate, parked, across, flipped, np.array(lanes)))
         assert all(tracks.sensor_motion is None for tracks in found), (parked, across, flipped)
@@ -167,7 +167,7 @@ def test_a_sensor_that_stops_stands() -> None:
 
 
 def test_frames_with_a_pose_are_not_estimated() -> None:
-    """A pose that is given is used, and ends what was estimated before."""
+    """A given pose is used, and ends the estimate."""
     tracker = optipmb.Tracker(GENERIC)
     density = tracker.initial()
     for t, boxes, _ in street(15.0, 10.0)[:10]:

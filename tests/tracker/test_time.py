@@ -85,7 +85,7 @@ def test_a_component_lives_until_the_next_frame_at_least(profile: str, rate: flo
 
 
 def made(kind: str, rate: float) -> optipmb.Parameters:
-    """The default for a detector that nobody tuned: that of the service, or one made for the rate."""
+    """The default for any detector: the service's, or one made for the rate."""
     return optipmb.load_profile("generic") if kind == "generic" else optipmb.generic_parameters(["car"], 1.0 / rate)
 
 

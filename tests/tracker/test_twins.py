@@ -1,4 +1,4 @@
-"""Every kernel has a plain twin that it must equal: a table of where, and twins of those that have none elsewhere."""
+"""Every kernel must equal a plain twin: a table of their tests, and the twins that fit in no other file."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from class_rows import class_rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from read_only import read_only
 
 from optipmb.calibration import SURE, calibrate_rows, log_odds
 from optipmb.class_posterior import UNGROUPED, Groups
@@ -31,7 +30,7 @@ from optipmb.detection_probability import of_rows
 from optipmb.errors import FrameError
 from optipmb.frame import MAX_COORDINATE, MAX_SPEED, _refuse, allowed
 from optipmb.hypotheses import detection_costs, first_detections, gate, gate_radii, local_hypotheses
-from optipmb.preprocess import Measurements, gather
+from optipmb.preprocess import Measurements
 from optipmb.warm import kernels
 
 COMPILING = settings(deadline=None)  # the first call compiles
@@ -70,7 +69,7 @@ TWINS = {
     "density.whole_periods": "test_kernels.test_periods_are_counted_to_the_nearest",
     "extract.confirm": "test_confirmed.test_confirmation_has_hysteresis",
     "detection_probability.of_rows": "test_twins.test_rows_have_the_value_of_their_class",
-    "extract.extract_tracks": "test_kernels.test_tracks_are_read_off_the_states",
+    "extract.extract": "test_kernels.test_tracks_are_read_off_the_states",
     "extract.tracks_in": "test_rows.test_kernels_read_the_columns_that_numpy_does",
     "extract.select_tracks": "test_kernels.test_tracks_are_selected_by_two_thresholds",
     "frame.allowed": "test_twins.test_values_are_allowed_as_numpy_says",
@@ -79,7 +78,6 @@ TWINS = {
     "geometry.corners": "test_geometry.test_iou_is_that_of_clipped_polygons",
     "geometry.intersection_area": "test_geometry.test_iou_is_that_of_clipped_polygons",
     "geometry.iou_exceeds": "test_kernels.test_cheap_rejections_change_no_decision",
-    "hypotheses.count_pairs": "test_effort.test_pairs_are_counted_up_to_a_limit",
     "lightweight.doubt": "test_kernels.test_tracks_are_read_off_the_states",
     "lightweight.follow_sign": "test_kernels.test_the_light_weight_filter_is_its_formulas",
     "lightweight.sign_probability": "test_kernels.test_tracks_are_read_off_the_states",
@@ -116,7 +114,6 @@ TWINS = {
     "geometry.insert": "test_kernels.test_a_search_finds_every_neighbour_once",
     "calibration.follow_box": "test_kernels.test_tracks_are_read_off_the_states",
     "paths._doubts": "test_paths.test_a_doubtful_heading_changes_no_motion",
-    "paths.move": "test_paths.test_states_are_predicted_as_numpy_does_step_by_step",
     "paths.predict_paths": "test_paths.test_states_are_predicted_as_numpy_does_step_by_step",
     "detection_probability.boxes_in_sensor": "test_geometry.test_points_in_boxes_counts_every_point",
     "detection_probability.boxes_of_cells": "test_geometry.test_points_in_boxes_counts_every_point",
@@ -126,7 +123,6 @@ TWINS = {
     "predict.predict_rows": "test_kernels.test_components_within_their_limit_are_predicted",
     "predict.rows_within": "test_kernels.test_components_within_their_limit_are_predicted",
     "predict.predict_density": "test_kernels.test_components_within_their_limit_are_predicted",
-    "preprocess.gather": "test_twins.test_measurements_are_the_chosen_rows",
     "preprocess.non_maximum_suppression": "test_geometry.test_suppression_is_the_greedy_one_per_group",
     "preprocess.precedes": "test_kernels.test_the_canonical_order_is_a_lexicographic_one",
     "preprocess.select": "test_kernels.test_only_scores_from_the_filter_on_are_chosen",
@@ -178,7 +174,7 @@ def test_rows_have_the_value_of_their_class() -> None:
 
 
 def test_misses_count_from_the_last_detection_without_fields_of_view() -> None:
-    """Stamps that are given hold; else they are those of the last detections, as many as there are objects."""
+    """Given stamps hold; else the stamps of the last detections, one for each object."""
     stamps, width = np.arange(3), {"mean": (3, 6), "covariance": (3, 6, 6), "auxiliary": (3, 4)}
     columns = {name: np.zeros(width.get(name, 3), column.number) for name, column in Bernoullis.described.items()} | {
         "seen_ns": 10 + stamps
@@ -200,7 +196,7 @@ SPEEDS = st.sampled_from([0.0, MAX_SPEED, -MAX_SPEED, np.nextafter(MAX_SPEED, np
 @COMPILING
 @given(data=st.data(), count=st.integers(0, 3), worst=st.integers(0, 6))
 def test_values_are_allowed_as_numpy_says(data: st.DataObject, count: int, worst: int) -> None:
-    """Bounds, signs, NaN and half-known velocities; what is not allowed is refused, and nothing else."""
+    """Bounds, signs, NaN and half-known velocities; refused are exactly the values that are not allowed."""
 
     def drawn(place: int, shape: tuple[int, ...], values: st.SearchStrategy[float]) -> np.ndarray:
         return data.draw(arrays(np.float64, shape, elements=values)) if place == worst else np.full(shape, 0.5)
@@ -275,25 +271,6 @@ def test_log_odds_are_bounded(score: float) -> None:
     with np.errstate(divide="ignore"):
         wanted = np.clip(np.log(np.float64(score)) - np.log1p(-np.float64(score)), -SURE, SURE)
     assert log_odds(score) == pytest.approx(wanted, rel=1e-14, abs=1e-14)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_measurements_are_the_chosen_rows(seed: int) -> None:
-    """Every column is that of the detections, by an index array; the height of the centre is the last of x_A."""
-    rng = np.random.default_rng(seed)
-    center, size, velocity = rng.normal(0, 9, (20, 3)), rng.uniform(1, 5, (20, 3)), rng.normal(0, 2, (20, 2))
-    velocity[3] = np.nan
-    yaw, score, label, source = (
-        rng.normal(0, 1, 20),
-        rng.uniform(0, 1, 20),
-        rng.integers(0, 3, 20),
-        rng.permutation(40)[:20],
-    )
-    chosen = rng.permutation(20)[:12]
-    out = gather(chosen, tuple(read_only(center, size, yaw, velocity, score, label, source)), 2)
-    wanted = center[:, :2], yaw, velocity, np.column_stack([size, center[:, 2]]), score, label, source
-    for found, column in zip(out, wanted, strict=True):
-        np.testing.assert_array_equal(found, column[chosen])
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -58,7 +58,7 @@ def test_the_prediction_is_that_of_a_linear_model(seed: int) -> None:
     (mean, covariance), dt = state(rng), float(rng.uniform(0.05, 3))
     own = class_row(process_noise=[0.2, 0.2, 0.7, 9.0, 9.0, 9.0], birth_unknown=[9.0, 9.0, 9.0, 9.0, 9.0, 1.5])
     out, spread = np.empty(6), np.empty((6, 6))
-    assert predict_state(mean, covariance, dt, own, np.empty((6, 6)), np.empty((12, 6)), out, spread) == 0
+    assert predict_state(mean, covariance, dt, own, (np.empty((6, 6)), np.empty((12, 6))), out, spread) == 0
     step = np.eye(4) + dt * np.eye(4, k=2)
     m, p = plain(mean, covariance)
     gained = 0.7**2 * dt + (3.0 * 1.5 * dt) ** 2
@@ -71,7 +71,7 @@ def test_the_prediction_is_that_of_a_linear_model(seed: int) -> None:
 @pytest.mark.parametrize("velocity", [True, False])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_update_is_the_linear_kalman_filter(seed: int, *, velocity: bool) -> None:
-    """K = P H' (H P H' + R)^-1 in the axes of the world, and no velocity across in those of the state."""
+    """K = P H' (H P H' + R)^-1 in the axes of the world, and no velocity across in the axes of the state."""
     rng = np.random.default_rng(seed)
     mean, covariance = state(rng)
     covariance[2:4, 2:4] += 1e6 * np.eye(2)  # so that the update finds no heading
@@ -110,7 +110,7 @@ def test_without_a_heading_the_update_of_a_known_one_leaves_its_row_out() -> Non
 
 
 def test_a_heading_is_found_taken_and_lost() -> None:
-    """By a velocity of four deviations, by a detection, and by doubt; position and velocity stay what they are."""
+    """By a velocity of four deviations, by a detection, and by doubt; position and velocity stay."""
     own = class_row(birth_unknown=[0.3, 0.3, 9.0, 0.2, 0.25, 1.25], noise_heading=0.125)
     mean, covariance = state(np.random.default_rng(0))
     mean[2] = 8.0
@@ -151,7 +151,7 @@ def test_a_heading_is_found_taken_and_lost() -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_boxes_of_unknown_heading_overlap_alike_in_all_axes(seed: int) -> None:
-    """One unknown heading is that of the other box, two make squares that face each other; turning changes nothing."""
+    """An unknown heading copies the other box's, two make squares that face each other; turning changes nothing."""
     rng = np.random.default_rng(seed)
     first, second = (np.array([*rng.normal(0, 1.5, 2), *rng.uniform(1, 5, 2), rng.uniform(-3, 3)]) for _ in range(2))
     threshold, angle = float(rng.uniform(0.02, 0.5)), float(rng.uniform(-3, 3))
@@ -199,7 +199,6 @@ def test_points_are_tracked_and_a_heading_comes_from_motion(profile: str) -> Non
     assert {tuple(one.id.tolist()) for one in found[2:]} == {(1, 2)}
     last = found[-1]
     car, person = (int(np.flatnonzero(last.center[:, 0].round() == x)[0]) for x in (5, 9))
-    assert last.measured is not None
     assert last.measured[[car, person]].tolist() == [1, 0]
     assert last.yaw[car] == pytest.approx(math.pi / 2, abs=0.02)
     assert last.heading_confidence[person] == 0.5
@@ -208,7 +207,7 @@ def test_points_are_tracked_and_a_heading_comes_from_motion(profile: str) -> Non
 
 
 def test_a_point_has_the_box_of_its_class_until_one_is_measured() -> None:
-    """The size of the profile, else that of the class's name; a first size, heading and height hold at once."""
+    """The size of the profile, else by the class's name; a first size, heading and height hold at once."""
     document = optipmb.load_profile("kitti").model_dump()
     document["classes"]["Car"]["default_size"] = (3.5, 1.5, 1.25)
     tracker = optipmb.OnlineTracker(optipmb.parse_parameters(document))
@@ -217,23 +216,39 @@ def test_a_point_has_the_box_of_its_class_until_one_is_measured() -> None:
     assert first.size.tolist()[car] == [3.5, 1.5, 1.25]
     assert first.size.tolist()[1 - car] == [0.7, 0.7, 1.75]
     assert first.center[:, 2].tolist() == (0.5 * first.size[:, 2]).tolist()
-    assert first.measured is not None
     assert first.measured.tolist() == [0, 0]
     whole = {"center": [[5.0, 0.8, 2.0]], "size": [[4.5, 2.0, 1.5]], "yaw": [1.5], "score": [0.6], "class": ["car"]}
     second = tracker.update(whole, t=0.1)
     car = int(np.flatnonzero(second.detection == 0)[0])
-    assert second.measured is not None
     assert second.measured[car] == 7
     assert second.size[car].tolist() == [4.5, 2.0, 1.5]
     assert second.center[car, 2] == 2.0
     assert second.yaw[car] == pytest.approx(1.5, abs=1e-6)
     third = points(tracker, 2)
     assert third.size[int(np.flatnonzero(third.center[:, 0] < 7)[0])].tolist() == [4.5, 2.0, 1.5]
+    assert optipmb.OnlineTracker("kitti").update(whole | {"score": [0.95]}, t=0.1).measured.tolist() == [7]
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "same"),
+    [(0.0, 0.1, True), (0.0, 3.1, True), (0.0, 1.5, False), (0.0, math.nan, True), (math.nan, 1.5, True)],
+)
+def test_a_detection_far_ahead_is_of_the_object_unless_it_has_turned(
+    first: float, second: float, *, same: bool
+) -> None:
+    """A car that moves 8 m in half a second keeps its id but where both headings are known and differ, modulo pi."""
+    tracker = optipmb.OnlineTracker(optipmb.generic_parameters(("car",), 0.5))
+    ids = []
+    for t, yaw in ((0.0, first), (0.5, second)):
+        box = {"center": [[16.0 * t, 0.0, 0.8]], "size": [[4.5, 1.9, 1.6]], "yaw": [yaw], "score": [0.95]}
+        tracks = tracker.update(box | {"class": ["car"]}, t=t)
+        ids += tracks.id[tracks.detection == 0].tolist()
+    assert (ids == [1, 1]) is same
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_order_of_detections_does_not_matter(seed: int) -> None:
-    """Also where equal detections differ only in what is unknown."""
+    """Also where equal detections differ only in unknown values."""
     rng = np.random.default_rng(seed)
     parameters = optipmb.parse_parameters(random_parameters(seed + 40))
     frames = []

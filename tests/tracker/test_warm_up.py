@@ -11,13 +11,12 @@ import sys
 import tempfile
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import pytest
 
 import optipmb
 from optipmb.warm import kernels
-
-if TYPE_CHECKING:
-    import pytest
 
 SUPPORT = Path(__file__).resolve().parents[1] / "support"
 
@@ -83,7 +82,7 @@ def test_after_a_warm_up_nothing_is_compiled() -> None:
 
 
 def test_all_kernels_are_counted() -> None:
-    """Every kernel that a module defines is among those that are looked at."""
+    """`kernels` has every kernel that a module defines."""
     folder = Path(optipmb.__file__).parent
     defined = set()
     for path in folder.glob("*.py"):
@@ -113,7 +112,7 @@ def test_kernels_are_counted_while_another_thread_imports(monkeypatch: pytest.Mo
 
 
 def test_programs_that_start_at_once_compile_once_together() -> None:
-    """One of them has all kernels compiled, by several processes; the other waits for it, and has what it needs."""
+    """One of them has all kernels compiled, by several processes; the other waits and loads them."""
     program = "import optipmb; print(optipmb.warm_up())"
     with tempfile.TemporaryDirectory() as cache:
         environment = os.environ | {"NUMBA_CACHE_DIR": cache, "OPTIPMB_COMPILE_PROCESSES": "2"}
@@ -130,17 +129,22 @@ def test_programs_that_start_at_once_compile_once_together() -> None:
     assert announced.startswith("optipmb: compiling the tracker, once after an installation")
 
 
-def test_a_compilation_is_announced_once_with_its_progress() -> None:
-    """A process without cached kernels says once that it compiles, then how many are compiled, on standard error."""
+@pytest.mark.parametrize("setting", ["OPTIPMB_COMPILE_PROCESSES", "NUMBA_OPT"])
+def test_a_compilation_is_announced_once_with_its_progress(setting: str) -> None:
+    """A process without cached kernels says once that it compiles, then how many are compiled, on standard error.
+
+    Without optimization nothing can be cached: no other processes compile.
+    """
     program = (
         "import optipmb.compiled as compiled; compiled.PROGRESS_S = 0.0\n"
         "import numpy as np, optipmb; optipmb.bev_iou(np.zeros((1, 5)), np.zeros((1, 5)))"
     )
     with tempfile.TemporaryDirectory() as cache:
-        environment = os.environ | {"NUMBA_CACHE_DIR": cache, "OPTIPMB_COMPILE_PROCESSES": "0"}
-        command = [sys.executable, "-c", program]
+        environment = os.environ | {"NUMBA_CACHE_DIR": cache, setting: "0"}
+        command = [sys.executable, "-W", "ignore", "-c", program]
         done = subprocess.run(command, capture_output=True, text=True, timeout=280, check=True, env=environment)
     first, *progress = done.stderr.splitlines()
     assert first == "optipmb: compiling the tracker, once after an installation; it takes up to a minute"
     counts = [re.fullmatch(r"optipmb: compiled (\d+) of (\d+) kernels", line) for line in progress]
     assert [int(found[1]) for found in counts if found] == list(range(1, len(progress) + 1))
+    assert len(progress) < 10

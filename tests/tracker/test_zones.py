@@ -123,7 +123,7 @@ def test_a_visit() -> None:
     ],
 )  # fmt: skip
 def test_how_an_object_enters_and_leaves(path: list[tuple[float, float] | None], found: list[tuple[str, str]]) -> None:
-    """Whoever is there at first appeared; whoever is not seen for two seconds is lost; short visits give nothing."""
+    """Objects there at first appeared; unseen for two seconds they are lost; short visits give nothing."""
     zone = replace(CROSSING, dwell_s=(), z=(-1, 6))
     assert heads(events_of([zone], along(*path)), "kind", "how") == found
 

@@ -75,7 +75,7 @@ class GrpcConnection:
         return GrpcSender(publishing, "detections"), GrpcSender(publishing, "points")
 
     def subscribe_streams(self, pattern: str, inbox: Inbox, *topics: Topic, prefix: str) -> GrpcSubscription:
-        """Move topics of a pattern of streams into an inbox: tracks, perhaps with problems, or events."""
+        """Move topics of a pattern of streams into an inbox: tracks or `now`, perhaps with problems, or events."""
         return GrpcSubscription(self._channels, pattern, inbox, Keys(prefix), topics=topics, timeout=self._timeout)
 
     def query(self, key: str, payload: bytes = b"", encoding: str = "", *, timeout: float = 2.0) -> tuple[Answer, ...]:

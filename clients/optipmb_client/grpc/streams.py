@@ -15,6 +15,7 @@ from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_client.errors import ConnectionFailed
 from optipmb_client.grpc.channels import CLOSE_S, Channels, ResumedCall
 from optipmb_client.incoming import Arrival, Inbox
+from optipmb_client.trace_context import attached
 
 __all__ = ["GrpcSender", "GrpcSubscription", "Publishing"]
 
@@ -182,8 +183,10 @@ class GrpcSender:
         request = pb.PublishRequest(**{self._topic: convert.to_proto(message)})
         return request.SerializeToString()
 
-    def put(self, payload: bytes) -> None:
-        """Send a packed message."""
+    def put(self, payload: bytes, attachment: bytes | None = None) -> None:
+        """Send a packed message, with the trace context of an attachment."""
+        if attachment is not None:  # protobuf merges messages that stand one after the other
+            payload += pb.PublishRequest(traceparent=attached(attachment)).SerializeToString()
         self._publishing.put(self._topic, payload)
 
     def close(self) -> None:
@@ -220,7 +223,7 @@ class GrpcSubscription(ResumedCall):
         pattern: of streams.
         inbox: for the messages.
         keys: of the network, for the names of arrivals.
-        topics: tracks, perhaps with problems, or events.
+        topics: tracks or tracks predicted to now, perhaps with problems, or events.
         timeout: seconds to wait until it is in force.
 
     Raises:
@@ -233,7 +236,9 @@ class GrpcSubscription(ResumedCall):
     ) -> None:
         self._events = "events" in topics
         super().__init__(channels, "SubscribeEvents" if self._events else "Subscribe", f"subscribe {pattern}")
-        request: Any = pb.SubscribeRequest(pattern=pattern, queue=QUEUE, history=True, problems="problems" in topics)
+        request: Any = pb.SubscribeRequest(
+            pattern=pattern, queue=QUEUE, history=True, problems="problems" in topics, predict="now" in topics
+        )
         if self._events:
             request = pb.SubscribeEventsRequest(pattern=pattern, final=False, history=True)
         self._request = request.SerializeToString()

@@ -108,7 +108,7 @@ class Connection:
         return self._session.subscribe(pattern, inbox.put, history=True)
 
     def subscribe_streams(self, pattern: str, inbox: Inbox, *topics: Topic, prefix: str) -> contextlib.ExitStack:
-        """Move topics of a pattern of streams into an inbox: tracks, perhaps with problems, or events."""
+        """Move topics of a pattern of streams into an inbox: tracks or `now`, perhaps with problems, or events."""
         self._session.require(CACHED * len(topics))
         subscriptions = contextlib.ExitStack()
         for topic in topics:

@@ -17,6 +17,7 @@ from optipmb_schemas import Detections, Keys, Points, Problem, encoding_of
 
 from optipmb_client.errors import ConnectionFailed
 from optipmb_client.incoming import Answer, Arrival
+from optipmb_client.trace_context import attached
 from optipmb_client.zenoh.handles import CLOSE_S, Channel, Declared, Query, Reading, Sender, directly, reason, usable
 from optipmb_client.zenoh.late_join import ANSWER_S, CacheQueries, LateJoin
 
@@ -224,8 +225,9 @@ class Session:
             lost = at in after_loss
             after_loss.discard(at)
             payload, encoding = sample.payload.to_bytes(), str(sample.encoding)
+            parent = attached(sample.attachment.to_bytes()) if sample.attachment is not None else ""
             try:
-                receive(Arrival(at, payload, encoding, time.monotonic_ns(), after_loss=lost))
+                receive(Arrival(at, payload, encoding, time.monotonic_ns(), after_loss=lost, traceparent=parent))
             except Exception:  # noqa: BLE001 - one message must not end the subscription; `failed` reports it
                 self._failed(key)
 

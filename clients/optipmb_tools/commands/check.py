@@ -80,9 +80,7 @@ def _classes(sequences: "Many[DataSequence]") -> list[dict[str, Any]]:
 
 
 def _print(findings: "Many[dict[str, Any]]", *tables: "Many[dict[str, Any]]") -> None:
-    table = plain_table(("", "finding", "change with"))
-    for column in table.columns[1:]:
-        column.no_wrap = False
+    table = plain_table(("", "finding", "change with"), folded=("finding", "change with"))
     for one in findings:
         mark = "WRONG " if one["wrong"] else ""
         table.add_row(one["topic"], mark + one["text"], one["option"])
@@ -90,9 +88,7 @@ def _print(findings: "Many[dict[str, Any]]", *tables: "Many[dict[str, Any]]") ->
     for rows in tables:
         print_table("")
         names = [name.replace("_", " ") for name in rows[0]] if rows else []
-        table = plain_table(names[:1], names[1:])
-        for column in table.columns[:1]:
-            column.no_wrap = False
+        table = plain_table(names[:1], names[1:], folded=names[:1])
         for row in rows:
             table.add_row(*("-" if value is None else str(value) for value in row.values()))
         print_table(table)

@@ -260,11 +260,13 @@ def number_or_text(value: str) -> float | str:
     return int(number) if number.is_integer() else number
 
 
-def plain_table(left: Sequence[str], right: Sequence[str] = (), *, title: str | None = None) -> Table:
-    """Return a table without lines; the columns `right`, of numbers, are aligned to the right."""
+def plain_table(
+    left: Sequence[str], right: Sequence[str] = (), *, title: str | None = None, folded: Sequence[str] = ()
+) -> Table:
+    """Return a table without lines; columns `right`, of numbers, are aligned to the right, `folded` ones may wrap."""
     table = Table(title=title, title_justify="left", box=None, pad_edge=False)
     for name in (*left, *right):
-        table.add_column(name, justify="right" if name in right else "left", no_wrap=True)
+        table.add_column(name, justify="right" if name in right else "left", no_wrap=name not in folded)
     return table
 
 

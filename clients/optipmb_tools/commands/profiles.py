@@ -61,10 +61,9 @@ def _list(*, as_json: bool) -> None:
     if as_json:
         print_json({"command": "profiles", "profiles": {one: list(it.labels) for one, it in known.items()}})
         return
-    table = plain_table(("profile", "Hz", "classes"))
+    names = ("profile", "Hz", "classes")
+    table = plain_table(names, folded=names)
     table.columns[1].justify = "right"
-    for column in table.columns:
-        column.no_wrap = False
     for one, it in known.items():
         table.add_row(one, f"{1.0 / it.nominal_period:g}", ", ".join(it.labels))
     table.add_row(library.AUTO, "any", "any: made for the data by track and tune")

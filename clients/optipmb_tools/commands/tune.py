@@ -25,6 +25,7 @@ from optipmb_tools.commands.options import (
     say,
 )
 from optipmb_tools.extras import needed
+from optipmb_tools.views.progress import TrialDisplay
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -109,7 +110,7 @@ def tune(data: LabelledOptions, *, how: TuneOptions, jobs: TuneJobs, as_json: As
         seed=how.seed,
         everything=how.everything,
     )
-    with jobs.executor(opened.frames, jobs.jobs) as executor, tuning.TrialDisplay() as display:
+    with jobs.executor(opened.frames, jobs.jobs) as executor, TrialDisplay() as display:
         tuned = tuning.tune_all(source, parameters, plan, out, display, how.name, executor)
     if as_json:
         results: Mapping[str, Any] = {name: one.to_json() for name, one in tuned.items()}
@@ -151,10 +152,7 @@ def _estimate(found: "Estimate", before: "Mapping[str, object]") -> Group:
 
 
 def _table(first: str, *others: str) -> Table:
-    table = plain_table((first,), others)
-    for column in table.columns:
-        column.no_wrap = False
-    return table
+    return plain_table((first,), others, folded=(first, *others))
 
 
 def _share(value: float) -> str:

@@ -131,7 +131,7 @@ def _rosbag(root: Path, _: str | Path | None, options: _Options) -> Dataset:
 
 
 def _scene(_root: Path, _: str | Path | None, options: _Options) -> Dataset:
-    from optipmb_tools.datasets.scene import SceneDataset, scene_options  # noqa: PLC0415  of one format
+    from optipmb_tools.datasets.scene.dataset import SceneDataset, scene_options  # noqa: PLC0415  of one format
 
     numbers = {}
     for option, value in options.items():

@@ -97,7 +97,7 @@ class RecordedDataset(Dataset):
     name = "mcap"
 
     def __init__(self, path: Path) -> None:
-        files = sorted(filter(_is_recording, path.iterdir()), key=lambda one: one.stem) if path.is_dir() else [path]
+        files = sorted(path.glob("[!.]*.mcap"), key=lambda one: one.stem) if path.is_dir() else [path]
         if not files:
             raise DatasetError(path, "a folder with recordings (.mcap)", "none in it")
         self._files = {f"{file.stem}." if path.is_dir() else "": RecordingFile(file) for file in files}
@@ -145,10 +145,6 @@ class RecordedDataset(Dataset):
     def write(self, out: Path, sequence: DataSequence, tracks: Mapping[int, Tracks]) -> Path:
         """Write `out/NAME.txt` in the format of KITTI, for a camera in the sensor's place."""
         return write_kitti_results(out / f"{sequence.name}.txt", synthetic_camera(), sequence.poses, tracks)
-
-
-def _is_recording(file: Path) -> bool:
-    return file.suffix == ".mcap" and not file.name.startswith(".")
 
 
 def _pose(message: Detections | Points) -> Pose:

@@ -526,7 +526,8 @@ class NuScenesDataset(Dataset):
         wanted: list[str] = []
         for name in names:
             if name == "all":
-                wanted += self._detected()
+                rows = None if self.submission is None else self.submission.rows.keys()
+                wanted += [one.name for one in scenes.values() if rows is None or rows & set(one.tokens)]
             elif name in SPLITS or name in splits:
                 members = scenes_of_split(name) if name in SPLITS else splits[name]
                 wanted += [scene for scene in members if scene in scenes]
@@ -551,13 +552,6 @@ class NuScenesDataset(Dataset):
     @property
     def _meta(self) -> Mapping[str, Any]:
         return {} if self.submission is None else self.submission.meta
-
-    def _detected(self) -> list[str]:
-        return [
-            scene.name
-            for scene in self.tables.scenes.values()
-            if self.submission is None or any(token in self.submission.rows for token in scene.tokens)
-        ]
 
 
 def _find_tables(root: Path) -> Path:

@@ -15,10 +15,8 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from optipmb_tools.datasets import Truth
-from optipmb_tools.evaluation.cases import Case, Rules, lives, match_frames, prepare, track_changes
+from optipmb_tools.evaluation.cases import Case, Rules, lives, match_frames, track_changes
 from optipmb_tools.evaluation.figures import defined, ratio
-from optipmb_tools.results import ResultTable
 
 _MOSTLY = 0.8
 _HARDLY = 0.2
@@ -112,14 +110,6 @@ class ClearResult(Counts):
         """Return the figures by their usual names; None where undefined."""
         objects = {"MT": self.mostly_tracked, "ML": self.mostly_lost, "objects": self.objects}
         return {name: defined(value) for name, value in {**self.figures(), **objects}.items()}
-
-
-def evaluate_clear(
-    truth: Truth, tracks: ResultTable, name: str, rules: Rules | None = None, *, sequence: str = ""
-) -> ClearResult:
-    """Return the CLEAR figures of one class in one sequence; by default boxes that overlap by a quarter match."""
-    rules = rules or Rules()
-    return clear(prepare(truth, tracks, name, rules, sequence), rules)
 
 
 def clear(case: Case, rules: Rules) -> ClearResult:

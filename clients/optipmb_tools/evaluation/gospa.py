@@ -22,7 +22,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from optipmb_tools.evaluation.cases import Case, Rules, assign_frames, best_pairs, counted
-from optipmb_tools.geometry import Floats
 
 CUTOFF = 2.0
 ORDER = 2.0
@@ -84,8 +83,4 @@ def _gospa(case: Case, frames: int, cutoff: float, order: float) -> GospaResult:
     ]
     most = np.maximum(objects, tracks)
     ospa = (parts[0] + limit * (most - paired)) / np.maximum(most, 1)
-    return GospaResult(frames, *(_sum_of_roots(part, order) for part in (sum(parts), *parts, ospa)))
-
-
-def _sum_of_roots(values: Floats, order: float) -> float:
-    return float((values ** (1.0 / order)).sum())
+    return GospaResult(frames, *(float((part ** (1.0 / order)).sum()) for part in (sum(parts), *parts, ospa)))

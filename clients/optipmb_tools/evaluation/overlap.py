@@ -22,13 +22,6 @@ def iou_3d(first: tuple[Floats, Floats, Floats], second: tuple[Floats, Floats, F
     return np.asarray(common / (volume - common), dtype=np.float64)
 
 
-def iou_bev(first: tuple[Floats, Floats, Floats], second: tuple[Floats, Floats, Floats]) -> Floats:
-    """Return the intersection over union (P,) of the outlines of pairs of boxes; arguments as in `iou_3d`."""
-    common = intersection_area(first, second)
-    area = first[1][:, 0] * first[1][:, 1] + second[1][:, 0] * second[1][:, 1]
-    return np.asarray(common / (area - common), dtype=np.float64)
-
-
 def iou_2d(first: Floats, second: Floats) -> Floats:
     """Return the intersection over union (P,) of pairs of image boxes (P, 4) x1 y1 x2 y2; 0 for boxes without area."""
     low, high = np.maximum(first[:, :2], second[:, :2]), np.minimum(first[:, 2:], second[:, 2:])

@@ -85,7 +85,7 @@ def stacked(parts: Sequence[Any], name: str) -> NDArray[Any]:
 
 @dataclass(frozen=True, kw_only=True)
 class FullTable(ResultTable):
-    """All columns of the tracks of one sequence in the world frame."""
+    """The tracks of one sequence in the world frame, with their probabilities and covariances."""
 
     velocity: Floats  # (R, 2)
     yaw_rate: Floats  # (R,)
@@ -118,9 +118,9 @@ def full_path(result: Path) -> Path:
 def write_full(path: Path, tracks: Mapping[int, Tracks]) -> None:
     """Write the tracks of a sequence by frame index; the file appears complete, or not at all.
 
-    Result files of the benchmarks have no room for covariances and probabilities. This file holds every column as a
-    numpy array, one row per track and frame, ordered by frame and, in a frame, as in the result file; where tracks have
-    predicted paths, these too, named as in messages. The same tracks always give the same bytes.
+    Result files of the benchmarks have no room for covariances and probabilities. This file holds them too, each
+    column as a numpy array, one row per track and frame, ordered by frame and, in a frame, as in the result file; where
+    tracks have predicted paths, these too, named as in messages. The same tracks always give the same bytes.
     """
     parts = [tracks[index] for index in sorted(tracks)]
     table = full_table(parts[0].labels if parts else (), tracks)

@@ -130,7 +130,7 @@ def smooth(
     """
     order = np.argsort(identity, kind="stable")
     before, after = order[:-1], order[1:]
-    known = covariance[:, OMEGA, OMEGA] != 0.0  # those of unknown heading stay (`optipmb.unknown_heading`)
+    known = covariance[:, OMEGA, OMEGA] != 0.0  # states of unknown heading stay (`optipmb.unknown_heading`)
     follows = (identity[before] == identity[after]) & known[before] & known[after]
     before, after = before[follows], after[follows]
     predicted, spread, gain = _predictions(
@@ -162,11 +162,11 @@ def _predictions(
     mean: Floats, covariance: Floats, dt: Floats, label: Ints, table: ClassTable
 ) -> tuple[Floats, Floats, Floats]:
     """Return m- (R, 6), P- (R, 6, 6) and G (R, 6, 6) of filtered states, each over its own time dt (R,), s."""
-    root, points = np.empty((STATE, STATE)), np.empty((2 * STATE, STATE))
+    root, points = buffers = np.empty((STATE, STATE)), np.empty((2 * STATE, STATE))
     predicted, spread, cross = np.empty_like(mean), np.empty_like(covariance), np.empty_like(covariance)
     for row, c in enumerate(label.tolist()):
         own = table.classes[c]
-        predict_state(mean[row], covariance[row], dt[row], own, root, points, predicted[row], spread[row])
+        predict_state(mean[row], covariance[row], dt[row], own, buffers, predicted[row], spread[row])
         # The deviations X - m_k are SPREAD times the columns of the root, once plus and once minus.
         cross[row, ORDER] = root @ (points[0::2] - points[1::2]) * (SPREAD * WEIGHT)
     gain = np.linalg.solve(spread, cross.transpose(0, 2, 1)).transpose(0, 2, 1)

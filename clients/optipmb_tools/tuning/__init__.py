@@ -1,15 +1,13 @@
 """Tuning: from a detector's results and labels to a parameter profile; ablation and parameter sweeps."""
 
-from optipmb_tools.tuning.display import TrialDisplay
 from optipmb_tools.tuning.estimate import Estimate
 from optipmb_tools.tuning.refine import Plan, Refined
 from optipmb_tools.tuning.run import Curves, Source, calibrate_scores, estimate_all, tune_all
 from optipmb_tools.tuning.scoring import Figures, plain_figures
 from optipmb_tools.tuning.values import value_of
-from optipmb_tools.tuning.variants import ROWS, Row, Variant, ablation, measure_variants, sweep, write_sweep
+from optipmb_tools.tuning.variants import Row, Variant, ablation, measure_variants, sweep, write_sweep
 
 __all__ = [
-    "ROWS",
     "Curves",
     "Estimate",
     "Figures",
@@ -17,7 +15,6 @@ __all__ = [
     "Refined",
     "Row",
     "Source",
-    "TrialDisplay",
     "Variant",
     "ablation",
     "calibrate_scores",

@@ -17,11 +17,11 @@ from optipmb import Parameters
 from optipmb_tools.evaluation.calibration import CalibrationResult
 from optipmb_tools.tuning.calibrate import Ranking, calibrate, cross_calibration, rank
 from optipmb_tools.tuning.clips import Degradation
-from optipmb_tools.tuning.display import TrialDisplay
 from optipmb_tools.tuning.estimate import estimate
 from optipmb_tools.tuning.scoring import MARGIN, Figures, Gain, Measured, Objective, folds_of, plain_figures
 from optipmb_tools.tuning.search import Dimension, Search, Values, dimensions, penalty, repaired
 from optipmb_tools.tuning.values import Value, only, value_of, with_calibration, with_heading_sign, with_values
+from optipmb_tools.views.progress import TrialDisplay
 
 PENALTY = 0.0005  # cost of a value that is a whole range away from its start
 WORTH = 0.0002  # least gain in the score less the margin for which a changed value is kept

@@ -20,11 +20,11 @@ from optipmb_tools.datasets import DataSequence, DatasetArguments
 from optipmb_tools.files import write_whole
 from optipmb_tools.run.bulk import Executor
 from optipmb_tools.tuning.clips import Clip, Degradation, degrade, load, of_class
-from optipmb_tools.tuning.display import TrialDisplay
 from optipmb_tools.tuning.estimate import Estimate, estimate, pair_all, score_curve
 from optipmb_tools.tuning.refine import Plan, Refined, refine
 from optipmb_tools.tuning.scoring import Objective, rules_of, scorer_of
 from optipmb_tools.tuning.values import only, with_classes, with_score_calibration, with_values, write_profile
+from optipmb_tools.views.progress import TrialDisplay
 
 Curves = dict[str, ScoreCalibration | None]  # by class; None where there was too little to measure one
 

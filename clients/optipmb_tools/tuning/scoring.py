@@ -20,11 +20,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optipmb import Parameters, warm_up
-from optipmb_tools.datasets import DataSequence, Truth
+from optipmb_tools.datasets import DataSequence
 from optipmb_tools.datasets.nuscenes import NuScenesSequence
-from optipmb_tools.evaluation import Case, Counts, Rules, clear, combine, default_rules
+from optipmb_tools.evaluation import Rules, combine, default_rules
 from optipmb_tools.evaluation.ab3dmot import evaluate_ab3dmot
-from optipmb_tools.evaluation.cases import ab3dmot_rules, prepare
+from optipmb_tools.evaluation.cases import Case, ab3dmot_rules, prepare
+from optipmb_tools.evaluation.clear import Counts, clear
 from optipmb_tools.evaluation.figures import defined
 from optipmb_tools.evaluation.hota import HotaResult, evaluate_hota
 from optipmb_tools.evaluation.nuscenes import (
@@ -252,7 +253,7 @@ class Objective:
         self.scorer = scorer
         self.metric = metric
         self.names = tuple(clip.name for clip in variants[0])
-        own = [self._own(clip) for clip in variants[0]]
+        own = [clip.truth.take(clip.truth.names == scorer.name) for clip in variants[0]]
         self.boxes = tuple(int((~truth.ignored).sum()) for truth in own)
         """Truth boxes of each sequence that count."""
         self._objects = [len(set(truth.id[~truth.ignored].tolist())) for truth in own]
@@ -262,9 +263,6 @@ class Objective:
         self._executor = executor or Here()
         self._executor.start(_measure, (variants, scorer))
         warm_up()
-
-    def _own(self, clip: Clip) -> Truth:
-        return clip.truth.take(clip.truth.names == self.scorer.name)
 
     def measure(
         self, parameters: Parameters, clips: Sequence[int], variants: Sequence[int] | None = None

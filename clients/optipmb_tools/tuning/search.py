@@ -232,7 +232,11 @@ class Search:
                 self._study.enqueue_trial({one.path: one.value(float(start[one.path])) for one in self._space})
             elif number % _TPE_EVERY:
                 self._study.enqueue_trial(self._moved(self._best(number), rng))
-            self._study.sampler = self._sampler(int(rng.integers(2**31)))
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # multivariate has been experimental for years
+                self._study.sampler = self._optuna.samplers.TPESampler(
+                    seed=int(rng.integers(2**31)), n_startup_trials=_TPE_WARMUP, multivariate=True
+                )
             self._study.optimize(lambda trial: self._scored(trial, score), n_trials=1)
             self._file.add_trial(self.trials[-1])
             on_trial(self._study.best_value)
@@ -255,11 +259,6 @@ class Search:
                 raise self._optuna.TrialPruned
 
         return score(values, guess)
-
-    def _sampler(self, seed: int) -> Any:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # multivariate has been experimental for years
-            return self._optuna.samplers.TPESampler(seed=seed, n_startup_trials=_TPE_WARMUP, multivariate=True)
 
     def _moved(self, best: Values, rng: np.random.Generator) -> dict[str, Value]:
         changed = 1 + int(rng.choice(len(_MOVED), p=_MOVED))

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from optipmb_tools.evaluation import ClassResult, ClearResult
+    from optipmb_tools.evaluation import ClassResult
+    from optipmb_tools.evaluation.clear import ClearResult
 
 _INK, _TRUTH = "#222222", "#B5B5B5"
 _MARGIN = 6.0

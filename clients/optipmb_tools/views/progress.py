@@ -15,7 +15,30 @@ from rich.text import Text
 PLAIN_PERIOD_S = 10.0
 
 
-class FrameProgress:
+class _Bar:
+    """A bar on a terminal, with a column of its own for the rate; None elsewhere."""
+
+    def __init__(self, rate: ProgressColumn, *, terminal: bool | None) -> None:
+        self._begun = self._shown = time.monotonic()
+        self._bar: Progress | None = None
+        if sys.stderr.isatty() if terminal is None else terminal:
+            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), rate, TimeRemainingColumn())
+            self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def _begin(self) -> None:
+        self._begun = self._shown = time.monotonic()
+        if self._bar is not None:
+            self._bar.start()
+
+
+class FrameProgress(_Bar):
     """Counts frames up to a total; shows itself from the first frame on. Safe to use from several threads.
 
     Args:
@@ -25,30 +48,13 @@ class FrameProgress:
     """
 
     def __init__(self, title: str, total: int, *, terminal: bool | None = None) -> None:
+        super().__init__(_FrameRate(), terminal=terminal)
         self._title = title
         self._total = total
         self._done = 0
         self._lock = threading.Lock()
-        self._bar: Progress | None = None
-        self._begun = self._shown = time.monotonic()
-        if sys.stderr.isatty() if terminal is None else terminal:
-            self._bar = Progress(
-                TextColumn("{task.description}"),
-                BarColumn(),
-                MofNCompleteColumn(),
-                _RateColumn(),
-                TimeRemainingColumn(),
-                console=Console(stderr=True),
-                transient=True,
-            )
-            self._task = self._bar.add_task(title, total=total)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
         if self._bar is not None:
-            self._bar.stop()
+            self._task = self._bar.add_task(title, total=total)
 
     def advance(self, frames: int = 1) -> None:
         """Count `frames` more as done."""
@@ -64,20 +70,51 @@ class FrameProgress:
                 self._shown = now
                 rate = self._done / (now - self._begun)
                 left = (self._total - self._done) / rate
-                text = f"{self._title}: {self._done} of {self._total} frames, {rate:.0f} per second, {left:.0f} s left"
-                print(text, file=sys.stderr, flush=True)  # noqa: T201  this is the display
+                _print(f"{self._title}: {self._done} of {self._total} frames, {rate:.0f} per second, {left:.0f} s left")
 
     def note(self, text: str) -> None:
         """Show a line of text."""
         if self._bar is not None:
             self._bar.console.print(text, markup=False, highlight=False)
         else:
-            print(text, file=sys.stderr, flush=True)  # noqa: T201  this is the display
+            _print(text)
 
-    def _begin(self) -> None:
-        self._begun = self._shown = time.monotonic()
+
+class TrialDisplay(_Bar):
+    """Shows the trials of one class after the other; trials that an earlier session has done take no time."""
+
+    def __init__(self, *, terminal: bool | None = None) -> None:
+        super().__init__(TextColumn("{task.fields[rate]}"), terminal=terminal)
+        self._name, self._total, self._done = "", 0, 0
+
+    def begin(self, name: str, trials: int) -> None:
+        """Show that a class begins, with so many trials."""
+        self._name, self._total, self._done = name, trials, 0
+        self._begin()
         if self._bar is not None:
-            self._bar.start()
+            for task in self._bar.task_ids:
+                self._bar.remove_task(task)
+            self._task = self._bar.add_task(name, total=trials, rate="")
+
+    def trial(self, best: float) -> None:
+        """Show that a trial is done, and the best value of its search so far."""
+        self._done += 1
+        now = time.monotonic()
+        rate = self._done / max(now - self._begun, 1e-9)
+        text = f"best {best:.4f}, {60.0 * rate:.1f} trials a minute"
+        if self._bar is not None:
+            self._bar.update(self._task, advance=1, rate=text)
+        elif now - self._shown >= PLAIN_PERIOD_S or self._done == self._total:
+            self._shown = now
+            left = (self._total - self._done) / rate
+            _print(f"{self._name}: trial {self._done} of {self._total}, {text}, {left:.0f} s left")
+
+    def note(self, text: str) -> None:
+        """Show the current step."""
+        if self._bar is not None:
+            self._bar.update(self._task, description=text)
+        else:
+            _print(text)
 
 
 class StatusLine:
@@ -104,12 +141,14 @@ class StatusLine:
             self._status.update(text)
         elif time.monotonic() - self._shown >= PLAIN_PERIOD_S:
             self._shown = time.monotonic()
-            print(text, file=sys.stderr, flush=True)  # noqa: T201  this is the display
+            _print(text)
 
 
-class _RateColumn(ProgressColumn):
-    """Frames per second."""
-
+class _FrameRate(ProgressColumn):
     def render(self, task: Task) -> Text:
         """Return the rate as text; nothing before there is one."""
         return Text("" if task.speed is None else f"{task.speed:.0f} frames/s", style="progress.data.speed")
+
+
+def _print(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)  # noqa: T201  this is the display

@@ -8,6 +8,7 @@ import re
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from statistics import median_high
 
 from optipmb_schemas import MemberSummary, Problem, ServiceStatus, SessionSummary
 from rich.console import Console, Group, JustifyMethod, RenderableType
@@ -226,7 +227,7 @@ class StatusView:
                 f"{seen.frames_hz:.1f}",
                 _lost(seen.lost_hz),
                 str(sum(session.queue for session in sessions)),
-                f"{_median([session.latency_p50_ms for session in sessions]):.1f}",
+                f"{median_high([session.latency_p50_ms for session in sessions] or [0.0]):.1f}",
                 _latency(max((session.latency_p99_ms for session in sessions), default=0.0)),
                 _curve(seen.curve),
             )
@@ -311,10 +312,6 @@ def _curve(values: Iterable[float]) -> str:
     if most <= 0.0:
         return BARS[0] * len(known)
     return "".join(BARS[round(value / most * (len(BARS) - 1))] for value in known)
-
-
-def _median(values: Sequence[float]) -> float:
-    return sorted(values)[len(values) // 2] if values else 0.0
 
 
 def parts(table: Table, width: int) -> Iterator[Table]:

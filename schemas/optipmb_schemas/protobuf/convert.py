@@ -171,13 +171,15 @@ class EncodedTracks:
     """The message `Tracks`, serialized."""
     sensor: str = ""
     """Stream of the detections, where several share a session."""
+    predicted_to_ns: int = 0
+    """Time of the states, where they are predicted."""
 
     @classmethod
     def of(cls, proto: pb.Tracks, columns: bytes = b"") -> Self:
         """Return the tracks of a message, and of columns that are serialized already."""
         payload = proto.SerializeToString() + columns
         place = (proto.stream, proto.epoch, proto.seq, proto.stamp_ns)
-        return cls(*place, proto.revision, proto.delivery.run, payload, proto.sensor)
+        return cls(*place, proto.revision, proto.delivery.run, payload, proto.sensor, proto.predicted_to_ns)
 
     def message(self) -> pb.Tracks:
         """Return the message."""

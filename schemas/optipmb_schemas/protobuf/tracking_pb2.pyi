@@ -162,7 +162,7 @@ class Delivery(_message.Message):
     def __init__(self, instance: _Optional[str] = ..., received_ns: _Optional[int] = ..., published_ns: _Optional[int] = ..., queue_ms: _Optional[float] = ..., decode_ms: _Optional[float] = ..., step_ms: _Optional[float] = ..., run: _Optional[int] = ..., final_session: _Optional[str] = ..., final_ns: _Optional[int] = ...) -> None: ...
 
 class Tracks(_message.Message):
-    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "sensor", "session", "revision", "profile", "cloud_used", "gap", "ignored", "world", "labels", "id", "label", "center", "size", "yaw", "heading_confidence", "velocity", "yaw_rate", "acceleration", "existence", "score", "covariance", "age", "time_since_detection", "detection", "confirmed", "measured", "class_probability", "horizons", "path_position", "path_yaw", "path_covariance", "relocation", "delivery")
+    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "sensor", "session", "revision", "profile", "cloud_used", "gap", "ignored", "world", "labels", "predicted_to_ns", "id", "label", "center", "size", "yaw", "heading_confidence", "velocity", "yaw_rate", "acceleration", "existence", "score", "covariance", "age", "time_since_detection", "detection", "confirmed", "measured", "class_probability", "horizons", "path_position", "path_yaw", "path_covariance", "relocation", "delivery")
     STREAM_FIELD_NUMBER: _ClassVar[int]
     EPOCH_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
@@ -176,6 +176,7 @@ class Tracks(_message.Message):
     IGNORED_FIELD_NUMBER: _ClassVar[int]
     WORLD_FIELD_NUMBER: _ClassVar[int]
     LABELS_FIELD_NUMBER: _ClassVar[int]
+    PREDICTED_TO_NS_FIELD_NUMBER: _ClassVar[int]
     ID_FIELD_NUMBER: _ClassVar[int]
     LABEL_FIELD_NUMBER: _ClassVar[int]
     CENTER_FIELD_NUMBER: _ClassVar[int]
@@ -213,6 +214,7 @@ class Tracks(_message.Message):
     ignored: int
     world: int
     labels: _containers.RepeatedScalarFieldContainer[str]
+    predicted_to_ns: int
     id: Array
     label: Array
     center: Array
@@ -237,7 +239,7 @@ class Tracks(_message.Message):
     path_covariance: Array
     relocation: Relocation
     delivery: Delivery
-    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., sensor: _Optional[str] = ..., session: _Optional[str] = ..., revision: _Optional[int] = ..., profile: _Optional[str] = ..., cloud_used: _Optional[bool] = ..., gap: _Optional[int] = ..., ignored: _Optional[int] = ..., world: _Optional[int] = ..., labels: _Optional[_Iterable[str]] = ..., id: _Optional[_Union[Array, _Mapping]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., heading_confidence: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., yaw_rate: _Optional[_Union[Array, _Mapping]] = ..., acceleration: _Optional[_Union[Array, _Mapping]] = ..., existence: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., covariance: _Optional[_Union[Array, _Mapping]] = ..., age: _Optional[_Union[Array, _Mapping]] = ..., time_since_detection: _Optional[_Union[Array, _Mapping]] = ..., detection: _Optional[_Union[Array, _Mapping]] = ..., confirmed: _Optional[_Union[Array, _Mapping]] = ..., measured: _Optional[_Union[Array, _Mapping]] = ..., class_probability: _Optional[_Union[Array, _Mapping]] = ..., horizons: _Optional[_Union[Array, _Mapping]] = ..., path_position: _Optional[_Union[Array, _Mapping]] = ..., path_yaw: _Optional[_Union[Array, _Mapping]] = ..., path_covariance: _Optional[_Union[Array, _Mapping]] = ..., relocation: _Optional[_Union[Relocation, _Mapping]] = ..., delivery: _Optional[_Union[Delivery, _Mapping]] = ...) -> None: ...
+    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., sensor: _Optional[str] = ..., session: _Optional[str] = ..., revision: _Optional[int] = ..., profile: _Optional[str] = ..., cloud_used: _Optional[bool] = ..., gap: _Optional[int] = ..., ignored: _Optional[int] = ..., world: _Optional[int] = ..., labels: _Optional[_Iterable[str]] = ..., predicted_to_ns: _Optional[int] = ..., id: _Optional[_Union[Array, _Mapping]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., heading_confidence: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., yaw_rate: _Optional[_Union[Array, _Mapping]] = ..., acceleration: _Optional[_Union[Array, _Mapping]] = ..., existence: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., covariance: _Optional[_Union[Array, _Mapping]] = ..., age: _Optional[_Union[Array, _Mapping]] = ..., time_since_detection: _Optional[_Union[Array, _Mapping]] = ..., detection: _Optional[_Union[Array, _Mapping]] = ..., confirmed: _Optional[_Union[Array, _Mapping]] = ..., measured: _Optional[_Union[Array, _Mapping]] = ..., class_probability: _Optional[_Union[Array, _Mapping]] = ..., horizons: _Optional[_Union[Array, _Mapping]] = ..., path_position: _Optional[_Union[Array, _Mapping]] = ..., path_yaw: _Optional[_Union[Array, _Mapping]] = ..., path_covariance: _Optional[_Union[Array, _Mapping]] = ..., relocation: _Optional[_Union[Relocation, _Mapping]] = ..., delivery: _Optional[_Union[Delivery, _Mapping]] = ...) -> None: ...
 
 class ZoneEvent(_message.Message):
     __slots__ = ("zone", "kind", "n", "id", "label", "at_ns", "position", "speed", "yaw", "how", "dwell_s", "direction")
@@ -458,12 +460,14 @@ class SessionSummary(_message.Message):
     def __init__(self, stream: _Optional[str] = ..., profile: _Optional[str] = ..., state: _Optional[str] = ..., rate_hz: _Optional[float] = ..., latency_p50_ms: _Optional[float] = ..., latency_p99_ms: _Optional[float] = ..., frames: _Optional[int] = ..., refused: _Optional[int] = ..., shed: _Optional[int] = ..., gaps: _Optional[int] = ..., tracks: _Optional[int] = ..., queue: _Optional[int] = ..., age_s: _Optional[float] = ..., worker: _Optional[int] = ..., sensors: _Optional[_Iterable[str]] = ..., silent: _Optional[_Iterable[str]] = ..., late: _Optional[int] = ..., duplicates: _Optional[int] = ..., configured: _Optional[str] = ...) -> None: ...
 
 class TrackRequest(_message.Message):
-    __slots__ = ("detections", "points")
+    __slots__ = ("detections", "points", "traceparent")
     DETECTIONS_FIELD_NUMBER: _ClassVar[int]
     POINTS_FIELD_NUMBER: _ClassVar[int]
+    TRACEPARENT_FIELD_NUMBER: _ClassVar[int]
     detections: Detections
     points: Points
-    def __init__(self, detections: _Optional[_Union[Detections, _Mapping]] = ..., points: _Optional[_Union[Points, _Mapping]] = ...) -> None: ...
+    traceparent: str
+    def __init__(self, detections: _Optional[_Union[Detections, _Mapping]] = ..., points: _Optional[_Union[Points, _Mapping]] = ..., traceparent: _Optional[str] = ...) -> None: ...
 
 class TrackResponse(_message.Message):
     __slots__ = ("tracks", "problem", "skipped")
@@ -486,14 +490,16 @@ class PublishOptions(_message.Message):
     def __init__(self, stream: _Optional[str] = ..., cache: _Optional[int] = ..., cache_clouds: _Optional[int] = ...) -> None: ...
 
 class PublishRequest(_message.Message):
-    __slots__ = ("options", "detections", "points")
+    __slots__ = ("options", "detections", "points", "traceparent")
     OPTIONS_FIELD_NUMBER: _ClassVar[int]
     DETECTIONS_FIELD_NUMBER: _ClassVar[int]
     POINTS_FIELD_NUMBER: _ClassVar[int]
+    TRACEPARENT_FIELD_NUMBER: _ClassVar[int]
     options: PublishOptions
     detections: Detections
     points: Points
-    def __init__(self, options: _Optional[_Union[PublishOptions, _Mapping]] = ..., detections: _Optional[_Union[Detections, _Mapping]] = ..., points: _Optional[_Union[Points, _Mapping]] = ...) -> None: ...
+    traceparent: str
+    def __init__(self, options: _Optional[_Union[PublishOptions, _Mapping]] = ..., detections: _Optional[_Union[Detections, _Mapping]] = ..., points: _Optional[_Union[Points, _Mapping]] = ..., traceparent: _Optional[str] = ...) -> None: ...
 
 class Acknowledgement(_message.Message):
     __slots__ = ("detections", "points", "points_wanted")
@@ -538,20 +544,22 @@ class TrackFilter(_message.Message):
     def __init__(self, classes: _Optional[_Iterable[str]] = ..., confirmed_only: _Optional[bool] = ..., min_existence: _Optional[float] = ..., area: _Optional[_Union[Polygon, _Mapping]] = ..., fields: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class SubscribeRequest(_message.Message):
-    __slots__ = ("pattern", "filter", "max_rate_hz", "queue", "history", "problems")
+    __slots__ = ("pattern", "filter", "max_rate_hz", "queue", "history", "problems", "predict")
     PATTERN_FIELD_NUMBER: _ClassVar[int]
     FILTER_FIELD_NUMBER: _ClassVar[int]
     MAX_RATE_HZ_FIELD_NUMBER: _ClassVar[int]
     QUEUE_FIELD_NUMBER: _ClassVar[int]
     HISTORY_FIELD_NUMBER: _ClassVar[int]
     PROBLEMS_FIELD_NUMBER: _ClassVar[int]
+    PREDICT_FIELD_NUMBER: _ClassVar[int]
     pattern: str
     filter: TrackFilter
     max_rate_hz: float
     queue: int
     history: bool
     problems: bool
-    def __init__(self, pattern: _Optional[str] = ..., filter: _Optional[_Union[TrackFilter, _Mapping]] = ..., max_rate_hz: _Optional[float] = ..., queue: _Optional[int] = ..., history: _Optional[bool] = ..., problems: _Optional[bool] = ...) -> None: ...
+    predict: bool
+    def __init__(self, pattern: _Optional[str] = ..., filter: _Optional[_Union[TrackFilter, _Mapping]] = ..., max_rate_hz: _Optional[float] = ..., queue: _Optional[int] = ..., history: _Optional[bool] = ..., problems: _Optional[bool] = ..., predict: _Optional[bool] = ...) -> None: ...
 
 class SubscribeResponse(_message.Message):
     __slots__ = ("tracks", "problem", "skipped")

@@ -23,8 +23,8 @@ from optipmb_schemas.installation import install_command
 from typer.main import get_command
 
 from optipmb_service import __version__
-from optipmb_service.app import edges, health_command
-from optipmb_service.app.lifecycle import leave_or_restart
+from optipmb_service.app import health_command
+from optipmb_service.app.lifecycle import leave_or_restart, run_gateway, run_router
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.settings import (
     DEFAULT_GRPC,
@@ -147,6 +147,8 @@ def run_command(**given: Unpack[Options]) -> None:
         _needed("optipmb_service.cluster.jetstream", "cluster")
     if settings.grpc:
         _needed("grpc", "grpc")
+    if settings.traces:
+        _needed("optipmb_service.stream.traces", "traces")
     if settings.workers > 1:
         from optipmb_service.app.workers import supervise  # noqa: PLC0415 - a process that tracks needs none
 
@@ -213,7 +215,7 @@ def config_command(
 @_taking(RouterOptions)
 def router_command(**given: Unpack[RouterOptions]) -> None:
     """Run a Zenoh router alone, without tracking. SIGINT and SIGTERM end it."""
-    leave_or_restart(asyncio.run(edges.run_router(_begin(_load({**given, "router": True})))))
+    leave_or_restart(asyncio.run(run_router(_begin(_load({**given, "router": True})))))
 
 
 @app.command("grpc")
@@ -222,7 +224,7 @@ def grpc_command(**given: Unpack[GatewayOptions]) -> None:
     """Run a gRPC gateway alone, a client of routers. Prints one line, `ready …`; SIGINT and SIGTERM end it."""
     settings = _client(given, grpc=DEFAULT_GRPC)
     _needed("optipmb_service.grpc.server", "grpc")
-    leave_or_restart(asyncio.run(edges.run_gateway(settings)))
+    leave_or_restart(asyncio.run(run_gateway(settings)))
 
 
 @app.command("ros2")

@@ -37,7 +37,7 @@ from optipmb_service import __version__
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.telemetry import logs
 from optipmb_service.telemetry.certificates import Certificates
-from optipmb_service.telemetry.health import BEAT_S, ProcessHealth
+from optipmb_service.telemetry.health import BEAT_S, ProcessHealth, Reporter
 from optipmb_service.telemetry.metrics import GATEWAY_METRICS, NETWORK_METRICS, TLS_METRICS, Metrics
 from optipmb_service.zenoh.client import LISTENING, Client, certificates_of
 
@@ -436,3 +436,38 @@ async def run_client(settings: Settings, serve: Callable[[StopRequest, ProcessHe
         return True
 
     return await run(settings, connected)
+
+
+async def run_router(settings: Settings) -> int:
+    """Route until SIGINT or SIGTERM; returns the exit status, as `run` does."""
+
+    async def serve(asked: StopRequest, health: ProcessHealth) -> bool:
+        router = Client(settings)
+        health.report(Reporter(router))
+        say_ready("router", settings.instance, settings.endpoints)
+        log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
+        await asked.wait()
+        health.ends()
+        await asyncio.to_thread(router.close)
+        return True
+
+    return await run(settings, serve)
+
+
+async def run_gateway(settings: Settings) -> int:
+    """Serve gRPC until SIGINT or SIGTERM; returns the exit status, as `run` does."""
+    from optipmb_service.grpc.server import Server  # noqa: PLC0415 - an extra that only this needs
+
+    async def serve(asked: StopRequest, health: ProcessHealth, client: Client) -> None:
+        server = Server(settings, client)
+        health.metrics.add(GATEWAY_METRICS, lambda: server.metrics)
+        await server.start()
+        health.report(Reporter(client))
+        settle()
+        say_ready("grpc", server.address, settings.connect)
+        log.info("ready", instance=settings.instance, grpc=server.address, connect=settings.connect)
+        await asked.wait()
+        health.ends()
+        await server.stop()
+
+    return await run_client(settings, serve)

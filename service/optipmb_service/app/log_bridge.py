@@ -60,15 +60,10 @@ class LogBridge(Reporter):
         self._subscriptions = [client.subscribe(client.keys.all(topic), self._take) for topic in keep]
 
     @property
-    def state(self) -> str:
-        """Ready while it has a router and the servers."""
-        return "unlinked" if super().failure else "degraded" if self.failure else "ready"
-
-    @property
     def failure(self) -> str:
         """Why nothing can be received or written; empty while it can."""
         why = self.writer.failure
-        return super().failure or (f"log: {why}" if why else "")
+        return self.unlinked or (f"log: {why}" if why else "")
 
     def close(self) -> None:
         """Write the waiting messages, within the grace, and end."""

@@ -53,7 +53,7 @@ LAST_S: Final = 1.0
 QOS: Final = {"tracks": 0, "problems": 0, "events": 1, "zones": 1}
 RETAINED: Final = "zones"
 KEPT: Final = frozenset({"events"})  # topics of the network that wait for the broker
-OLD: Final = frozenset({1, 132})  # how brokers refuse the version of the protocol: those of 3.1.1, and of 5
+OLD: Final = frozenset({1, 132})  # how brokers of 3.1.1, and of 5, refuse the version of the protocol
 
 
 class Bridge(Reporter):
@@ -96,14 +96,14 @@ class Bridge(Reporter):
         return self._reader.lost_events
 
     @property
-    def state(self) -> str:
-        """Ready while it has a router and the broker."""
-        return "unlinked" if super().failure else "degraded" if self.failure else "ready"
+    def skipped(self) -> int:
+        """Messages that newer ones replaced before the broker took them."""
+        return self._reader.outbox.left_out - self._reader.lost_events
 
     @property
     def failure(self) -> str:
         """Why nothing can be received or published; empty while it can."""
-        return super().failure or ("" if self.connected else f"mqtt: {self._why}")
+        return self.unlinked or ("" if self.connected else f"mqtt: {self._why}")
 
     async def run(self) -> None:
         """Publish until it is cancelled; connect again and again."""
@@ -168,7 +168,7 @@ class Bridge(Reporter):
             self._reader.receive(one)
 
     async def _publish(self, broker: aiomqtt.Client) -> None:
-        """Publish what comes; a few messages at once, and again what the broker has not confirmed."""
+        """Publish waiting messages, a few at once; repeat unconfirmed ones."""
         outbox, properties = self._reader.outbox, None
         if self._version is aiomqtt.ProtocolVersion.V5:
             properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
@@ -194,7 +194,7 @@ async def _until_lost(broker: aiomqtt.Client) -> None:
 
 
 def _tls(settings: Settings) -> ssl.SSLContext | None:
-    """Return the certificates for the broker: the system's authorities, or those of the folder.
+    """Return the certificates for the broker: of the system's authorities, or of the folder.
 
     Raises:
         OSError: a file cannot be used.

@@ -48,6 +48,7 @@ if TYPE_CHECKING:
 
     from optipmb_service.settings import Settings
     from optipmb_service.stream.profiles import Profiles
+    from optipmb_service.stream.traces import Traces
     from optipmb_service.zenoh.client import Client
 
 log = structlog.get_logger("optipmb_service")
@@ -56,6 +57,7 @@ DRAIN_POLL_S: Final = 0.01
 JOIN_S: Final = 0.3
 SAVE_S: Final = 0.5  # the last checkpoints have so long even where messages took all the time
 NAME_CHECK_NS: Final = 10_000_000_000  # how often another process of the same name is looked for
+TRACES_S: Final = 1.0  # for sending the last spans
 LEASES_S: Final = 1.0  # kept for releasing the leases, however long the checkpoints take
 
 
@@ -96,13 +98,15 @@ class Service(Reporter):
         except TransportError:
             store.close(JOIN_S)
             raise
-        self._reporter = ProblemReporter(self._transport.publish_problem)
+        super().__init__(self.client())
+        self._reporter = ProblemReporter(self.client().publish_problem)
         self._scheduler = Scheduler()
         self._member = Member(settings.instance, store, settings.lease_s)
         self._checkpoints = CheckpointWriter(
             store, settings.checkpoint_s, self._member, self._unkept, settings.keep_days * DAY_S, keeps_nothing
         )
         self._log = open_log(settings)
+        self._traces = _traces(settings) if settings.traces else None
         self._streams = Streams(
             settings,
             profiles,
@@ -115,6 +119,7 @@ class Service(Reporter):
             arm=arm,
             metrics=self._metrics,
             tracker=tracker or profiles.trackers(partial(optipmb.Tracker, max_pairs=settings.max_pairs)),
+            traces=self._traces,
         )
         self._intake = Intake(
             self._streams,
@@ -190,6 +195,8 @@ class Service(Reporter):
         self._member.close(ends.left())
         if self._log is not None:
             self._log.close(JOIN_S)
+        if self._traces is not None:
+            self._traces.close(min(TRACES_S, ends.left()))
         self._reporter.flush(time.monotonic_ns())
         unfinished = steps.unfinished(ends.left())
         self._transport.close()
@@ -250,10 +257,6 @@ class Service(Reporter):
             problems=self._reporter.newest(),
         )
 
-    def session(self) -> Client:
-        """Return the session for readers."""
-        return self.client()
-
     def detections_of(self, stream: str) -> str:
         """Return the pattern of the streams whose detections belong to the tracks of a stream."""
         return self._streams.fusion.seen_by(stream)
@@ -312,3 +315,9 @@ class Service(Reporter):
             checkpoints=self._checkpoints.written,
             checkpoint_age_s=None if complete_ns is None else max(0, now_ns - complete_ns) / SECOND,
         )
+
+
+def _traces(settings: Settings) -> Traces:
+    from optipmb_service.stream.traces import Traces  # noqa: PLC0415 - an extra that only this needs
+
+    return Traces(settings.instance)

@@ -118,7 +118,7 @@ async def _serve(
     settle()
     watching = loop.create_task(watch_keys(asked, lambda: service.key_numbers, settings.restart_keys))
     with grpc_edge(settings, service.client(), health.metrics):
-        # In this order: messages may come as soon as the ready line is out, after this event come those of sessions.
+        # In this order: messages may come as soon as the ready line is out, and sessions log after this event.
         log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
         if parent is None:
             say_ready("instance", settings.instance, (*settings.endpoints, *settings.connect))

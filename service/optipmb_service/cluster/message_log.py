@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from nats.aio.msg import Msg
 
-    from optipmb_service.cluster.log_position import Missed, Position
+    from optipmb_service.cluster.store import Missed, Position
 
 
 log = structlog.get_logger("optipmb_service")

@@ -1,4 +1,4 @@
-"""Store of leases and checkpoints: the port `LeaseStore`; its adapters are `sqlite` and `jetstream`.
+"""Store of leases and checkpoints: the port `LeaseStore`; its adapters are `sqlite` and `jetstream`. Parts of the log.
 
 A store holds records and bytes without interpreting them. Of every stream it keeps the newest two
 checkpoints: when the newest turns out to be torn, it is set aside (kept for diagnosis, never deleted by
@@ -8,6 +8,7 @@ frozen and wakes up cannot write over what its successor has saved since.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeVar
 
 if TYPE_CHECKING:
@@ -82,6 +83,45 @@ class LeaseStore(Protocol):
 
     def close(self, timeout: float) -> None:
         """Leave the store, within `timeout` seconds; may be called twice."""
+
+
+@dataclass(frozen=True)
+class Position:
+    """Frame of a stream, after which others are looked for.
+
+    Attributes:
+        epochs: publisher epochs before its own.
+        epoch: its own.
+        seq: its number.
+        tracked: whether it was tracked: those after it are wanted, within the bound on a stream with a position.
+    """
+
+    epochs: frozenset[bytes]
+    epoch: bytes
+    seq: int
+    tracked: bool
+
+    def covers(self, epoch: bytes, seq: int) -> bool:
+        """Return whether a frame is not later than this one."""
+        return epoch in self.epochs or (epoch == self.epoch and seq <= self.seq)
+
+
+@dataclass(frozen=True)
+class Missed:
+    """Part of the log that a session needs.
+
+    Attributes:
+        streams: whose detections.
+        common: a node, `site/node`, or a site, whose streams in the log are wanted too where `belongs` says so; empty:
+            none.
+        belongs: whether such a stream feeds the session.
+        positions: where streams are; of one without a position the last seconds are wanted.
+    """
+
+    streams: Sequence[str]
+    common: str
+    belongs: Callable[[str], bool]
+    positions: Mapping[str, Position]
 
 
 _T = TypeVar("_T")

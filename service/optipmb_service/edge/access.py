@@ -1,4 +1,4 @@
-"""Who calls, and what they may do: by a name, as the routers of a protected network decide.
+"""Rights of callers by their names, as the routers of a protected network decide.
 
 | name | may |
 | --- | --- |
@@ -6,7 +6,7 @@
 | `service/name` | read and command all streams |
 | `viewer/name` | read all streams |
 
-The name is that of a certificate or a token. Without both everybody may do everything, as on a network without access
+The name comes from a certificate or a token. Without both everybody may do everything, as on a network without access
 control.
 """
 
@@ -38,7 +38,7 @@ class NotAllowedError(Exception):
 
 @dataclass(frozen=True)
 class Caller:
-    """Who calls, and what they may do.
+    """A caller and its rights.
 
     Attributes:
         name: in the certificate, or of the token; empty: anybody.
@@ -80,7 +80,7 @@ class Caller:
 
 
 def token_names(setting: str, value: str) -> Tokens:
-    """Return the function that finds names: `module:function`, or that of a file with the SHA-256 of each token.
+    """Return the function that finds names: `module:function`, or one for a file with the SHA-256 of each token.
 
     Raises:
         ClientError: the setting cannot be used.

@@ -16,6 +16,7 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
 
 import optipmb_schemas as schemas
+import structlog
 from optipmb_client.merging import FinalEvents
 from optipmb_schemas import json_form
 from optipmb_schemas.json_form import EVERYTHING, Selection
@@ -25,6 +26,7 @@ from optipmb_service.zenoh.client import SharedSubscriptions, Turns
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
+    from optipmb_client.incoming import Answer
     from optipmb_client.zenoh.handles import Reading
     from optipmb_client.zenoh.session import Session
     from optipmb_schemas.json_form import Place
@@ -55,16 +57,23 @@ QUERY_S: Final = 2.0
 TOLERANCE: Final = 0.999
 """Part of a period that counts as a whole one: stamps of real sensors jitter."""
 
+PREDICTED_TOLERANCE: Final = 0.95
+"""The same of predicted states: the time of an output jitters by milliseconds."""
+
 REMEMBERED: Final = 64
 
 KINDS: Final[dict[str, type[schemas.Message]]] = {
     "detections": schemas.Detections,
     "tracks": schemas.Tracks,
+    "now": schemas.Tracks,
     "events": schemas.Events,
     "problems": schemas.Problem,
 }
 
 T = TypeVar("T")
+M = TypeVar("M", bound=schemas.Message)
+
+log = structlog.get_logger("optipmb_service")
 
 
 class Outbox(Generic[T]):
@@ -159,15 +168,18 @@ class Pace:
 
     Args:
         max_rate_hz: highest rate; 0: all frames.
+        predict: whether the stamps are times of predicted states, which nothing corrects.
 
     Raises:
         MessageError: it is no rate.
     """
 
-    def __init__(self, max_rate_hz: float) -> None:
+    def __init__(self, max_rate_hz: float, *, predict: bool = False) -> None:
         if not 0 <= max_rate_hz < float("inf"):
             raise schemas.MessageError("invalid_value", "max_rate_hz", "a rate in Hz, or 0", f"{max_rate_hz:g}")
-        self._period_ns = TOLERANCE * 1e9 / max_rate_hz if max_rate_hz else 0.0
+        tolerance = PREDICTED_TOLERANCE if predict else TOLERANCE
+        self._period_ns = tolerance * 1e9 / max_rate_hz if max_rate_hz else 0.0
+        self._predict = predict
         self._passed: dict[str, collections.deque[int]] = {}
 
     def passes(self, stream: str, stamp_ns: int) -> bool:
@@ -176,7 +188,7 @@ class Pace:
             return True
         passed = self._passed.setdefault(stream, collections.deque(maxlen=REMEMBERED))
         if stamp_ns in passed:
-            return True
+            return not self._predict
         if passed and abs(stamp_ns - passed[-1]) < self._period_ns:
             return False
         passed.append(stamp_ns)
@@ -200,10 +212,7 @@ class Publication:
     @cached_property
     def message(self) -> Any:
         """The message; None where it is not valid."""
-        try:
-            return schemas.decode(self.payload, KINDS[self.topic], encoding=self.encoding)
-        except schemas.MessageError:
-            return None
+        return _valid(KINDS[self.topic], self)
 
     @property
     def place(self) -> Place | None:
@@ -227,6 +236,15 @@ class Publication:
         return json_form.zones_json(self.message)
 
 
+def _valid(kind: type[M], one: Publication | Answer) -> M | None:
+    """Return the message that came; None for one that is not valid, which is logged."""
+    try:
+        return schemas.decode(one.payload, kind, encoding=one.encoding)
+    except schemas.MessageError as error:
+        log.warning("edge_invalid", reason=str(error))
+        return None
+
+
 class Text(NamedTuple):
     """A text that waits for a reader."""
 
@@ -245,6 +263,8 @@ class Wish:
     max_rate_hz: float = 0.0
     final: bool = True
     """Whether it gets events when they do not change any more, each once, or as they are published."""
+    predict: bool = False
+    """Whether it gets tracks at a fixed rate, predicted to now."""
 
     def keys(self, keys: schemas.Keys) -> list[str]:
         """Return the keys to subscribe to.
@@ -252,7 +272,8 @@ class Wish:
         Raises:
             MessageError: a pattern is none.
         """
-        topics = {"events" if topic == "zones" else topic for topic in self.topics}
+        named = {"zones": "events", "tracks": "now" if self.predict else "tracks"}
+        topics = {named.get(topic, topic) for topic in self.topics}
         return [keys.matching(one, topic) for topic in sorted(topics) for one in self.streams]  # type: ignore[arg-type]
 
 
@@ -260,7 +281,7 @@ class Reader:
     """Queue of the texts for one reader. To be made and read on its loop.
 
     Args:
-        wish: what it wants.
+        wish: its streams and topics.
         events: how many events may wait; beyond, the oldest are lost.
     """
 
@@ -272,8 +293,8 @@ class Reader:
         self.want(wish)
 
     def want(self, wish: Wish) -> None:
-        """Change what it wants."""
-        self._wish, self._pace = wish, Pace(wish.max_rate_hz)
+        """Change its streams and topics."""
+        self._wish, self._pace = wish, Pace(wish.max_rate_hz, predict=wish.predict)
 
     async def take(self, seconds: float | None = None) -> bytes | None:
         """Return the next text; None when events were lost, and the reader is to come again.
@@ -292,8 +313,9 @@ class Reader:
         if message is None:
             return
         stream, size, put = message.stream, len(one.payload), self.outbox.put
-        if one.topic == "tracks" and self._pace.passes(stream, message.stamp_ns):
-            put(f"tracks {stream}", Text("tracks", stream, partial(one.tracks, self._wish.selection)), size)
+        if one.topic in {"tracks", "now"}:
+            if self._pace.passes(stream, message.predicted_to_ns or message.stamp_ns):
+                put(f"tracks {stream}", Text("tracks", stream, partial(one.tracks, self._wish.selection)), size)
         elif one.topic == "problems":
             text = Text("problems", stream, partial(json_form.problem_json, message))
             put(f"problems {stream}", text, size, PROBLEMS)
@@ -338,7 +360,7 @@ class Feeds:
             return joined.pop_all().close
 
     def _subscribe(self, key: str, receive: Callable[[Publication], None]) -> Reading:
-        """Subscribe: to events with what was lost, and was published just before; to others as they come."""
+        """Subscribe: to events with recovery and history, to other topics without."""
         self._turns.take()
         if key.endswith("/events"):
             return self.session.subscribe(
@@ -375,10 +397,9 @@ async def listed(session: Session, keys: schemas.Keys, pattern: str) -> list[tup
     services = {keys.instance_of(key) for key in alive}
     found = []
     for answer in answers:
-        if answer.ok:
-            status = schemas.decode(answer.payload, schemas.ServiceStatus, encoding=answer.encoding)
-            if status.instance in services:
-                found += [(status.instance, one) for one in status.sessions if _matches(one.stream, pattern)]
+        status = _valid(schemas.ServiceStatus, answer) if answer.ok else None
+        if status is not None and status.instance in services:
+            found += [(status.instance, one) for one in status.sessions if _matches(one.stream, pattern)]
     return sorted(found, key=lambda entry: (entry[1].stream, entry[0]))
 
 

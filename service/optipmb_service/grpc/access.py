@@ -1,4 +1,4 @@
-"""Who calls over gRPC: by the name in the certificate, or of a token; `edge.access` tells what they may do.
+"""Names of callers over gRPC, from certificates or tokens; `edge.access` has their rights.
 
 The certificates of the gateway are read again when their files have changed, so that they can be renewed.
 """
@@ -26,7 +26,7 @@ log = structlog.get_logger("optipmb_service")
 
 
 class Access:
-    """Tells who calls.
+    """Finds the names of callers.
 
     Args:
         certificates: whether callers show one.

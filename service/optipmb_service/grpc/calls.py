@@ -90,6 +90,7 @@ class Call:
         gateway: the server of the call.
         caller: who makes it.
         left_out: responses that the caller was too slow for.
+        traceparent: W3C trace context in its metadata, unchecked.
     """
 
     def __init__(
@@ -98,6 +99,7 @@ class Call:
         self.gateway = gateway
         self.caller = caller
         self.left_out = 0
+        self.traceparent = str(dict(context.invocation_metadata() or ()).get("traceparent", ""))
         self._context = context
         self._method = method
         self._ended = asyncio.Event()

@@ -9,6 +9,7 @@ import time
 from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_schemas as schemas
+from optipmb_client.trace_context import attachment_of
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
@@ -137,6 +138,7 @@ class _Inputs:
         self._outgoing: Outgoing | None = None
         self._matched = asyncio.Event()
         self._waited = False
+        self._traceparent = ""
         self.stream = ""
         """Name of the stream; the first message says it."""
 
@@ -190,14 +192,16 @@ class _Inputs:
                 return
         put = outgoing.detections if isinstance(message, schemas.Detections) else outgoing.points
         payload = schemas.encoded(message)
+        attachment = attachment_of(self._traceparent)
         if len(payload) <= INLINE_BYTES:
-            put(payload)
+            put(payload, attachment)
         else:
-            await asyncio.to_thread(put, payload)
+            await asyncio.to_thread(put, payload, attachment)
 
     def _read(self, payload: bytes) -> Input:
         request = convert.parse(payload, self._kind)
         name = request.WhichOneof("request")
+        self._traceparent = request.traceparent or self._call.traceparent
         if name is None:
             raise schemas.MessageError("missing_field", "request", "detections or points", "nothing")
         message = getattr(request, name)

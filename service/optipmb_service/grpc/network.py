@@ -174,7 +174,7 @@ class Network:
         try:
             yield outgoing
         finally:
-            outgoing.wanted = _nobody
+            outgoing.wanted = lambda: None
             # Cached clouds take much memory; another call may have left its own publishers.
             if key[2] or not self._idle_publishers.keep(key, outgoing):
                 await asyncio.shield(asyncio.to_thread(outgoing.close))
@@ -243,7 +243,3 @@ class Network:
         except schemas.MessageError as error:
             self._invalid(str(error))
             return None
-
-
-def _nobody() -> None:
-    """Tell nobody."""

@@ -42,15 +42,16 @@ async def subscribe(call: Call) -> None:
     """Send the tracks of a pattern until the caller or the gateway ends it."""
     asked = await call.request(pb.SubscribeRequest)
     keys, network = call.gateway.client.keys, call.gateway.network
-    tracks, problems = keys.matching(asked.pattern, "tracks"), keys.matching(asked.pattern, "problems")
+    tracks = keys.matching(asked.pattern, "now" if asked.predict else "tracks")
+    problems = keys.matching(asked.pattern, "problems")
     call.caller.may_read(asked.pattern)
-    selection, pace = Selection(asked.filter), Pace(asked.max_rate_hz)
+    selection, pace = Selection(asked.filter), Pace(asked.max_rate_hz, predict=asked.predict)
     if asked.queue > MAX_QUEUE:
         raise schemas.MessageError("too_large", "queue", f"at most {MAX_QUEUE}", str(asked.queue))
     outbox = Outbox[bytes](asked.queue or QUEUE)
 
     def passes(one: EncodedTracks) -> bool:
-        return pace.passes(one.stream, one.stamp_ns)
+        return pace.passes(one.stream, one.predicted_to_ns or one.stamp_ns)
 
     def put(item: Item) -> None:
         outbox.put(item.stream, item.response, len(item.response))
@@ -61,7 +62,7 @@ async def subscribe(call: Call) -> None:
         if asked.problems:
             await subscriptions.enter_async_context(network.subscribed(problems, listener))
         await call.begin()
-        history = await network.recent(tracks)
+        history = [] if asked.predict else await network.recent(tracks)
         for one in history if asked.history else ():
             if passes(one):
                 await call.write(Item.of_tracks(one, selection).response)

@@ -42,7 +42,7 @@ RETRY_MS: Final = 15_000  # a reader whose stream cannot be subscribed to comes 
 PROTOCOL: Final = "optipmb.v1"  # subprotocol of the WebSocket
 BEARER: Final = "bearer."  # a second subprotocol with the token of a browser, which can set no header
 NAMES: Final = 256
-RECENT: Final = 32  # messages of events among which one has counts: those of more than a second
+RECENT: Final = 32  # newest messages of events, of more than a second, among which one has counts
 TRY_AGAIN, MALFORMED = 1013, 1008  # why a WebSocket was closed
 HEADERS: Final = {"cache-control": "no-store", "x-content-type-options": "nosniff", "referrer-policy": "no-referrer"}
 
@@ -239,6 +239,7 @@ class _Asked(Struct, frozen=True):
     max_rate_hz: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
     fields: Names = frozenset()
     events: Literal["final", "now"] = "final"
+    predict: bool = False
 
 
 class _Incoming(Struct, forbid_unknown_fields=True):
@@ -272,7 +273,7 @@ def wish_of(parameters: Mapping[str, Any]) -> Wish:
     if wrong := asked.fields - FIELDS:
         raise schemas.MessageError("invalid_value", "fields", f"of {', '.join(sorted(FIELDS))}", ascii(min(wrong))[:80])
     selection = Selection(asked.classes, asked.confirmed, asked.min_existence, asked.fields)
-    return Wish((asked.stream,), asked.topics, selection, asked.max_rate_hz, asked.events == "final")
+    return Wish((asked.stream,), asked.topics, selection, asked.max_rate_hz, asked.events == "final", asked.predict)
 
 
 class Api:
@@ -300,6 +301,8 @@ class Api:
     async def tracks(self, request: Request) -> Response:
         """Answer with the newest frame of each stream."""
         _, wish = await self._asked(request)
+        if wish.predict:
+            raise schemas.MessageError("invalid_value", "predict", "0 here: `stream` and `ws` predict", "1")
         (key,) = wish.keys(self._readers.keys)
         return _array([one.tracks(wish.selection) for one in await self._newest(key)])
 
@@ -350,7 +353,7 @@ class Api:
                 await websocket.close(MALFORMED, str(error)[:100])
                 return
             reader.want(wish)
-            async with joined.pop_all():  # what it read before, until it has the rest
+            async with joined.pop_all():  # the earlier subscriptions stay until the new ones are there
                 try:
                     await joined.enter_async_context(self._readers.joined(keys, reader))
                 except TransportError as error:
@@ -358,7 +361,7 @@ class Api:
                     return
 
     async def _asked(self, connection: HTTPConnection) -> tuple[Caller, Wish]:
-        """Return who asks, and for what they may read."""
+        """Return the caller and a wish that it may read."""
         caller = await self._readers.caller(connection)
         wish = wish_of(connection.query_params)
         wish.keys(self._readers.keys)
@@ -368,7 +371,7 @@ class Api:
     async def _newest(
         self, key: str, most: int = 1, fits: Callable[[Publication], bool] = lambda _: True
     ) -> list[Publication]:
-        """Return the newest message of each stream, by stream: that of the newest run."""
+        """Return the newest message of each stream, by stream, from its newest run."""
         newest: dict[str, Publication] = {}
         found = await asyncio.to_thread(self._readers.feeds().newest, key, most)
         for one in sorted((one for one in found if one.message is not None and fits(one)), key=_order):

@@ -111,10 +111,10 @@ def _answer(body: dict[str, object], *, well: bool) -> Response:
 
 
 class _Guarded:
-    """An application that answers known host names, and a bounded number of requests beside probes and readers.
+    """An application that answers known host names, and a bounded number of requests, without probes and readers.
 
-    A WebSocket is opened for programs, for pages of this service, and for those of the settings: a browser asks nobody
-    before it opens one for a page of a stranger.
+    A WebSocket is opened for programs, for pages of this service, and for pages of `http_origins`: a browser opens one
+    for the page of a stranger without asking.
     """
 
     def __init__(self, application: ASGIApp, settings: Settings, readers: Readers) -> None:

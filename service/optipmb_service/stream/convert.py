@@ -147,7 +147,7 @@ def tracks_of(result: optipmb.StepResult, stream: str, frame_id: FrameId, **fiel
     """Return the tracks of a frame, with paths and classes if there are any.
 
     What the tracker made of checked detections needs one look, not the checks of a message from elsewhere; where that
-    look finds something odd, those checks say what it is.
+    look finds something odd, those checks name the error.
 
     Args:
         result: of the step.

@@ -388,7 +388,8 @@ class PoseCheck:
         """
         if message.pose is None:
             return ""
-        (x, y, height), (w, _, _, z) = message.pose.translation.tolist(), message.pose.quaternion.tolist()
+        x, y, height = message.pose.translation.tolist()
+        w, _, _, z = message.pose.quaternion.tolist()
         here = optipmb.Relocation(x, y, height, 2.0 * math.atan2(z, w))
         world = self._world if message.relocation is None else message.relocation.world
         if self._last is None or world != self._world or self._astray >= policy.astray_frames:
@@ -398,21 +399,24 @@ class PoseCheck:
         dt = (message.stamp_ns - then_ns) / SECOND
         if dt <= 0.0:
             return ""
-        rate = _difference(here, there, 1.0 / dt) if self._rate is None else self._rate
-        ahead = optipmb.Relocation(*(one + dt * change for one, change in zip(there, rate, strict=True)))
-        x, y, height, turn = _difference(here, ahead)
-        far, (metres, acceleration, angle, change) = math.hypot(x, y, height), STEADY
         if policy.max_speed and math.dist(here[:3], there[:3]) > policy.pose_margin + policy.max_speed * dt:
             self._astray += 1
             return ""
         self._astray, self._last = 0, (message.stamp_ns, here)
-        if far <= metres + acceleration * dt * dt and abs(turn) <= angle + change * dt * dt:
-            self._rate = _difference(here, there, 1.0 / dt)
+        seen = _difference(here, there, 1.0 / dt)
+        rate = self._rate or seen
+        expected = optipmb.Relocation(*(one + dt * change for one, change in zip(there, rate, strict=True)))
+        error = _difference(here, expected)
+        distance, turn = math.hypot(*error[:3]), error.theta
+        metres, acceleration, angle, angular_acceleration = STEADY
+        if distance <= metres + acceleration * dt * dt and abs(turn) <= angle + angular_acceleration * dt * dt:
+            self._rate = seen
             return ""
+        # The sensor keeps its motion, which has turned with the world.
         motion = optipmb.Relocation(0.0, 0.0, 0.0, turn)
         self._rate = optipmb.Relocation(*motion.place(rate[:3]), rate.theta)
-        shift = [f"{one - other:.3f}" for one, other in zip(here, motion.place(ahead[:3]), strict=False)]
-        jump = f"{far:.2f} m and {math.degrees(turn):.2f} degrees"
+        shift = [f"{one - other:.3f}" for one, other in zip(here, motion.place(expected[:3]), strict=False)]
+        jump = f"{distance:.2f} m and {math.degrees(turn):.2f} degrees"
         return f"a jump by {jump}, as of a motion by [{', '.join(shift)}] m and {turn:.5f} rad"
 
 

@@ -63,8 +63,8 @@ CODES: Final = {
         "Check the sensor's clock.",
     ),
     "clock": (
-        "The stamps of twenty frames do not advance, or not in nanoseconds; the frames are tracked nevertheless.",
-        "Send the time of the measurement, in nanoseconds, as `stamp_ns`.",
+        "Stamps do not advance, or not in nanoseconds, or, with `outputs`, are not system time; frames are tracked.",
+        "Send the time of the measurement, in nanoseconds, as `stamp_ns`; in `outputs`, see `clock`.",
     ),
     "restarted": (
         "The session restarted: its tracks ended (`clock`: objects found again keep ids). `received` has the reason.",

@@ -394,7 +394,8 @@ class ServiceQueries:
         key = self._keys.recent(self._streams.instance)
 
         def give(packet: Packet) -> None:
-            request.answer_text(key, packet.payload or b"", packet.encoding, about=packet.key)
+            about = f"{packet.key}\n{packet.traceparent}" if packet.traceparent else packet.key
+            request.answer_text(key, packet.payload or b"", packet.encoding, about=about)
 
         self._handed_over((request.payload or b"").decode("ascii", "replace").splitlines(), give)
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 import structlog
 from optipmb_client.errors import ConnectionFailed as TransportError
 
-from optipmb_service.cluster.log_position import Missed, Position
+from optipmb_service.cluster.store import Missed, Position
 from optipmb_service.stream.directory import BACK_NS
 from optipmb_service.stream.timeline import number_of
 from optipmb_service.stream.values import MAX_SENSORS

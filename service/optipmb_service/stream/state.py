@@ -107,7 +107,7 @@ class FilterState:
         tracks: number of tracks at the last frame tracked.
         counts: of the frames.
         sensors: each sensor by its stream; the only one of a stream's own session by an empty name.
-        zones: what is known of the zones; None: it has none.
+        zones: state of the zones; None: it has none.
         worlds: its world frames; None: no relocation was announced.
     """
 

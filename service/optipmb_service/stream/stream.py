@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import optipmb_schemas as schemas
 import structlog
 from optipmb_client.errors import ConnectionFailed as TransportError
+from optipmb_client.trace_context import attachment_of
 
 from optipmb_service.stream.checkpoint import CheckpointError, forgotten
 from optipmb_service.stream.persistence import save_dump
@@ -31,9 +32,13 @@ from optipmb_service.zenoh.inputs import Packet
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from opentelemetry.context import Context
+
     from optipmb_service.stream.backlog import Backlog, Shed
     from optipmb_service.stream.checkpoint import Checkpoint
+    from optipmb_service.stream.fixed_rate import FixedRate
     from optipmb_service.stream.streams import Streams
+    from optipmb_service.stream.traces import FrameTrace, Traces
     from optipmb_service.stream.values import Output, Reached
     from optipmb_service.zenoh.transport import StreamPublisher
 
@@ -55,11 +60,12 @@ CLOUD_REFUSED: Final = {"invalid_value", "refused"}
 
 
 class Arrival(NamedTuple):
-    """Times of a frame's arrival, and of its decoding."""
+    """Times of a frame's arrival, and of its decoding; its trace, where traces are recorded."""
 
     wall_ns: int
     now_ns: int
     decode_ns: int
+    trace: FrameTrace | None = None
 
 
 class Stream:
@@ -87,7 +93,9 @@ class Stream:
         self._prefix = f"{streams.keys.prefix}/"
         self._step_limit_ns = streams.step_limit_ns
         self._publisher: StreamPublisher | None = None
-        self._unpublished: list[tuple[bytes, bytes | None, Tracked, int]] = []
+        self._fixed_rate: FixedRate | None = None
+        self._traces: Traces | None = streams.traces
+        self._unpublished: list[tuple[bytes, bytes | None, Tracked, int, Context | None]] = []
         """Encoded tracks and events that wait for the write lease, each with the time that its frame waited, ns."""
         self._ids = b""
         """Ids of the newest tracks, as the bytes of int64."""
@@ -188,17 +196,21 @@ class Stream:
             self.report("internal", "", "a message handled without an error", f"{type(error).__name__}: {error}")
 
     def _settle(self) -> None:
-        """Process frames whose wait is over, and ask for a turn for the others."""
+        """Process frames whose wait is over, send predicted tracks that are due, and ask for the next turn."""
         for origin, shed in self.backlog.shed_since().items():
             expected, received = f"at most {self._streams.queue_frames} frames waiting", "more; the oldest were dropped"
             self.report("shed", "", expected, f"{shed} {received}", count=shed, stream=self._stream_of(origin))
         session = self.session
-        if session is None or (deadline_ns := session.deadline_ns) is None:
+        if session is None:
             return
-        now_ns = time.monotonic_ns()
-        if deadline_ns <= now_ns and not self.backlog.clouds_waiting:
+        now_ns, deadline_ns = time.monotonic_ns(), session.deadline_ns
+        if deadline_ns is not None and deadline_ns <= now_ns and not self.backlog.clouds_waiting:
             self.deliver(session.on_tick(now_ns))
             deadline_ns = session.deadline_ns
+        if self._fixed_rate is not None:
+            self._send_predicted(session, self._fixed_rate)
+            due = [one for one in (deadline_ns, self._fixed_rate.due_ns) if one is not None]
+            deadline_ns = min(due, default=None)
         if deadline_ns == 0:
             self.backlog.wake()  # more is ready: after the other streams
         elif deadline_ns is not None and deadline_ns != self._armed_ns:
@@ -244,7 +256,9 @@ class Stream:
             return
         now_ns = time.monotonic_ns()
         self.sensors.arrived(packet, message.stream)
-        ticket = Arrival(packet.wall_ns, packet.now_ns, time.perf_counter_ns() - began_ns)
+        decode_ns = time.perf_counter_ns() - began_ns
+        trace = self._traces.received(packet, message) if self._traces else None
+        ticket = Arrival(packet.wall_ns, packet.now_ns, decode_ns, trace)
         if isinstance(message, schemas.Points):
             outputs = session.on_points(message, now_ns, ticket=ticket)
             if any(getattr(one, "code", "") in CLOUD_REFUSED for one in outputs):
@@ -303,10 +317,14 @@ class Stream:
                 log.error("session_quarantined", stream=self.name, error=output.error, file=file)
             else:
                 self._streams.reporter.report(output, time.monotonic_ns())
+        if self._fixed_rate is not None and (wrong := self._fixed_rate.take(outputs, time.monotonic_ns())):
+            self.report("clock", "stamp_ns", 'system time, or `clock = "arrival"` in `outputs`', wrong)
 
     def _open_publisher(self) -> None:
+        self._fixed_rate = self._streams.fixed_rate_for(self.name)
+        kinds = {"events": bool(self._policy.zones), "now": self._fixed_rate is not None}
         try:
-            self._publisher = self._streams.open_publisher(self.name, bool(self._policy.zones))
+            self._publisher = self._streams.open_publisher(self.name, **kinds)
         except TransportError as error:
             log.warning("publisher_failed", stream=self.name, error=str(error))
 
@@ -322,36 +340,54 @@ class Stream:
         ticket: Arrival = tracked.ticket
         passed_ns = time.monotonic_ns() - ticket.now_ns
         waited_ns = max(0, passed_ns - ticket.decode_ns - tracked.step_ns)
-        delivery = {
-            "instance": self._streams.instance,
-            "received_ns": ticket.wall_ns,
-            "published_ns": time.time_ns(),
-            "queue_ms": waited_ns / MILLISECOND,
-            "decode_ms": ticket.decode_ns / MILLISECOND,
-            "step_ms": tracked.step_ns / MILLISECOND,
-            "run": tracked.run,
-        }
+        delivery = self._delivery(tracked, waited_ns)
         events = tracked.encoded_events(delivery, self.durable)
         if not again:
             self._count_tracks(tracked.estimates.id.tobytes())
-        self._unpublished.append((b"" if again else tracked.encoded(delivery), events, tracked, waited_ns))
+        span = self._traces.tracked(ticket.trace, tracked) if self._traces and ticket.trace else None
+        self._unpublished.append((b"" if again else tracked.encoded(delivery), events, tracked, waited_ns, span))
         self._publish()
+
+    def _delivery(self, tracked: Tracked, waited_ns: int) -> dict[str, Any]:
+        return {
+            "instance": self._streams.instance,
+            "received_ns": tracked.ticket.wall_ns,
+            "published_ns": time.time_ns(),
+            "queue_ms": waited_ns / MILLISECOND,
+            "decode_ms": tracked.ticket.decode_ns / MILLISECOND,
+            "step_ms": tracked.step_ns / MILLISECOND,
+            "run": tracked.run,
+        }
+
+    def _send_predicted(self, session: Session, fixed_rate: FixedRate) -> None:
+        """Send the tracks predicted to now, if they are due."""
+        due_ns, now_ns = fixed_rate.due_ns, time.monotonic_ns()
+        tracked = fixed_rate.due(now_ns, time.time_ns(), session.parameters)
+        if tracked is None or due_ns is None or self._publisher is None:
+            return
+        try:
+            self._publisher.publish_now(tracked.encoded(self._delivery(tracked, now_ns - due_ns)))
+        except TransportError as error:
+            log.warning("publish_failed", stream=self.name, error=str(error))
 
     def _publish(self) -> None:
         """Publish what waits, if the write lease holds."""
         if not self._unpublished or not self._member.may_write(self.name, self._fence):
             return
         waiting, self._unpublished = self._unpublished, []
-        for payload, events, tracked, waited_ns in waiting:
+        for payload, events, tracked, waited_ns, span in waiting:
+            attachment = attachment_of(self._traces.traceparent(span)) if self._traces and span else None
             try:
                 if self._publisher is not None:
                     if payload:
-                        self._publisher.publish(payload)
+                        self._publisher.publish(payload, attachment)
                     if events is not None:
                         self._publisher.publish_events(events)
             except TransportError as error:
                 log.warning("publish_failed", stream=self.name, error=str(error))
                 continue
+            if self._traces and span:
+                self._traces.published(span)
             if payload:
                 latency_ns = time.monotonic_ns() - tracked.ticket.now_ns
                 self.meter.published(latency_ns)
@@ -634,8 +670,12 @@ class Stream:
         for message, ticket in session.unprocessed():
             key = (keys.detections if isinstance(message, schemas.Detections) else keys.points)(message.stream)
             payload = schemas.encode(message)
-            came = (ticket.wall_ns, ticket.now_ns) if isinstance(ticket, Arrival) else (wall_ns, now_ns)
-            self.backlog.push(Packet(key, payload, len(payload), schemas.encoding_of(message), *came))
+            came, parent = (wall_ns, now_ns), ""
+            if isinstance(ticket, Arrival):
+                came = ticket.wall_ns, ticket.now_ns
+                if self._traces and ticket.trace:
+                    parent = self._traces.traceparent(ticket.trace.context)
+            self.backlog.push(Packet(key, payload, len(payload), schemas.encoding_of(message), *came, parent))
 
     def keep(self) -> None:
         """Give the state to the checkpoint writer, if it changed."""
@@ -655,7 +695,7 @@ class Stream:
     def _drop_session(self, reason: str) -> None:
         if (session := self.session) is None:
             return
-        self.session, self._armed_ns = None, None
+        self.session, self._armed_ns, self._fixed_rate = None, None, None
         self._caches.forget()
         self._unpublished.clear()  # another owner publishes it
         self._count_tracks(b"")

@@ -22,6 +22,7 @@ from optipmb.zones import MOST
 from optipmb_service.cluster.leases import Change, partition_of
 from optipmb_service.stream.admission import Admission
 from optipmb_service.stream.backlog import MEGABYTE, Backlog, Bounds, ByteBudget
+from optipmb_service.stream.fixed_rate import FixedRate
 from optipmb_service.stream.problems import problem_of
 from optipmb_service.stream.profiles import FUSED, Fusion
 from optipmb_service.stream.stream import Stream
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from optipmb_service.stream.persistence import CheckpointWriter
     from optipmb_service.stream.profiles import Profiles
     from optipmb_service.stream.recovery import Log
+    from optipmb_service.stream.traces import Traces
     from optipmb_service.stream.values import Incarnation
     from optipmb_service.telemetry.metrics import Metrics
     from optipmb_service.telemetry.problem_reporter import ProblemReporter
@@ -91,7 +93,7 @@ class Streams:
     Args:
         settings: in force.
         profiles: the parameters that can be had.
-        open_publisher: opens the publisher of a stream's tracks, and of its events.
+        open_publisher: opens the publishers of a stream (`Transport.open_publisher`).
         reporter: takes problems.
         scheduler: runs the streams.
         member: knows which streams are tracked here.
@@ -100,6 +102,7 @@ class Streams:
         arm: calls a function at a monotonic time (ns).
         metrics: counts messages.
         tracker: makes the trackers of sessions.
+        traces: records spans of frames, where it is asked for.
     """
 
     caches: Intake
@@ -110,7 +113,7 @@ class Streams:
         settings: Settings,
         profiles: Profiles,
         *,
-        open_publisher: Callable[[str, bool], StreamPublisher],
+        open_publisher: Callable[..., StreamPublisher],
         reporter: ProblemReporter,
         scheduler: Scheduler,
         member: Member,
@@ -119,6 +122,7 @@ class Streams:
         arm: Callable[[Callable[[], None], int], None],
         metrics: Metrics,
         tracker: Callable[[optipmb.Parameters], Any] = optipmb.Tracker,
+        traces: Traces | None = None,
     ) -> None:
         self.profiles = profiles
         self.open_publisher = open_publisher
@@ -130,6 +134,7 @@ class Streams:
         self.arm = arm
         self.metrics = metrics
         self.tracker = tracker
+        self.traces = traces
         self.instance = settings.instance
         self.keys = schemas.Keys(settings.prefix)
         self.fusion = Fusion.of(settings)
@@ -288,6 +293,11 @@ class Streams:
         sensors = self.fusion.sensors_of(session, self.profiles.sensors)
         needs_view = bool(sensors.uses) or session in self.fusion.sites
         return replace(self.policy, zones=tuple(zones), sensors=sensors, needs_view=needs_view)
+
+    def fixed_rate_for(self, session: str) -> FixedRate | None:
+        """Return the output of a session at a fixed rate; None: it has none."""
+        output = self._settings.output_of(session)
+        return None if output is None else FixedRate(output)
 
     def tracking(self) -> list[Stream]:
         """Return the streams that have a session, by name."""

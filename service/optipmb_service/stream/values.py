@@ -91,7 +91,7 @@ class Policy:
         max_speed: fastest that a sensor moves; 0: any pose is taken.
         pose_margin: how far a pose may lie from where that speed allows.
         astray_frames: frames in a row that agree on another place until the session restarts there.
-        jumps: what is done about poses that jump within reach: `report` or `off`.
+        jumps: reaction to poses that jump within reach: `report` or `off`.
         zones: those whose events the session finds.
         sensors: how the frames of the sensors of a fused session are used.
         needs_view: whether a sensor without field of view is reported.
@@ -155,7 +155,7 @@ class Tracked:
         ticket: value that the caller gave with the detections.
         step_ns: time that conversion and tracking took.
         run: see `Session.run`.
-        events: those of the zones.
+        events: of the zones.
         counts: of all zones after the frame, by zone, name of `COUNTS` and class; None: not to be published.
         final: up to where the window does not change any more.
     """

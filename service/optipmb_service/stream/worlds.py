@@ -48,7 +48,7 @@ class Worlds:
 
     Attributes:
         number: of the density.
-        motions: into the newest worlds, the last one into that of the density; `optipmb.Relocation`.
+        motions: into the newest worlds, the last one into the density's; `optipmb.Relocation`.
         sensors: of each sensor.
     """
 
@@ -89,35 +89,59 @@ def relocated(before: FilterState, frame_id: FrameId, relocation: schemas.Reloca
     """Return a session in the world of a frame, or in the newest one, where that is newer."""
     if relocation is None and before.worlds is None:
         return Relocated(before)
-    worlds, name = before.worlds or Worlds(0, (), dict.fromkeys(before.sensors, SensorWorld(0, 0))), frame_id.sensor
-    number, zero = worlds.sensors.get(name, SensorWorld(worlds.number, 0))
-    continues = before.sensor(name).cursor.epoch == frame_id.epoch
-    motion, here, follows = None, number, True
+    worlds = before.worlds or Worlds(0, (), dict.fromkeys(before.sensors, SensorWorld(0, 0)))
+    last = worlds.sensors.get(frame_id.sensor, SensorWorld(worlds.number, 0))
+    same_publisher = before.sensor(frame_id.sensor).cursor.epoch == frame_id.epoch
     if relocation is None:
-        zero = zero if continues else number
+        motion = None
+        now = last if same_publisher else SensorWorld(last.number, last.number)
+        follows = True
+    elif before.last is None:
+        motion = _motion(relocation.translation.tobytes(), relocation.quaternion.tobytes())
+        now = SensorWorld(last.zero + relocation.world, last.zero)
+        worlds = Worlds(now.number, (motion,), {})
+        follows = True
     else:
         motion = _motion(relocation.translation.tobytes(), relocation.quaternion.tobytes())
-        here = zero + relocation.world
-        if before.last is None:
-            worlds = Worlds(here, (motion,), {})
-        elif not continues and ((same := motion in worlds.since(number - 1)[:1]) or relocation.world == 1):
-            here = number if same else number + 1
-            zero = here - relocation.world
-        follows = number <= here <= number + 1 or before.last is None or motion in worlds.since(here - 1)[:1]
-    if worlds.sensors.get(name) != (here, zero):
-        known = {other: one for other, one in worlds.sensors.items() if other in before.sensors}
-        worlds = replace(worlds, sensors=known | {name: SensorWorld(here, zero)})
-    if follows and here <= worlds.number:
-        return _behind(before if worlds is before.worlds else replace(before, worlds=worlds), worlds, here, motion)
-    if follows and here == worlds.number + 1 and motion is not None:
-        motions = (*worlds.motions, motion)[-KEPT:]
+        now = _announced(worlds, last, relocation.world, motion, same_publisher=same_publisher)
+        follows = now.number in {last.number, last.number + 1} or _leads_to(worlds, now.number, motion)
+    if worlds.sensors.get(frame_id.sensor) != now:
+        known = {name: one for name, one in worlds.sensors.items() if name in before.sensors}
+        worlds = replace(worlds, sensors=known | {frame_id.sensor: now})
+    if follows and now.number <= worlds.number:
+        state = before if worlds is before.worlds else replace(before, worlds=worlds)
+        return _behind(state, worlds, now.number, motion)
+    if follows and now.number == worlds.number + 1 and motion is not None:
+        moved = replace(worlds, number=now.number, motions=(*worlds.motions, motion)[-KEPT:])
         with suppress(optipmb.DensityError):
-            return Relocated(_moved(before, replace(worlds, number=here, motions=motions), motion), change="moves")
-    if relocation is not None:
-        here, zero = relocation.world, 0
-    sensors = {**worlds.sensors, name: SensorWorld(here, zero)}
-    worlds = Worlds(here, () if motion is None else (motion,), sensors)
-    return Relocated(replace(before, worlds=worlds), change="restarts")
+            return Relocated(_moved(before, moved, motion), change="moves")
+    return _restarted(before, worlds, frame_id.sensor, SensorWorld(relocation.world, 0) if relocation else now, motion)
+
+
+def _announced(
+    worlds: Worlds, last: SensorWorld, world: int, motion: optipmb.Relocation, *, same_publisher: bool
+) -> SensorWorld:
+    """Return the world of a sensor whose publisher counts it as `world`, and reached it by a motion."""
+    if not same_publisher:  # it counts from 1 again
+        if _leads_to(worlds, last.number, motion):
+            return SensorWorld(last.number, last.number - world)
+        if world == 1:
+            return SensorWorld(last.number + 1, last.number)
+    return SensorWorld(last.zero + world, last.zero)
+
+
+def _leads_to(worlds: Worlds, number: int, motion: optipmb.Relocation) -> bool:
+    """Return whether a motion is the kept one into a world."""
+    return worlds.since(number - 1)[:1] == (motion,)
+
+
+def _restarted(
+    state: FilterState, worlds: Worlds, sensor: str, now: SensorWorld, motion: optipmb.Relocation | None
+) -> Relocated:
+    """Return a session that begins in a world of which no motion from the world before is known."""
+    motions = () if motion is None else (motion,)
+    begun = Worlds(now.number, motions, {**worlds.sensors, sensor: now})
+    return Relocated(replace(state, worlds=begun), change="restarts")
 
 
 @lru_cache(256)

@@ -1,6 +1,6 @@
 """State of the process, for those who ask from outside: from before the service exists until after its end.
 
-The age of the control loop's last beat is reported. States: `starting`, then that of the service
+The age of the control loop's last beat is reported. States: `starting`, then the state of the service
 (`ready`, `degraded` when it works with a part missing, `paused` when it may not publish, `unlinked` without a router,
 or `draining` when others track its streams), then `stopping`.
 """
@@ -39,13 +39,18 @@ class Reporter:
 
     @property
     def state(self) -> str:
-        """State of the process while this works."""
-        return "unlinked" if self.failure else "ready"
+        """State of the process while this works: `unlinked` without a router, `degraded` after another failure."""
+        return "unlinked" if self.unlinked else "degraded" if self.failure else "ready"
+
+    @property
+    def unlinked(self) -> str:
+        """Why it has no network; empty while it has."""
+        return "" if self._session is None or self._session.linked() else "network: no router"
 
     @property
     def failure(self) -> str:
         """Why it cannot be used, or works with a part missing; empty while it works."""
-        return "" if self._session is None or self._session.linked() else "network: no router"
+        return self.unlinked
 
     @property
     def stuck(self) -> bool:
@@ -78,7 +83,8 @@ class ProcessHealth:
         self.metrics = metrics
         self.tls: Certificates | None = None
         """The certificates of the process; None while they are not read."""
-        self._service: Reporter | None = None
+        self._service = Reporter()
+        self._began = False
         self._ending = False
         self._beat_ns = time.monotonic_ns()
         metrics.add(PROCESS_METRICS, lambda: self)
@@ -89,7 +95,7 @@ class ProcessHealth:
 
     def report(self, service: Reporter) -> None:
         """Report the state of this part from now on."""
-        self._service = service
+        self._service, self._began = service, True
 
     def ends(self) -> None:
         """Report the end from now on."""
@@ -101,34 +107,32 @@ class ProcessHealth:
 
     def alive(self) -> bool:
         """Return whether the control loop turns and the working thread is not stuck."""
-        return self.beat_age_s() < STUCK_S and not (self._service is not None and self._service.stuck)
+        return self.beat_age_s() < STUCK_S and not self._service.stuck
 
     def failure(self) -> str:
         """Return why the service cannot be used, or works with a part missing; empty while it works."""
-        return "; ".join(
-            source.failure for source in (self.tls, self._service) if source is not None and source.failure
-        )
+        return "; ".join(one.failure for one in (self.tls, self._service) if one is not None and one.failure)
 
     def state(self) -> str:
         """Return the state of the process."""
         if self._ending:
             return "stopping"
-        state = "starting" if self._service is None else self._service.state
+        state = self._service.state if self._began else "starting"
         return "degraded" if state == "ready" and self.tls is not None and self.tls.failure else state
 
     def ready(self) -> bool:
         """Return whether the service can be used."""
-        usable = self._service is not None and self._service.usable and self.alive()
+        usable = self._service.usable and self.alive()
         return usable and self.state() in USABLE and not (self.tls is not None and self.tls.cut_off)
 
     def status(self) -> schemas.ServiceStatus | None:
         """Return the service's own report; None while it starts."""
-        return None if self._service is None else self._service.status()
+        return self._service.status()
 
     def session(self) -> Session | None:
         """Return the session for readers (`Reporter.session`); None while the service starts."""
-        return None if self._service is None else self._service.session()
+        return self._service.session()
 
     def detections_of(self, stream: str) -> str:
         """Return the pattern of the streams whose detections belong to a stream (`Reporter.detections_of`)."""
-        return stream if self._service is None else self._service.detections_of(stream)
+        return self._service.detections_of(stream)

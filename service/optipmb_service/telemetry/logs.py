@@ -33,6 +33,7 @@ EVENTS: Final = {
     "grpc_call": "A call has ended (level debug).",
     "grpc_connections": "The limit of open files allows fewer connections than the setting.",
     "grpc_invalid": "An invalid message from the network was not forwarded to callers.",
+    "edge_invalid": "An invalid message from the network was not forwarded to readers over HTTP or MQTT.",
     "grpc_certificates": "Renewed certificates cannot be read; the previous ones stay in use.",
     "certificate_ends": "Certificates that end within a week, and the `days` that they hold: renew them.",
     "certificate_ended": "A certificate has ended: no link with it can be opened. Renew it, and restart what listens"
@@ -78,6 +79,8 @@ EVENTS: Final = {
     "log_back": "The log can be written.",
     "log_unread": "The log could not be read for the session of `streams`: frames may be missing.",
     "log_cut": "A session missed more of the log than it takes at once: the oldest frames are left out.",
+    "traceparent_invalid": "A publisher sends the invalid trace context `received`: its frames begin new traces.",
+    "traces_failed": "A `text` of OpenTelemetry: spans could not be sent, or there were too many; some are lost.",
     "stream_stale": "No frame for `stale_s`: check the publisher.",
     "stream_back": "Frames arrive again.",
     "problem": "`count` messages were refused or lost since the last line: see the table of problems.",
@@ -271,11 +274,15 @@ def configure(form: Literal["console", "json"], level: str, worker: int | None =
         logger_factory=structlog.WriteLoggerFactory(file=cast("TextIO", _writer)),
     )
     logging.getLogger("optipmb").handlers = [_Library()]
+    logging.getLogger("opentelemetry").handlers = [_Library()]
 
 
 class _Library(logging.Handler):
-    """Logs the warnings of the tracker, which uses Python's own logging."""
+    """Logs the warnings of libraries, which use Python's own logging."""
 
     def emit(self, record: logging.LogRecord) -> None:
         """Log one of them."""
-        structlog.get_logger("optipmb_service").warning("tracker_message", text=record.getMessage())
+        ours = record.name.startswith("optipmb")
+        structlog.get_logger("optipmb_service").warning(
+            "tracker_message" if ours else "traces_failed", text=record.getMessage()
+        )

@@ -69,6 +69,7 @@ class Packet:
         encoding: the Zenoh encoding, as a text.
         wall_ns: arrival by the wall clock, ns since 1970; only reported, never decided by.
         now_ns: arrival by the monotonic clock, ns.
+        traceparent: W3C trace context that came along, unchecked; empty where no traces are recorded.
         origin: what tells the stream: the key without its topic.
         frame: whether it holds detections.
         held: bytes that it takes while it waits.
@@ -80,6 +81,7 @@ class Packet:
     encoding: str
     wall_ns: int
     now_ns: int
+    traceparent: str = ""
     origin: str = field(init=False)
     frame: bool = field(init=False)
     held: int = field(init=False)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 import optipmb_schemas as schemas
 import structlog
 from optipmb_client.errors import ConnectionFailed as TransportError
+from optipmb_client.trace_context import attached
 
 from optipmb_service.zenoh.client import Client
 from optipmb_service.zenoh.inputs import Packet, ReturnedPublishers, Topic
@@ -49,10 +50,11 @@ log = structlog.get_logger("optipmb_service")
 class StreamPublisher:
     """The publishers of a stream's tracks and events, and what else is declared while it is there."""
 
-    def __init__(self, sender: Sender, events: Sender | None, others: Sequence[Declared]) -> None:
-        self._declared = (*others, *([events] if events else []), sender)
+    def __init__(self, sender: Sender, events: Sender | None, now: Sender | None, others: Sequence[Declared]) -> None:
+        self._declared = (*others, *(one for one in (events, now, sender) if one is not None))
         self.publish = sender.put
         self.publish_events = (events or sender).put
+        self.publish_now = (now or sender).put
 
     def release(self) -> None:
         """Withdraw all of it."""
@@ -106,13 +108,15 @@ class Transport:
         self._prefix = settings.prefix
         self._instance = settings.instance
         self._max_bytes = settings.limits.max_bytes
+        self._traces = settings.traces
         self._client = Client(settings)
         self._topics: dict[str, Topic] = {}
         self._discover: Callable[[Sample], None] = lambda _: None
         self._all = False
         self._run = secrets.token_hex(8)
         """Tells this process from all others, also from others of its name."""
-        self._announcements = Announcements(self._client, self._keys, self._instance, self._run)
+        self.discover = Announcements(self._client, self._keys, self._instance, self._run).announce
+        """Announces streams, and no others."""
         self._returned = ReturnedPublishers(self._client, lambda *_: 0)
         self._alive: Declared | None = None
         self._owners: Reading | None = None
@@ -207,10 +211,6 @@ class Transport:
         self._client.watch(self._keys.all_publishers(), returned)
         self._client.watch(self._keys.all_discovered(), announced)
 
-    def discover(self, streams: set[str]) -> None:
-        """Announce these streams, and no others."""
-        self._announcements.announce(streams)
-
     def ask_recent(self, sessions: Sequence[str]) -> list[Packet]:
         """Return what other instances have received lately of sessions, as packets.
 
@@ -221,7 +221,8 @@ class Transport:
         for answer in self._client.query(self._keys.recent(), payload, timeout=RECENT_S, background=True):
             if answer.ok and answer.about:
                 now = time.time_ns(), time.monotonic_ns()
-                found.append(Packet(answer.about, answer.payload, len(answer.payload), answer.encoding, *now))
+                key, _, parent = answer.about.partition("\n")
+                found.append(Packet(key, answer.payload, len(answer.payload), answer.encoding, *now, parent))
         return found
 
     def ask_cache(self, stream: str, then: Callable[[list[Packet], bool], None]) -> None:
@@ -298,7 +299,9 @@ class Transport:
         payload = sample.payload
         size = len(payload)
         data = payload.to_bytes() if size <= self._max_bytes else None
-        receive(Packet(key, data, size, str(sample.encoding), wall_ns, now_ns))
+        attachment = sample.attachment if self._traces else None
+        parent = "" if attachment is None else attached(attachment.to_bytes())
+        receive(Packet(key, data, size, str(sample.encoding), wall_ns, now_ns, parent))
 
     # Sending
 
@@ -306,8 +309,8 @@ class Transport:
         """Say that this instance is alive; to be called when it is ready."""
         self._alive = self._client.token(self._keys.alive(self._instance))
 
-    def open_publisher(self, stream: str, events: bool = False) -> StreamPublisher:  # noqa: FBT001, FBT002 - as `Streams` calls it
-        """Open the publishers of a stream: of its tracks, and with `events` of those.
+    def open_publisher(self, stream: str, *, events: bool = False, now: bool = False) -> StreamPublisher:
+        """Open the publishers of a stream: of its tracks, and with `events` and `now` of those.
 
         Say that this instance tracks it, and declare its inputs' keys.
         """
@@ -319,13 +322,11 @@ class Transport:
 
         tracks = sender(self._keys.tracks(stream), schemas.Tracks)
         other = sender(self._keys.events(stream), schemas.Events) if events else None
+        encoding = schemas.encoding_of(schemas.Tracks)
+        latest = self._client.sender(self._keys.now(stream), encoding, express=True) if now else None
         token = self._client.token(self._keys.owner(stream, self._instance))
         inputs = (self._keys.detections(stream), self._keys.points(stream)) if self._all else ()
-        return StreamPublisher(tracks, other, (token, *map(self._client.declare_key, inputs)))
-
-    def publish_problem(self, problem: schemas.Problem) -> None:
-        """Send a problem on its stream's key; one without a stream has no key and is not sent."""
-        self._client.publish_problem(problem)
+        return StreamPublisher(tracks, other, latest, (token, *map(self._client.declare_key, inputs)))
 
     def watch_owners(self, on_owner: Callable[[str, str, bool], None] | None) -> None:
         """Tell which instance tracks which stream, or does so no longer (False), from now on; None: stop telling."""

@@ -1,4 +1,4 @@
-"""Compare this project's figures by AB3DMOT's protocol with those of the published evaluation.
+"""Compare this project's figures by AB3DMOT's protocol with the published evaluation.
 
 The published evaluation lives in an environment of its own:
 
@@ -35,7 +35,6 @@ Figures = dict[str, dict[str, Any]]
 
 
 def ours(root: Path, results: Path) -> tuple[Figures, list[str]]:
-    """Give our figures of a folder of results, and its sequences as the tool wants them."""
     dataset = open_dataset("kitti", root)
     chosen = [one for one in dataset.sequences(["all"]) if (results / f"{one.name}.txt").exists()]
     figures = evaluate_figures("kitti", load_recordings("kitti", chosen, results), ("Car", "Pedestrian", "Cyclist"))
@@ -44,7 +43,6 @@ def ours(root: Path, results: Path) -> tuple[Figures, list[str]]:
 
 
 def differences(root: Path, results: Path, tool: str) -> tuple[Figures, list[str]]:
-    """Give our figures and a line for each that is not the tool's."""
     found, sequences = ours(root, results)
     script = Path(__file__).with_name("run_ab3dmot.py")
     command = [tool, str(script), str(root / "training" / "label_02"), str(results), *sequences]
@@ -60,7 +58,6 @@ def differences(root: Path, results: Path, tool: str) -> tuple[Figures, list[str
 
 
 def main() -> None:
-    """Compare, say what differs, and keep the figures if asked to."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tool", required=True, help="Python of the environment with eval-ab-3d-mot")
     parser.add_argument("--root", type=Path, help="KITTI tracking root")

@@ -1,4 +1,4 @@
-"""Compare this project's nuScenes figures with those of the official tools on the same result files.
+"""Compare this project's nuScenes figures with the official tools on the same result files.
 
 The official tools need numpy 1, so they live in an environment of their own:
 
@@ -10,7 +10,7 @@ Then, in the environment of this project, from its root:
     export PYTHONPATH=tests/support
     python tests/clients/devkit/compare_devkit.py --root NUSCENES --devkit /tmp/devkit/bin/python
 
-NUSCENES is a root with `v1.0-mini` of scene-0103 and detections by CenterPoint. What is compared: the truth itself,
+NUSCENES is a root with `v1.0-mini` of scene-0103 and detections by CenterPoint. Compared are the truth itself,
 disturbed truth of several seeds, the greedy tracker on each detector, tracks in one frame only, and disturbed truth of
 generated pairs of scenes, with bicycle racks, unseen objects and uneven stamps. Ends with status 1 when any figure of
 any class, overall, at the best threshold or along the curve, differs by more than 1e-6. With `--keep` and no such
@@ -44,8 +44,6 @@ AGREED = Path(__file__).with_name("agreed.json")
 
 @dataclass(frozen=True)
 class Case:
-    """Tracks to be evaluated, by scene."""
-
     name: str
     root: Path
     detector: str
@@ -54,7 +52,6 @@ class Case:
 
 
 def cases(root: Path, folder: Path) -> Iterator[Case]:
-    """Give all cases: of the recorded scene, then of generated ones, which are written into a folder."""
     (sequence,) = NuScenesDataset(root, "centerpoint").sequences([SPLIT])
     scene = sequence.name
     # The official tools take distances by |a|^2 - 2 ab + |b|^2, which loses half of the digits near zero.
@@ -77,7 +74,6 @@ def cases(root: Path, folder: Path) -> Iterator[Case]:
 
 
 def official(python: Path, root: Path, results: Path) -> dict[str, Any]:
-    """Give the figures of the official tools."""
     script = Path(__file__).with_name("run_devkit.py")
     command = [python, script, root, "v1.0-mini", SPLIT, results]
     done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=900)
@@ -85,7 +81,6 @@ def official(python: Path, root: Path, results: Path) -> dict[str, Any]:
 
 
 def differences(ours: NuScenesScores, theirs: dict[str, Any], tolerance: float) -> Iterator[str]:
-    """Give a line for each figure that differs."""
     pairs = [("all", name, ours.overall[name], value) for name, value in theirs["overall"].items()]
     for label, values in theirs["classes"].items():
         scores = ours.classes[label]
@@ -109,7 +104,6 @@ def differences(ours: NuScenesScores, theirs: dict[str, Any], tolerance: float) 
 
 
 def main() -> int:
-    """Compare all cases."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--root", type=Path, required=True)
     parser.add_argument("--devkit", type=Path, required=True, help="the python of the other environment")

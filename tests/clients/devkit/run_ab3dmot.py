@@ -8,7 +8,7 @@ this project:
 Two accidents of the code are taken out, so that figures depend on nothing but tracks and truth:
 
 - The loop over thresholds keeps or drops the tracks that are exactly at a threshold by the rounding of a mean that is
-  taken again and again (the repackaged one drops them all). Here it is written anew and keeps them.
+  taken again and again (the repackaged one drops them all). This rewrite keeps them.
 - A track box that was matched at one threshold is remembered as matched at all later ones: if nothing matches it there,
   it is false even where it would not count otherwise. Here this is forgotten between thresholds.
 """
@@ -39,7 +39,6 @@ def count(tool: published.TrackingEvaluation, threshold: float = -1e4, recall: f
 
 
 def evaluate(labels: str, results: str, lengths: dict[str, int], name: str, limit: float) -> dict[str, Any]:
-    """Return the figures of one class at one least overlap."""
     published.filter_low_confidence = keep_reached
     tool = published.TrackingEvaluation("run", lengths, cls=name, thres=limit)
     tool.t_path, tool.gt_path = results, labels
@@ -78,7 +77,6 @@ def evaluate(labels: str, results: str, lengths: dict[str, int], name: str, limi
 
 
 def main(labels: str, results: str, *sequences: str) -> None:
-    """Print the figures of every class at every usual least overlap."""
     lengths = {name: int(count) for name, _, count in (text.partition("=") for text in sequences)}
     found = {
         f"{name} {limit:g}": evaluate(labels, results, lengths, name.lower(), limit)

@@ -15,7 +15,6 @@ from nuscenes.eval.tracking.evaluate import TrackingEval
 
 
 def main(root: str, version: str, split: str, results: str) -> None:
-    """Print per class and overall figures, and the thresholds of each class."""
     with tempfile.TemporaryDirectory() as out, contextlib.redirect_stdout(sys.stderr):
         evaluation = TrackingEval(
             config=config_factory("tracking_nips_2019"),

@@ -1,13 +1,11 @@
 """The command: starting, stopping, wrong use, settings."""
 
-from __future__ import annotations
-
 import json
 import resource
 import signal
 import socket
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from optipmb_schemas import Keys, ServiceStatus, SessionParameters, decode
@@ -19,9 +17,6 @@ from routers import free_endpoint, open_router
 from service_process import ServiceProcess
 
 import optipmb
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 KEYS = Keys()
 SENSOR = Sensor()
@@ -242,7 +237,6 @@ def test_json_logs_and_an_own_profile(tmp_path: Path) -> None:
 
 
 def config(capsys: pytest.CaptureFixture[str], *options: str) -> str:
-    """Run `config` in this process; return its output."""
     with pytest.raises(SystemExit) as ended:
         cli.main(("config", *options))
     shown = capsys.readouterr()

@@ -1,7 +1,5 @@
 """When a process restarts for the keys that it has declared, and when it does not."""
 
-from __future__ import annotations
-
 import asyncio
 
 import pytest
@@ -24,7 +22,7 @@ TURNS = 20
     ],
 )
 async def test_a_process_restarts_where_that_gives_it_numbers(keys: KeyNumbers, *, restarts: bool) -> None:
-    """When enough are used up, and not where what is open would need more than nine of ten of them again."""
+    """When enough are used up, unless reopening would need more than nine of ten of them again."""
     asked = StopRequest(NO_BOUND)
     watching = asyncio.create_task(watch_keys(asked, lambda: keys, MOST))
     for _ in range(TURNS):

@@ -1,7 +1,5 @@
 """The end of every process has a bound: where a step of it hangs, the process ends, and says where."""
 
-from __future__ import annotations
-
 import contextlib
 import faulthandler
 import os
@@ -10,8 +8,8 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import pytest
 from optipmb_schemas import Keys, SessionState
 from optipmb_service.app.lifecycle import LAST_S, EndBound, Steps, StopRequest, longest_end_s
 from optipmb_service.app.workers import WORKERS_S
@@ -20,9 +18,6 @@ from router import Node, Sensor
 from routers import free_endpoint, open_router
 from service_process import ServiceProcess
 from structlog.testing import capture_logs
-
-if TYPE_CHECKING:
-    import pytest
 
 HANGING = Path(__file__).parents[2] / "support" / "hanging"
 SENSOR = Sensor()

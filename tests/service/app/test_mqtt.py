@@ -1,11 +1,11 @@
-"""The bridge to MQTT: topics and payloads, and what waits and what is sent again when the broker goes and comes."""
-
-from __future__ import annotations
+"""The bridge to MQTT: topics and payloads, the queue, and repetition when the broker goes and comes."""
 
 import asyncio
 import contextlib
 import json
-from typing import TYPE_CHECKING, Any
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
 from broker import Broker, mosquitto
@@ -17,10 +17,6 @@ from watched import PROBLEM, STREAM, Session, events, settled, tracks
 aiomqtt = pytest.importorskip("aiomqtt")
 mqtt = pytest.importorskip("optipmb_service.app.mqtt")
 
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-    from pathlib import Path
-
 TOPIC = f"optipmb/v1/{STREAM}"
 ALIVE = "optipmb/v1/mqtt/one/alive"
 CONFIRMED = Selection(confirmed=True)
@@ -28,7 +24,6 @@ CONFIRMED = Selection(confirmed=True)
 
 @contextlib.asynccontextmanager
 async def bridging(session: Session, broker: Broker | str, **settings: Any) -> AsyncIterator[Any]:
-    """Run a bridge meanwhile."""
     address = broker if isinstance(broker, str) else f"mqtt://127.0.0.1:{broker.port}"
     network: Any = session
     bridge = mqtt.Bridge(Settings(instance="one", mqtt=MqttSettings(broker=address, **settings)), network)
@@ -42,7 +37,6 @@ async def bridging(session: Session, broker: Broker | str, **settings: Any) -> A
 
 
 async def until(true: Callable[[], bool]) -> None:
-    """Wait until something is so."""
     async with asyncio.timeout(60):
         while not true():  # noqa: ASYNC110 - nothing tells of it
             await asyncio.sleep(0.01)
@@ -108,7 +102,7 @@ async def test_events_wait_for_the_broker_and_tracks_do_not(session: Session) ->
 async def test_the_oldest_events_are_lost_where_too_many_wait(
     session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where too many wait they are counted, and the numbers of those that come show the gap."""
+    """Beyond the bound of the queue messages are counted, and the numbers of later ones show the gap."""
     monkeypatch.setattr(mqtt, "EVENTS", 3)
     broker = Broker()
     async with broker:

@@ -1,17 +1,12 @@
 """Folders of processes: removed at their end, or at the next start after a kill."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import pytest
 from optipmb_service.app.workers import HELD, private_folder
-
-if TYPE_CHECKING:
-    import pytest
 
 HOLDS = """
 import sys

@@ -1,16 +1,12 @@
 """The thread of the bridge to ROS 2: messages, and timers."""
 
-from __future__ import annotations
-
 import time
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import pytest
 from optipmb_service.app.ros2 import _Work
 from optipmb_service.settings import load
-
-if TYPE_CHECKING:
-    import pytest
 
 HANGS_S = 30.0
 

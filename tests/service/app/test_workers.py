@@ -1,13 +1,12 @@
 """What the parent of worker processes does with one that gives no sign of life."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from optipmb_service.app import workers
@@ -17,9 +16,6 @@ from optipmb_service.settings import load
 from optipmb_service.telemetry.health import ProcessHealth
 from optipmb_service.telemetry.metrics import Metrics
 from unbounded import NO_BOUND
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 
 @pytest.mark.parametrize(("status", "failed"), [(-9, 1), (0, 1), (3, 3)])

@@ -46,7 +46,6 @@ def _patient() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def nats(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NatsProcess]:
-    """A NATS server."""
     with NatsProcess(tmp_path_factory.mktemp("nats")) as server:
         yield server
 
@@ -83,8 +82,6 @@ def make(request: pytest.FixtureRequest) -> Iterator[Make]:
 
 
 def connected(store: LeaseStore) -> None:
-    """Wait until a store can be reached."""
-
     def reached() -> bool:
         try:
             store.follow(0)
@@ -478,7 +475,7 @@ def test_of_three_servers_one_may_be_lost(tmp_path: Path, monkeypatch: pytest.Mo
 
     Without two of them nothing is saved; when one is back, all goes on.
     """
-    monkeypatch.setattr(nats_connection, "CALL_S", 2.0)  # what is lost with a leader is asked again
+    monkeypatch.setattr(nats_connection, "CALL_S", 2.0)  # calls lost with a leader are repeated
     with NatsTrio(tmp_path) as servers:
         stores = [JetStream(servers.urls, "test") for _ in range(2)]
         members = [HandMember(name, store) for name, store in zip("ab", stores, strict=True)]

@@ -1,32 +1,27 @@
 """Reading the log for a session is bounded; it gets the newest frames."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
 from unittest.mock import AsyncMock, Mock
 
 import pytest
 from nats_process import NatsProcess
 from optipmb_schemas import Keys
 from optipmb_service.cluster import message_log
-from optipmb_service.cluster.log_position import Missed, Position
 from optipmb_service.cluster.message_log import LogMessage, LogReader, MessageLog, Retention
+from optipmb_service.cluster.store import Missed, Position
 from optipmb_service.stream.checkpoint import forgotten
 from optipmb_service.stream.profiles import Fusion
 from optipmb_service.stream.recovery import Log
 from optipmb_service.stream.session import Session
 from optipmb_service.stream.values import Policy
+from optipmb_service.zenoh.inputs import Packet
 from router import until
 
 import optipmb
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-    from pathlib import Path
-
-    from optipmb_service.zenoh.inputs import Packet
 
 STREAM = "a/b/c"
 EPOCH = bytes(16)
@@ -37,7 +32,6 @@ LAST_TRACKED = Missed((STREAM,), "", lambda _: False, {STREAM: Position(frozense
 
 @pytest.fixture
 def filled(tmp_path: Path) -> Iterator[MessageLog]:
-    """A log with frames of one stream."""
     with NatsProcess(tmp_path) as nats:
         one = MessageLog([nats.url], "optipmb/v1")
 

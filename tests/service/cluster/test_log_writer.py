@@ -1,9 +1,9 @@
 """The queue of the log is bounded in bytes; dropped messages are reported."""
 
-from __future__ import annotations
-
 import asyncio
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 import structlog
@@ -14,23 +14,16 @@ from optipmb_service.cluster.nats_connection import RefusedError
 from router import until
 from routers import free_endpoint
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-    from typing import Any
-
 ROOM = 5
 KEEP = {"detections": Retention(60, 2**25)}
 
 
 def message(seq: int, size: int) -> LogMessage:
-    """Detections of so many bytes."""
     return LogMessage("detections", "a/b/c", bytes(16), seq, seq, "", (0, 0), bytes(size), "")
 
 
 @pytest.fixture
 def log(tmp_path: Path) -> Iterator[MessageLog]:
-    """A log with a server."""
     with NatsProcess(tmp_path) as nats:
         one = MessageLog([nats.url], "optipmb/v1")
         until(lambda: not one.connection.failure, "it is connected")

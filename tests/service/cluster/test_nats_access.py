@@ -46,7 +46,6 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def serve(tmp_path: Path) -> Iterator[Serve]:
-    """Start a server with some configuration more; returns where it listens."""
     processes: list[subprocess.Popen[bytes]] = []
 
     def start(more: str) -> str:
@@ -66,7 +65,6 @@ def serve(tmp_path: Path) -> Iterator[Serve]:
 
 
 def protected(certificates: Path, *, asks: bool) -> str:
-    """The part of a configuration with certificates."""
     of = certificates / "router"
     files = f'cert_file: "{of}/cert.pem", key_file: "{of}/key.pem", ca_file: "{of}/ca.pem"'
     return f"tls {{ {files}, verify: {json.dumps(asks)} }}\n"
@@ -102,7 +100,6 @@ def refused(server: str, options: dict[str, Any] | None, why: str) -> None:
 
 
 def file_of(folder: Path, name: str, text: str) -> Path:
-    """A file with a text."""
     (folder / name).write_text(text)
     return folder / name
 

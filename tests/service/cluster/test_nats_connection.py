@@ -1,17 +1,12 @@
 """The connection to NATS servers that go and come."""
 
-from __future__ import annotations
-
 import gc
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from nats_process import NatsProcess
 from optipmb_service.cluster.nats_connection import NatsConnection
 from proxy import Proxy
 from router import until
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def test_connections_that_are_ended_before_the_greeting_are_closed(tmp_path: Path) -> None:

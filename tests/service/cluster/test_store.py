@@ -1,14 +1,12 @@
 """Where checkpoints are kept: whole batches, the last two of each, torn ones aside."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal
 import sqlite3
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from lease_log import Alone
@@ -25,13 +23,9 @@ from optipmb_service.cluster.sqlite import (
 )
 from optipmb_service.cluster.store import ENDED, StoreError, Write, load_newest
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
 
 @pytest.fixture(params=["memory", "file"])
 def store(request: pytest.FixtureRequest, tmp_path: Path) -> SqliteStore:
-    """A store in memory, or in a file."""
     return SqliteStore(tmp_path / "sessions.db" if request.param == "file" else None)
 
 

@@ -10,17 +10,18 @@ from socket import SO_RCVBUF, SOL_SOCKET
 from typing import TYPE_CHECKING, Any
 
 import pytest
+import structlog
 from optipmb_client.errors import ClientError
 from optipmb_schemas import (
     ServiceStatus,
     SessionSummary,
 )
 from optipmb_schemas.json_form import event_json, problem_json, tracks_json, with_skipped, zones_json
-from optipmb_service.edge.readers import EVENTS, Reader, Wish
+from optipmb_service.edge.readers import EVENTS, Publication, Reader, Wish
 from optipmb_service.http import application
 from optipmb_service.settings import Settings
 from router import until
-from watched import KEYS, PROBLEM, STREAM, Session, Watched, events, key_of, publication, served, tracks
+from watched import KEYS, PROBLEM, STREAM, Session, Watched, asked, events, key_of, publication, served, tracks
 from websocket import (
     ABNF,
     WebSocket,
@@ -40,53 +41,26 @@ OK = http.client.OK
 
 
 @pytest.fixture
-def watched() -> Watched:
-    """A service."""
-    return Watched()
-
-
-@pytest.fixture
-def session(watched: Watched) -> Session:
-    """Its session."""
-    assert watched.network is not None
-    return watched.network
-
-
-@pytest.fixture
 def address(watched: Watched) -> Iterator[str]:
-    """Where it answers."""
     with served(watched, http_clients=4, http_origins=["https://map.example"]) as address:
         yield address
 
 
 @pytest.fixture
 def guarded(watched: Watched, tmp_path: Path) -> Iterator[str]:
-    """The same with tokens."""
     file = tmp_path / "tokens.json"
     file.write_text(json.dumps({hashlib.sha256(token.encode()).hexdigest(): name for token, name in TOKENS.items()}))
     with served(watched, http_tokens=str(file)) as address:
         yield address
 
 
-@contextlib.contextmanager
-def asked(address: str, path: str, **headers: str) -> Iterator[http.client.HTTPResponse]:
-    """Ask for something; the answer's body is still to be read."""
-    host, _, port = address.rpartition(":")
-    with contextlib.closing(http.client.HTTPConnection(host, int(port), timeout=DEADLINE_S)) as connection:
-        connection.request("GET", path, headers={"connection": "close", **headers})
-        with connection.getresponse() as response:
-            yield response
-
-
 def get(address: str, path: str, **headers: str) -> tuple[int, Any]:
-    """Status and JSON of an answer."""
     with asked(address, f"/api/v1/{path}", **headers) as response:
         return response.status, json.loads(response.read())
 
 
 @contextlib.contextmanager
 def lines(address: str, query: str) -> Iterator[Iterator[bytes]]:
-    """Read server-sent events; gives the texts as they come."""
     with asked(address, f"/api/v1/stream?{query}") as response:
         assert response.status == OK
         assert response.readline() == b": hello\n"
@@ -105,14 +79,12 @@ def socket(address: str, query: str, **options: Any) -> Iterator[WebSocket]:
 
 
 def refused(address: str, query: str, **options: Any) -> tuple[int, bytes]:
-    """Status and body with which a WebSocket is refused before the handshake."""
     with pytest.raises(WebSocketBadStatusException) as raised, socket(address, query, **options):
         pass
     return raised.value.status_code, raised.value.resp_body or b""
 
 
 def closed(connection: WebSocket) -> int:
-    """Read until the other side closes; return its code."""
     while True:
         opcode, data = connection.recv_data(control_frame=True)
         if opcode == ABNF.OPCODE_CLOSE:
@@ -139,7 +111,7 @@ def test_get_stream_and_socket_give_the_same_text(session: Session, address: str
 
 
 def test_all_topics_come_on_one_connection(session: Session, address: str) -> None:
-    """Events and problems are texts of their own, counts too; what was not asked for does not come."""
+    """Events, problems and counts are texts of their own; topics not asked for do not come."""
     expected = [*event_json(events(1, 2)), zones_json(events(1)), problem_json(PROBLEM)]
     with socket(address, f"stream={STREAM}&topics=events,zones,problems&events=now") as connection:
         session.publish(tracks(1), events(1, 2), PROBLEM)
@@ -162,8 +134,17 @@ def test_the_newest_frame_is_that_of_the_latest_run(session: Session, address: s
     ]
 
 
+def test_what_is_not_valid_is_logged() -> None:
+    """A message that no reader gets is in the log of the process, once."""
+    with structlog.testing.capture_logs() as logged:
+        one = Publication(KEYS.tracks(STREAM), b"garbage", "", {})
+        assert (one.message, one.message) == (None, None)
+    assert [line["event"] for line in logged] == ["edge_invalid"]
+
+
 def test_streams_are_those_of_all_services(session: Session, address: str) -> None:
-    """Each with its instance; workers, which answer too, are left out."""
+    """Each with its instance; workers, which answer too, are left out, and so is an answer that is not valid."""
+    session.statuses.append(PROBLEM)
     for name in ("one", "one-w0"):
         summaries = [SessionSummary(stream=one, profile="kitti", state="running") for one in (STREAM, "x/y/z")]
         status = ServiceStatus(
@@ -199,6 +180,12 @@ def test_a_bad_parameter_is_refused_with_its_path(address: str, query: str, path
         assert answer["error"].startswith(f"{path}: expected ")
     status, body = refused(address, query)
     assert (status, json.loads(body)["path"]) == (http.client.BAD_REQUEST, path)
+
+
+def test_the_newest_tracks_are_not_predicted(address: str) -> None:
+    """Nothing of a fixed rate is kept to be asked for."""
+    status, answer = get(address, f"tracks?stream={ALL}&predict=1")
+    assert (status, answer["path"]) == (http.client.BAD_REQUEST, "predict")
 
 
 def test_tokens_decide_who_reads_what(guarded: str, session: Session) -> None:
@@ -237,7 +224,7 @@ def test_a_file_of_tokens_that_cannot_be_used_ends_the_start(tmp_path: Path, con
 
 
 def test_pages_of_strangers_open_no_socket(session: Session, address: str) -> None:
-    """A browser names the page's origin and asks nobody before it opens one: only our own and listed origins may."""
+    """A browser names the page's origin without a check of its own: only our own and listed origins may connect."""
     query = f"stream={STREAM}"
     for origin in ("https://evil.example", "http://127.0.0.1:1", "null"):
         assert refused(address, query, origin=origin)[0] == http.client.FORBIDDEN
@@ -330,7 +317,7 @@ async def test_the_rate_is_bounded_in_sensor_time() -> None:
 
 
 async def test_events_come_once_when_they_are_final_or_as_they_are_published() -> None:
-    """A revision replaces what is not final; who wants events now gets both."""
+    """A revision replaces events that are not final; a reader of all events gets both."""
     final, now = (Reader(Wish((ALL,), frozenset({"events"}), final=final)) for final in (True, False))
     corrected = events(1, 3, revision=1)
     published = [events(1, 2), corrected, events(5, 1, final_ns=5)]

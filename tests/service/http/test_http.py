@@ -1,7 +1,5 @@
 """Health, readiness and metrics over HTTP, and the same metrics over Zenoh."""
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 import itertools
@@ -12,10 +10,11 @@ import socket
 import subprocess
 import sys
 import threading
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
+from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from optipmb_client.errors import ClientError
@@ -32,11 +31,6 @@ from routers import free_endpoint, open_router
 from service_process import ServiceProcess
 from watched import Watched, served
 
-if TYPE_CHECKING:
-    from concurrent.futures import Future
-    from pathlib import Path
-
-
 KEYS = Keys()
 SENSOR = Sensor()
 END_S = 30.0
@@ -47,7 +41,6 @@ Samples = dict[tuple[str, tuple[tuple[str, str], ...]], float]
 
 
 def get(address: str, path: str) -> tuple[int, str]:
-    """Status and body of an answer."""
     host, _, port = address.rpartition(":")
     connection = http.client.HTTPConnection(host, int(port), timeout=60)
     try:
@@ -60,7 +53,6 @@ def get(address: str, path: str) -> tuple[int, str]:
 
 
 def status_for(address: str, path: str, host: str) -> int:
-    """Return the status of an answer to a request that names a host."""
     name, _, port = address.rpartition(":")
     with closing(http.client.HTTPConnection(name, int(port), timeout=10)) as connection:
         connection.request("GET", path, headers={"host": host})
@@ -68,20 +60,13 @@ def status_for(address: str, path: str, host: str) -> int:
 
 
 def address_of(service: ServiceProcess) -> str:
-    """Where a service said that it answers."""
     service.wait_log('"event": "http"')
     return str(re.findall(r'"address": "([^"]+)"', service.errors)[0])
 
 
 def samples(text: str) -> Samples:
-    """Every figure of a text in Prometheus' format."""
     families = text_string_to_metric_families(text)
     return {(one.name, tuple(sorted(one.labels.items()))): one.value for family in families for one in family.samples}
-
-
-def free_address() -> str:
-    """An address where nobody listens."""
-    return free_endpoint().removeprefix("tcp/")
 
 
 def test_health_follows_the_heartbeat() -> None:
@@ -107,7 +92,7 @@ def test_health_follows_the_heartbeat() -> None:
     ],
 )
 def test_a_host_that_is_not_the_service_s_is_refused(host: str, status: int) -> None:
-    """A name that a stranger lets point here gets no answer; addresses, plain names and those of the settings do."""
+    """A foreign host name gets no answer; addresses, plain names and names in the settings do."""
     with served(Watched(), http_hosts=["tracker.example.org"]) as address:
         assert status_for(address, "/", host) == status
 
@@ -202,7 +187,7 @@ def test_an_address_in_use_is_one_error() -> None:
 
 
 def test_a_service_tells_how_it_is_from_its_start_to_its_end() -> None:
-    """Alive but not ready while it waits for a router, ready with one; a signal ends it, whoever still is connected."""
+    """Alive but not ready while it waits for a router, ready with one; a signal ends it despite open connections."""
     endpoint = free_endpoint()
     options = ("--connect", endpoint, "--http", "127.0.0.1:0", "--log-format", "json")
     with ServiceProcess(*options, listen=False) as service:
@@ -223,7 +208,7 @@ def test_a_service_tells_how_it_is_from_its_start_to_its_end() -> None:
 
 
 def test_metrics_count_what_happened(tmp_path: Path) -> None:
-    """Every metric of a service is there, in Prometheus' format, with the figures of what was sent; also over Zenoh."""
+    """Every metric of a service is there, in Prometheus' format, with the figures of sent frames; also over Zenoh."""
     options = ("--http", "127.0.0.1:0", "--log-format", "json", "--instance", "one")
     environment = {"OPTIPMB_STORE": str(tmp_path), "OPTIPMB_CHECKPOINT_S": "0.1"}
     with ServiceProcess(*options, environment=environment) as service:
@@ -273,7 +258,7 @@ def test_metrics_count_what_happened(tmp_path: Path) -> None:
 
 
 def test_viewers_use_up_no_keys() -> None:
-    """Who looks at a stream again and again takes two keys; who asks for ever new streams is told to wait."""
+    """Repeated readers of a stream use two keys; a reader of ever new streams has to wait."""
     with ServiceProcess("--http", "127.0.0.1:0", "--log-format", "json") as service:
         address = address_of(service)
         service.wait_ready()

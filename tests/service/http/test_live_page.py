@@ -20,7 +20,7 @@ from optipmb_service.settings import Settings
 from optipmb_service.zenoh import client
 from router import until
 from tracks_message import tracks_message
-from watched import KEYS, Session, Watched, key_of, publication, served
+from watched import KEYS, Session, Watched, asked, key_of, publication, served
 
 from optipmb import Georeference
 
@@ -33,7 +33,6 @@ DEADLINE_S = 60.0
 
 
 def tracks(seq: int) -> Tracks:
-    """One track, a long way from the origin, and one that is not confirmed."""
     return tracks_message(
         STREAM,
         seq,
@@ -70,48 +69,18 @@ DETECTIONS = Detections(
 
 
 @pytest.fixture
-def watched() -> Watched:
-    """A service."""
-    return Watched()
-
-
-@pytest.fixture
-def session(watched: Watched) -> Session:
-    """Its session."""
-    assert watched.network is not None
-    return watched.network
-
-
-@pytest.fixture
 def address(watched: Watched) -> Iterator[str]:
-    """Where its page is."""
     with served(watched, http_clients=VIEWERS) as address:
         yield address
 
 
-@contextlib.contextmanager
-def asked(address: str, path: str) -> Iterator[http.client.HTTPResponse]:
-    """Ask for something; the answer's body is still to be read."""
-    host, _, port = address.rpartition(":")
-    connection = http.client.HTTPConnection(host, int(port), timeout=DEADLINE_S)
-    connection.request("GET", path, headers={"connection": "close"})
-    response = connection.getresponse()
-    try:
-        yield response
-    finally:
-        response.close()
-        connection.close()
-
-
 def get(address: str, path: str) -> tuple[int, bytes]:
-    """Status and body of an answer."""
     with asked(address, path) as response:
         return response.status, response.read()
 
 
 @contextlib.contextmanager
 def looking(address: str) -> Iterator[Iterator[dict[str, object]]]:
-    """Look at the stream; gives the frames as they come."""
     with asked(address, f"/live?stream={STREAM}") as response:
         assert response.status == http.client.OK
         assert response.getheader("content-type", "").startswith("text/event-stream")
@@ -159,7 +128,7 @@ def test_viewers_get_the_newest_frame_and_not_too_often(session: Session, addres
         began = time.monotonic()
         for seq in range(200):
             session.publish(tracks(seq))
-            time.sleep(0.005)  # the pace is what is tested
+            time.sleep(0.005)  # the pace is the claim
         took = time.monotonic() - began
         times = []
         for frame in frames:
@@ -240,7 +209,7 @@ def test_wrong_streams_and_a_service_that_starts_are_shown(watched: Watched, add
 
 
 def test_a_frame_holds_what_is_drawn() -> None:
-    """Tracks by column; detections and the sensor in the world frame, whatever frame they came in."""
+    """Tracks by column; detections and the sensor in the world frame, for either input frame."""
     detections = DETECTIONS
     text = live_frame(publication(tracks(1)), publication(detections))
     assert text is not None
@@ -268,7 +237,7 @@ def test_a_frame_holds_what_is_drawn() -> None:
 
 
 async def test_only_the_newest_is_kept() -> None:
-    """What nobody took in time is replaced; of detections the newest eight are kept, or one that is large."""
+    """Unread frames are replaced; of detections the newest eight are kept, or one that is large."""
     live = Live(None)
     for number in range(10):
         live.receive(publication(DETECTIONS.model_copy(update={"stream": f"site/node/sensor-{number}"})))

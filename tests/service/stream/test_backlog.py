@@ -1,7 +1,5 @@
 """The backlog of a session: what waits there is bounded, in order, and in one place; what leaves unprocessed counts."""
 
-from __future__ import annotations
-
 import threading
 from dataclasses import replace
 from typing import Any
@@ -17,18 +15,15 @@ TOPICS = {True: "detections", False: "points"}
 
 
 class Lost:
-    """What backlogs lose of what they hold."""
-
     def __init__(self) -> None:
         self.packets: list[Packet] = []
 
     def __call__(self, _: str, packets: list[Packet]) -> None:
-        """Note it."""
         self.packets += packets
 
 
 def bounds_of(**limits: Any) -> Bounds:
-    """Return bounds, none but those that are given."""
+    """Return bounds; the default is none."""
     bounds = Bounds(Lost(), UNLIMITED, UNLIMITED, UNLIMITED, ByteBudget(), ByteBudget(), UNLIMITED)
     return replace(bounds, **limits)
 
@@ -42,7 +37,6 @@ def live(**limits: Any) -> Backlog:
 
 
 def packet(number: int = 0, *, frame: bool = True, size: int = 0, at_s: float = 0, stream: str = "s") -> Packet:
-    """Return a packet known by its number."""
     return Packet(f"{stream}/{TOPICS[frame]}", bytes(size), size, "", number, round(at_s * SECOND))
 
 
@@ -58,7 +52,6 @@ def taken(backlog: Backlog) -> list[Packet]:
 
 
 def numbers(packets: list[Packet]) -> list[int]:
-    """Return the numbers of packets."""
     return [one.wall_ns for one in packets]
 
 
@@ -112,7 +105,7 @@ def test_urgent_commands_go_first() -> None:
 
 
 def test_no_sensor_takes_the_room_of_another() -> None:
-    """A sensor that floods a session loses its own frames and clouds, and what is lost is counted for it."""
+    """A sensor that floods a session loses its own frames and clouds, and the loss is counted for it."""
     backlog = live(frames=3, clouds=2, bytes=4000)
     for frame in (True, False):
         backlog.push(packet(frame=frame, stream="slow"))
@@ -126,7 +119,7 @@ def test_no_sensor_takes_the_room_of_another() -> None:
 
 
 def test_a_live_backlog_gives_back_what_it_took() -> None:
-    """Frames and clouds beyond the bytes go, the oldest clouds first; what is larger than all is not taken."""
+    """Frames and clouds beyond the bytes go, the oldest clouds first; a message above the bound is not taken."""
     budget = ByteBudget(10 * PACKET_BYTES)
     backlog = live(bytes=6 * PACKET_BYTES, queued=budget)
     for number in range(4):
@@ -141,7 +134,7 @@ def test_a_live_backlog_gives_back_what_it_took() -> None:
 
 @given(st.lists(st.tuples(st.integers(1, 50), st.booleans(), st.floats(0, 2)), max_size=60))
 def test_what_waits_for_a_takeover_is_bounded(arrivals: list[tuple[int, bool, float]]) -> None:
-    """By bytes over all streams and by age; what is left is in order, clouds go before frames."""
+    """By bytes over all streams and by age; the rest is in order, clouds go before frames."""
     budget = ByteBudget(4 * PACKET_BYTES)
     bounds = bounds_of(held=budget, keep_ns=5 * SECOND)
     backlogs = [Backlog("a/b/c", bounds, 0), Backlog("a/b/d", bounds, 0)]
@@ -171,7 +164,7 @@ def test_clouds_of_a_takeover_go_first() -> None:
 
 
 def test_what_was_missed_goes_before_what_waits() -> None:
-    """Packets from the log or a cache, then those that came while the session was opened, then newer ones."""
+    """Packets from the log or a cache, then packets received while the session was opened, then newer ones."""
     backlog = live()
     backlog.push(packet(1))
     backlog.open(packet(0))
@@ -200,7 +193,7 @@ ACTIONS = st.sampled_from(["own", "cloud", "foreign", "take", "open", "live", "l
 @settings(deadline=None)
 @given(st.lists(ACTIONS, max_size=80), st.integers(1, 12))
 def test_every_message_ends_in_one_place(actions: list[str], room: int) -> None:
-    """Whatever becomes of a session: each message to be tracked here is taken, handed over, or counted, once."""
+    """Through all changes of a session, each message to be tracked here is taken, handed over, or counted, once."""
     queued, held, lost = ByteBudget(room * PACKET_BYTES), ByteBudget(room * PACKET_BYTES), Lost()
     backlog = Backlog("a/b/c", bounds_of(lost=lost, frames=4, clouds=2, queued=queued, held=held, keep_ns=0), 0)
     backlog.attach(lambda: None)
@@ -221,7 +214,7 @@ def test_every_message_ends_in_one_place(actions: list[str], room: int) -> None:
             ended += numbers([item]) if isinstance(item := backlog.take(), Packet) else []
         elif action == "give":
             ended += numbers(backlog.recent()) if backlog.state == "foreign" else []
-            backlog.trim(UNASKED_NS + SECOND)  # what was given is dropped uncounted
+            backlog.trim(UNASKED_NS + SECOND)  # delivered packets are dropped uncounted
         else:
             changes[action](number)
     backlog.go_live()

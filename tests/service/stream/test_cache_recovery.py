@@ -1,21 +1,16 @@
-"""Which caches a session waits for, and how much of those that have answered is remembered."""
+"""Caches that a session waits for, and the bound on remembered answers."""
 
-from __future__ import annotations
-
+from collections.abc import Callable, Iterable
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from fusing import FUSED
 from optipmb_service.stream.directory import BACK_NS, StreamDirectory
 from optipmb_service.stream.recovery import MOST, CacheRecovery
 from optipmb_service.stream.session import Session
+from optipmb_service.zenoh.inputs import Packet
 
 import optipmb
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
-    from optipmb_service.zenoh.inputs import Packet
 
 
 class Publishers:
@@ -27,7 +22,6 @@ class Publishers:
         self.asked: list[str] = []
 
     def set(self, stream: str, *, present: bool) -> None:
-        """Have a publisher come or go."""
         assert self._directory.published(stream, "token", self.now_ns, present=present)
 
     def awaited(self, session: str, sensors: Iterable[str]) -> dict[str, bool]:
@@ -36,7 +30,6 @@ class Publishers:
         return self._directory.awaited("site/node", lambda _: True, sensors, self.now_ns)
 
     def ask_cache(self, stream: str, then: Callable[[list[Packet], bool], None]) -> None:
-        """Note it, without an answer."""
         del then
         self.asked.append(stream)
 

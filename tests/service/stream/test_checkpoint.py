@@ -1,6 +1,4 @@
-"""A session written down and taken up again: nothing is lost, nothing half is taken for whole."""
-
-from __future__ import annotations
+"""A session saved and restored: nothing is lost, nothing partial is accepted."""
 
 import hashlib
 import struct
@@ -62,7 +60,7 @@ def test_equal_sessions_give_equal_bytes() -> None:
 
 
 def test_classes_keep_their_order() -> None:
-    """The classes of a profile are numbered by their order in it, whatever their names."""
+    """The classes of a profile are numbered by their order in it, not by their names."""
     kitti = optipmb.load_profile("kitti")
     one = Session(SENSOR.stream, kitti)
     assert sorted(kitti.labels) != list(kitti.labels)
@@ -82,7 +80,7 @@ def test_a_snapshot_does_not_change_any_more() -> None:
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 19), st.permutations(range(20, 26)))
 def test_a_restored_session_goes_on_as_if_nothing_had_happened(cut: int, order: list[int]) -> None:
-    """Tracks, ids and state after a restore are those of the session that went on, also for frames that come late."""
+    """Tracks, ids and state after a restore equal the uninterrupted session, also for late frames."""
     one, merged = Session(SENSOR.stream, NUSCENES), Merged()
     merged.take(feed(one, range(cut + 1), SENSOR))
     two = Session.restore(decode_checkpoint(encode_checkpoint(one.snapshot())), 0)
@@ -112,7 +110,7 @@ def test_fields_of_view_outlive_a_restore() -> None:
 
 
 def test_scores_are_calibrated_once_also_over_a_restore() -> None:
-    """The window keeps the scores that came: tracks are those of a session that was sent the calibrated scores."""
+    """The window keeps the received scores: tracks equal a session that received the calibrated scores."""
     document = NUSCENES.model_dump()
     document["classes"]["car"]["score_calibration"] = {"detector": [0.2, 0.4], "calibrated": [0.5, 0.8]}
     one, other = Session(SENSOR.stream, optipmb.parse_parameters(document)), Session(SENSOR.stream, NUSCENES)
@@ -141,7 +139,7 @@ def test_rewind_goes_back_over_a_restore() -> None:
 
 
 def test_large_clouds_shorten_the_window_not_the_checkpoint() -> None:
-    """A checkpoint takes along what fits; the restored session goes back less far, and refuses what it cannot place."""
+    """A checkpoint holds a bounded window; the restored session goes back less far, and refuses older frames."""
     policy = Policy(checkpoint_bytes=100_000)
     one = Session(SENSOR.stream, NUSCENES, policy)
     for seq in (0, 1, 2, 3, 5, 6):
@@ -223,7 +221,7 @@ def test_torn_at_every_length() -> None:
 
 
 def test_any_changed_byte_is_noticed() -> None:
-    """A checkpoint with one bit turned over is refused, wherever it is."""
+    """A checkpoint with one bit turned over, at any position, is refused."""
     data = encode_checkpoint(example(7).snapshot())
     for at in range(len(data)):
         changed = bytearray(data)
@@ -257,7 +255,6 @@ def _set_profile(body: Any, **changes: Any) -> None:
 
 
 def _set(body: Any, column: str, number: bytes) -> None:
-    """Write the first number of a column of the objects."""
     density = body["head"]["density"]
     objects = bytearray(density["bernoulli"])
     at = optipmb.Bernoullis.described[column].begin * len(objects) // optipmb.Bernoullis.width
@@ -325,7 +322,7 @@ def test_more_may_be_added() -> None:
 @settings(max_examples=200, deadline=None)
 @given(st.binary(max_size=400))
 def test_any_body_is_read_or_refused(body: bytes) -> None:
-    """Whatever the bytes under a good seal, nothing but `CheckpointError` is raised."""
+    """For any bytes under a good seal, nothing but `CheckpointError` is raised."""
     with pytest.raises(CheckpointError):
         decode_checkpoint(seal(body, Incarnation()))
 

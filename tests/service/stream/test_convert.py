@@ -1,7 +1,5 @@
 """Messages that were checked once become frames without a second check: the same frames, and the same refusals."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from typing import Any
 
@@ -63,7 +61,7 @@ def messages(draw: st.DrawFn) -> schemas.Detections:
 
 
 def made(function: Any, *arguments: Any, **named: Any) -> Any:
-    """Return all values of a frame and how many objects were left out, or what is wrong."""
+    """Return all values of a frame and the number of omitted objects, or the error."""
     try:
         frame, left_out = function(*arguments, **named)
     except optipmb.FrameError as error:

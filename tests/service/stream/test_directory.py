@@ -1,7 +1,5 @@
 """Which streams a discoverer announces that have no session."""
 
-from __future__ import annotations
-
 from optipmb_service.stream.directory import BACK_NS, MAX_UNPROVEN_ANNOUNCED, QUEUED_NS, UNPROVEN_NS, StreamDirectory
 from optipmb_service.stream.values import SECOND
 
@@ -24,7 +22,7 @@ class Discoverer:
 
 
 def test_caches_are_awaited_of_publishers_that_are_there_or_may_come_back() -> None:
-    """Of sensors that were there before, not of those without a cache, nor of those that are gone for long."""
+    """Caches of sensors present before, except sensors without a cache and sensors absent for long."""
     streams = front, rear, plain, other = ["site/node/front", "site/node/rear", "site/node/plain", "site/car/lidar"]
     one = StreamDirectory("a", IDLE_NS, lambda _: True)
     one.began_ns = SECOND
@@ -44,7 +42,6 @@ def test_caches_are_awaited_of_publishers_that_are_there_or_may_come_back() -> N
 
 
 def names(count: int, site: str = "site") -> list[str]:
-    """Names of streams."""
     return [f"{site}/node-{number}/lidar" for number in range(count)]
 
 
@@ -75,7 +72,7 @@ def test_a_fleet_that_begins_at_once_is_announced() -> None:
 
 
 def test_a_stream_with_a_session_is_announced_at_once() -> None:
-    """What is tracked already waits for nobody: a discoverer that begins hears of all streams at once."""
+    """Tracked streams do not wait: a new discoverer hears of all streams at once."""
     one, fleet = Discoverer(), names(10_000)
     one.sessions |= set(fleet)
     one.hear(0, *names(2 * MAX_UNPROVEN_ANNOUNCED, "other"))

@@ -1,16 +1,14 @@
-"""Whatever happens to messages and sessions, they end as if nothing had happened: by search, and by simulation."""
-
-from __future__ import annotations
+"""Disturbed messages and sessions end like undisturbed ones: by search, and by simulation."""
 
 import os
 from dataclasses import replace
 
 import pytest
-from disturbed import World
+from disturbed import World, give
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
-from optipmb_schemas import Detections, MessageError, decode, encode
+from optipmb_schemas import Detections, MessageError, Points, decode, encode
 from optipmb_service.stream.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
 from optipmb_service.stream.session import Session
 from optipmb_service.stream.values import Policy
@@ -28,12 +26,11 @@ class Disturbed(RuleBasedStateMachine):
     """A stream whose messages hypothesis delivers as it likes, to a session that it crashes as it likes.
 
     The model is the session that gets everything once, in order, and never crashes. All that was sent is delivered in
-    the end: what was still under way, and what a crash forgot, from the publisher's cache.
+    the end: messages under way, and messages forgotten in a crash, from the publisher's cache.
     """
 
     @initialize(first=st.integers(0, 3))
     def begin(self, first: int) -> None:
-        """Nothing was sent yet."""
         self.sensor = Sensor()
         self.stamp_ns, self.seq = 10**6 * SECOND, first
         self.now_ns = 0
@@ -44,7 +41,6 @@ class Disturbed(RuleBasedStateMachine):
         self.saved = encode_checkpoint(self.session.snapshot())
 
     def fresh(self) -> Session:
-        """A session to which nothing has happened."""
         return Session(self.sensor.stream, NUSCENES, POLICY, tracker=chained)
 
     @rule(objects=st.integers(0, 3), step=st.sampled_from([0, 1, 1, 1, 2, 40, 70]), cloud=st.booleans())
@@ -65,64 +61,55 @@ class Disturbed(RuleBasedStateMachine):
 
     @rule(hours=st.sampled_from([-1, 1]))
     def jump(self, hours: int) -> None:
-        """The sensor's clock is set."""
         self.stamp_ns += hours * 3600 * SECOND
 
     @rule(lost=st.integers(1, 3))
     def drop(self, lost: int) -> None:
-        """Frames are lost for good, before any network."""
         self.seq += lost
 
     @precondition(lambda self: self.under_way)
     @rule(data=st.data())
     def deliver(self, data: st.DataObject) -> None:
-        """Any message that is under way arrives."""
         self.receive(self.under_way.pop(data.draw(st.integers(0, len(self.under_way) - 1))))
 
     @precondition(lambda self: self.under_way)
     @rule()
     def deliver_next(self) -> None:
-        """The next message arrives."""
         self.receive(self.under_way.pop(0))
 
     @precondition(lambda self: self.sent)
     @rule(data=st.data())
     def repeat(self, data: st.DataObject) -> None:
-        """Anything that was ever sent arrives, perhaps again."""
         self.receive(data.draw(st.sampled_from(self.sent)))
 
     @precondition(lambda self: self.sent)
     @rule(data=st.data())
     def malform(self, data: st.DataObject) -> None:
-        """A message arrives of which something is missing."""
+        """A truncated message arrives."""
         payload = data.draw(st.sampled_from(self.sent))
         self.receive(payload[: data.draw(st.integers(0, len(payload) - 1))])
 
     @rule(periods=st.integers(1, 30))
     def wait(self, periods: int) -> None:
-        """Time passes for the service."""
         self.now_ns += periods * SECOND // 10
         self.merged.take(self.session.on_tick(self.now_ns), self.session.run)
 
     @rule()
     def checkpoint(self) -> None:
-        """The session is written down; what is taken up from it is what was written down."""
+        """The session is saved; the restored one equals it."""
         self.saved = encode_checkpoint(self.session.snapshot())
         again = Session.restore(decode_checkpoint(self.saved), 0, POLICY, tracker=chained).snapshot()
         assert encode_checkpoint(replace(again, run=again.run - 1)) == self.saved
 
     @rule()
     def crash(self) -> None:
-        """The session is gone and comes back as it was written down; what was sent comes again, some time."""
+        """The session crashes and is restored; its messages arrive again at some time."""
         self.session = Session.restore(decode_checkpoint(self.saved), self.now_ns, POLICY, tracker=chained)
         self.saved = encode_checkpoint(self.session.snapshot())
         self.under_way = list(self.sent)
 
     def receive(self, payload: bytes) -> None:
         """Hand over what arrives, as a service does."""
-        from disturbed import give  # noqa: PLC0415 - beside its use
-        from optipmb_schemas import Points  # noqa: PLC0415 - beside its use
-
         for kind in (Detections, Points):
             try:
                 message = decode(payload, kind)
@@ -132,7 +119,7 @@ class Disturbed(RuleBasedStateMachine):
             return
 
     def teardown(self) -> None:
-        """All arrives that was sent; then nothing has ever happened."""
+        """Deliver all messages; then the session equals the model."""
         if not hasattr(self, "sent"):
             return
         for payload in self.under_way:

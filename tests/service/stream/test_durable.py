@@ -1,15 +1,14 @@
-"""What a service keeps, and what it says of itself: checkpoints, eviction, limits, the balance of its counters."""
-
-from __future__ import annotations
+"""Durability and reports of a service: checkpoints, eviction, limits, the balance of its counters."""
 
 import gc
 import os
 import resource
 import threading
 import time
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 import zenoh.ext
@@ -19,7 +18,7 @@ from optipmb_service.app.lifecycle import longest_end_s
 from optipmb_service.app.storage import STORE_FILE
 from optipmb_service.cluster.leases import ALIVE, member_key
 from optipmb_service.cluster.sqlite import SqliteStore
-from optipmb_service.cluster.store import StoreError, Write
+from optipmb_service.cluster.store import Fenced, StoreError, Write
 from optipmb_service.stream.persistence import CheckpointWriter
 from optipmb_service.stream.session import Session
 from optipmb_service.stream.stream import Stream
@@ -27,18 +26,13 @@ from router import Node, Sensor, plain, until
 
 import optipmb
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from optipmb_service.cluster.store import Fenced
-
 KEYS = Keys()
 SENSOR = Sensor()
 STREAMS = int(os.environ.get("OPTIPMB_TEST_STREAMS", "100"))
 
 
 def balance(state: SessionState) -> int:
-    """What is received and not accounted for."""
+    """Received frames not accounted for."""
     accounted = state.frames + state.duplicates + state.late + state.refused + state.shed + state.queue
     return state.received - accounted
 
@@ -67,7 +61,7 @@ def test_an_idle_session_is_kept_and_goes_on(start: Callable[..., Any], tmp_path
 
 
 def test_a_store_that_hangs_keeps_no_end_waiting(start: Callable[..., Any], tmp_path: Path) -> None:
-    """Whatever is waited for at the end, all of it takes less than whoever starts a process waits before a kill.
+    """All waits at the end together take less than a supervisor's usual delay before a kill.
 
     That nothing was kept is said.
     """
@@ -93,7 +87,7 @@ def test_a_store_that_hangs_keeps_no_end_waiting(start: Callable[..., Any], tmp_
 
 
 def test_a_closed_stream_that_moves_stays_closed(start: Callable[..., Any], tmp_path: Path) -> None:
-    """Whoever gets it has no session of it until its next frame, which then gets ids that were never used before."""
+    """The next owner has no session of it until its next frame, which then gets ids that were never used before."""
     service, endpoint = start(store=str(tmp_path))
     with Node(endpoint) as node:
         node.send(*(SENSOR.detections(seq) for seq in range(5)))
@@ -110,7 +104,7 @@ def test_a_closed_stream_that_moves_stays_closed(start: Callable[..., Any], tmp_
 
 
 def test_a_restart_goes_on(start: Callable[..., Any], tmp_path: Path) -> None:
-    """Fault 18: what was tracked before the end is there after the start, to the byte, without the publisher's help."""
+    """Fault 18: tracked state is there after the restart, to the byte, without the publisher's help."""
     service, endpoint = start(store=str(tmp_path))
     state = KEYS.query(SENSOR.stream, "state")
     with Node(endpoint) as node:
@@ -259,8 +253,6 @@ def test_what_a_checkpoint_contains_has_had_time_to_leave() -> None:
     written: list[float] = []
 
     class Watched(SqliteStore):
-        """Notes when it is written to."""
-
         def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
             written.append(time.monotonic())
             return super().save(checkpoints)
@@ -363,7 +355,7 @@ def test_many_streams_come_and_go(start: Callable[..., Any], tmp_path: Path) -> 
 
 
 def test_beyond_the_limit_a_stream_is_refused(start: Callable[..., Any]) -> None:
-    """Fault 20: one stream too many gets a problem that says so, and those that are tracked do not notice."""
+    """Fault 20: one stream too many gets a problem that says so; tracked streams do not notice."""
     _, endpoint = start(max_sessions=2)
     sensors = [replace(SENSOR, stream=f"site/node/{number}") for number in range(3)]
     with Node(endpoint) as node:
@@ -383,7 +375,7 @@ def _memory_kb() -> int:
 
 
 def test_fifty_sessions_are_restored_in_time(start: Callable[..., Any], tmp_path: Path) -> None:
-    """Fifty sessions of a hundred objects are all restored, and none has lost a frame; how long it took is told."""
+    """Fifty sessions of a hundred objects are all restored without a lost frame; the duration is reported."""
     sensors = [replace(SENSOR, stream=f"site/node/{number}", objects=100) for number in range(50)]
     service, endpoint = start(store=str(tmp_path))
     with Node(endpoint) as node:

@@ -1,7 +1,5 @@
 """Frames that need too much computing: refused as a function of the frames, and never for ever."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -1,9 +1,6 @@
 """Covariances that have lost their rank, weights next to nothing, long silences: finite, repaired, counted, shown."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import optipmb_schemas as schemas
@@ -12,16 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from optipmb_service.stream import convert
-from optipmb_service.stream.checkpoint import decode_checkpoint, encode_checkpoint
+from optipmb_service.stream.checkpoint import Checkpoint, decode_checkpoint, encode_checkpoint
 from optipmb_service.stream.session import Session
 from optipmb_service.stream.timeline import FrameId
 from router import Sensor
 from sessions import feed, tracks
 
 import optipmb
-
-if TYPE_CHECKING:
-    from optipmb_service.stream.checkpoint import Checkpoint
 
 NUSCENES = optipmb.load_profile("nuscenes")
 SENSOR = Sensor()
@@ -73,7 +67,6 @@ def test_a_covariance_that_no_message_can_carry_is_not_published() -> None:
 
 
 def told(found: optipmb.Tracks, paths: optipmb.PredictedPaths | None = None) -> schemas.Tracks:
-    """The message for tracks."""
     return convert.tracks_of(
         optipmb.StepResult(None, found, None, paths),  # type: ignore[arg-type]  # of the tracks alone
         SENSOR.stream,
@@ -91,7 +84,7 @@ def told(found: optipmb.Tracks, paths: optipmb.PredictedPaths | None = None) -> 
 @settings(max_examples=40, deadline=None)
 @given(data=st.data(), count=st.integers(0, 3))
 def test_a_message_that_is_made_without_its_checks_would_pass_them(data: st.DataObject, count: int) -> None:
-    """Whatever numbers the tracks hold, near every bound of the message: it is valid, or it is not made."""
+    """For any numbers in the tracks, near every bound of the message, it is valid or not made."""
     columns = {}
     for name, array in schemas.Tracks.arrays.items():
         shape = (count, *array.shape[1:])
@@ -120,7 +113,7 @@ def test_a_message_that_is_made_without_its_checks_would_pass_them(data: st.Data
 @pytest.mark.parametrize("value", [1e12, 1.1e12, 1e31, 1e39, np.inf, np.nan])
 @pytest.mark.parametrize("entry", ["position", "yaw", "covariance"])
 def test_paths_that_no_message_can_carry_are_not_published(entry: str, value: float) -> None:
-    """Whatever numbers predicted paths hold: the message is valid, or it is not made and the error names the field."""
+    """For any numbers in predicted paths, the message is valid, or it is not made and the error names the field."""
     found = tracks_after(4)
     count = len(found.id)
     mean, covariance = np.zeros((count, 2, 6)), np.broadcast_to(np.eye(6), (count, 2, 6, 6)).copy()
@@ -138,7 +131,6 @@ def test_paths_that_no_message_can_carry_are_not_published(entry: str, value: fl
 
 
 def tracks_after(frames: int) -> optipmb.Tracks:
-    """The tracks of the sensor's objects after some frames."""
     tracker = optipmb.Tracker(NUSCENES)
     density = tracker.initial()
     for seq in range(frames):

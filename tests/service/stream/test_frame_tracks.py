@@ -1,6 +1,4 @@
-"""Tracks on their way out: the bytes that are put together without a message are those of the message."""
-
-from __future__ import annotations
+"""Output tracks: bytes composed without a message equal the encoded message."""
 
 from typing import Any
 
@@ -10,7 +8,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from optipmb_service.stream.convert import tracks_of
 from optipmb_service.stream.timeline import FrameId
-from optipmb_service.stream.values import COLUMNS, Tracked
+from optipmb_service.stream.values import Tracked
 
 import optipmb
 
@@ -19,7 +17,6 @@ PARAMETERS = optipmb.load_profile("generic")
 
 
 def sound_tracks(count: int) -> optipmb.Tracks:
-    """Tracks whose numbers a message may hold."""
     rng = np.random.default_rng(count)
     columns: dict[str, Any] = {}
     for name, one in optipmb.Tracks.described.items():
@@ -37,19 +34,8 @@ def made(tracks: optipmb.Tracks, *parts: Any, frame_id: FrameId = FRAME, **field
 
 
 def delivery(run: int) -> dict[str, Any]:
-    """The values of a delivery part."""
     times = {"queue_ms": 0.5, "decode_ms": 0.0, "step_ms": 1e-3}
     return {"instance": "one", "received_ns": 2**60, "published_ns": 2**61, **times, "run": run}
-
-
-def test_the_columns_are_those_of_the_message_in_its_order() -> None:
-    """All that are there in every message, one behind the other and nothing between them; all of 8 bytes."""
-    names = [*schemas.Tracks.names]
-    assert [one for one in names if one in COLUMNS] == [*COLUMNS]
-    assert names[names.index("id") :][: len(COLUMNS)] == [*COLUMNS]
-    for name, one in optipmb.Tracks.described.items():
-        described = schemas.Tracks.arrays[name]
-        assert (described.dtype[1], described.shape) == ("8", ("N", *one.shape))
 
 
 @given(

@@ -1,41 +1,35 @@
-"""Several sensors feed one session by turns: what comes of it follows from their frames alone, none harms another."""
-
-from __future__ import annotations
+"""Several sensors feed one session by turns: the results depend on their frames alone, and none harms another."""
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
 from fusing import FRONT, FUSED, REAR, SIDE, drive
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_schemas import Pose
+from optipmb_schemas import Detections, Pose
 from optipmb_service.stream.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
 from optipmb_service.stream.pending import SensorQueue
 from optipmb_service.stream.session import Session
-from optipmb_service.stream.timeline import FusedTimeline
+from optipmb_service.stream.timeline import FrameId, FusedTimeline
 from optipmb_service.stream.values import MAX_SENSORS, Policy
 from router import SECOND, Sensor
 from sessions import Failing, Merged, begun, chained, delayed, feed, problems, tracks
 
 import optipmb
 
-if TYPE_CHECKING:
-    from optipmb_schemas import Detections
-    from optipmb_service.stream.timeline import FrameId
-
 NUSCENES = optipmb.load_profile("nuscenes")
 
 
 def fused(policy: Policy | None = None, **options: Any) -> Session:
-    """A session of several sensors; what it costs is hashing. Nothing is waited for at its beginning."""
+    """A session of several sensors with a hashing tracker. It waits for nothing at its beginning."""
     policy = policy or Policy(recovery_wait_ns=0)
     return Session(FUSED, NUSCENES, policy, fused=True, **{"tracker": chained, **options})
 
 
 def in_order(count: int = 6) -> list[Detections]:
-    """Frames of three sensors by stamp; the publisher of one of them is started anew between."""
+    """Frames of three sensors by stamp; the publisher of one of them restarts in between."""
     again = delayed(replace(REAR, epoch=b"R" * 16), 0.1 * count)
     frames = [sensor.detections(seq) for sensor in (FRONT, REAR, SIDE) for seq in range(count)]
     frames += [again.detections(seq) for seq in range(count // 2)]
@@ -43,7 +37,6 @@ def in_order(count: int = 6) -> list[Detections]:
 
 
 def given_to(session: Session, frames: list[Detections]) -> list[Any]:
-    """What a session makes of frames."""
     return [output for frame in frames for output in session.on_detections(frame, 0)]
 
 
@@ -53,10 +46,10 @@ IN_ORDER = in_order()
 @settings(max_examples=30, deadline=None)
 @given(st.permutations(range(len(IN_ORDER))), st.integers(0, len(IN_ORDER)))
 def test_any_interleaving_gives_the_state_of_frames_in_order(order: list[int], cut: int) -> None:
-    """Tracks and state are the same bytes in whatever order frames come, and over a restart in between."""
+    """Tracks and state are the same bytes for any order of frames, and over a restart in between."""
     epochs = [IN_ORDER[at].epoch for at in order]
     first, later = epochs.index(REAR.epoch), epochs.index(b"R" * 16)
-    if later < first:  # which publisher is the later one is told by who came first
+    if later < first:  # the order of arrival decides which publisher is the later one
         order[first], order[later] = order[later], order[first]
     one, other, merged, again = fused(), fused(), Merged(), Merged()
     merged.take(given_to(one, IN_ORDER))
@@ -70,7 +63,7 @@ def test_any_interleaving_gives_the_state_of_frames_in_order(order: list[int], c
 
 
 def test_a_frame_of_another_sensor_does_not_go_before_those_that_are_ready() -> None:
-    """Where frames go one at a time, those of one sensor that were left are still due when one of another comes."""
+    """When frames go one at a time, remaining frames of one sensor are still due when another sensor's frame comes."""
     one, policy = fused(Policy(recovery_wait_ns=0, at_once=1)), Policy()
     for seq in range(3):
         one.on_detections(FRONT.detections(seq, has_points=True), 0)
@@ -82,7 +75,7 @@ def test_a_frame_of_another_sensor_does_not_go_before_those_that_are_ready() -> 
 
 
 def test_tracks_name_the_session_and_the_sensor() -> None:
-    """The stream is that of the session, the sensor that of the frame; equal stamps go by the names of the sensors."""
+    """The stream belongs to the session, the sensor to the frame; equal stamps are ordered by sensor name."""
     one = fused()
     found = tracks(given_to(one, [SIDE.detections(0), REAR.detections(0), FRONT.detections(0)]))
     assert {m.stream for m in found} == {FUSED}
@@ -154,7 +147,7 @@ def test_a_cloud_is_that_of_its_sensor() -> None:
 
 
 def test_one_wrong_clock_is_refused_and_all_of_them_are_believed() -> None:
-    """A sensor hours ahead harms nobody however long it sends; when the others follow, the session begins anew."""
+    """A sensor hours ahead harms no other one, however long it sends; when the others follow, the session restarts."""
     one, wrong = fused(), delayed(REAR, 3600.0)
     given_to(one, [FRONT.detections(0), SIDE.detections(0), REAR.detections(0)])
     session = one.session
@@ -183,7 +176,7 @@ def test_a_clock_that_nobody_moves_is_left() -> None:
 
 
 def test_a_pose_is_believed_when_all_sensors_say_the_same() -> None:
-    """One sensor that is told elsewhere is refused; a vehicle that was carried off begins anew, once."""
+    """One sensor reported elsewhere is refused; when the whole vehicle has moved, the session restarts once."""
 
     def at(sensor: Sensor, seq: int, x: float) -> Detections:
         return sensor.detections(seq, pose=Pose(translation=np.array([x, 0, 0]), quaternion=np.array([1.0, 0, 0, 0])))
@@ -200,7 +193,7 @@ def test_a_pose_is_believed_when_all_sensors_say_the_same() -> None:
 
 
 def test_a_step_that_fails_quarantines_its_sensor() -> None:
-    """The others go on with the density as it was; the sensor comes back when its publisher starts anew."""
+    """The others go on with the same density; the sensor comes back when its publisher restarts."""
     one = fused(tracker=Failing)
     given_to(one, [FRONT.detections(0), REAR.detections(0)])
     session = one.session
@@ -241,7 +234,7 @@ def test_the_state_can_be_told_while_a_sensor_comes(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_sensor_that_is_silent_makes_room_for_another() -> None:
-    """Names may come and go for ever: of more than a session takes, those that were silent longest are forgotten.
+    """Sensor names may come and go for ever: beyond the limit of a session, the longest silent ones are forgotten.
 
     So it goes on when it was written down and restored in between.
     """
@@ -279,10 +272,7 @@ def test_what_is_remembered_of_sensors_is_bounded() -> None:
 
 
 class Tired(optipmb.Tracker):
-    """Refuses frames of seven objects for their effort."""
-
     def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
-        """Refuse, or go on."""
         if len(frame.score) == 7:
             raise optipmb.EffortError("pairs", "at most 7", "8")
         return super().step(density, frame)
@@ -321,7 +311,7 @@ def test_frames_held_are_judged_once_when_many_are_let_go() -> None:
 
 
 def test_after_a_restart_the_caches_of_all_sensors_are_waited_for() -> None:
-    """The cache of one may come before that of another, each longer than the window: nothing is late."""
+    """One cache may come before another, each longer than the window: nothing is late."""
     policy = Policy(rewind_ns=SECOND // 2)
     first = replace(policy, recovery_wait_ns=0)
     one, other, merged, again = fused(first), fused(first), Merged(), Merged()
@@ -338,7 +328,7 @@ def test_after_a_restart_the_caches_of_all_sensors_are_waited_for() -> None:
 
 
 def test_when_a_session_begins_the_caches_of_all_sensors_are_waited_for() -> None:
-    """What comes faster than time passes is held until the wait is over; what comes in time is not."""
+    """Frames faster than real time are held until the wait is over; punctual frames are not."""
     one, merged, frames = Session(FUSED, NUSCENES, fused=True, tracker=chained), Merged(), in_order(40)
     other, again = fused(), Merged()
     merged.take(given_to(one, sorted(frames, key=lambda frame: frame.stream)))
@@ -355,7 +345,7 @@ def test_when_a_session_begins_the_caches_of_all_sensors_are_waited_for() -> Non
 
 
 def test_a_cache_that_is_handed_over_slowly_leaves_room_for_another() -> None:
-    """Two seconds of one sensor come within 0.3 s; what comes then of another, which began earlier, is not late."""
+    """Two seconds of one sensor come within 0.3 s; frames of another one, which began earlier, are not late."""
     one, frames = fused(Policy()), drive(40)
     other, merged, again = fused(), Merged(), Merged()
     rear, front = ([frame for frame in frames if frame.stream == sensor.stream] for sensor in (REAR, FRONT))

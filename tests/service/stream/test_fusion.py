@@ -1,18 +1,18 @@
-"""Sensors of one node in the service: one session, tracks on one key; what is wrong with one is said to it alone."""
-
-from __future__ import annotations
+"""Sensors of one node in the service: one session, tracks on one key; problems go to the faulty sensor alone."""
 
 import contextlib
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import optipmb_service.stream.directory
 import optipmb_service.stream.recovery
 import pytest
 from fusing import FRONT, FUSED, REAR, drive
-from optipmb_schemas import Keys, SessionParameters, SessionState, Tracks, decode
+from optipmb_schemas import Detections, Keys, SessionParameters, SessionState, Tracks, decode
 from optipmb_service.cluster.leases import partition_of
 from optipmb_service.settings import SettingsInvalidError, load
 from optipmb_service.stream.checkpoint import digest_of
@@ -23,12 +23,6 @@ from router import Node, Sensor, until
 from sessions import Merged, tracks
 
 import optipmb
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from optipmb_schemas import Detections
 
 KEYS = Keys()
 CROSSING = "site/fused/crossing"
@@ -44,7 +38,7 @@ def undisturbed(frames: list[Detections]) -> tuple[dict[tuple[bytes, int], bytes
 
 
 def test_a_car_keeps_its_id_through_the_service(start: Callable[..., Any]) -> None:
-    """Two sensors publish, each on its key; the tracks on the key of both are those of the frames in order."""
+    """Two sensors publish, each on its key; the tracks on the common key equal the frames in order."""
     _, endpoint = start(fuse=["site/node/*"])
     frames, merged = drive(), Merged()
     wanted, _ = undisturbed(frames)
@@ -143,7 +137,7 @@ def test_a_sensor_that_is_heard_of_after_the_session_began_loses_no_frame(
 
 
 def test_queries_are_answered_for_the_session(start: Callable[..., Any]) -> None:
-    """State, parameters and a reset on its key; on that of a sensor the reply names it."""
+    """State, parameters and a reset on the session's key; on a sensor's key the reply names the session."""
     service, endpoint = start(fuse=["site/node/*"], profiles={FUSED: "kitti"}, stale_s=0.2)
     with Node(endpoint) as node:
         node.send(FRONT.detections(0), REAR.detections(0))
@@ -305,7 +299,7 @@ def test_a_list_of_patterns_comes_from_the_environment(monkeypatch: pytest.Monke
 
 
 def test_tracks_of_a_session_are_merged_by_sensor() -> None:
-    """Two sensors may share an epoch and a number: their tracks are those of two frames."""
+    """Two sensors may share an epoch and a number: their tracks belong to two frames."""
     from optipmb_client.merging import Merging, Novelty  # noqa: PLC0415 - of the client
 
     one, merging = Session(FUSED, optipmb.load_profile("nuscenes"), Policy(recovery_wait_ns=0), fused=True), Merging(10)

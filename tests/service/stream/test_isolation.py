@@ -1,12 +1,12 @@
-"""What one stream does, others do not feel: each test is a careless node beside a careful one."""
-
-from __future__ import annotations
+"""Streams do not affect each other: each test runs a careless node next to a careful one."""
 
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -40,13 +40,6 @@ from sessions import Gated
 
 import optipmb
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from optipmb_service.stream.recovery import Take
-
-
 KEYS = Keys()
 CAREFUL = Sensor("site/careful/lidar")
 CARELESS = Sensor("site/careless/lidar")
@@ -74,7 +67,7 @@ def test_no_sequence_number_overflows_a_counter(start: Callable[..., Any], tmp_p
 
 
 def crowd(seq: int, count: int) -> Detections:
-    """Small boxes within a metre, a second after those of the frame before."""
+    """Small boxes within a metre, a second after the frame before."""
     rng = np.random.default_rng(seq)
     center = np.c_[rng.uniform(-0.5, 0.5, (count, 2)), np.ones(count)]
     values = {"center": center, "size": np.full((count, 3), 0.05), "stamp_ns": CARELESS.stamp_ns(10 * seq)}
@@ -102,13 +95,10 @@ def test_a_crowd_in_one_place_costs_its_stream_alone(start: Callable[..., Any]) 
 
 
 class Slow:
-    """A tracker whose steps take a while of processor time once."""
-
     def __init__(self, parameters: optipmb.Parameters, busy: list[float]) -> None:
         self._tracker, self._busy = optipmb.Tracker(parameters), busy
 
     def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
-        """Step, after computing for as long as is asked."""
         ends = time.thread_time() + (self._busy.pop() if self._busy else 0.0)
         while time.thread_time() < ends:
             pass
@@ -153,12 +143,12 @@ def test_catching_up_after_a_restart_is_no_overload(start: Callable[..., Any], t
 def test_catching_up_from_the_log_keeps_no_other_waiting(
     start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What a stream has missed is tracked in its order, before what it sends, and others are tracked in between."""
+    """Missed frames of a stream are tracked in order, before its new ones, and others are tracked in between."""
     missed, newest = 200, 203
     gated = Gated(missed // 10)
 
     class Log:
-        def fetch(self, session: str, checkpoint: object, first: Take, later: Take) -> None:
+        def fetch(self, session: str, checkpoint: object, first: Callable[[list[Packet]], None], later: object) -> None:
             del checkpoint, later
             frames = [CARELESS.detections(seq) for seq in range(missed if session == CARELESS.stream else 0)]
             key, now_ns = KEYS.detections(session), time.monotonic_ns()
@@ -235,7 +225,7 @@ def test_a_checkpoint_that_cannot_be_made_is_its_streams_alone(monkeypatch: pyte
 
 
 def test_a_checkpoint_waits_for_a_write_lease_that_lapsed() -> None:
-    """What is put while the lease has lapsed is written when it holds again, and only then it is done."""
+    """A checkpoint put while the lease has lapsed is written when it holds again, and only then confirmed."""
     done = threading.Event()
     store = SqliteStore(None)
     leases = Alone(store)
@@ -402,7 +392,7 @@ def test_instances_without_a_common_store_are_told_of_each_other(start: Callable
 
 
 def test_messages_that_wait_are_bounded_in_bytes(start: Callable[..., Any]) -> None:
-    """A hundred messages of 1 MB while a step does not end: the queue keeps what it may, the rest is shed."""
+    """A hundred messages of 1 MB while a step does not end: the queue keeps its bound, the rest is shed."""
     gated = Gated()
 
     service, endpoint = start(tracker=gated.tracker, stream_mb=16, memory_mb=16)

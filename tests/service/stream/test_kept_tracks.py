@@ -1,16 +1,17 @@
 """Tracks that are asked for later: a range of stamps, each frame once, in bounded answers."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import queue
 import threading
+from collections.abc import Callable, Iterable
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 from unittest.mock import Mock
 
 import pytest
+import zenoh
 from commands import run_here
 from fake_service import tracks_of
 from nats_process import NatsProcess
@@ -25,19 +26,11 @@ from optipmb_tools.table_files import read_table
 from router import Node, Sensor, plain, until
 from routers import free_endpoint, open_client, open_router
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-    from pathlib import Path
-
-    import zenoh
-
 KEYS = Keys()
 SENSOR = Sensor()
 
 
 class Message(NamedTuple):
-    """Tracks of a frame, as they are kept."""
-
     seq: int
     order: tuple[int, int] = (1, 0)
     stamp_ns: int = 0
@@ -48,17 +41,15 @@ class Message(NamedTuple):
 
 
 def at(*seqs: int, **fields: Any) -> list[Message]:
-    """Messages of frames whose stamps are their numbers in seconds."""
     return [Message(seq=seq, stamp_ns=seq * 10**9, **fields) for seq in seqs]
 
 
 def seqs(messages: Iterable[Any]) -> list[int]:
-    """Their numbers."""
     return [one.seq for one in messages]
 
 
 def test_what_is_wanted_is_taken_by_stamp() -> None:
-    """Stamps from the first to the last, both included, in their order, whatever the order of publication."""
+    """Stamps from the first to the last, both included, in their order, for any order of publication."""
     found = TracksRange(2 * 10**9, 5 * 10**9)
     assert found.add(at(1, 2, 4, 3))
     assert found.add(at(5, 6))
@@ -67,7 +58,7 @@ def test_what_is_wanted_is_taken_by_stamp() -> None:
 
 
 def test_of_a_frame_the_tracks_that_hold_are_taken() -> None:
-    """The latest run, in it the latest revision, whatever came last; another sensor's frame is another one."""
+    """The latest run, in it the latest revision, for any order of arrival; another sensor's frame is another one."""
     found = TracksRange(0, None)
     first, corrected, later_run = (at(1, order=order)[0] for order in ((1, 0), (1, 3), (2, 0)))
     found.add([first, later_run, corrected, *at(1, sensor="a/b/c")])
@@ -85,7 +76,7 @@ def test_a_correction_after_the_range_counts() -> None:
 
 @pytest.mark.parametrize("bounds", [{"most": 3}, {"most_bytes": 30}])
 def test_an_answer_is_bounded_and_says_where_the_rest_begins(bounds: dict[str, int]) -> None:
-    """Parts from where the one before was cut have all frames once, whatever is read at a time."""
+    """Parts that continue at the last cut have all frames once, for any size of a part."""
     parts, next_ns = [], 0
     while next_ns is not None:
         found = TracksRange(next_ns, None, **bounds)
@@ -104,7 +95,7 @@ def test_frames_of_one_stamp_stay_together() -> None:
 
 
 def test_the_newest_tracks_are_there_without_a_log(node: Node) -> None:
-    """They are the messages that were published, byte for byte; what is not kept, and another stream, gives none."""
+    """They are the published messages, byte for byte; an expired range, and another stream, gives none."""
     node.send(*(SENSOR.detections(seq) for seq in range(10)))
     published = {one.seq: plain(one) for one in node.tracks(SENSOR.stream, 10)}
     key = KEYS.query(SENSOR.stream, "tracks")
@@ -134,7 +125,7 @@ def test_a_range_that_ends_before_it_begins_is_refused(node: Node) -> None:
 
 @pytest.mark.parametrize("payload", [encode(TracksRequest()), b""])
 def test_an_answer_that_breaks_off_is_an_error(payload: bytes) -> None:
-    """Without the last reply not all tracks have come; what has come is not taken for all."""
+    """Without the last reply the tracks are incomplete, and the reader learns it."""
     key = KEYS.query(SENSOR.stream, "tracks")
     endpoint, example = free_endpoint(), encode(tracks_of(SENSOR.detections(0)))
 
@@ -154,7 +145,7 @@ def test_an_answer_that_breaks_off_is_an_error(payload: bytes) -> None:
 
 
 def test_a_search_that_fails_takes_no_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A query that fails by an error that nobody foresaw is answered, and so is the next."""
+    """A query that fails by an unforeseen error is answered, and so is the next."""
     monkeypatch.setattr(service_tracks, "AT_ONCE", 1)
     kept, refused = Mock(), queue.SimpleQueue[Any]()
     kept.tracks.side_effect = ValueError("a mistake")

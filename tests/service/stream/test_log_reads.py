@@ -1,17 +1,12 @@
 """Reads of the log for sessions whose frames do not arrive."""
 
-from __future__ import annotations
-
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
+from optipmb_service.stream.checkpoint import Checkpoint
 from registries import Around, packet_of, streams_of
 from router import Sensor
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from optipmb_service.stream.checkpoint import Checkpoint
 
 SENSORS = [Sensor(stream=f"yard/{number}/lidar") for number in range(100)]
 LEASE_NS = 2 * 10**9
@@ -24,11 +19,9 @@ class Log:
         self.asked: list[tuple[str, Callable[[list[Any]], None]]] = []
 
     def fetch(self, _: str, __: object, first: Callable[[list[Any]], None], ___: object) -> None:
-        """Have nothing at the start."""
         first([])
 
     def look(self, checkpoint: Checkpoint, then: Callable[[list[Any]], None]) -> None:
-        """Take a question."""
         self.asked.append((checkpoint.stream, then))
 
 

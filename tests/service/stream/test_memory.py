@@ -1,14 +1,11 @@
 """What a process that tracks takes; what a session holds is free at its end, not when a garbage collection comes by."""
 
-from __future__ import annotations
-
-import gc
 import sys
-import weakref
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import optipmb_schemas as schemas
 import pytest
@@ -21,9 +18,6 @@ from router import Node, Sensor
 from service_process import ServiceProcess
 
 import optipmb
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 SENSOR = Sensor()
 STREAMS = 50
@@ -41,7 +35,6 @@ def resident_mb(process: int) -> float:
 
 @pytest.fixture(scope="module")
 def busy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceProcess]:
-    """A service with its own router and a store, 50 streams of 40 objects in it."""
     optipmb.warm_up()  # a process that compiles keeps the compiler's memory
     sensors = [replace(SENSOR, stream=f"site/node{k}/lidar", objects=40) for k in range(STREAMS)]
     environment = {"OPTIPMB_STORE": str(tmp_path_factory.mktemp("store"))}
@@ -82,7 +75,7 @@ def test_a_cloud_counts_once() -> None:
 
 
 def test_sessions_that_keep_little_are_not_closed_for_memory() -> None:
-    """Beyond the memory sessions are closed, the least recently used first, but for those that keep next to nothing."""
+    """Beyond the memory, the least recently used sessions are closed, except sessions of hardly any size."""
     kept_mb = [0.0, 0.01, 6.0, 0.2, 4.0, 9.0]  # the least recently used first; 10 MB may be kept
     named = zip(map(str, range(6)), kept_mb, strict=True)
     streams: Any = [
@@ -93,19 +86,3 @@ def test_sessions_that_keep_little_are_not_closed_for_memory() -> None:
     table.command = lambda name, *_, **__: closed.append(name)  # type: ignore[assignment,method-assign,func-returns-value]
     table._evict(streams)
     assert closed == ["2", "3", "4"]
-
-
-def test_a_session_is_freed_at_its_end() -> None:
-    """Nothing inside a session points back at it: its clouds go with the last reference to it."""
-    session = Session(SENSOR.stream, optipmb.load_profile("nuscenes"))
-    for seq in range(5):
-        session.on_points(SENSOR.points(seq), 0)
-        assert session.on_detections(SENSOR.detections(seq, has_points=True), 0)
-    session.reset()
-    gone = weakref.ref(session)
-    gc.disable()
-    try:
-        del session
-        assert gone() is None
-    finally:
-        gc.enable()

@@ -1,16 +1,14 @@
 """What streams cost that begin at once, and what becomes of their first frames: counted, without a network."""
 
-from __future__ import annotations
-
 import random
 import time
 from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
-from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_schemas import Keys
 from optipmb_service.cluster.leases import PARTITIONS, Change, partition_of
 from optipmb_service.stream import directory, streams
@@ -21,9 +19,6 @@ from optipmb_service.stream.values import SECOND
 from optipmb_service.zenoh.inputs import ALL, Packet
 from registries import Around, packet_of, streams_of
 from router import Sensor, until
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
 
 KEYS = Keys()
 STREAMS = [f"site/n{number:04}/lidar" for number in range(3 * NEW_STREAMS)]
@@ -44,29 +39,24 @@ class Network:
         """Nothing comes here."""
 
     def watch_streams(self, published: Callable[..., None], discovered: Callable[..., None]) -> None:
-        """Tell of the streams that there are."""
         for stream in self._announced:
             discovered(KEYS.discovered([stream], "other", "run"), True)
         for stream in self._published:
             published(f"{KEYS.detections(stream)}/@adv/pub/1/2/_", "token", True)
 
     def subscribe(self, kind: str, stream: str, *, cached: bool) -> None:
-        """Note it."""
         self.subscribed.append((kind, stream, cached))
 
     def unsubscribe(self, inputs: Iterable[object]) -> None:
-        """Nothing is withdrawn here."""
         assert not list(inputs)
 
     def watch_owners(self, told: Callable[..., None] | None) -> None:
-        """Nobody is heard of."""
+        """There are no announcements."""
 
     def discover(self, streams: set[str]) -> None:
-        """Nothing is announced here."""
         assert not streams
 
     def ask_recent(self, sessions: Sequence[str]) -> list[object]:
-        """Note it; nobody has anything."""
         asked = {session for group in self.asked for session in group}
         self.unasked.append(len({stream for _, stream, _ in self.subscribed} - asked))
         self.asked.append(list(sessions))
@@ -74,19 +64,15 @@ class Network:
 
 
 class Following(Network):
-    """Keeps what is subscribed to."""
-
     def __init__(self) -> None:
         super().__init__()
         self.now: set[tuple[str, str, bool]] = set()
 
     def subscribe(self, kind: str, stream: str, *, cached: bool) -> None:
-        """Add it."""
         assert (kind, stream, cached) not in self.now
         self.now.add((kind, stream, cached))
 
     def unsubscribe(self, inputs: Iterable[object]) -> None:
-        """Take it away."""
         left: Any = set(inputs)
         assert left <= self.now
         self.now -= left
@@ -96,8 +82,6 @@ class Following(Network):
 
 
 class Holding:
-    """A member that holds some partitions, which may change."""
-
     strained = False
 
     def __init__(self, held: set[int]) -> None:
@@ -105,16 +89,13 @@ class Holding:
 
     @property
     def partitions(self) -> set[int]:
-        """Return those of this moment."""
         return set(self._held)
 
     def holds(self, stream: str) -> bool:
-        """Whether a stream is of one of them."""
         return partition_of(stream) in self._held
 
 
 def member_of(network: Network, held: set[int]) -> tuple[Intake, Any]:
-    """Return the intake of a member that holds some partitions and tracks nothing yet."""
     streams = SimpleNamespace(
         on_owner=lambda: None,
         doubts_owners=False,
@@ -144,17 +125,14 @@ class Turning:
 
     @property
     def partitions(self) -> set[int]:
-        """Return them."""
         return self._held()
 
     @property
     def strained(self) -> bool:
-        """Whether it renews its lease late."""
         return bool(self._member.strained)
 
 
 def run(network: Network, intake: Intake, done: Callable[[], bool]) -> None:
-    """Have an intake work until something is reached."""
     intake.start()
     try:
         ends = time.monotonic() + WAIT_S
@@ -163,32 +141,6 @@ def run(network: Network, intake: Intake, done: Callable[[], bool]) -> None:
             time.sleep(0.01)
     finally:
         intake.close(WAIT_S)
-
-
-def test_an_error_of_the_network_does_not_end_the_intake() -> None:
-    """A subscription that fails is tried again in the next step."""
-
-    class Failing(Network):
-        fails = True
-
-        def subscribe(self, kind: str, stream: str, *, cached: bool) -> None:
-            if stream and self.fails:
-                self.fails = False
-                raise TransportError("no")
-            super().subscribe(kind, stream, cached=cached)
-
-    network, held = Failing(announced=STREAMS[:1]), set[int]()
-    intake, _ = member_of(network, held)
-
-    def subscribed() -> bool:
-        if not held:  # in the first call, when the intake has started
-            held.update(range(1, PARTITIONS))
-            for partition in tuple(held):
-                intake.changed(partition, Change.HELD)
-        return any(stream == STREAMS[0] for _, stream, _ in network.subscribed)
-
-    run(network, intake, subscribed)
-    assert not network.fails
 
 
 def test_new_streams_are_asked_for_a_few_at_a_time() -> None:
@@ -218,7 +170,7 @@ def test_new_streams_wait_while_the_lease_is_renewed_late(*, cached: bool) -> No
         late.strained = len(steps) < 3
         return set(range(1, PARTITIONS))
 
-    intake._member = Turning(held, late)  # type: ignore[assignment]  # what is used of it
+    intake._member = Turning(held, late)  # type: ignore[assignment]  # the only attribute used
     run(network, intake, lambda: {stream for _, stream, _ in network.subscribed} == own)
     assert steps[:3] == [0, 0, 0]
 
@@ -236,7 +188,7 @@ def test_only_publishers_with_a_cache_are_subscribed_to_with_recovery() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_subscriptions_are_those_of_who_begins_now(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
-    """Whatever streams and partitions came and went before, step by step, and whether publishers have caches.
+    """For all earlier streams and partitions, step by step, with and without caches of publishers.
 
     Of streams whose detections are received no longer it is forgotten that their caches had answered.
     """
@@ -278,7 +230,7 @@ def test_subscriptions_are_those_of_who_begins_now(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.parametrize("fails", ["subscribe", "discover", "ask_recent", "take_up"])
 def test_a_step_that_fails_is_done_again(monkeypatch: pytest.MonkeyPatch, fails: str) -> None:
-    """Sessions that are held while their streams come here are taken up, whatever raised in between."""
+    """Sessions held for an arriving stream are resumed, even after an error in between."""
     network, held = Network(announced=STREAMS[:5], published=STREAMS[5:10]), set[int]()
     intake, member = member_of(network, held)
     kept, taken, failed = set[str](), set[str](), list[str]()
@@ -314,11 +266,9 @@ class Others(Around):
         self.problems: list[str] = []
 
     def holds(self, _: str) -> bool:
-        """Return whether this member has the streams."""
         return self.holding
 
     def report(self, problem: Any, _: int) -> None:
-        """Note a problem."""
         self.problems.append(problem.code)
 
 
@@ -332,11 +282,9 @@ class Kept:
         self.streams = streams_of(self.others, reporter=self.others, **settings)
 
     def crowded(self, crowded: bool) -> None:  # noqa: FBT001 - the state itself
-        """Say whether too many streams are new."""
         self._patch.setattr(streams, "MAX_UNPROVEN", 0 if crowded else 256)
 
     def tracked(self) -> list[int]:
-        """Return the counts of frames, by session, after all turns."""
         self.others.run()
         return [state.frames for one in self.streams.tracking() if (state := one.state()) is not None]
 
@@ -345,12 +293,11 @@ SENSOR = Sensor(STREAMS[0])
 
 
 def detections(number: int) -> Packet:
-    """Return a frame of a stream."""
     return packet_of(SENSOR.detections(number))
 
 
 def test_what_others_received_reaches_a_stream_that_was_let_in(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stream that is let in while others are asked for what they received of it gets that as well."""
+    """A stream admitted while others are asked for their received messages gets these as well."""
     kept = Kept(monkeypatch)
     kept.streams.receive(detections(0))
     assert kept.tracked() == []
@@ -389,7 +336,7 @@ def test_what_is_put_off_counts_as_received(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_what_is_put_off_and_dropped_is_shed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the backlogs have no room for, and what has waited for too long, counts as shed, with a problem."""
+    """Messages beyond the backlogs' bounds of size and time count as shed, with a problem."""
     kept = Kept(monkeypatch, standby_mb=1)
     large = packet_of(SENSOR.detections(0, objects=1000))
     room = 2**20 // large.held
@@ -418,7 +365,7 @@ def test_what_is_put_off_is_within_the_quota(monkeypatch: pytest.MonkeyPatch) ->
 def test_what_a_session_passes_on_is_kept_until_it_is_asked_for(
     monkeypatch: pytest.MonkeyPatch, *, asked: bool
 ) -> None:
-    """Frames of a session that leaves are kept also where `standby_s` is 0, and count as shed if nobody asks."""
+    """Frames of a leaving session are kept also where `standby_s` is 0, and count as shed without a request."""
     kept = Kept(monkeypatch, standby_s=0)
     kept.crowded(False)
     held = [packet_of(SENSOR.detections(number, has_points=True)) for number in range(2)]

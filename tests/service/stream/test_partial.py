@@ -1,6 +1,4 @@
-"""Sessions of detections without heading, size or height: what is known of a track goes with it."""
-
-from __future__ import annotations
+"""Sessions of detections without heading, size or height: tracks carry the known part."""
 
 from typing import Any
 

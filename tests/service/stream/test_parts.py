@@ -1,15 +1,13 @@
 """The small parts: turns, problems, figures, profiles, settings, and what imports what."""
 
-from __future__ import annotations
-
 import re
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from optipmb_schemas import Problem
 from optipmb_service.settings import SettingsInvalidError, load
 from optipmb_service.stream.pending import CloudBuffer
 from optipmb_service.stream.problems import problem_of
@@ -22,9 +20,6 @@ from structlog.testing import capture_logs
 
 import optipmb
 
-if TYPE_CHECKING:
-    from optipmb_schemas import Problem
-
 SENSOR = Sensor()
 
 
@@ -32,7 +27,7 @@ SENSOR = Sensor()
 
 
 def test_workers_take_turns() -> None:
-    """With one thread, what has more to do waits until the others had their turn."""
+    """With one thread, further work of one part waits until the others had their turn."""
     turns: list[str] = []
     done = threading.Event()
 
@@ -50,11 +45,7 @@ def test_workers_take_turns() -> None:
     scheduler = Scheduler()
     gate = threading.Event()
 
-    class Gate:
-        def work(self) -> bool:
-            return gate.wait(60) and False
-
-    scheduler.submit(Gate().work)
+    scheduler.submit(lambda: gate.wait(60) and False)
     scheduler.submit(Work("long", 3).work)
     scheduler.submit(Work("short", 2).work)
     gate.set()
@@ -64,21 +55,15 @@ def test_workers_take_turns() -> None:
 
 
 def test_an_error_does_not_end_the_tracking_thread() -> None:
-    """What raises is not called again for what it had; others have their turns."""
+    """A part that raises is not called again for the same work; others have their turns."""
     gate = threading.Event()
 
-    class Broken:
-        def work(self) -> bool:
-            raise RuntimeError
-
-    class Sound:
-        def work(self) -> bool:
-            gate.set()
-            return False
+    def broken() -> bool:
+        raise RuntimeError
 
     scheduler = Scheduler()
-    scheduler.submit(Broken().work)
-    scheduler.submit(Sound().work)
+    scheduler.submit(broken)
+    scheduler.submit(lambda: bool(gate.set()))
     assert gate.wait(60)
     assert scheduler.close(5)
 
@@ -87,13 +72,12 @@ def test_a_step_that_does_not_end_does_not_keep_the_scheduler() -> None:
     """Closing gives up on a step that does not end, and says so."""
     entered, gate = threading.Event(), threading.Event()
 
-    class Stuck:
-        def work(self) -> bool:
-            entered.set()
-            return gate.wait(60) and False
+    def stuck() -> bool:
+        entered.set()
+        return gate.wait(60) and False
 
     scheduler = Scheduler()
-    scheduler.submit(Stuck().work)
+    scheduler.submit(stuck)
     assert entered.wait(60)
     assert not scheduler.close(0.05)
     gate.set()
@@ -103,14 +87,13 @@ def test_a_step_that_does_not_end_does_not_keep_the_scheduler() -> None:
 
 
 def problem(stream: str = "a/b/c", code: str = "late", count: int = 1) -> Problem:
-    """Some problem."""
     return problem_of(code, stream=stream, instance="x", message="m", count=count)
 
 
 @settings(deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, SECOND)), max_size=80))
 def test_no_problem_is_lost_and_few_are_published(steps: list[tuple[int, int]]) -> None:
-    """Counts on the key and in the log add up to what was reported, each kind at most once a second, once in ten."""
+    """Counts on the key and in the log add up to the reports, each kind at most once a second, once in ten."""
     published: list[Problem] = []
     one = ProblemReporter(published.append)
     now, last = 0, dict[str, int]()
@@ -156,7 +139,7 @@ def test_elements_of_an_array_are_one_kind() -> None:
 @settings(deadline=None)
 @given(st.text(max_size=2000))
 def test_a_problem_takes_any_text(text: str) -> None:
-    """Whatever was received, the problem can be made and its texts are printable."""
+    """For any input, the problem can be made and its texts are printable."""
     made = problem_of("x", stream="", instance="x", message=text, received=text, expected=text, path=text)
     assert made.message.isprintable()
 
@@ -209,11 +192,9 @@ def test_clouds_of_other_publishers() -> None:
 
 def test_profiles_that_cannot_be_named_in_messages_are_refused(tmp_path: Path) -> None:
     """A profile whose name no message could carry ends the start, not the first frame."""
-    values = optipmb.load_profile("kitti").model_dump(mode="json")
     own = tmp_path / "own.toml"
     text = Path(optipmb.__file__).parent.joinpath("profiles", "kitti.toml").read_text()
     own.write_text(text.replace('name = "kitti"', 'name = "not a name"'))
-    assert values["name"] == "kitti"
     with pytest.raises(optipmb.ParameterError, match="name"):
         Profiles.read(str(own), {})
 
@@ -275,14 +256,3 @@ def test_router_or_client() -> None:
     assert (router.is_router, router.endpoints) == (True, ("tcp/127.0.0.1:7447",))
     assert (client.is_router, client.endpoints) == (False, ())
     assert (both.is_router, both.endpoints) == (True, ("tcp/127.0.0.1:7447",))
-
-
-def test_streams_of_a_profile_share_a_tracker() -> None:
-    """A tracker keeps nothing of a stream: those of one profile have the same, other parameters have their own."""
-    profiles = Profiles.read("kitti", {})
-    tracker = profiles.trackers(optipmb.Tracker)
-    known = profiles.of("a/b/c")
-    equal, other = known.model_copy(deep=True), known.model_copy(update={"nominal_period": 0.5})
-    assert tracker(known) is tracker(equal)
-    assert tracker(other) is not tracker(known)
-    assert tracker(other).parameters.nominal_period == 0.5

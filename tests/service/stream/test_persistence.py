@@ -1,14 +1,13 @@
-"""The checkpoint writer: what it is given, what it keeps in memory while the store fails, whom it keeps waiting."""
-
-from __future__ import annotations
+"""The checkpoint writer: its input, its memory while the store fails, and its effect on frames."""
 
 import threading
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from lease_log import Alone
 from optipmb_service.cluster.sqlite import SqliteStore
-from optipmb_service.cluster.store import StoreError
+from optipmb_service.cluster.store import Fenced, StoreError
+from optipmb_service.stream.checkpoint import Checkpoint
 from optipmb_service.stream.persistence import CheckpointWriter
 from optipmb_service.stream.session import Session
 from optipmb_service.stream.streams import KEPT_AT_ONCE
@@ -17,17 +16,10 @@ from router import Sensor, until
 
 import optipmb
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from optipmb_service.cluster.store import Fenced
-    from optipmb_service.stream.checkpoint import Checkpoint
-
 FIRST, SECOND = Sensor("site/first/lidar"), Sensor("site/second/lidar")
 
 
 def snapshot(sensor: Sensor) -> Checkpoint:
-    """The state of a session without a frame."""
     return Session(sensor.stream, optipmb.load_profile("nuscenes")).snapshot()
 
 
@@ -41,7 +33,6 @@ class Full(SqliteStore):
         self.may_fail = threading.Semaphore(0)
 
     def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
-        """Save, or fail."""
         if not self.full:
             return super().save(checkpoints)
         self.tries.release()
@@ -168,7 +159,7 @@ def test_what_waits_for_its_lease_grows_older() -> None:
 
 
 def test_the_end_says_whether_all_is_written() -> None:
-    """What a store refuses, and what has lost its write lease, is not written when the writer ends; else all is."""
+    """At its end the writer skips refused checkpoints and lost leases, and writes all others."""
 
     def end(store: SqliteStore, *, lapsed: bool = False) -> bool:
         leases = Alone(store)
@@ -205,7 +196,7 @@ def test_the_end_says_when_a_state_cannot_be_written() -> None:
 
 
 def test_states_are_given_for_a_few_streams_at_a_time() -> None:
-    """Those of the sessions that changed, in pieces between which a frame that comes has its turn."""
+    """Checkpoints of changed sessions, in pieces between which a new frame has its turn."""
     around = Around()
     streams = streams_of(around)
     sensors = [replace(FIRST, stream=f"site/node{number:02d}/lidar") for number in range(2 * KEPT_AT_ONCE + 3)]

@@ -1,7 +1,5 @@
 """Poses that no sensor can have: refused with the reason, until they are many that agree."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 
@@ -24,19 +22,16 @@ POLICY = Policy()
 
 
 def frame(seq: int, x: float) -> Detections:
-    """A frame of a sensor at x, with objects around it."""
     pose = Pose(translation=np.array([x, 0.0, 0.0]), quaternion=np.array([1.0, 0, 0, 0]))
     center = SENSOR.detections(seq).center
     return SENSOR.detections(seq, frame="sensor", pose=pose, center=center)
 
 
 def feed(one: Session, places: dict[int, float]) -> list[Output]:
-    """Give frames by number and place."""
     return [output for seq, x in places.items() for output in one.on_detections(frame(seq, x), 0)]
 
 
 def session(**changes: Any) -> Session:
-    """A session of the sensor's stream."""
     return Session(SENSOR.stream, NUSCENES, **changes)
 
 
@@ -89,7 +84,7 @@ def test_silence_gives_a_sensor_time_to_move() -> None:
 @settings(max_examples=20, deadline=None)
 @given(st.permutations(range(8)), st.sets(st.integers(1, 7), max_size=6))
 def test_refusals_do_not_depend_on_arrival(order: list[int], far: set[int]) -> None:
-    """Which frames are astray follows from the frames in order, whatever came when."""
+    """Frames off the path follow from the frames in order, for any order of arrival."""
     places = {seq: 300.0 if seq in far else 0.0 for seq in range(8)}
     one, other = session(tracker=chained), session(tracker=chained)
     feed(one, {seq: places[seq] for seq in order})
@@ -98,7 +93,7 @@ def test_refusals_do_not_depend_on_arrival(order: list[int], far: set[int]) -> N
 
 
 def shifted(seq: int, motion: optipmb.Relocation | None, turn: float = 0.02) -> Detections:
-    """A frame of a sensor that drives along a bend, in the world after a motion that nobody announced."""
+    """A frame of a sensor that drives along a bend, in the world after an unannounced motion."""
     yaw = turn * seq
     pose = optipmb.Pose(
         np.array([50.0 + seq, 0.02 * seq * seq, 1.8]), np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])

@@ -1,6 +1,4 @@
-"""A step that raises costs its session alone, and what it needs to happen again is saved and replayed."""
-
-from __future__ import annotations
+"""A step that raises costs its session alone; its input is saved and can be replayed."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -28,12 +26,11 @@ AGAIN = replace(SENSOR, epoch=b"b" * 16, start_s=SENSOR.start_s + 1.5)
 
 
 def session(**changes: Any) -> Session:
-    """A session whose tracker raises for seven objects."""
     return Session(SENSOR.stream, NUSCENES, tracker=Failing, **changes)
 
 
 def failed() -> tuple[Session, bytes]:
-    """A session that failed at frame 5, with clouds and a late frame before it, and what it saved."""
+    """A session that failed at frame 5, with clouds and a late frame before it, and its dump."""
     one = session()
     for seq in (0, 1, 3, 2, 4):
         one.on_points(SENSOR.points(seq, count=50), 0)
@@ -46,7 +43,7 @@ def failed() -> tuple[Session, bytes]:
 
 
 def test_a_failing_step_quarantines_its_session() -> None:
-    """The density is what it was, frames are refused with a problem that says why, and counted."""
+    """The density is unchanged, frames are refused with a problem that gives the reason, and counted."""
     one, _ = failed()
     density = one.density
     outputs = feed(one, [6, 7], SENSOR)
@@ -93,10 +90,7 @@ def test_a_late_frame_that_fails_leaves_the_rest_alone() -> None:
 
 
 class FailingClouds(optipmb.Tracker):
-    """Raises for a cloud of seven points."""
-
     def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
-        """Step, or raise."""
         if frame.cloud is not None and len(frame.cloud.xyz) == 7:
             raise ZeroDivisionError("seven")
         return super().step(density, frame)
@@ -119,7 +113,7 @@ def test_a_late_cloud_that_fails_is_no_frame(epoch: bytes) -> None:
 
 
 def test_others_go_on() -> None:
-    """A session beside one that fails gives what it gives alone."""
+    """A session next to a failing one gives the same results as alone."""
     other, expected = Session("site/node/other", NUSCENES, tracker=Failing), Merged()
     alone, merged = Session("site/node/other", NUSCENES, tracker=Failing), Merged()
     sensor = replace(SENSOR, stream="site/node/other")
@@ -129,7 +123,7 @@ def test_others_go_on() -> None:
     assert merged.plain() == expected.plain()
 
 
-# What is saved
+# The dump
 
 
 def test_a_dump_fails_again_in_the_same_way() -> None:
@@ -147,10 +141,7 @@ def test_a_dump_leads_to_the_same_density() -> None:
     seen: list[bytes] = []
 
     class Noting(Failing):
-        """Notes each density that comes in."""
-
         def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
-            """Note and step."""
             seen.append(b"".join(column.tobytes() for column in optipmb.columns_of(density).values()))
             return super().step(density, frame)
 
@@ -175,7 +166,7 @@ def test_a_dump_leads_to_the_same_density() -> None:
 
 @given(st.binary(max_size=300))
 def test_what_is_no_dump_is_refused(data: bytes) -> None:
-    """Whatever the bytes, nothing but the decoder's one error is raised."""
+    """For any bytes, nothing but the decoder's one error is raised."""
     with pytest.raises(schemas.MessageError):
         schemas.decode_dump(data)
 

@@ -1,9 +1,8 @@
 """What one node and one site may have: sessions, messages, bytes; and whose session goes when there is no room."""
 
-from __future__ import annotations
-
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,9 +12,6 @@ from optipmb_service.stream.admission import Admission, victim_of
 from optipmb_service.stream.values import Incarnation
 from optipmb_service.telemetry.stream_meter import StreamMeter
 from router import SECOND, Node, Sensor, until
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 KEYS = Keys()
 

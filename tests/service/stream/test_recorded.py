@@ -1,10 +1,9 @@
-"""Recorded sequences, disturbed: the state and the tracks are those of the recording in order, byte for byte."""
-
-from __future__ import annotations
+"""Recorded sequences, disturbed: state and tracks equal the recording in order, byte for byte."""
 
 import random
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,10 +17,6 @@ from router import SECOND
 from sessions import Merged
 
 import optipmb
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 STREAM = "site/node/lidar"
 LATE = 4

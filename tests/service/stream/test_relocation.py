@@ -1,11 +1,10 @@
 """Worlds that move under a session, as publishers announce it: tracks, poses and zones move with them."""
 
-from __future__ import annotations
-
 import math
 import random
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,9 +21,6 @@ from sessions import Merged, begun, dumps, plain, problems, tracks
 import optipmb
 from optipmb.zones import Zone
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
 SENSOR = Sensor()
 PROFILE = optipmb.load_profile("nuscenes")
 JUMP = optipmb.Relocation(10.0, -3.0, 0.5, math.radians(5.0))
@@ -32,14 +28,12 @@ BACK = optipmb.Relocation(-4.0, 20.0, -1.5, math.radians(-40.0))
 
 
 def announced(motion: optipmb.Relocation, world: int = 1) -> Relocation:
-    """The part of a message that says how its world came about."""
     half = 0.5 * motion.theta
     turn = np.array([math.cos(half), 0.0, 0.0, math.sin(half)])
     return Relocation(world=world, translation=np.array(motion[:3]), quaternion=turn)
 
 
 def moved(message: Detections, *motions: optipmb.Relocation) -> dict[str, Any]:
-    """The fields of a message in the world after motions."""
     fields = {name: getattr(message, name) for name in ("center", "yaw", "velocity", "pose")}
     for motion in motions:
         if message.pose is not None:
@@ -54,18 +48,15 @@ def moved(message: Detections, *motions: optipmb.Relocation) -> dict[str, Any]:
 
 
 def relocated(message: Detections, *motions: optipmb.Relocation, said: bool = True) -> Detections:
-    """A message in the world after motions, which it announces."""
     relocation = announced(motions[-1], len(motions)) if motions and said else None
     return message.model_copy(update=moved(message, *motions) | {"relocation": relocation})
 
 
 def session(**changes: Any) -> Session:
-    """A session of the sensor's stream."""
     return Session(SENSOR.stream, PROFILE, **changes)
 
 
 def feed(one: Session, messages: Iterable[Detections], now_ns: int = 0) -> list[Output]:
-    """Give messages to a session."""
     return [output for message in messages for output in one.on_detections(message, now_ns)]
 
 
@@ -76,7 +67,7 @@ def jumping(count: int = 20, at: int = 10, *motions: optipmb.Relocation) -> list
 
 
 def assert_moved(found: Sequence[Tracks], before: Sequence[Tracks], *motions: optipmb.Relocation) -> None:
-    """Tracks are those of another run in the world after motions: ids and detections equal, numbers nearly."""
+    """Tracks equal another run in the moved world: ids and detections equal, numbers nearly."""
     assert len(found) == len(before)
     for one, other in zip(found, before, strict=True):
         assert one.session == other.session
@@ -125,7 +116,7 @@ def test_no_motion_changes_nothing() -> None:
 
 
 def test_two_motions_are_their_product() -> None:
-    """Tracks after two jumps are those of the run without, moved by both; the tracks say where they happened."""
+    """Tracks after two jumps equal the run without, moved by both; the tracks give the positions of the jumps."""
     messages = [*jumping(10), *jumping(15, 0)[10:], *jumping(25, 0, JUMP, BACK)[15:]]
     found = tracks(feed(session(), messages))
     assert [(one.seq, one.world, one.relocation) for one in found if one.relocation] == [
@@ -257,7 +248,7 @@ def test_a_publisher_may_restart_with_the_numbers_of_its_world() -> None:
 
 @pytest.mark.parametrize("several", [False, True])
 def test_any_numbers_leave_a_state_that_can_be_read(*, several: bool) -> None:
-    """Whatever publishers number, in epochs of theirs: the tracks and the checkpoint hold numbers that they may."""
+    """For any world numbers of publishers and epochs, tracks and checkpoint hold valid numbers."""
     chance = random.Random(4)
     one = Session(FUSED, PROFILE, fused=True, policy=Policy(recovery_wait_ns=0)) if several else session()
     for seq in range(200):

@@ -1,7 +1,5 @@
 """Late, repeated and disordered messages: the session ends where it would have ended had all come once and in order."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
@@ -23,7 +21,6 @@ WAIT_NS = Policy().cloud_wait_ns
 
 
 def session(**changes: Any) -> Session:
-    """A session of the sensor's stream."""
     return Session(SENSOR.stream, NUSCENES, **changes)
 
 
@@ -37,7 +34,7 @@ def ends(seqs: Any, **changes: Any) -> tuple[bytes, dict[tuple[bytes, int], byte
 @settings(max_examples=30, deadline=None)
 @given(st.permutations(range(9)))
 def test_any_order_inside_the_window_is_the_order(order: list[int]) -> None:
-    """Whatever the order of arrival, also of the first frame, state and tracks are those of the order of the stamps."""
+    """For any order of arrival, also of the first frame, state and tracks equal the order of the stamps."""
     state, merged, _ = ends(order)
     expected, in_order, _ = ends(range(9))
     assert state == expected
@@ -60,7 +57,7 @@ def test_late_frames_and_a_restore_keep_the_counts_of_scores() -> None:
 
 
 def test_corrected_tracks_have_a_higher_revision() -> None:
-    """A late frame comes out with those behind it: it for the first time, they anew; the gap before them closes."""
+    """A late frame is published for the first time, later frames are published again; the gap before them closes."""
     one = session()
     first = tracks(feed(one, [0, 1, 3, 4], SENSOR))
     assert [(m.seq, m.revision, m.gap) for m in first] == [(0, 0, 0), (1, 0, 0), (3, 0, 1), (4, 0, 0)]
@@ -181,7 +178,7 @@ def late_cloud(*, allowed: bool) -> tuple[Session, Session, list[Output]]:
 
 
 def test_a_late_cloud_corrects_by_setting() -> None:
-    """With `late_clouds`, a cloud that comes after its frame was tracked gives what it would have given in time."""
+    """With `late_clouds`, a cloud received after its frame was tracked gives the same result as a punctual one."""
     one, other, outputs = late_cloud(allowed=True)
     assert [(m.seq, m.revision, m.cloud_used) for m in tracks(outputs)] == [(1, 1, True), (2, 1, True), (3, 1, True)]
     assert one.counters.clouds_missed == 0
@@ -189,7 +186,7 @@ def test_a_late_cloud_corrects_by_setting() -> None:
 
 
 def test_a_late_cloud_is_not_used_without_the_setting() -> None:
-    """By default what was tracked without a cloud stays so."""
+    """By default, frames tracked without a cloud stay so."""
     one, _, outputs = late_cloud(allowed=False)
     assert outputs == []
     assert (one.counters.clouds_used, one.counters.clouds_missed) == (3, 1)
@@ -214,7 +211,7 @@ def test_clouds_and_frames_may_come_in_any_order(order: list[int]) -> None:
 
 
 def test_a_reset_is_a_wall() -> None:
-    """A frame from before a reset is late: what was forgotten does not come back."""
+    """A frame from before a reset is late: forgotten frames do not come back."""
     one = session()
     feed(one, [0, 1, 3], SENSOR)
     one.reset()

@@ -1,7 +1,5 @@
 """A session as a function of its messages: order, clouds, restarts, failures, commands."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import count
 from typing import Any
@@ -25,12 +23,10 @@ LOST = 10
 
 
 def session(**changes: Any) -> Session:
-    """A session of the sensor's stream."""
     return Session(SENSOR.stream, NUSCENES, instance="test", **changes)
 
 
 def feed(one: Session, seqs: Any, sensor: Sensor = SENSOR, **changes: Any) -> list[Output]:
-    """Give frames to a session at time zero."""
     return sessions.feed(one, seqs, sensor, **changes)
 
 
@@ -133,7 +129,7 @@ def test_a_restarted_publisher_continues() -> None:
 
 @pytest.mark.parametrize("shift_s", [-3600.0, -0.5, 3600.0])
 def test_a_jump_begins_a_new_session_without_reusing_ids(shift_s: float) -> None:
-    """A replay or a clock set anew starts over: new session id, higher track ids."""
+    """A replay or a reset clock starts over: new session id, higher track ids."""
     one = session()
     before = tracks(feed(one, range(5)))[-1]
     again = replace(SENSOR, epoch=b"b" * 16, start_s=SENSOR.start_s + shift_s)
@@ -503,10 +499,11 @@ def test_a_stamp_ahead_ends_no_track() -> None:
     assert (one.counters.refused, one.counters.new_epochs) == (2, 0)
 
 
-def test_a_jump_that_frames_agree_on_is_reported() -> None:
-    """Three frames in a row an hour ahead begin a new session, which is a problem of its own kind."""
+@pytest.mark.parametrize("shift_s", [-3600.0, 3600.0])
+def test_a_jump_that_frames_agree_on_is_reported(shift_s: float) -> None:
+    """Three frames in a row an hour ahead or back begin a new session, which is a problem of its own kind."""
     one = session()
     feed(one, range(5))
-    outputs = feed(one, range(5, 9), replace(SENSOR, start_s=SENSOR.start_s + 3600))
+    outputs = feed(one, range(5, 9), replace(SENSOR, start_s=SENSOR.start_s + shift_s))
     assert [problem.code for problem in problems(outputs)] == ["time_jump", "time_jump", "restarted"]
     assert (begun(outputs), len(tracks(outputs))) == (["jump"], 2)

@@ -1,19 +1,14 @@
-"""A session passes from member to member: whatever comes in between, each of its frames is tracked once."""
+"""A session passes from member to member: each of its frames is tracked once, through all faults."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_service.cluster.leases import Change, partition_of
+from optipmb_service.stream.checkpoint import Checkpoint
 from registries import Around, packet_of, streams_of
 from router import Sensor
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from optipmb_service.stream.checkpoint import Checkpoint
 
 SENSOR = Sensor()
 NAME = SENSOR.stream
@@ -21,7 +16,7 @@ PARTITION = partition_of(NAME)
 
 
 class Cluster:
-    """A store and a lease that two members share; what they ask of the store waits until the test says so."""
+    """A store and a lease that two members share; their requests to the store wait for the test."""
 
     def __init__(self) -> None:
         self.kept: Checkpoint | None = None
@@ -32,8 +27,6 @@ class Cluster:
 
 
 class Held(Around):
-    """Everything around the streams of one member."""
-
     def __init__(self, cluster: Cluster) -> None:
         super().__init__()
         self.cluster = cluster
@@ -41,20 +34,15 @@ class Held(Around):
         self.streams = streams_of(self, standby_s=600)
 
     def holds(self, _: str) -> bool:
-        """Return whether a session may begin here."""
         return self.cluster.held is self and not self.leaving
 
     def fence(self, _: str) -> int | None:  # type: ignore[override]  # without a lease there is none
-        """Return the fence of the lease."""
         return self.cluster.fence if self.cluster.held is self else None
 
     def may_write(self, _: str, fence: int | None) -> bool:  # type: ignore[override]  # both are given
-        """Return whether tracks may be published."""
         return fence is not None and fence == self.fence("")
 
     def put(self, checkpoint: Checkpoint, fence: int | None, then: Callable[[], None] | None = None) -> None:
-        """Write a state, later; a fence that is not the newest is refused."""
-
         def write() -> None:
             if fence == self.cluster.fence:
                 self.cluster.kept = checkpoint
@@ -64,14 +52,11 @@ class Held(Around):
         self.cluster.asked.append(write)
 
     def recall(self, stream: str, restore: Any, then: Any, _: object = None) -> None:
-        """Read the newest state, later."""
         del stream
         self.cluster.asked.append(lambda: then(restore(self.cluster.kept) if self.cluster.kept else None))
 
 
 class World:
-    """Two members, the frames that are sent, and where they arrive."""
-
     def __init__(self, *, cached: bool) -> None:
         self.cluster = Cluster()
         self.members = [Held(self.cluster), Held(self.cluster)]
@@ -81,28 +66,24 @@ class World:
         self._take(self.members[0])
 
     def send(self) -> None:
-        """Send a frame to those that receive it: all where no publisher has a cache."""
+        """Send a frame to its receivers: all members where no publisher has a cache."""
         for member in self._receiving if self._cached else self.members:
             member.streams.receive(packet_of(SENSOR.detections(self.sent)))
         self.sent += 1
 
     def turn(self) -> None:
-        """Give each member a turn."""
         for member in self.members:
             member.turn()
 
     def answer(self) -> None:
-        """End a read or a write of the store."""
         if self.cluster.asked:
             self.cluster.asked.pop(0)()
 
     def keep(self) -> None:
-        """Have states kept."""
         for member in self.members:
             member.streams.keep()
 
     def recall(self) -> None:
-        """Have the session given up in order."""
         if (holder := self.cluster.held) is not None:
             holder.leaving = True
             holder.streams.changed(PARTITION, Change.RECALLED)
@@ -118,7 +99,6 @@ class World:
         self._take(other)
 
     def end(self) -> None:
-        """Let everything come to rest."""
         for _ in range(20):
             while self.cluster.asked:
                 self.answer()

@@ -1,12 +1,12 @@
 """The counts of messages over all streams, as the metrics show them: they only grow, and each message counts once."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import FrameType
+from typing import Any
 
+import pytest
 from optipmb_service.stream import backlog, stream
 from optipmb_service.stream import streams as table
 from optipmb_service.stream.values import MAX_SENSORS
@@ -15,22 +15,16 @@ from optipmb_service.zenoh.inputs import Packet
 from registries import Around, packet_of, streams_of
 from router import Sensor
 
-if TYPE_CHECKING:
-    from types import FrameType
-
-    import pytest
-
 SENSOR = Sensor()
 TRACED = {str(Path(module.__file__)) for module in (stream, backlog)}
 
 
 def packet(seq: int) -> Packet:
-    """Return a frame as it comes."""
     return packet_of(SENSOR.detections(seq))
 
 
 def test_totals_never_fall_and_count_nothing_twice() -> None:
-    """Between any two lines that open, close or restore a session the totals are what they were, or more."""
+    """Between any two lines that open, close or restore a session, the totals never fall."""
     around = Around()
     streams, seen = streams_of(around), [MessageCounters()]
 
@@ -63,7 +57,7 @@ def test_totals_never_fall_and_count_nothing_twice() -> None:
 
 
 def test_a_command_without_room_is_no_message(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A query on a stream that finds no room among those that are new is told so, and counts as no frame."""
+    """A query on a stream that finds no room among new streams gets an error, and counts as no frame."""
     monkeypatch.setattr(table, "MAX_UNPROVEN", 0)
     streams = streams_of(Around())
     assert not streams.command(SENSOR.stream, lambda _: None, urgent=True)
@@ -80,7 +74,7 @@ def test_a_message_on_a_key_of_no_stream_is_refused_as_what_it_is() -> None:
 
 
 def test_what_one_sensor_too_many_sends_is_counted_as_what_it_is() -> None:
-    """Of a sensor beyond those that a session takes, a frame counts as refused, and a cloud as a refused cloud."""
+    """A frame of a sensor beyond the limit of a session counts as refused, and a cloud as a refused cloud."""
     around = Around()
     streams = streams_of(around, fuse=("site/node/*",), recovery_wait_s=0)
     for number in range(MAX_SENSORS):

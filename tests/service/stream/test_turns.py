@@ -1,21 +1,16 @@
-"""What waits in a stream: other streams have their turn while it is worked off, and what is dropped of it counts."""
-
-from __future__ import annotations
+"""A stream's queue: other streams have their turn while it is processed, and dropped messages count."""
 
 import threading
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
+import pytest
 from optipmb_schemas import Keys, SessionState
 from optipmb_service.cluster.sqlite import SqliteStore
 from router import Node, Sensor, until
 from sessions import Gated
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    import pytest
 
 KEYS = Keys()
 CAREFUL = Sensor("site/careful/lidar")
@@ -70,7 +65,7 @@ def test_what_is_dropped_before_a_session_begins_is_counted(
         node.send(*(CARELESS.detections(seq, objects=objects) for seq in range(sent)))
         problem = node.problem(CARELESS.stream, "shed")
         node.send(CAREFUL.detections(1))
-        node.tracks(CAREFUL.stream, 2)  # on the same link: what was sent before has come
+        node.tracks(CAREFUL.stream, 2)  # on the same link, so earlier messages have arrived
         gate.set()
         node.tracks(CARELESS.stream, 1)
         until(lambda: node.ask(KEYS.query(CARELESS.stream, "state"), SessionState).queue == 0, "all are tracked")

@@ -1,9 +1,9 @@
-"""Events of zones in sessions: the same whatever came late, after a restore, and with other zones beside."""
+"""Events of zones in sessions: the same with late frames, after a restore, and with further zones."""
 
-from __future__ import annotations
-
+from collections.abc import Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 from optipmb_client.merging import FinalEvents
@@ -12,6 +12,7 @@ from optipmb_service.settings import SettingsInvalidError, ZoneSettings, load
 from optipmb_service.stream.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
 from optipmb_service.stream.profiles import Profiles
 from optipmb_service.stream.session import Session
+from optipmb_service.stream.streams import Streams
 from optipmb_service.stream.values import Output, Policy, Tracked
 from registries import Around, packet_of, streams_of
 from router import SECOND, Sensor
@@ -19,12 +20,6 @@ from sessions import feed
 
 import optipmb
 from optipmb.zones import Event, Zone
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from pathlib import Path
-
-    from optipmb_service.stream.streams import Streams
 
 SENSOR = Sensor()
 PROFILE = optipmb.load_profile("nuscenes")
@@ -48,7 +43,6 @@ def final(outputs: Iterable[Output]) -> list[Event]:
 
 
 def in_order(policy: Policy = POLICY, frames: int = 40) -> tuple[list[Event], Session]:
-    """Return the events of frames in order."""
     session = Session(SENSOR.stream, PROFILE, policy)
     return final(feed(session, range(frames), SENSOR)), session
 
@@ -115,7 +109,7 @@ def test_a_zone_that_was_changed_begins_anew_and_the_others_go_on() -> None:
 
 
 def test_sessions_without_zones_have_none_in_their_checkpoints() -> None:
-    """Their bytes are those of before."""
+    """Their bytes are unchanged."""
     _, session = in_order(Policy())
     assert b"zones" not in encode_checkpoint(session.snapshot())
 
@@ -139,17 +133,15 @@ class Reader(Around):
         self.problems: list[Problem] = []
 
     def publish_events(self, payload: bytes) -> None:
-        """Read a message."""
         message = decode(payload, Events)
         self.messages.append(message)
         self.final += self.merged.take(message)
 
     def report(self, problem: Problem, _: int) -> None:
-        """Note a problem."""
         self.problems.append(problem)
 
     def serve(self, seqs: Iterable[int], lost: Iterable[int] = (), sensor: Sensor = SENSOR, **settings: Any) -> None:
-        """Track frames in a process that begins with what was kept, and is killed after its states were kept.
+        """Track frames in a process that starts with the kept states, and is killed after saving its own.
 
         Every fifth frame the states are written too; those behind `lost` never are.
         """
@@ -167,7 +159,6 @@ class Reader(Around):
             self.run()
 
     def keep(self, streams: Streams) -> None:
-        """Write the states."""
         streams.keep()
         self.run()
         for checkpoint in self.kept.values():
@@ -175,13 +166,11 @@ class Reader(Around):
 
     @property
     def events(self) -> list[tuple[object, ...]]:
-        """The events of all frames, final or not."""
         rest = sorted(self.merged.held.values(), key=lambda one: one.stamp_ns)
         return told([*self.final, *rest])
 
 
 def told(messages: Iterable[Events]) -> list[tuple[object, ...]]:
-    """Return the events of messages."""
     return [
         (event.zone, event.kind, event.n, event.id, one.labels[event.label], event.at_ns, event.position)
         for one in messages
@@ -202,7 +191,7 @@ def told(messages: Iterable[Events]) -> list[tuple[object, ...]]:
     ],
 )
 def test_final_events_never_change(runs: list[tuple[Iterable[int], Iterable[int]]]) -> None:
-    """In order, with late frames and through restarts they are those of a session of frames in order."""
+    """In order, with late frames and through restarts, they equal a session of frames in order."""
     reader = Reader()
     for seqs, lost in (*runs, (range(40, 60), ())):
         reader.serve(seqs, lost)

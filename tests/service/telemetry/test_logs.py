@@ -1,7 +1,5 @@
 """Log lines: not too many of one event, and none lost without a word."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import http.client
@@ -10,7 +8,8 @@ import re
 import signal
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import structlog
@@ -19,10 +18,6 @@ from hypothesis import strategies as st
 from optipmb_service.telemetry.logs import BURST, LINES_PER_SECOND, QUEUE_BYTES, Limiter, LineWriter, configure
 from router import Node, Sensor, until
 from routers import free_endpoint
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 END_S = 60.0
 

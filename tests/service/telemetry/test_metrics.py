@@ -1,7 +1,5 @@
 """What a process measures: as Prometheus' own client would count it, and the same for the parent of workers."""
 
-from __future__ import annotations
-
 import re
 from types import SimpleNamespace
 
@@ -14,7 +12,6 @@ NAMES = ("latency", "queue", "decode", "step")
 
 
 def filled() -> Metrics:
-    """Metrics in which something was counted."""
     metrics = Metrics()
     for number, seconds in enumerate(DURATIONS):
         metrics.received("detections", 100 + number)

@@ -12,27 +12,22 @@ KEYS = Keys()
 
 
 class Tokens:
-    """A session with its tokens, and a member that hears of them."""
-
     def __init__(self) -> None:
         self.now: set[str] = set()
         self.heard = StreamDirectory("other", 1, lambda _: True)
 
     def token(self, key: str) -> "Token":
-        """Declare one, and have it heard of."""
         assert key not in self.now
         self.now.add(key)
         self._tell(key, present=True)
         return Token(self, key)
 
     def withdraw(self, key: str) -> None:
-        """Withdraw one, and have that heard of."""
         self.now.remove(key)
         self._tell(key, present=False)
 
     @property
     def announced(self) -> list[str]:
-        """The streams of all tokens."""
         return sorted(stream for key in self.now for stream in KEYS.discovered_streams(key))
 
     def _tell(self, key: str, *, present: bool) -> None:
@@ -41,13 +36,10 @@ class Tokens:
 
 
 class Token:
-    """A token that is declared."""
-
     def __init__(self, session: Tokens, key: str) -> None:
         self._session, self._key = session, key
 
     def close(self) -> None:
-        """Withdraw it."""
         self._session.withdraw(self._key)
 
 

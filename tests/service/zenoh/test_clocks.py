@@ -1,41 +1,33 @@
 """Clocks and identities of publishers over real Zenoh: faults are reported, and nothing is lost by them."""
 
-from __future__ import annotations
-
 import time
+from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from optipmb_schemas import Detections, Keys, Pose, Problem, ServiceStatus, SessionState, Tracks, decode
+from optipmb_service.app.service import Service
 from router import DEADLINE_S, SECOND, Node, Sensor, until
 from routers import free_endpoint
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-    from pathlib import Path
-
-    from optipmb_service.app.service import Service
 
 KEYS = Keys()
 SENSOR = Sensor()
 
 
 def said(node: Node, code: str, stream: str = SENSOR.stream) -> list[Problem]:
-    """The problems of a kind that came so far."""
     key = KEYS.problems(stream)
     found = [decode(payload, Problem) for at, payload, _ in node.problems_seen.items if at == key]
     return [one for one in found if one.code == code]
 
 
 def state(node: Node) -> SessionState:
-    """The state of the sensor's session."""
     return node.ask(KEYS.query(SENSOR.stream, "state"), SessionState)
 
 
 def send(node: Node, stamps: Iterable[int], sensor: Sensor = SENSOR, first: int = 0) -> None:
-    """Publish frames with these stamps; the objects move as if nothing was wrong with them."""
     for seq, stamp_ns in enumerate(stamps, first):
         node.send(sensor.detections(seq, stamp_ns=stamp_ns))
 

@@ -1,25 +1,19 @@
 """The Zenoh session of a service: what its configuration makes of publishers and subscribers."""
 
-from __future__ import annotations
-
 import contextlib
 import json
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+import zenoh
+from optipmb_client.zenoh.handles import Sender
 from optipmb_client.zenoh.session import Session
 from optipmb_schemas import Keys, Tracks, encoding_of
 from optipmb_service.settings import load
 from optipmb_service.zenoh.client import Client
 from router import until
 from routers import free_endpoint, open_client, open_router
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    import zenoh
-    from optipmb_client.zenoh.handles import Sender
 
 KEYS = Keys()
 ECHO = "echo"
@@ -28,7 +22,6 @@ ECHO = "echo"
 
 @pytest.fixture
 def endpoint() -> Iterator[str]:
-    """Endpoint of a router that lists its declarations."""
     endpoint = free_endpoint()
     with open_router(endpoint, adminspace=True) as router:
         router.declare_queryable(ECHO, lambda query: query.reply(ECHO, b""))
@@ -37,7 +30,6 @@ def endpoint() -> Iterator[str]:
 
 @contextlib.contextmanager
 def connected(endpoint: str, file: Path | None = None) -> Iterator[Client]:
-    """The session of a member."""
     given = {"connect": [endpoint], "instance": "member", "store": "none"}
     client = Client(load(None, given | ({} if file is None else {"zenoh_config": str(file)})).settings)
     yield client
@@ -45,7 +37,6 @@ def connected(endpoint: str, file: Path | None = None) -> Iterator[Client]:
 
 
 def opened_publisher(member: Client, stream: str) -> Sender:
-    """The publisher of a stream's tracks."""
     return member.cached_sender(KEYS.tracks(stream), encoding_of(Tracks), cache=8, detected=False)
 
 

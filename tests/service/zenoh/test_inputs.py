@@ -1,12 +1,11 @@
 """Subscriptions of a topic that come and go, and queries of publishers' caches meanwhile."""
 
-from __future__ import annotations
-
 import threading
 from collections import Counter
+from collections.abc import Iterator
 from functools import partial
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import Any, Final, cast
 
 import optipmb_service.zenoh.inputs
 import pytest
@@ -16,9 +15,6 @@ from optipmb_schemas import Keys
 from optipmb_service.zenoh.inputs import ALL, Topic
 from router import Collected
 from routers import free_endpoint, open_router
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 KEYS: Final = Keys()
 STREAM: Final = "site/node/lidar"
@@ -38,11 +34,9 @@ class Network:
         self.topic = Topic("detections", self.link, self.receive, self.answered.append)
 
     def receive(self, sample: zenoh.Sample) -> None:
-        """Take a message."""
         self.received.add(str(sample.key_expr), sample.payload.to_bytes(), "")
 
     def publish(self, *payloads: bytes) -> None:
-        """Send messages."""
         for payload in payloads:
             self.publisher.put(payload)
 
@@ -54,7 +48,6 @@ class Network:
 
 @pytest.fixture
 def network() -> Iterator[Network]:
-    """A publisher that has sent two messages before anybody subscribed."""
     with open_router(free_endpoint()) as session:
         one = Network(session)
         one.publish(b"0", b"1")

@@ -1,8 +1,6 @@
 """The numbers that a Zenoh session has for keys: counted as Zenoh takes them, and never given twice."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator
 
 import pytest
 import zenoh
@@ -10,13 +8,9 @@ from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_client.zenoh.session import CACHED, MOST_KEYS, PLAIN, Session
 from optipmb_service.zenoh.inputs import Topic
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
 
 @pytest.fixture
 def session() -> Iterator[Session]:
-    """A session alone."""
     config = zenoh.Config()
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("listen/endpoints", "[]")

@@ -1,14 +1,14 @@
 """The service over real Zenoh: streams in, tracks out, questions answered, faults contained."""
 
-from __future__ import annotations
-
 import json
 import os
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +16,7 @@ import zenoh
 import zenoh.ext
 from optipmb_client import Connection
 from optipmb_client.errors import ConnectionFailed as TransportError
+from optipmb_client.zenoh.handles import Query
 from optipmb_client.zenoh.session import HEARTBEAT_S
 from optipmb_schemas import (
     Density,
@@ -43,12 +44,6 @@ from routers import free_endpoint, open_router
 from sessions import Gated
 
 import optipmb
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from optipmb_client.zenoh.handles import Query
 
 KEYS = Keys()
 SENSOR = Sensor()

@@ -1,10 +1,9 @@
 """Queries that come faster than they are answered."""
 
-from __future__ import annotations
-
 import threading
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import optipmb_service.zenoh.transport
 import pytest
@@ -12,9 +11,6 @@ from optipmb_schemas import Keys, Problem, SessionState, decode
 from optipmb_service.stream import queries
 from optipmb_service.stream.queries import StreamQueries
 from router import Node, Sensor, until
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 KEYS: Final = Keys()
 SENSOR: Final = Sensor()

@@ -3,11 +3,10 @@
 Each of these is tried on a thread of its own, for a test that fails would wait for ever.
 """
 
-from __future__ import annotations
-
 import threading
 import time
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Iterator
+from typing import Final
 
 import optipmb_client.zenoh.session
 import pytest
@@ -20,23 +19,17 @@ from optipmb_service.zenoh.transport import Transport
 from router import until
 from routers import free_endpoint, open_client, open_router
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-
 KEYS: Final = Keys()
 HANGS_S: Final = 60.0
 
 
 @pytest.fixture
 def session() -> Iterator[Session]:
-    """A session that is a router itself."""
     with open_router(free_endpoint()) as session:
         yield Session(session)
 
 
 def ends(work: Callable[[], object]) -> None:
-    """Do something that could wait for ever."""
     thread = threading.Thread(target=work, daemon=True)
     thread.start()
     thread.join(HANGS_S)

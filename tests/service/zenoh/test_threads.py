@@ -1,18 +1,13 @@
 """The threads of Zenoh: how many a message wakes, and their states in the interpreter."""
 
-from __future__ import annotations
-
 import ctypes
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import zenoh
 from optipmb_client.zenoh.session import Session
 from routers import free_endpoint, open_client, open_router
 from service_process import ServiceProcess
-
-if TYPE_CHECKING:
-    import zenoh
 
 MESSAGES = 50
 

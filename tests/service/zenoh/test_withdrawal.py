@@ -1,17 +1,13 @@
 """Withdrawal of declarations, while the threads of the network call into Python."""
 
-from __future__ import annotations
-
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import Any
 
 import pytest
 import zenoh
 import zenoh.ext
 from optipmb_client.zenoh.session import Session
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 ROUNDS = 60
 """Where Zenoh's own way is taken, one in ten stops the process."""

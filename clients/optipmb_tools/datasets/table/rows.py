@@ -381,7 +381,7 @@ class _Table:
         )
 
     def _note_missing(self, *, scored: bool, points: bool, boxes: bool) -> None:
-        """Note what is assumed of columns that there are not."""
+        """Note assumptions about missing columns."""
         if not boxes:
             meaning = "they are unknown" if scored else "only centres can be compared"
             self._reading.note("sizes", f"no columns for the size or the heading: {meaning}")
