@@ -108,7 +108,7 @@ class _Progress(event.Listener):
             print(name, flush=True)  # noqa: T201 - to that process
         elif self.said_at is not None and time.monotonic() > self.said_at + PROGRESS_S:
             self.said_at = time.monotonic()
-            _log.warning("optipmb: compiled %d of %d kernels", len(self.compiled), len(self.kernels))
+            _log.warning("optipmb: compiled %d of %d kernels", len(self.compiled), len(self.kernels | self.compiled))
 
     @staticmethod
     def _name(event: Any) -> str:

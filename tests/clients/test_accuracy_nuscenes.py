@@ -76,24 +76,19 @@ def test_the_figures_of_the_ablation_come_out_as_they_are_written(capsys: pytest
         assert printed == list(csv.reader(file))[1:]
 
 
-def test_the_profile_that_ships_is_what_tuning_gives(tmp_path: Path) -> None:
-    """The command of docs/tuning.md for nuScenes writes the profile that ships, but for the motion."""
+@pytest.mark.parametrize(
+    ("name", "written"), [("nuscenes", "tuned.toml"), ("nuscenes-megvii", "calibrated.toml")], ids=["tuning", "curves"]
+)
+def test_a_profile_that_ships_is_what_its_command_gives(tmp_path: Path, name: str, written: str) -> None:
+    """The command of docs/tuning.md that names a profile writes the one that ships, but for the motion."""
     page = (DOCS / "tuning.md").read_text(encoding="utf-8")
-    (line,) = (line for line in page.splitlines() if line.startswith("optipmb tune") and "--name nuscenes " in line)
-    words = line.split()[1:]
-    words[words.index("--root") + 1], words[words.index("--out") + 1] = str(nuscenes_root()), str(tmp_path)
+    (line,) = (
+        line for line in page.splitlines() if line.startswith("optipmb tune") and f"--name {name} " in f"{line} "
+    )
+    words, root = line.split()[1:], nuscenes_root() if name == "nuscenes" else all_nuscenes(tmp_path)
+    words[words.index("--root") + 1], words[words.index("--out") + 1] = str(root), str(tmp_path)
     assert run(words) == 0
-    assert without_motion(tmp_path / "tuned.toml") == without_motion(PROFILES / "nuscenes.toml")
-
-
-def test_the_profile_for_megvii_is_what_its_command_gives(tmp_path: Path) -> None:
-    """The command of docs/tuning.md that measures the curves writes the profile that ships, but for the motion."""
-    page = (DOCS / "tuning.md").read_text(encoding="utf-8")
-    (line,) = (line for line in page.splitlines() if line.startswith("optipmb tune") and "nuscenes-megvii" in line)
-    words = line.split()[1:]
-    words[words.index("--root") + 1], words[words.index("--out") + 1] = str(all_nuscenes(tmp_path)), str(tmp_path)
-    assert run(words) == 0
-    assert without_motion(tmp_path / "calibrated.toml") == without_motion(PROFILES / "nuscenes-megvii.toml")
+    assert without_motion(tmp_path / written) == without_motion(PROFILES / f"{name}.toml")
 
 
 @pytest.mark.parametrize(("name", "amota", "before"), [("car", 0.885, 0.875), ("pedestrian", 0.82, 0.37)])

@@ -109,23 +109,17 @@ def test_what_is_wrong_is_said_in_one_line(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("routed", [False, True])
 @pytest.mark.parametrize("command", ["replay", "status"])
-def test_no_router_is_status_1(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """Without a listener, one line names the endpoint, and the status is 1."""
-    address = free_endpoint()
+def test_no_service_is_status_1(
+    command: str, endpoint: str, capsys: pytest.CaptureFixture[str], *, routed: bool
+) -> None:
+    """Without a router one line names the endpoint, with one but no service the service; the status is 1."""
+    address = endpoint if routed else free_endpoint()
     options = [*SMALL, "--wait", "0.3"] if command == "replay" else ["--timeout", "0.3"]
     assert run([command, *options, "--connect", address]) == 1
     (line,) = capsys.readouterr().err.splitlines()
-    assert address in line
-
-
-@pytest.mark.parametrize("command", ["replay", "status"])
-def test_no_service_is_status_1(command: str, endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """A router without a service: one line, status 1."""
-    options = [*SMALL, "--wait", "0.3"] if command == "replay" else ["--timeout", "0.3"]
-    assert run([command, *options, "--connect", endpoint]) == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "service" in line
+    assert ("service" if routed else address) in line
 
 
 def test_missing_frames_are_status_1(endpoint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

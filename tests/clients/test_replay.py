@@ -91,28 +91,32 @@ def test_frames_without_clouds_say_that_none_comes(endpoint: str, link: Connecti
     assert {message.has_points for message in service.seen.detections} == {False}
 
 
-def test_the_window_bounds_the_frames_under_way(
-    endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path
+@pytest.mark.parametrize(
+    ("pace", "seq", "most"), [(Pace(window=4, patience_s=60.0), 0, 4), (Pace(speed=1.0, patience_s=60.0), 2, 6)]
+)
+def test_frames_sent_ahead_are_bounded(
+    endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path, pace: Pace, seq: int, most: int
 ) -> None:
-    """At full speed, at most a window of frames is sent ahead of the returned ones."""
-    gate = threading.Event()
-    ahead: list[int] = []
+    """Without tracks, at full speed a window of frames is sent ahead, at the recorded rate four frames with clouds.
+
+    So the cache holds the clouds of all of them.
+    """
+    gate, ahead = threading.Event(), list[int]()
 
     def sent() -> int:
         """By the newest cloud: on a busy machine the first may be sent before the subscription is known."""
         return max((cloud.seq for cloud in service.seen.points), default=-1) + 1
 
     def answer(message: Detections, tracks: Tracks) -> list[Tracks]:
-        if message.seq == 0:
-            until(lambda: sent() >= 4, "the frames of the window gather behind the first")
-            gate.wait(0.2)  # in which no other comes: a wait that is never answered, on purpose
+        if message.seq == seq:
+            until(lambda: sent() >= most, "the frames gather behind the first without tracks")
+            gate.wait(0.5)  # further ones would be due: a wait that is never answered, on purpose
             ahead.append(sent())
         return [tracks]
 
     with FakeService(endpoint, Behaviour(answer)) as service:
-        (result,) = run(link, dataset, tmp_path, pace=Pace(window=4, patience_s=60.0))
-    assert ahead == [4]
-    assert result.missing == 0
+        (result,) = run(link, dataset, tmp_path, pace=pace)
+    assert (ahead, result.missing) == ([most], 0)
 
 
 def test_recorded_pace_is_kept(endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path) -> None:
@@ -124,28 +128,6 @@ def test_recorded_pace_is_kept(endpoint: str, link: Connection, dataset: Dataset
     assert result.missing == 0
     assert took >= 0.05 * (FRAMES - 1)
     assert len(service.seen.detections) == FRAMES
-
-
-def test_at_the_recorded_rate_clouds_wait_for_a_successor(
-    endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path
-) -> None:
-    """While no tracks come back only four frames with clouds are sent ahead, so that the cache holds all of them."""
-    gate, ahead = threading.Event(), list[int]()
-
-    def sent() -> int:
-        return max((cloud.seq for cloud in service.seen.points), default=-1)
-
-    def answer(message: Detections, tracks: Tracks) -> list[Tracks]:
-        if message.seq == 2:
-            until(lambda: sent() == 5, "three more frames are sent")
-            gate.wait(0.5)  # five more would be due: a wait that is never answered, on purpose
-            ahead.append(sent())
-        return [tracks]
-
-    with FakeService(endpoint, Behaviour(answer)) as service:
-        (result,) = run(link, dataset, tmp_path, pace=Pace(speed=1.0, patience_s=60.0))
-    assert ahead == [5]
-    assert (result.missing, len(service.seen.points)) == (0, FRAMES)
 
 
 def test_lost_tracks_are_reported_as_missing(endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path) -> None:

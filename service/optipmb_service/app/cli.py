@@ -359,7 +359,6 @@ def _begin(loaded: Loaded) -> Settings:
 
 
 def _client(given: Mapping[str, Any], **defaults: Any) -> Settings:
-    """Return the settings of a process that is a client of routers."""
     settings = _begin(_load(given, connect=[DEFAULT_LISTEN], **defaults))
     return settings.model_copy(update={"router": False, "listen": ()})
 

@@ -348,22 +348,22 @@ def _monitoring(settings: Settings, health: ProcessHealth) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def grpc_edge(settings: Settings, client: Client, metrics: Metrics) -> Iterator[None]:
-    """Serve gRPC in this process where the settings say so, and add its metrics.
+def grpc_edge(settings: Settings, client: Client, metrics: Metrics) -> Iterator[str]:
+    """Serve gRPC in this process where the settings say so, and add its metrics; give its address, empty without one.
 
     Raises:
         ClientError: it cannot be served.
     """
     if not settings.grpc:
-        yield
+        yield ""
         return
     try:
         from optipmb_service.grpc.server import serving  # noqa: PLC0415 - an extra that only this needs
     except ModuleNotFoundError as error:
         raise ClientError(f"gRPC needs {error.name}, which is not installed: {install_command('grpc')}") from error
-    with serving(settings, client) as calls:
-        metrics.add(GATEWAY_METRICS, lambda: calls)
-        yield
+    with serving(settings, client) as server:
+        metrics.add(GATEWAY_METRICS, lambda: server.metrics)
+        yield server.address
 
 
 async def run(
@@ -456,18 +456,14 @@ async def run_router(settings: Settings) -> int:
 
 async def run_gateway(settings: Settings) -> int:
     """Serve gRPC until SIGINT or SIGTERM; returns the exit status, as `run` does."""
-    from optipmb_service.grpc.server import Server  # noqa: PLC0415 - an extra that only this needs
 
     async def serve(asked: StopRequest, health: ProcessHealth, client: Client) -> None:
-        server = Server(settings, client)
-        health.metrics.add(GATEWAY_METRICS, lambda: server.metrics)
-        await server.start()
-        health.report(Reporter(client))
-        settle()
-        say_ready("grpc", server.address, settings.connect)
-        log.info("ready", instance=settings.instance, grpc=server.address, connect=settings.connect)
-        await asked.wait()
-        health.ends()
-        await server.stop()
+        with grpc_edge(settings, client, health.metrics) as address:
+            health.report(Reporter(client))
+            settle()
+            say_ready("grpc", address, settings.connect)
+            log.info("ready", instance=settings.instance, grpc=address, connect=settings.connect)
+            await asked.wait()
+            health.ends()
 
     return await run_client(settings, serve)

@@ -76,15 +76,14 @@ class LogBridge(Reporter):
         self._log.connection.close(CLOSE_S)
 
     def _take(self, message: Arrival) -> None:
-        """Put a valid message into the log; one that is not, who tracks reports."""
+        """Put a message into the log; an invalid one is counted here and reported by the service that tracks."""
+        kind = schemas.Detections if message.key.endswith("/detections") else schemas.Tracks
         try:
             stream = self._client.keys.stream_of(message.key)
-            kind = schemas.Detections if message.key.endswith("/detections") else schemas.Tracks
             content = schemas.decode(message.payload, kind, encoding=message.encoding, limits=self._limits)
         except schemas.MessageError:
-            self.invalid += 1
-            return
-        if content.stream != stream:
+            content = None
+        if content is None or content.stream != stream:
             self.invalid += 1
             return
         topic: Topic = "detections"

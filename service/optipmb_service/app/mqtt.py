@@ -126,11 +126,6 @@ class Bridge(Reporter):
             await asyncio.sleep(RETRY_S)
 
     async def _serve(self, broker: aiomqtt.Client) -> None:
-        """Publish over a connection.
-
-        Raises:
-            MqttError: it is lost.
-        """
         await broker.publish(self._alive, b"1", qos=1, retain=True)
         self.connected, self._why = True, ""
         log.info("mqtt_connected", broker=self._mqtt.broker, protocol=self._version.name)

@@ -295,7 +295,6 @@ class Service(Reporter):
         self._report("duplicate_name", path="instance", expected=expected, received=name, message=message)
 
     def _unkept(self, stream: str, why: str) -> None:
-        """Report that the state of a stream cannot be kept."""
         self._report("internal", stream=stream, expected="a state that can be written down", received=why)
 
     def _report(self, code: str, *, stream: str = "", **texts: str) -> None:

@@ -378,7 +378,6 @@ class AggregateView(Reporter):
         request.answer(request.key, asked)
 
     def _samples(self) -> Iterator[tuple[int, bytes]]:
-        """Yield the metrics of the workers that answer, each with its number."""
         for index, answer in enumerate(self._ask(self._keys.metrics)):
             if answer is not None:
                 yield index, answer
@@ -391,7 +390,7 @@ class AggregateView(Reporter):
 
 
 def _newest(parts: Iterable[schemas.ServiceStatus]) -> tuple[schemas.MemberSummary, ...]:
-    """Return the members that workers know: each as it knows itself, else as who heard of it last does."""
+    """Return the members that workers know: each as it knows itself, else as the worker that heard of it last."""
     members: dict[str, tuple[bool, float, schemas.MemberSummary]] = {}
     for part in parts:
         for one in part.members:

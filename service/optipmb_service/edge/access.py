@@ -14,11 +14,12 @@ from __future__ import annotations
 
 import hashlib
 import importlib
+import inspect
 import json
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from optipmb_client.errors import ClientError
 
@@ -95,11 +96,26 @@ def token_names(setting: str, value: str) -> Tokens:
     return function
 
 
-def _file(setting: str, file: Path) -> Tokens:
+async def name_by(tokens: Tokens, metadata: Mapping[str, str], certificate: str = "") -> str | None:
+    """Return the name of a token; None where it is missing or not valid."""
+    found = tokens(metadata, certificate)
+    return await found if inspect.isawaitable(found) else found
+
+
+def json_file(setting: str, file: Path) -> Any:
+    """Return the contents of a file.
+
+    Raises:
+        ClientError: it cannot be read.
+    """
     try:
-        names = json.loads(file.read_text(encoding="utf-8"))
+        return json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise ClientError(f"setting {setting}: {file}: {error}") from error
+
+
+def _file(setting: str, file: Path) -> Tokens:
+    names = json_file(setting, file)
     if not isinstance(names, dict) or not all(isinstance(name, str) and name for name in names.values()):
         raise ClientError(f"setting {setting}: {file}: expected a JSON object of names by the SHA-256 of their tokens")
 

@@ -5,15 +5,13 @@ The certificates of the gateway are read again when their files have changed, so
 
 from __future__ import annotations
 
-import inspect
-import json
 from typing import TYPE_CHECKING, Any, Final
 
 import grpc
 import structlog
 from optipmb_client.errors import ClientError
 
-from optipmb_service.edge.access import ANYBODY, Caller, token_names
+from optipmb_service.edge.access import ANYBODY, Caller, json_file, name_by, token_names
 from optipmb_service.grpc.calls import EndCall
 
 if TYPE_CHECKING:
@@ -63,8 +61,7 @@ class Access:
             name = next(iter(context.auth_context().get("x509_common_name", ())), b"").decode(errors="replace")
         if self._tokens is not None:
             metadata = {key: value for key, value in context.invocation_metadata() or () if isinstance(value, str)}
-            found = self._tokens(metadata, name)
-            token = await found if inspect.isawaitable(found) else found
+            token = await name_by(self._tokens, metadata, name)
             if not token:
                 raise EndCall(grpc.StatusCode.UNAUTHENTICATED, "the token is missing or not valid")
             name = token
@@ -76,10 +73,7 @@ class Access:
 
 
 def _names(file: Path) -> frozenset[str]:
-    try:
-        names = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ClientError(f"setting grpc_names: {file}: {error}") from error
+    names = json_file("grpc_names", file)
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ClientError(f"setting grpc_names: {file}: expected a JSON list of names")
     return frozenset(names)

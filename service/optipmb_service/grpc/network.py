@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import collections
 import contextlib
+import itertools
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Final, TypeVar
@@ -197,26 +198,19 @@ class Network:
 
     def _receive(self, listeners: tuple[Listener, ...], message: Arrival) -> None:
         """Take a message on the thread of its subscription."""
+        arrived: list[tuple[Listener, Item]] = []
+        topic = message.key.rpartition("/")[2]
         if not listeners:
             return
-        arrived: list[tuple[Listener, Item]] = []
-        if message.key.endswith("/problems"):
-            problem = self._decoded(schemas.Problem, message)
-            if problem is not None:
-                item = Item.of_problem(problem)
-                arrived = [(listener, item) for listener in listeners]
-        elif message.key.endswith("/events"):
-            events = self._decoded(schemas.Events, message)
-            if events is not None:
-                item = Item(events.stream, b"", events=events)
-                arrived = [(listener, item) for listener in listeners]
-        else:
-            tracks = self._tracks(message)
-            if tracks is not None:
-                wanting = [one for one in listeners if one.passes(tracks)]
-                selections = {one.selection.key: one.selection for one in wanting}
-                items = {key: Item.of_tracks(tracks, selection) for key, selection in selections.items()}
-                arrived = [(one, items[one.selection.key]) for one in wanting]
+        if topic == "problems" and (problem := self._decoded(schemas.Problem, message)) is not None:
+            arrived = list(zip(listeners, itertools.repeat(Item.of_problem(problem))))
+        elif topic == "events" and (events := self._decoded(schemas.Events, message)) is not None:
+            arrived = list(zip(listeners, itertools.repeat(Item(events.stream, b"", events=events))))
+        elif topic == "tracks" and (tracks := self._tracks(message)) is not None:
+            wanting = [one for one in listeners if one.passes(tracks)]
+            selections = {one.selection.key: one.selection for one in wanting}
+            items = {key: Item.of_tracks(tracks, selection) for key, selection in selections.items()}
+            arrived = [(one, items[one.selection.key]) for one in wanting]
         self._arrived.extend(arrived)
         if arrived and not self._waking:  # items that are added after this are still handed over
             self._waking = True

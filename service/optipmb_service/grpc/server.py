@@ -262,7 +262,7 @@ class Server:
 
 
 @contextlib.contextmanager
-def serving(settings: Settings, client: Client) -> Iterator[CallMetrics]:
+def serving(settings: Settings, client: Client) -> Iterator[Server]:
     """Serve meanwhile, on a thread with a loop of its own: neither side waits for the other.
 
     Raises:
@@ -281,7 +281,7 @@ def serving(settings: Settings, client: Client) -> Iterator[CallMetrics]:
     try:
         server = asyncio.run_coroutine_threadsafe(begin(), loop).result()
         log.info("grpc", address=server.address)
-        yield server.metrics
+        yield server
     finally:
         if server is not None:
             with contextlib.suppress(TimeoutError):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import inspect
 import time
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Protocol
@@ -22,7 +21,7 @@ from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from optipmb_service.edge.access import ANYBODY, Caller, NotAllowedError, token_names
+from optipmb_service.edge.access import ANYBODY, Caller, NotAllowedError, name_by, token_names
 from optipmb_service.edge.readers import Feeds, Reader, Wish, listed
 
 if TYPE_CHECKING:
@@ -130,9 +129,7 @@ class Readers:
         for one in connection.scope.get("subprotocols", ()):
             if one.startswith(BEARER):
                 metadata["authorization"] = f"Bearer {one[len(BEARER) :]}"
-        found = self._names(metadata, "")
-        name = await found if inspect.isawaitable(found) else found
-        if not name:
+        if not (name := await name_by(self._names, metadata)):
             raise NoTokenError("the token is missing or not valid")
         return Caller(name, self._reads(name))
 

@@ -328,20 +328,18 @@ class Bridge:
             raise error.under(path) from None
 
     def _refuse(self, stream: _Stream, error: schemas.MessageError, stamp_ns: int | None = None) -> None:
-        stream.refused += 1
         problem = schemas.Problem.of(error, stream=stream.name, instance=self._instance)
-        stream.problems += 1
-        stream.problem = problem.message
-        self._node.report(problem.model_copy(update={"stamp_ns": stamp_ns}))
+        self._report(stream, problem.model_copy(update={"stamp_ns": stamp_ns}))
 
     def _tell(self, stream: _Stream, code: str, text: str, stamp_ns: int, *, refused: int = 1) -> None:
+        about: dict[str, Any] = {"stream": stream.name, "instance": self._instance, "code": code, "stamp_ns": stamp_ns}
+        self._report(stream, schemas.Problem(**about, message=text[:500]), refused)
+
+    def _report(self, stream: _Stream, problem: schemas.Problem, refused: int = 1) -> None:
         stream.refused += refused
-        text = text[:500]
         stream.problems += 1
-        stream.problem = text
-        self._node.report(
-            schemas.Problem(stream=stream.name, instance=self._instance, code=code, message=text, stamp_ns=stamp_ns)
-        )
+        stream.problem = problem.message
+        self._node.report(problem)
 
 
 def _stamp(header: Any) -> int:

@@ -51,7 +51,7 @@ class Traces:
 
     def __init__(self, instance: str, provider: TracerProvider | None = None) -> None:
         if provider is None:
-            ours = Resource(
+            ours = Resource.create(
                 {"service.name": "optipmb-service", "service.instance.id": instance, "process.pid": os.getpid()}
             )
             provider = TracerProvider(resource=ours.merge(OTELResourceDetector().detect()), shutdown_on_exit=False)

@@ -366,5 +366,4 @@ def _name(stream: str, *, cached: bool) -> str:
 
 
 def _log_link(peer: str, kind: str, came: bool) -> None:  # noqa: FBT001 - the signature of a watcher
-    """Log that a node or a router has linked to the session, or has gone."""
     log.info("peer_connected" if came else "peer_lost", peer=peer, kind=kind)

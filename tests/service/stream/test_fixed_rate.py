@@ -81,7 +81,7 @@ class Process(Around):
         """Whether the process holds the stream."""
         return self.owns
 
-    def publish(self, payload: bytes) -> None:
+    def publish(self, payload: bytes, *_: object) -> None:
         """Collect tracks."""
         self.tracks.append(decode(payload, Tracks))
 

@@ -139,9 +139,10 @@ def test_elements_of_an_array_are_one_kind() -> None:
 @settings(deadline=None)
 @given(st.text(max_size=2000))
 def test_a_problem_takes_any_text(text: str) -> None:
-    """For any input, the problem can be made and its texts are printable."""
+    """For any input, the problem can be made, and its texts are printable and bounded."""
     made = problem_of("x", stream="", instance="x", message=text, received=text, expected=text, path=text)
     assert made.message.isprintable()
+    assert len(made.message) <= 500
 
 
 # Figures

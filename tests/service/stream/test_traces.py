@@ -129,6 +129,21 @@ def test_a_frame_keeps_its_context_where_it_waits() -> None:
     assert process.published[1][1].split("-")[1] == PARENT.split("-")[1]
 
 
+def test_a_frame_keeps_its_context_when_its_stream_moves() -> None:
+    """A pending frame goes to the next member of the stream below the span that received it here."""
+    process = Traced()
+    process.send(SENSOR.detections(0, has_points=False))
+    process.send(SENSOR.detections(1, has_points=True), PARENT)
+    process.streams.command(SENSOR.stream, lambda one: one.close_session("moved"), urgent=False)
+    process.run()  # and it comes back
+    process.send(SENSOR.points(1))
+    here, there, _cloud = process.spans()[1]["receive"]
+    assert there.parent is not None
+    assert traceparent(there.parent) == traceparent(here.context)
+    (step,) = process.spans()[1]["step"]
+    assert step.parent == there.context
+
+
 def test_payloads_are_those_without_traces() -> None:
     """Tracks and states do not depend on whether traces are recorded, but for the times of delivery."""
     traced = Traced()

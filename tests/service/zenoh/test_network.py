@@ -22,7 +22,6 @@ from optipmb_schemas import (
     Density,
     Detections,
     Keys,
-    Problem,
     ResetRequest,
     ServiceStatus,
     SessionParameters,
@@ -107,22 +106,6 @@ def test_json_is_understood(node: Node) -> None:
     assert [plain(message) for message in node.tracks(SENSOR.stream, 1)] == offline(SENSOR, [0])
 
 
-def test_a_cloud_is_waited_for(node: Node) -> None:
-    """A frame that has a cloud is tracked with it, whichever comes first; without, after the wait."""
-    key = KEYS.query(SENSOR.stream, "parameters")
-    node.ask(key, SessionParameters, SessionParameters(cloud_wait_s=10.0))
-    node.send(SENSOR.points(0), SENSOR.detections(0, has_points=True))
-    node.tracks(SENSOR.stream, 1)
-    node.send(SENSOR.detections(1, has_points=True), SENSOR.points(1))
-    node.tracks(SENSOR.stream, 2)
-    node.ask(key, SessionParameters, SessionParameters(cloud_wait_s=0.1))
-    node.send(SENSOR.detections(2, has_points=True))
-    received = node.tracks(SENSOR.stream, 3)
-    assert [message.cloud_used for message in received] == [True, True, False]
-    assert received[2].delivery is not None
-    assert received[2].delivery.queue_ms >= 90
-
-
 def test_a_fast_replay_keeps_all_its_clouds(node: Node) -> None:
     """Eight frames and clouds in flight at once, no cloud lost, in order."""
     wait = SessionParameters(cloud_wait_s=10.0)
@@ -134,15 +117,6 @@ def test_a_fast_replay_keeps_all_its_clouds(node: Node) -> None:
     received = node.tracks(SENSOR.stream, 64)
     assert [message.seq for message in received] == list(range(64))
     assert all(message.cloud_used for message in received)
-
-
-def test_duplicates_are_dropped(node: Node) -> None:
-    """A frame sent twice gives one message and is counted."""
-    node.send(SENSOR.detections(0), SENSOR.detections(0), SENSOR.detections(1))
-    received = node.tracks(SENSOR.stream, 2)
-    state = node.ask(KEYS.query(SENSOR.stream, "state"), SessionState)
-    assert [message.seq for message in received] == [0, 1]
-    assert (state.frames, state.duplicates) == (2, 1)
 
 
 def test_a_bad_frame_is_reported_with_its_field(node: Node) -> None:
@@ -231,14 +205,6 @@ def test_streams_are_independent(node: Node) -> None:
         assert [plain(message) for message in node.tracks(sensor.stream, 10)] == offline(sensor, range(10))
 
 
-def test_unknown_classes_are_reported_once(node: Node) -> None:
-    """A class the profile lacks is left out of every frame and told of once."""
-    for seq in range(5):
-        node.send(SENSOR.detections(seq, labels=("car", "dog"), label=np.array([0, 0, 1])))
-    assert [message.ignored for message in node.tracks(SENSOR.stream, 5)] == [1] * 5
-    assert [(p.code, p.received) for p in node.problems(SENSOR.stream)] == [("unknown_class", "'dog'")]
-
-
 def test_an_error_in_the_tracker_is_contained(start: Callable[..., Any], tmp_path: Path) -> None:
     """Fault 15: an exception in a step quarantines that stream and saves its frames; others go on, a reset helps."""
 
@@ -264,22 +230,6 @@ def test_an_error_in_the_tracker_is_contained(start: Callable[..., Any], tmp_pat
         assert (state.received, state.frames, state.refused) == (3, 1, 2)
         node.send(SENSOR.detections(3))
         assert node.tracks(SENSOR.stream, 2)[-1].seq == 3
-
-
-def test_a_publisher_that_starts_anew_goes_on(start: Callable[..., Any]) -> None:
-    """A publisher disappears in the middle of a stream; its successor continues the session and its ids."""
-    _, endpoint = start()
-    with Node(endpoint) as watcher:
-        first = Node(endpoint)
-        first.send(*(SENSOR.detections(seq) for seq in range(5)))
-        before = watcher.tracks(SENSOR.stream, 5)[-1]
-        first.close()
-        with Node(endpoint) as second:
-            again = replace(SENSOR, epoch=b"b" * 16, start_s=SENSOR.start_s + 0.5)
-            second.send(*(again.detections(n, center=SENSOR.detections(5 + n).center) for n in range(5)))
-            after = watcher.tracks(SENSOR.stream, 10)[-1]
-    assert after.session == before.session
-    assert list(after.id) == list(before.id)
 
 
 def test_the_service_fetches_what_it_missed(start: Callable[..., Any]) -> None:
@@ -455,31 +405,6 @@ def test_sessions_are_limited_and_idle_ones_freed(start: Callable[..., Any]) -> 
         until(freed, "the idle session is closed")
         node.send(other.detections(1))
         assert node.tracks(other.stream, 1)[0].seq == 1
-
-
-def test_an_overloaded_stream_sheds_its_oldest(start: Callable[..., Any]) -> None:
-    """More frames than the queue holds while a step takes its time: the oldest go, counted and reported."""
-    gated = Gated()
-
-    service, endpoint = start(tracker=gated.tracker, queue_frames=4)
-    with Node(endpoint) as node:
-        node.send(SENSOR.detections(0))
-        assert gated.entered.wait(60)
-        node.send(*(SENSOR.detections(seq) for seq in range(1, 11)))
-        until(lambda: service.status().sessions[0].shed == 6, "six frames are shed")
-        gated.gate.set()
-        received = node.tracks(SENSOR.stream, 5)
-        assert [(message.seq, message.gap) for message in received] == [(0, 0), (7, 6), (8, 0), (9, 0), (10, 0)]
-        assert node.problem(SENSOR.stream, "shed").count == 6
-
-
-def test_a_problem_says_it_in_one_sentence(node: Node) -> None:
-    """Problems are readable by people and bounded, for any input."""
-    node.send_raw(KEYS.detections("a/b/c"), b"{" + b'"x":"\x1b[31m' * 1000)
-    problem = node.problems("a/b/c")[0]
-    assert isinstance(problem, Problem)
-    assert problem.message.isprintable()
-    assert len(problem.message) <= 500
 
 
 def test_a_silent_stream_is_stale(start: Callable[..., Any]) -> None:
