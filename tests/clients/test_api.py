@@ -13,6 +13,7 @@ import pytest
 import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from opentelemetry.sdk.trace import TracerProvider
 from optipmb_client import Connection, ConnectionFailed, EventSubscriber, Publisher, Subscriber
 from optipmb_client.incoming import Inbox
 from optipmb_client.links import Link
@@ -94,6 +95,22 @@ def test_without_numpy_the_same_is_published(link: Connection, endpoint: str) ->
         messages = [arrival.read(kind).model_copy(update={"epoch": bytes(16)}) for arrival in arrivals if arrival]
         assert messages[:count] == messages[count:]
         assert len(messages) == 2 * count
+
+
+def test_messages_carry_the_context_of_the_active_span(link: Connection) -> None:
+    """Detections and clouds do, whichever way they are published; without a span they carry nothing."""
+    boxes, clouds = listen(link, "detections"), listen(link, "points")
+    tracer = TracerProvider(shutdown_on_exit=False).get_tracer("node")
+    with Publisher(STREAM, connection=link) as publisher:
+        until(lambda: publisher.points_wanted, "clouds are wanted")
+        with tracer.start_as_current_span("detect") as span:
+            publisher.publish(stamp_ns=5, pose=POSE, points=[[1.0, 2.0, 3.0]], **ONE)
+            publisher.publish_points(stamp_ns=6, pose=POSE, points=[[1.0, 2.0, 3.0]])
+        publisher.publish(stamp_ns=7, pose=POSE, **ONE)
+        arrivals = [inbox.get(DEADLINE_S) for inbox in (boxes, clouds, clouds, boxes)]
+    context = span.get_span_context()
+    said = f"00-{context.trace_id:032x}-{context.span_id:016x}-{context.trace_flags:02x}"
+    assert [one.traceparent for one in arrivals if one] == [said, said, said, ""]
 
 
 def test_detections_arrive_as_published(link: Connection) -> None:

@@ -33,7 +33,7 @@ EVENTS: Final = {
     "grpc_call": "A call has ended (level debug).",
     "grpc_connections": "The limit of open files allows fewer connections than the setting.",
     "grpc_invalid": "An invalid message from the network was not forwarded to callers.",
-    "edge_invalid": "An invalid message from the network was not forwarded to readers over HTTP or MQTT.",
+    "edge_invalid": "An invalid message from the network was left out over HTTP or MQTT, or in a list of streams.",
     "grpc_certificates": "Renewed certificates cannot be read; the previous ones stay in use.",
     "certificate_ends": "Certificates that end within a week, and the `days` that they hold: renew them.",
     "certificate_ended": "A certificate has ended: no link with it can be opened. Renew it, and restart what listens"
