@@ -25,7 +25,6 @@ SCALARS = (
     *(msgpack.Timestamp(0, 0), msgpack.ExtType(1, b"")),
 )
 NUMBERS = (0.0, -0.0, NAN, INF, -INF, 5e-324, -5e-324, 1.0, 1.0 + 2**-52, 1e3, 1001.0, -1e4, 1e4, 1.00001e4, 1e8, 1.1e8)
-SMALL = (Limits(max_detections=2), Limits(max_labels=1), Limits(max_values=60), Limits(max_depth=3), Limits(max_text=4))
 
 
 NAMES = sorted(kind.__name__ for kind in DECODERS)
@@ -142,15 +141,6 @@ def test_bytes_that_encoding_does_not_give_again_are_not_kept(examples: dict[str
     }
     assert check(written(without))
     assert taken(decode(written(without), Detections)) is None
-
-
-@pytest.mark.parametrize("limits", SMALL, ids=str)
-def test_limits_are_those_of_the_models(examples: dict[str, Message], limits: Limits) -> None:
-    """A message above a limit is not read here."""
-    payload = encode(examples["Detections"])
-    assert not check(payload, Detections, limits)
-    with pytest.raises(MessageError):
-        decode(payload, Detections, limits=limits)
 
 
 def test_limits_of_a_service_need_no_models(examples: dict[str, Message]) -> None:
