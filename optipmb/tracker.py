@@ -40,14 +40,12 @@ from optipmb.unknown_heading import all_measured, measured_bits
 from optipmb.update import first_detected_states, ukf_updates
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
     from optipmb.frame import Frame
     from optipmb.paths import PredictedPaths
     from optipmb.rows import Array, Columns, Index
-    from optipmb.table import ClassRow
+    from optipmb.table import Classes
 
 
 class Prior(NamedTuple):
@@ -98,7 +96,7 @@ class Update(NamedTuple):
 
 @kernel
 def update(
-    prior: Columns, p_d: Array, measurements: Columns, moment: Columns, confusion: Array, classes: Sequence[ClassRow]
+    prior: Columns, p_d: Array, measurements: Columns, moment: Columns, confusion: Array, classes: Classes
 ) -> Columns:
     """Update the prediction with the measurements: from the fields of the named tuples to the fields of `Update`.
 
@@ -274,12 +272,18 @@ class Tracker:
         scores, score = None, frame.score
         if self.parameters.self_calibration:
             scores, table = calibrated(density, frame, table)
+            table.restrict(self.parameters)
             score = scores.meant
         z, chosen, below_score, suppressed = preprocess(frame, table, self._max_pairs, score)
+        if not self.parameters.trust_size:
+            z.auxiliary[:] = np.nan
+        if not self.parameters.trust_heading:
+            z.yaw[:] = np.nan
         check_effort(predicted, z, moment.dt, table, self._max_pairs)
 
         # Detection probabilities p_d(x_+), zero out of view
-        prior = predicted if modules.habm else with_measurement_births(predicted, z, table)
+        announces = not modules.habm and self.parameters.starts_tracks
+        prior = with_measurement_births(predicted, z, table) if announces else predicted
         looks, prior = look(frame.field_of_view, prior, moment, table)
         p_d = detection_probability(prior, cloud, looks, moment, table)
 
