@@ -30,10 +30,10 @@ def driving(endpoint: str) -> Iterator[None]:
     ended = threading.Event()
 
     def publish() -> None:
-        sensor = Sensor(STREAM, start_s=time.time())
+        sensor = Sensor(STREAM)
         with Node(endpoint) as node:
             for seq in range(10_000):
-                node.send(sensor.detections(seq))
+                node.send(sensor.detections(seq, stamp_ns=time.time_ns()))
                 if ended.wait(0.1):
                     return
 

@@ -206,7 +206,7 @@ class Network:
             arrived = list(zip(listeners, itertools.repeat(Item.of_problem(problem))))
         elif topic == "events" and (events := self._decoded(schemas.Events, message)) is not None:
             arrived = list(zip(listeners, itertools.repeat(Item(events.stream, b"", events=events))))
-        elif topic == "tracks" and (tracks := self._tracks(message)) is not None:
+        elif topic in {"tracks", "now"} and (tracks := self._tracks(message)) is not None:
             wanting = [one for one in listeners if one.passes(tracks)]
             selections = {one.selection.key: one.selection for one in wanting}
             items = {key: Item.of_tracks(tracks, selection) for key, selection in selections.items()}
