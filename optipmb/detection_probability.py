@@ -153,15 +153,10 @@ def points_in_boxes(cloud: PointCloud, center: Array, size: Array, yaw: Array) -
 
 @long_kernel
 def count_points(xyz: Coordinates, center: Array, half: Array, yaw: Array, rotation: Array, counts: Index) -> None:
-    """Add to `counts` (N,) the points in each box.
+    """Add to `counts` (N,), N > 0, the points in each box.
 
-    Args:
-        xyz: (P, 3) in the sensor frame.
-        center: (N, 3) centres in the sensor frame, N > 0.
-        half: (N, 3) half the sizes.
-        yaw: (N,) yaw in the world.
-        rotation: (3, 3) world from sensor.
-        counts: (N,) is added to.
+    Points (P, 3), centres (N, 3) and halves of the sizes are in the sensor frame, yaws (N,) in the world; `rotation` is
+    world from sensor.
     """
     axes, low, high = boxes_in_sensor(center, half, yaw, rotation)
     left, right = np.float32(max(low[:, 0].min(), -RANGE)), np.float32(min(high[:, 0].max(), RANGE))
@@ -198,14 +193,8 @@ def count_points(xyz: Coordinates, center: Array, half: Array, yaw: Array, rotat
 def cells_of_points(block: Coordinates, x_cells: Cells, y_cells: Cells, heights: Cells, cell_of: Small) -> None:
     """Write the cell of each point to `cell_of`; NOWHERE where it is above or below all boxes, or NaN.
 
-    A loop without branches, which the compiler vectorizes.
-
-    Args:
-        block: (3 P,) x, y, z of one point after the other, in the sensor frame.
-        x_cells: where the grid begins, and its cells per metre.
-        y_cells: likewise.
-        heights: lowest and highest z of a box.
-        cell_of: (P,) or longer.
+    A loop without branches, which the compiler vectorizes. `block` has x, y, z of one point after the other, `x_cells`
+    and `y_cells` where the grid begins and its cells per metre, `heights` the lowest and highest z of a box.
     """
     lowest, highest = heights
     for p in range(block.shape[0] // 3):

@@ -172,7 +172,7 @@ def overlaps(first: Array, second: Array) -> Array:
     return result
 
 
-NOBODY: Final = -1
+END_OF_CHAIN: Final = -1
 """End of a chain."""
 
 SMALLEST_SIDE: Final = 4
@@ -189,7 +189,7 @@ def empty_torus(count: int) -> tuple[Index, Index, int]:
     side = SMALLEST_SIDE
     while side * side < count:
         side *= 2
-    return np.full(side * side, NOBODY), np.empty(count, np.int64), side
+    return np.full(side * side, END_OF_CHAIN), np.empty(count, np.int64), side
 
 
 @kernel

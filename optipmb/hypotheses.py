@@ -18,17 +18,15 @@ from optipmb.compiled import kernel
 from optipmb.density import PHI, V, X, Y
 from optipmb.errors import EffortError
 from optipmb.frame import PLAIN
-from optipmb.geometry import NOBODY, block, empty_torus, insert
+from optipmb.geometry import END_OF_CHAIN, block, empty_torus, insert
 from optipmb.predict import heading_unknown, wrap
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from optipmb.class_posterior import Groups
     from optipmb.density import Bernoullis, Density, Poissons
     from optipmb.preprocess import Measurements
     from optipmb.rows import Array, Index
-    from optipmb.table import ClassRow, ClassTable
+    from optipmb.table import Classes, ClassTable
 
     Targets = tuple[Array, Index, Array]  # positions, classes or groups, and widening of measurements
 
@@ -76,7 +74,7 @@ def local_hypotheses(
     measurements: Measurements,
     groups: Groups,
     dt: float,
-    classes: Sequence[ClassRow],
+    classes: Classes,
 ) -> Hypotheses:
     """Enumerate the hypotheses that pass the class gate and the distance gate, with their costs.
 
@@ -127,7 +125,7 @@ def exclude_turned(
     log_likelihood: Array,
     objects: Bernoullis,
     measurements: Measurements,
-    classes: Sequence[ClassRow],
+    classes: Classes,
 ) -> None:
     """Write a likelihood of zero for pairs outside eta_dist whose headings do not agree, modulo pi.
 
@@ -154,14 +152,7 @@ def detection_costs(
     """Compute the cost of each detection hypothesis and the association probability of each measurement.
 
     ``w = -ln [r p_d N(z; z_hat, S) / (1 - r + r (1 - p_d))]`` (eq. Detection Hypothesis Update) and
-    ``p_a = min[1, sum_n N(z; z_hat^n, S^n)]`` (eq. Association Probability).
-
-    Arguments of its own:
-        row: (K,) object of each pair, ascending.
-        association: (M,) receives p_a.
-
-    Returns:
-        (K,) costs.
+    ``p_a = min[1, sum_n N(z; z_hat^n, S^n)]`` (eq. Association Probability), which `association` (M,) receives.
     """
     cost = np.empty(row.shape[0])
     association[:] = 0.0
@@ -180,7 +171,7 @@ def detection_costs(
 
 @kernel
 def first_detections(
-    measurement: Index, log_e: Array, score: Array, association: Array, label: Index, classes: Sequence[ClassRow]
+    measurement: Index, log_e: Array, score: Array, association: Array, label: Index, classes: Classes
 ) -> tuple[Index, Array, Array]:
     """Compute kind, cost and existence of the first-time detection hypothesis of each measurement.
 
@@ -194,13 +185,6 @@ def first_detections(
     and a birth that the component forbids.
 
     A score below `announce_score` is clutter, with components or without.
-
-    Arguments of its own:
-        log_e: (L,) ln e^j.
-        label: (M,) z_c.
-
-    Returns:
-        (M,) `FROM_POISSON`, `CLUTTER` or `NEWBORN`, (M,) w and (M,) r.
     """
     n_measurements = score.shape[0]
     kind, cost, existence = np.empty(n_measurements, np.int64), np.empty(n_measurements), np.empty(n_measurements)
@@ -245,14 +229,11 @@ FEW: Final = 256
 
 
 @kernel
-def gate_radii(covariance: Array, label: Index, dt: float, classes: Sequence[ClassRow]) -> Array:
+def gate_radii(covariance: Array, label: Index, dt: float, classes: Classes) -> Array:
     """Compute the gating distance of each object.
 
     It is eta_dist, and at least the way that its speed may deviate: so many standard deviations of v over dt. The paper
     has eta_dist alone, at the one frame rate of a data set.
-
-    Returns:
-        (N,) m.
     """
     radius = np.empty(label.shape[0])
     for n in range(label.shape[0]):
@@ -266,15 +247,12 @@ def gate_radii(covariance: Array, label: Index, dt: float, classes: Sequence[Cla
 
 
 @kernel
-def gate_widening(position: Array, label: Index, classes: Sequence[ClassRow]) -> Array:
+def gate_widening(position: Array, label: Index, classes: Classes) -> Array:
     """Compute by how much each detection widens the gates that it may lie in.
 
     eta_dist is chosen for detections with R of their class. What R_m of a detection has beyond it widens the gate, as
     variances add up: ``eta^2 + chi^2 max(0, lambda_1(R_m) - sigma^2)``, lambda_1 the larger eigenvalue, chi^2 the
     quantile `DEVIATIONS_2`. A detection that is more accurate than its class has the gate of the class.
-
-    Arguments of its own:
-        label: (M,) z_c.
 
     Returns:
         (M,) m^2, to be added to the squares of gating distances.
@@ -297,7 +275,7 @@ def gate(
     radius: Array,
     position: Array,
     measured_label: Index,
-    classes: Sequence[ClassRow],
+    classes: Classes,
     by_group: bool,
 ) -> tuple[Index, Index, Array]:
     """Find the measurements of an object's class or group within its gate and their position likelihoods.
@@ -319,12 +297,7 @@ def gate(
         row, measurement = pairs_of_few(mean, kind, radius, targets, len(classes))
     else:
         row, measurement = pairs_of_many(mean, kind, radius, targets, len(classes), UNLIMITED)
-        for k in range(row.shape[0]):  # measurements of an object in ascending order
-            m, slot = measurement[k], k
-            while slot > 0 and row[slot - 1] == row[k] and measurement[slot - 1] > m:
-                measurement[slot] = measurement[slot - 1]
-                slot -= 1
-            measurement[slot] = m
+        sort_measurements(row, measurement)
     log_likelihood = np.empty(row.shape[0])
     own_noise = position.shape[1] > PLAIN
     rho_xx, rho_xy, rho_yy = 1.0, 0.0, 1.0
@@ -348,7 +321,21 @@ def gate(
 
 
 @kernel
-def groups(label: Index, classes: Sequence[ClassRow]) -> Index:
+def sort_measurements(row: Index, measurement: Index) -> None:
+    """Sort the measurements of each object."""
+    begin = 0
+    for k in range(row.shape[0]):
+        if row[k] != row[begin]:
+            begin = k
+        m, slot = measurement[k], k
+        while slot > begin and measurement[slot - 1] > m:
+            measurement[slot] = measurement[slot - 1]
+            slot -= 1
+        measurement[slot] = m
+
+
+@kernel
+def groups(label: Index, classes: Classes) -> Index:
     """Return the group (N,) of each class of `label` (N,)."""
     group = np.empty(label.shape[0], np.int64)
     for n in range(label.shape[0]):
@@ -397,7 +384,7 @@ def pairs_of_few(mean: Array, label: Index, radius: Array, targets: Targets, cla
 def pairs_of_many(
     mean: Array, label: Index, radius: Array, targets: Targets, classes: int, most: int
 ) -> tuple[Index, Index]:
-    """Find the pairs within the gates by looking at neighbours, up to `most` + 1; ordered by object alone.
+    """Find the pairs within the gates by looking at neighbours, until there are more than `most`; ordered by object.
 
     The measurements stand in a torus of cells twice as wide as the widest gate of their class, so that a gate touches
     at most three cells along each axis.
@@ -416,7 +403,7 @@ def pairs_of_many(
     count = 0
     for n in range(mean.shape[0]):
         eta = radius[n]
-        if eta < 0.0:
+        if eta < 0.0 or count > most:
             continue
         eta_2 = eta * eta
         reach = math.sqrt(eta_2 + wider[label[n]])
@@ -424,7 +411,7 @@ def pairs_of_many(
         for i in range(first_x, last_x + 1):
             for j in range(first_y, last_y + 1):
                 m = head[(i & (side - 1)) * side + (j & (side - 1))]
-                while m != NOBODY:
+                while m != END_OF_CHAIN:
                     dx, dy = position[m, 0] - mean[n, 0], position[m, 1] - mean[n, 1]
                     if dx * dx + dy * dy <= eta_2 + widening[m] and measured_label[m] == label[n]:
                         if count == capacity:
@@ -432,8 +419,6 @@ def pairs_of_many(
                             row, measurement = _grown(row, capacity), _grown(measurement, capacity)
                         row[count], measurement[count] = n, m
                         count += 1
-                        if count > most:
-                            return row[:count], measurement[:count]
                     m = following[m]
     return row[:count], measurement[:count]
 

@@ -28,13 +28,11 @@ from optipmb.density import PHI, STATE, A, V
 from optipmb.predict import heading_unknown, wrap
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from optipmb.association import Survivors
     from optipmb.density import Bernoullis, Moment
     from optipmb.preprocess import Measurements
     from optipmb.rows import Array
-    from optipmb.table import ClassRow
+    from optipmb.table import Classes, ClassRow
 
 
 @kernel
@@ -45,7 +43,7 @@ def light_weight_filter(
     next_id: int,
     measurements: Measurements,
     moment: Moment,
-    classes: Sequence[ClassRow],
+    classes: Classes,
 ) -> None:
     """Update the non-motion states of all objects, new and old.
 
@@ -53,13 +51,8 @@ def light_weight_filter(
     Score). Missed: x_A stays, ``x_s = 0``. New: x_A = z_A before, ids from `next_id` on. The counters are kept as
     stamps, so that they mean the same at every frame rate: x_cnt is the number of nominal periods since `seen_ns`,
     x_len is one more than the (real) number since `born_ns`. The evidence follows `optipmb.calibration`, the sign of
-    the heading turns the motion states where it changes. `extracted` and `confirmed` stay as they were.
-
-    Arguments of its own:
-        survivors: which objects the posterior has.
-        posterior: the objects, whose motion states and classes are known; receives all other columns.
-        objects: the predicted objects.
-        next_id: id of the first new object.
+    the heading turns the motion states where it changes. `extracted` and `confirmed` stay. `posterior` has the motion
+    states and classes, and receives all other columns.
     """
     stamp_ns, label = moment.stamp_ns, posterior.label
     mean, covariance, auxiliary, identity = posterior.mean, posterior.covariance, posterior.auxiliary, posterior.id
@@ -83,11 +76,8 @@ def light_weight_filter(
         else:
             identity[k] = objects.id[n]
             born_ns[k], seen_ns[k], extracted[k] = objects.born_ns[n], objects.seen_ns[n], objects.extracted[n]
-            confirmed[k], evidence[k], heading_odds[k] = (
-                objects.confirmed[n],
-                objects.evidence[n],
-                objects.heading_odds[n],
-            )
+            confirmed[k], evidence[k] = objects.confirmed[n], objects.evidence[n]
+            heading_odds[k] = objects.heading_odds[n]
             for s in range(4):
                 auxiliary[k, s] = objects.auxiliary[n, s]
         own, first = classes[label[k]], born_ns[k] == stamp_ns
@@ -127,13 +117,9 @@ CERTAIN: Final = 2.0
 def follow_sign(
     odds: float, kept: float, own: ClassRow, score: float, yaw: float, mean: Array, covariance: Array
 ) -> float:
-    """Return h_k of a detected object, and turn its state in place where the sign has changed.
+    """Return h_k of a detected object by its `odds` h_{k-1}, and turn its state in place where the sign has changed.
 
-    Arguments of its own:
-        odds: h_{k-1}; zero before the first detection.
-        kept: kappa.
-        own: parameters of its class: lambda, b_d, b_v and v_0.
-        yaw: z_phi.
+    `kept` is kappa; the odds are zero before the first detection.
     """
     blind = math.isnan(yaw)
     latest = 0.0 if blind else own.sign_detection * score * math.cos(yaw - mean[PHI])

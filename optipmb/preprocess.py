@@ -14,7 +14,7 @@ import numpy as np
 from optipmb.compiled import kernel
 from optipmb.errors import EffortError
 from optipmb.frame import PLAIN
-from optipmb.geometry import NOBODY, block, boxes_overlap, empty_torus, insert
+from optipmb.geometry import END_OF_CHAIN, block, boxes_overlap, empty_torus, insert
 from optipmb.hypotheses import UNLIMITED
 from optipmb.table import known_length
 
@@ -181,12 +181,10 @@ def sort_canonically(order: Index, score: Array, center: Array, size: Array, yaw
 def non_maximum_suppression(boxes: Array, label: Index, classes: Classes, most: int) -> NDArray[np.bool_]:
     """Keep each box unless a kept box of its group before it overlaps it by more than the threshold of its class.
 
-    Arguments of its own:
-        boxes: (M, 5) bird's-eye boxes, best first.
-        most: pairs of boxes whose overlap is computed before it gives up.
+    `boxes` (M, 5) are bird's-eye boxes, best first.
 
     Returns:
-        (M,) whether the box is kept; empty after giving up.
+        (M,) whether the box is kept; empty where more than `most` overlaps had to be computed.
     """
     count, left = boxes.shape[0], most
     keep = np.ones(count, np.bool_)
@@ -205,7 +203,7 @@ def non_maximum_suppression(boxes: Array, label: Index, classes: Classes, most: 
         for i in range(first_x, last_x + 1):
             for j in range(first_y, last_y + 1):
                 k = head[(i & (side - 1)) * side + (j & (side - 1))]
-                while k != NOBODY and keep[m]:
+                while k != END_OF_CHAIN and keep[m]:
                     if classes[label[k]].suppressed_with == g:
                         dx, dy, reach = boxes[k, 0] - boxes[m, 0], boxes[k, 1] - boxes[m, 1], radius[k] + radius[m]
                         if dx * dx + dy * dy < reach * reach:

@@ -168,12 +168,9 @@ def copy_rows(slots: Slots, first: int, out: Slots) -> None:
 
 @kernel
 def next_slot(slots: Slots, counts: Array, needed: float) -> None:
-    """Evaluate the middle slot of an object, and begin a new one.
+    """Evaluate the middle of the slots of an object in the counts of its class, and begin a new slot.
 
-    Args:
-        slots: (`SLOTS`, `SLOT`) is written.
-        counts: (`COUNTS`, `BINS`) of the class; is written.
-        needed: share of looks in which a lasting object is detected.
+    A lasting object is detected in the share `needed` of looks.
     """
     hits, looks = np.zeros(SLOTS), np.empty(SLOTS)
     for s in range(SLOTS):

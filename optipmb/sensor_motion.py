@@ -260,13 +260,8 @@ def sideways(pairs: Pairs, ahead: Array, reach: Array, walks: NDArray[np.bool_])
     """Return how far the nearest target is from where each object can have moved to, (N,) up to `MOST_SIDEWAYS`.
 
     Half the square in standard deviations: across its axis, along which it drives as far as its reach; a walker reaches
-    a circle.
-
-    Args:
-        pairs: objects and detections.
-        ahead: (N, 2) axes of the objects.
-        reach: (N,) how far they can move, m.
-        walks: (N,) whether they can move any way.
+    a circle. `ahead` (N, 2) are the axes of the objects, `reach` (N,) is how far they can move, m, and `walks` (N,)
+    whether they can move any way.
     """
     out = np.full(pairs.start.shape[0], MOST_SIDEWAYS)
     for n in range(out.shape[0]):

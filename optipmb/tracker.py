@@ -40,14 +40,12 @@ from optipmb.unknown_heading import all_measured, measured_bits
 from optipmb.update import first_detected_states, ukf_updates
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
     from optipmb.frame import Frame
     from optipmb.paths import PredictedPaths
     from optipmb.rows import Array, Columns, Index
-    from optipmb.table import ClassRow
+    from optipmb.table import Classes
 
 
 class Prior(NamedTuple):
@@ -98,7 +96,7 @@ class Update(NamedTuple):
 
 @kernel
 def update(
-    prior: Columns, p_d: Array, measurements: Columns, moment: Columns, confusion: Array, classes: Sequence[ClassRow]
+    prior: Columns, p_d: Array, measurements: Columns, moment: Columns, confusion: Array, classes: Classes
 ) -> Columns:
     """Update the prediction with the measurements: from the fields of the named tuples to the fields of `Update`.
 

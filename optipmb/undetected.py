@@ -17,13 +17,11 @@ from optipmb.hypotheses import CLUTTER
 from optipmb.update import birth_states
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from optipmb.density import Density, Moment
     from optipmb.hypotheses import Hypotheses
     from optipmb.preprocess import Measurements
     from optipmb.rows import Array, Index
-    from optipmb.table import ClassRow, ClassTable
+    from optipmb.table import Classes, ClassTable
 
 
 AGED: Final = -1
@@ -39,7 +37,7 @@ def update_undetected(
     hypotheses: Hypotheses,
     measurements: Measurements,
     moment: Moment,
-    classes: Sequence[ClassRow],
+    classes: Classes,
 ) -> tuple[Array, Index]:
     """Return the array of the Poisson components that stay under RPP, and of lambda_b; and the fate of each, (J + M,).
 
@@ -56,10 +54,8 @@ def update_undetected(
     lambda_b has a component for each low-scored measurement of M_low, of weight ``mu_b = mu_ab (1 - p_a)`` (eq. HABM);
     a zero weight makes none.
 
-    Arguments of its own:
-        components: the components.
-        n_predicted: how many of them were predicted; those behind were made by the measurements of this frame, which
-            do not use them up. Then nothing is born here: HABM is off.
+    `n_predicted` components were predicted. The others were made by the measurements of this frame, which do not use
+    them up; then HABM is off, and nothing is born here.
     """
     adaptive = n_predicted == p_d.shape[0]
     capacity = p_d.shape[0] + measurements.score.shape[0]
@@ -95,7 +91,7 @@ def with_births(
     weight: Array,
     measurements: Measurements,
     stamp_ns: int,
-    classes: Sequence[ClassRow],
+    classes: Classes,
 ) -> Array:
     """Return the array of the components in `kept` (K,) and, behind them, of births by measurements (L,).
 

@@ -28,7 +28,7 @@ from optipmb.density import (
     whole_periods,
 )
 from optipmb.extract import Tracks, extract, select_tracks
-from optipmb.geometry import NOBODY, bev_iou, block, box_iou, empty_torus, insert, iou_exceeds
+from optipmb.geometry import END_OF_CHAIN, bev_iou, block, box_iou, empty_torus, insert, iou_exceeds
 from optipmb.hypotheses import CLUTTER, FROM_POISSON, NEWBORN, Hypotheses
 from optipmb.lightweight import light_weight_filter
 from optipmb.predict import predict_density, predict_state
@@ -151,7 +151,7 @@ def test_a_search_finds_every_neighbour_once(seed: int, count: int, extent: floa
     for i in range(first_x, last_x + 1):
         for j in range(first_y, last_y + 1):
             number = head[(i & (side - 1)) * side + (j & (side - 1))]
-            while number != NOBODY:
+            while number != END_OF_CHAIN:
                 met.append(int(number))
                 number = following[number]
     assert len(set(met)) == len(met)

@@ -96,6 +96,7 @@ TWINS = {
     "hypotheses.groups": "test_class_posterior.test_pairs_weigh_by_what_the_detector_calls_them",
     "hypotheses.pairs_of_few": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
     "hypotheses.pairs_of_many": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
+    "hypotheses.sort_measurements": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
     "hypotheses.local_hypotheses": "test_twins.test_hypotheses_are_those_of_their_parts",
     "lightweight.light_weight_filter": "test_kernels.test_the_light_weight_filter_is_its_formulas",
     "predict.decay_and_turn": "test_motion.test_the_prediction_is_the_textbook_unscented_transform",

@@ -520,8 +520,8 @@ class Session:
     # Settings
 
     def _transition(self, parameters: optipmb.Parameters) -> Transition:
-        self._scores: dict[int, tuple[NDArray[np.float64], NDArray[np.int64]]] = {}
-        """By profile of a sensor: the score filter of each class; its detections, and those below the filter."""
+        self._scores: dict[str, tuple[NDArray[np.float64], NDArray[np.int64]]] = {}
+        """Score filter of each class; its detections, and those below it: by sensor where it has its own parameters."""
         return Transition(self.stream, parameters, self._make, self._policy)
 
     def _limit_wait(self, cloud_wait_ns: int) -> None:
@@ -552,6 +552,7 @@ class Session:
             del self._sensors[name]
             self._quarantine.pop(name, None)
             self._blind.discard(name)
+            self._scores.pop(name, None)
 
     def _follow(self, gone: Sequence[FrameId] = ()) -> None:
         """Give the timeline to the queues; `gone` are the frames that have left the window."""
@@ -815,10 +816,11 @@ class Session:
 
     def _low_scores(self, frame_id: FrameId, frame: optipmb.Frame, parameters: optipmb.Parameters) -> list[Output]:
         """Count the detections below the score filter; report each class that loses most of them, once."""
-        if (counted := self._scores.get(id(parameters))) is None:
-            filters = np.array([one.score_filter for one in parameters.classes.values()])
-            counted = self._scores[id(parameters)] = filters, np.zeros((2, len(filters)), np.int64)
-        filters, counts = counted
+        sensor = "" if parameters is self.parameters else frame_id.sensor
+        if sensor not in self._scores:
+            limits = np.array([one.score_filter for one in parameters.classes.values()])
+            self._scores[sensor] = limits, np.zeros((2, len(limits)), np.int64)
+        filters, counts = self._scores[sensor]
         labels, size = parameters.labels, len(filters)
         counts[0] += np.bincount(frame.label, minlength=size)
         low = frame.score < filters[frame.label]
