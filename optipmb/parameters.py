@@ -410,28 +410,11 @@ def parse_parameters(document: dict[str, Any]) -> Parameters:
 
 
 MEASUREMENT: Final = (
-    "score_filter",
-    "nms_iou",
-    "suppress_in_group",
-    "class_confusion",
-    "score_calibration",
-    "gate",
-    "detection",
-    "expected_points",
-    "detection_floor",
-    "ground_clearance",
-    "measurement_noise",
-    "reported_noise",
-    "clutter_rate",
-    "area",
-    "birth_score",
-    "announce_score",
-    "adaptive_birth_rate",
-    "baseline_birth_rate",
-    "undetected_birth_rate",
-    "birth_heading_speed",
-    "birth",
-)
+    "score_filter", "nms_iou", "suppress_in_group", "class_confusion", "score_calibration", "gate", "detection",
+    "expected_points", "detection_floor", "ground_clearance", "measurement_noise", "reported_noise", "clutter_rate",
+    "area", "birth_score", "announce_score", "adaptive_birth_rate", "baseline_birth_rate", "undetected_birth_rate",
+    "birth_heading_speed", "birth",
+)  # fmt: skip
 """What a sensor has of its own profile, of each class."""
 
 FLAGS: Final = ("starts_tracks", "trust_size", "trust_heading")
