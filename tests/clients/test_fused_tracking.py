@@ -1,16 +1,14 @@
 """The sensors of a recording track into one density offline: the bytes of a service with the setting `fuse`."""
 
-from __future__ import annotations
-
 import csv
 import re
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
 from commands import result_of, run_here
 from fusing import FRONT, FUSED, REAR, SIDE, drive
-from optipmb_schemas import Keys, Tracks, encode, encoding_of
+from optipmb_schemas import Detections, Keys, Tracks, encode, encoding_of
 from optipmb_service.stream.session import Session
 from optipmb_service.stream.values import Policy
 from optipmb_tools.datasets import DatasetError, open_dataset
@@ -22,11 +20,6 @@ from sessions import Merged
 
 import optipmb
 from optipmb.parameters import ALIKE
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from optipmb_schemas import Detections
 
 KITTI = optipmb.load_profile("kitti")
 COLUMNS = ("id", "center", "size", "yaw", "velocity", "existence", "score", "covariance", "age", "detection")
@@ -75,7 +68,7 @@ def tabled(path: Path, frames: list[Detections]) -> Path:
 
 
 def same(sequence: FusedSequence, wanted: list[Tracks], sensors: optipmb.Sensors = ALIKE) -> None:
-    """Compare the tracks of a sequence with those of a service, byte for byte."""
+    """Check that the tracks of a sequence equal a service's, byte for byte."""
     found = track_whole(KITTI, sequence, sensors=sensors).tracks.values()
     assert len(found) == len(wanted)
     for ours, theirs in zip(found, wanted, strict=True):

@@ -65,7 +65,7 @@ def denied(call: Any) -> grpc.StatusCode:
 def test_a_node_tracks_its_own_streams_alone(network: Network, secured: GatewayProcess) -> None:
     """It gets tracks of its own detections; another node's it may neither publish, nor read, nor reset.
 
-    Of sessions of its site it may read those that name it.
+    It may read sessions of its site that name it.
     """
     own = stub(network, NODE, secured)
     responses = list(own.Track(detections(frame(seq, LIDAR)) for seq in range(10)))

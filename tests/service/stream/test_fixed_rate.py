@@ -1,9 +1,9 @@
 """Output at a fixed rate: tracks predicted to now by `predict_tracks`, while frames come, from the owner alone."""
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import optipmb_service.stream.stream as module
@@ -18,10 +18,6 @@ from registries import Around, packet_of, streams_of
 from router import SECOND, Sensor
 
 import optipmb
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 MS = 1_000_000
 SENSOR = Sensor()
@@ -58,7 +54,6 @@ class Process(Around):
     perf_counter_ns = thread_time_ns = monotonic_ns
 
     def time_ns(self) -> int:
-        """Return the system's time."""
         return self.now_ns + self.wall_ns
 
     def until(self, now_ns: int) -> None:
@@ -78,23 +73,18 @@ class Process(Around):
         self.run()
 
     def may_write(self, *_: object) -> bool:
-        """Whether the process holds the stream."""
         return self.owns
 
     def publish(self, payload: bytes, *_: object) -> None:
-        """Collect tracks."""
         self.tracks.append(decode(payload, Tracks))
 
     def publish_now(self, payload: bytes) -> None:
-        """Collect predicted tracks."""
         self.now.append((self.now_ns, payload))
 
     def report(self, problem: Problem, _: int) -> None:
-        """Collect problems."""
         self.problems.append(problem)
 
     def predicted(self) -> list[Tracks]:
-        """Return the predicted tracks."""
         return [decode(payload, Tracks) for _, payload in self.now]
 
 
@@ -111,7 +101,6 @@ def process(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Process]:
 
 
 def columns(message: Tracks) -> dict[str, Any]:
-    """Return the columns of a message as the tracker has them."""
     found = {name: np.array(getattr(message, name)) for name in optipmb.Tracks.described}
     return found | {"confirmed": found["confirmed"].astype(bool)}
 

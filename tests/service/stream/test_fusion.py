@@ -207,7 +207,7 @@ def test_streams_of_several_nodes_feed_one_session() -> None:
 
 
 def test_nodes_of_a_site_share_tracks(start: Callable[..., Any]) -> None:
-    """The tracks are those of one session with all their frames; detections below the node `fused` are refused."""
+    """The tracks equal one session with all their frames; detections below the node `fused` are refused."""
     fused = {"crossing": {"streams": ["site/*/front", "site/*/rear"]}}
     service, endpoint = start(fused=fused, sensors={"site/*/rear": {"trust_size": False}}, recovery_wait_s=30)
     there = replace(REAR, stream="site/other/rear")
@@ -258,14 +258,14 @@ def test_nodes_of_a_site_share_tracks(start: Callable[..., Any]) -> None:
     ],
 )
 def test_a_wrong_session_of_nodes_is_named(options: dict[str, Any], text: str) -> None:
-    """The path and what is wrong; a stream feeds one session."""
+    """The error names path and problem; a stream feeds one session."""
     with pytest.raises(SettingsInvalidError) as caught:
         load(None, options)
     assert text in str(caught.value)
 
 
 def test_patterns_without_a_common_stream_are_allowed() -> None:
-    """Whatever their letters have in common."""
+    """For any letters in common."""
     fused = {
         "a": {"streams": ["s/n/l*r", "s/n/x*"]},
         "b": {"streams": ["s/n/l*a", "s/m/*"]},

@@ -1,14 +1,13 @@
-"""Sensors of a fused session that differ: settings, bytes over a restart, dumps, and what is said of them."""
+"""Sensors of a fused session that differ: settings, bytes over a restart, dumps, and reports."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import optipmb_schemas as schemas
 import pytest
 from fusing import FRONT, FUSED, REAR, SIDE, drive
-from optipmb_schemas import Keys, SessionParameters, SessionState
+from optipmb_schemas import Detections, Keys, SessionParameters, SessionState
 from optipmb_service.settings import SettingsInvalidError, load, missing_files
 from optipmb_service.stream.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
 from optipmb_service.stream.profiles import Profiles
@@ -19,11 +18,6 @@ from router import Node, until
 from sessions import Failing, Merged, dumps, problems, tracks
 
 import optipmb
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from optipmb_schemas import Detections
 
 KEYS = Keys()
 NUSCENES = optipmb.load_profile("nuscenes")
@@ -40,18 +34,16 @@ def fused(sensors: optipmb.Sensors, **options: Any) -> Session:
 
 
 def given_to(session: Session, frames: list[Detections]) -> list[Any]:
-    """What a session makes of frames."""
     return [output for frame in frames for output in session.on_detections(frame, 0)]
 
 
 def in_order(count: int = 12) -> list[Detections]:
-    """Frames of three sensors by stamp."""
     frames = [sensor.detections(seq) for sensor in (FRONT, REAR, SIDE) for seq in range(count)]
     return sorted(frames, key=lambda one: (one.stamp_ns, one.stream))
 
 
 def test_an_empty_entry_changes_no_byte() -> None:
-    """Tracks, session ids and the state are those of a session without the setting."""
+    """Tracks, session ids and the state equal a session without the setting."""
     one, other = fused(optipmb.Sensors()), fused(optipmb.Sensors.read({"site/node/*": {}}))
     found, again = tracks(given_to(one, drive(30))), tracks(given_to(other, drive(30)))
     assert [schemas.encode(message) for message in found] == [schemas.encode(message) for message in again]
@@ -117,7 +109,7 @@ def test_scores_are_compared_with_the_filter_of_the_sensor() -> None:
 
 
 def test_the_service_uses_and_shows_the_setting(start: Callable[..., Any]) -> None:
-    """`q/parameters` of the fused session has it, that of others not."""
+    """`q/parameters` of the fused session has it, other sessions have not."""
     sensors = {"site/*/rear": {"profile": "kitti", "trust_size": False}, "yard/*/*": {"trust_size": False}}
     _, endpoint = start(fuse=["site/node/*"], sensors=sensors)
     frames = drive(20)

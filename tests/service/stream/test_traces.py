@@ -58,7 +58,6 @@ class Traced(Around):
         self.run()
 
     def spans(self) -> dict[int, dict[str, list[ReadableSpan]]]:
-        """Return the spans by frame and name."""
         found: dict[int, dict[str, list[ReadableSpan]]] = defaultdict(lambda: defaultdict(list))
         for one in self.exporter.get_finished_spans():
             found[int((one.attributes or {})["optipmb.seq"])][one.name].append(one)  # type: ignore[arg-type]
@@ -244,19 +243,16 @@ class Collector(HTTPServer):
         super().__init__(("127.0.0.1", 0), Handler)
 
     def spans(self, scope: str = "optipmb_service") -> list[Any]:
-        """Return the spans so far."""
         groups = [group for one in self.requests for resource in one.resource_spans for group in resource.scope_spans]
         return [span for group in groups if group.scope.name == scope for span in group.spans]
 
     def services(self) -> set[str]:
-        """Return the names of the services that sent spans."""
         found = [one.resource.attributes for request in self.requests for one in request.resource_spans]
         return {pair.value.string_value for pairs in found for pair in pairs if pair.key == "service.name"}
 
 
 @pytest.fixture
 def collector() -> Iterator[Collector]:
-    """A collector that answers."""
     with Collector() as server:
         thread = threading.Thread(target=server.serve_forever, daemon=True)
         thread.start()
