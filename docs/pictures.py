@@ -1,4 +1,4 @@
-"""Pictures of docs/concepts.md and docs/zones.md: `python docs/pictures.py docs/images`. Needs the extra `plot`."""
+"""Pictures of concepts, fusion and zones: `python docs/pictures.py docs/images`; needs the extra `plot`."""
 
 from __future__ import annotations
 
@@ -131,8 +131,93 @@ def draw_zones(figure: Figure) -> None:
     axes.legend(frameon=False, fontsize=8, loc="upper left", ncols=2)
 
 
+def radar_of(session: optipmb.Parameters) -> optipmb.Parameters:
+    """Return the profile of a radar: it misses half of the objects, by a metre and more."""
+    document = session.model_dump(mode="json") | {"name": "radar"}
+    for one in document["classes"].values():
+        one["measurement_noise"] |= {"position": 1.5, "heading": 1.0}
+        one |= {"detection": 0.5, "clutter_rate": 8.0, "gate": 5.0, "score_filter": 0.1, "reported_noise": None}
+    return optipmb.parse_parameters(document)
+
+
+def two_sensors(frames: int = 130) -> tuple[list[tuple[str, int, np.ndarray]], list[np.ndarray]]:
+    """Return x, y, yaw and score of what a lidar and a radar detect by turns, and the paths of four cars."""
+    rng, half = np.random.default_rng(4), np.pi / 2
+    cars = ((0, -3.0, 9.0, 0.0), (25, 3.5, 8.0, np.pi), (10, -3.0, 7.0, half), (35, 3.5, 8.0, 0.0))
+    found, paths = [], [[] for _ in cars]
+    for k in range(2 * frames):
+        is_radar, true = k % 2, []
+        for (begins, aside, speed, yaw), path in zip(cars, paths, strict=True):
+            along = speed * (k / 20 - begins / RATE) - 55.0
+            x, y = along * np.cos(yaw) - aside * np.sin(yaw), along * np.sin(yaw) + aside * np.cos(yaw)
+            if k / 2 < begins or along > 60.0:  # noqa: PLR2004 - m
+                continue
+            path.append((x, y))
+            seen = np.hypot(x, y) < 70 and abs(np.arctan2(y, x)) < 0.35 if is_radar else np.hypot(x, y) < 40  # noqa: PLR2004 - m
+            if seen and rng.random() < (0.6 if is_radar else 0.9):
+                noise, turn = (1.2, 0.8) if is_radar else (0.12, 0.05)
+                true.append((x + rng.normal(0, noise), y + rng.normal(0, noise), yaw + rng.normal(0, turn), 0.8))
+        for _ in range(rng.poisson(1.0 if is_radar else 0.2)):
+            angle, away = rng.uniform(-0.35, 0.35) * (1 if is_radar else 9), rng.uniform(5, 65 if is_radar else 40)
+            true.append((away * np.cos(angle), away * np.sin(angle), rng.uniform(-3, 3), rng.uniform(0.2, 0.7)))
+        found.append((("lidar", "radar")[is_radar], k * 10**9 // 20, np.array(true).reshape(-1, 4)))
+    return found, [np.array(path) for path in paths]
+
+
+def draw_fusion(figure: Figure) -> None:
+    """Draw the tracks of a lidar and a radar, with one profile and with one for each."""
+    found, paths = two_sensors()
+    session = optipmb.load_profile("kitti")
+    use = optipmb.Sensor(radar_of(session), starts_tracks=True, trust_size=False, trust_heading=False)
+    views = {
+        "lidar": optipmb.FieldOfView((-np.pi, np.pi), (-1.5, 1.5), (0, 40)),
+        "radar": optipmb.FieldOfView((-0.35, 0.35), (-1.5, 1.5), (0, 70)),
+    }
+    pose = optipmb.Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+    ways = (("one profile for both", optipmb.Sensors()), ("a profile for the radar", optipmb.Sensors((("*", use),))))
+    for axes, (title, sensors) in zip(figure.subplots(2, 1, sharex=True), ways, strict=True):
+        trackers = {"lidar": optipmb.Tracker(session), "radar": optipmb.Tracker(sensors.parameters(session, "radar"))}
+        density, tracks = trackers["lidar"].initial(), {}
+        for sensor, stamp_ns, boxes in found:
+            columns = {
+                "center": np.c_[boxes[:, :2], np.full(len(boxes), 0.8)],
+                "yaw": boxes[:, 2],
+                "score": boxes[:, 3],
+            }
+            columns |= {"label": np.zeros(len(boxes), int), "size": np.tile((4.5, 1.9, 1.6), (len(boxes), 1))}
+            frame, _ = optipmb.make_frame(
+                trackers[sensor].parameters,
+                stamp_ns=stamp_ns,
+                labels=("Car",),
+                field_of_view=views[sensor],
+                pose=pose,
+                **columns,
+            )
+            result = trackers[sensor].step(density, frame)
+            density = result.density
+            for number, place, sure in zip(
+                *(getattr(result.tracks, n) for n in ("id", "center", "confirmed")), strict=True
+            ):
+                if sure:
+                    tracks.setdefault(int(number), []).append(place[:2])
+        for path in paths:
+            axes.plot(*path.T, color=TRUTH, linewidth=5, label="true path" if path is paths[0] else "_")
+        for sensor, mark, colour in (("radar", "x", GHOST), ("lidar", ".", "#222222")):
+            places = np.concatenate([boxes[:, :2] for name, _, boxes in found if name == sensor])
+            axes.plot(*places.T, mark, color=colour, markersize=3, alpha=0.5, label=sensor)
+        for place, path in enumerate(tracks.values()):
+            axes.plot(*np.array(path).T, color=TRACK, linewidth=1.5, label="_" if place else "tracks")
+        axes.set(title=title, aspect="equal", ylabel="y (m)", xlim=(-57, 72), ylim=(-26, 26))
+    axes.set_xlabel("x (m)")
+    axes.legend(frameon=False, fontsize=8, loc="lower left", ncols=4)
+
+
 def main(folder: Path) -> None:
     """Write the pictures into a folder."""
+    figure = Figure(figsize=(7.5, 6.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    draw_fusion(figure)
+    figure.savefig(folder / "fusion.png", dpi=100, metadata={"Software": None})
     tracks, found = scene()
     figure = Figure(figsize=(6.0, 4.6), layout="constrained")
     FigureCanvasAgg(figure)

@@ -15,11 +15,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args, get_origin
 
 from optipmb_service.settings import (
+    FusedSettings,
     LimitSettings,
     MqttSettings,
     OutputSettings,
     Ros2Settings,
     Ros2Stream,
+    SensorSettings,
     Settings,
     SiteSettings,
     ZoneSettings,
@@ -50,6 +52,7 @@ def settings() -> str:
     """Return the table of all settings."""
     tables: tuple[tuple[str, type[BaseModel]], ...] = (
         *(("", Settings), ("limits.", LimitSettings), ("sites.NAME.", SiteSettings)),
+        *(("fused.NAME.", FusedSettings), ("sensors.PATTERN.", SensorSettings)),
         *(("zones.NAME.", ZoneSettings), ("outputs.PATTERN.", OutputSettings)),
         *(("ros2.", Ros2Settings), ("ros2.streams.NAME.", Ros2Stream), ("mqtt.", MqttSettings)),
     )

@@ -179,12 +179,14 @@ class Looks:
     Attributes:
         in_view: (N,) share of each object that is in view, in [0, 1].
         poisson_in_view: (J,) share of each Poisson component.
+        counted: (N,) share of a miss of each object that counts: `in_view` times the attention of the sensor.
         time: (N,) s since each object was last looked at.
         misses: of the objects, if this frame misses them.
     """
 
     in_view: Array
     poisson_in_view: Array
+    counted: Array
     time: Array
     misses: Misses
 
@@ -200,13 +202,16 @@ def look(view: FieldOfView | None, prior: Density, moment: Moment, table: ClassT
     that was not detected for `LONGEST_UNSEEN_S`, and for a component whose gate no longer holds one standard deviation
     of its position.
 
+    A sensor looks at a class with its attention (`optipmb.Sensor`): a miss counts for that part of the time, and the
+    rest is left for the next look.
+
     Returns:
         The looks, None while no frame has had a field of view; and the prediction, with later stamps of Poisson
         components out of view.
     """
     bernoulli, poisson, misses = prior.bernoulli, prior.poisson, prior.misses
     before_ns, now_ns = moment.before_ns, moment.stamp_ns
-    if view is None and misses is None:
+    if view is None and misses is None and table.attention is None:
         return None, prior
     view = view or FieldOfView()
     if misses is None:
@@ -216,7 +221,13 @@ def look(view: FieldOfView | None, prior: Density, moment: Moment, table: ClassT
     in_view, poisson_in_view = np.empty(len(bernoulli)), np.empty(len(poisson))
     for rows, share in ((bernoulli, in_view), (poisson, poisson_in_view)):
         shares_in_view(rows.mean, rows.covariance, table.known_boxes(rows.label, rows.auxiliary), *where, share)
-    time, missed_from_ns = count_looks(in_view, misses.looked_ns, misses.missed_from_ns, tuple(moment))
+    looked_ns, counted = np.where(in_view > 0.0, now_ns, misses.looked_ns), in_view
+    if table.attention is not None:
+        attention = table.attention[bernoulli.label]
+        in_view *= attention > 0.0
+        counted = in_view * attention
+        looked_ns = misses.looked_ns + np.rint(attention * (looked_ns - misses.looked_ns)).astype(np.int64)
+    time, missed_from_ns = count_looks(counted, misses.looked_ns, misses.missed_from_ns, tuple(moment))
     lost = now_ns - bernoulli.seen_ns > LONGEST_UNSEEN_S * 1e9
     missed_from_ns[lost] = misses.missed_from_ns[lost]
     if len(poisson):
@@ -225,8 +236,11 @@ def look(view: FieldOfView | None, prior: Density, moment: Moment, table: ClassT
         hidden = np.where(largest > table["gate"][poisson.label] ** 2, 0.0, 1.0 - poisson_in_view)
         hidden_ns = np.rint(hidden * max(0, now_ns - before_ns)).astype(np.int64)
         prior = replace(prior, poisson=poisson.replaced(born_ns=np.minimum(poisson.born_ns + hidden_ns, now_ns)))
-    looked_ns = np.where(in_view > 0.0, now_ns, misses.looked_ns)
-    return Looks(in_view, poisson_in_view, time, Misses(missed_from_ns=missed_from_ns, looked_ns=looked_ns)), prior
+    if table.attention is not None:
+        poisson_in_view *= table.attention[poisson.label] > 0.0
+    return Looks(
+        in_view, poisson_in_view, counted, time, Misses(missed_from_ns=missed_from_ns, looked_ns=looked_ns)
+    ), prior
 
 
 def follow_looks(
@@ -248,7 +262,7 @@ def follow_looks(
     missed_from_ns, looked_ns = np.full(count, stamp_ns, np.int64), np.full(count, stamp_ns, np.int64)
     missed_from_ns[:known] = np.where(hit, stamp_ns, looks.misses.missed_from_ns[row])
     looked_ns[:known] = np.where(hit, stamp_ns, looks.misses.looked_ns[row])
-    share = looks.in_view[row]
+    share = looks.counted[row]
     hidden = ~hit & (share == 0.0)
     objects.score[:known][hidden] = before.score[row][hidden]
     label = objects.label[:known]

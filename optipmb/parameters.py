@@ -10,8 +10,11 @@ filter with survival probability one needs to forget objects (`max_misses`, `min
 
 from __future__ import annotations
 
+import math
 import tomllib
+from dataclasses import dataclass
 from difflib import get_close_matches
+from fnmatch import fnmatchcase
 from importlib import resources
 from itertools import pairwise
 from operator import not_
@@ -23,6 +26,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from optipmb.errors import ParameterError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from pydantic_core import ErrorDetails
 
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -243,6 +248,12 @@ class ClassParameters(_Table):
         default=None,
         description="time constant, s, with which the acceleration decays; none: it stays constant (the paper)",
     )
+    attention: Probability = Field(
+        default=1.0,
+        exclude_if=(1.0).__eq__,
+        description="part of its time that a miss counts for, less than 1 for a sensor that detects less than others; "
+        "0: it does not show the class (`optipmb.Sensor`)",
+    )
     gate_deviations: NonNegative = Field(
         default=0.0,
         description="the gate holds the way of so many standard deviations of the speed, or eta_dist where that is "
@@ -314,6 +325,15 @@ class Parameters(_Table):
     )
     self_calibration: bool = Field(
         default=False, exclude_if=not_, description="true: scores are calibrated by `optipmb.self_calibration`"
+    )
+    starts_tracks: bool = Field(
+        default=True, exclude_if=bool, description="false: detections continue tracks, and start and announce none"
+    )
+    trust_size: bool = Field(
+        default=True, exclude_if=bool, description="false: sizes and heights of detections count as unknown"
+    )
+    trust_heading: bool = Field(
+        default=True, exclude_if=bool, description="false: headings of detections count as unknown"
     )
     sensor_motion: bool = Field(
         default=False,
@@ -387,6 +407,147 @@ def parse_parameters(document: dict[str, Any]) -> Parameters:
         first = error.errors(include_url=False)[0]
         path = ".".join(str(part) for part in first["loc"]) or "profile"
         raise ParameterError(path, *_explained(first)) from error
+
+
+MEASUREMENT: Final = (
+    "score_filter",
+    "nms_iou",
+    "suppress_in_group",
+    "class_confusion",
+    "score_calibration",
+    "gate",
+    "detection",
+    "expected_points",
+    "detection_floor",
+    "ground_clearance",
+    "measurement_noise",
+    "reported_noise",
+    "clutter_rate",
+    "area",
+    "birth_score",
+    "announce_score",
+    "adaptive_birth_rate",
+    "baseline_birth_rate",
+    "undetected_birth_rate",
+    "birth_heading_speed",
+    "birth",
+)
+"""What a sensor has of its own profile, of each class."""
+
+FLAGS: Final = ("starts_tracks", "trust_size", "trust_heading")
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """How the frames of one of several sensors of a session are used (not in the paper).
+
+    The density does not depend on parameters other than the classes, so the frames of a sensor go through a `Tracker`
+    with parameters of their own: those of the session, with the measurement side of another profile (`MEASUREMENT`).
+    Motion, survival, extraction and limits stay those of the session.
+
+    A miss of a sensor that detects less says less. With p the detection probability of a class in the profile of the
+    session and q in that of the sensor, it says as much as so many misses of the session's:
+
+        attention a = min[1, ln(1 - q) / ln(1 - p)]
+
+    It counts for that part of its time in the evidence of a track and in its counters, and the rest is left for the
+    next frame. So a sensor that detects nothing changes nothing. A class that the profile of the sensor lacks has a =
+    0: its detections are left out, and nothing of it is missed.
+
+    Attributes:
+        profile: whose measurement side holds; None: that of the session.
+        starts_tracks: whether its detections start and announce tracks.
+        trust_size: whether sizes and heights of its boxes are used; else they count as unknown.
+        trust_heading: whether their headings are used.
+    """
+
+    profile: Parameters | None = None
+    starts_tracks: bool = True
+    trust_size: bool = True
+    trust_heading: bool = True
+
+    def parameters(self, session: Parameters) -> Parameters:
+        """Return the parameters of its frames in a session."""
+        if self == Sensor():
+            return session
+        values: dict[str, Any] = {name: getattr(session, name) and getattr(self, name) for name in FLAGS}
+        if (own := self.profile) is not None:
+            values |= {"detection_time": own.detection_time, "classes": dict(session.classes)}
+            for label, known in session.classes.items():
+                measured: dict[str, Any] = {"attention": 0.0}
+                if (other := own.classes.get(label)) is not None:
+                    measured = {name: getattr(other, name) for name in MEASUREMENT}
+                    share = math.log1p(-other.detection) / math.log1p(-known.detection)
+                    measured["attention"] = min(1.0, share) * other.attention
+                values["classes"][label] = known.model_copy(update=measured)
+        return session.model_copy(update=values)
+
+    def shown(self) -> dict[str, Any]:
+        """Return what differs from an ordinary sensor, with the name of the profile."""
+        values = {name: False for name in FLAGS if not getattr(self, name)}
+        return values if self.profile is None else {"profile": self.profile.name, **values}
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """How the frames of the sensors of a session are used.
+
+    Attributes:
+        uses: pairs of a pattern of streams, `site/node/sensor` with `*` for any text, and the use; the first that
+            matches holds. A name without a slash is compared with the part behind the last slash of a pattern.
+    """
+
+    uses: tuple[tuple[str, Sensor], ...] = ()
+
+    @classmethod
+    def read(cls, tables: Mapping[str, Mapping[str, Any]]) -> Sensors:
+        """Return what settings say, `[sensors."site/node/sensor"]` with the fields of `Sensor`, and read the profiles.
+
+        Raises:
+            ParameterError: a profile cannot be read, or a value is not allowed.
+        """
+        if not isinstance(tables, dict):
+            raise ParameterError("sensors", "a table for each pattern of streams", repr(tables)[:80])
+        return cls(tuple((pattern, _sensor(f"sensors.{pattern}", table)) for pattern, table in tables.items()))
+
+    def parameters(self, session: Parameters, sensor: str) -> Parameters:
+        """Return the parameters of the frames of a sensor; those of the session where it is an ordinary one."""
+        for pattern, use in self.uses:
+            if fnmatchcase(sensor, pattern if "/" in sensor else pattern.rpartition("/")[2]):
+                return use.parameters(session)
+        return session
+
+    def shown(self) -> dict[str, dict[str, Any]]:
+        """Return the uses by pattern; none where all sensors are ordinary ones."""
+        shown = {pattern: use.shown() for pattern, use in self.uses}
+        return shown if any(shown.values()) else {}
+
+
+ALIKE: Final = Sensors()
+"""Sensors that do not differ."""
+
+
+def _sensor(path: str, table: object) -> Sensor:
+    if not isinstance(table, dict):
+        raise ParameterError(path, "a table", repr(table))
+    values: dict[str, Any] = {}
+    for name, value in table.items():
+        if name == "profile" and isinstance(value, str):
+            values[name] = _sensor_profile(f"{path}.profile", value) if value else None
+        elif name in FLAGS and isinstance(value, bool):
+            values[name] = value
+        else:
+            expected = "true or false" if name in FLAGS else f"one of profile, {', '.join(FLAGS)}"
+            raise ParameterError(f"{path}.{name}", expected, repr(value) if name in FLAGS else repr(name))
+    return Sensor(**values)
+
+
+def _sensor_profile(path: str, name: str) -> Parameters:
+    try:
+        return load_profile(name)
+    except ParameterError as error:
+        where = path if error.path == "profile" else f"{path} {name}: {error.path}"
+        raise ParameterError(where, error.expected, error.received) from error
 
 
 def _explained(problem: ErrorDetails) -> tuple[str, str]:

@@ -139,6 +139,10 @@ CLASS: Final = np.dtype([(name, _TYPES[kind]) for name, kind in ClassRow.__annot
 """A row of the table; the same for all profiles, so that kernels are compiled once."""
 
 
+OUT_OF_REACH: Final = 2.0
+"""A threshold above all scores."""
+
+
 @dataclass(frozen=True, slots=True)
 class ClassTable:
     """The classes of a profile and the parameters common to them.
@@ -148,12 +152,14 @@ class ClassTable:
         period: nominal period, s.
         detection_time: s that p_d holds for, zero per frame (`optipmb.detection_probability.over_time`).
         confusion: (C, C) Lambda of `optipmb.class_posterior`; (0, 0) where no two classes have a group in common.
+        attention: (C,) of `optipmb.Sensor`; None where all are 1.
     """
 
     classes: Sequence[ClassRow]
     period: float
     detection_time: float
     confusion: Array
+    attention: Array | None
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         column: NDArray[Any] = np.asarray(self.classes)[name]
@@ -173,6 +179,13 @@ class ClassTable:
         classes: Any = np.array(self.classes)
         return replace(self, classes=classes)
 
+    def restrict(self, parameters: Parameters) -> None:
+        """Put thresholds out of reach of scores, where detections start no tracks or a class has no attention."""
+        if not parameters.starts_tracks:
+            self["announce_score"][:] = self["birth_score"][:] = OUT_OF_REACH
+        if self.attention is not None:
+            self["score_filter"][self.attention == 0.0] = OUT_OF_REACH
+
     @classmethod
     def of(cls, parameters: Parameters) -> ClassTable:
         """Lay out the classes of a profile as a table."""
@@ -189,7 +202,11 @@ class ClassTable:
             for name, value in (_values(p) | shared).items():
                 classes[name][c] = value
         confusion = _confusion(classes, np.array([p.class_confusion for p in rows]))
-        return cls(classes, parameters.nominal_period, parameters.detection_time, confusion)
+        attention = np.array([p.attention for p in rows])
+        narrow = None if (attention == 1.0).all() else attention
+        table = cls(classes, parameters.nominal_period, parameters.detection_time, confusion, narrow)
+        table.restrict(parameters)
+        return table
 
 
 @kernel

@@ -272,12 +272,18 @@ class Tracker:
         scores, score = None, frame.score
         if self.parameters.self_calibration:
             scores, table = calibrated(density, frame, table)
+            table.restrict(self.parameters)
             score = scores.meant
         z, chosen, below_score, suppressed = preprocess(frame, table, self._max_pairs, score)
+        if not self.parameters.trust_size:
+            z.auxiliary[:] = np.nan
+        if not self.parameters.trust_heading:
+            z.yaw[:] = np.nan
         check_effort(predicted, z, moment.dt, table, self._max_pairs)
 
         # Detection probabilities p_d(x_+), zero out of view
-        prior = predicted if modules.habm else with_measurement_births(predicted, z, table)
+        announces = not modules.habm and self.parameters.starts_tracks
+        prior = with_measurement_births(predicted, z, table) if announces else predicted
         looks, prior = look(frame.field_of_view, prior, moment, table)
         p_d = detection_probability(prior, cloud, looks, moment, table)
 

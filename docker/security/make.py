@@ -31,6 +31,7 @@ CHUNK: Final = re.compile(r"[A-Za-z0-9_.-]+")
 MAX_NAME: Final = 64  # characters of a CN
 SOON_S: Final = 7 * 24 * 3600  # a certificate that ends within a week is renewed
 PORT: Final = 7447
+NODE_CHUNKS: Final = 2
 
 READ: Final = ("declare_subscriber", "liveliness_query", "declare_liveliness_subscriber")
 WRITE: Final = ("put", "delete")
@@ -61,12 +62,12 @@ def recoverable(*keys: str) -> tuple[str, ...]:
     return tuple(key for one in keys for key in (one, f"{one}/@adv/**"))
 
 
-def node(prefix: str, name: str) -> Role:
-    """Give a perception node `site/node`: it publishes for its own sensors, and reads their results."""
+def node(prefix: str, name: str, reads: tuple[str, ...] = ()) -> Role:
+    """Give a perception node `site/node`: it publishes for its own sensors, and reads their results, and `reads`."""
     inputs = recoverable(f"{prefix}/{name}/*/detections", f"{prefix}/{name}/*/points")
-    outputs = recoverable(*(f"{prefix}/{name}/*/{topic}" for topic in OUTPUTS))
+    outputs = recoverable(*(f"{prefix}/{one}/{topic}" for one in (f"{name}/*", *reads) for topic in OUTPUTS))
     questions = (f"{prefix}/{name}/*/q/*",)
-    presence = (f"{prefix}/service/*/alive", f"{prefix}/owner/{name}/*/*")
+    presence = (f"{prefix}/service/*/alive", *(f"{prefix}/owner/{one}/*" for one in (f"{name}/*", *reads)))
     everywhere = recoverable(f"{prefix}/**")
     return Role(
         name,
@@ -323,11 +324,17 @@ def make(options: argparse.Namespace) -> list[str]:
     """
     out: Path = options.out
     prefix: str = options.prefix
+    reads: dict[str, tuple[str, ...]] = {}
+    for one in options.reads:
+        name, _, session = one.partition("=")
+        reads[_named(name, chunks=2)] = (*reads.get(name, ()), _named(session, chunks=3))
     roles = [
-        *(node(prefix, _named(name, chunks=2)) for name in options.node),
+        *(node(prefix, _named(name, chunks=2), reads.pop(name, ())) for name in options.node),
         *(service(prefix, _named(name)) for name in options.service),
         *(viewer(prefix, _named(name)) for name in options.viewer),
     ]
+    if reads:
+        raise MakeError(f"--reads: expected a node that --node names, received {', '.join(reads)}")
     gateways = [gateway(prefix, _named(host)) for host in options.gateway]
     endpoints = [options.connect or f"tls/{options.router[0]}:{PORT}"]
     authority = Authority(out / "authority", options.days)
@@ -360,9 +367,10 @@ def _named(name: str, chunks: int = 1) -> str:
     if (
         not good
         or parts[0] in {"service", "owner", "viewer", "router", "gateway"}
+        or (chunks == NODE_CHUNKS and parts[1] == "fused")  # sessions of the nodes of a site have that name
         or len(name) > MAX_NAME - len("service/")
     ):
-        shape = "site/node" if chunks > 1 else "a name"
+        shape = ("a name", "site/node", "site/fused/name")[chunks - 1]
         raise MakeError(f"expected {shape} of letters, digits and _ . -, received {name!r}")
     return name
 
@@ -413,6 +421,10 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--router", action="append", required=True, metavar="HOST", help="name or address, repeatable")
     parser.add_argument("--service", action="append", default=[], metavar="NAME", help="a tracking service")
     parser.add_argument("--node", action="append", default=[], metavar="SITE/NODE", help="a perception node")
+    parser.add_argument(
+        "--reads", action="append", default=[], metavar="NODE=SESSION",
+        help="session whose tracks, events and problems a node may read, as garage/kiosk=garage/fused/crossing",
+    )  # fmt: skip
     parser.add_argument("--viewer", action="append", default=[], metavar="NAME", help="one who reads everything")
     parser.add_argument("--gateway", action="append", default=[], metavar="HOST", help="a gRPC gateway, on this host")
     parser.add_argument("--connect", metavar="ENDPOINT", help="where clients connect; default: tls/ROUTER:7447")

@@ -1,4 +1,4 @@
-"""When certificates end, read from their files without a library for them."""
+"""Certificates: when they end, read from their files without a library for them, and the use of a folder of them."""
 
 from __future__ import annotations
 
@@ -10,11 +10,25 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = ["end_of", "ended"]
+__all__ = ["context_of", "end_of", "ended"]
 
 _PEM = re.compile(r"-----BEGIN CERTIFICATE-----.+?-----END CERTIFICATE-----", re.DOTALL)
 _VALIDITY = re.compile(rb"(?:\x17\x0d|\x18\x0f)\d{12,14}Z(?:\x17\x0d|\x18\x0f)(\d{12,14})Z")
 """Two times, one after the other, as ASN.1 has them: UTCTime with two digits of the year, GeneralizedTime with four."""
+
+
+def context_of(folder: Path | None) -> ssl.SSLContext:
+    """Return the context of a client that trusts `ca.pem` of a folder and shows `cert.pem`, if that is there.
+
+    None: it trusts the authorities of the system.
+
+    Raises:
+        OSError: a file cannot be used.
+    """
+    context = ssl.create_default_context(cafile=None if folder is None else str(folder / "ca.pem"))
+    if folder is not None and (folder / "cert.pem").exists():
+        context.load_cert_chain(folder / "cert.pem", folder / "key.pem")
+    return context
 
 
 def end_of(file: Path) -> datetime | None:

@@ -38,6 +38,11 @@ class SessionParameters(Message):
         description="Restart the session for a change; without it a running session refuses one.",
     )
     values: Plain | None = Field(default=None, description="In replies: all parameters in force. Ignored in queries.")
+    sensors: Plain | None = Field(
+        default=None,
+        description="In replies of a fused session with the setting `sensors`: what its sensors have of their own, by "
+        "pattern. Ignored in queries.",
+    )
     session: SessionId | None = Field(
         default=None,
         description="In replies: the session that has them, as in its tracks; absent where the stream has none. "

@@ -4,7 +4,7 @@ A dump holds the density before the last frames, these frames as the messages th
 which software it was. It is one msgpack map, and does not depend on the service: `optipmb track --dump` reads it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Final, TypeVar
 
 import msgpack
@@ -68,6 +68,7 @@ class Dump:
         next_id: its next track id.
         density: its arrays as bytes, one string for each part.
         frames: the last frames in the order of processing; the error was raised by one of them.
+        sensors: the parameters of the sensors that have others, by stream.
     """
 
     stream: str
@@ -79,11 +80,13 @@ class Dump:
     next_id: StrictInt
     density: dict[str, StrictBytes]
     frames: tuple[DumpedFrame, ...]
+    sensors: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
 def encode_dump(dump: Dump) -> bytes:
     """Return the bytes of a dump."""
-    packed: bytes = _msgpack.packb({"format": FORMAT, "version": VERSION} | _DUMP.dump_python(dump))
+    without = None if dump.sensors else {"sensors"}
+    packed: bytes = _msgpack.packb({"format": FORMAT, "version": VERSION} | _DUMP.dump_python(dump, exclude=without))
     return packed
 
 

@@ -19,6 +19,7 @@ import socket
 import tomllib
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
@@ -241,6 +242,50 @@ class SiteSettings(BaseModel):
     """direction of the world's x axis, degrees clockwise from true north; 90: x is east, y is north"""
 
 
+Node = Annotated[str, _form(r"[A-Za-z0-9_.-]+/[A-Za-z0-9_.-]+", "a node looks like site/node")]
+
+
+class FusedSettings(BaseModel):
+    """A session of sensors of several nodes of a site, `site/fused/NAME`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    streams: Patterns = Field(min_length=1, max_length=64)
+    """patterns of streams of one site (as `garage/*/radar`) that feed it; a stream feeds one session"""
+    read: tuple[Node, ...] = ()
+    """nodes (as `garage/kiosk`) that may read it over gRPC and HTTP with a certificate or token, besides viewers and
+    services; in a protected network `make.py --reads` lets them"""
+
+    @field_validator("streams")
+    @classmethod
+    def _check_site(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        sites = {pattern.partition("/")[0] for pattern in value}
+        if len(sites) > 1 or "*" in "".join(sites):
+            raise ValueError(f"patterns of one site, named without *, received {', '.join(sorted(sites))}")
+        return value
+
+    @property
+    def site(self) -> str:
+        """The site of all its streams."""
+        return self.streams[0].partition("/")[0]
+
+
+class SensorSettings(BaseModel):
+    """How the frames of a sensor of a fused session are used, where it differs from the others."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    profile: str = ""
+    """profile name or TOML file, of which the measurement side holds for its frames: thresholds, detection, noise,
+    clutter, births, `score_calibration`; default: the session's"""
+    starts_tracks: bool = True
+    """its detections start tracks; `false`: they only continue those of other sensors"""
+    trust_size: bool = True
+    """use the sizes and heights of its boxes; `false`: as if it did not measure them"""
+    trust_heading: bool = True
+    """use the headings of its boxes; `false`: as if it did not measure them"""
+
+
 Shape = tuple[tuple[float, float], ...]
 FARTHEST: Final = 100_000.0
 """Distance of a zone from the origin of its site, m, beyond which latitude and longitude are likely exchanged."""
@@ -370,6 +415,12 @@ class Settings(BaseSettings):
     """profiles by stream pattern (as `site/*/lidar*`); the first match applies"""
     fuse: Patterns = ()
     """patterns of streams (as `site/*/lidar*`) that feed one session per node, `site/node/fused`"""
+    fused: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")], FusedSettings] = Field(default_factory=dict)
+    """sessions of sensors of several nodes, `site/fused/NAME`, by name; no node may be named `fused` then; equal on all
+    members of a cluster"""
+    sensors: dict[Pattern, SensorSettings] = Field(default_factory=dict)
+    """sensors of fused sessions that differ, by stream pattern; the first match applies; equal on all members of a
+    cluster"""
     cloud_wait_s: float = Field(default=0.1, ge=0, le=60)
     """longest wait of a frame for its cloud"""
     cloud_memory_s: float = Field(default=2.0, ge=0, le=3600)
@@ -514,6 +565,15 @@ class Settings(BaseSettings):
             if any(fnmatchcase(session, pattern) for pattern in one.streams) and (not one.geo or site in self.sites)
         ]
 
+    @property
+    def fused_sessions(self) -> dict[str, FusedSettings]:
+        """The sessions of `fused` by their names, `site/fused/NAME`."""
+        return {f"{one.site}/fused/{name}": one for name, one in self.fused.items()}
+
+    def readable_by(self, node: str) -> frozenset[str]:
+        """Return the sessions of `fused` that a node may read."""
+        return frozenset(session for session, one in self.fused_sessions.items() if node in one.read)
+
     def output_of(self, session: str) -> OutputSettings | None:
         """Return the output at a fixed rate of a session; None: it has none."""
         return next((one for pattern, one in self.outputs.items() if fnmatchcase(session, pattern)), None)
@@ -636,6 +696,7 @@ def load(
         raise SettingsInvalidError("setting listen: neither an endpoint to listen on nor one to connect to")
     if settings.fuse and not settings.rewind_s:
         raise SettingsInvalidError("setting fuse: sensors do not come in order of their stamps: rewind_s must not be 0")
+    _check_fused(settings)
     _check_cluster(settings)
     _check_zones(settings)
     if settings.workers > 1 and settings.zenoh_config is not None and settings.is_router:
@@ -652,6 +713,7 @@ def missing_files(settings: Settings) -> list[str]:
     """Return a text for each file and folder that the settings name and that is not there."""
     named: dict[str, Any] = {name: getattr(settings, name) for name in FILES}
     named |= {"profile": settings.profile} | {f"profiles.{key}": value for key, value in settings.profiles.items()}
+    named |= {f"sensors.{key}.profile": one.profile for key, one in settings.sensors.items()}
     return [
         f"setting {name}: {value}: no such file"
         for name, value in named.items()
@@ -686,6 +748,45 @@ def _check_cluster(settings: Settings) -> None:
             raise SettingsInvalidError(f"setting cluster_tls: {folder}: cert.pem and key.pem belong together")
     if file is not None and not file.is_file():
         raise SettingsInvalidError(f"setting cluster_credentials: {file}: no such file")
+
+
+def _check_fused(settings: Settings) -> None:
+    """Refuse streams that would feed two sessions, and streams of a node with the name of the sessions.
+
+    Raises:
+        SettingsInvalidError: there are such.
+    """
+    if settings.fused and not settings.rewind_s:
+        raise SettingsInvalidError(
+            "setting fused: sensors do not come in order of their stamps: rewind_s must not be 0"
+        )
+    sessions = [(f"fused.{name}.streams", one.streams) for name, one in settings.fused.items()]
+    others = [("fuse", settings.fuse)] if settings.fuse else []
+    for number, (path, patterns) in enumerate(sessions):
+        if node := next((one for one in patterns if one.split("/")[1] == "fused"), ""):
+            raise SettingsInvalidError(f"setting {path}: no node is named fused, received {node}")
+        for other, theirs in (*sessions[:number], *others):
+            both = next(((one, two) for one in patterns for two in theirs if _overlap(one, two)), None)
+            if both is not None:
+                streams = f"a stream feeds one session, {both[0]} and {both[1]} of {other} have some in common"
+                raise SettingsInvalidError(f"setting {path}: {streams}")
+
+
+def _overlap(one: str, other: str) -> bool:
+    """Return whether some stream matches two patterns."""
+    parts = zip(one.split("/"), other.split("/"), strict=True)
+    return all(_share(tuple(part), tuple(wanted)) for part, wanted in parts)
+
+
+@cache
+def _share(one: tuple[str, ...], other: tuple[str, ...]) -> bool:
+    """Return whether some text matches two patterns, given as their characters."""
+    if not (one and other):
+        return set(one + other) <= {"*"}
+    if one[0] == "*" or other[0] == "*":
+        (rest, text) = (one[1:], other) if one[0] == "*" else (other[1:], one)
+        return any(_share(rest, text[begin:]) for begin in range(len(text) + 1))
+    return one[0] == other[0] and _share(one[1:], other[1:])
 
 
 def _check_zones(settings: Settings) -> None:

@@ -6,7 +6,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_client import Connection, ConnectionFailed, EventSubscriber, Publisher, Subscriber
 from optipmb_client.incoming import Inbox
+from optipmb_client.links import Link
 from optipmb_schemas import (
     Detections,
     Events,
@@ -32,9 +33,6 @@ from router import until
 from routers import free_endpoint, open_client
 from tracks_message import SESSION, tracks_message
 from without_numpy import command, publish_everything
-
-if TYPE_CHECKING:
-    from optipmb_client.links import Link
 
 DEADLINE_S = 60.0
 STREAM = "garage/robot-1/lidar"

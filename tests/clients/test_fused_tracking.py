@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,10 +16,12 @@ from optipmb_service.stream.values import Policy
 from optipmb_tools.datasets import DatasetError, open_dataset
 from optipmb_tools.datasets.fused import FusedSequence
 from optipmb_tools.recordings.files import RecordingWriter
+from optipmb_tools.run.profiles import read_sensors
 from optipmb_tools.run.tracking import track_whole
 from sessions import Merged
 
 import optipmb
+from optipmb.parameters import ALIKE
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -29,9 +32,20 @@ KITTI = optipmb.load_profile("kitti")
 COLUMNS = ("id", "center", "size", "yaw", "velocity", "existence", "score", "covariance", "age", "detection")
 
 
-def served(frames: list[Detections]) -> list[Tracks]:
+UNEQUAL = """
+profile = "kitti"  # of the service
+[sensors."site/*/rear"]
+profile = "nuscenes"
+starts_tracks = false
+[sensors."*/*/s*"]
+trust_size = false
+trust_heading = false
+"""
+
+
+def served(frames: list[Detections], sensors: optipmb.Sensors = ALIKE) -> list[Tracks]:
     """The tracks of a service, the last of each frame, in the order of the frames."""
-    one, merged = Session(FUSED, KITTI, Policy(recovery_wait_ns=0), fused=True), Merged()
+    one, merged = Session(FUSED, KITTI, Policy(recovery_wait_ns=0, sensors=sensors), fused=True), Merged()
     for frame in sorted(frames, key=lambda one: one.stamp_ns):
         merged.take(one.on_detections(frame, 0))
     found = [message for _, message in merged.newest.values()]
@@ -60,8 +74,9 @@ def tabled(path: Path, frames: list[Detections]) -> Path:
     return path
 
 
-def same(sequence: FusedSequence, wanted: list[Tracks]) -> None:
-    found = track_whole(KITTI, sequence).tracks.values()
+def same(sequence: FusedSequence, wanted: list[Tracks], sensors: optipmb.Sensors = ALIKE) -> None:
+    """Compare the tracks of a sequence with those of a service, byte for byte."""
+    found = track_whole(KITTI, sequence, sensors=sensors).tracks.values()
     assert len(found) == len(wanted)
     for ours, theirs in zip(found, wanted, strict=True):
         for name in COLUMNS:
@@ -88,6 +103,55 @@ def test_a_table_gives_the_bytes_of_the_service(tmp_path: Path) -> None:
     assert isinstance(sequence, FusedSequence)
     assert (sequence.name, len(sequence)) == ("a", len(frames))
     same(sequence, served(frames))
+
+
+@pytest.mark.parametrize("form", ["mcap", "table"])
+def test_sensors_that_differ_give_the_bytes_of_the_service(tmp_path: Path, form: str) -> None:
+    """By the table `sensors` of the settings; in a table of detections the column has the last part of a name."""
+    settings = tmp_path / "service.toml"
+    settings.write_text(UNEQUAL, encoding="utf-8")
+    sensors = read_sensors(settings)
+    frames = [one.detections(seq, has_points=False) for one in (FRONT, REAR, SIDE) for seq in range(12)]
+    path = recorded(tmp_path / "a.mcap", frames) if form == "mcap" else tabled(tmp_path / "a.csv", frames)
+    (sequence,) = open_dataset(form, path, fuse="1").sequences(["all"])
+    assert isinstance(sequence, FusedSequence)
+    wanted = served(frames, sensors)
+    same(sequence, wanted, sensors)
+    assert [one.covariance.tobytes() for one in wanted] != [one.covariance.tobytes() for one in served(frames)]
+
+
+def test_the_command_reads_how_sensors_differ(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """No id begins in frames of a sensor that starts no tracks."""
+    frames = [one.detections(seq, has_points=False) for one in (FRONT, REAR) for seq in range(12)]
+    source, out, settings = tabled(tmp_path / "a.csv", frames), tmp_path / "tracks.csv", tmp_path / "service.toml"
+    settings.write_text('[sensors."site/node/front"]\nstarts_tracks = false\n', encoding="utf-8")
+    run_here(capsys, "track", source, "--fuse", "--sensors", settings, "--out", out, "--profile", "kitti")
+    begun: dict[str, str] = {}
+    with out.open(encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            begun.setdefault(row["id"], row["sensor"])
+    assert set(begun.values()) == {"rear"}
+
+
+@pytest.mark.parametrize(
+    ("text", "fuse", "error"),
+    [
+        ("", False, "expected --fuse"),
+        ("[sensors", True, r"service.toml: Expected"),
+        ('[sensors."a/b/c"]\nprofile = "none"', True, r"sensors.a/b/c.profile: expected one of"),
+    ],
+)
+def test_a_wrong_table_of_sensors_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, error: str, *, fuse: bool
+) -> None:
+    """One line names the file and the field."""
+    settings = tmp_path / "service.toml"
+    settings.write_text(text, encoding="utf-8")
+    source = tabled(tmp_path / "a.csv", [FRONT.detections(0)])
+    options = ["--sensors", settings, *(["--fuse"] if fuse else [])]
+    done = run_here(capsys, "track", source, *options, "--out", tmp_path / "out")
+    assert done.returncode == 2
+    assert re.search(error, " ".join(done.stderr.split()))
 
 
 def test_tracks_of_a_table_say_the_sensor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,8 +17,7 @@ from optipmb_schemas import Density, Detections, Keys, Points, Pose, Tracks, enc
 from optipmb_tools.cli import run
 from optipmb_tools.recordings.files import RecordingWriter
 from optipmb_tools.views.colours import COLOURS, colour_of, rgb_of
-from optipmb_tools.views.density_queries import DensityQueries
-from optipmb_tools.views.viewer import LEGEND, View
+from optipmb_tools.views.viewer import LEGEND, DensityQueries, View
 from routers import free_endpoint
 from tracks_message import tracks_message
 

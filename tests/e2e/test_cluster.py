@@ -105,6 +105,15 @@ def holds(member: ServiceProcess, partitions: int) -> None:
     until(lambda: _held(member) == partitions, f"{partitions} partitions are held")
 
 
+def ids_of(states: dict[str, SessionState]) -> dict[str, str]:
+    return {stream: state.session for stream, state in states.items()}
+
+
+def share(*members: ServiceProcess) -> None:
+    for member in members:
+        holds(member, PARTITIONS // len(members))
+
+
 def _held(member: ServiceProcess) -> int:
     lines = [line for line in member.errors.splitlines() if "partitions_held" in line]
     return int(lines[-1].partition("held=")[2].split()[0]) if lines else 0
@@ -119,10 +128,9 @@ def test_members_take_over(cluster: Cluster, capsys: pytest.CaptureFixture[str])
     node = cluster.node
     first = cluster.member("a")
     send(node, 0, 10, sensors=SENSORS)
-    sessions = {stream: state.session for stream, state in cluster.check(10, "a").items()}
+    sessions = ids_of(cluster.check(10, "a"))
     second = cluster.member("b", cluster.beyond)
-    for member in (first, second):
-        holds(member, PARTITIONS // 2)
+    share(first, second)
     send(node, 10, 20, sensors=SENSORS)
     cluster.check(20, "a", "b")
 
@@ -131,11 +139,10 @@ def test_members_take_over(cluster: Cluster, capsys: pytest.CaptureFixture[str])
     send(node, 20, 60, 0.1, sensors=SENSORS)
     states = cluster.check(60, "b")
     killed_s = cluster.outage_s(killed_ns)
-    assert {stream: state.session for stream, state in states.items()} == sessions
+    assert ids_of(states) == sessions
 
     third = cluster.member("c")
-    for member in (second, third):
-        holds(member, PARTITIONS // 2)
+    share(second, third)
     send(node, 60, 70, sensors=SENSORS)
     cluster.check(70, "b", "c")
     freeze(second)
@@ -147,8 +154,7 @@ def test_members_take_over(cluster: Cluster, capsys: pytest.CaptureFixture[str])
     before = [len(published_by(node, "b", sensor)) for sensor in SENSORS]
     thaw(second)
     second.wait_log("lease_lost")
-    for member in (second, third):
-        holds(member, PARTITIONS // 2)
+    share(second, third)
     cluster.settled("b", "c")
     assert [len(published_by(node, "b", sensor)) for sensor in SENSORS] == before
     send(node, frames, frames + 10, sensors=SENSORS)
@@ -159,7 +165,7 @@ def test_members_take_over(cluster: Cluster, capsys: pytest.CaptureFixture[str])
     send(node, frames + 10, frames + 30, sensors=SENSORS)
     states = cluster.check(frames + 30, "b")
     ended_s = cluster.outage_s(ended_ns)
-    assert {stream: state.session for stream, state in states.items()} == sessions
+    assert ids_of(states) == sessions
     with capsys.disabled():
         print(f"\nsilent after a kill {killed_s:.2f} s, a freeze {frozen_s:.2f} s, SIGTERM {ended_s:.2f} s (lease 2 s)")  # noqa: T201 - the figures
 
@@ -197,15 +203,14 @@ def test_all_members_are_restarted_in_turn(cluster: Cluster, capsys: pytest.Capt
 
     shared()
     send(cluster.node, 0, 1, sensors=SENSORS)
-    sessions = {stream: state.session for stream, state in cluster.check(1, *names).items()}
+    sessions = ids_of(cluster.check(1, *names))
     with Sending(cluster.node, 1) as sending:
         for name in names:
             shared()
             assert members[name].end()[0] == 0
             members[name] = cluster.member(name)
         shared()
-    states = cluster.check(sending.frames, *names)
-    assert {stream: state.session for stream, state in states.items()} == sessions
+    assert ids_of(cluster.check(sending.frames, *names)) == sessions
     silent_s = max(longest_silence_s(cluster.node, sensor) for sensor in SENSORS)
     with capsys.disabled():
         print(f"\nsilent for {silent_s:.2f} s at most while three members were restarted in turn")  # noqa: T201 - the figure
@@ -227,7 +232,7 @@ def test_a_machine_becomes_a_cluster(cluster: Cluster, tmp_path: Path) -> None:
     assert (status, "expected the checkpoints of a service, found none" in text) == (1, True)
     alone = cluster.member("alone", cluster="", store=tmp_path / "alone")
     send(cluster.node, 0, 10, sensors=SENSORS)
-    sessions = {stream: state.session for stream, state in cluster.check(10, "alone").items()}
+    sessions = ids_of(cluster.check(10, "alone"))
     status, text = copied()
     assert (status, "a service uses it: end it first" in text) == (1, True)
     assert alone.end()[0] == 0
@@ -235,11 +240,9 @@ def test_a_machine_becomes_a_cluster(cluster: Cluster, tmp_path: Path) -> None:
     assert copied() == (0, "copied 0 sessions; left out 6 of streams that the cluster has sessions of\n")
     names = ("a", "b")
     members = [cluster.member(name) for name in names]
-    for member in members:
-        holds(member, PARTITIONS // 2)
+    share(*members)
     send(cluster.node, 10, 20, sensors=SENSORS)
-    states = cluster.check(20, *names)
-    assert {stream: state.session for stream, state in states.items()} == sessions
+    assert ids_of(cluster.check(20, *names)) == sessions
     status, text = copied()
     assert (status, "tracks in the cluster: end its members, copy, and start them again" in text) == (1, True)
 
@@ -261,10 +264,9 @@ def test_a_site_that_is_cut_off(tmp_path: Path, capsys: pytest.CaptureFixture[st
         cluster = Cluster(tmp_path, nats, fleet, beyond, node)
         here = cluster.member("here")
         send(node, 0, 10, sensors=SENSORS)
-        sessions = {stream: state.session for stream, state in cluster.check(10, "here").items()}
+        sessions = ids_of(cluster.check(10, "here"))
         away = cluster.member("away", beyond.endpoint, cluster=f"nats://{to_server.address}")
-        for member in (here, away):
-            holds(member, PARTITIONS // 2)
+        share(here, away)
         send(node, 10, 20, sensors=SENSORS)
         cluster.check(20, "here", "away")
 
@@ -277,11 +279,9 @@ def test_a_site_that_is_cut_off(tmp_path: Path, capsys: pytest.CaptureFixture[st
         to_server.mend()
         to_router.mend()
         away.wait_log("lease_lost")
-        for member in (here, away):
-            holds(member, PARTITIONS // 2)
+        share(here, away)
         send(node, 80, 90, sensors=SENSORS)
-        states = cluster.check(90, "here", "away")
-        assert {stream: state.session for stream, state in states.items()} == sessions
+        assert ids_of(cluster.check(90, "here", "away")) == sessions
     with capsys.disabled():
         print(f"\nsilent for {silent_s:.2f} s at most after a site was cut off (lease 2 s)")  # noqa: T201 - the figure
 
@@ -302,10 +302,9 @@ def test_a_member_without_a_router(cluster: Cluster) -> None:
                 return error.code, error.read().decode()
 
     here, away = cluster.member("here"), cluster.member("away", cluster.beyond, http=address)
-    for member in (here, away):
-        holds(member, PARTITIONS // 2)
+    share(here, away)
     send(node, 0, 10, sensors=SENSORS)
-    sessions = {stream: state.session for stream, state in cluster.check(10, "here", "away").items()}
+    sessions = ids_of(cluster.check(10, "here", "away"))
     assert ready()[0] == 200
     cluster.router.kill()
     killed_ns = time.monotonic_ns()
@@ -318,12 +317,11 @@ def test_a_member_without_a_router(cluster: Cluster) -> None:
     assert sorted((one.state, len(one.fences)) for one in members) == [("alive", PARTITIONS), ("unlinked", 0)]
 
     cluster.router.start()
-    for member in (here, away):
-        holds(member, PARTITIONS // 2)
+    share(here, away)
     send(node, 40, 50, sensors=SENSORS)
     states = cluster.check(50, "here", "away")
     assert ready()[0] == 200
-    assert {stream: state.session for stream, state in states.items()} == sessions
+    assert ids_of(states) == sessions
 
 
 def test_two_members_of_one_name(cluster: Cluster) -> None:
@@ -370,8 +368,7 @@ def test_a_cut_between_two_routers(tmp_path: Path) -> None:
         cluster = Cluster(tmp_path, nats, fleet, beyond, node)
         here = cluster.member("here")
         away = cluster.member("away", beyond.endpoint)
-        for member in (here, away):
-            holds(member, PARTITIONS // 2)
+        share(here, away)
 
         def send_plain(first: int, last: int) -> None:
             for seq in range(first, last):
@@ -404,10 +401,9 @@ def test_all_leases_and_checkpoints_are_purged(cluster: Cluster) -> None:
     """Members write their leases again, and their sessions go on, to the byte, also after a kill."""
     assert cluster.nats is not None
     first, second = members = [cluster.member(name) for name in "ab"]
-    for member in members:
-        holds(member, PARTITIONS // 2)
+    share(*members)
     send(cluster.node, 0, 10, sensors=SENSORS)
-    sessions = {stream: state.session for stream, state in cluster.check(10, "a", "b").items()}
+    sessions = ids_of(cluster.check(10, "a", "b"))
     purge(cluster.nats)
     for member in members:
         member.wait_log("leases_gone")
@@ -417,8 +413,7 @@ def test_all_leases_and_checkpoints_are_purged(cluster: Cluster) -> None:
     time.sleep(1.5)  # three times `checkpoint_s`
     second.process.kill()
     send(cluster.node, 40, 60, 0.1, sensors=SENSORS)
-    states = cluster.check(60, "a")
-    assert {stream: state.session for stream, state in states.items()} == sessions
+    assert ids_of(cluster.check(60, "a")) == sessions
     assert first.end()[0] == 0
 
 
@@ -427,8 +422,7 @@ def test_a_member_that_dies_before_a_purge(cluster: Cluster) -> None:
     """Its record is gone, and its partitions are taken within the lease all the same."""
     assert cluster.nats is not None
     first, second = members = [cluster.member(name) for name in "ab"]
-    for member in members:
-        holds(member, PARTITIONS // 2)
+    share(*members)
     second.process.kill()
     purge(cluster.nats)
     holds(first, PARTITIONS)

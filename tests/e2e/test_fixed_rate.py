@@ -1,7 +1,5 @@
 """Output at a fixed rate of a real service: over Zenoh, gRPC and WebSocket, and of the next owner after a kill."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import json
@@ -9,21 +7,17 @@ import re
 import signal
 import threading
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from fleet import RouterProcess
 from gateway import GatewayProcess
 from optipmb_client import Subscriber
+from optipmb_schemas import Tracks
 from router import Node, Sensor, until
 from service_process import ServiceProcess
 from websocket import create_connection
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from optipmb_schemas import Tracks
 
 RATE_HZ = 20
 OUTPUTS = {"OPTIPMB_OUTPUTS": json.dumps({"garage/*/*": {"rate_hz": RATE_HZ}})}

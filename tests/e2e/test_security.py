@@ -36,6 +36,7 @@ PACE_S = 0.005
 """Between frames, as of a very fast sensor: the router drops what comes closer together than its rate allows."""
 EVERYBODY = (
     *("--node", ROBOT, "--node", OTHER, "--service", "tracker", "--service", "spare"),
+    *("--reads", f"{ROBOT}=garage/fused/crossing"),
     *("--viewer", "ops", "--megabytes", "1", "--rate", str(RATE)),
 )  # fmt: skip
 
@@ -179,6 +180,21 @@ def test_a_node_cannot_read_anothers_tracks(node: Party, network: Network, viewe
         assert tracker.deliver(own, b"own", node)
         assert viewer.wait(lambda seen: (theirs, b"theirs") in seen)
     assert (theirs, b"theirs") not in node.seen
+
+
+@pytest.mark.parametrize("topic", ["tracks", "events", "problems"])
+def test_a_node_reads_sessions_of_its_site_that_it_is_let_read(
+    node: Party, network: Network, viewer: Party, topic: str
+) -> None:
+    """Tracks, events and problems of a fused session that `--reads` names; of another one nothing."""
+    own, other = (f"{KEYS.prefix}/garage/fused/{name}/{topic}" for name in ("crossing", "yard"))
+    node.read(own, other)
+    viewer.read(other)
+    with Party(network.config(SERVICE)) as tracker:
+        tracker.put(other, b"other")
+        assert tracker.deliver(own, b"own", node)
+        assert viewer.wait(lambda seen: (other, b"other") in seen)
+    assert (other, b"other") not in node.seen
 
 
 def test_a_node_cannot_read_anothers_detections(node: Party, network: Network, viewer: Party) -> None:
@@ -349,13 +365,17 @@ def test_keys_are_private(network: Network) -> None:
 
 @pytest.mark.parametrize(
     "options",
-    [("--node", "robot-1"), ("--node", "a/b/c"), ("--node", "service/x"), ("--node", "a/*"), ("--viewer", "a/b")],
+    [
+        *(("--node", one) for one in ("robot-1", "a/b/c", "service/x", "a/*", "a/fused")),
+        *(("--reads", one) for one in ("a/b=c", "a/b=a/fused/x")),  # of no node
+        ("--viewer", "a/b"),
+    ],
 )
 def test_names_that_could_mean_more_are_refused(tmp_path: Path, options: tuple[str, ...]) -> None:
     """A name that is no name, or would match more than one, is refused in one line."""
     done = make(tmp_path, *options)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
-    assert re.match(r"make\.py: expected (site/node|a name) of letters", done.stderr)
+    assert re.match(r"make\.py: (expected (site/\S+|a name) of letters|--reads: expected a node)", done.stderr)
 
 
 def test_the_page_lists_every_probe() -> None:

@@ -4,20 +4,16 @@ Flipping bytes of msgpack or JSON mostly gives neither, and the search would go 
 bytes. Maps inside of byte strings, such as the messages in a checkpoint, are changed in the same way.
 """
 
-from __future__ import annotations
-
 import json
 import random
 import struct
+from collections.abc import Callable, Iterator
 from copy import deepcopy
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgpack
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    Mutate = Callable[[bytes, int], bytes]
+Mutate = Callable[[bytes, int], bytes]
 
 _msgpack: Any = msgpack  # its type information is partial
 

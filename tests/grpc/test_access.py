@@ -1,5 +1,6 @@
 """Who may do what over gRPC: by the name in the certificate, on a protected network with real processes."""
 
+import json
 import os
 import shutil
 import time
@@ -37,7 +38,8 @@ def network(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Network]:
 def secured(network: Network) -> Iterator[GatewayProcess]:
     folder = network.folder / "gateway" / "localhost"
     options = ("--zenoh-config", str(folder / "zenoh.json5"), "--grpc-tls", str(folder))
-    names = {"OPTIPMB_GRPC_NAMES": str(folder / "names.json")}
+    fused = {name: {"streams": [f"garage/{name}/*"], "read": [ROBOT] * (name == "let")} for name in ("let", "other")}
+    names = {"OPTIPMB_GRPC_NAMES": str(folder / "names.json"), "OPTIPMB_FUSED": json.dumps(fused)}
     with GatewayProcess(network.endpoint, *options, environment=names) as process:
         process.wait_ready()
         yield process
@@ -61,7 +63,10 @@ def denied(call: Any) -> grpc.StatusCode:
 
 
 def test_a_node_tracks_its_own_streams_alone(network: Network, secured: GatewayProcess) -> None:
-    """It gets tracks of its own detections; another node's stream it may neither publish, nor read, nor reset."""
+    """It gets tracks of its own detections; another node's it may neither publish, nor read, nor reset.
+
+    Of sessions of its site it may read those that name it.
+    """
     own = stub(network, NODE, secured)
     responses = list(own.Track(detections(frame(seq, LIDAR)) for seq in range(10)))
     assert [one.tracks.seq for one in responses] == list(range(10))
@@ -74,6 +79,9 @@ def test_a_node_tracks_its_own_streams_alone(network: Network, secured: GatewayP
     assert denied(lambda: own.Reset(pb.ResetRequest(stream=FOREIGN))) == no
     assert {one.session.stream for one in own.ListStreams(pb.ListStreamsRequest()).streams} == {LIDAR}
     assert own.GetState(pb.GetStateRequest(stream=LIDAR)).state.frames == 10
+    assert list(own.QueryTracks(pb.QueryTracksRequest(pattern="garage/fused/let"))) == []
+    assert denied(own.QueryTracks(pb.QueryTracksRequest(pattern="garage/fused/other"))) == no
+    assert denied(lambda: own.Reset(pb.ResetRequest(stream="garage/fused/let"))) == no
 
 
 def test_a_viewer_reads_everything_and_changes_nothing(network: Network, secured: GatewayProcess) -> None:

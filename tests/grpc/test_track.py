@@ -1,19 +1,18 @@
 """`Track`: input as of a native publisher, output as for a native subscriber."""
 
-from __future__ import annotations
-
 import queue
 import secrets
 import threading
 import time
-from typing import TYPE_CHECKING, Any, Self
+from collections.abc import Iterator
+from typing import Any, Self
 
 import grpc
 import numpy as np
 import pytest
 import zenoh
 import zenoh.ext
-from gateway import detections, frame, points
+from gateway import GatewayProcess, detections, frame, points
 from google.rpc import error_details_pb2
 from grpc_status import rpc_status
 from opentelemetry.sdk.trace import TracerProvider
@@ -23,12 +22,7 @@ from optipmb_schemas import Detections, Keys, Points, Tracks, decode, encode
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from routers import open_client
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from gateway import GatewayProcess
-    from service_process import ServiceProcess
+from service_process import ServiceProcess
 
 KEYS = Keys()
 DEADLINE_S = 30.0

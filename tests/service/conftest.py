@@ -41,7 +41,8 @@ def start(_compiled: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
             given = {"listen": [endpoint], "instance": "test", "grace_s": 0.2, "store": "none", "profile": "nuscenes"}
             given |= options
             settings = load(None, given).settings
-            service = Service(settings, Profiles.read(settings.profile, settings.profiles), arm, tracker)
+            profiles = Profiles.read(settings.profile, settings.profiles, settings.sensors)
+            service = Service(settings, profiles, arm, tracker)
             stack.callback(service.stop)
             service.start()
             return service, (settings.endpoints or settings.connect)[0]

@@ -1,7 +1,5 @@
 """What imports what: the arrows between the folders of the service, and what its pure folders leave alone."""
 
-from __future__ import annotations
-
 import ast
 import re
 from functools import cache

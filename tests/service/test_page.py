@@ -1,7 +1,5 @@
 """Test that docs/operation.md and docs/reference.md describe the code."""
 
-from __future__ import annotations
-
 import ast
 import re
 import socket

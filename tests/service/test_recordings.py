@@ -6,13 +6,12 @@ the `filter` they depend on the tracker too, whose numbers may differ on another
 is meant to change bytes, `OPTIPMB_TEST_RECORD=1 pytest tests/service/test_recordings.py` rewrites the file.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import threading
 import time
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Callable, Iterable
+from typing import Any, Final
 
 import optipmb_schemas as schemas
 import pytest
@@ -22,7 +21,7 @@ from optipmb_service.stream.checkpoint import decode_checkpoint, encode_checkpoi
 from optipmb_service.stream.profiles import Profiles
 from optipmb_service.stream.queries import StreamQueries
 from optipmb_service.stream.session import Session
-from optipmb_service.stream.values import Policy, Quarantined, RefusedError, Tracked
+from optipmb_service.stream.values import Output, Policy, Quarantined, RefusedError, Tracked
 from optipmb_service.zenoh.inputs import Packet
 from registries import Around, packet_of, streams_of
 from router import SECOND
@@ -30,11 +29,6 @@ from scenarios import FILE, PROFILE, SCENARIOS, SENSOR, STREAM, Raw, Recorded, S
 from sessions import chained
 
 import optipmb
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
-    from optipmb_service.stream.values import Output
 
 RECORD: Final = bool(os.environ.get("OPTIPMB_TEST_RECORD"))
 BETWEEN_NS: Final = SECOND // 50

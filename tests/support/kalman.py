@@ -8,23 +8,18 @@ pedestrian from the first), and for a frame or three after the last one, with th
 works in the world frame, which is what its compensation of the camera's own motion comes to.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from boxes import Row, table_of
+from numpy.typing import NDArray
 from optipmb_tools.evaluation.overlap import intersection_area
 from optipmb_tools.geometry import box_corners, wrap_angle
+from optipmb_tools.results import ResultTable
+from optipmb_tools.tuning.clips import Clip
 from scipy.optimize import linear_sum_assignment
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-    from optipmb_tools.results import ResultTable
-    from optipmb_tools.tuning.clips import Clip
-
-    Array = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 MEASURED, STATES = 7, 10
 YAW = 3

@@ -1,23 +1,18 @@
 """The streams of a process alone: nothing of the network, of other members or of a disk around them."""
 
-from __future__ import annotations
-
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any, Self
 
 from optipmb_schemas import Detections, Keys, Points, encode, encoding_of
 from optipmb_service.settings import Settings
+from optipmb_service.stream.checkpoint import Checkpoint
 from optipmb_service.stream.profiles import Profiles
 from optipmb_service.stream.streams import Streams
 from optipmb_service.telemetry.metrics import Metrics
 from optipmb_service.telemetry.problem_reporter import ProblemReporter
 from optipmb_service.zenoh.inputs import Packet
 from sessions import chained
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from optipmb_service.stream.checkpoint import Checkpoint
 
 
 class Around:
@@ -70,7 +65,7 @@ class Around:
     def may_write(self, *_: object) -> bool:
         return True
 
-    def open_publisher(self, _: str, **kinds: bool) -> Around:  # noqa: ARG002 - as the service calls it
+    def open_publisher(self, _: str, **kinds: bool) -> Self:  # noqa: ARG002 - as the service calls it
         return self
 
     def look(self) -> None:

@@ -1,14 +1,13 @@
 """A service that a test speaks for, and its HTTP server: readers of its session get what the test publishes."""
 
-from __future__ import annotations
-
 import contextlib
 import fnmatch
 import http.client
 import threading
 import time
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from optipmb_client.incoming import Answer, Arrival
@@ -28,9 +27,6 @@ from optipmb_schemas import (
 from optipmb_service.edge.readers import Publication
 from optipmb_service.http import Server, application
 from optipmb_service.settings import Settings
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
 
 KEYS = Keys()
 STREAM = "garage/rig/lidar"

@@ -22,6 +22,7 @@ EXCEPTIONS = {
     # to show why a first frame takes a while; a folder; processes that compile
     "compiled": {"fcntl", "logging", "os", "stat", "subprocess", "tempfile", "time"},
     "warm": {"gc", "os", "pickle"},  # the programs of those processes
+    "parameters": {"fnmatch"},  # patterns of sensors
     "online": {"datetime", "matplotlib", "pandas", "pyarrow", "supervision"},  # dates, and forms that users ask for
 }
 TOUCHES_FILES = {"compiled", "parameters", "prepared", "warm"}

@@ -49,6 +49,12 @@ class TrackOptions:
         bool,
         typer.Option("--fuse", help="The sensors of a recording feed one density, by turns: by the column sensor."),
     ] = False
+    sensors: Annotated[
+        Path | None,
+        typer.Option(
+            "--sensors", help="With --fuse: settings of a service (TOML), whose [sensors] say how sensors differ."
+        ),
+    ] = None
     keep_input: Annotated[
         bool, typer.Option("--keep-input", help="Of a bag, with --out FILE.mcap: also copy what is in it.")
     ] = False
@@ -60,6 +66,8 @@ class TrackOptions:
     def check_out(self, data: Data) -> None:
         """Refuse a file where the results are several; a bag of tracks holds one topic of a bag."""
         out = self.out
+        if self.sensors is not None and not self.fuse:
+            raise UsageError(f"--sensors {self.sensors}: expected --fuse, for one sensor has --profile alone")
         if self.submission is not None and (self.full or is_table(out)):
             raise UsageError("--submission: expected a folder as --out, and no --full: the files are for the benchmark")
         if out.suffix != ".mcap":
@@ -111,6 +119,7 @@ def track(
         warn(doubt)
     if name == profiles.AUTO:
         warn(f"profile auto: {parameters.provenance}")
+    sensors = profiles.read_sensors(how.sensors)
     results = []
     failed = None
     try:
@@ -122,7 +131,7 @@ def track(
                 opened.dataset,
                 chosen,
                 how.out,
-                tracking.Tracking(parameters, how.classes or (), full=how.full, smooth=how.smooth),
+                tracking.Tracking(parameters, how.classes or (), full=how.full, smooth=how.smooth, sensors=sensors),
                 executor=executor,
                 on_frame=progress.advance,
                 note=lambda text: progress.note(f"optipmb: {text}"),

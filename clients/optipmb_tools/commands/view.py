@@ -144,8 +144,6 @@ def _live(service: ServiceOptions, timeout: float, how: WatchOptions) -> Iterato
     """Yield messages as they come; None now and then while there are none."""
     from optipmb_client.incoming import Inbox  # noqa: PLC0415  of a running service
 
-    from optipmb_tools.views.density_queries import DensityQueries  # noqa: PLC0415  as above
-
     keys = Keys(service.prefix)
     topics = [topic for topic in TOPICS if how.points or topic != "points"]
     wanted = [keys.matching(pattern, topic) for pattern in how.streams or ["*/*/*"] for topic in topics]
@@ -154,7 +152,11 @@ def _live(service: ServiceOptions, timeout: float, how: WatchOptions) -> Iterato
         connection = stack.enter_context(service.connection(timeout))
         for key in wanted:
             connection.subscribe(key, inbox)
-        queries = stack.enter_context(DensityQueries(connection, inbox, service.prefix)) if how.poisson else None
+        queries = None
+        if how.poisson:
+            from optipmb_tools.views.viewer import DensityQueries  # noqa: PLC0415  an extra of the installation
+
+            queries = stack.enter_context(DensityQueries(connection, inbox, service.prefix))
         while True:
             arrival = inbox.get(TICK_S)
             message = None if arrival is None else _message(arrival.key, arrival.payload, arrival.encoding)

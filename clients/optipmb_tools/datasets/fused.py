@@ -37,8 +37,8 @@ class FusedSequence(DataSequence):
 
     def frames(self) -> Iterator[DetectionFrame]:
         """Yield every frame in the order in which the service tracks them."""
-        for index, (_, _, frame) in enumerate(self._merged()):
-            yield replace(frame, index=index)
+        for index, (_, number, frame) in enumerate(self._merged()):
+            yield replace(frame, index=index, sensor=self.sensors[number].sensor)
 
     def _merged(self) -> Iterator[tuple[int, int, DetectionFrame]]:
         streams = (_numbered(number, one) for number, one in enumerate(self.sensors))

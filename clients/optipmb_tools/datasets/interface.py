@@ -64,6 +64,7 @@ class DetectionFrame:
     cloud: Cloud | None = None
     field_of_view: FieldOfView | None = None  # in the axes of `pose`; None: everywhere
     position_covariance: Floats | None = None  # (M, 3, 3) along the axes of the sensor, NaN where unknown
+    sensor: str = ""  # its name, in a sequence of several
 
     def __len__(self) -> int:
         return len(self.label)

@@ -56,18 +56,20 @@ def replay(dump: Dump, tracker: Callable[[optipmb.Parameters], Any] = optipmb.Tr
     """
     try:
         parameters = optipmb.parse_parameters(dump.parameters)
+        others = {name: optipmb.parse_parameters(values) for name, values in dump.sensors.items()}
         labels = parameters.labels
         columns = optipmb.columns_in(dump.density, len(labels))
         density = optipmb.density_of(dump.stamp_ns, dump.next_id, columns, labels)
     except optipmb.OptipmbError as error:
         raise UsageError(f"dump of {dump.stream}: {error}") from error
-    steps: optipmb.Tracker = tracker(parameters)
+    ordinary = parameters, tracker(parameters)
+    sensors = {name: (one, tracker(one)) for name, one in others.items()}
     result = Replayed(dump.stream, len(dump.frames), dump.error)
     for frame in dump.frames:
         if frame.anew:
             density = optipmb.Density.empty(parameters.labels, density.next_id)
         try:
-            density = _step(steps, parameters, density, frame)
+            density = _step(*sensors.get(frame.detections.stream, ordinary), density, frame)
         except Exception as error:  # noqa: BLE001  the result
             mark = frame.detections
             text = f"{type(error).__name__}: {error}"
@@ -77,7 +79,7 @@ def replay(dump: Dump, tracker: Callable[[optipmb.Parameters], Any] = optipmb.Tr
 
 
 def _step(
-    steps: optipmb.Tracker, parameters: optipmb.Parameters, density: optipmb.Density, given: DumpedFrame
+    parameters: optipmb.Parameters, steps: optipmb.Tracker, density: optipmb.Density, given: DumpedFrame
 ) -> optipmb.Density:
     """Step by one frame, and make its tracks a message: a value that no message may have is an error too."""
     message = given.detections

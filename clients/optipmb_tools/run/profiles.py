@@ -1,7 +1,9 @@
 """Parameter profiles: by name, from a file, or made for the data."""
 
 import itertools
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from statistics import median
 from typing import Any, Final
 
@@ -10,6 +12,7 @@ from optipmb_client.errors import UsageError
 from optipmb import (
     OptipmbError,
     Parameters,
+    Sensors,
     class_indices,
     generic_parameters,
     load_profile,
@@ -17,6 +20,7 @@ from optipmb import (
     profiles,
     warm_up,
 )
+from optipmb.parameters import ALIKE
 from optipmb_tools.datasets import DataSequence
 from optipmb_tools.datasets.motion import LEAST_ALONG, SURE_MOVES, headings_along
 
@@ -49,6 +53,20 @@ def read_profile(profile: str) -> Parameters:
         return load_profile(profile)
     except OptipmbError as error:
         raise UsageError(f"--profile {profile}: {error}") from error
+
+
+def read_sensors(settings: Path | None) -> Sensors:
+    """Return what the table `sensors` of a settings file says; without a file all sensors are alike.
+
+    Raises:
+        UsageError: The file cannot be read, or a value is not allowed.
+    """
+    if settings is None:
+        return ALIKE
+    try:
+        return Sensors.read(tomllib.loads(settings.read_text(encoding="utf-8")).get("sensors", {}))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, OptipmbError) as error:
+        raise UsageError(f"--sensors {settings}: {error}") from error
 
 
 def fields_of(tables: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, str, dict[str, float]]]:

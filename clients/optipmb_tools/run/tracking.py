@@ -13,11 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from optipmb_client.errors import ClientError, UsageError
 from optipmb_schemas import Tracks, path_fields, track_fields
 
 import optipmb
 from optipmb import (
+    Density,
     FieldOfView,
     Frame,
     Modules,
@@ -26,12 +28,14 @@ from optipmb import (
     PointCloud,
     Pose,
     PredictedPaths,
+    Sensors,
     StepResult,
     Tracker,
     make_frame,
     predict_tracks,
     warm_up,
 )
+from optipmb.parameters import ALIKE
 from optipmb_tools.datasets import DataSequence, Dataset, DatasetArguments, DetectionFrame, selected_frames
 from optipmb_tools.files import remove_unfinished
 from optipmb_tools.results.output import Latency, Results, horizons_for, latency
@@ -83,16 +87,32 @@ def tracker_frame(parameters: Parameters, sequence: str, given: DetectionFrame) 
 _warm = functools.cache(warm_up)  # once in each process
 
 
+def _trackers(
+    parameters: Parameters, modules: Modules | None, sensors: Sensors
+) -> Callable[[str], tuple[Parameters, Tracker, NDArray[np.float64]]]:
+    """Return a function that gives the parameters of a sensor, their tracker and score filters."""
+
+    @functools.cache
+    def used(sensor: str) -> tuple[Parameters, Tracker, NDArray[np.float64]]:
+        own = sensors.parameters(parameters, sensor)
+        return own, Tracker(own, modules), np.array([one.score_filter for one in own.classes.values()])
+
+    return used
+
+
 def track_whole(
     parameters: Parameters,
     sequence: DataSequence,
     classes: Sequence[str] = (),
     modules: Modules | None = None,
     *,
+    sensors: Sensors = ALIKE,
     smooth: bool = False,
     on_frame: Callable[[], None] = lambda: None,
 ) -> Tracked:
     """Track one sequence, with `smooth` so that states are given all frames of their track.
+
+    Frames that name their sensor are used as `sensors` say.
 
     Raises:
         UsageError: A frame holds values that the tracker refuses.
@@ -104,18 +124,20 @@ def track_whole(
     steps: list[int] = []
     clouds = detections = estimated = 0
     left_out: Counter[str] = Counter()
-    least = np.array([one.score_filter for one in parameters.classes.values()])
-    given, low = np.zeros(len(least), np.int64), np.zeros(len(least), np.int64)
+    size = len(parameters.classes)
+    given, low = np.zeros(size, np.int64), np.zeros(size, np.int64)
     smoother = None
     if smooth:
         from optipmb_tools.run.smoothing import Smoother  # noqa: PLC0415  of --smooth alone
 
         smoother = Smoother(parameters)
     # A smoother joins the frames of a track, which an estimated motion has in axes of their own.
-    tracker = Tracker(parameters.model_copy(update={"sensor_motion": False}) if smooth else parameters, modules)
-    density = tracker.initial()
+    followed = parameters.model_copy(update={"sensor_motion": False}) if smooth else parameters
+    used = _trackers(followed, modules, sensors)
+    density = Density.empty(parameters.labels)
     for frame in selected_frames(sequence, classes):
-        taken = tracker_frame(parameters, sequence.name, frame)
+        own, tracker, least = used(frame.sensor)
+        taken = tracker_frame(own, sequence.name, frame)
         started = time.perf_counter_ns()
         result = tracker.step(density, taken)
         steps.append(time.perf_counter_ns() - started)
@@ -128,9 +150,9 @@ def track_whole(
         detections += len(frame)
         if len(taken.source) < len(frame):
             left_out.update(frame.labels[i] for i in np.delete(frame.label, taken.source).tolist())
-        given += np.bincount(taken.label, minlength=len(least))
+        given += np.bincount(taken.label, minlength=size)
         if not parameters.self_calibration:  # which never filters the upper half of a class
-            low += np.bincount(taken.label[taken.score < least[taken.label]], minlength=len(least))
+            low += np.bincount(taken.label[taken.score < least[taken.label]], minlength=size)
         on_frame()
     for name, count, total in zip(parameters.labels, low.tolist(), given.tolist(), strict=True):
         if count:
@@ -199,6 +221,7 @@ class Tracking:
     modules: Modules | None = None
     full: bool = False  # also write all columns of the tracks
     smooth: bool = False  # estimate states from all frames of their track (`optipmb_tools.run.smoothing`)
+    sensors: Sensors = ALIKE  # how frames that name their sensor are used
 
 
 @dataclass(frozen=True)
@@ -234,7 +257,8 @@ def _track_one(job: _Job, name: str) -> tuple[TrackedSequence, Path | Columns]:
     """Track one sequence and write its results; idempotent. Return the rows where all sequences share one table."""
     dataset, how = job.dataset, job.how
     sequence = job.sequences[name] if name in job.sequences else dataset.sequences([name])[0]
-    found = track_whole(how.parameters, sequence, how.classes, how.modules, smooth=how.smooth, on_frame=job.on_frame)
+    options: dict[str, Any] = {"sensors": how.sensors, "smooth": how.smooth, "on_frame": job.on_frame}
+    found = track_whole(how.parameters, sequence, how.classes, how.modules, **options)
     written = Results(dataset, job.out, full=how.full).write(sequence, found.tracks)
     beyond = []
     if dataset.name == "nuscenes" and isinstance(written, Path):

@@ -7,13 +7,18 @@ not detected yet) and `poisson/weight` (how many), and the figures `count/…`. 
 """
 
 import collections
+import threading
+import time
 from collections.abc import Iterable
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from optipmb_schemas import Density, Detections, Message, Points, Tracks
+from optipmb_client.errors import ConnectionFailed
+from optipmb_client.incoming import Arrival, Inbox
+from optipmb_client.zenoh import Connection
+from optipmb_schemas import PREFIX, Density, Detections, Keys, Message, Points, Tracks
 
 from optipmb_tools.geometry import Floats, rotation_of, shown_boxes
 from optipmb_tools.views.colours import rgb_of
@@ -37,6 +42,9 @@ INK: Final = (30, 30, 30)
 FAINT: Final = (235, 225, 235)
 EXPECTED: Final = (120, 90, 140)
 """Colours of a Poisson component that expects next to nothing, and of one that expects an object or more."""
+
+QUERY_PERIOD_S: Final = 0.5
+QUERY_S: Final = 1.0
 
 SERIES: Final = (
     ("tracks", "tracks", (0, 114, 178)),
@@ -280,3 +288,57 @@ def _by_height(points: Floats) -> np.ndarray:
     low, high = np.quantile(points[:, 2], [0.02, 0.98]) if len(points) else (0.0, 1.0)
     share = np.clip((points[:, 2] - low) / max(high - low, 1e-6), 0.0, 1.0)[:, None]
     return np.asarray(np.array([60, 70, 90]) * (1 - share) + np.array([170, 190, 215]) * share, dtype=np.uint8)
+
+
+class DensityQueries:
+    """Queries, on a thread of its own, the density of every stream that has had tracks since the last query.
+
+    Answers go into an inbox, among the messages that were subscribed to; errors are left out. A stream is asked twice a
+    second at most, and not at all while it is silent. So a service that is slow to answer delays neither tracks nor
+    their reader.
+
+    Args:
+        connection: Where to ask; closed by the caller, after this.
+        inbox: Where answers go, by the key of the query.
+        prefix: Of the keys.
+    """
+
+    def __init__(self, connection: Connection, inbox: Inbox, prefix: str = PREFIX) -> None:
+        self._connection = connection
+        self._inbox = inbox
+        self._keys = Keys(prefix)
+        self._due: set[str] = set()
+        self._lock = threading.Lock()
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="densities", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join(2 * QUERY_S)
+
+    def note(self, stream: str) -> None:
+        """Say that a stream has new tracks; never waits."""
+        with self._lock:
+            self._due.add(stream)
+
+    def _run(self) -> None:
+        while not self._over.wait(QUERY_PERIOD_S):
+            with self._lock:
+                due, self._due = self._due, set()
+            for stream in sorted(due):
+                if self._over.is_set():
+                    return
+                self._ask(self._keys.query(stream, "density"))
+
+    def _ask(self, key: str) -> None:
+        try:
+            answers = self._connection.query(key, timeout=QUERY_S)
+        except ConnectionFailed:
+            return  # the connection is being closed, or links again
+        for answer in answers:
+            if answer.ok:
+                self._inbox.put(Arrival(answer.key, answer.payload, answer.encoding, time.monotonic_ns()))

@@ -400,20 +400,22 @@ class SessionState(_message.Message):
     def __init__(self, stream: _Optional[str] = ..., session: _Optional[str] = ..., state: _Optional[str] = ..., profile: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., received: _Optional[int] = ..., frames: _Optional[int] = ..., duplicates: _Optional[int] = ..., late: _Optional[int] = ..., inserted: _Optional[int] = ..., corrected: _Optional[int] = ..., refused: _Optional[int] = ..., shed: _Optional[int] = ..., gaps: _Optional[int] = ..., new_epochs: _Optional[int] = ..., clouds_used: _Optional[int] = ..., clouds_missed: _Optional[int] = ..., repaired: _Optional[int] = ..., clouds_refused: _Optional[int] = ..., tracks: _Optional[int] = ..., bernoullis: _Optional[int] = ..., poissons: _Optional[int] = ..., next_id: _Optional[int] = ..., queue: _Optional[int] = ..., digest: _Optional[str] = ...) -> None: ...
 
 class SessionParameters(_message.Message):
-    __slots__ = ("profile", "cloud_wait_s", "horizons", "restart", "values", "session")
+    __slots__ = ("profile", "cloud_wait_s", "horizons", "restart", "values", "sensors", "session")
     PROFILE_FIELD_NUMBER: _ClassVar[int]
     CLOUD_WAIT_S_FIELD_NUMBER: _ClassVar[int]
     HORIZONS_FIELD_NUMBER: _ClassVar[int]
     RESTART_FIELD_NUMBER: _ClassVar[int]
     VALUES_FIELD_NUMBER: _ClassVar[int]
+    SENSORS_FIELD_NUMBER: _ClassVar[int]
     SESSION_FIELD_NUMBER: _ClassVar[int]
     profile: str
     cloud_wait_s: float
     horizons: Array
     restart: bool
     values: _struct_pb2.Struct
+    sensors: _struct_pb2.Struct
     session: str
-    def __init__(self, profile: _Optional[str] = ..., cloud_wait_s: _Optional[float] = ..., horizons: _Optional[_Union[Array, _Mapping]] = ..., restart: _Optional[bool] = ..., values: _Optional[_Union[_struct_pb2.Struct, _Mapping]] = ..., session: _Optional[str] = ...) -> None: ...
+    def __init__(self, profile: _Optional[str] = ..., cloud_wait_s: _Optional[float] = ..., horizons: _Optional[_Union[Array, _Mapping]] = ..., restart: _Optional[bool] = ..., values: _Optional[_Union[_struct_pb2.Struct, _Mapping]] = ..., sensors: _Optional[_Union[_struct_pb2.Struct, _Mapping]] = ..., session: _Optional[str] = ...) -> None: ...
 
 class SessionSummary(_message.Message):
     __slots__ = ("stream", "profile", "state", "rate_hz", "latency_p50_ms", "latency_p99_ms", "frames", "refused", "shed", "gaps", "tracks", "queue", "age_s", "worker", "sensors", "silent", "late", "duplicates", "configured")

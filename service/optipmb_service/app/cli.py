@@ -207,7 +207,7 @@ def config_command(
     for name in values.keys() - plain.keys():
         typer.echo(f"\n[{name}]  # {loaded.sources[name]}")
         for key, value in values[name].items():
-            shown = f"{_toml(key) if name == 'profiles' else key} = {_toml(value)}"
+            shown = f"{_toml(key) if name in {'profiles', 'sensors'} else key} = {_toml(value)}"
             typer.echo(f"# {key} is not set" if value is None else shown)
 
 

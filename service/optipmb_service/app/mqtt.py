@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import collections
 import contextlib
-import ssl
 from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
@@ -17,6 +16,7 @@ import aiomqtt
 import structlog
 from aiomqtt.exceptions import MqttConnectError
 from optipmb_client.errors import ClientError
+from optipmb_schemas.certificates import context_of
 from optipmb_schemas.json_form import Selection
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
@@ -79,7 +79,7 @@ class Bridge(Reporter):
         self._version = aiomqtt.ProtocolVersion.V5
         try:
             user = settings.mqtt.credentials.read_text("utf-8").strip() if settings.mqtt.credentials else ""
-            self._tls = _tls(settings)
+            self._tls = context_of(settings.mqtt.tls) if settings.mqtt.broker.startswith("mqtts") else None
         except (OSError, ValueError) as error:
             raise ClientError(f"settings mqtt.credentials, mqtt.tls: {error}") from error
         self._user, _, self._password = user.partition(":")
@@ -186,21 +186,6 @@ class Bridge(Reporter):
 async def _until_lost(broker: aiomqtt.Client) -> None:
     async for _ in broker.messages:
         pass
-
-
-def _tls(settings: Settings) -> ssl.SSLContext | None:
-    """Return the certificates for the broker: of the system's authorities, or of the folder.
-
-    Raises:
-        OSError: a file cannot be used.
-    """
-    if not settings.mqtt.broker.startswith("mqtts"):
-        return None
-    folder = settings.mqtt.tls
-    context = ssl.create_default_context(cafile=None if folder is None else str(folder / "ca.pem"))
-    if folder is not None and (folder / "cert.pem").exists():
-        context.load_cert_chain(folder / "cert.pem", folder / "key.pem")
-    return context
 
 
 async def run(settings: Settings) -> int:

@@ -48,7 +48,6 @@ if TYPE_CHECKING:
 
     from optipmb_service.settings import Settings
     from optipmb_service.stream.profiles import Profiles
-    from optipmb_service.stream.traces import Traces
     from optipmb_service.zenoh.client import Client
 
 log = structlog.get_logger("optipmb_service")
@@ -106,7 +105,11 @@ class Service(Reporter):
             store, settings.checkpoint_s, self._member, self._unkept, settings.keep_days * DAY_S, keeps_nothing
         )
         self._log = open_log(settings)
-        self._traces = _traces(settings) if settings.traces else None
+        self._traces: Traces | None = None
+        if settings.traces:
+            from optipmb_service.stream.traces import Traces  # noqa: PLC0415 - an extra that only this needs
+
+            self._traces = Traces(settings.instance)
         self._streams = Streams(
             settings,
             profiles,
@@ -314,9 +317,3 @@ class Service(Reporter):
             checkpoints=self._checkpoints.written,
             checkpoint_age_s=None if complete_ns is None else max(0, now_ns - complete_ns) / SECOND,
         )
-
-
-def _traces(settings: Settings) -> Traces:
-    from optipmb_service.stream.traces import Traces  # noqa: PLC0415 - an extra that only this needs
-
-    return Traces(settings.instance)

@@ -162,4 +162,4 @@ def open_log(settings: Settings) -> Log | None:
     from optipmb_service.cluster.message_log import LogReader, MessageLog  # noqa: PLC0415 - an extra
 
     reader = LogReader(MessageLog(settings.cluster, settings.prefix, nats_access(settings)), settings.standby_s)
-    return Log(reader, Keys(settings.prefix), Fusion(settings.fuse))
+    return Log(reader, Keys(settings.prefix), Fusion.of(settings))

@@ -256,7 +256,7 @@ class AggregateView(Reporter):
     def __init__(self, settings: Settings, supervisor: Supervisor, network: Transport, metrics: Metrics) -> None:
         self._instance = settings.instance
         self._keys = schemas.Keys(settings.prefix)
-        self._fusion = Fusion(settings.fuse)
+        self._fusion = Fusion.of(settings)
         self._limits = settings.limits.limits()
         self._supervisor = supervisor
         self._names = [f"{settings.instance}-w{worker.index}" for worker in supervisor.workers]

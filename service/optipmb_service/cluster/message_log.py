@@ -235,10 +235,12 @@ class MessageLog:
         request |= {"batch": BATCH, "max_bytes": BATCH_BYTES}
         return [(one.number, one.message) for one in await self._found(topic, request)]
 
-    async def streams(self, topic: Topic, node: str) -> list[str]:
-        """Return the streams of a node (`site/node`) that have messages in a log."""
+    async def streams(self, topic: Topic, common: str) -> list[str]:
+        """Return the streams of a node (`site/node`) or a site that have messages in a log."""
         name = self._names[topic]
-        request = {"subjects_filter": self._subject(topic, f"{node}/any").rpartition(".")[0] + ".*"}
+        any_of = 2 - common.count("/")
+        head = self._subject(topic, common + any_of * "/any").rsplit(".", any_of)[0]
+        request = {"subjects_filter": head + any_of * ".*"}
         try:
             state = (await self.connection.ask(f"STREAM.INFO.{name}", request))["state"]
         except RefusedError as refused:
@@ -363,8 +365,8 @@ class LogReader:
 
             async def read(messages: list[LogMessage] = messages) -> None:
                 streams = set(wanted.streams)
-                if wanted.node:
-                    streams.update(filter(wanted.belongs, await self._log.streams("detections", wanted.node)))
+                if wanted.common:
+                    streams.update(filter(wanted.belongs, await self._log.streams("detections", wanted.common)))
                 for stream in sorted(streams):
                     await self._read(stream, wanted.positions.get(stream), following, messages)
 

@@ -11,7 +11,6 @@ import binascii
 import contextlib
 import json
 import re
-import ssl
 import threading
 from concurrent.futures import CancelledError
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -20,6 +19,7 @@ import structlog
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from nats.aio.client import Client
 from nats.errors import Error as NatsError
+from optipmb_schemas.certificates import context_of
 
 from optipmb_service.cluster.store import StoreError
 
@@ -44,10 +44,6 @@ EXISTS: Final = 10058
 ENDS: Final = frozenset({"204", "404"})  # status that ends a batch: that was all, or there is nothing
 NOBODY: Final = "503"
 NO_STREAM: Final = 10059  # there is no JetStream stream of a name, or none that answers now
-
-CA: Final = "ca.pem"
-CERTIFICATE: Final = "cert.pem"
-KEY: Final = "key.pem"
 
 _JWT: Final = re.compile(r"-+BEGIN NATS USER JWT-+\s+(\S+)\s+-+END")
 _SEED: Final = re.compile(r"-+BEGIN USER NKEY SEED-+\s+(\S+)\s+-+END")
@@ -289,7 +285,7 @@ def access(tls: Path | None = None, credentials: Path | None = None) -> dict[str
     options: dict[str, Any] = {}
     if tls is not None:
         try:
-            options["tls"] = _context(tls)
+            options["tls"] = context_of(tls)
         except OSError as error:  # also one of its contents
             raise StoreError(f"cluster_tls: {tls}: {error}") from error
     if credentials is not None:
@@ -298,13 +294,6 @@ def access(tls: Path | None = None, credentials: Path | None = None) -> dict[str
         except (OSError, ValueError) as error:
             raise StoreError(f"cluster_credentials: {credentials}: {error}") from error
     return options
-
-
-def _context(folder: Path) -> ssl.SSLContext:
-    context = ssl.create_default_context(cafile=str(folder / CA))
-    if (folder / CERTIFICATE).exists():
-        context.load_cert_chain(folder / CERTIFICATE, folder / KEY)
-    return context
 
 
 def _user(file: Path) -> dict[str, Any]:

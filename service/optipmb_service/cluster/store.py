@@ -112,13 +112,14 @@ class Missed:
 
     Attributes:
         streams: whose detections.
-        node: `site/node`, whose streams in the log are wanted too where `belongs` says so; empty: none.
-        belongs: whether a stream of the node feeds the session.
+        common: a node, `site/node`, or a site, whose streams in the log are wanted too where `belongs` says so; empty:
+            none.
+        belongs: whether such a stream feeds the session.
         positions: where streams are; of one without a position the last seconds are wanted.
     """
 
     streams: Sequence[str]
-    node: str
+    common: str
     belongs: Callable[[str], bool]
     positions: Mapping[str, Position]
 

@@ -1,1 +1,1 @@
-"""What the edges share: who calls, what waits for a reader, and subscriptions that readers have in common."""
+"""Common parts of the edges: rights of callers, queues of readers, and subscriptions that readers share."""

@@ -2,7 +2,7 @@
 
 | name | may |
 | --- | --- |
-| `site/node` | publish and track its own streams, `site/node/*`, read and command them |
+| `site/node` | publish and track its own streams, `site/node/*`, read and command them; read what `fused` lets it |
 | `service/name` | read and command all streams |
 | `viewer/name` | read all streams |
 
@@ -43,9 +43,11 @@ class Caller:
 
     Attributes:
         name: in the certificate, or of the token; empty: anybody.
+        reads: streams that a node may read besides its own.
     """
 
     name: str = ANYBODY
+    reads: frozenset[str] = frozenset()
 
     def may_publish(self, stream: str) -> None:
         """Raise NotAllowedError unless the caller may publish a stream."""
@@ -53,7 +55,8 @@ class Caller:
 
     def may_read(self, pattern: str) -> None:
         """Raise NotAllowedError unless the caller may read all streams of a pattern."""
-        self._check(self.name == ANYBODY or bool(self._role) or self._owns(pattern), f"read {pattern}")
+        own = self._owns(pattern) or pattern in self.reads
+        self._check(self.name == ANYBODY or bool(self._role) or own, f"read {pattern}")
 
     def may_command(self, stream: str) -> None:
         """Raise NotAllowedError unless the caller may reset a stream and set its parameters."""

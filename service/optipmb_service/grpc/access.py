@@ -15,6 +15,7 @@ from optipmb_service.edge.access import ANYBODY, Caller, json_file, name_by, tok
 from optipmb_service.grpc.calls import EndCall
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
 FILES: Final = ("key.pem", "cert.pem", "ca.pem")
@@ -30,13 +31,22 @@ class Access:
         names: a JSON file with a list, the names that are let in; default: all that the authority has certified.
         tokens: `module:function` of one's own, called with the metadata of a call and the name in its certificate (or
             nothing); it returns the name that holds, or None to refuse. It may be a coroutine.
+        reads: returns the streams that a node may read besides its own, by its name.
 
     Raises:
         ClientError: the file or the function cannot be used.
     """
 
-    def __init__(self, *, certificates: bool, names: Path | None = None, tokens: str = "") -> None:
+    def __init__(
+        self,
+        *,
+        reads: Callable[[str], frozenset[str]],
+        certificates: bool,
+        names: Path | None = None,
+        tokens: str = "",
+    ) -> None:
         self._certificates = certificates
+        self._reads = reads
         self._names = None if names is None else _names(names)
         self._tokens = token_names("grpc_tokens", tokens) if tokens else None
 
@@ -59,7 +69,7 @@ class Access:
             not name or (self._names is not None and name not in self._names)
         ):
             raise EndCall(grpc.StatusCode.PERMISSION_DENIED, f"{name or 'a certificate without a name'} is not let in")
-        return Caller(name)
+        return Caller(name, self._reads(name))
 
 
 def _names(file: Path) -> frozenset[str]:

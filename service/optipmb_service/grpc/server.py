@@ -119,7 +119,10 @@ class Server:
         self._reporter = ProblemReporter(client.publish_problem)
         self._most = settings.grpc_calls
         self._access = Access(
-            certificates=settings.grpc_tls is not None, names=settings.grpc_names, tokens=settings.grpc_tokens
+            certificates=settings.grpc_tls is not None,
+            names=settings.grpc_names,
+            tokens=settings.grpc_tokens,
+            reads=settings.readable_by,
         )
         most = settings.limits.max_bytes + HEADROOM
         options = (

@@ -100,6 +100,7 @@ class Readers:
         self._places = places
         self._most = settings.http_clients
         self._names = token_names("http_tokens", settings.http_tokens) if settings.http_tokens else None
+        self._reads = settings.readable_by
         self.count = 0
         self._feeds: Feeds | None = None
 
@@ -130,7 +131,7 @@ class Readers:
                 metadata["authorization"] = f"Bearer {one[len(BEARER) :]}"
         if not (name := await name_by(self._names, metadata)):
             raise NoTokenError("the token is missing or not valid")
-        return Caller(name)
+        return Caller(name, self._reads(name))
 
     def enter(self) -> Callable[[], None]:
         """Count a reader until the result is called.

@@ -62,8 +62,9 @@ def page(health: ProcessHealth, readers: Readers, places: Mapping[str, Place]) -
     async def live(request: Request) -> Response:
         stream = request.query_params.get("stream", "")
         tracks = readers.keys.tracks(stream)
-        (await readers.caller(request)).may_read(stream)
-        detections = readers.keys.all("detections").replace("*/*/*", health.detections_of(stream))
+        seen = health.detections_of(stream)
+        (await readers.caller(request)).may_read(seen)
+        detections = readers.keys.all("detections").replace("*/*/*", seen)
         place = places.get(stream.partition("/")[0])
         return readers.stream((tracks, detections), lambda: Live(place), HEADERS, PERIOD_S)
 

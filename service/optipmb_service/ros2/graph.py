@@ -18,20 +18,6 @@ import struct
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-__all__ = [
-    "GID",
-    "NO_HASH",
-    "PUBLISHER",
-    "SUBSCRIPTION",
-    "Endpoint",
-    "Matching",
-    "Node",
-    "Qos",
-    "TopicKey",
-    "attachment",
-    "parse_endpoint",
-]
-
 PUBLISHER: Final = "MP"
 SUBSCRIPTION: Final = "MS"
 NO_HASH: Final = "TypeHashNotSupported"

@@ -159,18 +159,19 @@ class StreamDirectory:
             return {stream: bool(known.tokens) for stream, known in self._streams.items()}
 
     def awaited(
-        self, node: str, belongs: Callable[[str], bool], sensors: Iterable[str], now_ns: int
+        self, common: str, belongs: Callable[[str], bool], sensors: Iterable[str], now_ns: int
     ) -> dict[str, bool]:
         """Return the streams whose caches may hold something: True where a publisher is there, False: it may come back.
 
         Args:
-            node: `site/node`.
-            belongs: whether a stream of the node is in question.
+            common: their node, `site/node`, or their site.
+            belongs: whether a stream of it is in question.
             sensors: the streams of earlier publishers.
             now_ns: monotonic time.
         """
         with self._lock:
-            there = (stream for stream in self._nodes.get(node, ()) if self._streams[stream].tokens)
+            nodes = [common] if "/" in common else [one for one in self._nodes if one.startswith(f"{common}/")]
+            there = (one for node in nodes for one in self._nodes.get(node, ()) if self._streams[one].tokens)
             found = {stream: True for stream in there if belongs(stream)}
             for stream in sensors:
                 known = self._streams.get(stream, _Known(left_ns=self.began_ns))

@@ -26,7 +26,7 @@ import optipmb_schemas as schemas
 import structlog
 
 from optipmb_service.cluster.leases import PARTITIONS, Change, partition_of
-from optipmb_service.stream.directory import StreamDirectory, node_of
+from optipmb_service.stream.directory import StreamDirectory
 from optipmb_service.stream.values import SECOND
 from optipmb_service.zenoh.inputs import Input
 
@@ -183,8 +183,8 @@ class Intake:
             sensors: streams that were there before; their publishers may come back.
         """
         session_of = self._streams.fusion.session_of
-        node = node_of(session)
-        return self._directory.awaited(node, lambda one: session_of(one) == session, sensors, time.monotonic_ns())
+        common = self._streams.fusion.feeds(session)
+        return self._directory.awaited(common, lambda one: session_of(one) == session, sensors, time.monotonic_ns())
 
     def ask_cache(self, stream: str, then: Callable[[list[Packet], bool], None]) -> None:
         """Call `then` soon with what the caches of a stream hold, all frames, and with whether all have answered.

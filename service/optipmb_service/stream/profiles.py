@@ -3,24 +3,26 @@
 All profiles are read once, at the start, so that a bad file ends the start and not a session. Over the network only
 these and the profiles that come with the tracker can be asked for, never a path.
 
-The sensors of a node that the setting `fuse` names share a session, `site/node/fused`: its tracks, queries, owner and
-checkpoint are found by that name, as if it were a stream's.
+The sensors of a node that the setting `fuse` names share a session, `site/node/fused`, and so do the streams of a site
+that `fused.NAME` names, `site/fused/NAME`. Its tracks, queries, owner and checkpoint are found by that name, as if it
+were a stream's.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Final
 
 import optipmb_schemas as schemas
 
 import optipmb
+from optipmb.parameters import ALIKE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from optipmb_service.settings import ZoneSettings
+    from optipmb_service.settings import SensorSettings, Settings, ZoneSettings
 
 
 @dataclass(frozen=True)
@@ -31,14 +33,18 @@ class Profiles:
         default: name of the profile of streams that no pattern names, as the settings give it.
         patterns: pairs of stream pattern and profile name, the first that matches holds.
         known: all profiles by the name that the settings give, and by the name inside the file.
+        sensors: those of fused sessions that differ.
     """
 
     default: str
     patterns: tuple[tuple[str, str], ...]
     known: Mapping[str, optipmb.Parameters]
+    sensors: optipmb.Sensors = ALIKE
 
     @classmethod
-    def read(cls, default: str, patterns: Mapping[str, str]) -> Profiles:
+    def read(
+        cls, default: str, patterns: Mapping[str, str], sensors: Mapping[str, SensorSettings] | None = None
+    ) -> Profiles:
         """Load every profile named, and the tracker's own.
 
         Raises:
@@ -50,7 +56,8 @@ class Profiles:
                 known[name] = _loaded(name)
         for parameters in tuple(known.values()):
             known.setdefault(parameters.name, parameters)
-        return cls(default, tuple(patterns.items()), known)
+        tables = {pattern: one.model_dump() for pattern, one in (sensors or {}).items()}
+        return cls(default, tuple(patterns.items()), known, optipmb.Sensors.read(tables))
 
     def check_zones(self, zones: Mapping[str, ZoneSettings]) -> None:
         """Check the classes of zones.
@@ -110,7 +117,7 @@ def _loaded(name: str) -> optipmb.Parameters:
 
 
 FUSED: Final = "fused"
-"""The sensor in the name of such a session."""
+"""The sensor in the name of such a session, or the node."""
 
 
 @dataclass(frozen=True)
@@ -119,26 +126,53 @@ class Fusion:
 
     Attributes:
         patterns: of streams, `site/node/sensor`, each part with `*` for any text.
+        sites: patterns of the streams of several nodes, by the session that they feed, `site/fused/NAME`.
     """
 
     patterns: Sequence[str] = ()
+    sites: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, settings: Settings) -> Fusion:
+        """Return what settings say."""
+        return cls(settings.fuse, {name: one.streams for name, one in settings.fused_sessions.items()})
 
     def session_of(self, stream: str) -> str:
-        """Return the name of the session that a stream feeds: its own, or its node's."""
-        if not self.patterns:
+        """Return the name of the session that a stream feeds: its own, its node's, or one of its site."""
+        if not (self.patterns or self.sites):
             return stream
         parts = tuple(stream.split("/"))
+        for session, patterns in self.sites.items():
+            if any(_matches(parts, pattern) for pattern in patterns):
+                return session
         matched = any(_matches(parts, pattern) for pattern in self.patterns)
         return f"{parts[0]}/{parts[1]}/{FUSED}" if matched else stream
 
     def is_session(self, name: str) -> bool:
         """Return whether a name is of a fused session; no sensor may have it."""
         site, node, sensor = name.split("/")
+        if self.sites and node == FUSED:
+            return True
         return sensor == FUSED and any(_matches((site, node), pattern) for pattern in self.patterns)
+
+    def sensors_of(self, name: str, sensors: optipmb.Sensors) -> optipmb.Sensors:
+        """Return what settings say of the sensors that may feed a session."""
+        if not (sensors.uses and self.is_session(name)):
+            return ALIKE
+        parts = tuple(self.feeds(name).split("/"))
+        return optipmb.Sensors(tuple(one for one in sensors.uses if _matches(parts, one[0])))
+
+    def feeds(self, name: str) -> str:
+        """Return what the streams of a fused session have in common: their site or their node, `site/node`."""
+        site, node, _ = name.split("/")
+        return site if self.sites and node == FUSED else f"{site}/{node}"
 
     def seen_by(self, name: str) -> str:
         """Return the pattern of the streams whose detections belong to the tracks of a session, in Zenoh's words."""
-        return f"{name.rpartition('/')[0]}/*" if self.is_session(name) else name
+        if not self.is_session(name):
+            return name
+        common = self.feeds(name)
+        return f"{common}/*" if "/" in common else f"{common}/*/*"
 
 
 def _matches(parts: tuple[str, ...], pattern: str) -> bool:

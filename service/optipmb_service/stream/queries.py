@@ -296,6 +296,7 @@ class StreamQueries:
             cloud_wait_s=session.cloud_wait_s if session else self._streams.policy.cloud_wait_ns / SECOND,
             horizons=np.array(parameters.horizons, np.float64),
             values=parameters.model_dump(mode="json"),
+            sensors=self._streams.policy_for(stream.name).sensors.shown() or None,
             session=session.session if session else None,
         )
 

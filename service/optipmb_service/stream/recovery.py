@@ -70,7 +70,7 @@ class Log:
         try:
             wanted = Missed(
                 streams=() if fused else (session,),
-                node=session.rpartition("/")[0] if fused else "",
+                common=self._fusion.feeds(session) if fused else "",
                 belongs=lambda stream: self._fusion.session_of(stream) == session,
                 positions={} if checkpoint is None else positions_of(checkpoint),
             )
@@ -82,7 +82,7 @@ class Log:
     def look(self, checkpoint: Checkpoint, then: Take) -> None:
         """Call `then` soon, once, with the frames after the newest ones of a checkpoint."""
         positions = newest_of(checkpoint)
-        wanted = Missed(tuple(positions), node="", belongs=lambda _: False, positions=positions)
+        wanted = Missed(tuple(positions), common="", belongs=lambda _: False, positions=positions)
         self._reader.missed(wanted, lambda messages: then(self._packets(messages)), again_s=())
 
     def tracks(

@@ -51,6 +51,8 @@ from optipmb_service.telemetry.stream_meter import Counters, total
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from numpy.typing import NDArray
+
     from optipmb_service.stream.pending import Judged
     from optipmb_service.stream.state import Inputs
     from optipmb_service.stream.timeline import Decision, Timeline
@@ -109,6 +111,8 @@ class Session:
         self._clock = clock
         self._sensors: dict[str, SensorQueue] = {}
         self._quarantine: dict[str, str] = {}
+        self._blind: set[str] = set()
+        """Sensors of which it was reported that they have no field of view."""
         self._estimated = ""
         """Incarnation in which the motion of a sensor was reported as estimated."""
         self._deliveries = Deliveries()
@@ -516,10 +520,9 @@ class Session:
     # Settings
 
     def _transition(self, parameters: optipmb.Parameters) -> Transition:
-        self._filters = np.array([one.score_filter for one in parameters.classes.values()])
-        self._scores = np.zeros((2, len(self._filters)), np.int64)
-        """Detections of each class of the profile, and of these the ones below its score filter."""
-        return Transition(self.stream, parameters, self._make(parameters), self._policy)
+        self._scores: dict[str, tuple[NDArray[np.float64], NDArray[np.int64]]] = {}
+        """Score filter of each class; its detections, and those below it: by sensor where it has its own parameters."""
+        return Transition(self.stream, parameters, self._make, self._policy)
 
     def _limit_wait(self, cloud_wait_ns: int) -> None:
         """Set the longest wait for a cloud."""
@@ -548,6 +551,8 @@ class Session:
         for name in self._timeline.silent([name for name, one in self._sensors.items() if not one.held])[:1]:
             del self._sensors[name]
             self._quarantine.pop(name, None)
+            self._blind.discard(name)
+            self._scores.pop(name, None)
 
     def _follow(self, gone: Sequence[FrameId] = ()) -> None:
         """Give the timeline to the queues; `gone` are the frames that have left the window."""
@@ -606,10 +611,11 @@ class Session:
     ) -> list[Output]:
         """Process a frame that has a place, or hold it; return the outputs of all frames that it made ready."""
         outputs: list[Output] = []
+        parameters = self._window.transition.parameters_of(frame_id.sensor)
         detections = schemas.encoded(message)
         queue.remember(frame_id, detections)
         try:
-            frame, ignored = convert.frame_of(self.parameters, message)
+            frame, ignored = convert.frame_of(parameters, message)
         except optipmb.FrameError as error:
             self._timeline = self._timeline.note(frame_id)
             queue.timeline = judged[0].note(frame_id)
@@ -622,10 +628,11 @@ class Session:
         if self._policy.jumps == "report" and (found := queue.poses.add(message, self._policy)):
             expected = "a pose where the motion of the sensor leads, or a `relocation`"
             outputs.append(self._problem("world_jump", frame_id, "pose", expected, found))
-        if (
-            frame_id.seq % SCORED_EVERY == 0 and not self.parameters.self_calibration
-        ):  # which never filters the upper half of a class
-            outputs += self._low_scores(frame_id, frame)
+        if self._policy.needs_view and message.field_of_view is None and frame_id.sensor not in self._blind:
+            self._blind.add(frame_id.sensor)
+            outputs.append(self._problem("no_view", frame_id, "field_of_view", "where the sensor sees", "nothing"))
+        if frame_id.seq % SCORED_EVERY == 0 and not parameters.self_calibration:
+            outputs += self._low_scores(frame_id, frame, parameters)  # none is filtered of the upper half of a class
         deadline_ns, inputs = queue.cloud_deadline_ns(message, since_ns), (message, frame, ignored)
         pending = PendingFrame(frame_id, detections, inputs, deadline_ns, ticket, judged)
         waits = queue.held or deadline_ns is not None or queue.clouds.newest_ns is not None
@@ -807,21 +814,26 @@ class Session:
                 return [begun, self._problem("restarted", one.frame.frame_id, "", "a stream that goes on", received)]
         return []
 
-    def _low_scores(self, frame_id: FrameId, frame: optipmb.Frame) -> list[Output]:
+    def _low_scores(self, frame_id: FrameId, frame: optipmb.Frame, parameters: optipmb.Parameters) -> list[Output]:
         """Count the detections below the score filter; report each class that loses most of them, once."""
-        labels, size = self.parameters.labels, len(self._filters)
-        self._scores[0] += np.bincount(frame.label, minlength=size)
-        low = frame.score < self._filters[frame.label]
+        sensor = "" if parameters is self.parameters else frame_id.sensor
+        if sensor not in self._scores:
+            limits = np.array([one.score_filter for one in parameters.classes.values()])
+            self._scores[sensor] = limits, np.zeros((2, len(limits)), np.int64)
+        filters, counts = self._scores[sensor]
+        labels, size = parameters.labels, len(filters)
+        counts[0] += np.bincount(frame.label, minlength=size)
+        low = frame.score < filters[frame.label]
         if not low.any():
             return []
-        self._scores[1] += np.bincount(frame.label[low], minlength=size)
-        given, removed = self._scores
+        counts[1] += np.bincount(frame.label[low], minlength=size)
+        given, removed = counts
         problems: list[Output] = []
         for index in np.flatnonzero((given >= SCORED) & (2 * removed > given)).tolist():
-            received = f"{removed[index]} of {given[index]} below {self._filters[index]:g}"
-            expected = f"most scores of {labels[index]} above the filter of the profile {self.parameters.name}"
+            received = f"{removed[index]} of {given[index]} below {filters[index]:g}"
+            expected = f"most scores of {labels[index]} above the filter of the profile {parameters.name}"
             problems.append(self._problem("score_filter", frame_id, f"{labels[index]}.score", expected, received))
-            self._filters[index] = 0.0  # reported
+            filters[index] = 0.0  # reported
         return problems
 
     def _left_out(self, outcome: Outcome) -> list[Output]:

@@ -137,7 +137,7 @@ class Streams:
         self.traces = traces
         self.instance = settings.instance
         self.keys = schemas.Keys(settings.prefix)
-        self.fusion = Fusion(settings.fuse)
+        self.fusion = Fusion.of(settings)
         self.limits = settings.limits.limits()
         self.policy = policy_of(settings)
         self._zone = cache(settings.zone)
@@ -283,14 +283,16 @@ class Streams:
     # Present streams
 
     def policy_for(self, session: str) -> Policy:
-        """Return the policy of a session, with its zones."""
+        """Return the policy of a session, with its zones and sensors."""
         names = self._settings.zones_of(session)
         if len(names) > MOST:
             expected, received = f"at most {MOST} zones and lines for a session", f"{len(names)}; the last are left out"
             self._report("refused", session, expected, received, path="zones")
         site, known = session.partition("/")[0], self._settings.zones
         zones = (self._zone(name, site if known[name].geo else "") for name in names[:MOST])
-        return replace(self.policy, zones=tuple(zones))
+        sensors = self.fusion.sensors_of(session, self.profiles.sensors)
+        needs_view = bool(sensors.uses) or session in self.fusion.sites
+        return replace(self.policy, zones=tuple(zones), sensors=sensors, needs_view=needs_view)
 
     def fixed_rate_for(self, session: str) -> FixedRate | None:
         """Return the output of a session at a fixed rate; None: it has none."""
@@ -601,7 +603,8 @@ class Streams:
     def _parsed(self, key: str) -> tuple[str, str]:
         stream = self.keys.stream_of(key)
         if self.fusion.is_session(stream):
-            raise schemas.MessageError("invalid_value", "key", f"a sensor not named {FUSED}, as its tracks", key)
+            part = "sensor" if stream.endswith(f"/{FUSED}") else "node"
+            raise schemas.MessageError("invalid_value", "key", f"a {part} not named {FUSED}, as its tracks", key)
         return stream, self.fusion.session_of(stream)
 
     def _backlog(self, session: str, now_ns: int) -> Backlog:

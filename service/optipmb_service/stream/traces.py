@@ -64,8 +64,10 @@ class Traces:
     def received(self, packet: Packet, message: schemas.Detections | schemas.Points) -> FrameTrace:
         """Record the span `receive` of a message that has just been decoded, below the context that came with it."""
         parent = self._w3c.extract({HEADER: packet.traceparent})
-        if packet.traceparent and not get_current_span(parent).get_span_context().is_valid:
-            self._report(message.stream, packet.traceparent)
+        invalid = packet.traceparent and not get_current_span(parent).get_span_context().is_valid
+        if invalid and message.stream not in self._reported and len(self._reported) < MAX_REPORTED:
+            self._reported.add(message.stream)
+            log.warning("traceparent_invalid", stream=message.stream, received=packet.traceparent)
         about = {
             "optipmb.stream": message.stream,
             "optipmb.topic": "detections" if packet.frame else "points",
@@ -111,8 +113,3 @@ class Traces:
         closing = threading.Thread(target=self._provider.shutdown, name="traces", daemon=True)
         closing.start()
         closing.join(seconds)
-
-    def _report(self, stream: str, received: str) -> None:
-        if stream not in self._reported and len(self._reported) < MAX_REPORTED:
-            self._reported.add(stream)
-            log.warning("traceparent_invalid", stream=stream, received=received)

@@ -37,7 +37,7 @@ from optipmb_service.stream.worlds import in_one_world, relocated
 from optipmb_service.telemetry.stream_meter import total
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from optipmb.zones import Event
     from optipmb_service.stream.state import Inputs, Position, ProcessedFrame
@@ -81,17 +81,29 @@ class Transition:
     Args:
         stream: `site/node/sensor`.
         parameters: the profile.
-        tracker: steps the density.
-        policy: where a sensor can be.
+        tracker: makes what steps the density.
+        policy: where a sensor can be, and how its frames are used.
     """
 
-    def __init__(self, stream: str, parameters: optipmb.Parameters, tracker: optipmb.Tracker, policy: Policy) -> None:
+    def __init__(
+        self,
+        stream: str,
+        parameters: optipmb.Parameters,
+        tracker: Callable[[optipmb.Parameters], optipmb.Tracker],
+        policy: Policy,
+    ) -> None:
         self.stream = stream
         self.parameters = parameters
-        self._tracker = tracker
+        self._trackers = [(parameters, tracker(parameters))]
+        """Each with its parameters: that of the profile, and those of sensors that differ."""
+        self._make = tracker
+        self._of: dict[str, int] = {}
+        """Index of the tracker of each sensor, where some differ."""
         self._policy = policy
         self._shapes = Shapes.of(policy.zones)
         values = json.dumps(parameters.model_dump(mode="json", exclude={"horizons"}))  # no track depends on them
+        if policy.sensors.shown():
+            values += repr(policy.sensors)
         self._digest = hashlib.blake2b(values.encode(), digest_size=16).digest()
 
     def name(self, frame_id: FrameId | None, starts: int) -> str:
@@ -102,6 +114,25 @@ class Transition:
             where.append(frame_id.sensor)
         digest.update(json.dumps([self.stream, starts, *where]).encode())
         return digest.hexdigest()
+
+    def parameters_of(self, sensor: str) -> optipmb.Parameters:
+        """Return the parameters of the frames of a sensor."""
+        return self._used(sensor)[0]
+
+    def _used(self, sensor: str) -> tuple[optipmb.Parameters, optipmb.Tracker]:
+        """Return parameters and tracker of the frames of a sensor."""
+        if not self._policy.sensors.uses:
+            return self._trackers[0]
+        if (index := self._of.get(sensor)) is None:
+            parameters = self._policy.sensors.parameters(self.parameters, sensor)
+            known = [one for one, _ in self._trackers]
+            if parameters not in known:
+                self._trackers.append((parameters, self._make(parameters)))
+                known.append(parameters)
+            if len(self._of) >= MAX_SENSORS:
+                self._of.clear()
+            index = self._of[sensor] = known.index(parameters)
+        return self._trackers[index]
 
     def no_objects(self, next_id: int) -> optipmb.Density:
         """Return an empty density."""
@@ -127,12 +158,12 @@ class Transition:
             return replace(refused, last=before.last), Outcome(frame)
         if inputs is None:
             message = frame.message
-            inputs = message, *convert.frame_of(self.parameters, message)
+            inputs = message, *convert.frame_of(self.parameters_of(frame_id.sensor), message)
         message, seen, ignored = inputs
         world = relocated(before, frame_id, message.relocation)
         if world.ahead:
             try:
-                seen, ignored = convert.frame_of(self.parameters, message, world.ahead)
+                seen, ignored = convert.frame_of(self.parameters_of(frame_id.sensor), message, world.ahead)
             except optipmb.FrameError as error:
                 world = world._replace(ahead=None, fault=error)
         if world.ahead is None:
@@ -235,12 +266,18 @@ class Transition:
                 versions={name: version(name) for name in ("optipmb", "numpy", "numba")}
                 | {"python": platform.python_version()},
                 parameters=self.parameters.model_dump(mode="json"),
+                sensors=self._differing({frame.frame_id.sensor for frame in frames}),
                 stamp_ns=base.density.stamp_ns,
                 next_id=base.density.next_id,
                 density=optipmb.bytes_of(base.density),
                 frames=tuple(dumped),
             )
         )
+
+    def _differing(self, sensors: set[str]) -> dict[str, dict[str, Any]]:
+        """Return the parameters of the sensors that have others than the profile."""
+        used = {name: self.parameters_of(name) for name in sorted(sensors)}
+        return {name: one.model_dump(mode="json") for name, one in used.items() if one is not self.parameters}
 
     def _begin(self, before: FilterState, frame: ProcessedFrame, reason: Reason, jump_ns: int | None = None) -> Begun:
         return Begun(
@@ -282,7 +319,7 @@ class Transition:
             density = before.density if keeps else self.no_objects(before.density.next_id)
             before = before.begun_anew(density, begun.session)
         sensor = before.sensor(frame_id.sensor)
-        result = self._tracker.step(before.density, seen)
+        result = self._used(frame_id.sensor)[1].step(before.density, seen)
         used = bool(result.diagnostics.cloud_used)
         same = sensor.tracked is not None and sensor.tracked[0] == frame_id.epoch
         highest = sensor.tracked[1] if sensor.tracked is not None and same else frame_id.seq - 1

@@ -11,6 +11,7 @@ import optipmb_schemas as schemas
 from pydantic import AfterValidator, Field
 
 import optipmb
+from optipmb.parameters import ALIKE
 from optipmb.zones import COUNTS, Event, Zone
 from optipmb_service.telemetry.stream_meter import MAX_COUNT
 
@@ -92,6 +93,8 @@ class Policy:
         astray_frames: frames in a row that agree on another place until the session restarts there.
         jumps: reaction to poses that jump within reach: `report` or `off`.
         zones: those whose events the session finds.
+        sensors: how the frames of the sensors of a fused session are used.
+        needs_view: whether a sensor without field of view is reported.
         at_once: frames that are ready which one call takes through the tracker; the next calls take the others. More
             are taken only while more than `held_bytes` are held.
     """
@@ -114,6 +117,8 @@ class Policy:
     jumps: Literal["off", "report"] = "report"
     at_once: int = 2**62
     zones: tuple[Zone, ...] = ()
+    sensors: optipmb.Sensors = ALIKE
+    needs_view: bool = False
 
     @property
     def jump_limits(self) -> JumpLimits:

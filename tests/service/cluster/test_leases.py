@@ -1,12 +1,12 @@
 """Leases of partitions, over SQLite, a real NATS server, and the store in memory that the simulation below uses."""
 
-from __future__ import annotations
-
 import random
 import threading
 from collections import Counter
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -19,17 +19,11 @@ from optipmb_service.cluster.jetstream import JetStream
 from optipmb_service.cluster.leases import LEFT_AT_ONCE, PARTITIONS, Change, partition_key, partition_of
 from optipmb_service.cluster.member import Member
 from optipmb_service.cluster.sqlite import SqliteStore
-from optipmb_service.cluster.store import ENDED, Fenced, Record, StoreError, Write
+from optipmb_service.cluster.store import ENDED, Fenced, LeaseStore, Record, StoreError, Write
 from optipmb_service.stream.persistence import CheckpointWriter
 from router import until
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
-    from optipmb_service.cluster.store import LeaseStore
-
-    Make = Callable[[], LeaseStore]
+Make = Callable[[], LeaseStore]
 
 STREAM = "a.b/c_d/e-f"
 TICK_S = LEASE_S / 20

@@ -113,9 +113,12 @@ def test_a_session_begins_whatever_the_log_says(filled: MessageLog, monkeypatch:
 
 
 def test_what_was_closed_does_not_come_back(filled: MessageLog) -> None:
-    """A session of several sensors that was closed by a query begins with new frames, not with those in the log."""
-    session = Session("a/b/fused", optipmb.load_profile("nuscenes"), Policy(), fused=True)
-    closed = forgotten(session.snapshot())
+    """A session of several sensors that was closed by a query begins with new frames, not with those in the log.
+
+    Others begin with the frames of their node or site.
+    """
+    state = Session("a/b/fused", optipmb.load_profile("nuscenes"), Policy(), fused=True)
+    closed = forgotten(state.snapshot())
     found: list[list[tuple[Packet, bool]]] = []
     came = threading.Event()
 
@@ -124,11 +127,13 @@ def test_what_was_closed_does_not_come_back(filled: MessageLog) -> None:
         came.set()
 
     frames = Log(LogReader(filled, 600.0), Keys(), Fusion(("a/*/*",)))
-    for checkpoint in (None, closed):
+    of_site = Log(LogReader(filled, 600.0), Keys(), Fusion((), {"a/fused/x": ["a/*/c"], "b/fused/x": ["b/*/*"]}))
+    asked = ((frames, "a/b/fused", None), (frames, "a/b/fused", closed), (of_site, "a/fused/x", None))
+    for reader, session, checkpoint in (*asked, (of_site, "b/fused/x", None)):
         came.clear()
-        frames.fetch("a/b/fused", checkpoint, take, lambda _: None)
+        reader.fetch(session, checkpoint, take, lambda _: None)
         assert came.wait(60.0)
-    assert [len(one) for one in found] == [FRAMES, 0]
+    assert [len(one) for one in found] == [FRAMES, 0, FRAMES, 0]
 
 
 def test_a_log_that_is_not_there_is_asked_for_once_in_a_while(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,13 +1,14 @@
 """NATS servers with access control: real servers, with certificates and users of each kind."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json
 import socket
+import subprocess
 import threading
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -25,12 +26,7 @@ from router import Node, Sensor, until
 from routers import free_endpoint, open_router
 from service_process import ServiceProcess
 
-if TYPE_CHECKING:
-    import subprocess
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
-    Serve = Callable[[str], str]
+Serve = Callable[[str], str]
 
 STREAM = "site/node/sensor"
 

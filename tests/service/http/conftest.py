@@ -1,7 +1,5 @@
 """A service as the HTTP server sees it."""
 
-from __future__ import annotations
-
 import pytest
 from watched import Session, Watched
 

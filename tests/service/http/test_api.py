@@ -1,13 +1,13 @@
 """JSON over HTTP: who may read, what readers get, and what slow and many readers cost."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import http.client
 import json
+from collections.abc import Iterator
+from pathlib import Path
 from socket import SO_RCVBUF, SOL_SOCKET
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 import structlog
@@ -29,10 +29,6 @@ from websocket import (
     WebSocketConnectionClosedException,
     create_connection,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 ALL = "garage/*/*"
 DEADLINE_S = 60.0

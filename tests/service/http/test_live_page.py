@@ -1,14 +1,13 @@
 """What the page costs and gives: viewers, their taps, and the frames that they get. A browser sees it in tests/e2e."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import functools
 import http.client
 import json
 import time
-from typing import TYPE_CHECKING, Any, cast
+from collections.abc import Iterator, MutableMapping
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -23,9 +22,6 @@ from tracks_message import tracks_message
 from watched import KEYS, Session, Watched, asked, key_of, publication, served
 
 from optipmb import Georeference
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, MutableMapping
 
 VIEWERS = 6
 STREAM = "yard/gate/lidar"

@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from sessions import Merged, tracks
 import optipmb
 
 KEYS = Keys()
+CROSSING = "site/fused/crossing"
 OTHER = Sensor("site/other/lidar", b"o" * 16)
 
 
@@ -188,6 +190,92 @@ def test_the_sensors_of_a_session_have_one_owner() -> None:
     assert not fusion.is_session("street/car-7/fused")
     names = [f"yard/crane/s{number}" for number in range(20)]
     assert len({partition_of(fusion.session_of(name)) for name in names}) == 1
+
+
+def test_streams_of_several_nodes_feed_one_session() -> None:
+    """By the patterns of their site; no node has the name of such sessions."""
+    options = {"crossing": {"streams": ["site/*/lidar*", "site/cam-*/front"]}, "yard": {"streams": ["other/a/*"]}}
+    fusion = Fusion.of(load(None, {"fused": options, "fuse": ["site/*/radar"]}).settings)
+    assert fusion.session_of("site/car-7/lidar-front") == fusion.session_of("site/cam-1/front") == CROSSING
+    assert fusion.session_of("site/car-7/radar") == "site/car-7/fused"
+    assert fusion.session_of("site/car-7/front") == "site/car-7/front"
+    assert fusion.session_of("street/car-7/lidar") == "street/car-7/lidar"
+    assert fusion.session_of("other/a/x") == "other/fused/yard"
+    assert all(map(fusion.is_session, (CROSSING, "site/fused/another", "site/car-7/fused")))
+    assert [fusion.seen_by(name) for name in (CROSSING, "site/car-7/fused")] == ["site/*/*", "site/car-7/*"]
+    assert not Fusion.of(load(None, {}).settings).is_session(CROSSING)
+
+
+def test_nodes_of_a_site_share_tracks(start: Callable[..., Any]) -> None:
+    """The tracks are those of one session with all their frames; detections below the node `fused` are refused."""
+    fused = {"crossing": {"streams": ["site/*/front", "site/*/rear"]}}
+    service, endpoint = start(fused=fused, sensors={"site/*/rear": {"trust_size": False}}, recovery_wait_s=30)
+    there = replace(REAR, stream="site/other/rear")
+    frames = [sensor.detections(seq) for seq in range(20) for sensor in (FRONT, there)]
+    sensors = optipmb.Sensors.read({"site/*/rear": {"trust_size": False}})
+    one = Session(CROSSING, optipmb.load_profile("nuscenes"), Policy(recovery_wait_ns=0, sensors=sensors), fused=True)
+    merged = Merged()
+    with Node(endpoint) as node:
+        for frame in frames:
+            merged.take(one.on_detections(frame, 0))
+        node.send(*frames, OTHER.detections(0))
+        until(lambda: node.ask(KEYS.query(CROSSING, "state"), SessionState).frames == len(frames), "all are tracked")
+        assert node.ask(KEYS.query(CROSSING, "state"), SessionState).session == one.session
+        found = Merged()
+        with node.tracks_seen.changed:
+            for key, payload, _ in node.tracks_seen.items:
+                if key == KEYS.tracks(CROSSING):
+                    found.add(decode(payload, Tracks), 0)
+        assert found.plain() == merged.plain()
+        assert node.refused(KEYS.query(FRONT.stream, "state")).expected.startswith(CROSSING)
+        node.send_raw(KEYS.detections("site/fused/lidar"), b"")
+        blind = {FRONT.stream, there.stream}
+
+        def reported() -> bool:
+            found = service.status().problems
+            named = any(one.expected == "a node not named fused, as its tracks" for one in found)
+            return named and {one.stream for one in found if one.code == "no_view"} == blind
+
+        until(reported, "sensors without field of view, and the reserved name")
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"fused": {"a": {"streams": ["*/n/*"]}}}, "patterns of one site, named without *, received *"),
+        ({"fused": {"a": {"streams": ["s/n/*", "t/n/*"]}}}, "patterns of one site, named without *, received s, t"),
+        ({"fused": {"a": {"streams": []}}}, "setting fused.a.streams"),
+        ({"fused": {"a": {"streams": ["s/n/*"] * 65}}}, "setting fused.a.streams"),
+        ({"fused": {"a/b": {"streams": ["s/n/*"]}}}, "setting fused.a/b"),
+        ({"fused": {"a": {"streams": ["s/fused/x"]}}}, "no node is named fused"),
+        ({"fused": {"a": {"streams": ["s/n/*"], "read": ["kiosk"]}}}, "a node looks like site/node, received 'kiosk'"),
+        ({"fused": {"a": {"streams": ["s/n/*"]}}, "rewind_s": 0}, "rewind_s must not be 0"),
+        (
+            {"fused": {"a": {"streams": ["s/n/x*"]}, "b": {"streams": ["s/*/*y"]}}},
+            "fused.b.streams: a stream feeds one session, s/*/*y and s/n/x* of fused.a.streams have some in common",
+        ),
+        ({"fused": {"a": {"streams": ["s/n/*"]}}, "fuse": ["*/*/lidar"]}, "and */*/lidar of fuse have some in common"),
+    ],
+)
+def test_a_wrong_session_of_nodes_is_named(options: dict[str, Any], text: str) -> None:
+    """The path and what is wrong; a stream feeds one session."""
+    with pytest.raises(SettingsInvalidError) as caught:
+        load(None, options)
+    assert text in str(caught.value)
+
+
+def test_patterns_without_a_common_stream_are_allowed() -> None:
+    """Whatever their letters have in common."""
+    fused = {
+        "a": {"streams": ["s/n/l*r", "s/n/x*"]},
+        "b": {"streams": ["s/n/l*a", "s/m/*"]},
+        "c": {"streams": ["t/n/*"]},
+    }
+    assert load(None, {"fused": fused, "fuse": ["s/n/y*"]}).settings.fused_sessions.keys() == {
+        "s/fused/a",
+        "s/fused/b",
+        "t/fused/c",
+    }
 
 
 @pytest.mark.parametrize(

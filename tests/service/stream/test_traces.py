@@ -1,14 +1,14 @@
 """Traces: spans of frames by OpenTelemetry, from the context that a publisher sends to the context of the tracks."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
 import threading
 from collections import defaultdict
+from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final
 
 import pytest
 import structlog
@@ -16,21 +16,15 @@ from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTrace
 from opentelemetry.sdk.trace import ReadableSpan, TracerProvider
 from opentelemetry.sdk.trace.export import SimpleSpanProcessor
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
+from opentelemetry.trace import SpanContext
 from optipmb_client import Publisher, Subscriber
 from optipmb_client.trace_context import attached, attachment_of
-from optipmb_schemas import Tracks, decode
+from optipmb_schemas import Detections, Points, Tracks, decode
 from optipmb_service.stream.checkpoint import encode_checkpoint
 from optipmb_service.stream.traces import Traces
 from registries import Around, packet_of, streams_of
 from router import Sensor, plain, until
 from service_process import ServiceProcess
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from opentelemetry.trace import SpanContext
-    from optipmb_schemas import Detections, Points
 
 SENSOR = Sensor()
 PARENT = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"
@@ -42,7 +36,7 @@ def traceparent(context: SpanContext) -> str:
 
 
 class Traced(Around):
-    """The streams of a process that records spans, and what it publishes."""
+    """The streams of a process that records spans, and its published tracks."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -54,7 +48,6 @@ class Traced(Around):
         self.streams = streams_of(self, traces=self.traces)
 
     def publish(self, payload: bytes, attachment: bytes | None = None) -> None:  # type: ignore[override]
-        """Keep what is published."""
         self.published.append((payload, attached(attachment)))
 
     def send(self, message: Detections | Points, parent: str = "") -> None:
@@ -274,7 +267,7 @@ def collector() -> Iterator[Collector]:
 
 @pytest.mark.parametrize("options", [(), ("--workers", "2")])
 def test_a_trace_goes_through_processes(collector: Collector, options: tuple[str, ...]) -> None:
-    """The span of a node is the parent of those that a service exports, and those of the tracks' reader."""
+    """The span of a node is the parent of the service's spans, which are parents of the tracks' reader."""
     variables = {
         "OPTIPMB_TRACES": "true",
         "OTEL_EXPORTER_OTLP_ENDPOINT": f"http://127.0.0.1:{collector.server_port}",
@@ -329,7 +322,7 @@ def test_a_collector_that_fails_is_logged_and_harms_nothing(collector: Collector
 
 
 def test_the_missing_extra_is_named(tmp_path: Path) -> None:
-    """A service that is to record traces says at its start what is missing."""
+    """A service that is to record traces names the missing extra at its start."""
     (tmp_path / "opentelemetry").mkdir()
     (tmp_path / "opentelemetry" / "__init__.py").write_text("")  # in the place of the real one
     variables = {"OPTIPMB_TRACES": "true", "PYTHONPATH": os.pathsep.join((str(tmp_path), *sys.path))}

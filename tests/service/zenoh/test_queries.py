@@ -1,5 +1,6 @@
 """Queries that come faster than they are answered."""
 
+import contextlib
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -8,9 +9,14 @@ from typing import Any, Final
 import optipmb_service.zenoh.transport
 import pytest
 from optipmb_schemas import Keys, Problem, SessionState, decode
+from optipmb_service.settings import Settings
 from optipmb_service.stream import queries
-from optipmb_service.stream.queries import StreamQueries
+from optipmb_service.stream.queries import ServiceQueries, StreamQueries
+from optipmb_service.zenoh.inputs import Packet
+from optipmb_service.zenoh.transport import Transport
+from registries import Around, packet_of, streams_of
 from router import Node, Sensor, until
+from routers import free_endpoint, open_router
 
 KEYS: Final = Keys()
 SENSOR: Final = Sensor()
@@ -72,3 +78,22 @@ def test_queries_beyond_those_that_may_be_open_are_refused(
         assert {(one.code, str(MOST) in one.expected) for one in refused} == {("refused", True)}
         for _ in range(2 * MOST):  # each gives its room back
             assert [ok for ok, _, _ in node.query(key, None, ASK_S)] == [True]
+
+
+@pytest.mark.parametrize("parent", ["", "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"])
+def test_messages_that_move_to_another_member_keep_their_trace_context(parent: str) -> None:
+    """They come with the key under which they were published, and with the context, where they have one."""
+    packet, endpoint = packet_of(SENSOR.detections(0)), free_endpoint()
+    nothing: Any = None
+    packet.traceparent = parent
+    member = ServiceQueries(
+        streams_of(Around()), status=nothing, metrics=nothing, hand_over=lambda _, give: give(packet), workers=1
+    )
+    with open_router(endpoint), contextlib.ExitStack() as closing:
+        there, here = (Transport(Settings(instance=name, connect=[endpoint], store="none")) for name in ("b", "a"))
+        closing.callback(there.close)
+        closing.callback(here.close)
+        there.serve_service(member.answer)
+        found: list[Packet] = []
+        until(lambda: found.extend(here.ask_recent([SENSOR.stream])) or found, "the messages")
+    assert [(one.key, one.payload, one.traceparent) for one in found] == [(packet.key, packet.payload, parent)]
