@@ -280,7 +280,7 @@ def all_within(words: Array) -> bool:
         good &= identity > before
         before = identity
     for k in range(TRACK):
-        low, high = _BOUNDS_OF_WORDS[k]
+        low, high = _BOUNDS_OF_WORDS[k, 0], _BOUNDS_OF_WORDS[k, 1]
         if low <= high:
             for value in words[k * count : (k + 1) * count]:
                 good &= low <= value <= high

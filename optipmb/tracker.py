@@ -288,28 +288,20 @@ class Tracker:
         p_d = detection_probability(prior, cloud, looks, moment, table)
 
         # PMB update: hypotheses, association, states, births
-        missed_from_ns = prior.missed_from_ns if looks is None else looks.misses.missed_from_ns
+        since_ns = prior.missed_from_ns if looks is None else looks.misses.missed_from_ns
         likely = UNGROUPED if prior.class_probability is None else prior.class_probability
-        given = (
-            prior.bernoulli.words,
-            missed_from_ns,
-            likely,
-            prior.poisson.words,
-            len(predicted.poisson),
-            prior.next_id,
-        )
+        given = prior.bernoulli.words, since_ns, likely, prior.poisson.words, len(predicted.poisson), prior.next_id
         after = Update(*update(given, p_d, tuple(z), tuple(moment), table.confusion, table.classes))
         objects = Bernoullis.of(after.objects)
         poisson = Poissons.of(after.components) if modules.rpp else Poissons.empty()
         misses = None if looks is None else follow_looks(looks, after, prior.bernoulli, objects, z, moment, table)
         pi = None if prior.class_probability is None else after.class_probability
         born = len(objects) - after.known
-        posterior = Density(moment.stamp_ns, prior.next_id + born, objects, poisson, density.labels, misses, pi)
+        next_id, labels, sensor = prior.next_id + born, density.labels, density.sensor
+        posterior = Density(moment.stamp_ns, next_id, objects, poisson, labels, misses, pi, sensor=sensor)
         if scores is not None:
             own = followed(scores, predicted, posterior, after, chosen, moment, table)
             posterior = replace(posterior, self_calibration=own)
-        if density.sensor is not None:
-            posterior = replace(posterior, sensor=density.sensor)
 
         # Track extraction
         shown = objects.words, posterior.missed_from_ns, after.measurement, tuple(z), tuple(moment)

@@ -314,8 +314,10 @@ def moment_match(log_weight: Array, mean: Array, covariance: Array, mean_out: Ar
     Headings are averaged as differences from the heading of the heaviest component, taken in (-pi, pi]. Where one of
     them is unknown, the heaviest component stands for all. Weights need not sum to one.
     """
-    count, largest, others, straight = log_weight.shape[0], log_weight.max(), 0.0, False
+    count, largest, others, straight = log_weight.shape[0], -math.inf, 0.0, False
     weight = np.empty(count)
+    for j in range(count):
+        largest = max(largest, log_weight[j])
     for j in range(count):
         weight[j] = math.exp(log_weight[j] - largest)
         straight |= heading_unknown(covariance[j])
@@ -327,7 +329,10 @@ def moment_match(log_weight: Array, mean: Array, covariance: Array, mean_out: Ar
         if weight[j] > weight[heaviest]:
             heaviest = j
     if straight:
-        mean_out[:], covariance_out[:] = mean[heaviest], covariance[heaviest]
+        for s in range(STATE):
+            mean_out[s] = mean[heaviest, s]
+            for t in range(STATE):
+                covariance_out[s, t] = covariance[heaviest, s, t]
         return
     deviation, shift = np.empty((count, STATE)), np.zeros(STATE)
     for j in range(count):
