@@ -202,6 +202,14 @@ class _Index(IndexDataCacheFile):
         except (AttributeError, ImportError):
             return {}
 
+    def save(self, key: Any, data: Any) -> None:
+        """Save machine code; one process at a time, for numba reads the index and then replaces it."""
+        with ExitStack() as stack:
+            with suppress(OSError):  # its file system has no locks
+                file = stack.enter_context((Path(self._cache_path) / "optipmb.index.lock").open("a"))
+                fcntl.flock(file, fcntl.LOCK_EX)
+            super().save(key, data)  # type: ignore[no-untyped-call]  # numba ships no types
+
 
 class _PackageIndex(_Index):
     """An index of the package: where one kernel has no machine code, helper processes compile all of them."""
