@@ -46,7 +46,8 @@ def address(watched: Watched) -> Iterator[str]:
 def guarded(watched: Watched, tmp_path: Path) -> Iterator[str]:
     file = tmp_path / "tokens.json"
     file.write_text(json.dumps({hashlib.sha256(token.encode()).hexdigest(): name for token, name in TOKENS.items()}))
-    with served(watched, http_tokens=str(file)) as address:
+    fused = {"crossing": {"streams": ["garage/*/radar"], "read": ["garage/rig"]}}
+    with served(watched, http_tokens=str(file), fused=fused) as address:
         yield address
 
 
@@ -185,7 +186,7 @@ def test_the_newest_tracks_are_not_predicted(address: str) -> None:
 
 
 def test_tokens_decide_who_reads_what(guarded: str, session: Session) -> None:
-    """No token or a wrong one: 401; a node reads its own streams: 403 for others. Health asks for none."""
+    """No token or a wrong one: 401; a node reads its own streams and `fused` ones that name it. Health asks none."""
     viewer, node = {"authorization": "Bearer secret"}, {"authorization": "bearer rig"}
     for path in ("streams", f"tracks?stream={ALL}", f"zones?stream={ALL}", f"stream?stream={ALL}"):
         assert get(guarded, path)[0] == get(guarded, path, authorization="Bearer no")[0] == http.client.UNAUTHORIZED
@@ -195,6 +196,8 @@ def test_tokens_decide_who_reads_what(guarded: str, session: Session) -> None:
         assert response.status == http.client.UNAUTHORIZED, "the page shows no tracks to those who may not read them"
     assert get(guarded, f"tracks?stream={ALL}", **viewer)[0] == OK
     assert get(guarded, "tracks?stream=garage/rig/*", **node)[0] == OK
+    assert get(guarded, "tracks?stream=garage/fused/crossing", **node)[0] == OK
+    assert get(guarded, "tracks?stream=garage/fused/*", **node)[0] == http.client.FORBIDDEN
     assert refused(guarded, f"stream={ALL}")[0] == http.client.UNAUTHORIZED
     assert refused(guarded, f"stream={ALL}", header=["Authorization: Bearer rig"])[0] == http.client.FORBIDDEN
     with socket(guarded, f"stream={ALL}", subprotocols=["optipmb.v1", "bearer.secret"]) as connection:
