@@ -520,8 +520,10 @@ def _sensor(path: str, table: object) -> Sensor:
         elif name in FLAGS and isinstance(value, bool):
             values[name] = value
         else:
-            expected = "true or false" if name in FLAGS else f"one of profile, {', '.join(FLAGS)}"
-            raise ParameterError(f"{path}.{name}", expected, repr(value) if name in FLAGS else repr(name))
+            expected = {"profile": "the name of a profile or a TOML file"} | dict.fromkeys(FLAGS, "true or false")
+            if name not in expected:
+                raise ParameterError(f"{path}.{name}", f"one of {', '.join(expected)}", repr(name))
+            raise ParameterError(f"{path}.{name}", expected[name], repr(value))
     return Sensor(**values)
 
 
