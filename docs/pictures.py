@@ -150,10 +150,10 @@ def two_sensors(frames: int = 130) -> tuple[list[tuple[str, int, np.ndarray]], l
         for (begins, aside, speed, yaw), path in zip(cars, paths, strict=True):
             along = speed * (k / 20 - begins / RATE) - 55.0
             x, y = along * np.cos(yaw) - aside * np.sin(yaw), along * np.sin(yaw) + aside * np.cos(yaw)
-            if k / 2 < begins or along > 60.0:  # noqa: PLR2004 - m
+            if k / 2 < begins or along > 60.0:  # noqa: PLR2004 - end of the road, m
                 continue
             path.append((x, y))
-            seen = np.hypot(x, y) < 70 and abs(np.arctan2(y, x)) < 0.35 if is_radar else np.hypot(x, y) < 40  # noqa: PLR2004 - m
+            seen = np.hypot(x, y) < 70 and abs(np.arctan2(y, x)) < 0.35 if is_radar else np.hypot(x, y) < 40  # noqa: PLR2004 - ranges, m, and half of the angle of the radar
             if seen and rng.random() < (0.6 if is_radar else 0.9):
                 noise, turn = (1.2, 0.8) if is_radar else (0.12, 0.05)
                 true.append((x + rng.normal(0, noise), y + rng.normal(0, noise), yaw + rng.normal(0, turn), 0.8))

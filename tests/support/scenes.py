@@ -13,6 +13,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+import optipmb
 from optipmb import Frame, Modules, Parameters, StepResult
 
 Array = NDArray[np.float64]
@@ -237,8 +238,6 @@ def partial(
 
 def frame_of(parameters: Parameters, given: SceneFrame) -> Frame:
     """The tracker's frame of a scene's frame."""
-    import optipmb  # noqa: PLC0415 - scenes can be generated without the tracker
-
     cloud = None
     if given.cloud is not None:
         pose = optipmb.Pose(translation=given.cloud.pose.translation, quaternion=given.cloud.pose.quaternion)
@@ -334,8 +333,6 @@ def boxes(  # noqa: PLR0913 - a detection has this many columns
     field_of_view: Any = None,
 ) -> Frame:
     """A frame of boxes of one class at (x, y) and z = 0; scalars and single rows stand for all of them."""
-    import optipmb  # noqa: PLC0415 - scenes can be generated without the tracker
-
     position = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
     count = len(position)
     frame, _ = optipmb.make_frame(
@@ -357,8 +354,6 @@ def boxes(  # noqa: PLR0913 - a detection has this many columns
 
 def steps(parameters: Parameters, frames: Iterable[Frame], modules: Modules | None = None) -> list[StepResult]:
     """The results of a tracker for frames, one after the other."""
-    import optipmb  # noqa: PLC0415 - as above
-
     tracker, results = optipmb.Tracker(parameters, modules), []
     density = tracker.initial()
     for frame in frames:

@@ -262,7 +262,7 @@ def test_a_reset_ends_the_output_until_the_next_frame(process: Callable[..., Pro
     """Tracks of a discarded density are not predicted."""
     one = process(RATE)
     one.frame(SENSOR.detections(0))
-    one.streams.command(SENSOR.stream, lambda stream: stream.deliver(stream.session.reset()), urgent=True)  # type: ignore[union-attr]
+    one.streams.command(SENSOR.stream, lambda stream: stream.deliver(stream.session.reset()), urgent=True)  # type: ignore[union-attr]  # it has one
     one.run()
     before = len(one.now)
     one.until(one.now_ns + 90 * MS)

@@ -47,7 +47,7 @@ class Traced(Around):
         self.traces = Traces("test", provider)
         self.streams = streams_of(self, traces=self.traces)
 
-    def publish(self, payload: bytes, attachment: bytes | None = None) -> None:  # type: ignore[override]
+    def publish(self, payload: bytes, attachment: bytes | None = None) -> None:  # type: ignore[override]  # as the service calls it
         self.published.append((payload, attached(attachment)))
 
     def send(self, message: Detections | Points, parent: str = "") -> None:
@@ -60,7 +60,7 @@ class Traced(Around):
     def spans(self) -> dict[int, dict[str, list[ReadableSpan]]]:
         found: dict[int, dict[str, list[ReadableSpan]]] = defaultdict(lambda: defaultdict(list))
         for one in self.exporter.get_finished_spans():
-            found[int((one.attributes or {})["optipmb.seq"])][one.name].append(one)  # type: ignore[arg-type]
+            found[int(str((one.attributes or {})["optipmb.seq"]))][one.name].append(one)
         return found
 
 
@@ -147,7 +147,7 @@ def test_payloads_are_those_without_traces() -> None:
     payloads = [[plain(decode(one, Tracks)) for one, _ in process.published] for process in (traced, plain_one)]
     assert payloads[0] == payloads[1]
     assert [parent for _, parent in plain_one.published] == [""] * 5
-    states = [process.streams.of(SENSOR.stream).session.snapshot() for process in (traced, plain_one)]  # type: ignore[union-attr]
+    states = [process.streams.of(SENSOR.stream).session.snapshot() for process in (traced, plain_one)]  # type: ignore[union-attr]  # both have one
     assert encode_checkpoint(states[0]) == encode_checkpoint(states[1])
 
 
