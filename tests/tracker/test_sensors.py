@@ -203,6 +203,15 @@ def test_headings_that_are_not_trusted_are_as_unknown_ones() -> None:
     assert [one.tracks.words.tobytes() for _, _, one in ours] == [one.tracks.words.tobytes() for _, _, one in theirs]
 
 
+@pytest.mark.parametrize("detection", [0.02, 0.5, 0.95])
+def test_a_miss_says_as_much_as_the_detection_probability_of_its_sensor(detection: float) -> None:
+    """With odds of existence times 1 - q at a miss, (1 - p)^a = 1 - q; a better sensor's miss counts as one."""
+    own = Sensor(changed(KITTI, detection=detection)).parameters(KITTI)
+    for name, session in KITTI.classes.items():
+        naive = 1.0 - min(detection, session.detection)
+        assert (1.0 - session.detection) ** own.classes[name].attention == pytest.approx(naive, rel=1e-12)
+
+
 def test_a_class_that_the_profile_of_a_sensor_lacks_is_neither_detected_nor_missed() -> None:
     """Its detections are left out, and existence and scores of others' objects stay."""
     without = KITTI.model_copy(update={"classes": {name: KITTI.classes[name] for name in ("Pedestrian", "Cyclist")}})
@@ -233,6 +242,7 @@ def test_an_ordinary_sensor_has_the_parameters_of_the_session() -> None:
     [
         ({"a/b/c": {"starts": True}}, r"sensors\.a/b/c\.starts: expected one of profile, starts_tracks"),
         ({"a/b/c": {"trust_size": 1}}, r"sensors\.a/b/c\.trust_size: expected true or false, received 1"),
+        ({"a/b/c": {"profile": 3}}, r"sensors\.a/b/c\.profile: expected the name of a profile"),
         ({"a/b/c": {"profile": "radra"}}, r"sensors\.a/b/c\.profile: expected one of"),
         ({"a/b/c": 1}, r"sensors\.a/b/c: expected a table"),
         (1, "sensors: expected a table"),
