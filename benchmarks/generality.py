@@ -4,20 +4,32 @@ Prints CSV, a row for each cell and profile. All classes of a detector are track
 made from the first frames of each recording, as `optipmb track --profile auto` does. Slower rates take every second
 and every fifth frame of KITTI. Columns in addition to `optipmb evaluate`:
 
+- IDF1, IDS all: of the tracks above the best threshold, and identity switches of all tracks.
+- scenes: AMOTA of nuScenes, the mean over scenes that have objects.
 - sure: HOTA of the confirmed tracks alone, without a threshold on scores.
+- gain: confirmed tracks with an object within two metres, less those without, as a share of the objects.
 - confirmed: share of all tracks that are confirmed.
 - delay: mean time from the first frame of a track to its first confirmed one, s, of tracks that are ever confirmed.
 - ghosts: confirmed tracks without an object within two metres.
-- ECE: expected calibration error of `existence`, over ten bins.
+- NEES, inside: of the positions of confirmed tracks; inside is the share within the ellipse of 95 %.
+- existence: largest difference of the predicted and the observed share of objects, of tenths with `TENTH` of the boxes.
+- speed: root mean square error of the velocity of moving objects in KITTI, m/s, against labels half a second apart.
+
+With `--summary` it prints the figures by which a change of the default is judged, a line each. With `--cache` a cell is
+computed once for each state of the tracker.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import functools
+import hashlib
+import json
+import math
 import sys
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,22 +37,26 @@ from typing import TYPE_CHECKING
 import numpy as np
 from optipmb_tools.datasets import open_dataset
 from optipmb_tools.evaluation import default_rules
-from optipmb_tools.evaluation.calibration import calibration
-from optipmb_tools.evaluation.cases import CENTRE_DISTANCE
-from optipmb_tools.geometry import Pose, to_sensor, to_world
+from optipmb_tools.evaluation.calibration import calibration, rows_of, sample
+from optipmb_tools.evaluation.cases import CENTRE_DISTANCE, best_pairs
+from optipmb_tools.evaluation.clear import clear
+from optipmb_tools.geometry import Pose, stack_poses, to_sensor, to_world
 from optipmb_tools.results import FullTable, full_table, stacked
 from optipmb_tools.results.kitti import LEAST_SHOWN
 from optipmb_tools.run import profiles
+from optipmb_tools.run.tracking import tracker_frame
 from optipmb_tools.tuning.clips import Clip, load, of_class
 from optipmb_tools.tuning.scoring import plain_figures, rules_of, scorer_of
 
 import optipmb
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from optipmb_tools.datasets import DataSequence, DetectionFrame, Truth
+    from optipmb_tools.evaluation.cases import Case
     from optipmb_tools.geometry import Bools, Floats, Ints
+    from optipmb_tools.tuning.scoring import Measured, Scorer
 
     from optipmb import Parameters, Tracks
 
@@ -58,13 +74,26 @@ DETECTORS = {
 """Folder and classes of each detector; `nuscenes-more` has seven scenes."""
 STRIDES = {"kitti": (1, 2, 5), "nuscenes": (1,), "nuscenes-more": (1,)}
 SHOWN = ("sAMOTA", "AMOTA", "MOTA", "HOTA", "HOTA, all", "IDS", "FP", "FN")
-PARTS = ("sure", "confirmed", "delay", "ghosts", "ECE")
+PARTS = (
+    *("IDF1", "IDS all", "scenes", "sure", "gain", "confirmed", "delay", "ghosts"),
+    *("NEES", "inside", "existence", "speed"),
+)
 TUNED = {
     "kitti": ("kitti", "kitti-second-iou", "kitti-virconv"),
     "nuscenes": ("nuscenes", "nuscenes-megvii"),
     "nuscenes-more": ("nuscenes", "nuscenes-megvii"),
 }
 LEAST = 1e-3
+FEW_SEQUENCES = ("0004", "0007", "0011", "0017", "scene-0061", "scene-0103", "scene-0553", "scene-1077")
+"""Those of `--fast`."""
+TENTH = 0.02
+"""Share of the boxes from which a tenth of the existence probabilities is looked at."""
+MOVING = 2.0
+"""Speed from which an object counts as moving, m/s."""
+
+
+STANDING = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+Figures = dict[str, dict[str, "float | None"]]
 
 
 @dataclass(frozen=True)
@@ -91,7 +120,7 @@ class Thinned:
         """Yield them."""
         for frame in self.whole.frames():
             if frame.index % self.stride == 0:
-                pose = frame.pose if self.posed else Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+                pose = frame.pose if self.posed else STANDING
                 scores = {"": frame.score, "scaled": 0.4 * frame.score, "cubed": frame.score**3}[self.distort]
                 yield replace(frame, index=frame.index // self.stride, pose=pose, score=np.maximum(scores, LEAST))
 
@@ -116,14 +145,14 @@ class Cell:
     profile: str
     posed: bool = True
     distort: str = ""
+    fast: bool = False
 
-    def rows(self) -> list[list[str]]:
-        """Return a row of figures for each class."""
+    def figures(self) -> Figures:
+        """Return the figures of each class."""
         folder, names = DETECTORS[self.detector]
         dataset = "kitti" if folder == "kitti" else "nuscenes"
-        rules = rules_of(dataset)
-        opened = open_dataset(dataset, self.root / folder, self.detector, clouds=False)
-        sequences = list(opened.sequences(["all"]))
+        rules, near = rules_of(dataset), default_rules(dataset, "distance", CENTRE_DISTANCE)
+        sequences = sequences_of(self.root, self.detector, fast=self.fast)
         plain = self.stride == 1 and self.posed and not self.distort
         taken = sequences if plain else [Thinned(one, self.stride, self.posed, self.distort) for one in sequences]
         tracked = []
@@ -131,37 +160,52 @@ class Cell:
             parameters = profiles.profile_for(self.profile, [one])
             clip = load(one, parameters, rules)
             tracked.append((clip, *track(clip, parameters, posed=self.posed)))
-        rows = []
+        found = {}
         for name in names:
             if name not in tracked[0][0].labels:
                 continue
             scorer = scorer_of(dataset, name, sequences)
-            near = default_rules(dataset, "distance", CENTRE_DISTANCE)
-            all_of, sure, true, existence, certain, waits = [], [], [], [], [], []
+            all_of, sure, waits, speeds, good, certain = [], [], [], [], [], []
             for clip, table, confirmed in tracked:
                 own, mine = of_class(clip, name, rules), table.names == name
-                all_of.append(scorer.measure(own, table.take(mine)))
-                sure.append(scorer.measure(own, table.take(mine & confirmed)))
-                found = calibration(own.world, table.take(mine), table.take(mine), name, near)
-                existence.append(found.existence)
-                true.append(found.true)
                 shown = table.take(mine & confirmed)
-                ghosts = calibration(own.world, shown, shown, name, near)
-                certain.append((~ghosts.true).sum())
+                all_of.append(scorer.measure(own, table.take(mine)))
+                sure.append(scorer.measure(own, shown))
+                good.append(calibration(own.world, table.take(mine), table.take(mine), name, near))
+                certain.append(calibration(own.world, shown, shown, name, near))
                 waits.extend(_delays(table.id[mine], clip.stamps[table.frame[mine]], confirmed[mine]))
-            figures = plain_figures(scorer.figures(all_of))
-            confirmed_share = sum(int((table.names[sure_of] == name).sum()) for _, table, sure_of in tracked)
-            count = sum(int((table.names == name).sum()) for _, table, _ in tracked)
-            extra = (
-                plain_figures(scorer.figures(sure))["HOTA, all"],
-                confirmed_share / max(count, 1),
-                float(np.mean(waits)) if waits else None,
-                int(sum(certain)),
-                calibration_error(np.concatenate(existence), np.concatenate(true)),
-            )
-            key = (self.detector, f"1/{self.stride}", name, self.profile, "" if self.posed else "none", self.distort)
-            rows.append([*key, *(_shown(figures[one]) for one in SHOWN), *(_shown(one) for one in extra)])
-        return rows
+                if dataset == "kitti":
+                    pairs = sample(own.world, shown, shown, name, near)
+                    rows = pairs.row[pairs.true]
+                    speeds.append(_velocity_errors(own, shown.take(rows), pairs.owner[pairs.true]))
+            whole = scorer.figures(all_of)
+            every, closest = sum(good[1:], good[0]), sum(certain[1:], certain[0])
+            counts = [clear(one.near, scorer.near) for one in all_of]
+            truth = sum(one.truth for one in counts)
+            squared = np.concatenate(speeds) if speeds else np.empty(0)
+            found[name] = {key: plain_figures(whole)[key] for key in SHOWN} | {
+                "IDF1": identity_f1([one.near for one in all_of], whole["threshold"]),
+                "IDS all": sum(one.switches for one in counts),
+                "scenes": _mean_of_scenes(scorer, all_of),
+                "sure": plain_figures(scorer.figures(sure))["HOTA, all"],
+                "gain": (2 * int(closest.true.sum()) - len(closest.true)) / max(truth, 1),
+                "confirmed": len(closest.true) / max(len(every.true), 1),
+                "delay": float(np.mean(waits)) if waits else None,
+                "ghosts": int((~closest.true).sum()),
+                "NEES": closest.mean if self.posed else None,
+                "inside": closest.coverage if self.posed else None,
+                "existence": existence_error(every.existence, every.true),
+                "speed": float(np.sqrt(squared.mean())) if len(squared) else None,
+            }
+        return found
+
+
+@functools.cache
+def sequences_of(root: Path, detector: str, *, fast: bool) -> tuple[DataSequence, ...]:
+    """Return the sequences of a detector, with `fast` a few of them."""
+    folder = DETECTORS[detector][0]
+    opened = open_dataset("kitti" if folder == "kitti" else "nuscenes", root / folder, detector, clouds=False)
+    return tuple(one for one in opened.sequences(["all"]) if not fast or one.name in FEW_SEQUENCES)
 
 
 def track(clip: Clip, parameters: Parameters, *, posed: bool) -> tuple[FullTable, Bools]:
@@ -184,10 +228,47 @@ def track(clip: Clip, parameters: Parameters, *, posed: bool) -> tuple[FullTable
     return table, confirmed
 
 
-def calibration_error(existence: Floats, true: Bools) -> float:
-    """Return the mean distance between `existence` and the share of true tracks, over ten bins by their counts."""
+def existence_error(existence: Floats, true: Bools) -> float | None:
+    """Return the largest difference of the mean of `existence` and the share of true tracks over tenths."""
     place = np.minimum((existence * 10).astype(np.int64), 9)
-    return float(np.abs(np.bincount(place, existence - true, 10)).sum() / max(len(existence), 1))
+    count, off = np.bincount(place, minlength=10), np.bincount(place, existence - true, 10)
+    looked_at = count >= max(TENTH * len(existence), 1)
+    return float(np.abs(off[looked_at] / count[looked_at]).max()) if looked_at.any() else None
+
+
+def identity_f1(cases: Sequence[Case], threshold: float) -> float:
+    """Return IDF1 of the tracks from a mean score on: of the pairs of identities that agree in most frames."""
+    agreed = total = 0
+    for whole in cases:
+        case = whole.from_score(threshold)
+        counts = ~case.ignored[case.truth_row]
+        pairs = np.column_stack((case.truth_id[case.truth_row], case.track_id[case.track_row]))[counts]
+        both, times = np.unique(pairs, axis=0, return_counts=True)
+        if len(both):
+            chosen = best_pairs(both[:, 0], both[:, 1], times.astype(np.float64))
+            agreed += int(times[chosen].sum())
+        total += int((~case.ignored).sum() + (~case.excused).sum())
+    return 2.0 * agreed / max(total, 1)
+
+
+def _mean_of_scenes(scorer: Scorer, measured: Sequence[Measured]) -> float | None:
+    if scorer.scenes is None:
+        return None
+    found = [scorer.figures([one])["AMOTA"] for one in measured if (~one.near.ignored).any()]
+    return float(np.nanmean(found)) if found else None
+
+
+def _velocity_errors(clip: Clip, tracks: FullTable, owner: Ints) -> Floats:
+    """Return the squared errors of the velocities of tracks whose object moves, by its labels before and after."""
+    truth, half = clip.world, max(1, round(0.25 / np.median(np.diff(clip.stamps * 1e-9))))
+    before = rows_of(truth.frame, truth.id, tracks.frame - half, owner)
+    after = rows_of(truth.frame, truth.id, tracks.frame + half, owner)
+    known = (before >= 0) & (after >= 0)
+    frame = tracks.frame[known]
+    seconds = (clip.stamps[frame + half] - clip.stamps[frame - half]) * 1e-9
+    velocity = (truth.center[after[known], :2] - truth.center[before[known], :2]) / seconds[:, None]
+    errors = ((tracks.velocity[known] - velocity) ** 2).sum(axis=1)
+    return np.asarray(errors[np.linalg.norm(velocity, axis=1) > MOVING], np.float64)
 
 
 def _delays(identity: Ints, stamp_ns: Ints, confirmed: Bools) -> Iterator[float]:
@@ -202,8 +283,179 @@ def _shown(value: float | None) -> str:
     return str(int(value)) if value == int(value) and abs(value) > 1 else f"{value:.4f}"
 
 
-def _rows(cell: Cell) -> list[list[str]]:
-    return cell.rows()
+SMOOTHED = (0.1, 0.2, 0.3, 0.5)
+"""Standard deviations of the white noise of boxes, m."""
+
+
+def smoothing() -> float:
+    """Return the error of tracks beside that of their boxes, for objects at constant velocity at 10 Hz."""
+    ratios, rng = [], np.random.Generator(np.random.PCG64(1))
+    for noise in SMOOTHED:
+        tracker = optipmb.OnlineTracker("generic")
+        start, velocity = np.array([[10.0, -20.0], [40.0, 10.0], [0.0, 30.0]]), np.array([[8.0, 0], [-12, 3], [1, 1]])
+        errors = []
+        for k in range(300):
+            place = start + 0.1 * k * velocity
+            boxes = place + noise * rng.standard_normal((3, 2))
+            yaw, size = np.arctan2(velocity[:, 1], velocity[:, 0]), [[4.5, 1.9, 1.6], [4.5, 1.9, 1.6], [0.7, 0.7, 1.75]]
+            given = {"center": np.column_stack((boxes, np.zeros(3))), "size": size, "yaw": yaw, "score": [0.9] * 3}
+            tracks = tracker.update(given, t=0.1 * k, label=["car", "car", "pedestrian"])
+            for n, detection in zip(range(len(tracks)), tracks.detection.tolist(), strict=True):
+                if k >= 50 and detection >= 0:
+                    of_track = tracks.center[n, :2] - place[detection]
+                    errors.append(((of_track**2).sum(), ((boxes - place)[detection] ** 2).sum()))
+        ratios.append(math.sqrt(np.divide(*np.sum(errors, axis=0))))
+    return float(np.mean(ratios))
+
+
+STOOD = 50
+"""Frames that a sensor is taken to stand for."""
+
+
+def false_starts(root: Path, detectors: Iterable[str], *, fast: bool) -> tuple[int, int]:
+    """Return in how many frames a standing sensor is said to move, and how many frames there are.
+
+    Boxes are in the axes of the world, with the sensor as the origin once in `STOOD` frames.
+    """
+    wrong = count = 0
+    for one in (one for detector in detectors for one in sequences_of(root, detector, fast=fast)):
+        parameters = profiles.profile_for("auto", [one])
+        tracker, (rotation, translation) = optipmb.Tracker(parameters), stack_poses(one.poses)
+        density = tracker.initial()
+        for frame in one.frames():
+            if frame.index % STOOD == 0:
+                density, origin = tracker.initial(), translation[min(frame.index + STOOD // 2, len(translation) - 1)]
+            center, yaw = to_world(rotation[[frame.index]], translation[[frame.index]], frame.center, frame.yaw)
+            still = replace(frame, center=center - origin, yaw=yaw, pose=STANDING)
+            density = tracker.step(density, tracker_frame(parameters, one.name, still)).density
+            wrong += density.sensor_motion is not None
+            count += 1
+    return wrong, count
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The figures by which a change of the default is judged."""
+
+    of: Callable[..., Figures]  # figures of the classes of a cell: detector, stride, …
+    root: Path
+    fast: bool
+
+    def lines(self) -> Iterator[tuple[str, str]]:
+        """Yield name and value of each figure."""
+        for name, value in SUMMARY.items():
+            yield name, value(self)
+
+    def across(self, figure: str, label: str, cells: Iterable[tuple[str, int]], **given: bool) -> list[float]:
+        """Return a figure of a class in some cells that have it."""
+        values = (self.of(*cell, **given).get(label, {}).get(figure) for cell in cells)
+        return [value for value in values if value is not None]
+
+
+KITTI = tuple(name for name, (folder, _) in DETECTORS.items() if folder == "kitti")
+NUSCENES = (("centerpoint", 1), ("megvii", 1))
+EIGHT = {"centerpoint": 1, "megvii": 7}  # scenes
+ALL = tuple(product(KITTI, STRIDES["kitti"])) + NUSCENES
+
+
+def _joined(values: Iterable[float], form: str = ".1f", scale: float = 1.0) -> str:
+    return " / ".join(format(scale * value, form) for value in values)
+
+
+def _unposed(given: Summary) -> str:
+    return _joined((given.across("sAMOTA", "Car", [cell], posed=False)[0] for cell in UNPOSED), scale=100.0)
+
+
+UNPOSED = (("pointrcnn", 1), ("second_iou", 2), ("pvrcnn", 5))
+
+
+def _eight(given: Summary, profile: dict[str, str]) -> str:
+    found = []
+    for label in ("car", "pedestrian"):
+        parts = [
+            (given.of(detector, 1, profile.get(detector, "auto"))[label]["scenes"] or 0.0, count)
+            for detector, count in EIGHT.items()
+        ]
+        found.append(sum(value * count for value, count in parts) / sum(EIGHT.values()))
+    return _joined(found, scale=100.0)
+
+
+def _sums(given: Summary, figure: str) -> str:
+    cars = [sum(given.across(figure, "Car", product(KITTI, [stride]))) for stride in STRIDES["kitti"]]
+    others = [sum(given.across(figure, label, NUSCENES)) for label in ("car", "pedestrian")]
+    return f"{_joined(cars, '.0f')}; {_joined(others, '.0f')}"
+
+
+def _ranges(given: Summary, figure: str, form: str, scale: float = 1.0) -> str:
+    """Return the least and largest value of a figure over all cells, and the cells in a line each."""
+    parts = []
+    for label in ("car", "pedestrian"):
+        cells = [(cell, given.of(*cell)) for cell in ALL]
+        values = [(found[name][figure] or 0.0) for _, found in cells for name in found if name.lower() == label]
+        parts.append(f"{label} {scale * min(values):{form}} to {scale * max(values):{form}}")
+    return ", ".join(parts)
+
+
+def _gains(given: Summary) -> str:
+    values = []
+    for detector in ("pointrcnn", "second_iou"):
+        for label in ROAD_USERS:
+            values += given.across("gain", label, [(detector, 1), (detector, 5)])
+    values += given.across("gain", "Car", [("casa", 1)])
+    for label in ("car", "pedestrian"):
+        values += given.across("gain", label, NUSCENES)
+    return f"{np.mean(values):.3f} over {len(values)} cells"
+
+
+def _starts(given: Summary) -> str:
+    wrong, count = false_starts(given.root, ("pointrcnn", "pvrcnn", "centerpoint", "megvii"), fast=given.fast)
+    return f"{wrong} of {count} frames"
+
+
+def _speeds(given: Summary) -> str:
+    return _joined((given.across("speed", "Car", [cell])[0] for cell in product(KITTI, [1])), ".2f")
+
+
+SUMMARY: dict[str, Callable[[Summary], str]] = {
+    "sAMOTA without poses, PointRCNN 10 Hz / SECOND 5 Hz / PV-RCNN 2 Hz": _unposed,
+    "false starts of a standing sensor": _starts,
+    "AMOTA of eight nuScenes scenes, car / pedestrian, auto": lambda given: _eight(given, {}),
+    "the same, tuned": lambda given: _eight(given, {"centerpoint": "nuscenes", "megvii": "nuscenes-megvii"}),
+    "switches at the best threshold, KITTI cars 10 / 5 / 2 Hz; nuScenes car / pedestrian": (
+        lambda given: _sums(given, "IDS")
+    ),
+    "switches of all tracks": lambda given: _sums(given, "IDS all"),
+    "ghosts": lambda given: _sums(given, "ghosts"),
+    "HOTA, %": lambda given: _ranges(given, "HOTA", ".1f", 100.0),
+    "inside the 95 % ellipse, %": lambda given: _ranges(given, "inside", ".0f", 100.0),
+    "NEES": lambda given: _ranges(given, "NEES", ".1f"),
+    "position error of tracks beside boxes": lambda _: f"{smoothing():.2f}",
+    "velocity error of moving cars, m/s, by KITTI detector": _speeds,
+    "existence, largest difference": lambda given: _ranges(given, "existence", ".2f"),
+    "confirmed, (TP - FP) / true": _gains,
+}
+
+
+def _state(profile: str) -> str:
+    """Return a digest of everything that figures depend on beside the data."""
+    folder = Path(optipmb.__file__).parent
+    files = [*folder.glob("*.py"), *folder.glob("profiles/*.toml"), Path(__file__)]
+    content = b"".join(one.read_bytes() for one in sorted(files))
+    return hashlib.sha256(content + profile.encode()).hexdigest()[:16]
+
+
+def figures(cell: Cell, cache: Path | None = None) -> Figures:
+    """Return the figures of the classes of a cell, those of a cache where it has them."""
+    key = "-".join(str(one) for one in astuple(cell)[1:])
+    path = None if cache is None else cache / _state(cell.profile) / f"{key}.json"
+    if path is not None and path.is_file():
+        known: Figures = json.loads(path.read_text())
+        return known
+    found = cell.figures()
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(found))
+    return found
 
 
 def main() -> None:
@@ -218,19 +470,35 @@ def main() -> None:
     parser.add_argument("--unposed", action="store_true", help="withhold the poses of the sensor")
     parser.add_argument("--distort", default="", choices=["", "scaled", "cubed"], help="scores x 0.4, or cubed")
     parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--fast", action="store_true", help="a few sequences only")
+    parser.add_argument("--summary", action="store_true", help="print the figures by which the default is judged")
+    parser.add_argument("--cache", type=Path, help="folder of figures of cells")
     given = parser.parse_args()
+    measured = functools.partial(figures, cache=given.cache)
+    if given.summary:
+
+        def of(detector: str, stride: int, profile: str = "auto", *, posed: bool = True) -> Figures:
+            return measured(Cell(given.root, detector, stride, profile, posed, given.distort, given.fast))
+
+        for name, value in Summary(of, given.root, given.fast).lines():
+            print(f"{name}: {value}", flush=True)  # noqa: T201
+        return
     cells = [
-        Cell(given.root, detector, stride, name, not given.unposed, given.distort)
+        Cell(given.root, detector, stride, name, not given.unposed, given.distort, given.fast)
         for detector, stride in product(given.detectors.split(","), map(int, given.strides.split(",")))
         if stride in STRIDES[folder := DETECTORS[detector][0]]
         for profile in given.profiles.split(",")
         for name in (TUNED[folder] if profile == "best" else (profile,))
     ]
     out = csv.writer(sys.stdout, lineterminator="\n")
-    out.writerow(("detector", "rate", "class", "profile", "poses", "scores", *SHOWN, *PARTS))
+    columns = (*SHOWN, *PARTS)
+    out.writerow(("detector", "rate", "class", "profile", "poses", "scores", *columns))
     with ProcessPoolExecutor(given.jobs) as pool:
-        for rows in pool.map(_rows, cells):
-            out.writerows(rows)
+        for cell, found in zip(cells, pool.map(measured, cells), strict=True):
+            how = "" if cell.posed else "none", cell.distort
+            for name, values in found.items():
+                key = (cell.detector, f"1/{cell.stride}", name, cell.profile, *how)
+                out.writerow([*key, *(_shown(values[one]) for one in columns)])
             sys.stdout.flush()
 
 
