@@ -200,11 +200,11 @@ ablate: install
 
 # A hundred SIGKILLs in the middle of recorded sequences, which CI does three times; needs the KITTI data.
 kills: install
-	OPTIPMB_TEST_KILLS=100 $(BIN)/pytest -q tests/e2e/test_kill.py -o faulthandler_timeout=0
+	OPTIPMB_TEST_KILLS=100 $(BIN)/pytest -q tests/e2e/test_kill.py --timeout 0 -o faulthandler_timeout=0
 
 # An hour of load, which CI does for seconds.
 soak: install
-	OPTIPMB_TEST_SOAK_S=3600 OPTIPMB_TEST_SOAK_STREAMS=10 $(BIN)/pytest -q tests/e2e/test_soak.py -o faulthandler_timeout=0
+	OPTIPMB_TEST_SOAK_S=3600 OPTIPMB_TEST_SOAK_STREAMS=10 $(BIN)/pytest -q tests/e2e/test_soak.py --timeout 0 -o faulthandler_timeout=0
 
 # What is found is kept in tests/fuzz/found, where the tests take it up. `make -j2 fuzz` searches two decoders at once.
 FUZZ_S ?= 1800

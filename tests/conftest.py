@@ -1,7 +1,9 @@
-"""What all tests share: interrupts as in a terminal, and which tests run by a command of their own."""
+"""What all tests share: interrupts as in a terminal, an end that nothing delays, and tests with their own command."""
 
+import faulthandler
 import gc
 import signal
+import sys
 from collections.abc import Generator
 from pathlib import Path
 
@@ -44,3 +46,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.path in marker_of:
             item.add_marker(marker_of[item.path])
+
+
+def pytest_unconfigure() -> None:
+    """Bound the end of the process, which waits for threads of tests that failed; their stacks are printed then."""
+    faulthandler.dump_traceback_later(60, exit=True, file=sys.__stderr__)

@@ -330,7 +330,7 @@ def test_numbers_stay_in_order_from_many_threads(link: Connection) -> None:
         for thread in threads:
             thread.start()
         for thread in threads:
-            thread.join()
+            thread.join(60)
         arrivals = [inbox.get(10.0) for _ in range(200)]
     assert [decode(a.payload, Detections).seq for a in arrivals if a] == list(range(200))
 
@@ -489,7 +489,7 @@ def test_a_slow_program_loses_its_oldest_messages_and_counts_them(link: Connecti
 def test_closing_ends_a_loop_in_another_thread(link: Connection) -> None:
     """`close` ends a loop that waits without a timeout."""
     subscriber = Subscriber(STREAM, connection=link)
-    loop = threading.Thread(target=lambda: list(subscriber))
+    loop = threading.Thread(target=lambda: list(subscriber), daemon=True)
     loop.start()
     subscriber.close()
     loop.join(DEADLINE_S)

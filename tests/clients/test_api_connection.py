@@ -85,7 +85,7 @@ def test_a_router_that_comes_later_within_the_timeout_is_waited_for() -> None:
             assert not connection.closed
             assert connection._session.linked()
     finally:
-        timer.join()
+        timer.join(60)
         opened[0].close()
 
 
@@ -222,7 +222,7 @@ def test_closing_an_inbox_wakes_its_reader() -> None:
     """A reader that waits without a timeout returns None when the inbox is closed."""
     inbox = Inbox(1)
     results: list[object] = []
-    reader = threading.Thread(target=lambda: results.append(inbox.get(None)))
+    reader = threading.Thread(target=lambda: results.append(inbox.get(None)), daemon=True)
     reader.start()
     inbox.close()
     reader.join(10.0)

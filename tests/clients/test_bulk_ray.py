@@ -138,13 +138,13 @@ def test_a_killed_node_loses_nothing(cluster: Any, data: Path, plain: dict[str, 
         victims.append(node.node_id)
         raylet = node.all_processes["raylet"][0].process
         raylet.kill()
-        raylet.wait()  # its workers end when it is gone, and a zombie is not
+        raylet.wait(60)  # its workers end when it is gone, and a zombie is not
 
-    killer = threading.Thread(target=kill)
+    killer = threading.Thread(target=kill, daemon=True)
     killer.start()
     with executor_for(0, cluster.address) as executor:
         results = tracked(data, tmp_path / "out", Dying(executor, tmp_path, {"r017"}, {"r050"}))
-    killer.join()
+    killer.join(60)
     assert len(victims) == 1
     assert len(results) == RECORDINGS
     assert bytes_of(tmp_path / "out") == plain

@@ -208,7 +208,7 @@ def test_foxglove_is_served_live(tmp_path: Path) -> None:
             for message in (tracks(0, [3]), detections(0), points(0, 700), problem):
                 server.show(message)
             concurrent.futures.wait([result], timeout=0.05)
-        found = {topic.removeprefix(f"/{STREAM}/"): one for topic, one in result.result().items()}
+        found = {topic.removeprefix(f"/{STREAM}/"): one for topic, one in result.result(60).items()}
         client.close()
     assert found["tracks/scene"][0] == 1_500_000_000
     assert [entity.id for entity in found["tracks/scene"][1].entities] == ["3"]

@@ -128,9 +128,9 @@ def test_bytes_do_not_depend_on_the_order_of_closing(root: Path, tmp_path: Path)
         for thread in work[:: -1 if number == 1 else 1]:
             thread.start()
             if number != 2:
-                thread.join()
+                thread.join(60)
         for thread in work:
-            thread.join()
+            thread.join(60)
         results.close(sequences)
         written.append((tmp_path / str(number) / FILE).read_bytes())
     assert written[0] == written[1] == written[2]

@@ -209,7 +209,9 @@ def test_a_service_that_comes_late_is_waited_for(
 ) -> None:
     """A replay started just before its service goes through."""
     results: list[ReplayedSequence] = []
-    thread = threading.Thread(target=lambda: results.extend(run(link, dataset, tmp_path, pace=Pace(service_s=20.0))))
+    thread = threading.Thread(
+        target=lambda: results.extend(run(link, dataset, tmp_path, pace=Pace(service_s=20.0))), daemon=True
+    )
     thread.start()
     with FakeService(endpoint):
         thread.join(30.0)

@@ -288,7 +288,7 @@ def test_the_viewer_is_served_to_a_browser(incident: Path) -> None:
                 time.sleep(0.05)  # another program's port: there is nothing to wait on
     finally:
         process.kill()
-        process.communicate()
+        process.communicate(timeout=60)
 
 
 @pytest.mark.parametrize(

@@ -177,7 +177,7 @@ class Sending:
         self.frames = first
         self._node = node
         self._enough = threading.Event()
-        self._thread = threading.Thread(target=self._run)
+        self._thread = threading.Thread(target=self._run, daemon=True)
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -185,7 +185,7 @@ class Sending:
 
     def __exit__(self, *_: object) -> None:
         self._enough.set()
-        self._thread.join()
+        self._thread.join(60)
 
     def _run(self) -> None:
         while not self._enough.wait(0.1):

@@ -45,7 +45,7 @@ class Disturbance:
         self.count = 0
         self._act = act
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run)
+        self._thread = threading.Thread(target=self._run, daemon=True)
 
     def _run(self) -> None:
         while not self._stop.wait(0.002):
@@ -98,7 +98,7 @@ def test_a_client_killed_in_the_middle(
                 others.receive(60.0)
             kill(victim)
 
-        killer = threading.Thread(target=kill_in_the_middle)
+        killer = threading.Thread(target=kill_in_the_middle, daemon=True)
         killer.start()
         result = replay()
         killer.join(60.0)

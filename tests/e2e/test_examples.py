@@ -59,7 +59,7 @@ def test_publisher_and_subscriber(service: ServiceProcess, tmp_path: Path, *, nu
         ) as subscriber,
     ):
         assert subscriber.stdout is not None
-        reader = threading.Thread(target=read, args=(subscriber.stdout,))
+        reader = threading.Thread(target=read, args=(subscriber.stdout,), daemon=True)
         reader.start()
         numbers = itertools.count()
         box = {"label": ["car"], "center": [[0, 0, 1]], "size": [[4, 2, 1.5]], "yaw": [0], "score": [0.9]}

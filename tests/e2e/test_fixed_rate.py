@@ -15,6 +15,7 @@ from fleet import RouterProcess
 from gateway import GatewayProcess
 from optipmb_client import Subscriber
 from optipmb_schemas import Tracks
+from readers import received
 from router import Node, Sensor, until
 from service_process import ServiceProcess
 from websocket import create_connection
@@ -37,13 +38,13 @@ def driving(endpoint: str) -> Iterator[None]:
                 if ended.wait(0.1):
                     return
 
-    thread = threading.Thread(target=publish)
+    thread = threading.Thread(target=publish, daemon=True)
     thread.start()
     try:
         yield
     finally:
         ended.set()
-        thread.join()
+        thread.join(60)
 
 
 def check(messages: list[Tracks]) -> None:
@@ -75,7 +76,7 @@ def test_a_websocket_gives_predicted_tracks() -> None:
         url = f"ws://{address}/api/v1/ws?stream=garage/*/*&predict=1&max_rate_hz=5"
         socket = create_connection(url, timeout=60, suppress_origin=True)
         with contextlib.closing(socket), driving(service.endpoint):
-            texts = [json.loads(socket.recv()) for _ in range(8)]
+            texts = [json.loads(received(socket)) for _ in range(8)]
     times = [int(one["predicted_to_ns"]) for one in texts]
     assert all(later - earlier >= 0.95e9 / 5 for earlier, later in itertools.pairwise(times))
     assert all(int(one["stamp_ns"]) < at for one, at in zip(texts, times, strict=True))

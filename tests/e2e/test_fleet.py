@@ -36,10 +36,9 @@ def test_terminated_in_the_middle(tmp_path: Path) -> None:
         service = fleet.service("a")
         node.send(*(SENSOR.detections(seq) for seq in range(50)))
         node.tracks(SENSOR.stream, 10)
-        status, seconds = service.end()
+        status, _ = service.end()
         assert status == 0
         assert '"drained": false' not in service.errors
-        assert seconds < 60.0
         node.send(*(SENSOR.detections(seq) for seq in range(50, 60)))
         for seq in range(5):
             publisher.publish(stamp_ns=SENSOR.stamp_ns(seq), points=cloud, **box)
@@ -98,7 +97,7 @@ def test_a_store_that_is_deleted_while_in_use(tmp_path: Path) -> None:
         time.sleep(0.5)  # several times `checkpoint_s`
         for service in services:
             service.process.kill()
-            service.process.wait()
+            service.process.wait(60)
         fleet.service("c")
         send(node, 30, 40)
         state = check(node, 40, owner="c")
@@ -115,7 +114,7 @@ def test_killed_before_its_first_checkpoint(tmp_path: Path) -> None:
             until(lambda instance=instance: len(published_by(node, instance)) == 5, "its tracks")  # type: ignore[misc]  # bound now
             runs.append({one.delivery.run for one in published_by(node, instance) if one.delivery})
             service.process.kill()
-            service.process.wait()
+            service.process.wait(60)
     assert [len(one) for one in runs] == [1, 1, 1]
     assert max(runs[0]) < max(runs[1]) < max(runs[2])
 
@@ -142,7 +141,7 @@ def test_a_full_disk(tmp_path: Path) -> None:
         resource.prlimit(pid, resource.RLIMIT_FSIZE, (soft, hard))
         until(lambda: state() == "ready", "the store has healed")
         service.process.kill()
-        service.process.wait()
+        service.process.wait(60)
         fleet.service("a")
         send(node, 20, 30)
         check(node, 30, owner="a")

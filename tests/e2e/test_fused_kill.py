@@ -92,7 +92,7 @@ def test_killed_while_two_sensors_feed_one_session(tmp_path: Path, session: str,
         node.send(*frames[:40])
         until(lambda: tracked(20), "frames are tracked", RESTART_S)
         service.process.kill()
-        service.process.wait()
+        service.process.wait(60)
         node.send(*frames[40:60])
         service = fleet.service("one", wait=False)
         node.send(*frames[60:])

@@ -2,7 +2,9 @@
 
 import asyncio
 import contextlib
+import itertools
 import json
+import queue
 import re
 import threading
 import urllib.request
@@ -14,6 +16,8 @@ import pytest
 from broker import Broker
 from browser import browser, console, wait
 from optipmb_schemas.json_form import Selection, tracks_json
+from readers import received
+from readers import texts as events_of
 from router import Node, Sensor
 from service_process import ServiceProcess
 from websocket import create_connection
@@ -44,30 +48,35 @@ def address_of(service: ServiceProcess) -> str:
     return str(re.findall(r'"http", .*?"address": "([^"]+)"|"address": "([^"]+)"', service.errors)[0][1])
 
 
-def read(address: str, count: int, subscribed: threading.Event) -> list[bytes]:
+def read(address: str, count: int, lines: queue.SimpleQueue[bytes]) -> None:
+    """Put the first line of an answer and the texts that follow."""
     with urllib.request.urlopen(f"http://{address}/api/v1/stream?stream={SENSOR.stream}", timeout=60) as response:
-        assert response.readline() == b": hello\n"
-        subscribed.set()
-        lines = (line[6:-1] for line in response if line.startswith(b"data: "))
-        return [next(lines) for _ in range(count)]
+        lines.put(response.readline())
+        for text in itertools.islice(events_of(response), count):
+            lines.put(text)
 
 
 def frames(service: ServiceProcess, address: str) -> tuple[list[bytes], list[bytes]]:
-    """Publish frames and compare what readers get; return the texts of tracks and of events."""
+    """Publish each frame when all readers have the one before, and compare; return the texts of tracks and of events.
+
+    Readers get the newest frame alone of those that wait for them.
+    """
     base, query = f"http://{address}/api/v1", f"stream={SENSOR.stream}&topics=tracks,events&events=now"
     socket = create_connection(f"ws://{address}/api/v1/ws?{query}", timeout=60, suppress_origin=True)
-    subscribed = threading.Event()
+    lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     with contextlib.closing(socket), Node(service.endpoint) as node, ThreadPoolExecutor(1) as pool:
-        reading = pool.submit(read, address, FRAMES, subscribed)
-        assert subscribed.wait(60)
+        reading = pool.submit(read, address, FRAMES, lines)
+        assert lines.get(timeout=60) == b": hello\n"
         expected: list[bytes] = []
         texts: list[bytes] = []
         for seq in range(FRAMES):
             node.send(SENSOR.detections(seq))
             expected.append(tracks_json(node.tracks(SENSOR.stream, seq + 1)[-1], CONFIRMED))
             while len(of(texts, "tracks")) <= seq:
-                texts.append(str(socket.recv()).encode())
-        assert of(texts, "tracks") == reading.result() == expected
+                texts.append(str(received(socket)).encode())
+            assert lines.get(timeout=60) == expected[-1]
+        reading.result(60)
+        assert of(texts, "tracks") == expected
         assert get(f"{base}/tracks?stream=*/*/*") == b"[%b]" % expected[-1]
         assert [one["stream"] for one in json.loads(get(f"{base}/streams"))] == [SENSOR.stream]
         assert json.loads(get(f"{base}/zones?stream=*/*/*"))[0]["zones"]["all"]
@@ -114,7 +123,7 @@ def test_the_example_page_draws_tracks(service: ServiceProcess, tmp_path: Path) 
                     return
                 node.send(SENSOR.detections(seq))
 
-    thread = threading.Thread(target=publish)
+    thread = threading.Thread(target=publish, daemon=True)
     thread.start()
     try:
         with browser(tmp_path) as chrome:
@@ -126,4 +135,4 @@ def test_the_example_page_draws_tracks(service: ServiceProcess, tmp_path: Path) 
             assert console(chrome) == []
     finally:
         over.set()
-        thread.join()
+        thread.join(60)

@@ -74,7 +74,7 @@ def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[
             time.sleep(moments.uniform(0.0, 0.02))  # a moment in the life of a frame, not a wait for anything
             service.process.kill()
             killed = time.monotonic_ns()
-            service.process.wait()
+            service.process.wait(60)
             service = fleet.service("one", wait=False)
             replay.finish(RESTART_S)
             outages.append(_outage(replay, killed))
@@ -94,7 +94,7 @@ def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[
             for subscription in subscriptions:
                 subscription.close()
             inbox.close()
-            reader.join()
+            reader.join(60)
             replay.close()
         assert service.end()[0] == 0
     _tell(

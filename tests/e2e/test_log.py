@@ -108,7 +108,7 @@ def test_a_successor_reads_what_nobody_tracked(logged: Logged) -> None:
     first = logged.member("a")
     frames = logged.tracked(10, "a")
     first.process.kill()
-    first.process.wait()
+    first.process.wait(60)
     logged.send(frames, frames + TRACKS_CACHE)
     logged.member("b")
     frames = logged.tracked(frames + TRACKS_CACHE, "b")

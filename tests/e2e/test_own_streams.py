@@ -190,7 +190,7 @@ def test_streams_that_move_lose_no_frame_and_no_cloud(pair: Pair) -> None:
             sent += 1
             time.sleep(0.05)  # the rate of a sensor
 
-    publishing = threading.Thread(target=publish, args=(sensors,))
+    publishing = threading.Thread(target=publish, args=(sensors,), daemon=True)
     publishing.start()
     try:
         for turn in range(3):
@@ -198,7 +198,7 @@ def test_streams_that_move_lose_no_frame_and_no_cloud(pair: Pair) -> None:
                 node.move("ba"[(turn + number) % 2], sensor.stream)
     finally:
         ending.set()
-        publishing.join()
+        publishing.join(60)
     for sensor in sensors:
         until(lambda: len(distinct(node, sensor)) == sent, f"{sent} frames are tracked")  # noqa: B023 - called here
         assert distinct(node, sensor) == with_clouds(sensor, sent)

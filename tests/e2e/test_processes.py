@@ -59,7 +59,7 @@ def test_the_service_ends_when_its_parent_is_killed() -> None:
         "from optipmb_tools.run.service_process import ServiceProcess\n"
         "with ServiceProcess() as service:\n"
         "    print(service.process.pid, flush=True)\n"
-        "    service.process.wait()\n"
+        "    service.process.wait(60)\n"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as parent:
         assert parent.stdout is not None
@@ -95,7 +95,7 @@ def test_an_interrupted_demo_leaves_nothing_behind(tmp_path: Path, stage: str, n
             out, err = process.communicate(timeout=120)
     finally:
         process.kill()
-        process.wait()
+        process.wait(60)
     assert process.returncode == status, err
     assert out == ""
     assert "Traceback" not in err

@@ -28,11 +28,11 @@ def test_no_cloud_is_lost_by_a_takeover(tmp_path: Path, capsys: pytest.CaptureFi
             (owner,) = node.alive(KEYS.all_owners())
             freeze(services[KEYS.instance_of(owner)])
 
-        disturbing = threading.Thread(target=disturb)
+        disturbing = threading.Thread(target=disturb, daemon=True)
         disturbing.start()
         out = tmp_path / "replayed"
         done = run_here(capsys, "replay", *SCENE, "--speed", "1", "--connect", fleet.endpoint, "--out", str(out))
-        disturbing.join()
+        disturbing.join(60)
         assert done.returncode == 0, done.stdout + done.stderr
     (offline,) = (tmp_path / "offline").rglob("0000.txt")
     (replayed,) = out.rglob("0000.txt")

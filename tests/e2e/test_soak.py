@@ -67,7 +67,7 @@ def test_nothing_grows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
         service = fleet.service("soak", fresh=True)
         running = [pool.submit(run_load, connection, load, frames) for load, frames in loads.items()]
         samples, extra = _watched(connection, service.process.pid, running, capsys)
-        runs = [one.result() for one in running]
+        runs = [one.result(60) for one in running]
         status = _when_all_is_done(connection, sum(one.sent for one in runs) + 3 * extra)
         assert service.end()[0] == 0
     cloudless = sum(one.cloudless for one in runs)

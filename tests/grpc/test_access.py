@@ -109,7 +109,7 @@ def test_without_a_certificate_of_the_authority_there_is_no_connection(
     network: Network, secured: GatewayProcess, tmp_path: Path
 ) -> None:
     """Plain text, and a certificate of another authority, get no answer."""
-    plain = rpc.TrackingServiceStub(grpc.insecure_channel(secured.address))
+    plain = rpc.TrackingServiceStub(secured.channel())
     assert denied(lambda: plain.GetState(pb.GetStateRequest(stream=LIDAR), timeout=60)) == grpc.StatusCode.UNAVAILABLE
     assert make(tmp_path, *network.options).returncode == 0
     shutil.copy(network.folder / NODE / "ca.pem", tmp_path / NODE / "ca.pem")

@@ -92,7 +92,7 @@ def test_what_the_gateway_lacks_is_an_error(gateway: GatewayProcess) -> None:
 
 def test_a_health_probe(gateway: GatewayProcess) -> None:
     """The standard health service says SERVING for the process and for the service, and NOT_FOUND for others."""
-    health = health_pb2_grpc.HealthStub(grpc.insecure_channel(gateway.address))
+    health = health_pb2_grpc.HealthStub(gateway.channel())
     for name in ("", SERVICE):
         assert (
             health.Check(health_pb2.HealthCheckRequest(service=name)).status == health_pb2.HealthCheckResponse.SERVING
@@ -105,7 +105,7 @@ def test_a_health_probe(gateway: GatewayProcess) -> None:
 def test_a_client_that_has_no_schema(gateway: GatewayProcess, stub: Any, stream: str) -> None:
     """By reflection alone, as grpcurl does, a client finds the service, its methods and messages, and calls one."""
     list(stub.Track(detections(frame(seq, stream)) for seq in range(5)))
-    channel = grpc.insecure_channel(gateway.address)
+    channel = gateway.channel()
     database = ProtoReflectionDescriptorDatabase(channel)
     assert SERVICE in database.get_services()
     pool = descriptor_pool.DescriptorPool(database)

@@ -8,7 +8,7 @@ from typing import Any
 import grpc
 import numpy as np
 import pytest
-from gateway import GatewayProcess, detections, frame, resident
+from gateway import DEADLINES, GatewayProcess, detections, frame, resident
 from grpc_status import rpc_status
 from optipmb_schemas import Tracks, encode
 from optipmb_schemas.protobuf import convert
@@ -187,7 +187,7 @@ def test_a_slow_reader_gets_the_newest_and_is_told_what_it_missed(gateway: Gatew
     asleep = subscribed(gateway.stub(), pattern=stream, queue=4)
     awake = subscribed(gateway.stub(), pattern=stream, queue=1024)
     received: list[Any] = []
-    reader = threading.Thread(target=lambda: received.extend(taken(awake, 200)))
+    reader = threading.Thread(target=lambda: received.extend(taken(awake, 200)), daemon=True)
     reader.start()
     list(stub.Track(detections(frame(seq, stream, **many)) for seq in range(200)))
     reader.join(60)
@@ -215,7 +215,7 @@ def test_what_is_left_of_a_frame_is_a_message(stub: Any, stream: str) -> None:
 def test_200_subscribers_and_one_asleep(gateway: GatewayProcess, stream: str) -> None:
     """Every reader gets every frame, a sleeping one the number of missed frames, and all take little memory."""
     # A connection of its own for each, whose window does not grow: unread responses wait in the gateway.
-    options = [("grpc.use_local_subchannel_pool", 1), ("grpc.http2.bdp_probe", 0)]
+    options = [("grpc.use_local_subchannel_pool", 1), ("grpc.http2.bdp_probe", 0), ("grpc.service_config", DEADLINES)]
     many = {"label": np.zeros(100, dtype=int), "center": np.random.default_rng(1).uniform(-90, 90, (100, 3))}
     many |= {"size": np.tile([4.5, 1.9, 1.6], (100, 1)), "yaw": np.zeros(100), "score": np.full(100, 0.9)}
     frames = [frame(seq, stream, **many) for seq in range(FRAMES)]
@@ -228,7 +228,7 @@ def test_200_subscribers_and_one_asleep(gateway: GatewayProcess, stream: str) ->
             await call.initial_metadata()
             in_force.release()
             if asleep is not None:
-                await asleep.wait()
+                await asyncio.wait_for(asleep.wait(), 60)
             received, skipped = [], 0
             while not received or received[-1] < FRAMES - 1:
                 response = await call.read()
@@ -243,7 +243,7 @@ def test_200_subscribers_and_one_asleep(gateway: GatewayProcess, stream: str) ->
         readers = [asyncio.create_task(subscribe(None)) for _ in range(SUBSCRIBERS - 1)]
         sleeper = asyncio.create_task(subscribe(asleep))
         for _ in range(SUBSCRIBERS):
-            await in_force.acquire()
+            await asyncio.wait_for(in_force.acquire(), 60)
         stub = gateway.stub()
         for one in frames:
             await asyncio.to_thread(lambda one=one: list(stub.Track(iter([detections(one)]))))

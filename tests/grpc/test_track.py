@@ -21,6 +21,7 @@ from optipmb_client.trace_context import attached
 from optipmb_schemas import Detections, Keys, Points, Tracks, decode, encode
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
+from router import until
 from routers import open_client
 from service_process import ServiceProcess
 
@@ -172,7 +173,7 @@ def test_a_heartbeat_brings_nothing_again(service: ServiceProcess, stub: Any, st
                 recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
             )
             for _ in range(20):  # a heartbeat has come
-                recovered.recv()
+                until(lambda: recovered.try_recv() is not None, "what a heartbeat brings")
         yield detections(frame(21, stream))
 
     call = stub.Track(requests())
@@ -198,7 +199,7 @@ def test_what_is_no_message_of_the_call_ends_it(stub: Any, stream: str, second: 
 
 def test_bytes_that_are_no_protobuf(gateway: Any) -> None:
     """They end the call as INVALID_ARGUMENT, malformed."""
-    call = grpc.insecure_channel(gateway.address).stream_stream("/optipmb.v1.TrackingService/Track")
+    call = gateway.channel().stream_stream("/optipmb.v1.TrackingService/Track")
     with pytest.raises(grpc.RpcError) as raised:
         list(call(iter([b"\xff\xff\xff\xff"])))
     assert raised.value.code() == grpc.StatusCode.INVALID_ARGUMENT
@@ -211,18 +212,17 @@ def test_a_call_without_a_message_ends(stub: Any) -> None:
 
 
 def test_acknowledgements_are_few(stub: Any, stream: str) -> None:
-    """One comes when the stream is open, and one within a second of a message that covers all until then."""
-    began = time.monotonic()
+    """One comes when the stream is open; the next ones, which nothing but time brings, cover many messages each."""
     requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
     for seq in range(40):
         requests.put(detections(frame(seq, stream), pb.PublishRequest))
     call = stub.Publish(iter(requests.get, None), timeout=DEADLINE_S)
     numbers = [-1]
-    while numbers[-1] < 39:  # the call stays open: nothing but time brings them
+    while numbers[-1] < 39:  # the call stays open
         newest = next(call).acknowledgement
         numbers.append(newest.detections if newest.HasField("detections") else -1)
     assert numbers == sorted(numbers)
-    assert len(numbers) <= 4 + time.monotonic() - began
+    assert len(numbers) < 20
     requests.put(None)
     assert {one.acknowledgement.detections for one in call} <= {39}
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import grpc
 import pytest
-from gateway import detections, frame
+from gateway import channel_to, detections, frame
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
 from router import Node
@@ -24,7 +24,7 @@ def workers() -> Iterator[tuple[ServiceProcess, str]]:
 
 def test_streams_of_all_workers(workers: tuple[ServiceProcess, str]) -> None:
     """Streams of both workers are tracked, listed with their worker, asked about, reset and queried at one address."""
-    stub = rpc.TrackingServiceStub(grpc.insecure_channel(workers[1]))
+    stub = rpc.TrackingServiceStub(channel_to(workers[1]))
     with Node(workers[0].endpoint) as node:
         for number, stream in enumerate(STREAMS):
             node.move("garage", stream, number % 2)
@@ -45,7 +45,7 @@ def test_streams_of_all_workers(workers: tuple[ServiceProcess, str]) -> None:
 def test_the_end_is_in_order(workers: tuple[ServiceProcess, str]) -> None:
     """On SIGTERM a subscription ends as UNAVAILABLE, and the service with status 0."""
     process, address = workers
-    call = rpc.TrackingServiceStub(grpc.insecure_channel(address)).Subscribe(pb.SubscribeRequest(pattern="*/*/*"))
+    call = rpc.TrackingServiceStub(channel_to(address)).Subscribe(pb.SubscribeRequest(pattern="*/*/*"))
     call.initial_metadata()
     status, _ = process.end()
     with pytest.raises(grpc.RpcError) as raised:

@@ -250,11 +250,11 @@ import optipmb_schemas as schemas
 sys.setswitchinterval(1e-6)
 payload, start = schemas.encode(Sensor().detections(0)), threading.Barrier(8)
 def decode():
-    start.wait()
+    start.wait(60)
     schemas.decode(payload, schemas.Detections)
 threads = [threading.Thread(target=decode) for _ in range(8)]
 for one in threads: one.start()
-for one in threads: one.join()
+for one in threads: one.join(60)
 """
 
 

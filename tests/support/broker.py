@@ -110,4 +110,4 @@ def mosquitto(folder: Path) -> Iterator[str]:
         yield f"mqtt://127.0.0.1:{port}"
     finally:
         process.terminate()
-        process.wait()
+        process.wait(60)

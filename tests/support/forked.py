@@ -45,7 +45,7 @@ def server() -> socket.socket:
 
     def end() -> None:
         asking.close()
-        process.wait()
+        process.wait(60)
 
     atexit.register(end)
     threads = asking.recv(32)

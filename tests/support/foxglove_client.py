@@ -9,6 +9,7 @@ from typing import Any
 import websocket
 from mcap.records import Schema
 from mcap_protobuf.decoder import DecoderFactory
+from readers import received
 
 SUBPROTOCOL = "foxglove.sdk.v1"
 MESSAGE = 1
@@ -30,13 +31,15 @@ class FoxgloveClient:
         """Subscribe to topics as they are advertised; give log time and content of the first message of each."""
         found: dict[str, tuple[int, Any]] = {}
         patient_until_s = time.monotonic() + PATIENCE_S
+        ends = time.monotonic() + 6 * PATIENCE_S
         while set(found) != topics:
+            assert time.monotonic() < ends, f"no message of {topics - set(found)}"
             if time.monotonic() > patient_until_s:
                 # Once in hundreds of runs the server's library sent nothing of a channel that it had just announced.
                 self.close()
                 self._connect()
                 patient_until_s = time.monotonic() + PATIENCE_S
-            data = self._socket.recv()
+            data = received(self._socket)
             if isinstance(data, str):
                 about = json.loads(data)
                 if about["op"] == "advertise":

@@ -1,5 +1,6 @@
 """A real gateway in a process of its own, and what tests say to it with the generated stubs alone."""
 
+import json
 import socket
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,6 +20,10 @@ STREAM = "garage/robot-1/lidar"
 
 PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])
 """How a client of HTTP/2 begins: with this the handshake is over, and the connection is idle."""
+
+
+DEADLINES = json.dumps({"methodConfig": [{"name": [{}], "timeout": "60s"}]})
+"""The deadline of every call, unless it has an earlier one."""
 
 
 class GatewayProcess(ServiceProcess):
@@ -43,8 +48,16 @@ class GatewayProcess(ServiceProcess):
             fresh=fresh,
         )
 
+    def channel(self, options: Sequence[tuple[str, int]] = ()) -> grpc.Channel:
+        return channel_to(self.address, options)
+
     def stub(self, options: Sequence[tuple[str, int]] = ()) -> Any:
-        return rpc.TrackingServiceStub(grpc.insecure_channel(self.address, options=options))
+        return rpc.TrackingServiceStub(self.channel(options))
+
+
+def channel_to(address: str, options: Sequence[tuple[str, int]] = ()) -> grpc.Channel:
+    """Return a channel whose calls all have a deadline."""
+    return grpc.insecure_channel(address, options=[*options, ("grpc.service_config", DEADLINES)])
 
 
 def connected(gateway: GatewayProcess) -> socket.socket:

@@ -42,7 +42,7 @@ class NatsProcess:
     def kill(self) -> None:
         if self.process is not None:
             self.process.kill()
-            self.process.wait()
+            self.process.wait(60)
             self.process = None
 
 
@@ -86,7 +86,7 @@ class NatsTrio:
     def kill(self, index: int) -> None:
         process = self._processes.pop(index)
         process.kill()
-        process.wait()
+        process.wait(60)
 
 
 def started(command: Sequence[str | Path], address: str, log: Path) -> subprocess.Popen[bytes]:

@@ -11,6 +11,9 @@ from routers import free_endpoint
 
 CHUNK = 1 << 16
 
+LIMIT_S = 120.0
+"""No test cuts it for so long."""
+
 
 class Proxy:
     """Takes connections and passes their bytes on.
@@ -49,12 +52,12 @@ class Proxy:
         for way in self._ways:
             way.set()
         self._sockets[0].shutdown(socket.SHUT_RDWR)
-        self._threads[0].join()  # nothing is accepted from here on
+        self._threads[0].join(60)  # nothing is accepted from here on
         for one in self._sockets[1:]:
             with contextlib.suppress(OSError):  # the other side has gone
                 one.shutdown(socket.SHUT_RDWR)
         for thread in self._threads[1:]:
-            thread.join()
+            thread.join(60)
         for one in self._sockets:
             one.close()
 
@@ -81,7 +84,7 @@ class Proxy:
             while True:
                 near, _ = listener.accept()
                 self.accepted += 1
-                self._whole.wait()
+                self._whole.wait(LIMIT_S)
                 self._sockets.append(near)
                 try:
                     far = socket.create_connection(self._target)
@@ -118,8 +121,8 @@ class Proxy:
             while True:
                 due, data = way.get()
                 time.sleep(max(0.0, due - time.monotonic()))  # the length of the way, not a wait for anything
-                self._whole.wait()
-                passes.wait()
+                self._whole.wait(LIMIT_S)
+                passes.wait(LIMIT_S)
                 if not data:
                     sink.shutdown(socket.SHUT_WR)
                     return

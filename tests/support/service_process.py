@@ -62,9 +62,9 @@ class ServiceProcess:
     ) -> None:
         if self.process.poll() is None:
             self.process.kill()
-        self.process.wait()
+        self.process.wait(60)
         for thread in self._threads:
-            thread.join()
+            thread.join(60)
         for stream in (self.process.stdout, self.process.stderr):
             if stream is not None:
                 stream.close()

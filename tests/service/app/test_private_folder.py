@@ -37,12 +37,12 @@ def test_what_a_killed_process_left_is_removed_and_nothing_else(
     lives, kept = holder()
     killed, left = holder()
     killed.kill()
-    killed.communicate()
+    killed.communicate(timeout=60)
     (left / "router").touch()
     assert {kept, left} < set(tmp_path.iterdir())
     with private_folder() as own:
         assert set(tmp_path.iterdir()) == {kept, own, tmp_path / "optipmb-other", tmp_path / "another"}
         assert own.stat().st_mode & 0o077 == 0
-    lives.communicate()
+    lives.communicate(timeout=60)
     assert lives.returncode == 0
     assert set(tmp_path.iterdir()) == {tmp_path / "optipmb-other", tmp_path / "another"}

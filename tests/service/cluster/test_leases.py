@@ -105,14 +105,14 @@ def test_of_writes_at_once_one_wins(make: Make) -> None:
         revisions: dict[int, int | None] = {}
 
         def put(index: int, write: Write = write, together: threading.Barrier = together) -> None:
-            together.wait()
+            together.wait(60)
             revisions[index] = stores[index].put(write._replace(value=str(index)))  # noqa: B023 - joined below
 
         threads = [threading.Thread(target=put, args=(index,)) for index in range(len(stores))]
         for thread in threads:
             thread.start()
         for thread in threads:
-            thread.join()
+            thread.join(60)
         ((winner, revision),) = [one for one in revisions.items() if one[1] is not None]
         assert len(revisions) == len(stores)
         assert stores[0].get(write.key) == (write.key, str(winner), revision)

@@ -112,7 +112,7 @@ def test_a_message_that_may_not_be_published_is_given_up(tmp_path: Path) -> None
     finally:
         log.connection.close(10.0)
         process.kill()
-        process.wait()
+        process.wait(60)
 
 
 def test_a_message_that_lets_no_other_be_written_is_given_up(log: MessageLog, monkeypatch: pytest.MonkeyPatch) -> None:

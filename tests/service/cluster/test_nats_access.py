@@ -57,7 +57,7 @@ def serve(tmp_path: Path) -> Iterator[Serve]:
     yield start
     for one in processes:
         one.kill()
-        one.wait()
+        one.wait(60)
 
 
 def protected(certificates: Path, *, asks: bool) -> str:
@@ -143,7 +143,7 @@ def test_nothing_is_said_to_a_server_without_tls(tmp_path: Path) -> None:
                 while data := connection.recv(4096):
                     heard.append(data)
 
-        thread = threading.Thread(target=pose)
+        thread = threading.Thread(target=pose, daemon=True)
         thread.start()
         options = access(None, file_of(tmp_path, "user", "tracker:secret"))
         store = JetStream([f"tls://127.0.0.1:{listener.getsockname()[1]}"], "test", options=options)

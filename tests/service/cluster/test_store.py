@@ -172,7 +172,7 @@ def test_killed_while_saving_leaves_whole_batches(tmp_path: Path) -> None:
         done = [int(child.stdout.readline()) for _ in range(5)][-1]
         child.kill()
         done = max([done, *map(int, child.stdout.read().split())])
-        child.wait()
+        child.wait(60)
         child.stdout.close()
         store = SqliteStore(tmp_path / "s")
         found = {store.load(stream) for stream in store.streams()}
@@ -261,7 +261,7 @@ def test_a_member_that_is_killed_is_gone_at_once(tmp_path: Path) -> None:
     child.send_signal(signal.SIGSTOP)
     assert not store.gone("one/1")
     child.kill()
-    child.wait()
+    child.wait(60)
     child.stdin.close()
     child.stdout.close()
     assert store.gone("one/1")

@@ -20,6 +20,7 @@ from optipmb_schemas.json_form import event_json, problem_json, tracks_json, wit
 from optipmb_service.edge.readers import EVENTS, Publication, Reader, Wish
 from optipmb_service.http import application
 from optipmb_service.settings import Settings
+from readers import received, texts
 from router import until
 from watched import KEYS, PROBLEM, STREAM, Session, Watched, asked, events, key_of, publication, served, tracks
 from websocket import (
@@ -61,7 +62,7 @@ def lines(address: str, query: str) -> Iterator[Iterator[bytes]]:
     with asked(address, f"/api/v1/stream?{query}") as response:
         assert response.status == OK
         assert response.readline() == b": hello\n"
-        yield (line[6:-1] for line in response if line.startswith(b"data: "))
+        yield texts(response)
 
 
 @contextlib.contextmanager
@@ -96,7 +97,7 @@ def test_get_stream_and_socket_give_the_same_text(session: Session, address: str
     with lines(address, query) as events, socket(address, query) as connection:
         session.publish(message)
         text = next(events)
-        assert connection.recv() == text.decode()
+        assert received(connection) == text.decode()
         assert session.subscriptions[0][0] == f"{KEYS.prefix}/{ALL}/tracks"
         assert len(session.subscriptions) == 1, "they share it"
     assert text == tracks_json(message)
@@ -112,11 +113,11 @@ def test_all_topics_come_on_one_connection(session: Session, address: str) -> No
     expected = [*event_json(events(1, 2)), zones_json(events(1)), problem_json(PROBLEM)]
     with socket(address, f"stream={STREAM}&topics=events,zones,problems&events=now") as connection:
         session.publish(tracks(1), events(1, 2), PROBLEM)
-        found = sorted(connection.recv().encode() for _ in expected)
+        found = sorted(str(received(connection)).encode() for _ in expected)
         assert found == sorted(text for text in expected if text is not None)
-    with lines(address, f"stream={STREAM}&topics=zones") as texts:
+    with lines(address, f"stream={STREAM}&topics=zones") as found_texts:
         session.publish(events(2, 3))
-        assert next(texts) == zones_json(events(2))
+        assert next(found_texts) == zones_json(events(2))
     session.cache = [(key_of(events(4)), events(4))]
     assert get(address, f"zones?stream={STREAM}")[1] == [json.loads(zones_json(events(4)) or b"")]
 
@@ -203,7 +204,7 @@ def test_tokens_decide_who_reads_what(guarded: str, session: Session) -> None:
     with socket(guarded, f"stream={ALL}", subprotocols=["optipmb.v1", "bearer.secret"]) as connection:
         assert connection.subprotocol == "optipmb.v1"
         session.publish(tracks(1))
-        assert json.loads(connection.recv())["seq"] == 1
+        assert json.loads(received(connection))["seq"] == 1
     with socket(guarded, "stream=garage/rig/*", subprotocols=["optipmb.v1", "bearer.rig"]) as connection:
         connection.send(json.dumps({"subscribe": {"stream": ALL}}))
         assert closed(connection) == 1008
@@ -232,7 +233,7 @@ def test_pages_of_strangers_open_no_socket(session: Session, address: str) -> No
     for origin in (f"http://{address}", "https://map.example"):
         with socket(address, query, origin=origin) as connection:
             session.publish(tracks(1))
-            assert json.loads(connection.recv())["seq"] == 1
+            assert json.loads(received(connection))["seq"] == 1
     with asked(address, "/api/v1/asyncapi.json", origin="https://map.example") as response:
         assert response.getheader("access-control-allow-origin") == "https://map.example"
     with asked(address, "/api/v1/asyncapi.json", origin="https://evil.example") as response:
@@ -247,7 +248,7 @@ def test_a_client_changes_what_it_reads(session: Session, address: str) -> None:
         until(lambda: any(key.endswith("garage/other/*/tracks") for key, _ in session.subscriptions), "it has changed")
         while True:
             session.publish(tracks(1), other)
-            if (text := json.loads(connection.recv()))["seq"] == 2:
+            if (text := json.loads(received(connection)))["seq"] == 2:
                 break
         assert [set(one) for one in text["objects"]] == [{"id", "yaw"}] * 2
     for bad in ("{", "[]", '{"subscribe": 3}', '{"subscribe": {"stream": "a"}}', '{"publish": {}}'):
@@ -348,4 +349,4 @@ def test_a_socket_that_loses_events_is_closed(session: Session, address: str) ->
             session.publish(tracks(seq, count=2000), events(seq, 100))
         assert closed(connection) == 1013
         with pytest.raises((WebSocketConnectionClosedException, OSError)):
-            connection.recv()
+            received(connection)

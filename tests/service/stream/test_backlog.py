@@ -255,7 +255,7 @@ def test_messages_from_many_threads_are_all_taken() -> None:
             assert isinstance(item, Packet)
             ended.append(item)
     for thread in threads:
-        thread.join()
+        thread.join(60)
     backlog.go_live()
     ended += taken(backlog)
     for origin in map(str, range(3)):

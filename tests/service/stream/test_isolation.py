@@ -296,7 +296,7 @@ def test_a_question_about_the_state_keeps_no_frame_waiting(
         node.send(CAREFUL.detections(1))
         node.tracks(CAREFUL.stream, 2)
         gate.set()
-        assert decode(answer.result()[0][2], SessionState).frames == frames  # the state at the question
+        assert decode(answer.result(60)[0][2], SessionState).frames == frames  # the state at the question
 
 
 def test_a_stream_that_opens_keeps_no_other_waiting(

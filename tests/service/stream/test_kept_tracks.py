@@ -162,7 +162,7 @@ def test_caches_that_do_not_answer_keep_nothing_of_the_log_waiting(tmp_path: Pat
 
     def recent(_: str) -> list[tuple[bytes, str]]:
         asked.set()
-        answered.wait()
+        assert answered.wait(60)
         return []
 
     with NatsProcess(tmp_path) as nats:

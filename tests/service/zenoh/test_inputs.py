@@ -95,7 +95,7 @@ def test_messages_on_their_way_when_their_stream_is_left_do_not_hide_what_follow
         receive(*arguments)
 
     monkeypatch.setattr(network.received, "add", slowly)
-    publishing = threading.Thread(target=network.publish, args=(b"3",))
+    publishing = threading.Thread(target=network.publish, args=(b"3",), daemon=True)
     publishing.start()
     arrived.wait(CLOSE_S)
     passed = threading.Event()
@@ -143,7 +143,9 @@ def test_messages_of_several_threads_are_handed_over_one_at_a_time(network: Netw
     topic.subscribe(ALL, KEYS.all("points"), cached=False)
     sent = [[bytes((sender, number)) for number in range(20)] for sender in range(4)]
     senders = [
-        threading.Thread(target=lambda own=own: [network.session.put(KEYS.points(STREAM), one) for one in own])
+        threading.Thread(
+            target=lambda own=own: [network.session.put(KEYS.points(STREAM), one) for one in own], daemon=True
+        )
         for own in sent
     ]
     for sender in senders:
@@ -171,7 +173,7 @@ def test_a_thread_waits_while_too_many_messages_wait(network: Network, monkeypat
 
     def send(*payloads: bytes) -> threading.Thread:
         put = partial(network.session.put, KEYS.points(STREAM))
-        sender = threading.Thread(target=lambda: [put(payload) for payload in payloads])
+        sender = threading.Thread(target=lambda: [put(payload) for payload in payloads], daemon=True)
         sender.start()
         return sender
 

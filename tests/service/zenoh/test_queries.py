@@ -71,7 +71,7 @@ def test_queries_beyond_those_that_may_be_open_are_refused(
         node.send(SENSOR.detections(1))
         node.tracks(SENSOR.stream, 2)
         gate.set()
-        answers = [answer for one in asked for answer in one.result()]
+        answers = [answer for one in asked for answer in one.result(60)]
         refused = [decode(payload, Problem) for ok, _, payload in answers if not ok]
         answered = [decode(payload, SessionState) for ok, _, payload in answers if ok]
         assert (len(refused), len(answered)) == (ASKED - MOST, MOST)

@@ -98,7 +98,7 @@ def test_subscribing_to_what_is_sent_in_the_same_session_waits_for_no_cache(sess
         sending.start()
         topic.subscribe(str(number), key)
         over.set()
-        sending.join()
+        sending.join(60)
         topic.leave([str(number)])
 
     ends(lambda: [subscribe(number) for number in range(20)])
