@@ -44,6 +44,7 @@ ARROWS = {
 """What each folder, or module beside the folders, may import of the others; also for the type checker alone."""
 
 PURE = {
+    "arrivals",
     "checkpoint",
     "convert",
     "pending",

@@ -11,6 +11,7 @@ import threading
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from optipmb_service.stream.arrivals import BACK_NS
 from optipmb_service.stream.values import SECOND
 
 if TYPE_CHECKING:
@@ -24,11 +25,6 @@ FORGET_NS: Final = 10 * SECOND
 
 TOKEN_NS: Final = SECOND
 """Longest delay of the token of a publisher with a cache after its first message."""
-
-BACK_NS: Final = 5 * SECOND
-"""Longest delay of a token after a session has begun: a client that lost its router tries every 4 s at least.
-
-Sessions wait no longer than `recovery_wait_s` in any case."""
 
 MAX_UNPROVEN_ANNOUNCED: Final = 256
 """Streams without a session that this instance announces at once: each costs members a token and subscriptions."""

@@ -7,18 +7,13 @@ as behind a cut between two routers.
 
 from __future__ import annotations
 
-import contextlib
 import time
-from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import structlog
-from optipmb_client.errors import ConnectionFailed as TransportError
 
 from optipmb_service.cluster.store import Missed, Position
-from optipmb_service.stream.directory import BACK_NS
 from optipmb_service.stream.timeline import number_of
-from optipmb_service.stream.values import MAX_SENSORS
 from optipmb_service.zenoh.inputs import Packet
 
 if TYPE_CHECKING:
@@ -29,8 +24,6 @@ if TYPE_CHECKING:
     from optipmb_service.cluster.message_log import LogMessage, LogReader
     from optipmb_service.stream.checkpoint import Checkpoint
     from optipmb_service.stream.profiles import Fusion
-    from optipmb_service.stream.session import Session
-    from optipmb_service.stream.streams import Streams
 
     Take = Callable[[list[Packet]], None]
 
@@ -38,9 +31,6 @@ log = structlog.get_logger("optipmb_service")
 
 MOST_PAUSES: Final = 8
 """Longest pause between two reads that find nothing, in times of the silence before the first one."""
-
-MOST: Final = 4 * MAX_SENSORS
-"""Complete caches that are remembered; when there are more, those are forgotten whose publishers have gone."""
 
 
 class Log:
@@ -170,58 +160,3 @@ class LogCheck:
         if found:
             self._pause_ns, self._next_ns = self._silent_ns, 0
         self.under_way = False
-
-
-class CacheRecovery:
-    """Publishers' caches that one session waits for; for the tracking thread alone.
-
-    Args:
-        session: its name.
-        streams: have the caches.
-    """
-
-    def __init__(self, session: str, streams: Streams) -> None:
-        self._session = session
-        self._streams = streams
-        self._answered: set[str] = set()
-        self._asked: set[str] = set()
-        self._most = MOST
-
-    def answered(self, *streams: str) -> None:
-        """Note that all has come which the caches of these streams held."""
-        self._answered.update(streams)
-        self._asked.update(streams)
-        if len(self._answered) > self._most:
-            there = self._streams.caches.awaited(self._session, self._answered).keys()
-            self._answered &= there
-            self._asked &= there
-            self._most = max(MOST, 2 * len(self._answered))  # present publishers are not looked at each time
-
-    def ask_again(self, stream: str) -> None:
-        """Note that the cache of a stream has not answered in full."""
-        self._asked.discard(stream)
-
-    def forget(self) -> None:
-        """Begin again: the session has ended."""
-        self._answered.clear()
-        self._asked.clear()
-        self._most = MOST
-
-    def awaited(self, session: Session, take: Callable[[str, list[Packet], bool], None]) -> bool:
-        """Return whether caches may hold missing frames; ask the caches that were not asked.
-
-        Args:
-            session: has the sensors.
-            take: called on any thread with a stream, what its cache held, and whether it has answered in full.
-        """
-        caches = self._streams.caches
-        awaited = caches.awaited(self._session, session.sensors)
-        for stream, is_there in awaited.items():
-            if is_there and stream not in self._asked:
-                self._asked.add(stream)
-                with contextlib.suppress(TransportError):  # the end
-                    caches.ask_cache(stream, partial(take, stream))
-        # Tokens of sensors that a young session does not know may be on their way.
-        young_ns = session.young_since_ns
-        is_young = young_ns is not None and time.monotonic_ns() - young_ns < BACK_NS
-        return is_young or not awaited.keys() <= self._answered

@@ -25,6 +25,7 @@ import optipmb_schemas as schemas
 
 import optipmb
 from optipmb_service.stream import convert
+from optipmb_service.stream.arrivals import Arrivals
 from optipmb_service.stream.checkpoint import Checkpoint
 from optipmb_service.stream.pending import PendingFrame, SensorQueue
 from optipmb_service.stream.problems import problem_of
@@ -126,14 +127,7 @@ class Session:
         start = FilterState(transition.no_objects(incarnation.next_id), name, incarnation.starts)
         self._window = ReorderWindow(start, transition)
         self._restored = False
-        self._recovery_ns: int | None = None
-        """Monotonic end of the recovery; None: there is none."""
-        self._began: tuple[int, int] | None = None
-        """Stamp and arrival of the first frame, while a fused session waits for its other sensors."""
-        self._from_cache = False
-        """Whether its frames come faster than time passes."""
-        self._young_ns: int | None = None
-        """First stamp of a fused session that was restored before it may have known all its sensors."""
+        self.arrivals = Arrivals(self._policy)
         self._now_ns = 0
         """When frames became ready last (monotonic)."""
         if not fused:
@@ -164,9 +158,8 @@ class Session:
                 expected = "a reset or a restarted publisher: the session is quarantined"
                 return [self._refuse("quarantined", frame_id, "", expected, error)]
             outputs += self._end_quarantine(frame_id.sensor)
-        recovery_ns = self._policy.recovery_wait_ns if self._fused else 0
-        if recovery_ns and not (self._restored or self._began or self.counters.frames):
-            self._began, self._recovery_ns = (frame_id.stamp_ns, since_ns), now_ns + recovery_ns
+        if self._fused and not (self._restored or self.arrivals.waiting or self.counters.frames):
+            self.arrivals.begin(frame_id.stamp_ns, since_ns, now_ns)
         judged = queue.judge(frame_id)
         if queue.is_alive(frame_id, judged[1]):
             outputs += self._reinstate(frame_id)
@@ -206,7 +199,7 @@ class Session:
         if self._has_ready:
             return 0
         due = [
-            self._recovery_ns if self._is_behind_gap(one.held[0].frame_id) else one.held[0].deadline_ns
+            self.arrivals.deadline_ns if self._waits(one.held[0].frame_id) else one.held[0].deadline_ns
             for one in self._sensors.values()
             if one.held
         ]
@@ -344,10 +337,10 @@ class Session:
         one._restored = True
         one._deliveries = replace(checkpoint.deliveries)
         one._quarantine = dict(checkpoint.quarantine)
-        one._recovery_ns = now_ns + one._policy.recovery_wait_ns
-        if checkpoint.fused and checkpoint.base.last is None:
-            # Of the beginning of a session: other sensors may have been there that it does not know yet.
-            one._young_ns = min((frame.frame_id.stamp_ns for frame in checkpoint.window), default=None)
+        # Of the beginning of a session: other sensors may have been there that it does not know yet.
+        is_young = checkpoint.fused and checkpoint.base.last is None
+        stamps = (frame.frame_id.stamp_ns for frame in checkpoint.window if is_young)
+        one.arrivals.resume(now_ns, min(stamps, default=None))
         one._timeline = type(one._timeline).resume(one._policy.jump_limits, checkpoint)
         places = one._timeline.places()
         frames = [replace(frame, place=places[frame.frame_id]) for frame in checkpoint.window]
@@ -363,30 +356,13 @@ class Session:
         return one
 
     @property
-    def recovering(self) -> bool:
-        """Whether frames behind a gap wait, because those missing may still come from the publisher's cache."""
-        return self._recovery_ns is not None and not self._began
-
-    @property
-    def awaits_caches(self) -> bool:
-        """Whether frames wait because others before them, or of other sensors, may still come from caches."""
-        return self._recovery_ns is not None
-
-    @property
-    def young_since_ns(self) -> int | None:
-        """Monotonic start of recovery while the sensor set is incomplete, else None."""
-        if self._recovery_ns is None or (self._began is None and self._young_ns is None):
-            return None
-        return self._recovery_ns - self._policy.recovery_wait_ns
-
-    @property
     def sensors(self) -> set[str]:
         """The sensors that it knows of, by stream; of one stream an empty name."""
         return set(self._sensors)
 
     def recovered(self, now_ns: int) -> list[Output]:
         """End the recovery: all that the caches had is here. Return the outputs of frames that waited for it."""
-        self._end_recovery()
+        self.arrivals.end()
         return self._advance(now_ns)
 
     def again(self) -> list[Tracked]:
@@ -498,7 +474,7 @@ class Session:
             condition = "closed"
         elif self._quarantine and self._quarantine.keys() >= self._sensors.keys():
             condition = "quarantined"
-        elif self.recovering:
+        elif self.arrivals.recovering:
             condition = "recovering"
         return schemas.SessionState(
             stream=self.stream,
@@ -566,36 +542,11 @@ class Session:
         del self._quarantine[sensor]
         return []
 
-    # Recovery
-
-    def _end_recovery(self) -> None:
-        self._recovery_ns, self._began, self._from_cache, self._young_ns = None, None, False, None
-
-    def _is_behind_gap(self, frame_id: FrameId) -> bool:
-        """Return whether a frame waits for others that caches may hold: of its sensor, and of live ones.
-
-        After a restore the frames between the checkpoint and the crash come from the caches. When a fused session
-        begins, the caches come one after the other: until it is known which sensors there are, none goes ahead of the
-        time that has passed by more than half of the time for which late frames are inserted. The other half is for
-        sensors that began a little earlier and are heard of a little later.
-        """
-        if self._recovery_ns is None:
-            return False
-        margin_ns, stamp_ns = self._policy.rewind_ns // 2, frame_id.stamp_ns
-        if self._began:
-            first_ns, began_ns = self._began
-            ahead_ns = stamp_ns - first_ns - margin_ns
-            # Stamps that pass faster than time come from a cache, and the other caches begin as early.
-            self._from_cache |= ahead_ns > self._now_ns - began_ns
-            return ahead_ns > (0 if self._from_cache else self._now_ns - began_ns)
-        if self._young_ns is not None and stamp_ns - self._young_ns > margin_ns:
-            return True
-        for name, newest_ns in self._timeline.live().items():
-            queue = self._sensors.get(name)
-            reached_ns = queue.held[0].frame_id.stamp_ns if queue and queue.held else newest_ns
-            if name != frame_id.sensor and reached_ns < stamp_ns:
-                return True
-        return not self._timeline.complete_until(frame_id, self._window.head.sensor(frame_id.sensor).tracked)
+    def _waits(self, frame_id: FrameId) -> bool:
+        """Return whether the earliest pending frame of a sensor waits for others that may still come."""
+        held = {name: one.held[0].frame_id.stamp_ns for name, one in self._sensors.items() if one.held}
+        last = self._window.head.sensor(frame_id.sensor).tracked
+        return self.arrivals.waits(frame_id, self._now_ns, self._timeline, held, last)
 
     # Processing
 
@@ -636,7 +587,7 @@ class Session:
         deadline_ns, inputs = queue.cloud_deadline_ns(message, since_ns), (message, frame, ignored)
         pending = PendingFrame(frame_id, detections, inputs, deadline_ns, ticket, judged)
         waits = queue.held or deadline_ns is not None or queue.clouds.newest_ns is not None
-        if len(self._sensors) == 1 and not waits and self._recovery_ns is None:  # mostly
+        if len(self._sensors) == 1 and not waits and not self.arrivals.waiting:  # mostly
             self._now_ns, self._has_ready = now_ns, False
             return [*outputs, *self._process(pending)]
         queue.add(pending)
@@ -675,8 +626,8 @@ class Session:
         """
         if now_ns is not None:
             self._now_ns = now_ns
-            if self._recovery_ns is not None and now_ns >= self._recovery_ns:
-                self._end_recovery()
+            if (deadline_ns := self.arrivals.deadline_ns) is not None and now_ns >= deadline_ns:
+                self.arrivals.end()
         outputs: list[Output] = []
         self._has_ready, taken, policy = False, 0, self._policy
         ends_ns = self._clock() + FLUSH_NS if now_ns is None else None
@@ -697,7 +648,7 @@ class Session:
         if len(queues) > 1:
             queues.sort(key=lambda one: (one.held[0].frame_id.stamp_ns, one.held[0].frame_id.sensor))
         for one in queues:
-            if pending := one.take(now_ns, self._is_behind_gap):
+            if pending := one.take(now_ns, self._waits):
                 return pending
         return None
 

@@ -10,6 +10,7 @@ is only reported.
 
 from __future__ import annotations
 
+import contextlib
 import time
 from dataclasses import replace
 from functools import partial
@@ -20,10 +21,11 @@ import structlog
 from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_client.trace_context import attachment_of
 
+from optipmb_service.stream.arrivals import Arrivals
 from optipmb_service.stream.checkpoint import CheckpointError, forgotten
 from optipmb_service.stream.persistence import save_dump
 from optipmb_service.stream.problems import problem_of
-from optipmb_service.stream.recovery import CacheRecovery, LogCheck
+from optipmb_service.stream.recovery import LogCheck
 from optipmb_service.stream.session import Session
 from optipmb_service.stream.values import MAX_SENSORS, SECOND, Begun, Incarnation, Quarantined, Tracked
 from optipmb_service.telemetry.stream_meter import MAX_COUNT, Counters, MessageCounters, StreamMeter, total
@@ -99,7 +101,7 @@ class Stream:
         """Encoded tracks and events that wait for the write lease, each with the time that its frame waited, ns."""
         self._ids = b""
         """Ids of the newest tracks, as the bytes of int64."""
-        self._caches = CacheRecovery(name, streams)
+        self.arrivals = Arrivals(self._policy)
         self._resting: dict[str, int] = {}
         """Monotonic time until when messages of a sensor are refused that took too long."""
         self._changed = False
@@ -440,21 +442,28 @@ class Stream:
 
     def on_caches_answered(self, *streams: str) -> None:
         """Go on behind gaps: all that the caches of these streams held has come. Of several sensors all must have."""
-        self._caches.answered(*streams)
+        self.arrivals.answer(*streams)
         self.ask(Stream._end_recovery, create=False)
 
     def _end_recovery(self) -> None:
         session = self.session
-        if session is None or not session.awaits_caches:
+        if session is None or not self.arrivals.waiting:
             return
-        if not (self.fused and self._caches.awaited(session, self._take_cached)):
-            self._changed = True
-            self.deliver(session.recovered(time.monotonic_ns()))
+        now_ns = time.monotonic_ns()
+        if self.fused:
+            caches = self._streams.caches.awaited(self.name, session.sensors)
+            for stream in self.arrivals.to_ask(caches):
+                with contextlib.suppress(TransportError):  # the end
+                    self._streams.caches.ask_cache(stream, partial(self._take_cached, stream))
+            if not self.arrivals.complete(caches, now_ns):
+                return
+        self._changed = True
+        self.deliver(session.recovered(now_ns))
 
     def _take_cached(self, stream: str, packets: list[Packet], complete: bool) -> None:  # noqa: FBT001 - as the network calls it
         """Take what a cache held; one that has not answered is asked again. Called on any thread."""
         self.backlog.recover(packets)
-        then = partial(self.on_caches_answered if complete else self._caches.ask_again, stream)
+        then = partial(self.on_caches_answered if complete else self.arrivals.ask_again, stream)
         self.backlog.command(then, urgent=False)
 
     def look_in_log(self) -> None:
@@ -548,7 +557,8 @@ class Stream:
             self._open_publisher()
             session = self._restored(restored) if restored else self._new(incarnation, fence)
             self._counts.open(session)
-            self._changed, self.session = False, session
+            session.arrivals.answer(*self.arrivals.answered)
+            self._changed, self.session, self.arrivals = False, session, session.arrivals
             if restored:
                 self.durable = self.durable or session.final
                 self._check_zones(session)
@@ -696,7 +706,7 @@ class Stream:
         if (session := self.session) is None:
             return
         self.session, self._armed_ns, self._fixed_rate = None, None, None
-        self._caches.forget()
+        self.arrivals = Arrivals(self._policy)
         self._unpublished.clear()  # another owner publishes it
         self._count_tracks(b"")
         if self._publisher is not None:

@@ -184,7 +184,7 @@ def test_what_no_cache_has_is_a_gap() -> None:
         assert two.on_tick(99 + Policy().recovery_wait_ns) == []
         outputs = two.on_tick(100 + Policy().recovery_wait_ns) if end == "deadline" else two.recovered(100)
         assert [(m.seq, m.gap) for m in tracks(outputs)] == [(8, 3), (9, 0)]
-        assert not two.recovering
+        assert not two.arrivals.waiting
         late = tracks(feed(two, [6], SENSOR))
         assert [(m.seq, m.revision, m.gap) for m in late] == [(6, 0, 1), (8, 1, 1), (9, 1, 0)]
 

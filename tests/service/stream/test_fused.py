@@ -368,7 +368,7 @@ def test_a_silent_sensor_holds_up_nobody_for_longer_than_the_wait_for_recovery()
     assert not feed(one, range(1, 4), FRONT)
     assert one.deadline_ns == 2 * SECOND
     assert [m.seq for m in tracks(one.on_tick(2 * SECOND))] == [1, 2, 3]
-    assert not one.recovering
+    assert not one.arrivals.waiting
 
 
 @pytest.mark.parametrize("close", [False, True])
