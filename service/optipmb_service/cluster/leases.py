@@ -127,6 +127,7 @@ class LeaseTable:
         position: the highest revision seen.
         held: partitions that it holds, each with its fence; may be read by any thread.
         leaving: partitions of `held` that it is about to leave, since when.
+        lost: partitions that it held and others have taken, until that is reported.
         state: value of its record; unless `alive`, others are to have its partitions.
         moving: whether it has fewer partitions than it is to have, or more.
         changed_ns: when something but a renewal was seen last.
@@ -137,6 +138,7 @@ class LeaseTable:
     position: int = 0
     held: dict[int, int] = field(default_factory=dict)
     leaving: dict[int, int] = field(default_factory=dict)
+    lost: set[int] = field(default_factory=set)
     state: str = ALIVE
     moving: bool = False
     changed_ns: int = 0
@@ -190,6 +192,8 @@ class LeaseTable:
         if holder == self.member:
             self.held[partition] = revision
         else:
+            if partition in self.held.keys() - self.leaving.keys() and holder != NOBODY:
+                self.lost.add(partition)
             self.held.pop(partition, None)
             self.leaving.pop(partition, None)
 

@@ -347,13 +347,16 @@ class Member:
     def _lose(self) -> None:
         """Begin again as a new member: another one has ended this one, and takes its partitions."""
         self._may_write_until_ns = 0
-        if self._table.held:
-            log.error("lease_lost", member=self._table.member, partitions=len(self._table.held))
+        self._report_lost(self._table.lost | self._reported.keys())  # the records of some may have come before
         self._error = "another member has taken over its partitions"
         state, self._table = self._table.state, self._joining()
         self._table.state = state
         self._gone = set()
         self._revision = 0
+
+    def _report_lost(self, partitions: set[int]) -> None:
+        if partitions:
+            log.error("lease_lost", member=self._table.member, partitions=len(partitions))
 
     def _joining(self) -> LeaseTable:
         return LeaseTable(f"{self._instance}/{secrets.token_hex(4)}", self._lease_ns)
@@ -365,6 +368,8 @@ class Member:
 
     def _settle(self) -> None:
         """Report changes of partitions."""
+        self._report_lost(self._table.lost)
+        self._table.lost = set()
         held, leaving = dict(self._table.held), set(self._table.leaving)
         reported, self._reported = self._reported, held
         if held != reported:

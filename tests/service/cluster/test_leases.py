@@ -22,6 +22,7 @@ from optipmb_service.cluster.sqlite import SqliteStore
 from optipmb_service.cluster.store import ENDED, Fenced, LeaseStore, Record, StoreError, Write
 from optipmb_service.stream.persistence import CheckpointWriter
 from router import until
+from structlog.testing import capture_logs
 
 Make = Callable[[], LeaseStore]
 
@@ -231,6 +232,22 @@ def test_who_is_silent_for_a_lease_loses_all(make: Make) -> None:
     assert sorted(sleeper.changes) == [(partition, Change.LOST) for partition in sorted(partitions)]
     even(sleeper, other)
     assert not sleeper.member.may_write(stream, fence)
+
+
+@pytest.mark.parametrize("passed_s", [0.0, LEASE_S])
+def test_a_member_logs_once_that_others_have_its_partitions(passed_s: float) -> None:
+    """It does so whether it notices by its own record, or before that by the records of its partitions."""
+    shared = Shared()
+    sleeper, other = HandMember("z", MemoryLeases(shared)), HandMember("a", MemoryLeases(shared))
+    even(sleeper, other)
+    count = len(sleeper.held)
+    assert sleeper.turn(TICK_S)
+    while len(other.held) < PARTITIONS:
+        assert other.turn(TICK_S)
+    with capture_logs() as logs:
+        assert sleeper.turn(passed_s)
+        even(sleeper, other)
+    assert [line["partitions"] for line in logs if line["event"] == "lease_lost"] == [count]
 
 
 def test_a_partition_is_left_when_the_state_of_its_streams_is_kept(make: Make) -> None:
