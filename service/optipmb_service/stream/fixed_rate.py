@@ -82,8 +82,9 @@ class FixedRate:
             return None
         newest = self._newest
         stamp_ns = 0 if newest is None else newest.header["stamp_ns"]
-        age_ns = now_ns - self._arrived_ns if self._by_arrival else wall_ns - stamp_ns
-        if newest is None or self._wrong or age_ns > self._longest_ns:
+        silent_ns = now_ns - self._arrived_ns
+        age_ns = silent_ns if self._by_arrival else wall_ns - stamp_ns
+        if newest is None or self._wrong or max(age_ns, silent_ns) > self._longest_ns:
             self.due_ns = None
             return None
         self.due_ns += ((now_ns - self.due_ns) // self._period_ns + 1) * self._period_ns

@@ -66,6 +66,7 @@ class PendingFrame:
         deadline_ns: until when it waits for its cloud (monotonic); None: it does not.
         ticket: value that the caller gave with it.
         judged: the timeline that it was judged by on arrival, the decision, and the timeline with it.
+        since_ns: when it arrived (monotonic).
         points: its cloud, once its turn has come.
         missed: whether it waited for a cloud in vain.
     """
@@ -76,6 +77,7 @@ class PendingFrame:
     deadline_ns: int | None
     ticket: Any
     judged: Judged
+    since_ns: int
     points: schemas.Points | None = None
     missed: bool = False
 
@@ -226,18 +228,18 @@ class SensorQueue:
         self.held_bytes = 0
         return count
 
-    def take(self, now_ns: int | None, behind_gap: Callable[[FrameId], bool]) -> PendingFrame | None:
+    def take(self, now_ns: int | None, waits: Callable[[PendingFrame], bool]) -> PendingFrame | None:
         """Return the next frame if it is ready, with its cloud, None otherwise.
 
         Args:
             now_ns: monotonic time; None: nothing waits any longer.
-            behind_gap: whether a frame is held for others before it.
+            waits: whether a frame is held for others.
         """
         if not self.held:
             return None
         head, clouds = self.held[0], self.clouds
         full = self.held_bytes > self.policy.held_bytes or len(self.held) > MAX_HELD
-        if now_ns is not None and not full and behind_gap(head.frame_id):
+        if now_ns is not None and not full and waits(head):
             return None
         points = self._cloud(head) if clouds.newest_ns is not None else None
         head.missed = points is None and head.deadline_ns is not None
@@ -247,7 +249,11 @@ class SensorQueue:
             if not full:
                 return None
         head.points = points
-        del self.held[0]
+        return self.pop()
+
+    def pop(self) -> PendingFrame:
+        """Remove the next frame and return it."""
+        head = self.held.pop(0)
         self.held_bytes -= head.size
         return head
 

@@ -198,11 +198,7 @@ class Session:
         """When `on_tick` is due (monotonic, ns), 0: at once; None while no frame waits."""
         if self._has_ready:
             return 0
-        due = [
-            self.arrivals.deadline_ns if self._waits(one.held[0].frame_id) else one.held[0].deadline_ns
-            for one in self._sensors.values()
-            if one.held
-        ]
+        due = [self._due_ns(one.held[0]) for one in self._sensors.values() if one.held]
         return min((one for one in due if one is not None), default=None)
 
     def refuse(self) -> None:
@@ -542,11 +538,38 @@ class Session:
         del self._quarantine[sensor]
         return []
 
-    def _waits(self, frame_id: FrameId) -> bool:
-        """Return whether the earliest pending frame of a sensor waits for others that may still come."""
+    def _is_early(self, frame_id: FrameId) -> bool:
+        """Return whether the earliest pending frame of a sensor waits for others that sources may still send."""
+        if not self.arrivals.waiting:
+            return False
         held = {name: one.held[0].frame_id.stamp_ns for name, one in self._sensors.items() if one.held}
         last = self._window.head.sensor(frame_id.sensor).tracked
         return self.arrivals.waits(frame_id, self._now_ns, self._timeline, held, last)
+
+    def _is_ahead(self, pending: PendingFrame) -> bool:
+        """Return whether a frame waits for others, to learn whether its clock or time itself has gone on so far.
+
+        Most sensors decide. A frame on the old clock refuses it (`_process`).
+        """
+        timeline = self._timeline
+        if not isinstance(timeline, FusedTimeline) or not timeline.is_ahead(pending.frame_id):
+            return False
+        queues = self._sensors.items()
+        ahead = {name for name, one in queues if one.held and timeline.is_ahead(one.held[0].frame_id)}
+        return 2 * len(ahead) <= len(timeline.live().keys() | ahead) and self._now_ns < self._follows_ns(pending)
+
+    def _follows_ns(self, pending: PendingFrame) -> int:
+        """Return until when the frames of other sensors follow it (monotonic)."""
+        return pending.since_ns + self._policy.rewind_ns
+
+    def _waits(self, pending: PendingFrame) -> bool:
+        return self._is_early(pending.frame_id) or self._is_ahead(pending)
+
+    def _due_ns(self, pending: PendingFrame) -> int | None:
+        """Return when a pending frame need not wait any longer (monotonic)."""
+        if self._is_early(pending.frame_id):
+            return self.arrivals.deadline_ns
+        return self._follows_ns(pending) if self._is_ahead(pending) else pending.deadline_ns
 
     # Processing
 
@@ -585,7 +608,7 @@ class Session:
         if frame_id.seq % SCORED_EVERY == 0 and not parameters.self_calibration:
             outputs += self._low_scores(frame_id, frame, parameters)  # none is filtered of the upper half of a class
         deadline_ns, inputs = queue.cloud_deadline_ns(message, since_ns), (message, frame, ignored)
-        pending = PendingFrame(frame_id, detections, inputs, deadline_ns, ticket, judged)
+        pending = PendingFrame(frame_id, detections, inputs, deadline_ns, ticket, judged, since_ns)
         waits = queue.held or deadline_ns is not None or queue.clouds.newest_ns is not None
         if len(self._sensors) == 1 and not waits and not self.arrivals.waiting:  # mostly
             self._now_ns, self._has_ready = now_ns, False
@@ -663,8 +686,21 @@ class Session:
                 return self._refused(frame_id, decision)
         frame = ProcessedFrame(frame_id, pending.detections, pending.points, pending.missed, 0, [], decision.place)
         if decision.last:
-            return self._step([frame], timeline, frame_id, pending.ticket, began_ns, pending.inputs)
+            outputs = self._step([frame], timeline, frame_id, pending.ticket, began_ns, pending.inputs)
+            return [*outputs, *self._refuse_ahead()] if self.held else outputs
         return self._step(self._window.inserted(frame, timeline.places()), timeline, frame_id, pending.ticket, began_ns)
+
+    def _refuse_ahead(self) -> list[Output]:
+        """Refuse the first frame of each sensor that is ahead, as another one goes on; those after it follow it."""
+        outputs: list[Output] = []
+        for queue in self._sensors.values():
+            timeline = self._timeline
+            if queue.held and isinstance(timeline, FusedTimeline) and timeline.is_ahead(queue.held[0].frame_id):
+                frame_id = queue.pop().frame_id
+                decision, self._timeline = timeline.doubted(frame_id)
+                self._follow()
+                outputs += self._refused(frame_id, decision)
+        return outputs
 
     def _amend(self, message: schemas.Points, frame_id: FrameId, ticket: Any) -> list[Output]:
         """Put a cloud that came after its frame into the window."""
@@ -750,7 +786,7 @@ class Session:
             expected = f"the publisher that began last; stop one of the two, this one is tracked again {silent}"
             return [self._refuse("duplicate_epoch", frame_id, "epoch", expected, frame_id.epoch.hex())]
         if decision.verdict is Verdict.JUMPED:
-            expected = "a stamp near those of the session's other sensors, or all of them on another clock"
+            expected = "a stamp near those of the session's other sensors, or most of them on another clock"
             return [self._refuse("time_jump", frame_id, "stamp_ns", expected, received)]
         self._deliveries.late += 1
         return [self._problem("late", frame_id, "stamp_ns", "a frame inside the window", received)]

@@ -455,11 +455,13 @@ class JumpedFrames:
 
     Attributes:
         count: how many.
+        first_ns: stamp of the first of them.
         since_ns: stamp of the first of them that came after the session's clock moved last.
         newest_ns: stamp of the last one.
     """
 
     count: int
+    first_ns: int
     since_ns: int
     newest_ns: int
 
@@ -472,9 +474,12 @@ class FusedTimeline(Timeline):
     are beyond the publisher's before; other sensors are not concerned.
 
     The session's clock is the highest stamp. A frame further from it than the gap limit, ahead or back, is refused, so
-    one sensor's wrong clock costs the others nothing. The jump is believed, and the density restarts, when
-    `JUMP_FRAMES` frames of the sensor agree and the others do too: each sensor that fed the session lately is on the
-    new clock as well, or for as long as the gap limit none has moved the old one.
+    one sensor's wrong clock costs the others nothing. So is a frame that is only further ahead than a late frame may
+    be behind (`is_ahead`), once another sensor has gone on with the old clock: until then it waits. The jump is
+    believed when `JUMP_FRAMES` frames of the sensor agree and most sensors that fed the session lately are on the new
+    clock as well, or none has moved the old one for as long as the gap limit. The density restarts, unless the gap
+    limit is kept. Most sensors that are late for longer than the gap limit, as behind a clock that drifts, also
+    restart it.
 
     Attributes:
         generation: number of jumps that were believed; all frames of the window are of this one.
@@ -504,19 +509,32 @@ class FusedTimeline(Timeline):
             clock[one.sensor] = max(one.stamp_ns, clock.get(one.sensor, one.stamp_ns))
         return cls(limits, checkpoint.seen, base.cursors, base.last, frame_ids, clock, generation)
 
+    def is_ahead(self, frame_id: FrameId) -> bool:
+        """Return whether a frame would make frames of all others late, and nothing says yet whether they follow."""
+        return self._jump_ns(frame_id) > self.limits.back_ns and not self._is_doubted(frame_id.sensor)
+
+    def doubted(self, frame_id: FrameId) -> tuple[Decision, Timeline]:
+        """Refuse a frame that is ahead, and those of its sensor that follow it, until most sensors agree."""
+        decision, _ = self._refuse(frame_id, Verdict.JUMPED)
+        return decision, replace(self, jumped=self._jumped(frame_id))
+
+    def _is_doubted(self, sensor: str) -> bool:
+        one = self.jumped.get(sensor)
+        return one is not None and one.newest_ns > max(self.clock.values(), default=0)
+
     def _jump_ns(self, frame_id: FrameId) -> int:
         return frame_id.stamp_ns - max(self.clock.values(), default=frame_id.stamp_ns)
 
     def _place(self, frame_id: FrameId, number: int) -> tuple[Decision, Timeline]:
-        epochs = self.seen.get(frame_id.sensor, ())
-        if self.clock and abs(self._jump_ns(frame_id)) > self.limits.ahead_ns:
+        epochs, jump_ns = self.seen.get(frame_id.sensor, ()), self._jump_ns(frame_id)
+        if abs(jump_ns) > self.limits.ahead_ns or (jump_ns > self.limits.back_ns and self._is_doubted(frame_id.sensor)):
             return self._other_clock(frame_id)
         refusal = self._no_place(frame_id, number if number >= 0 else len(epochs))
         if refusal is None:
             return self._admit(frame_id)
         newest = number < 0 or (number == len(epochs) - 1 and frame_id.seq > epochs[number].highest)
-        if refusal is Verdict.LATE and newest and frame_id.stamp_ns < self.clock.get(frame_id.sensor, 0):
-            return self._other_clock(frame_id, refusal)  # the sensor's own clock has stepped back
+        if refusal is Verdict.LATE and newest:
+            return self._other_clock(frame_id, refusal)  # its clock has stepped back, or that of another one ahead
         return self._refuse(frame_id, refusal)
 
     def _no_place(self, frame_id: FrameId, number: int) -> Verdict | None:
@@ -567,18 +585,18 @@ class FusedTimeline(Timeline):
 
     def _other_clock(self, frame_id: FrameId, refusal: Verdict = Verdict.JUMPED) -> tuple[Decision, Timeline]:
         """Refuse a frame whose stamp is far from the session's clock, or restart on its own."""
-        sensor, stamp_ns = frame_id.sensor, frame_id.stamp_ns
-        before = self.jumped.get(sensor)
-        one = JumpedFrames(1, stamp_ns, stamp_ns)
-        if before is not None and 0 < stamp_ns - before.newest_ns <= self.limits.ahead_ns:
-            one = JumpedFrames(before.count + 1, before.since_ns, stamp_ns)
-        jumped = {**_latest(self.jumped, MAX_SENSORS - 1), sensor: one}
-        agreed = all(
-            _agrees(jumped.get(name), stamp_ns, self.limits.ahead_ns) for name in self.live() if name != sensor
-        )
-        alone = stamp_ns - one.since_ns > self.limits.ahead_ns
-        if one.count < JUMP_FRAMES or not (agreed or alone):
+        sensor, stamp_ns, limit_ns = frame_id.sensor, frame_id.stamp_ns, self.limits.ahead_ns
+        jumped = self._jumped(frame_id)
+        one = jumped[sensor]
+        agreeing = {name for name, other in jumped.items() if _agrees(other, stamp_ns, limit_ns)}
+        believed = 2 * len(agreeing) > len(self.live().keys() | agreeing)
+        if refusal is Verdict.LATE and stamp_ns > self.clock.get(sensor, 0):  # delay ends, a wrong clock does not
+            believed &= stamp_ns - one.first_ns > limit_ns
+        alone = stamp_ns - one.since_ns > limit_ns
+        if one.count < JUMP_FRAMES or not (believed or alone):
             return self._refuse(frame_id, refusal)[0], replace(self, jumped=jumped)
+        if 0 < self._jump_ns(frame_id) <= limit_ns:
+            return self._admit(frame_id)
         begun = replace(
             self,
             seen=self._remember(frame_id),
@@ -588,6 +606,15 @@ class FusedTimeline(Timeline):
             jumped={},
         )
         return Decision(Verdict.RESTART, _placed(frame_id, begun.generation), last=True), begun
+
+    def _jumped(self, frame_id: FrameId) -> dict[str, JumpedFrames]:
+        """Return the frames with another clock, with one more."""
+        sensor, stamp_ns = frame_id.sensor, frame_id.stamp_ns
+        before = self.jumped.get(sensor)
+        one = JumpedFrames(1, stamp_ns, stamp_ns, stamp_ns)
+        if before is not None and 0 < stamp_ns - before.newest_ns <= self.limits.ahead_ns:
+            one = replace(before, count=before.count + 1, newest_ns=stamp_ns)
+        return {**_latest(self.jumped, MAX_SENSORS - 1), sensor: one}
 
     def _moved(self, frame_id: FrameId, seen: Mapping[str, object]) -> Mapping[str, int]:
         """Return the clock with a frame; of sensors that are seen no more, which were not live, nothing is left."""
@@ -611,8 +638,8 @@ def _order(frame_id: FrameId) -> tuple[int, str, int]:
     return frame_id.stamp_ns, frame_id.sensor, frame_id.seq
 
 
-def _agrees(other: JumpedFrames | None, stamp_ns: int, gap_limit_ns: int) -> bool:
-    return other is not None and other.count >= JUMP_FRAMES and abs(other.newest_ns - stamp_ns) <= gap_limit_ns
+def _agrees(other: JumpedFrames, stamp_ns: int, gap_limit_ns: int) -> bool:
+    return other.count >= JUMP_FRAMES and abs(other.newest_ns - stamp_ns) <= gap_limit_ns
 
 
 def number_of(epochs: Sequence[SeenNumbers], epoch: bytes | None) -> int:

@@ -215,6 +215,25 @@ def test_a_silent_stream_has_no_output(process: Callable[..., Process]) -> None:
     assert not one.problems
 
 
+@pytest.mark.parametrize("clock", ["ahead", "set back"])
+def test_a_silent_stream_has_no_output_whatever_the_clock(process: Callable[..., Process], clock: str) -> None:
+    """Where stamps are ahead, and where the system's clock is set back, `longest_s` counts from the last arrival."""
+    one = process(RATE | {"longest_s": 0.3})
+    ahead_ns = 3600 * SECOND
+    for seq in range(3):
+        if clock == "ahead":
+            one.wall_ns = SENSOR.stamp_ns(0) - ahead_ns
+            one.frame(SENSOR.detections(seq), seq * SECOND // 10)
+        else:
+            one.frame(SENSOR.detections(seq))
+    arrived_ns = one.now_ns
+    if clock == "set back":
+        one.wall_ns -= ahead_ns
+    one.until(2 * SECOND)
+    assert one.now
+    assert one.now[-1][0] - arrived_ns <= 300 * MS
+
+
 @pytest.mark.parametrize("away_s", [-1000.0, -1.0, 1.0, 1000.0])
 def test_stamps_of_another_clock_are_a_problem(process: Callable[..., Process], away_s: float) -> None:
     """After 5 s, once; nothing is sent from then on, until stamps are right. By arrival such stamps are as good."""
