@@ -1,9 +1,13 @@
-"""The command `optipmb`. An error is one line on standard error and a status: 2 for wrong input, 1 for the rest."""
+"""The command `optipmb`. An error is one line on standard error and a status: 2 for wrong input, 1 for the rest.
+
+An error that no code foresaw is such a line too, which says what was being read; `--debug` shows its traceback.
+"""
 
 import inspect
 import re
 import signal
 import sys
+import traceback
 from collections.abc import Iterable, Sequence
 from importlib import import_module
 from importlib.metadata import version
@@ -17,7 +21,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from optipmb_tools.commands.options import MANY, RAY_ADDRESS, grouped
 from optipmb_tools.extras import to_install
-from optipmb_tools.files import DatasetError
+from optipmb_tools.files import DatasetError, unexpected
 
 FAILED = 1
 WRONG = 2
@@ -107,30 +111,46 @@ def _options(
     _show: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
+    _debug: Annotated[
+        bool, typer.Option("--debug", help="Show the traceback of an error; also after a command.")
+    ] = False,
 ) -> None:
     """Options before the command."""
 
 
 def run(arguments: Sequence[str]) -> int:
     """Run one command line, without the program's name; return the exit status."""
+    end = arguments.index("--") if "--" in arguments else len(arguments)
+    debug = "--debug" in arguments[:end]
     try:
-        words = filled(spread(arguments, MANY), "--ray", RAY_ADDRESS, "local")
-        words = filled(words, "--submission", re.compile(r"\d*\.?\d+"), "default")
-        result = app(words or ["--help"], prog_name="optipmb", standalone_mode=False)
-        return int(result or 0)
-    except _OptionError as error:
-        return _fail(WRONG, error.format_message())
-    except ModuleNotFoundError as error:
-        text = to_install(error.name or "", f"optipmb {arguments[0]}")
-        if text is None:
-            raise
-        return _fail(FAILED, text)
-    except (UsageError, DatasetError, MessageError, ClientError) as error:
-        return _fail(FAILED if isinstance(error, ClientError) else WRONG, str(error))
-    except OSError as error:
-        return _fail(WRONG, f"{error.filename}: {error.strerror}" if error.filename else str(error))
+        words = [one for place, one in enumerate(arguments) if one != "--debug" or place > end]
+        return _run(words)
     except (KeyboardInterrupt, typer.Abort):
         return _fail(INTERRUPTED, "interrupted")
+    except Exception as error:  # noqa: BLE001  the last handler: no traceback reaches a user who did not ask for it
+        status, text = _line_of(error, " ".join(arguments[:1]))
+        if debug:
+            traceback.print_exc()
+        return _fail(status, text)
+
+
+def _run(arguments: list[str]) -> int:
+    words = filled(spread(arguments, MANY), "--ray", RAY_ADDRESS, "local")
+    words = filled(words, "--submission", re.compile(r"\d*\.?\d+"), "default")
+    return int(app(words or ["--help"], prog_name="optipmb", standalone_mode=False) or 0)
+
+
+def _line_of(error: Exception, command: str) -> tuple[int, str]:
+    """Return the exit status and the line of an error."""
+    if isinstance(error, _OptionError):
+        return WRONG, error.format_message()
+    if isinstance(error, ModuleNotFoundError) and (text := to_install(error.name or "", f"optipmb {command}")):
+        return FAILED, text
+    if isinstance(error, UsageError | DatasetError | MessageError | ClientError):
+        return FAILED if isinstance(error, ClientError) else WRONG, str(error)
+    if isinstance(error, OSError):
+        return WRONG, f"{error.filename}: {error.strerror}" if error.filename else str(error)
+    return FAILED, unexpected(error)
 
 
 def main() -> NoReturn:

@@ -1,9 +1,12 @@
 """Reading files with errors that name the place, and writing files that appear complete or not at all."""
 
+import codecs
+import contextlib
 import os
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,14 +28,85 @@ class DatasetError(ValueError):
         super().__init__(f"{place}: expected {expected}, received {received}")
 
 
+_FOREIGN: Final = {
+    b"version https://git-lfs": "a pointer of Git LFS: git lfs pull fetches the file",
+    b"<!doctype html": "a page of HTML, as a download gives that asks for a login",
+    b"<html": "a page of HTML, as a download gives that asks for a login",
+    b"pk\x03\x04": "a ZIP archive or a spreadsheet: unpack it, or save it as CSV",
+    b"\x1f\x8b": "a file compressed by gzip: unpack it, or name it *.gz",
+    b"\x28\xb5\x2f\xfd": "a file compressed by Zstandard: unpack it, or name it *.zst",
+    b"par1": "a Parquet file: name it *.parquet",
+    b"arrow1": "a Feather file: name it *.feather",
+    b"feather": "a Feather file of version 1: write it again as Parquet",
+    b"\x89hdf": "an HDF5 file: write it as Parquet",
+    b"\x89mcap": "a recording: name it *.mcap",
+    b"sqlite format 3": "a database of SQLite: name a bag *.db3, export a table as CSV",
+    b"\x93numpy": "an array of numpy: write it as a table",
+}
+"""First bytes of files, in lower case, and what these are."""
+
+
+def refuse_foreign(path: Path, what: str, data: bytes, *own: bytes) -> None:
+    """Raise a `DatasetError` where data begin like another kind of file than `own`."""
+    head = data[:64].removeprefix(codecs.BOM_UTF8).lstrip().lower()
+    for magic, found in _FOREIGN.items():
+        if head.startswith(magic) and magic not in own:
+            raise DatasetError(path, what, found)
+
+
+@contextlib.contextmanager
+def reading(path: Path | str) -> Iterator[None]:
+    """Name a file in the unexpected errors of the libraries that read it."""
+    try:
+        yield
+    except DatasetError:
+        raise
+    except Exception as error:
+        error.add_note(f"{path} was being read")
+        raise
+
+
+def unexpected(error: BaseException) -> str:
+    """Return the line that reports an error that no code foresaw, and what was being read."""
+    notes = "; ".join(dict.fromkeys(getattr(error, "__notes__", ())))
+    text = f"{type(error).__name__}: {error}" + (f" ({notes})" if notes else "")
+    return f"unexpected {text}: please report this line, with the file if you can; --debug shows the traceback"
+
+
+def decode_text(path: Path, data: bytes, what: str, encoding: str | None = None) -> str:
+    r"""Return the text of a file without byte order mark, its lines ended by ``\n``.
+
+    Args:
+        path: The file, for errors.
+        data: Its bytes.
+        what: Names what is expected where the bytes are none.
+        encoding: Of the user; None: UTF-8, or UTF-16 where the first bytes are its mark.
+
+    Raises:
+        DatasetError: The bytes are no text in the encoding.
+    """
+    marked = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    used = encoding or ("utf-16" if marked else "utf-8-sig")
+    text, wrong = "", data.find(0) if used == "utf-8-sig" else -1
+    try:
+        text = data.decode(used)
+    except LookupError as error:
+        raise DatasetError("--option encoding", "latin-1, cp1252, utf-8, utf-16-le …", repr(encoding)) from error
+    except UnicodeDecodeError as error:
+        wrong = error.start
+    if wrong >= 0:
+        raise DatasetError(path, what, f"byte 0x{data[wrong]:02x}", line=data[:wrong].count(b"\n") + 1)
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
 def read_text(path: Path, what: str) -> str:
     """Return the text of a file; `what` names its content in the error when it cannot be read."""
     try:
-        return path.read_text(encoding="utf-8")
+        data = path.read_bytes()
     except OSError as error:
         raise DatasetError(path, what, error.strerror or "an unreadable file") from error
-    except UnicodeDecodeError as error:
-        raise DatasetError(path, what, "bytes that are not text") from error
+    refuse_foreign(path, what, data)
+    return decode_text(path, data, f"{what} as text in UTF-8")
 
 
 def read_points(path: Path, what: str, columns: int) -> NDArray[np.float32]:
@@ -45,15 +119,16 @@ def read_points(path: Path, what: str, columns: int) -> NDArray[np.float32]:
         data = path.read_bytes()
     except OSError as error:
         raise DatasetError(path, what, error.strerror or "an unreadable file") from error
+    refuse_foreign(path, what, data)
     if len(data) % (4 * columns):
         raise DatasetError(path, f"{4 * columns} bytes per point", f"{len(data)} bytes")
     return np.ascontiguousarray(np.frombuffer(data, dtype="<f4").reshape(-1, columns)[:, :3])
 
 
-def read_rows(path: Path, what: str, separator: str | None = None) -> list[tuple[int, list[str]]]:
-    """Return (line number from 1, fields) of every line of a file that is not blank."""
-    lines = enumerate(read_text(path, what).splitlines(), start=1)
-    return [(number, line.split(separator)) for number, line in lines if line.strip()]
+def read_rows(path: Path, what: str) -> list[tuple[int, list[str]]]:
+    """Return (line number from 1, fields) of every line that is not blank; commas and blanks divide fields."""
+    lines = enumerate(read_text(path, what).replace(",", " ").split("\n"), start=1)
+    return [(number, fields) for number, line in lines if (fields := line.split())]
 
 
 def numbers(path: Path, rows: Iterable[tuple[int, list[str]]], columns: int, what: str) -> NDArray[np.float64]:

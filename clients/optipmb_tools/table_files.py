@@ -6,7 +6,6 @@ with a file for each frame, are read as records, one for each box; such a folder
 or has `.txt` files in the format of KITTI's object benchmark.
 """
 
-import codecs
 import io
 import json
 import re
@@ -18,7 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optipmb_tools.extras import needed
-from optipmb_tools.files import DatasetError, numbers, read_rows, read_text, write_whole
+from optipmb_tools.files import (
+    DatasetError,
+    decode_text,
+    numbers,
+    read_rows,
+    read_text,
+    reading,
+    refuse_foreign,
+    write_whole,
+)
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -34,6 +42,11 @@ _PICKLES: Final = (".pkl", ".pickle")
 _COMPRESSED: Final = (".gz", ".bz2", ".zst")
 _SEPARATORS: Final = ",;\t"
 _MOST_PARTS: Final = 16
+_EXACT: Final = 2**53  # integers up to it are exact as 64-bit numbers with a point
+_INT64: Final = 2**63
+_LONGEST_LINE: Final = 1 << 25  # bytes of a line of JSON that pyarrow reads; longer ones are read one by one
+_OWN: Final = {".parquet": (b"par1",), ".feather": (b"arrow1", b"feather"), ".arrow": (b"arrow1", b"feather")}
+_OWN_COMPRESSED: Final = (b"\x1f\x8b", b"\x28\xb5\x2f\xfd")
 _DATE: Final = re.compile(
     r"(\d{4}([-/])\d\d?\2\d\d?|\d\d?([-/.])\d\d?\3\d{4})[T ]+\d\d?:\d\d[:.,\d]*( ?UTC|(Z|[-+]\d\d(:?\d\d)?))?"
 )
@@ -106,21 +119,26 @@ def read_table(path: Path, options: Mapping[str, str] | None = None) -> Columns:
         if kind in _PICKLES:
             found = "a pickle, which may run any program: docs/own-data.md, Recipes, converts it in five lines"
         raise DatasetError(path, f"a table ({', '.join((*SUFFIXES, *_READ_ONLY))})", found)
+    columns: Columns = {}
     try:
         if not path.stat().st_size:
             raise DatasetError(path, "a table", "an empty file")
-        table = _read(pa, path, kind, options)
+        if not path.is_dir():
+            with path.open("rb") as file:
+                own = _OWN_COMPRESSED if path.suffix.lower() in _COMPRESSED else _OWN.get(kind, ())
+                refuse_foreign(path, f"a table ({kind})", file.read(64), *own)
+        with reading(path):
+            table = _read(pa, path, kind, options)
+            for name, column in zip(table.column_names, table.columns, strict=True):
+                for part, values in _parts(pa, str(name), column.combine_chunks()):
+                    if part in columns:
+                        raise DatasetError(path, "every column once", f"{part!r} twice")
+                    columns[part] = _dates(pa, path, part, values, options) if values.dtype.kind == "U" else values
     except OSError as error:  # pyarrow's errors of content are of this kind too
         found = "no such file" if isinstance(error, FileNotFoundError) else error.strerror or str(error)
         raise DatasetError(path, f"a table ({kind})", found) from error
     except pa.ArrowException as error:
         raise DatasetError(path, f"a table ({kind})", str(error)) from error
-    columns: Columns = {}
-    for name, column in zip(table.column_names, table.columns, strict=True):
-        for part, values in _parts(pa, str(name), column.combine_chunks()):
-            if part in columns:
-                raise DatasetError(path, "every column once", f"{part!r} twice")
-            columns[part] = _dates(pa, path, part, values, options) if values.dtype.kind == "U" else values
     return columns
 
 
@@ -132,10 +150,7 @@ def _read(pa: Any, path: Path, kind: str, options: Mapping[str, str]) -> Any:
     if kind == ".json":
         return _rows(pa, split_boxes(read_json(path)))
     if kind in {".jsonl", ".ndjson"}:
-        from pyarrow import json as arrow_json  # noqa: PLC0415  packages of an extra
-
-        with pa.input_stream(path) as stream:
-            table = arrow_json.read_json(stream)
+        table = _read_lines(pa, path, options)
     elif kind == ".parquet":
         from pyarrow import parquet  # noqa: PLC0415  as above
 
@@ -150,23 +165,45 @@ def _read(pa: Any, path: Path, kind: str, options: Mapping[str, str]) -> Any:
     return table
 
 
+def _read_lines(pa: Any, path: Path, options: Mapping[str, str]) -> Any:
+    """Return the table of JSON Lines; read one by one where pyarrow cannot, so that the wrong one is named."""
+    from pyarrow import json as arrow_json  # noqa: PLC0415  packages of an extra
+
+    text = _text(path, options)
+    try:
+        read = arrow_json.ReadOptions(block_size=_LONGEST_LINE)
+        table = arrow_json.read_json(io.BytesIO(text.encode()), read_options=read)
+    except pa.ArrowInvalid:
+        table = None
+    if table is not None and not _rounded(pa, table):
+        return table
+    records = []
+    for number, line in enumerate(text.split("\n"), start=1):
+        if line.strip():
+            try:
+                record = json.loads(line)
+            except json.JSONDecodeError as error:
+                raise DatasetError(path, "an object of JSON in every line", error.msg, line=number) from error
+            if not isinstance(record, dict):
+                raise DatasetError(path, "an object of JSON in every line", repr(line[:60]), line=number)
+            records.append(record)
+    return _rows(pa, split_boxes(records))
+
+
+def _rounded(pa: Any, table: Any) -> list[str]:
+    """Return the columns whose integers may have lost digits, as pyarrow reads those beyond 64 bits with a point."""
+    import pyarrow.compute as pc  # noqa: PLC0415  packages of an extra
+
+    names = [field.name for field in table.schema if pa.types.is_floating(field.type)]
+    return [name for name in names if (pc.max(pc.abs(table[name])).as_py() or 0.0) >= _INT64]
+
+
 def _text(path: Path, options: Mapping[str, str]) -> str:
     """Return the text of a file in the encoding that the user or its first bytes say; UTF-8 otherwise."""
     with _pyarrow().input_stream(path) as stream:
         data = bytes(stream.read())
-    marked = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    encoding = options.get("encoding", "utf-16" if marked else "utf-8-sig")
-    text, wrong = "", data.find(0) if encoding == "utf-8-sig" else -1
-    try:
-        text = data.decode(encoding)
-    except LookupError as error:
-        raise DatasetError("--option encoding", "latin-1, cp1252, utf-8, utf-16-le …", repr(encoding)) from error
-    except UnicodeDecodeError as error:
-        wrong = error.start
-    if wrong >= 0:
-        expected = "text in UTF-8 (--option encoding=latin-1, cp1252 or utf-16-le reads others)"
-        raise DatasetError(path, expected, f"byte 0x{data[wrong]:02x}", line=data[:wrong].count(b"\n") + 1)
-    return re.sub(r"\Asep=.(?=\n)", "", text.replace("\r\n", "\n"))
+    expected = "text in UTF-8 (--option encoding=latin-1, cp1252 or utf-16-le reads others)"
+    return re.sub(r"\Asep=.(?=\n)", "", decode_text(path, data, expected, options.get("encoding")))
 
 
 def line_of(path: Path, row: int, options: Mapping[str, str] | None = None) -> int:
@@ -192,8 +229,8 @@ def _normal_text(path: Path, original: str, kind: str) -> tuple[bytes, str]:
         separator = " "
         head, rest = (re.sub(r"(?m)^ +| +$", "", re.sub(r"[ \t]+", " ", part)) for part in (head, rest))
         comments = [" ".join(line.split()) for line in comments]
-    if is_kitti_object(head):
-        raise DatasetError(path, "a table", "boxes of a frame as in KITTI's object benchmark: name their folder")
+    if known := _benchmark(head):
+        raise DatasetError(path, "a table", known)
     if not _has_names(head.split(separator)):  # numpy writes the names of the columns into a comment
         names = [line for line in comments if line.count(separator) == head.count(separator)]
         if not names:
@@ -208,14 +245,32 @@ def _normal_text(path: Path, original: str, kind: str) -> tuple[bytes, str]:
     return f"{head}\n{rest}".encode(), separator
 
 
+def _benchmark(line: str) -> str | None:
+    """Return what a first line without names of columns is in the format of a benchmark."""
+    fields = re.split(r"[,;\s]+", line.strip(" \t,;"))
+    numeric = [_is_number(one) for one in fields]
+    if is_kitti_object(line):
+        return "boxes of a frame as in KITTI's object benchmark: name their folder"
+    if len(fields) in {17, 18} and numeric[:3] == [True, True, False] and all(numeric[3:]):
+        return "labels or results of KITTI's tracking benchmark: --dataset kitti reads a folder of it"
+    if len(fields) == 15 and all(numeric):  # noqa: PLR2004  fields of a detection
+        return "detections for KITTI's tracking benchmark: --dataset kitti reads a folder of it"
+    if all(one.isdigit() for one in fields[:1]) and fields[7:] == ["-1"] * 3 and all(numeric):
+        return "image boxes as of MOTChallenge: boxes in pixels lie nowhere in the world, 3D boxes are needed"
+    return None
+
+
 def _read_text(pa: Any, path: Path, kind: str, options: Mapping[str, str]) -> Any:
     from pyarrow import csv  # noqa: PLC0415  packages of an extra
 
     data, separator = _normal_text(path, _text(path, options), kind)
 
-    def parsed(decimal: str, *, threads: bool = True) -> Any:
+    def parsed(decimal: str, *texts: str, threads: bool = True) -> Any:
         null = ["", "nan", "NaN", "NA", "null", "None"]
-        convert = csv.ConvertOptions(null_values=null, strings_can_be_null=True, decimal_point=decimal)
+        types = dict.fromkeys(texts, pa.string())
+        convert = csv.ConvertOptions(
+            null_values=null, strings_can_be_null=True, decimal_point=decimal, column_types=types
+        )
         parse, read = csv.ParseOptions(delimiter=separator), csv.ReadOptions(use_threads=threads)
         return csv.read_csv(io.BytesIO(data), parse_options=parse, convert_options=convert, read_options=read)
 
@@ -228,6 +283,13 @@ def _read_text(pa: Any, path: Path, kind: str, options: Mapping[str, str]) -> An
         table = parsed(decimal or ".", threads=False)  # raises with the number of the row
     if decimal is None and _has_commas(pa, path, table):
         table = parsed(",")
+    if rounded := _rounded(pa, table):
+        import pyarrow.compute as pc  # noqa: PLC0415  packages of an extra
+
+        texts = parsed(".", *rounded)
+        for name in rounded:
+            if pc.all(pc.match_substring_regex(texts[name], r"^\s*-?\d+\s*$")).as_py():
+                table = table.set_column(table.column_names.index(name), name, texts[name])
     names = enumerate(table.column_names)  # a separator at the end of the lines gives one without name and values
     return table.select([place for place, name in names if name or table.column(place).null_count < len(table)])
 
@@ -285,7 +347,7 @@ def _rows(pa: Any, records: list[dict[str, Any]]) -> Any:
         values = [one.get(name) for one in records]
         try:
             columns[name] = pa.array(values)
-        except (pa.ArrowInvalid, pa.ArrowTypeError):
+        except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError):
             columns[name] = pa.array([None if value is None else str(value) for value in values])
     return pa.table(columns)
 
@@ -322,12 +384,26 @@ def _parts(pa: Any, name: str, column: Any) -> Iterator[tuple[str, NDArray[Any]]
             yield from _parts(pa, f"{name}.{place}", child)
     elif types.is_timestamp(kind):
         yield name, column.cast(pa.timestamp("ns")).to_numpy(zero_copy_only=False).astype("datetime64[ns]")
-    elif types.is_integer(kind) and not column.null_count:
-        yield name, column.to_numpy(zero_copy_only=False).astype(np.int64)
-    elif types.is_integer(kind) or types.is_floating(kind) or types.is_decimal(kind) or types.is_null(kind):
+    elif types.is_integer(kind) or (types.is_decimal(kind) and not kind.scale):
+        yield name, _integers(pa, column)
+    elif types.is_floating(kind) or types.is_decimal(kind) or types.is_null(kind):
         yield name, column.cast(pa.float64()).to_numpy(zero_copy_only=False)
+    elif types.is_binary(kind) or types.is_large_binary(kind):
+        yield from _parts(pa, name, column.cast(pa.string()))
     else:
         yield name, np.array(["" if value is None else str(value) for value in column.to_pylist()], dtype=np.str_)
+
+
+def _integers(pa: Any, column: Any) -> NDArray[Any]:
+    """Return integers as such; with missing ones, as float64 where that is exact; others as text."""
+    import pyarrow.compute as pc  # noqa: PLC0415  packages of an extra
+
+    low, high = (value or 0 for value in pc.min_max(column).as_py().values())
+    if not column.null_count and -_INT64 <= low <= high < _INT64:
+        return np.asarray(column.cast(pa.int64()).to_numpy(zero_copy_only=False), dtype=np.int64)
+    if -_EXACT <= low <= high <= _EXACT:
+        return np.asarray(column.cast(pa.float64()).to_numpy(zero_copy_only=False))
+    return np.array(["" if value is None else str(value) for value in column.to_pylist()], dtype=np.str_)
 
 
 def to_arrow(columns: Mapping[str, NDArray[Any]]) -> "pa.Table":
@@ -384,15 +460,23 @@ def frame_files(folder: Path) -> list[Path]:
     """Return the files of a folder with the boxes of a frame each; none where it is no such folder."""
     for suffix in (".json", ".txt"):
         files = sorted(folder.glob(f"*{suffix}"))
-        text = next((file.read_bytes().decode(errors="replace") for file in files if file.stat().st_size), "")
+        text = next(filter(None, map(_begin, files)), "")
         if is_kitti_object(text) if suffix == ".txt" else text[:1] == "{" and '"bboxes_3d"' in text:
             return files
     return []
 
 
+def _begin(file: Path) -> str:
+    """Return the text of a file from its first character on; none where it is no text."""
+    try:
+        return read_text(file, "text").lstrip()
+    except DatasetError:
+        return ""
+
+
 def is_kitti_object(text: str) -> bool:
     """Tell whether a text begins with a box in the format of KITTI's object benchmark."""
-    return re.match(r"[A-Za-z]\w*( +-?\d[-+.e\d]*){14,15} *(\n|$)", text) is not None
+    return re.match(r"[A-Za-z]\w*([ \t]+-?\d[-+.e\d]*){14,15}[ \t]*(\n|$)", text) is not None
 
 
 def read_frames(folder: Path) -> list[_Record]:

@@ -85,8 +85,9 @@ def test_what_fails_stops_nothing_else(jobs: int) -> None:
         task: 2 * task for task in tasks if task not in {13, 14, 15}
     }
     assert failed[13] == Failed("thirteen", wrong_input=True)
-    assert (failed[14].reason, failed[14].wrong_input) == ("ZeroDivisionError: fourteen", False)
-    assert failed[14].trace in [f"{note}\n" for note in notes]
+    assert failed[14].reason.startswith("unexpected ZeroDivisionError: fourteen: please report")
+    assert not failed[14].wrong_input
+    assert failed[14].trace.endswith("ZeroDivisionError: fourteen\n")
     if jobs > 1:
         assert failed[15].reason == "its process died (killed, or out of memory), 3 times"
         assert sum(note.startswith("task 15: its process died") for note in notes) == 2

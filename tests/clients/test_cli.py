@@ -7,12 +7,14 @@ import sys
 import time
 from pathlib import Path
 
+import pyarrow as pa
 import pytest
 from commands import optipmb, run_here, start
 from fake_service import Behaviour, FakeService
 from hypothesis import given
 from hypothesis import strategies as st
 from optipmb_tools.cli import run, spread
+from pyarrow import parquet
 from routers import free_endpoint
 
 SMALL = ["--dataset", "scene", "--option", "frames=8", "--option", "vehicles=4", "--option", "clouds=0"]
@@ -210,6 +212,25 @@ def test_a_signal_ends_a_replay_cleanly(endpoint: str, tmp_path: Path, number: i
     assert "Traceback" not in err
     assert len(service.seen.closed) == 1
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("debug", [[], ["--debug"]])
+def test_an_error_that_no_code_foresaw_is_one_line(
+    debug: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The line names the error and the file that was being read, and asks for a report; --debug adds the traceback."""
+    path = tmp_path / "d.parquet"
+    parquet.write_table(pa.table({"t": [1.0]}), path)
+
+    def broken(*_: object) -> None:
+        raise KeyError("inside")
+
+    monkeypatch.setattr(parquet, "read_table", broken)
+    assert run(["check", str(path), *debug]) == 1
+    err = capsys.readouterr().err
+    *before, line = err.splitlines()
+    assert line.startswith(f"optipmb: unexpected KeyError: 'inside' ({path} was being read): please report this line")
+    assert bool(before) == ("Traceback" in err) == bool(debug)
 
 
 def test_a_closed_pipe_is_no_error(endpoint: str, tmp_path: Path) -> None:

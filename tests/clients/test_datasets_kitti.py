@@ -1,5 +1,6 @@
 """The reader of the KITTI tracking benchmark, on small written roots and on the real data."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -414,3 +415,34 @@ def test_headings_across_the_motion_are_named(tmp_path: Path, capsys: pytest.Cap
         done = run_here(capsys, "track", "--dataset", "kitti", "--root", root, "--out", tmp_path / "out")
         assert done.returncode == 0, done.stderr
         assert ("headings and motion disagree" in done.stderr) == (name == "across"), done.stderr
+
+
+def test_a_sequence_without_calibration_is_named(tmp_path: Path) -> None:
+    """Detections of a sequence that has no calib file are left out with a note."""
+    for name in ("0000", "0001"):
+        write_root(tmp_path, name=name)
+    (tmp_path / "training/calib/0001.txt").unlink()
+    dataset = KittiDataset(tmp_path)
+    assert [one.name for one in dataset.sequences(["all"])] == ["0000"]
+    assert "1 of 2 sequences with detections are left out, without a calib/SSSS.txt: 0001" in dataset.notes[0]
+
+
+def test_files_without_any_detection_end_with_status_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Sequences without detections are named; where there are no others, the status is 1."""
+    for name in ("0000", "0001"):
+        write_root(tmp_path, name=name, scores=())
+    done = run_here(capsys, "track", "--dataset", "kitti", "--root", tmp_path, "--out", tmp_path / "out")
+    assert done.returncode == 1
+    assert "no detections in 2 of 2 recordings, 6 frames: 0000 0001" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "change", [str, lambda text: "\ufeff" + text.replace("\n", "\r\n"), lambda text: text.replace(",", "\t")]
+)
+def test_detections_are_read_as_other_systems_write_them(change: Callable[[str], str], tmp_path: Path) -> None:
+    """A byte order mark, line ends of Windows, and blanks or tabs between the fields change no box."""
+    write_root(tmp_path, scores=("2.0", "1.0"))
+    path = tmp_path / "detections/rcnn/Car/0000.txt"
+    path.write_bytes(change(path.read_text()).encode())
+    (frame, *_) = only_sequence(tmp_path).frames()
+    assert len(frame) == 2

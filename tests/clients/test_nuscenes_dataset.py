@@ -352,6 +352,18 @@ def test_all_means_scenes_with_detections(tmp_path: Path) -> None:
     assert caught.value.path == str(path)
 
 
+def test_samples_that_the_tables_lack_are_named(tmp_path: Path) -> None:
+    """Samples of other scenes are counted in a note; a file without any sample of the tables is refused."""
+    scenes = [one_scene(name="scene-0103"), one_scene(name="scene-0916")]
+    write_root(tmp_path, scenes[:1])
+    path = write_detections(tmp_path, "made", scenes)
+    assert NuScenesDataset(tmp_path).notes[-1].endswith("3 of 6 samples are not in v1.0-mini: left out")
+    write_detections(tmp_path, "made", scenes[1:])
+    with pytest.raises(DatasetError, match="none of them: the 3 samples of the file are of another release") as caught:
+        NuScenesDataset(tmp_path).sequences(["all"])
+    assert caught.value.path == str(path)
+
+
 def test_the_root_may_be_the_folder_of_the_tables(tmp_path: Path) -> None:
     """The root is the folder around the tables or that folder itself; of several releases one must be named."""
     scene = one_scene()

@@ -5,12 +5,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from commands import run_here
 from optipmb_tools.camera import kitti_from_sensor
 from optipmb_tools.datasets import DatasetError, open_dataset
 from optipmb_tools.table_files import Columns, line_of, read_table, write_table
 from own_tables import FRAMES, boxes
+from pyarrow import parquet
 
 PLAIN = "t,x,class\n0.0,1.5,car\n0.1,-2.25,Fuß\n"
 
@@ -119,8 +121,12 @@ def test_the_day_is_found_where_a_number_exceeds_twelve(tmp_path: Path) -> None:
             "d.txt",
             "0 1 Car 0 0 -1.5 1 2 3 4 1.5 1.6 4.2 1 1.6 20 1.57\n",
             {},
-            "a first line with the names of the columns",
+            "--dataset kitti reads a folder of it",
         ),
+        ("d.txt", "1,1,794.2,247.5,71.2,174.8,-1,-1,-1,-1\n", {}, "image boxes as of MOTChallenge"),
+        ("d.parquet", "version https://git-lfs.github.com/spec/v1\noid sha256:0\n", {}, "git lfs pull"),
+        ("d.csv", "<!DOCTYPE html>\n<html>\n", {}, "a page of HTML"),
+        ("d.csv", "PK\3\4and more", {}, "a ZIP archive or a spreadsheet"),
         ("d.pkl", "anything", {}, "docs/own-data.md, Recipes"),
         ("d.npy", "anything", {}, "a table (.csv, .tsv, .parquet, .jsonl, .ndjson, .feather, .arrow, .json, .txt)"),
         ("d.xlsx", "anything", {}, "a table (.csv, .tsv, .parquet, .jsonl, .ndjson, .feather, .arrow, .json, .txt)"),
@@ -289,3 +295,62 @@ def test_results_are_refused_in_an_unknown_format_before_tracking(
     assert done.returncode == 2
     assert "a folder, or a table (.csv, .tsv, .parquet" in done.stderr.splitlines()[-1]
     assert [file.name for file in tmp_path.iterdir()] == ["d.csv"]
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".jsonl", ".json", ".parquet"])
+@pytest.mark.parametrize("first", [1_700_000_000_000_000_001, 2**64 - 1])
+def test_integers_keep_their_digits_where_one_is_missing(first: int, suffix: str, tmp_path: Path) -> None:
+    """Integers of 64 bits, signed or not, are read to the last digit, also in a column with an empty cell."""
+    path = tmp_path / f"d{suffix}"
+    values = [first, None, first - 2]
+    if suffix == ".csv":
+        path.write_text("a,t\n" + "".join(f"1,{'' if one is None else one}\n" for one in values))
+    elif suffix == ".parquet":
+        parquet.write_table(pa.table({"t": pa.array(values, pa.uint64())}), path)
+    else:
+        records = [{"t": one} for one in values]
+        lines = "\n".join(map(json.dumps, records))
+        path.write_text(json.dumps(records) if suffix == ".json" else lines)
+    assert read_table(path)["t"].tolist() == ["" if one is None else str(one) for one in values]
+
+
+def test_a_missing_stamp_among_long_ones_is_named_with_its_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An empty cell in a column of nanoseconds ends with the line of the cell."""
+    stamps = 1_700_000_000_000_000_000 + np.repeat(np.arange(FRAMES), 3) * 100_000_000
+    texts = stamps.astype(np.str_)
+    texts[50] = ""
+    write_table(tmp_path / "d.csv", boxes(t=None, stamp_ns=texts))
+    done = run_here(capsys, "track", tmp_path / "d.csv", "--out", tmp_path / "t.csv")
+    assert done.returncode == 2
+    assert "d.csv:52: expected stamps in column stamp_ns" in done.stderr.splitlines()[-1]
+
+
+def test_json_lines_may_be_long_and_of_several_types(tmp_path: Path) -> None:
+    """A line of several megabytes is read, and one that pyarrow refuses is named."""
+    frames = [{"t": t, "boxes": [[0.1234567 + i, 1.0, 0.8, 4.5, 1.9, 1.6, 0.0] for i in range(40_000)]} for t in (0, 1)]
+    path = tmp_path / "d.jsonl"
+    path.write_text("\n".join(map(json.dumps, frames)))
+    assert len(read_table(path)["boxes.0"]) == 80_000
+    path.write_text('{"x": 1.5}\r\n\r\n{"x": "two"}\r\n')
+    assert read_table(path)["x"].tolist() == ["1.5", "two"]
+    path.write_text('{"x": 1.5}\n{"x": }\n')
+    with pytest.raises(DatasetError, match=r"d.jsonl:2: expected an object of JSON in every line"):
+        read_table(path)
+
+
+@pytest.mark.parametrize("how", ["\r\n", "\ufeff", "\t", "first"])
+def test_frames_of_kitti_are_read_as_other_systems_write_them(how: str, tmp_path: Path) -> None:
+    """Line ends of Windows, a byte order mark, tabs, and a first file with nothing but a line end change no box."""
+    for folder in ("plain", "changed"):
+        (tmp_path / folder).mkdir()
+        for i in range(3):
+            text = f"Car 0.00 0 0.0 1 2 3 4 1.5 1.9 4.5 {i} 1.6 20 0.1 0.9\n" * 2 if i else "\n"
+            if folder == "changed" and i:
+                text = {"\r\n": text.replace("\n", "\r\n"), "\ufeff": "\ufeff" + text}.get(how, text)
+                text = text.replace(" ", "\t") if how == "\t" else text
+            elif not i and how != "first":
+                text = "Car 0.00 0 0.0 1 2 3 4 1.5 1.9 4.5 0 1.6 20 0.1 0.9\n"
+            (tmp_path / folder / f"{i:06d}.txt").write_bytes(text.encode())
+    same(read_table(tmp_path / "changed"), read_table(tmp_path / "plain"))

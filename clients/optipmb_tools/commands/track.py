@@ -32,6 +32,9 @@ if TYPE_CHECKING:
     from optipmb_tools.run.tracking import TrackedSequence
 
 
+_SHOWN = 20  # recordings that are named
+
+
 @dataclass(frozen=True, kw_only=True)
 class TrackOptions:
     """Options of offline tracking."""
@@ -158,8 +161,12 @@ def _say_result(result: "TrackedSequence") -> None:
 
 
 def _complain(results: "list[TrackedSequence]", profile: str) -> None:
-    """Print the detections that were left out; end with status 1 if there were detections and no tracks."""
+    """Print the detections that were left out; end with status 1 without tracks."""
     detections = sum(one.detections for one in results)
+    if empty := [one.name for one in results if not one.detections]:
+        frames = sum(one.frames for one in results if not one.detections)
+        shown = " ".join([*empty[:_SHOWN], *(["…"] if len(empty) > _SHOWN else [])])
+        warn(f"no detections in {len(empty)} of {len(results)} recordings, {frames} frames: {shown}")
     left_out: Counter[str] = sum((Counter(one.left_out) for one in results), Counter())
     if left_out:
         named = ", ".join(f"{count} {name}" for name, count in sorted(left_out.items()))
@@ -172,8 +179,9 @@ def _complain(results: "list[TrackedSequence]", profile: str) -> None:
         from optipmb_tools.results.nuscenes import NUSCENES_MAX_BOXES  # noqa: PLC0415  of one format
 
         warn(f"{cut} boxes in {samples} samples are not written: a sample of nuScenes has {NUSCENES_MAX_BOXES} at most")
-    if detections and not any(one.tracks for one in results):
-        warn(f"no tracks came of {detections} detections: do their scores and rate fit profile {profile}?")
+    if not any(one.tracks for one in results):
+        if detections:
+            warn(f"no tracks came of {detections} detections: do their scores and rate fit profile {profile}?")
         raise typer.Exit(1)
 
 

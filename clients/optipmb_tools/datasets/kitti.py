@@ -44,6 +44,7 @@ _AXES = np.eye(4)
 _AXES[:3, :3] = SENSOR_FROM_CAMERA
 
 _ROTATION_ERROR = 1e-3  # far more than the rounding of the text, far less than a matrix that is no rotation
+_FRAME = re.compile(r"\d{1,6}(\.0*)?")
 _DETECTION = "frame type x1 y1 x2 y2 score h w l x y z ry alpha"
 _LABEL = "frame id type truncated occluded alpha x1 y1 x2 y2 h w l x y z ry"
 _WHOLE = ("frame", "id", "truncated", "occluded")  # columns of whole numbers
@@ -114,10 +115,10 @@ class KittiSequence(DataSequence):
         """Return the last frame that detections, labels, scans or images have; -1 without any."""
         images = (self._dataset.base / "image_02" / self.name).glob("*.*")
         frames = [*self._scans, *(int(path.stem) for path in images if path.stem.isdigit())]
-        files = [(folder / f"{self.name}.txt", ",") for folder in self._folders.values()]
-        for path, separator in (*files, (self._dataset.text("label_02", self.name), None)):
-            rows = read_rows(path, "frames", separator) if path.is_file() else []
-            frames += [int(fields[0]) for _, fields in rows if fields[0].strip().isdigit()]
+        files = [folder / f"{self.name}.txt" for folder in self._folders.values()]
+        for path in (*files, self._dataset.text("label_02", self.name)):
+            rows = read_rows(path, "frames") if path.is_file() else []
+            frames += [int(float(fields[0])) for _, fields in rows if _FRAME.fullmatch(fields[0])]
         return max(frames, default=-1)
 
     @property
@@ -238,12 +239,16 @@ class KittiDataset(Dataset):
             self.notes.append(f"submission: confirmed tracks from these mean scores on, in the image: {least}")
             if missing := sorted({path.stem for path in (base / "calib").glob("*.txt")} - set(self.present())):
                 self.notes.append(f"submission: no detections, so no file, of {' '.join(missing)}")
+        detected = set() if self.detector is None else {path.stem for path in self.detector.glob("*/*.txt")}
+        if lacking := sorted(detected - set(self.present())):
+            text = f"{len(lacking)} of {len(detected)} sequences with detections are left out, without a calib/SSSS.txt"
+            self.notes.append(f"{base}: {text}: {' '.join(lacking)}")
 
     @cached_property
     def probability(self) -> bool:
         """Whether the scores of the detector are probabilities already, not logits: all lie in (0, 1]."""
         for path in sorted(self.need_detector().glob("*/*.txt")):
-            for _, fields in read_rows(path, "a detection file", ","):
+            for _, fields in read_rows(path, "a detection file"):
                 try:
                     if not 0.0 < float(fields[6]) <= 1.0:
                         return False
@@ -454,7 +459,7 @@ def read_detections(path: Path, frames: int, type_code: int | None) -> Columns:
         DatasetError: A line has not 15 numbers, a frame lies outside the sequence, a size is not positive, or the type
             is another one.
     """
-    rows = read_rows(path, "a detection file", ",")
+    rows = read_rows(path, "a detection file")
     values = numbers(path, rows, len(_DETECTION.split()), _DETECTION)
     lines = [line for line, _ in rows]
     _check_frames(path, lines, values[:, 0], frames)

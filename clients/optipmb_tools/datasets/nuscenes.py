@@ -508,7 +508,10 @@ class NuScenesDataset(Dataset):
     @cached_property
     def notes(self) -> tuple[str, ...]:
         """Assumptions about the detections, and the content of a submission."""
-        found = () if self.submission is None else self.submission.notes
+        found = list(self.submission.notes) if self.submission is not None else []
+        if self.submission is not None and (others := len(self.submission.rows) - len(self._known)):
+            folder, count = self.tables.folder.name, len(self.submission.rows)
+            found.append(f"{self.submission.path}: {others} of {count} samples are not in {folder}: left out")
         all_written = "submission: all tracks are written, whatever their score, as AMOTA is over all scores"
         return (*found, *((all_written,) if self._submission else ()))
 
@@ -526,8 +529,8 @@ class NuScenesDataset(Dataset):
         wanted: list[str] = []
         for name in names:
             if name == "all":
-                rows = None if self.submission is None else self.submission.rows.keys()
-                wanted += [one.name for one in scenes.values() if rows is None or rows & set(one.tokens)]
+                detected = None if self.submission is None else self._known
+                wanted += [one.name for one in scenes.values() if detected is None or detected & set(one.tokens)]
             elif name in SPLITS or name in splits:
                 members = scenes_of_split(name) if name in SPLITS else splits[name]
                 wanted += [scene for scene in members if scene in scenes]
@@ -548,6 +551,20 @@ class NuScenesDataset(Dataset):
     def join(self, out: Path, sequences: Sequence[DataSequence]) -> None:
         """Write `out/tracking_results.json` from the files of these scenes."""
         join_scenes(out, [sequence.name for sequence in sequences], self._meta)
+
+    @property
+    def _known(self) -> set[str]:
+        """The samples of the detections that the tables have.
+
+        Raises:
+            DatasetError: There are none.
+        """
+        submission = self.need_submission()
+        known = submission.rows.keys() & {token for one in self.tables.scenes.values() for token in one.tokens}
+        if submission.rows and not known:
+            received = f"none of them: the {len(submission.rows)} samples of the file are of another release?"
+            raise DatasetError(submission.path, f"samples of {self.tables.folder.name}", received)
+        return known
 
     @property
     def _meta(self) -> Mapping[str, Any]:

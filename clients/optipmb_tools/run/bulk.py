@@ -30,7 +30,7 @@ from optipmb_client.errors import ClientError, UsageError
 from optipmb_schemas import MessageError
 
 from optipmb_tools.extras import needed
-from optipmb_tools.files import DatasetError
+from optipmb_tools.files import DatasetError, unexpected
 
 T = TypeVar("T")
 Function: TypeAlias = Callable[[Any, Any], Any]  # a function of a module: (arguments of all tasks, task) -> value
@@ -69,7 +69,7 @@ def attempt(function: Function, shared: Any, task: Any) -> Any:
     except ClientError as error:
         return Failed(str(error))
     except Exception as error:  # noqa: BLE001  reported with its trace; other tasks go on
-        return Failed(f"{type(error).__name__}: {error}", trace=traceback.format_exc())
+        return Failed(unexpected(error), trace=traceback.format_exc())
 
 
 class Executor(ABC):
@@ -243,7 +243,7 @@ def run(
         executor: After its `start`.
         tasks: Each is sent to where it runs.
         name: Name of a task in messages.
-        note: Called with a line when a process died, and with the trace of an unexpected error.
+        note: Called with a line when a process died.
     """
     waiting = deque((place, 1) for place in range(len(tasks)))
     running: dict[Future[Any], tuple[int, int]] = {}
@@ -261,8 +261,6 @@ def run(
                     waiting.appendleft((place, number + 1))
                     continue
                 result = Failed(f"{died}, {number} times" if number > 1 else str(died))
-            if isinstance(result, Failed) and result.trace:
-                note(result.trace.rstrip())
             yield place, result
 
 

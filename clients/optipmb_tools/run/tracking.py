@@ -251,6 +251,8 @@ class RecordingsFailed(ClientError):  # noqa: N818  as its siblings
         self.failures = dict(failures)
         names = " ".join([*itertools.islice(failures, SHOWN), *(["…"] if len(failures) > SHOWN else [])])
         super().__init__(f"{len(failures)} of {count} recordings failed, the others are tracked: {names}")
+        for trace in dict.fromkeys(one.trace for one in failures.values() if one.trace):
+            self.add_note(trace)
 
 
 def _track_one(job: _Job, name: str) -> tuple[TrackedSequence, Path | Columns]:
