@@ -14,7 +14,7 @@ constraints=${3:-/dev/null}
 
 "$python" -m venv "$work/venv"
 "$work/venv/bin/python" -m pip install --quiet --disable-pip-version-check --constraint "$constraints" \
-  "$wheel[grpc,plot,record,service,table,traces,tune]" hypothesis pytest pytest-asyncio pytest-xdist \
+  "$wheel[grpc,plot,record,service,table,traces,tune]" hypothesis pytest pytest-asyncio pytest-timeout pytest-xdist \
   foxglove-schemas-protobuf mcap-protobuf-support mcap-ros2-support websocket-client
 "$work/venv/bin/python" -m pip check --disable-pip-version-check
 mkdir "$work/away" && cd "$work/away" # nothing of the source tree is importable from here, but for what tests share
@@ -24,7 +24,7 @@ unset PYTHONPATH
 # One file or folder for each package of others that the product rests on.
 "$work/venv/bin/python" -m pytest -W ignore::DeprecationWarning -c "$root/pyproject.toml" --rootdir "$root" -o cache_dir="$work/cache" -q -n 3 --dist loadfile \
   "$root"/tests/e2e/test_processes.py "$root"/tests/service/zenoh "$root"/tests/service/http/test_http.py "$root"/tests/grpc/test_track.py "$root"/tests/service/stream/test_traces.py \
-  "$root"/tests/tracker/test_twins.py "$root"/tests/schemas/test_codec.py \
+  "$root"/tests/tracker/test_oracle.py "$root"/tests/schemas/test_codec.py \
   "$root"/tests/clients/test_api.py "$root"/tests/clients/test_cli.py "$root"/tests/clients/test_mcap_files.py "$root"/tests/clients/test_tuning_search.py
 "$work/venv/bin/python" --version
 echo "the wheel works there"

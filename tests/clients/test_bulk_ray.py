@@ -99,7 +99,7 @@ def test_killed_workers_of_a_local_cluster_lose_nothing(data: Path, plain: dict[
         folder = Path(executor._folder.name)  # type: ignore[attr-defined]  # of Ray's logs and sockets
         assert with_word(str(folder))
         assert not usage_stats_enabled()
-        results = tracked(data, tmp_path / "out", Dying(executor, tmp_path, {"r017", "r090"}))
+        results = tracked(data, tmp_path / "out", Dying(executor, tmp_path, {"r004", "r012"}))
     assert len(results) == RECORDINGS
     assert bytes_of(tmp_path / "out") == plain
     assert len(list(tmp_path.glob("*.begun"))) == 2
@@ -127,7 +127,7 @@ def test_commands_give_what_one_process_gives(cluster: Any, tmp_path: Path) -> N
 
 def test_a_killed_node_loses_nothing(cluster: Any, data: Path, plain: dict[str, bytes], tmp_path: Path) -> None:
     """With a node and a worker killed during recordings, results equal one process byte for byte."""
-    mark = tmp_path / "r050.begun"
+    mark = tmp_path / "r008.begun"
     victims: list[str] = []
 
     def kill() -> None:
@@ -143,7 +143,7 @@ def test_a_killed_node_loses_nothing(cluster: Any, data: Path, plain: dict[str, 
     killer = threading.Thread(target=kill, daemon=True)
     killer.start()
     with executor_for(0, cluster.address) as executor:
-        results = tracked(data, tmp_path / "out", Dying(executor, tmp_path, {"r017"}, {"r050"}))
+        results = tracked(data, tmp_path / "out", Dying(executor, tmp_path, {"r004"}, {"r008"}))
     killer.join(60)
     assert len(victims) == 1
     assert len(results) == RECORDINGS

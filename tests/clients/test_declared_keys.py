@@ -1,6 +1,7 @@
 """Keys that one connection can declare in its life: more are refused, and nothing is lost."""
 
-from collections.abc import Callable, Iterator
+import itertools
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -39,10 +40,7 @@ def connection(tmp_path: Path) -> Iterator[Connection]:
         yield connection
 
 
-@pytest.mark.parametrize("opened", [_cached, _plain, _plain_cached, _subscribed])
-def test_what_was_opened_early_is_heard_to_the_last(
-    connection: Connection, opened: Callable[[Connection, str], Sender | Reading]
-) -> None:
+def test_what_was_opened_early_is_heard_to_the_last(connection: Connection) -> None:
     """When a connection has declared all keys that it can, the next publisher is refused, and early ones go on.
 
     Zenoh alone uses numbers again that are in use, and what their publishers send is lost without an error.
@@ -52,7 +50,8 @@ def test_what_was_opened_early_is_heard_to_the_last(
     early = connection.cached_sender("early", "", cache=1)
 
     def come_and_go() -> None:
-        for number in range(MOST_KEYS):
+        kinds = itertools.cycle((_cached, _plain, _plain_cached, _subscribed))
+        for number, opened in zip(range(MOST_KEYS), kinds, strict=False):
             opened(connection, f"passing/{number}").close()
 
     with pytest.raises(ConnectionFailed, match="open another one"):

@@ -1,65 +1,191 @@
-"""Which way dependencies run: nodes and tools know the messages, and the tools the tracker."""
+"""Rules of the repository: which way imports run, what is pure computation, and what the documentation names."""
 
 import ast
-from collections.abc import Iterator
+import re
+import subprocess
+import sys
+from functools import cache
 from pathlib import Path
 
 import optipmb_client
 import optipmb_schemas
 import optipmb_service
 import optipmb_tools
+import pytest
 
 import optipmb
 
-PACKAGES = (optipmb, optipmb_schemas, optipmb_client, optipmb_tools, optipmb_service)
+DOCS = Path(__file__).parents[2] / "docs"
+PACKAGES = {
+    name: Path(next(iter(package.__path__)))
+    for name, package in {
+        "optipmb": optipmb,
+        "optipmb_schemas": optipmb_schemas,
+        "optipmb_client": optipmb_client,
+        "optipmb_tools": optipmb_tools,
+        "optipmb_service": optipmb_service,
+    }.items()
+}
+SERVICE, TRACKER = PACKAGES["optipmb_service"], PACKAGES["optipmb"]
+
+USES = {
+    "optipmb": set(),
+    "optipmb_schemas": set(),
+    "optipmb_client": {"optipmb_schemas"},
+    "optipmb_tools": {"optipmb", "optipmb_schemas", "optipmb_client"},
+    "optipmb_service": {"optipmb", "optipmb_schemas", "optipmb_client"},
+}
+"""The packages of this repository that each imports: the tools start the service as a program."""
+
+LINK = ("zenoh", "incoming", "errors", "merging", "trace_context")
+"""Modules of the client that the service imports."""
+
+AT_HOME = {
+    "zenoh": PACKAGES["optipmb_client"] / "zenoh",
+    "nats": SERVICE / "cluster",
+    "starlette": SERVICE / "http",
+    "uvicorn": SERVICE / "http",
+    "grpc": SERVICE / "grpc",
+    "google": SERVICE / "grpc",
+    "grpc_health": SERVICE / "grpc",
+    "grpc_reflection": SERVICE / "grpc",
+    "grpc_status": SERVICE / "grpc",
+    "opentelemetry.sdk": SERVICE / "stream/traces.py",
+}
+"""Where the service imports a library; of all packages, only the client's `zenoh/` imports Zenoh."""
+
+SESSION = {
+    "arrivals",
+    "checkpoint",
+    "convert",
+    "pending",
+    "problems",
+    "session",
+    "state",
+    "timeline",
+    "transition",
+    "values",
+    "window",
+    "worlds",
+}
+"""Modules of `stream/` that make up a session."""
+
+IO = {"threading", "asyncio", "socket", "queue", "sqlite3", "os", "tempfile", "structlog"}
+
+COMPUTATION = {
+    "__future__", "collections", "contextlib", "dataclasses", "difflib", "functools", "hashlib", "importlib",
+    "itertools", "math", "numba", "numpy", "operator", "optipmb", "pathlib", "pydantic", "pydantic_core", "re", "sys",
+    "tomllib", "types", "typing",
+}  # fmt: skip
+EXCEPTIONS = {
+    # to show why a first frame takes a while; a folder; processes that compile
+    "compiled": {"fcntl", "logging", "os", "stat", "subprocess", "tempfile", "time"},
+    "warm": {"gc", "os", "pickle"},  # the programs of those processes
+    "parameters": {"fnmatch"},  # patterns of sensors
+    "online": {"datetime", "matplotlib", "pandas", "pyarrow", "supervision"},  # dates, and forms that users ask for
+}
+TOUCHES_FILES = {"compiled", "parameters", "prepared", "warm"}
 
 
-def imported(source: Path) -> Iterator[str]:
-    for node in ast.walk(ast.parse(source.read_text())):
-        if isinstance(node, ast.Import):
-            yield from (name.name.partition(".")[0] for name in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{source}: imports are written in full"
-            yield (node.module or "").partition(".")[0]
+@cache
+def tree(source: Path) -> ast.Module:
+    return ast.parse(source.read_text(encoding="utf-8"))
 
 
-def importers(package: str, name: str) -> set[str]:
-    root = Path(next(each for each in PACKAGES if each.__name__ == package).__path__[0])
-    sources = sorted(root.rglob("*.py"))
-    assert len(sources) > 10
-    return {str(source.relative_to(root)) for source in sources if name in set(imported(source))}
+@cache
+def imported(source: Path) -> frozenset[str]:
+    """Full names of everything that a module imports, with `package.name` for `from package import name`."""
+    names = set()
+    for part in ast.walk(tree(source)):
+        if isinstance(part, ast.Import):
+            names |= {alias.name for alias in part.names}
+        elif isinstance(part, ast.ImportFrom):
+            assert part.level == 0, f"{source}: imports are written in full"
+            names |= {f"{part.module}.{alias.name}" for alias in part.names}
+    return frozenset(names)
 
 
-def test_nodes_need_the_messages_alone() -> None:
-    """The package of a node imports neither tracker nor tools nor service."""
-    assert [importers("optipmb_client", name) for name in ("optipmb", "optipmb_tools", "optipmb_service")] == [
-        set()
-    ] * 3
+def first(source: Path) -> set[str]:
+    return {name.partition(".")[0] for name in imported(source)}
 
 
-def test_the_messages_depend_on_no_other_part() -> None:
-    """Their package imports neither tracker nor client nor service."""
-    assert all(importers("optipmb_schemas", name) == set() for name in ("optipmb", "optipmb_client", "optipmb_service"))
+@pytest.mark.parametrize("package", PACKAGES)
+def test_packages_import_only_what_stands_below_them(package: str) -> None:
+    """A node needs the messages alone, the tracker nothing, and of the client the service needs its link."""
+    for source in sorted(PACKAGES[package].rglob("*.py")):
+        assert (first(source) & set(PACKAGES)) - {package} <= USES[package], source
+        if package == "optipmb_service":
+            client = {name.split(".")[1] for name in imported(source) if name.startswith("optipmb_client.")}
+            assert client <= set(LINK), source
 
 
-def test_the_tools_do_not_know_the_service() -> None:
-    """No module imports optipmb_service: the demo starts it as a program. No other package imports the tools."""
-    assert importers("optipmb_tools", "optipmb_service") == set()
-    assert all(importers(each.__name__, "optipmb_tools") == set() for each in PACKAGES if each is not optipmb_tools)
+def test_libraries_of_an_edge_stay_there() -> None:
+    """Zenoh, NATS, HTTP, the additions of gRPC and the recorder of traces are imported in one place each."""
+    for package in PACKAGES.values():
+        for source in sorted(package.rglob("*.py")):
+            for library, home in (AT_HOME if package == SERVICE else {"zenoh": AT_HOME["zenoh"]}).items():
+                used = any(name == library or name.startswith(f"{library}.") for name in imported(source))
+                assert not used or source.is_relative_to(home), f"{source} imports {library}"
 
 
-def test_the_tracker_is_imported_for_offline_tracking_alone() -> None:
-    """Only what tracks offline, what tunes the tracker, and the matching of class names and places import optipmb."""
-    offline = {path for path in importers("optipmb_tools", "optipmb") if not path.startswith("tuning/")}
-    assert offline == {
-        "datasets/interface.py",
-        *(f"run/{name}.py" for name in ("dumps", "profiles", "smoothing", "tracking")),
-    }
+def test_folders_of_the_service_import_what_the_page_says() -> None:
+    """The table of docs/architecture.md has each folder and module, and what it may import of the others."""
+    page = (DOCS / "architecture.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)(?:/|\.py)` \|.*\| ([^|]*) \|$", page, re.MULTILINE)
+    allowed = {folder: set(re.findall(r"`(\w+)`", imports)) for folder, imports in rows}
+    for source in sorted(SERVICE.rglob("*.py")):
+        folder, *rest = source.relative_to(SERVICE).parts
+        place = folder if rest else source.stem
+        if place in {"app", "__init__", "__main__"}:
+            continue
+        own = {name.split(".")[1] for name in imported(source) if name.startswith("optipmb_service.")}
+        assert own - {place, "__version__"} <= allowed[place], source
 
 
-def test_zenoh_is_imported_in_one_folder() -> None:
-    """Of all packages only the client imports zenoh, and of that only the folder zenoh/."""
-    modules = {f"zenoh/{name}.py" for name in ("configuration", "connection", "handles", "session")}
-    assert {each.__name__: importers(each.__name__, "zenoh") for each in PACKAGES} == {
-        each.__name__: modules if each is optipmb_client else set() for each in PACKAGES
-    }
+@pytest.mark.parametrize("name", sorted(SESSION))
+def test_a_session_is_pure(name: str) -> None:
+    """A module of a session imports no other module of its folder, and none that waits, stores, sends or logs."""
+    source = SERVICE / f"stream/{name}.py"
+    own = {name.split(".")[2] for name in imported(source) if name.startswith("optipmb_service.stream.")}
+    assert own <= SESSION
+    assert not first(source) & IO
+
+
+@pytest.mark.parametrize("source", sorted(TRACKER.glob("*.py")), ids=lambda path: path.stem)
+def test_the_tracker_is_pure_computation(source: Path) -> None:
+    """No network, clock or randomness; files are read by few modules; no state outside the density."""
+    assert first(source) <= COMPUTATION | EXCEPTIONS.get(source.stem, set())
+    if source.stem not in TOUCHES_FILES:
+        assert not first(source) & {"pathlib", "importlib", "tomllib"}
+        calls = [node.func for node in ast.walk(tree(source)) if isinstance(node, ast.Call)]
+        assert not {call.id for call in calls if isinstance(call, ast.Name)} & {
+            "open",
+            "print",
+            "input",
+            "exec",
+            "eval",
+        }
+    assert not [node for node in ast.walk(tree(source)) if isinstance(node, ast.Global | ast.Nonlocal)]
+    for node in tree(source).body:
+        if isinstance(node, ast.Assign | ast.AnnAssign) and source.stem != "__init__":
+            assert not isinstance(node.value, ast.List | ast.Dict | ast.Set), ast.unparse(node)
+
+
+def test_importing_the_tracker_brings_in_no_other_package_and_no_network() -> None:
+    """A fresh interpreter has neither zenoh nor the other packages loaded."""
+    code = "import sys, optipmb; print(' '.join(sorted({name.split('.')[0] for name in sys.modules})))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    loaded = set(done.stdout.split())
+    assert not loaded & {"zenoh", "msgpack", "typer", *PACKAGES} - {"optipmb"}
+
+
+def test_the_page_of_reliability_names_tests_that_exist() -> None:
+    """Twenty-two faults, each with at least one test, and every test on the page is a function of its file."""
+    page = (DOCS / "reliability.md").read_text(encoding="utf-8")
+    (table,) = re.findall(r"<!-- faults -->\n(.*?)<!-- end -->", page, re.DOTALL)
+    rows = re.findall(r"^\| (\d+) \|(.*)$", table, re.MULTILINE)
+    assert [int(number) for number, _ in rows] == list(range(1, 23))
+    assert all("::test_" in row for _, row in rows)
+    for file, name in re.findall(r"`(tests/\S+?\.py)::(test_\w+)`", page):
+        functions = {part.name for part in ast.walk(tree(DOCS.parent / file)) if isinstance(part, ast.FunctionDef)}
+        assert name in functions, f"{file}::{name}"

@@ -300,22 +300,6 @@ def test_latitude_and_longitude_stand_for_x_and_y(tmp_path: Path, capsys: pytest
     assert run_here(capsys, "track", data[0], "--origin", "98,11,0", "--out", out).returncode == 2
 
 
-def test_processes_give_the_bytes_of_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """`--jobs 2` over four recordings writes the same table as one process, and the same files in a folder."""
-    plain = boxes()
-    four = {name: np.concatenate([values] * 4) for name, values in plain.items()}
-    # Recordings differ, so that none may stand for another.
-    four["x"] = four["x"] + np.repeat([0.0, 1.0, 2.0, 3.0], 3 * FRAMES)
-    data = table(tmp_path / "d.parquet", {**four, "log": np.repeat(["a", "b", "c", "d"], 3 * FRAMES)})
-    for jobs in ("1", "2"):
-        for out in ((tmp_path / jobs / "t.jsonl",), (tmp_path / jobs / "files", "--full")):
-            assert run_here(capsys, "track", data, "--jobs", jobs, "--out", *out).returncode == 0
-    files = sorted(path.relative_to(tmp_path / "1") for path in (tmp_path / "1").rglob("*") if path.is_file())
-    assert len(files) == 9
-    for path in files:
-        assert (tmp_path / "1" / path).read_bytes() == (tmp_path / "2" / path).read_bytes(), path
-
-
 def test_processes_evaluate_as_one_does(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """`evaluate --jobs 2` prints what one process prints, for the classes of a scene and the tracks of two trackers."""
     data = ("--dataset", "scene", "--option", "frames=10", "--option", "clouds=0")

@@ -9,7 +9,7 @@ from optipmb_tools.cli import run
 import optipmb
 
 PAGE = Path(__file__).parents[2] / "docs" / "tuning.md"
-SCENE = ["--dataset", "scene", "--option", "frames=16", "--option", "clouds=0", "--sequences", "0000", "0001"]
+SCENE = ["--dataset", "scene", "--option", "frames=12", "--option", "clouds=0", "--sequences", "0000", "0001"]
 CARS = [*SCENE, "--profile", "kitti-paper", "--classes", "Car"]
 FEW = ["--trials", "3", "--fold-trials", "1", "--folds", "2"]
 

@@ -69,8 +69,10 @@ def test_the_service_ends_when_its_parent_is_killed() -> None:
     assert wait_until_ended({child}, 60.0) == set()
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
-@pytest.mark.parametrize("stage", ["starting", "replaying"])
+@pytest.mark.parametrize(
+    ("stage", "number", "status"),
+    [("starting", signal.SIGINT, 130), ("replaying", signal.SIGTERM, 143), ("replaying", signal.SIGKILL, -9)],
+)
 def test_an_interrupted_demo_leaves_nothing_behind(tmp_path: Path, stage: str, number: int, status: int) -> None:
     """However the demo ends, at any stage, the service ends too, and there is no traceback."""
     environment = os.environ | {"PYTHONFAULTHANDLER": "1"}  # SIGABRT prints where each thread is

@@ -1,4 +1,4 @@
-"""Two hundred small recordings, and tasks that die in the middle, for the tests of work in bulk."""
+"""Twenty small recordings, and tasks that die in the middle, for the tests of work in bulk."""
 
 import os
 import signal
@@ -17,7 +17,7 @@ from optipmb_tools.run.tracking import Tracking, track
 from optipmb_tools.table_files import write_table
 from own_tables import FRAMES, boxes
 
-RECORDINGS = 200
+RECORDINGS = 20
 LONG = 5
 """Frames of each."""
 

@@ -10,9 +10,12 @@ import pytest
 from compare import density_bytes
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from scenes import Options, scene
 
 import optipmb
+from optipmb.errors import FrameError
+from optipmb.frame import MAX_COORDINATE, MAX_SPEED, _refuse, allowed
 
 KITTI = optipmb.load_profile("kitti")
 
@@ -218,3 +221,39 @@ def test_the_identity_moves_nothing(yaw: list[float], sign: float) -> None:
     (plain, _), (posed, _) = (optipmb.make_frame(KITTI, **given_columns, pose=pose) for pose in (None, identity))
     for name in ("center", "size", "yaw", "velocity", "score", "label", "source"):
         assert getattr(plain, name).tobytes() == getattr(posed, name).tobytes()
+
+
+COORDINATES = st.sampled_from(
+    [0.0, -3.5, MAX_COORDINATE, -MAX_COORDINATE, np.nextafter(MAX_COORDINATE, np.inf), np.nan]
+)
+LENGTHS = st.sampled_from([1.0, 1e-300, MAX_COORDINATE, 0.0, -1.0, np.inf, np.nan])
+SCORES = st.sampled_from([0.5, 1.0, 1e-300, 0.0, -0.5, np.nextafter(1.0, 2.0), np.nan])
+SPEEDS = st.sampled_from([0.0, MAX_SPEED, -MAX_SPEED, np.nextafter(MAX_SPEED, np.inf), np.nan, -np.inf])
+
+
+@settings(deadline=None)  # the first call compiles
+@given(data=st.data(), count=st.integers(0, 3), worst=st.integers(0, 6))
+def test_values_are_allowed_as_numpy_says(data: st.DataObject, count: int, worst: int) -> None:
+    """Bounds, signs, NaN and half-known velocities; refused are exactly the values that are not allowed."""
+
+    def drawn(place: int, shape: tuple[int, ...], values: st.SearchStrategy[float]) -> np.ndarray:
+        return data.draw(arrays(np.float64, shape, elements=values)) if place == worst else np.full(shape, 0.5)
+
+    label = data.draw(arrays(np.int64, count, elements=st.integers(-1, 3))) if worst == 0 else np.zeros(count, np.int64)
+    center, size = drawn(1, (count, 3), COORDINATES), drawn(2, (count, 3), LENGTHS)
+    yaw, score, velocity = drawn(3, (count,), COORDINATES), drawn(4, (count,), SCORES), drawn(5, (count, 2), SPEEDS)
+    unknown = np.isnan(velocity).all(axis=1, keepdims=True)
+    far = np.abs(np.where(np.isnan(center) & [False, False, True], 0.0, center))
+    known_size, known_yaw = np.where(np.isnan(size), 1.0, size), np.where(np.isnan(yaw), 0.0, yaw)
+    wanted = (
+        bool(((label >= 0) & (label < 3)).all())
+        and bool((far <= MAX_COORDINATE).all() and (np.abs(known_yaw) <= MAX_COORDINATE).all())
+        and bool(((known_size > 0) & (known_size <= MAX_COORDINATE)).all() and ((score > 0) & (score <= 1)).all())
+        and bool(((np.abs(velocity) <= MAX_SPEED) | unknown).all())
+    )
+    assert allowed(label, 3, center, size, yaw, score, velocity) == wanted
+    if wanted:
+        _refuse(label, 3, center, size, yaw, score, velocity)
+    else:
+        with pytest.raises(FrameError):
+            _refuse(label, 3, center, size, yaw, score, velocity)

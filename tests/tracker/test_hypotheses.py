@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import permutations
 
 import numpy as np
 import oracle_formulas as textbook
@@ -104,24 +103,6 @@ def test_the_edge_of_the_gate_is_inside() -> None:
     np.testing.assert_array_equal(measurement, [0, 1, 2, 3])
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_costs_and_association_probabilities_are_the_formulas(seed: int) -> None:
-    """W of eq. Detection Hypothesis Update and p_a of eq. Association Probability, p_a at most one."""
-    rng = np.random.default_rng(seed)
-    row, measurement = np.repeat(np.arange(8), 3), rng.integers(0, 5, 24)
-    likelihood = rng.normal(-2, 1.5, 24)
-    r, p_d = rng.uniform(1e-6, 1, 8), rng.uniform(0.01, 0.99, 8)
-    r[0] = 1.0
-    association = np.full(6, np.nan)
-    cost = detection_costs(row, measurement, likelihood, r, p_d, association)
-    for k, n in enumerate(row):
-        ratio = r[n] * p_d[n] * math.exp(likelihood[k]) / (1 - r[n] + r[n] * (1 - p_d[n]))
-        assert cost[k] == pytest.approx(-math.log(ratio), rel=1e-12)
-    wanted = [min(1.0, sum(math.exp(likelihood[k]) for k in range(24) if measurement[k] == m)) for m in range(6)]
-    np.testing.assert_allclose(association, wanted, rtol=1e-12)
-    assert association[5] == 0
-
-
 def test_costs_stay_finite_where_likelihoods_vanish() -> None:
     """Far in the tail, where exp would be zero, the cost still orders the hypotheses."""
     arguments = np.array([0, 0]), np.array([0, 1]), np.array([-2000.0, -3000.0]), np.array([0.5]), np.array([0.9])
@@ -129,24 +110,6 @@ def test_costs_stay_finite_where_likelihoods_vanish() -> None:
     cost = detection_costs(*arguments, association)
     assert cost[0] < cost[1] < math.inf
     np.testing.assert_array_equal(association, 0)
-
-
-def test_each_kind_of_first_detection_has_its_formula() -> None:
-    """Poisson components in the gate, a low score without, a high score without."""
-    log_e = np.log([0.2, 0.3, 0.05])
-    clutter, birth = [np.nan, 0.01], [np.nan, 0.002]
-    kind, cost, existence = first_detections(
-        np.array([0, 0, 3]),
-        log_e,
-        np.array([0.9, 0.1, 0.5, 0.1]),
-        np.array([0, 0, 0.25, 1.0]),
-        np.ones(4, np.int64),
-        class_rows(2, clutter_intensity=clutter, birth_intensity=birth, birth_score=[np.nan, 0.5]),
-    )
-    np.testing.assert_array_equal(kind, [FROM_POISSON, CLUTTER, NEWBORN, FROM_POISSON])
-    wanted = [-math.log(0.5 + 0.01), -math.log(0.01), -math.log(0.002 * 0.75 + 0.01), -math.log(0.05 + 0.01)]
-    np.testing.assert_allclose(cost, wanted, rtol=1e-12)
-    np.testing.assert_allclose(existence, [0.5 / 0.51, 0, 1, 0.05 / 0.06], rtol=1e-12)
 
 
 @pytest.mark.parametrize("over_clutter", [False, True])
@@ -222,52 +185,6 @@ def total(cost: Array, first: Array, assigned: NDArray[np.int64]) -> float:
     objects = np.flatnonzero(assigned != UNASSIGNED)
     free = np.setdiff1d(np.arange(first.size), assigned[objects])
     return float(cost[objects, assigned[objects]].sum() + first[free].sum())
-
-
-def sparse_costs(rng: np.random.Generator, objects: int, measurements: int, density: float) -> tuple[Array, Array]:
-    """Random costs with closed gates."""
-    cost = rng.normal(0, 2, (objects, measurements))
-    cost[rng.random(cost.shape) > density] = np.inf
-    return cost, rng.normal(1, 1, measurements)
-
-
-@pytest.mark.parametrize("seed", range(30))
-def test_no_global_hypothesis_is_cheaper(seed: int) -> None:
-    """Brute force over all assignments of small cases finds none better, and each measurement is used once."""
-    rng = np.random.default_rng(seed)
-    objects, measurements = (int(n) for n in rng.integers(1, 5, 2))
-    cost, first = sparse_costs(rng, objects, measurements, 0.7)
-    assigned = associate(hypotheses(cost, first), objects)
-    used = assigned[assigned != UNASSIGNED]
-    assert len(set(used.tolist())) == len(used)
-    best = math.inf
-    for choice in permutations([*range(measurements), *[UNASSIGNED] * objects], objects):
-        if all(m == UNASSIGNED or np.isfinite(cost[n, m]) for n, m in enumerate(choice)):
-            best = min(best, total(cost, first, np.array(choice)))
-    assert total(cost, first, assigned) == pytest.approx(best, rel=1e-12, abs=1e-12)
-
-
-@pytest.mark.parametrize("density", [0.02, 0.1, 0.5, 1.0])
-@pytest.mark.parametrize("seed", range(4))
-def test_the_pairs_give_the_optimum_of_the_full_matrix(seed: int, density: float) -> None:
-    """The same assignment as the Hungarian algorithm on [costs | diagonal of first-time costs], infinite elsewhere."""
-    rng = np.random.default_rng(seed)
-    cost, first = sparse_costs(rng, 50, 60, density)
-    matrix = np.full((60, 110), np.inf)
-    matrix[:, :50] = cost.T
-    matrix[np.arange(60), 50 + np.arange(60)] = first
-    rows, columns = linear_sum_assignment(matrix)
-    wanted = np.full(50, UNASSIGNED)
-    wanted[columns[columns < 50]] = rows[columns < 50]
-    np.testing.assert_array_equal(associate(hypotheses(cost, first), 50), wanted)
-
-
-def test_a_pair_that_is_not_cheaper_is_not_used() -> None:
-    """At equal cost the measurement keeps its own first-time detection."""
-    assigned = associate(hypotheses(np.array([[1.0]]), np.array([1.0])), 1)
-    np.testing.assert_array_equal(assigned, [UNASSIGNED])
-    assigned = associate(hypotheses(np.array([[np.nextafter(1.0, 0)]]), np.array([1.0])), 1)
-    np.testing.assert_array_equal(assigned, [0])
 
 
 def least(cost: Array, first: Array) -> float:

@@ -1,4 +1,4 @@
-"""The motion kernels against numerical integration and the textbook unscented transform."""
+"""The motion against numerical integration, at all times and turns; states are compared by the oracle."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.integrate import quad, solve_ivp
 
 from optipmb.predict import (
-    ORDER,
     TINY_PIVOT,
     ctra_displacement,
     predict_state,
@@ -76,16 +75,6 @@ def test_the_displacement_is_the_integral_of_the_velocity(v: float, omega: float
         assert found == pytest.approx(wanted, rel=1e-10, abs=1e-11 * (1 + dt * (abs(v) + abs(a) * dt)))
 
 
-@COMPILING
-@given(v=SPEEDS, a=st.floats(-10, 10), dt=st.floats(1e-3, 10))
-def test_no_turn_is_the_straight_line(v: float, a: float, dt: float) -> None:
-    """For omega -> 0 the way is v t + a t^2 / 2, without a jump."""
-    for omega in (0.0, 1e-14, -1e-14):
-        along, across = ctra_displacement(v, omega, a, dt)
-        assert along == pytest.approx(v * dt + a * dt * dt / 2, rel=1e-12, abs=1e-12)
-        assert abs(across) < 1e-9
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_the_quadrature_of_the_oracle_solves_the_differential_equation(seed: int) -> None:
     """The oracle's own transition is checked too: it solves x' = v cos phi, y' = v sin phi, v' = a, phi' = omega."""
@@ -97,16 +86,6 @@ def test_the_quadrature_of_the_oracle_solves_the_differential_equation(seed: int
 
     solution = solve_ivp(derivative, (0, dt), x, method="DOP853", rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(textbook.ctra(x, dt), solution.y[:, -1], rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_the_square_root_squared_is_the_covariance(seed: int) -> None:
-    """L L' is the covariance in the order with position last, L is lower triangular, and nothing is repaired."""
-    _, covariance = random_state(np.random.default_rng(seed))
-    root = np.full((6, 6), np.nan)
-    assert square_root(covariance, root) == 0
-    np.testing.assert_array_equal(np.triu(root, 1), 0)
-    np.testing.assert_allclose(root @ root.T, covariance[np.ix_(ORDER, ORDER)], rtol=1e-12, atol=1e-12)
 
 
 def test_a_covariance_without_full_rank_is_repaired_and_counted() -> None:
@@ -171,60 +150,6 @@ def test_a_way_in_two_parts_is_the_way() -> None:
     cos, sin = math.cos(0.24), math.sin(0.24)
     parts = along + cos * more[0] - sin * more[1], across + sin * more[0] + cos * more[1], *more[2:]
     np.testing.assert_allclose(parts, whole, rtol=1e-12)
-
-
-@pytest.mark.parametrize("dt", [0.1, 2.0])
-@pytest.mark.parametrize("seed", range(4))
-def test_constant_velocity_keeps_speed_and_heading(seed: int, dt: float) -> None:
-    """The textbook transform of x + v dt along phi; turn rate and acceleration stay zero and gain no uncertainty."""
-    rng = np.random.default_rng(seed)
-    mean, covariance = random_state(rng)
-    mean[4:] = 0.0
-    covariance[4:] = covariance[:, 4:] = 0.0
-    covariance[4, 4], covariance[5, 5] = 0.04, 0.25
-    noise = rng.uniform(0.01, 1, 6)
-    found = predicted(mean, covariance, dt, noise, straight=True)
-    wanted = textbook.predict(mean, covariance, np.diag(noise**2), dt, straight=True)
-    np.testing.assert_allclose(np.exp(1j * found[0][3]), np.exp(1j * wanted[0][3]), atol=1e-10)
-    np.testing.assert_allclose(np.delete(found[0], 3), np.delete(wanted[0], 3), rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(found[1], wanted[1], rtol=1e-9, atol=1e-9 * np.abs(wanted[1]).max())
-    np.testing.assert_allclose(found[1][4:, 4:], np.diag([0.04, 0.25]), rtol=1e-12)
-
-
-@pytest.mark.parametrize("tau", [math.inf, 0.7])
-@pytest.mark.parametrize("dt", [1e-3, 0.1, 0.5, 2.0])
-@pytest.mark.parametrize("seed", range(8))
-def test_the_prediction_is_the_textbook_unscented_transform(seed: int, dt: float, tau: float) -> None:
-    """Mean and covariance equal the naive sums over twelve transformed points, plus Q dt."""
-    rng = np.random.default_rng(seed)
-    mean, covariance = random_state(rng)
-    if seed == 0:
-        mean[4] = 0.0
-        covariance *= 1e-6
-    noise = rng.uniform(0.01, 1, 6)
-    found = predicted(mean, covariance, dt, noise, tau)
-    wanted = textbook.predict(mean, covariance, np.diag(noise**2), dt, tau)
-    np.testing.assert_allclose(np.exp(1j * found[0][3]), np.exp(1j * wanted[0][3]), atol=1e-10)
-    np.testing.assert_allclose(np.delete(found[0], 3), np.delete(wanted[0], 3), rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(found[1], wanted[1], rtol=1e-9, atol=1e-9 * np.abs(wanted[1]).max())
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_a_straight_certain_motion_is_the_linear_prediction(seed: int) -> None:
-    """With heading certain and no turn, the transform is the Kalman prediction of constant acceleration."""
-    rng = np.random.default_rng(seed)
-    dt, phi = rng.uniform(0.05, 2), rng.uniform(-3, 3)
-    mean = np.array([*rng.normal(0, 50, 2), rng.normal(0, 8), phi, 0.0, rng.normal()])
-    root = rng.normal(size=(6, 6))
-    root[3:5] = 0
-    covariance = root @ root.T + np.diag([1, 1, 1, 1e-11, 1e-11, 1])
-    transition = np.eye(6)
-    for row, direction in ((0, math.cos(phi)), (1, math.sin(phi))):
-        transition[row, 2], transition[row, 5] = direction * dt, direction * dt**2 / 2
-    transition[2, 5] = transition[3, 4] = dt
-    found = predicted(mean, covariance, dt, np.full(6, 1e-9))
-    np.testing.assert_allclose(found[0][[0, 1, 2, 5]], (transition @ mean)[[0, 1, 2, 5]], atol=1e-6)
-    np.testing.assert_allclose(found[1], transition @ covariance @ transition.T, atol=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(8))

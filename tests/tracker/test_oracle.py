@@ -43,7 +43,7 @@ def follow(parameters: optipmb.Parameters, modules: optipmb.Modules, seed: int, 
 def test_every_combination_of_modules_equals_algorithm_1(profile: str, flags: tuple[bool, ...]) -> None:
     """With each of ADP, HABM, RPP and OTE on or off, every step equals the literal Algorithm 1 to 1e-9."""
     parameters = optipmb.load_profile(profile)
-    options = Options(labels=parameters.labels, frames=12, period=parameters.nominal_period)
+    options = Options(labels=parameters.labels, frames=8, period=parameters.nominal_period)
     seed = sum(flag << i for i, flag in enumerate(flags)) + 100 * PROFILES.index(profile)
     seen = follow(parameters, optipmb.Modules(*flags), seed, options)
     assert seen["tracks"] > 0
@@ -53,18 +53,18 @@ def test_every_combination_of_modules_equals_algorithm_1(profile: str, flags: tu
 def test_long_scenes_equal_algorithm_1(profile: str) -> None:
     """Over a long scene nothing drifts apart, and everything that can happen happened."""
     parameters = optipmb.load_profile(profile)
-    options = Options(labels=parameters.labels, frames=60, period=parameters.nominal_period)
+    options = Options(labels=parameters.labels, frames=40, period=parameters.nominal_period)
     seen = follow(parameters, optipmb.Modules(), 7, options)
     assert min(seen.values()) > 10, seen
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(9))
 def test_random_parameters_equal_algorithm_1(seed: int) -> None:
     """The agreement does not hang on the values of the two profiles; two in three of these have a calibration."""
     parameters = parse_parameters(random_parameters(seed, calibrated=seed % 3 > 0))
     rng = np.random.default_rng(seed)
     options = Options(
-        frames=18,
+        frames=12,
         objects=int(rng.integers(4, 16)),
         extent=float(rng.choice([8.0, 30.0])),
         missed=float(rng.uniform(0, 0.6)),

@@ -1,6 +1,5 @@
 """What a process that tracks takes; what a session holds is free at its end, not when a garbage collection comes by."""
 
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -47,13 +46,13 @@ def busy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceProcess]:
             yield service
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.alone
 def test_a_worker_with_fifty_streams_stays_below_its_memory(busy: ServiceProcess) -> None:
     """Below 320 MB resident, with full windows, caches and checkpoints of 50 streams with 40 objects each."""
     assert resident_mb(busy.process.pid) < WORKER_MB
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.alone
 def test_a_worker_loads_no_solvers(busy: ServiceProcess) -> None:
     """No library of scipy's solvers, or of plots and tables, is mapped into a process that tracks."""
     mapped = Path(f"/proc/{busy.process.pid}/maps").read_text(encoding="utf-8")
