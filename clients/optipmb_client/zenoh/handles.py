@@ -55,10 +55,24 @@ class Sender(Declared):
     It is withdrawn by letting go of it; a message that another thread is sending may still go out. What Zenoh calls
     `undeclare` waits for the heartbeats to end with the lock of the interpreter held. While the thread that sends them
     waits for that lock, the whole process would be blocked for ten seconds.
+
+    Args:
+        publisher: Zenoh's.
+        forget: As for `Declared`.
+        withdraw: Called with a function that lets go of the publisher.
+        cached: Whether the publisher keeps messages for recovery.
     """
 
-    def __init__(self, publisher: Any, forget: Callable[[Declared], None], *, cached: bool) -> None:
+    def __init__(
+        self,
+        publisher: Any,
+        forget: Callable[[Declared], None],
+        withdraw: Callable[[Callable[[], object]], object],
+        *,
+        cached: bool,
+    ) -> None:
         super().__init__(self._let_go, forget)
+        self._withdraw = withdraw
         self._publisher = publisher  # Any: Zenoh leaves parts of these untyped, and one wrongly typed
         self._cached = cached
 
@@ -93,7 +107,8 @@ class Sender(Declared):
             raise ConnectionFailed("this publisher has been closed") from error
 
     def _let_go(self) -> None:
-        self._publisher = None
+        publisher, self._publisher = self._publisher, None
+        self._withdraw(lambda: publisher)  # the reference ends with the function
 
 
 class Reading:

@@ -112,6 +112,11 @@ class Session:
         self._declared: set[Declared] = set()
         """References: Zenoh withdraws declarations without any. Senders are withdrawn so."""
         self._senders: weakref.WeakSet[Sender] = weakref.WeakSet()
+        self._linking: set[str] = set()
+        """Routers to which a link is being set up."""
+        self._held: list[Callable[[], object]] = []
+        """Withdrawals that wait for the end of that."""
+        self._link_listeners = self._follow_links()
 
     @property
     def closed(self) -> bool:
@@ -195,7 +200,7 @@ class Session:
                 if cache is None
                 else zenoh.ext.declare_advanced_publisher(self._session, key, **options)
             )
-        sender = Sender(publisher, lambda _: self._free(keys), cached=cache is not None)
+        sender = Sender(publisher, lambda _: self._free(keys), self._withdraw, cached=cache is not None)
         self._senders.add(sender)
         return sender
 
@@ -445,9 +450,46 @@ class Session:
             self._declared.discard(declared)
             self._free(keys)
 
-        declared = Declared(undeclare, forget)
+        declared = Declared(partial(self._withdraw, undeclare), forget)
         self._declared.add(declared)
         return declared
+
+    def _follow_links(self) -> tuple[object, object]:
+        """Have withdrawals wait while Zenoh sets up a link to a router; return references to the listeners.
+
+        Zenoh collects what is declared, and sends it to the new router, without a lock in between: a withdrawal would
+        overtake its declaration, which the router would then keep until the link ends. On the thread that does this,
+        Zenoh tells of the transport before, and of its link after.
+        """
+
+        def follow_transport(event: Any) -> None:
+            if event.transport.whatami == zenoh.WhatAmI.ROUTER:
+                follow(str(event.transport.zid), begins=event.kind == zenoh.SampleKind.PUT)
+
+        def follow(router: str, *, begins: bool) -> None:
+            with self._lock:
+                if begins:
+                    self._linking.add(router)
+                    return
+                self._linking.discard(router)
+                if self._linking or not self._held:
+                    return
+                held, self._held = self._held, []
+            threading.Thread(target=_call, args=(held,), name="withdrawals", daemon=True).start()
+
+        info = self._session.info
+        with usable():
+            return (
+                info.declare_transport_events_listener(directly(follow_transport)),
+                info.declare_link_events_listener(directly(lambda event: follow(str(event.link.zid), begins=False))),
+            )
+
+    def _withdraw(self, undeclare: Callable[[], object]) -> None:
+        with self._lock:
+            if self._linking:
+                self._held.append(undeclare)
+                return
+        undeclare()
 
     def require(self, keys: int) -> None:
         """Raise `ConnectionFailed` if fewer key numbers are left."""
@@ -473,6 +515,12 @@ class Session:
     def _free(self, keys: int) -> None:
         with self._lock:
             self._open_keys -= keys
+
+
+def _call(withdrawals: list[Callable[[], object]]) -> None:
+    while withdrawals:  # each is let go at once: that is how a publisher is withdrawn
+        with contextlib.suppress(zenoh.ZError):  # the session is closed
+            withdrawals.pop(0)()
 
 
 def _options(timeout: float, *, background: bool) -> dict[str, Any]:

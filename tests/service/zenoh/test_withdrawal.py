@@ -1,12 +1,17 @@
 """Withdrawal of declarations, while the threads of the network call into Python."""
 
+import threading
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 import zenoh
 import zenoh.ext
-from optipmb_client.zenoh.session import Session
+from fleet import RouterProcess
+from optipmb_client import Connection
+from optipmb_client.zenoh.configuration import configured
+from optipmb_client.zenoh.session import Session, opened
+from router import until
 
 ROUNDS = 60
 """Where Zenoh's own way is taken, one in ten stops the process, for ten seconds each time."""
@@ -47,3 +52,47 @@ def test_withdrawing_never_stops_the_process(session: zenoh.Session) -> None:
         sender.close()
     left = session.liveliness().get("stream/*/@adv/**", timeout=1.0)
     assert [reply for reply in left if reply.ok is not None] == []
+
+
+def test_nothing_withdrawn_while_a_link_is_set_up_stays_at_the_router() -> None:
+    """A token that is closed while Zenoh declares all of them to a new router is not there afterwards; the others are.
+
+    Closed at once, most of those that Zenoh has collected and not sent would stay.
+    """
+    began, ended = threading.Event(), threading.Event()
+
+    def listen(info: Any) -> tuple[object, object]:
+        def on(event: Any, phase: threading.Event) -> None:
+            if event.kind == zenoh.SampleKind.PUT:
+                phase.set()
+
+        return (
+            info.declare_transport_events_listener(zenoh.handlers.Callback(lambda one: on(one, began), indirect=False)),
+            info.declare_link_events_listener(zenoh.handlers.Callback(lambda one: on(one, ended), indirect=False)),
+        )
+
+    with RouterProcess() as router:
+        values = {"mode": "client", "connect/endpoints": [router.endpoint], "connect/timeout_ms": -1}
+        zenohs = opened(configured(values))
+        session = Session(zenohs)
+        tokens = {f"token/{number}": session.token(f"token/{number}") for number in range(2000)}
+        closed = set()
+
+        def close_some() -> None:
+            assert began.wait(60.0)
+            while len(tokens) > 1000 and not ended.wait(1e-5):
+                key, token = tokens.popitem()
+                token.close()
+                closed.add(key)
+
+        router.kill()
+        listeners = listen(zenohs.info)
+        thread = threading.Thread(target=close_some)
+        thread.start()
+        router.start()
+        thread.join(60.0)
+        with Connection(router.endpoint) as observer:
+            until(lambda: set(observer.alive("token/*")) == tokens.keys(), "only the open tokens are there", 60.0)
+        assert closed
+        del listeners
+        session.close()
