@@ -222,7 +222,10 @@ class _PackageIndex(_Index):
                 data = super().load(key)  # type: ignore[no-untyped-call]  # as above
                 if data is None and writable:
                     progress.built = set()
-                    _compile_all(count, progress.built)
+                    try:
+                        _compile_all(count, progress.built)
+                    except OSError as error:  # no right, no memory, too many processes, no interpreter any more
+                        _log.warning("optipmb: cannot start other processes (%s): this one compiles alone", error)
                     data = super().load(key)  # type: ignore[no-untyped-call]  # as above
         return data
 

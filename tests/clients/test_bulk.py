@@ -1,9 +1,11 @@
 """Many recordings in several processes: despite killed and failed workers, results equal one process byte for byte."""
 
+import errno
 import json
 import os
 import signal
 import time
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -91,6 +93,19 @@ def test_what_fails_stops_nothing_else(jobs: int) -> None:
     if jobs > 1:
         assert failed[15].reason == "its process died (killed, or out of memory), 3 times"
         assert sum(note.startswith("task 15: its process died") for note in notes) == 2
+
+
+def test_a_system_that_starts_no_process_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where no other process can be started, one error says what to do."""
+
+    def refuse(*_: object) -> None:
+        raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(ProcessPoolExecutor, "submit", refuse)
+    with Processes(2) as executor:
+        executor.start(double, 2)
+        with pytest.raises(ClientError, match="temporarily unavailable; --jobs 1 needs none"):
+            values(executor, [1], str)
 
 
 @pytest.mark.parametrize("executor", [Here(), Processes(2)], ids=["here", "processes"])

@@ -43,6 +43,13 @@ def test_a_service_that_cannot_start_is_told_with_its_words() -> None:
     assert not running(service.process.pid)
 
 
+def test_a_service_that_the_system_does_not_start_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where no process can be started, the error says so."""
+    monkeypatch.setattr(sys, "executable", "/no/interpreter")
+    with pytest.raises(ServiceUnavailable, match=r"cannot start a service on this machine.*/no/interpreter"):
+        ServiceProcess().__enter__()
+
+
 def test_a_frozen_service_is_killed() -> None:
     """A service that does not follow SIGTERM, here one that is frozen in its start, is killed after its grace."""
     with ServiceProcess(grace_s=0.5) as service:

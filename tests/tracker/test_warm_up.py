@@ -145,6 +145,21 @@ def test_programs_that_start_at_once_compile_once_together(tmp_path: Path) -> No
     assert announced.startswith("optipmb: compiling the tracker, once after an installation")
 
 
+def test_a_process_that_cannot_start_others_compiles_alone() -> None:
+    """Without the right to run the interpreter a kernel is compiled where it is called, and one line says so."""
+    program = (
+        "import sys; sys.executable = '/no/interpreter'\n"
+        "import numpy as np, optipmb; print(optipmb.bev_iou(np.zeros((1, 5)), np.zeros((1, 5))).shape)"
+    )
+    with tempfile.TemporaryDirectory() as cache:
+        environment = os.environ | {"NUMBA_CACHE_DIR": cache, "OPTIPMB_COMPILE_PROCESSES": "2"}
+        command = [sys.executable, "-W", "ignore", "-c", program]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=110, check=True, env=environment)
+    assert done.stdout == "(1, 1)\n"
+    line = "optipmb: cannot start other processes ([Errno 2] No such file or directory: '/no/interpreter'): "
+    assert done.stderr.count(f"{line}this one compiles alone\n") == 1
+
+
 @pytest.mark.parametrize("setting", ["OPTIPMB_COMPILE_PROCESSES", "NUMBA_OPT"])
 def test_a_compilation_is_announced_once_with_its_progress(setting: str) -> None:
     """A process without cached kernels says once that it compiles, then how many are compiled, on standard error.

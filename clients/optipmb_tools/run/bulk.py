@@ -150,11 +150,14 @@ class Processes(Executor):
         """Give the task to an idle process, or to a new one."""
         pool = self._idle.pop() if self._idle else self._new()
         try:
-            future = pool.submit(_run, self._call, task)
-        except BrokenProcessPool:  # it was killed while it was idle
-            pool.shutdown()
-            pool = self._new()
-            future = pool.submit(_run, self._call, task)
+            try:
+                future = pool.submit(_run, self._call, task)
+            except BrokenProcessPool:  # it was killed while it was idle
+                pool.shutdown()
+                pool = self._new()
+                future = pool.submit(_run, self._call, task)
+        except OSError as error:
+            raise ClientError(f"cannot start another process: {error}; --jobs 1 needs none") from error
         self._busy[future] = pool
         return future
 

@@ -76,15 +76,18 @@ class ServiceProcess:
             self._log = self._log or Path(folder) / "service.log"
             self._log.parent.mkdir(parents=True, exist_ok=True)
             with self._log.open("wb") as log:
-                self._process = subprocess.Popen(  # noqa: S603  our own interpreter and our own module
-                    self._command,
-                    stdin=subprocess.DEVNULL,
-                    stdout=log,
-                    stderr=subprocess.STDOUT,
-                    start_new_session=True,
-                    cwd=folder,  # files of the service are removed with it
-                    env={"XDG_STATE_HOME": folder} | self._environment,
-                )
+                try:
+                    self._process = subprocess.Popen(  # noqa: S603  our own interpreter and our own module
+                        self._command,
+                        stdin=subprocess.DEVNULL,
+                        stdout=log,
+                        stderr=subprocess.STDOUT,
+                        start_new_session=True,
+                        cwd=folder,  # files of the service are removed with it
+                        env={"XDG_STATE_HOME": folder} | self._environment,
+                    )
+                except OSError as error:
+                    raise ServiceUnavailable(f"cannot start a service on this machine: {error}") from error
             started.callback(self.stop)
             self._context = started.pop_all()
         return self

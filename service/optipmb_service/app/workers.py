@@ -102,9 +102,13 @@ class Worker:
 
     async def run(self, settings: Settings, private: Path) -> int:
         """Start the process, and return its exit status when it has ended; below 0: the signal that killed it."""
-        process = self._process = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "optipmb_service.app.worker", stdin=PIPE, stdout=PIPE, limit=LINE_BYTES
-        )
+        try:
+            process = self._process = await asyncio.create_subprocess_exec(
+                sys.executable, "-m", "optipmb_service.app.worker", stdin=PIPE, stdout=PIPE, limit=LINE_BYTES
+            )
+        except OSError as error:  # no right, no memory, too many processes, no interpreter any more
+            log.error("worker_not_started", worker=self.index, error=str(error))  # noqa: TRY400 - the text says it all
+            return 1
         log.info("worker_started", worker=self.index, pid=process.pid)
         try:
             order = {"settings": settings.model_dump(mode="json"), "index": self.index, "private": str(private)}

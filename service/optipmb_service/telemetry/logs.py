@@ -93,6 +93,8 @@ EVENTS: Final = {
     "query": "A query was answered (level debug).",
     "internal_error": "A bug, with its traceback: report it. The stream continues.",
     "worker_started": "The parent has started a worker.",
+    "worker_not_started": "The system refuses to start a worker, for this reason. At the start the service ends with"
+    " status 1, later it tries again after `again_s` of `worker_ended`.",
     "worker_ended": "A worker has ended by itself, with this status (below 0: by this signal). It is restarted"
     " after `again_s`; until then the state is `degraded`.",
     "worker_restarts": "A worker has declared `restart_keys` keys and ended in order; it is started again at once.",

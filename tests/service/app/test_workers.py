@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,6 +16,7 @@ from optipmb_service.app.workers import Supervisor, Worker, serve_workers
 from optipmb_service.settings import load
 from optipmb_service.telemetry.health import ProcessHealth
 from optipmb_service.telemetry.metrics import Metrics
+from structlog.testing import capture_logs
 from unbounded import NO_BOUND
 
 
@@ -33,6 +35,18 @@ async def test_a_worker_that_ends_in_its_first_start_ends_the_command(
     )
     assert not await supervisor.start()
     assert supervisor.failed == failed
+
+
+async def test_a_worker_that_cannot_be_started_ends_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the system starts no other process, the command ends with status 1 and the reason, and does not wait."""
+    monkeypatch.setattr(sys, "executable", "/no/interpreter")
+    supervisor = Supervisor(
+        load(None, {"workers": 2, "store": "none"}).settings, StopRequest(EndBound(60.0)), Path("unused")
+    )
+    with capture_logs() as logs:
+        assert not await asyncio.wait_for(supervisor.start(), 60.0)
+    assert supervisor.failed == 1
+    assert "/no/interpreter" in next(line["error"] for line in logs if line["event"] == "worker_not_started")
 
 
 @pytest.mark.parametrize(
