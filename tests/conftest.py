@@ -8,6 +8,7 @@ from collections.abc import Generator
 from pathlib import Path
 
 import forked
+import guard
 import hypothesis
 import pytest
 
@@ -17,6 +18,7 @@ HERE = Path(__file__).parent
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 forked.ALLOWED = True
+guard.begin()
 
 OTHERS = {
     "alone": ("e2e/test_cluster.py", "e2e/test_load.py", "e2e/test_soak.py"),
