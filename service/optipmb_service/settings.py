@@ -704,7 +704,7 @@ def load(
         raise SettingsInvalidError(
             "setting workers: with zenoh_config, a router of its own: start `optipmb-service router` and connect to it"
         )
-    known = {f"{PREFIX}{name.upper()}" for name in Settings.model_fields}
+    known = {f"{PREFIX}{name.upper()}" for name in Settings.model_fields} | {f"{PREFIX}COMPILE_PROCESSES"}  # tracker's
     unknown = (name for name in os.environ if name.startswith(PREFIX) and name.split("__")[0] not in known)
     return Loaded(settings, sources, tuple(sorted(unknown)))
 

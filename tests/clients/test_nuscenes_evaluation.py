@@ -17,7 +17,7 @@ from nuscenes_tables import Scene, Thing, crowd, write_detections, write_root
 from optipmb_tools.cli import run
 from optipmb_tools.datasets import DatasetError
 from optipmb_tools.datasets.nuscenes import NuScenesDataset, NuScenesSequence
-from optipmb_tools.evaluation.cases import Case, lives
+from optipmb_tools.evaluation.cases import Case
 from optipmb_tools.evaluation.nuscenes import (
     Event,
     Matching,
@@ -92,14 +92,6 @@ def test_perfect_tracks_are_perfect() -> None:
     assert best.threshold == 0.5
 
 
-def test_distance_is_the_precision() -> None:
-    """Tracks that are off by a metre have AMOTP 1 and are otherwise perfect; off by 2 m they match nothing."""
-    scores = cars(TWO, followed(TWO, dx=1.0))
-    assert (scores.amota, scores.amotp, scores.best.motp) == (1.0, 1.0, 1.0)
-    far = cars(TWO, followed(TWO, dx=2.0))
-    assert (far.amota, far.amotp, far.best.recall) == (0.0, 2.0, 0.0)
-
-
 ONE = still(1, 0.0)
 AWAY = [(frame, 1, 5.0 if frame in (4, 5) else 0.0, 0.0) for frame in range(10)]
 CHANGED = [*still(7, 0.0, range(5)), *still(8, 0.0, range(5, 10))]
@@ -135,20 +127,6 @@ def test_known_figures(truth: list[Row], tracks: list[Row], expected: dict[str, 
     """Small cases with known answers."""
     best = vars(cars(truth, followed(tracks)).best)
     assert {name: best[name] for name in expected} == pytest.approx(expected)
-
-
-def test_switches_leave_recalls_unreached() -> None:
-    """Recalls that only switches would reach count as not reached."""
-    for truth, tracks, recall in ((ONE, CHANGED, 0.9), (TWO, NEW, 0.1)):
-        scores = cars(truth, followed(tracks))
-        assert scores.amota == pytest.approx((recall >= RECALLS).mean())
-        assert scores.amotp == pytest.approx(2.0 * (recall < RECALLS).mean())
-
-
-def test_scores_are_averaged_over_the_track() -> None:
-    """A track is kept or dropped as a whole, by the mean of its scores."""
-    best = cars(ONE, [(*row, 0.1 if row[0] % 2 else 0.9) for row in ONE]).best
-    assert (best.threshold, best.tp) == (pytest.approx(0.5), 10)
 
 
 def test_holes_are_filled() -> None:
@@ -297,21 +275,6 @@ def test_matching_is_the_definition(seed: int) -> None:
         kept = [row for row in tracks if scores[row[1]] >= threshold]
         assert found.false_positives == len(kept) - sum(event != Event.MISS for event, _ in wanted)
         assert found.frames == len({row[0] for row in (*truth, *kept)})
-
-
-@PATIENT
-@given(st.lists(st.lists(st.booleans(), min_size=1, max_size=12), min_size=1, max_size=5))
-def test_lives_of_objects_are_the_definition(given_lives: list[list[bool]]) -> None:
-    """Share, delay, longest gap and breaks equal what walking along each object counts."""
-    rows = sorted((frame, one) for one, life in enumerate(given_lives) for frame in range(len(life)))
-    frame, owner = np.array(rows, dtype=np.int64).T
-    found = lives(owner, frame, np.array([given_lives[one][when] for when, one in rows]))
-    texts = ["".join(".x"[matched] for matched in life) for life in given_lives]
-    tracked = [text for text in texts if "x" in text]
-    assert found.share == pytest.approx([text.count("x") / len(text) for text in texts])
-    assert found.delay.tolist() == [text.index("x") for text in tracked]
-    assert found.longest.tolist() == [max(map(len, text.split("x"))) for text in tracked]
-    assert found.breaks == sum(bool(part) for text in tracked for part in text.strip(".").split("x"))
 
 
 @PATIENT

@@ -74,13 +74,6 @@ def test_nothing_is_estimated_from_nothing() -> None:
     assert found.to_json()["flip_rate"] is None
 
 
-def test_a_detector_without_errors_has_none_that_correlate() -> None:
-    """Boxes that are the labels give no correlation, and no warning."""
-    found = estimated(recorded(Habits(position=0.0, heading=0.0)))
-    assert found.pairs > 0
-    assert math.isnan(found.lasting)
-
-
 def test_the_noise_of_generated_scenes_is_theirs() -> None:
     """The detector of the scenes errs by decimetres, turns one car in a hundred, and finds most of them."""
     parameters = optipmb.load_profile("kitti")

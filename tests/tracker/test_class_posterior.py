@@ -219,29 +219,6 @@ def test_a_density_from_before_there_were_posteriors_goes_on() -> None:
     np.testing.assert_allclose(found.class_probability, wanted.class_probability, rtol=1e-12)
 
 
-@pytest.mark.parametrize("field", ["class_confusion", "class_memory"])
-@pytest.mark.parametrize("value", [1e-300, 1e-10, 1.0 - 1e-12])
-def test_values_that_underflow_are_refused(field: str, value: float) -> None:
-    """So near 0 or 1, a probability would become zero within a few frames, and no later label could raise it."""
-    with pytest.raises(optipmb.ParameterError, match=field):
-        motor(**{field: value})
-
-
-@pytest.mark.parametrize(
-    "values", [{"class_confusion": 1e-9}, {"class_memory": 1e-9}, {"class_confusion": 1e-9, "class_memory": 1.0 - 1e-9}]
-)
-def test_the_outermost_values_keep_a_posterior(values: dict[str, float]) -> None:
-    """After a hundred labels of one class and two hundred of another the newest object is of the latter."""
-    parameters = motor(**values)
-    labels = ["car"] * 100 + ["truck"] * 200
-    for result in steps(parameters, [seen(parameters, 0.1 * k, (name, 0.0, 1.0)) for k, name in enumerate(labels)]):
-        posterior = result.density.class_probability
-        assert posterior is not None
-        np.testing.assert_allclose(posterior.sum(axis=1), 1.0)
-    assert posterior is not None
-    assert posterior[-1, LABELS.index("truck")] > 0.9
-
-
 def test_a_vehicle_of_two_names_keeps_its_id_by_default() -> None:
     """A car that is called a truck in three frames of ten is one track of `auto`, a car."""
     parameters = optipmb.generic_parameters(("car", "truck"), 0.1)

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 import optipmb
 from optipmb.detection_probability import CELLS, NOWHERE, SIDE, boxes_in_sensor, boxes_of_cells, cells_of_points
-from optipmb.geometry import intersection_area
 from optipmb.hypotheses import UNLIMITED
 from optipmb.preprocess import non_maximum_suppression
 
@@ -64,35 +63,6 @@ def test_iou_is_symmetric_and_moves_with_the_world(
     assert overlap(moved(a), moved(b)) == pytest.approx(found, abs=1e-9)
 
 
-@COMPILING
-@given(
-    x=st.floats(-5, 5), y=st.floats(-5, 5), a=st.tuples(LENGTHS, LENGTHS), b=st.tuples(LENGTHS, LENGTHS), angle=ANGLES
-)
-def test_aligned_boxes_overlap_in_a_rectangle(
-    x: float, y: float, a: tuple[float, float], b: tuple[float, float], angle: float
-) -> None:
-    """For equal yaws, of any size, the intersection is known exactly."""
-    c, s = math.cos(angle), math.sin(angle)
-    sides = [
-        max(0.0, min(a[i] / 2, offset + b[i] / 2) - max(-a[i] / 2, offset - b[i] / 2))
-        for i, offset in enumerate((x, y))
-    ]
-    first, second = np.array([0, 0, *a, angle]), np.array([c * x - s * y, s * x + c * y, *b, angle])
-    assert intersection_area(first, second) == pytest.approx(sides[0] * sides[1], rel=1e-9, abs=1e-9)
-
-
-def test_iou_is_a_table_of_all_pairs() -> None:
-    """(N, 5) and (M, 5) give (N, M); nothing gives nothing."""
-    rng = np.random.default_rng(0)
-    a, b = (
-        rng.uniform([0, 0, 1, 1, -3], [5, 5, 4, 4, 3], (7, 5)),
-        rng.uniform([0, 0, 1, 1, -3], [5, 5, 4, 4, 3], (4, 5)),
-    )
-    found = optipmb.bev_iou(a, b)
-    np.testing.assert_allclose(found, [[textbook.iou(p, q) for q in b] for p in a], atol=1e-9)
-    assert optipmb.bev_iou(np.zeros((0, 5)), b).shape == (0, 4)
-
-
 @pytest.mark.parametrize("group", [[0, 1, 2], [0, 1, 0]])
 @pytest.mark.parametrize("mixed", [False, True])
 @pytest.mark.parametrize("seed", range(6))
@@ -113,21 +83,6 @@ def test_suppression_is_the_greedy_one_per_group(seed: int, *, mixed: bool, grou
     found = non_maximum_suppression(boxes, label, class_rows(3, nms_iou=thresholds, suppressed_with=group), UNLIMITED)
     np.testing.assert_array_equal(np.flatnonzero(found), wanted)
     assert 0 < len(wanted) < 60
-
-
-def test_nothing_to_suppress() -> None:
-    """No boxes, no result; one box stays."""
-    one = np.array([[0.0, 0, 4, 2, 0]])
-    label, classes = np.zeros(1, np.int64), class_rows(1, nms_iou=0.1)
-    assert non_maximum_suppression(one[:0], label[:0], classes, UNLIMITED).shape == (0,)
-    np.testing.assert_array_equal(non_maximum_suppression(one, label, classes, UNLIMITED), [True])
-
-
-def test_what_was_suppressed_suppresses_nothing() -> None:
-    """A chain of boxes, each overlapping the next: the first and the third stay."""
-    boxes = np.array([[0.0, 0, 4, 2, 0], [2.5, 0, 4, 2, 0], [5.0, 0, 4, 2, 0]])
-    keep = non_maximum_suppression(boxes, np.zeros(3, np.int64), class_rows(1, nms_iou=0.1), UNLIMITED)
-    np.testing.assert_array_equal(keep, [True, False, True])
 
 
 def random_pose(rng: np.random.Generator, *, far: float = 20.0) -> optipmb.Pose:
@@ -175,16 +130,6 @@ def test_faces_edges_and_corners_belong_to_the_box(quaternion: list[float]) -> N
     assert optipmb.points_in_boxes(optipmb.PointCloud(outside, pose), *arguments)[0] == 1
 
 
-def test_faces_are_inside_to_the_last_bit() -> None:
-    """With an identity pose a point exactly on a face counts."""
-    pose = optipmb.Pose(translation=np.zeros(3), quaternion=np.array([1.0, 0, 0, 0]))
-    points = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], np.float32)
-    found = optipmb.points_in_boxes(
-        optipmb.PointCloud(points, pose), np.zeros((1, 3)), np.full((1, 3), 2.0), np.zeros(1)
-    )
-    assert found[0] == 6
-
-
 def test_points_that_are_not_finite_are_in_no_box() -> None:
     """NaN and infinite points, as drivers send for missing returns, are passed over."""
     pose = optipmb.Pose(translation=np.zeros(3), quaternion=np.array([1.0, 0, 0, 0]))
@@ -216,17 +161,6 @@ def test_points_at_the_faces_of_boxes_fall_into_their_cells(seed: int) -> None:
         assert n in boxes[start[cell] : start[cell + 1]]
         assert occupied[cell]
     assert not occupied[NOWHERE]
-
-
-def test_no_points_and_no_boxes() -> None:
-    """An empty cloud fills no box, and a cloud without boxes counts nothing."""
-    pose = optipmb.Pose(translation=np.zeros(3), quaternion=np.array([1.0, 0, 0, 0]))
-    empty = optipmb.PointCloud(np.zeros((0, 3), np.float32), pose)
-    np.testing.assert_array_equal(
-        optipmb.points_in_boxes(empty, np.zeros((2, 3)), np.ones((2, 3)), np.zeros(2)), [0, 0]
-    )
-    some = optipmb.PointCloud(np.zeros((5, 3), np.float32), pose)
-    assert optipmb.points_in_boxes(some, np.zeros((0, 3)), np.ones((0, 3)), np.zeros(0)).shape == (0,)
 
 
 @settings(deadline=None, max_examples=50)

@@ -58,49 +58,6 @@ def test_a_poisson_component_lives_for_its_steps() -> None:
     assert weights == [[2.0], [pytest.approx(2 * 0.099)], [pytest.approx(2 * 0.099**2)], []]
 
 
-def test_a_low_score_at_an_object_announces_less() -> None:
-    """The weight is mu_ab (1 - p_a): next to a tracked object the component is lighter than in the open."""
-    parameters = car(gate=20.0)
-    frames = [boxes(parameters, 0, (0, 0)), boxes(parameters, 0.1, [(0.7, 0), (15, 0)], score=0.3, size=(0.4, 0.4, 1))]
-    weight = steps(parameters, frames)[1].density.poisson
-    order = np.argsort(weight.mean[:, 0])
-    assert weight.weight[order[0]] < 2.0
-    assert weight.weight[order[-1]] == pytest.approx(2.0, abs=1e-3)
-
-
-def test_rpp_off_forgets_all_components() -> None:
-    """Without RPP every Poisson component goes at the end of the step, as in GNN-PMB."""
-    parameters = car()
-    frames = [boxes(parameters, 0.1 * k, (0, 0), score=0.3) for k in range(3)]
-    for result in steps(parameters, frames, optipmb.Modules(rpp=False)):
-        assert len(result.density.poisson.weight) == len(result.density.bernoulli.id) == 0
-
-
-def test_habm_off_starts_tracks_from_any_score() -> None:
-    """Without HABM every measurement adds a component of the baseline's weight and may start a track at once."""
-    for changes, weight in (({}, 0.1), ({"baseline_birth_rate": 0.4}, 0.4)):
-        parameters = car(**changes)
-        result = steps(parameters, [boxes(parameters, 0, (0, 0), score=0.2)], optipmb.Modules(habm=False))[0]
-        np.testing.assert_array_equal(result.density.bernoulli.id, [1])
-        assert result.density.bernoulli.existence[0] < 1.0
-        np.testing.assert_allclose(result.density.poisson.weight, [weight * (1.0 - 0.9)])
-
-
-def test_a_missed_object_follows_the_misdetection_formula() -> None:
-    """R = r+ (1 - p_d) / (1 - r+ + r+ (1 - p_d)) with r+ = r p_s, until it falls below min_existence."""
-    parameters = car(extract_known=0.7)
-    results = steps(parameters, [boxes(parameters, 0, (0, 0)), *[boxes(parameters, 0.1 * k) for k in range(1, 6)]])
-    r, expected = 1.0, []
-    for _ in range(5):
-        predicted = 0.99 * r
-        r = predicted * 0.1 / (1 - predicted + predicted * 0.1)
-        expected.append([pytest.approx(r)] if r >= 1e-3 else [])
-    assert [result.density.bernoulli.existence.tolist() for result in results[1:]] == expected
-    assert expected[-1] == []
-    np.testing.assert_array_equal(results[1].tracks.score, [0.0])
-    np.testing.assert_array_equal(results[1].tracks.detection, [-1])
-
-
 @pytest.mark.parametrize("silent", [False, True])
 def test_a_certain_object_is_removed_after_its_misses(*, silent: bool) -> None:
     """With p_s = 1 r stays 1; six missed periods are kept, the seventh removes, with frames or without."""
@@ -148,15 +105,6 @@ def test_a_known_track_is_dropped_after_eta_cnt_misses() -> None:
     assert [len(result.tracks) for result in steps(parameters, frames, optipmb.Modules(ote=False))] == [1] * 6
 
 
-def test_size_and_height_are_filtered_by_the_score() -> None:
-    """x_A = (1 - z_s) x_A + z_s z_A: a certain detection replaces, an uncertain one nudges."""
-    parameters = car()
-    frames = [boxes(parameters, 0, (0, 0), size=(4, 2, 1)), boxes(parameters, 0.1, (0, 0), size=(5, 3, 2), score=0.6)]
-    result = steps(parameters, frames)[1]
-    np.testing.assert_allclose(result.tracks.size, [[4.6, 2.6, 1.6]])
-    np.testing.assert_allclose(result.tracks.score, [0.6 * (1 - math.exp(-2))])
-
-
 def test_confidence_counts_time_not_frames() -> None:
     """x_len is in nominal periods: the same second at twice the rate gives the same confidence."""
     parameters = car()
@@ -165,24 +113,6 @@ def test_confidence_counts_time_not_frames() -> None:
     np.testing.assert_allclose(slow[-1].tracks.score, fast[-1].tracks.score)
     np.testing.assert_allclose(slow[-1].tracks.age, [0.3])
     np.testing.assert_allclose(fast[-1].tracks.time_since_detection, [0.0])
-
-
-def test_survival_is_per_nominal_period() -> None:
-    """Prediction over two periods at once forgets as much as two predictions of one: r+ = r p_s^2."""
-    parameters = car(detection=0.001)
-    once = steps(parameters, [boxes(parameters, 0, (0, 0)), boxes(parameters, 0.2)])[-1].density.bernoulli.existence
-    twice = steps(parameters, [boxes(parameters, 0, (0, 0)), boxes(parameters, 0.1), boxes(parameters, 0.2)])
-    np.testing.assert_allclose(once, 0.99**2, rtol=1e-4)
-    np.testing.assert_allclose(twice[-1].density.bernoulli.existence, once, rtol=1e-4)
-
-
-def test_a_repeated_stamp_predicts_nothing() -> None:
-    """Dt = 0: a second frame of the same stamp without detections changes r by the misdetection alone."""
-    parameters = car()
-    first, second = steps(parameters, [boxes(parameters, 1, (0, 0)), boxes(parameters, 1)])
-    np.testing.assert_array_equal(second.density.bernoulli.mean, first.density.bernoulli.mean)
-    np.testing.assert_array_equal(second.density.bernoulli.covariance, first.density.bernoulli.covariance)
-    np.testing.assert_array_equal(second.density.bernoulli.existence, [1.0])
 
 
 def test_classes_do_not_mix() -> None:

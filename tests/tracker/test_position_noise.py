@@ -132,21 +132,6 @@ def test_turning_the_world_turns_the_update() -> None:
         np.testing.assert_allclose(other_spread, whole @ one_spread @ whole.T, rtol=1e-8, atol=1e-9)
 
 
-def test_a_less_certain_detection_moves_a_track_less() -> None:
-    """The larger the covariance, the nearer the posterior is to the prediction, and the more it leaves unknown."""
-    mean, covariance, spread = pair(np.random.default_rng(2))
-    z = np.array([mean[0] + 1.0, mean[1] - 1.0, mean[3]])
-    moved, left = [], []
-    for scale in (0.01, 0.1, 1.0, 10.0, 1000.0):
-        found, found_spread = updated(mean, covariance, z, scale * spread, [np.nan, np.nan])
-        moved.append(float(np.hypot(*(found - mean)[:2])))
-        left.append(float(np.trace(found_spread[:2, :2])))
-    assert moved == sorted(moved, reverse=True)
-    assert left == sorted(left)
-    assert moved[0] > 1.0
-    assert moved[-1] < 0.05
-
-
 def test_the_likelihood_of_a_pair_has_the_covariance_of_its_detection() -> None:
     """It is ln N(z; z_hat, P_xy + Sigma), another for each detection of an object."""
     rng = np.random.default_rng(4)

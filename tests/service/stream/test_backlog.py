@@ -1,6 +1,5 @@
 """The backlog of a session: what waits there is bounded, in order, and in one place; what leaves unprocessed counts."""
 
-import threading
 from dataclasses import replace
 from typing import Any
 
@@ -71,28 +70,6 @@ def test_a_live_backlog_is_bounded_ordered_and_counts(kinds: list[int], frames: 
     assert backlog.counts() == (0, max(0, len(sent[0]) - frames), max(0, len(sent[1]) - clouds))
 
 
-def test_a_backlog_asks_for_one_turn() -> None:
-    """Only the first message asks for a turn, until that one ends; a closed backlog takes nothing."""
-    turns: list[int] = []
-    backlog = live()
-    backlog.attach(lambda: turns.append(1))
-    backlog.push(packet())
-    backlog.push(packet(frame=False))
-    backlog.wake()
-    assert len(turns) == 1
-    backlog.take()
-    assert backlog.end_turn(close=True) is True
-    backlog.take()
-    assert backlog.end_turn(close=False) is False
-    backlog.push(packet())
-    assert len(turns) == 2
-    backlog.take()
-    assert backlog.end_turn(close=True) is None
-    assert not backlog.push(packet())
-    assert not backlog.command(print, urgent=True)
-    assert len(turns) == 2
-
-
 def test_urgent_commands_go_first() -> None:
     """A question overtakes the frames that wait, an ordinary command does not."""
     backlog, order = live(), []
@@ -152,15 +129,6 @@ def test_what_waits_for_a_takeover_is_bounded(arrivals: list[tuple[int, bool, fl
         one.go_live()
         taken(one)
     assert budget.used == 0
-
-
-def test_clouds_of_a_takeover_go_first() -> None:
-    """When there is no room a session gives up its clouds, then its oldest frames."""
-    backlog = Backlog("a/b/c", bounds_of(held=ByteBudget(6 * PACKET_BYTES)), 0)
-    for number in range(5):
-        backlog.push(packet(number, size=10))
-        backlog.push(packet(number, size=30, frame=False))
-    assert sum(one.frame for one in backlog.recent()) == 5
 
 
 def test_what_was_missed_goes_before_what_waits() -> None:
@@ -236,27 +204,3 @@ def test_first_messages_are_kept_until_they_are_asked_for(*, expected: bool) -> 
     assert len(backlog.recent()) == expected
     backlog.trim(10 * SECOND + 1)
     assert not backlog.recent()
-
-
-def test_messages_from_many_threads_are_all_taken() -> None:
-    """While the session is opened, left and live in turn, as threads of the network and the tracking thread do."""
-    backlog, ended, count = live(), list[Packet](), 2000
-
-    def send(origin: int) -> None:
-        for number in range(count):
-            backlog.push(packet(number, stream=str(origin)))
-
-    threads = [threading.Thread(target=send, args=(origin,)) for origin in range(3)]
-    for thread in threads:
-        thread.start()
-    for change in [backlog.open, backlog.leave, backlog.go_live] * 200:
-        change()
-        while (item := backlog.take()) is not None:
-            assert isinstance(item, Packet)
-            ended.append(item)
-    for thread in threads:
-        thread.join(60)
-    backlog.go_live()
-    ended += taken(backlog)
-    for origin in map(str, range(3)):
-        assert numbers([one for one in ended if one.origin == origin]) == list(range(count))

@@ -69,19 +69,3 @@ def test_a_fleet_that_begins_at_once_is_announced() -> None:
     one.sessions |= announced
     assert one.hear(now_ns + 2 * UNPROVEN_NS) == set(fleet)
     assert now_ns < QUEUED_NS
-
-
-def test_a_stream_with_a_session_is_announced_at_once() -> None:
-    """Tracked streams do not wait: a new discoverer hears of all streams at once."""
-    one, fleet = Discoverer(), names(10_000)
-    one.sessions |= set(fleet)
-    one.hear(0, *names(2 * MAX_UNPROVEN_ANNOUNCED, "other"))
-    assert set(fleet) <= one.hear(1, *fleet)
-
-
-def test_a_stream_that_got_no_session_in_its_time_has_another_turn() -> None:
-    """Where members are slow, a stream that sent one message is announced again after others have had their turn."""
-    one, fleet = Discoverer(), names(2 * MAX_UNPROVEN_ANNOUNCED)
-    assert one.hear(0, *fleet) == set(fleet[:MAX_UNPROVEN_ANNOUNCED])
-    assert one.hear(UNPROVEN_NS + 1) == set(fleet[MAX_UNPROVEN_ANNOUNCED:])
-    assert one.hear(2 * (UNPROVEN_NS + 1)) == set(fleet[:MAX_UNPROVEN_ANNOUNCED])

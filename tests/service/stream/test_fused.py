@@ -11,9 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_schemas import Detections, Pose
 from optipmb_service.stream.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
-from optipmb_service.stream.pending import SensorQueue
 from optipmb_service.stream.session import Session
-from optipmb_service.stream.timeline import FrameId, FusedTimeline
 from optipmb_service.stream.values import MAX_SENSORS, Policy
 from router import SECOND, Sensor
 from sessions import Failing, Merged, begun, chained, delayed, feed, problems, tracks
@@ -61,18 +59,6 @@ def test_any_interleaving_gives_the_state_of_frames_in_order(order: list[int], c
     assert state_bytes(one.snapshot()) == state_bytes(other.snapshot())
     assert merged.plain() == again.plain()
     assert len(merged.newest) == len(IN_ORDER)
-
-
-def test_a_frame_of_another_sensor_does_not_go_before_those_that_are_ready() -> None:
-    """When frames go one at a time, remaining frames of one sensor are still due when another sensor's frame comes."""
-    one, policy = fused(Policy(recovery_wait_ns=0, at_once=1)), Policy()
-    for seq in range(3):
-        one.on_detections(FRONT.detections(seq, has_points=True), 0)
-    assert len(tracks(one.on_tick(policy.cloud_wait_ns))) == 1
-    assert (one.held, one.deadline_ns) == (2, 0)
-    found = tracks(one.on_detections(SIDE.detections(3, has_points=False), policy.cloud_wait_ns))
-    assert [(message.sensor, message.seq) for message in found] == [(FRONT.stream, 1)]
-    assert (one.held, one.deadline_ns) == (2, 0)
 
 
 def test_tracks_name_the_session_and_the_sensor() -> None:
@@ -271,21 +257,6 @@ def test_a_session_takes_so_many_sensors() -> None:
     assert len(one.density.bernoulli) == 1
 
 
-def test_the_state_can_be_told_while_a_sensor_comes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The state of a session may be asked for by any thread, also when a sensor comes while they are counted."""
-    one, length = fused(), SensorQueue.__len__
-    given_to(one, [FRONT.detections(0), REAR.detections(0)])
-
-    def interrupted(pending: SensorQueue) -> int:
-        one.on_detections(replace(SIDE, stream=f"site/car/lidar-{len(one.sensors)}").detections(0), 0)
-        return length(pending)
-
-    monkeypatch.setattr(SensorQueue, "__len__", interrupted)
-    before = len(one.sensors)
-    assert one.state().queue == 0
-    assert len(one.sensors) == before + 2
-
-
 def test_a_sensor_that_is_silent_makes_room_for_another() -> None:
     """Sensor names may come and go for ever: beyond the limit of a session, the longest silent ones are forgotten.
 
@@ -340,25 +311,6 @@ def test_a_jump_stays_believed_when_its_first_frame_is_refused() -> None:
         outputs = feed(session, [103], later)
         assert (begun(outputs), len(tracks(outputs))) == (["jump"], 1)
     assert state_bytes(restored.snapshot()) == state_bytes(one.snapshot())
-
-
-def test_frames_held_are_judged_once_when_many_are_let_go() -> None:
-    """Letting n held frames go after a restore takes a number of judgements that grows with n, not with its square."""
-    one = fused()
-    given_to(one, in_order(4))
-    restored = Session.restore(decode_checkpoint(encode_checkpoint(one.snapshot())), 0, tracker=chained)
-    for sensor in (FRONT, SIDE):
-        feed(restored, range(6, 106), sensor)  # behind a gap: 4 and 5 are missing
-    judged, judge = [0], FusedTimeline.judge
-
-    def counted(timeline: FusedTimeline, frame_id: FrameId) -> Any:
-        judged[0] += 1
-        return judge(timeline, frame_id)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(FusedTimeline, "judge", counted)
-        assert len(tracks(restored.recovered(0))) == 200
-    assert judged[0] < 1000
 
 
 def test_after_a_restart_the_caches_of_all_sensors_are_waited_for() -> None:

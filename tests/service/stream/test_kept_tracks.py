@@ -1,9 +1,7 @@
 """Tracks that are asked for later: a range of stamps, each frame once, in bounded answers."""
 
-import asyncio
 import json
 import queue
-import threading
 from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
@@ -14,14 +12,10 @@ import pytest
 import zenoh
 from commands import run_here
 from fake_service import tracks_of
-from nats_process import NatsProcess
 from optipmb_client import Connection, ServiceRefused, ServiceUnavailable, kept_tracks
 from optipmb_schemas import Keys, Limits, Tracks, TracksRequest, decode, encode, encoding_of
-from optipmb_service.cluster.message_log import LogReader, MessageLog
 from optipmb_service.stream import kept_tracks as service_tracks
 from optipmb_service.stream.kept_tracks import LATE_NS, TracksRange
-from optipmb_service.stream.profiles import Fusion
-from optipmb_service.stream.recovery import Log
 from optipmb_tools.table_files import read_table
 from router import Node, Sensor, plain, until
 from routers import free_endpoint, open_client, open_router
@@ -154,29 +148,6 @@ def test_a_search_that_fails_takes_no_room(monkeypatch: pytest.MonkeyPatch) -> N
         query.answer(Mock(payload=b"", refuse=refused.put), SENSOR.stream)
         problem = refused.get(timeout=60.0)
         assert (problem.code, problem.received) == ("unlogged", "ValueError: a mistake")
-
-
-def test_caches_that_do_not_answer_keep_nothing_of_the_log_waiting(tmp_path: Path) -> None:
-    """The loop of the connection to NATS goes on while the caches are asked for what the log does not have."""
-    asked, answered, finished = threading.Event(), threading.Event(), threading.Event()
-
-    def recent(_: str) -> list[tuple[bytes, str]]:
-        asked.set()
-        assert answered.wait(60)
-        return []
-
-    with NatsProcess(tmp_path) as nats:
-        reader = LogReader(log := MessageLog([nats.url], KEYS.prefix), 1.0)
-        until(lambda: not log.connection.failure, "it is connected")
-        query = service_tracks.TrackQuery(Log(reader, KEYS, Fusion()), recent, "test", Limits())
-        try:
-            query.answer(Mock(payload=b"", finish=finished.set), SENSOR.stream)
-            assert asked.wait(60.0)
-            log.connection.call(asyncio.sleep(0), calls=60.0)
-        finally:
-            answered.set()
-            assert finished.wait(60.0)
-            reader.close(60.0)
 
 
 def test_the_client_asks_part_by_part(

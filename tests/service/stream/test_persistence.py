@@ -10,8 +10,6 @@ from optipmb_service.cluster.store import Fenced, StoreError
 from optipmb_service.stream.checkpoint import Checkpoint
 from optipmb_service.stream.persistence import CheckpointWriter
 from optipmb_service.stream.session import Session
-from optipmb_service.stream.streams import KEPT_AT_ONCE
-from registries import Around, packet_of, streams_of
 from router import Sensor, until
 
 import optipmb
@@ -96,43 +94,6 @@ def test_no_error_of_the_writer_loses_a_state() -> None:
     store.close()
 
 
-def test_who_is_waited_for_keeps_no_other_waiting() -> None:
-    """Sessions close one after the other, each while the one before is written: all others are written, too."""
-    store, ended = SqliteStore(None), threading.Event()
-    leases = Alone(store)
-    writer = CheckpointWriter(store, 0.3, leases)
-    closing, other = snapshot(FIRST), snapshot(SECOND)
-
-    def close_another() -> None:
-        if not ended.is_set():
-            writer.put(closing, leases.fence(closing.stream), close_another)
-
-    writer.start(lambda: writer.put(other, leases.fence(other.stream)))
-    close_another()
-    until(lambda: other.stream in store.streams(), "the other one is written")
-    ended.set()
-    writer.close(5)
-    assert store.streams() == (FIRST.stream, SECOND.stream)
-    store.close()
-
-
-def test_what_somebody_waits_for_is_not_all() -> None:
-    """A state written at once leaves the age of what the store has as it was: others may wait for their round."""
-    store, kept = SqliteStore(None), threading.Event()
-    leases = Alone(store)
-    writer = CheckpointWriter(store, 60.0, leases)
-    before_ns = writer.complete_ns
-    writer.start(lambda: None)
-    writer.put(snapshot(SECOND), leases.fence(SECOND.stream))
-    writer.put(snapshot(FIRST), leases.fence(FIRST.stream), kept.set)
-    assert kept.wait(60.0)
-    assert (store.streams(), writer.complete_ns) == ((FIRST.stream,), before_ns)
-    writer.close(5)
-    assert store.streams() == (FIRST.stream, SECOND.stream)
-    assert writer.complete_ns > before_ns
-    store.close()
-
-
 def test_what_waits_for_its_lease_grows_older() -> None:
     """While a lease has lapsed the store has not all; with nothing to write it has, round after round."""
     store, rounds = SqliteStore(None), [0]
@@ -193,28 +154,3 @@ def test_the_end_says_when_a_state_cannot_be_written() -> None:
     assert tried.wait(60.0)
     assert writer.close(60.0) is False
     store.close()
-
-
-def test_states_are_given_for_a_few_streams_at_a_time() -> None:
-    """Checkpoints of changed sessions, in pieces between which a new frame has its turn."""
-    around = Around()
-    streams = streams_of(around)
-    sensors = [replace(FIRST, stream=f"site/node{number:02d}/lidar") for number in range(2 * KEPT_AT_ONCE + 3)]
-    for seq in range(2):
-        for sensor in sensors:
-            streams.receive(packet_of(sensor.detections(seq)))
-    around.run()
-    streams.keep()
-    streams.receive(packet_of(sensors[0].detections(2)))
-    kept = []
-    while around.turn():
-        kept.append((len(around.kept), streams.totals().frames))
-    frames = 2 * len(sensors)
-    few, more = KEPT_AT_ONCE, 2 * KEPT_AT_ONCE
-    assert kept == [(few, frames), (few, frames + 1), (more, frames + 1), (len(sensors), frames + 1)]
-    around.kept.clear()
-    streams.keep()
-    around.run()
-    assert around.kept.keys() == {sensors[0].stream}
-    streams.keep()
-    assert not around.turn()

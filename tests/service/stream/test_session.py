@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import sessions
-from optipmb_schemas import PATHS, Detections, decode, encode
+from optipmb_schemas import PATHS
 from optipmb_service.stream.checkpoint import decode_checkpoint, encode_checkpoint
 from optipmb_service.stream.session import Session
 from optipmb_service.stream.values import Incarnation, Output, Policy, RefusedError
@@ -208,52 +208,6 @@ def test_frames_keep_their_order_while_one_waits() -> None:
     assert feed(one, [1], has_points=False) == []
     assert one.state().queue == 2
     assert [message.seq for message in tracks(one.on_points(SENSOR.points(0), 1))] == [0, 1]
-
-
-def test_frames_that_are_ready_together_go_one_at_a_time() -> None:
-    """Each call has the tracks of one frame, and the next one is due at once; they are the same bytes."""
-    one, other = session(policy=Policy(at_once=1)), session()
-    feed(one, range(20), has_points=True)
-    feed(other, range(20), has_points=True)
-    assert one.deadline_ns == WAIT_NS
-    got = []
-    while one.deadline_ns is not None:
-        found = tracks(one.on_tick(WAIT_NS))
-        assert len(found) == 1
-        assert one.deadline_ns == (0 if one.held else None)
-        got += found
-    assert [plain(a) for a in got] == [plain(b) for b in tracks(other.on_tick(WAIT_NS))]
-
-
-def test_more_than_one_at_a_time_goes_for_the_bytes_that_are_held() -> None:
-    """A large frame that comes behind small ones has so many of them go that no more bytes are held than may be."""
-    most = 100_000
-    one = session(policy=Policy(at_once=1, held_bytes=most, rewind_ns=0))
-    feed(one, range(20), has_points=True)
-    before = one.held
-    assert before == 20
-    for seq in range(20, 23):
-        one.on_detections(SENSOR.detections(seq, objects=400, has_points=True), 0)
-        assert one.held_bytes <= most
-    assert one.held < before
-
-
-def test_frames_that_came_as_bytes_give_the_checkpoint_of_those_that_did_not() -> None:
-    """The very bytes are kept and go into checkpoints, and each frame counts the same, however it came."""
-    made = [SENSOR.detections(2**20 + number, has_points=True) for number in range(10)]
-    came = [decode(encode(message), Detections) for message in (*made[:3], *made)][3:]
-    sizes = [len(getattr(message, "encoded", b"")) for message in came]
-    assert sizes == [len(encode(message)) for message in made]
-    one, other = session(), session()
-    for message, same in zip(made, came, strict=True):
-        one.on_detections(message, 0)
-        other.on_detections(same, 0)
-    assert other.held_bytes == one.held_bytes > 2 * sum(sizes)
-    assert len(tracks(one.on_tick(WAIT_NS))) == len(tracks(other.on_tick(WAIT_NS))) == 10
-    assert sum(sizes) < other.held_bytes == one.held_bytes < 2 * sum(sizes)
-    checkpoint = other.snapshot()
-    assert encode_checkpoint(checkpoint) == encode_checkpoint(one.snapshot())
-    assert all(kept.detections is message.encoded for kept, message in zip(checkpoint.window, came, strict=True))
 
 
 def test_a_reset_takes_no_longer_than_it_may() -> None:

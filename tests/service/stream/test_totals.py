@@ -6,9 +6,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-import pytest
 from optipmb_service.stream import backlog, stream
-from optipmb_service.stream import streams as table
 from optipmb_service.stream.values import MAX_SENSORS
 from optipmb_service.telemetry.stream_meter import MessageCounters
 from optipmb_service.zenoh.inputs import Packet
@@ -54,14 +52,6 @@ def test_totals_never_fall_and_count_nothing_twice() -> None:
         assert values == sorted(values), name
     assert (seen[-1].received, seen[-1].frames, seen[-1].duplicates) == (8, 6, 2)
     assert streams.totals() == seen[-1]
-
-
-def test_a_command_without_room_is_no_message(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A query on a stream that finds no room among new streams gets an error, and counts as no frame."""
-    monkeypatch.setattr(table, "MAX_UNPROVEN", 0)
-    streams = streams_of(Around())
-    assert not streams.command(SENSOR.stream, lambda _: None, urgent=True)
-    assert streams.totals() == MessageCounters()
 
 
 def test_a_message_on_a_key_of_no_stream_is_refused_as_what_it_is() -> None:
