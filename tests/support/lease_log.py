@@ -18,6 +18,7 @@ class Shared:
 
     records: dict[str, Record] = field(default_factory=dict)
     checkpoints: dict[str, list[bytes]] = field(default_factory=dict)
+    numbers: dict[str, bytes] = field(default_factory=dict)
     revision: int = 0
     lock: threading.Lock = field(default_factory=threading.Lock)
     """Of those who write at the same time, one is accepted."""
@@ -72,6 +73,7 @@ class MemoryLeases:
                 refused.add(stream)
             else:
                 self.shared.checkpoints[stream] = [*self.shared.checkpoints.get(stream, []), one.data][-KEPT:]
+                self.shared.numbers[stream] = one.numbers
                 self.shared.revision += 1
         return frozenset(refused)
 
@@ -79,6 +81,9 @@ class MemoryLeases:
         self._reach()
         kept = self.shared.checkpoints.get(stream)
         return kept[-1] if kept else None
+
+    def numbers(self, stream: str) -> bytes | None:
+        return self.shared.numbers.get(stream)
 
     def expire(self, age_s: float) -> int:
         del age_s

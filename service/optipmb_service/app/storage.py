@@ -126,7 +126,7 @@ def _copy(source: SqliteStore, target: LeaseStore) -> tuple[int, int]:
                 known += 1
             elif data is not None:
                 partition = partition_of(stream)
-                batch[stream] = Fenced(partition_key(partition), fences[partition], data)
+                batch[stream] = Fenced(partition_key(partition), fences[partition], data, source.numbers(stream) or b"")
         if target.save(batch):
             raise _held("a member that has just begun")
         copied += len(batch)

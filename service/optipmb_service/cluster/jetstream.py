@@ -31,6 +31,7 @@ NOT_THE_NEWEST: Final = 10071
 UNDECIDED: Final = 10164  # several servers have not agreed yet on a write that was asked for before
 NOTHING_THERE: Final = 10037
 AGAIN_S: Final = 0.05
+MOST_NUMBERS: Final = 4096  # streams of which it is remembered what was written
 
 EXPECTED: Final = "Nats-Expected-Last-Subject-Sequence"
 
@@ -54,6 +55,8 @@ class JetStream:
         self._name = f"OPTIPMB_{token(prefix)}"
         self._keep_s = round(keep_s)
         self._there = False
+        self._numbers: dict[str, bytes] = {}
+        """Numbers that were written last, by stream."""
         self.max_bytes = 2**19
         """Bytes that a checkpoint may have; the server's own limit, once that is known."""
 
@@ -91,6 +94,11 @@ class JetStream:
         found = self._call(self._last(self._subject("checkpoint", stream)))
         return None if found is None else found[1]
 
+    def numbers(self, stream: str) -> bytes | None:
+        """Return the numbers saved with the newest checkpoint of a stream, also after that has gone; else None."""
+        found = self._call(self._last(self._subject("numbers", stream)))
+        return None if found is None else found[1]
+
     def expire(self, age_s: float) -> int:
         """Return 0: the server itself forgets a checkpoint that is old."""
         del age_s
@@ -111,6 +119,7 @@ class JetStream:
 
     def _lost(self) -> None:
         self._there = False  # the server may come back without its files
+        self._numbers.clear()
 
     async def _ready(self) -> None:
         """Create the JetStream stream, unless it is there."""
@@ -166,6 +175,12 @@ class JetStream:
                 headers["Nats-TTL"] = f"{self._keep_s}s"
             async with turn:
                 kept = await self._publish(self._subject("checkpoint", stream), one.data, headers)
+                if kept is not None and one.numbers and self._numbers.get(stream) != one.numbers:
+                    headers.pop("Nats-TTL", None)
+                    await self._publish(self._subject("numbers", stream), one.numbers, headers)
+                    if len(self._numbers) >= MOST_NUMBERS:
+                        self._numbers.clear()
+                    self._numbers[stream] = one.numbers
             return stream if kept is None else None
 
         refused = await asyncio.gather(*(save(*one) for one in checkpoints.items()))

@@ -43,6 +43,7 @@ BUSY_PAUSE_S: Final = 0.01
 LOG_BYTES: Final = 4 * 2**20  # size of the write-ahead log from which its pages go into the file
 ASIDE: Final = 64  # torn checkpoints kept in all; beyond it the oldest go
 LEASES: Final = "leases.db"  # file of the records
+NUMBERS: Final = 2**17  # streams whose numbers are kept without a checkpoint; beyond it the longest silent go
 ENDED_KEPT: Final = 64  # records of ended members; who has followed none of the later ones was ended itself
 SLICE: Final = 64  # streams of one transaction
 SLICE_BYTES: Final = 4 * 2**20  # bytes of checkpoints of one transaction; one checkpoint may have more
@@ -57,7 +58,7 @@ CREATE TABLE IF NOT EXISTS checkpoints (
 CREATE TABLE IF NOT EXISTS aside (
     number INTEGER PRIMARY KEY, stream TEXT NOT NULL, reason TEXT NOT NULL, data BLOB NOT NULL
 );
-CREATE TABLE IF NOT EXISTS written (stream TEXT PRIMARY KEY, at REAL NOT NULL);
+CREATE TABLE IF NOT EXISTS numbers (stream TEXT PRIMARY KEY, at REAL NOT NULL, data BLOB NOT NULL);
 """
 
 _OLD_MEMBERS: Final = """
@@ -66,7 +67,13 @@ DELETE FROM records WHERE key LIKE 'member/%' AND value = 'ended' AND revision <
 )
 """
 _NEWEST: Final = "SELECT data FROM checkpoints WHERE stream = ? ORDER BY number DESC LIMIT 1"
-_SILENT: Final = "SELECT stream FROM written WHERE at < ? LIMIT ?"
+_SILENT: Final = """
+SELECT stream FROM numbers WHERE at < ? AND EXISTS (SELECT 1 FROM checkpoints WHERE stream = numbers.stream) LIMIT ?
+"""
+_OLD_NUMBERS: Final = """
+DELETE FROM numbers WHERE at < (SELECT at FROM numbers ORDER BY at DESC LIMIT 1 OFFSET ?)
+    AND NOT EXISTS (SELECT 1 FROM checkpoints WHERE stream = numbers.stream)
+"""
 
 
 class MemberLocks:
@@ -391,7 +398,7 @@ class SqliteStore:
                 fences = self._fences({one.lease for _, one in some})
                 for stream, one in some:
                     if fences.get(one.lease) == one.fence:
-                        self._write(connection, stream, one.data)
+                        self._write(connection, stream, one)
                     else:
                         refused.add(stream)
         return frozenset(refused)
@@ -402,12 +409,12 @@ class SqliteStore:
             query = f"SELECT key, revision FROM records WHERE key IN ({marks})"  # noqa: S608 - question marks
             return dict(connection.execute(query, tuple(keys)).fetchall())
 
-    def _write(self, connection: sqlite3.Connection, stream: str, data: bytes) -> None:
+    def _write(self, connection: sqlite3.Connection, stream: str, one: Fenced) -> None:
         (last,) = connection.execute(
             "SELECT coalesce(max(number), 0) FROM checkpoints WHERE stream = ?", (stream,)
         ).fetchone()
-        connection.execute("INSERT INTO checkpoints VALUES (?, ?, ?)", (stream, last + 1, data))
-        connection.execute("INSERT OR REPLACE INTO written VALUES (?, ?)", (stream, self._clock()))
+        connection.execute("INSERT INTO checkpoints VALUES (?, ?, ?)", (stream, last + 1, one.data))
+        connection.execute("INSERT OR REPLACE INTO numbers VALUES (?, ?, ?)", (stream, self._clock(), one.numbers))
         connection.execute("DELETE FROM checkpoints WHERE stream = ? AND number <= ?", (stream, last + 1 - KEPT))
 
     def load(self, stream: str) -> bytes | None:
@@ -416,6 +423,12 @@ class SqliteStore:
             row = connection.execute(_NEWEST, (stream,)).fetchone()
         return None if row is None else bytes(row[0])
 
+    def numbers(self, stream: str) -> bytes | None:
+        """Return the numbers saved with the newest checkpoint of a stream; else None."""
+        with self._checkpoints.use() as connection:
+            row = connection.execute("SELECT data FROM numbers WHERE stream = ?", (stream,)).fetchone()
+        return bytes(row[0]) if row and row[0] else None
+
     def streams(self) -> tuple[str, ...]:
         """Return the streams that have a checkpoint, by name."""
         with self._checkpoints.use() as connection:
@@ -423,11 +436,11 @@ class SqliteStore:
         return tuple(row[0] for row in rows)
 
     def expire(self, age_s: float) -> int:
-        """Forget some streams of which nothing was saved for so long; return how many."""
+        """Forget the checkpoints of some streams of which nothing was saved for so long; return how many."""
         with self._checkpoints.transaction() as connection:
             old = connection.execute(_SILENT, (self._clock() - age_s, SLICE)).fetchall()
             connection.executemany("DELETE FROM checkpoints WHERE stream = ?", old)
-            connection.executemany("DELETE FROM written WHERE stream = ?", old)
+            connection.execute(_OLD_NUMBERS, (NUMBERS,))
         return len(old)
 
     def set_aside(self, stream: str, reason: str) -> None:

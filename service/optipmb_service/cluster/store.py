@@ -39,11 +39,15 @@ class Write(NamedTuple):
 
 
 class Fenced(NamedTuple):
-    """A checkpoint, the record of its lease, and the revision of that record: the fence."""
+    """A checkpoint, the record of its lease, and the revision of that record: the fence.
+
+    `numbers` are bytes that are kept when the checkpoint is not any more.
+    """
 
     lease: str
     fence: int
     data: bytes
+    numbers: bytes = b""
 
 
 class LeaseStore(Protocol):
@@ -75,8 +79,11 @@ class LeaseStore(Protocol):
     def load(self, stream: str) -> bytes | None:
         """Return the newest checkpoint of a stream, None without one."""
 
+    def numbers(self, stream: str) -> bytes | None:
+        """Return the numbers saved with the newest checkpoint of a stream, also after that has gone; else None."""
+
     def expire(self, age_s: float) -> int:
-        """Forget streams of which nothing was saved for so long, some at a time; return how many, 0 at last."""
+        """Forget checkpoints of streams of which nothing was saved for so long, some at a time; return how many."""
 
     def set_aside(self, stream: str, reason: str) -> None:
         """Move the newest checkpoint of a stream to those set aside; the one before it is the newest then."""

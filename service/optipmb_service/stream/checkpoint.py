@@ -1,9 +1,10 @@
 """Checkpoint of a session: its state between two frames as a value that never changes, as bytes, and back.
 
-The bytes are a head (magic, version, next ids, the first 16 bytes of the SHA-256 digest of these and the body) and a
-body, one msgpack map. Equal checkpoints give equal bytes. Reading is total and bounded: it returns a checkpoint whose
-parts fit together or raises `CheckpointError`, and the digest is compared before anything else is looked at. There is
-one version; others are refused by number, with the next ids. Fields that are not described here are ignored.
+The bytes are a head and a body, one msgpack map. The head is the same in all formats: magic, number of the format, next
+ids, the first 16 bytes of the SHA-256 digest of these and all that follows, and the numbers that are never used again,
+a msgpack map with its length before it. So a release names a format that it cannot read, and goes on with the numbers.
+Fields that are not described here are ignored. Equal checkpoints give equal bytes. Reading is total and bounded: it
+returns a checkpoint whose parts fit together or raises `CheckpointError`.
 
 What depends on how messages were delivered (duplicates, the revisions of corrected tracks, crashes) is kept, but is no
 state: `state_bytes` leaves it out, so that two sessions that took the same frames can be compared.
@@ -46,14 +47,15 @@ from optipmb_service.telemetry.stream_meter import MAX_COUNT
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-VERSION: Final = 1
+VERSION: Final = 4
 MAGIC: Final = b"OPTIPMB\0"
 DIGEST: Final = 16
 _START: Final = MAGIC + VERSION.to_bytes(2, "big")
 _IDS: Final = struct.Struct(">QQ")
-"""Lives of the stream and next track id. All versions have them here: a release that cannot read a checkpoint must not
-give out the ids of its session again."""
+"""Incarnations of the stream and next track id."""
+_LENGTH: Final = struct.Struct(">I")
 HEAD: Final = len(_START) + _IDS.size + DIGEST
+"""Bytes up to the numbers."""
 MAX_BYTES: Final = 2**28
 MAX_PROFILES: Final = 64
 """Profiles whose form in checkpoints is remembered."""
@@ -70,7 +72,7 @@ _SOFTWARE: Final = version("optipmb")
 class CheckpointError(ValueError):
     """The bytes are no checkpoint that this service can read; the text says why.
 
-    `incarnation` has the ids that the session used, where the checkpoint is whole and of another version; else None.
+    `incarnation` has the numbers that the session used, where the checkpoint is whole and of another format; else None.
     """
 
     def __init__(self, text: str, incarnation: Incarnation | None = None) -> None:
@@ -117,6 +119,11 @@ class Checkpoint:
         """Id of the present incarnation of the density."""
         return self.head.session
 
+    @property
+    def incarnation(self) -> Incarnation:
+        """Numbers that a later session continues."""
+        return self.head.incarnation(self.run)
+
 
 def forgotten(checkpoint: Checkpoint) -> Checkpoint:
     """Return the checkpoint of a closed stream: its session after a reset, without its counts."""
@@ -129,8 +136,7 @@ def forgotten(checkpoint: Checkpoint) -> Checkpoint:
 
 def encode_checkpoint(checkpoint: Checkpoint) -> bytes:
     """Return the bytes of a checkpoint; equal ones give equal bytes."""
-    head = checkpoint.head
-    return seal(_msgpack.packb(_body(checkpoint), default=_packed), Incarnation(head.starts, head.density.next_id))
+    return seal(_msgpack.packb(_body(checkpoint), default=_packed), checkpoint.incarnation)
 
 
 def state_bytes(checkpoint: Checkpoint) -> bytes:
@@ -158,26 +164,53 @@ def decode_checkpoint(data: bytes) -> Checkpoint:
 
 
 def seal(body: bytes, incarnation: Incarnation) -> bytes:
-    """Return a body with the head that names its version, holds the next ids and guards it."""
+    """Return a body with the head that names its format, holds the numbers and guards it."""
     start = _START + _IDS.pack(incarnation.starts, incarnation.next_id)
-    return b"".join((start, _digest(start, body), body))
+    numbers = _msgpack.packb({"run": incarnation.run, "events": dict(sorted(incarnation.events.items()))})
+    rest = b"".join((_LENGTH.pack(len(numbers)), numbers, body))
+    return b"".join((start, _digest(start, rest), rest))
+
+
+def numbers_in(data: bytes) -> Incarnation:
+    """Return the numbers of a checkpoint of any format, or of its head alone.
+
+    Raises:
+        CheckpointError: torn or changed.
+    """
+    return _opened(data)[1]
 
 
 def _open(data: bytes) -> bytes:
+    version, incarnation, body = _opened(data)
+    if version != VERSION:
+        raise CheckpointError(_other_format(version), incarnation)
+    return body
+
+
+def _other_format(version: int) -> str:
+    return f"format {version}: expected {VERSION}, the only one of this release; start the release that wrote it"
+
+
+def _opened(data: bytes) -> tuple[int, Incarnation, bytes]:
     if len(data) < HEAD or data[: len(MAGIC)] != MAGIC:
         raise CheckpointError("no checkpoint: its first bytes are others")
     if len(data) > MAX_BYTES:
         raise CheckpointError(f"{len(data)} bytes: more than a checkpoint has")
-    start, body = data[: HEAD - DIGEST], data[HEAD:]
-    if data[HEAD - DIGEST : HEAD] != _digest(start, body):
-        raise CheckpointError("torn or changed: the digest is that of other bytes")
+    start, rest = data[: HEAD - DIGEST], data[HEAD:]
     version = int.from_bytes(start[len(MAGIC) : len(_START)], "big")
-    if version != VERSION:
-        raise CheckpointError(
-            f"version {version}: expected {VERSION}, the only one of this release; start the release that wrote it",
-            Incarnation(*(min(one, MAX_COUNT) for one in _IDS.unpack_from(start, len(_START)))),
-        )
-    return body
+    if data[HEAD - DIGEST : HEAD] != _digest(start, rest):
+        torn = "torn or changed: the digest is that of other bytes"
+        raise CheckpointError(torn if version == VERSION else f"{_other_format(version)}; {torn}")
+    starts, next_id = (min(one, MAX_COUNT) for one in _IDS.unpack_from(start, len(_START)))
+    length = int.from_bytes(rest[: _LENGTH.size], "big")
+    numbers, body = rest[_LENGTH.size : _LENGTH.size + length], rest[_LENGTH.size + length :]
+    try:
+        known = _Numbers.model_validate(read_map(numbers, schemas.STORED))
+    except (ValidationError, schemas.MessageError) as error:
+        if version == VERSION:
+            raise CheckpointError(f"numbers: {error}") from None
+        known = _Numbers(run=0, events={})  # formats before 4 have none
+    return version, Incarnation(starts, next_id, known.run, known.events), body
 
 
 def _digest(start: bytes, body: bytes) -> bytes:
@@ -253,6 +286,11 @@ def _packed_profile(parameters: optipmb.Parameters) -> bytes:
 
 Flag = Annotated[bool, Field(strict=True)]
 Text = Annotated[str, Field(strict=True, max_length=MAX_ERROR)]
+
+
+class _Numbers(BaseModel):
+    run: Count
+    events: dict[str, Count]
 
 
 class _Zones(BaseModel):

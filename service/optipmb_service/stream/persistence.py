@@ -25,13 +25,21 @@ import structlog
 
 from optipmb_service.cluster.leases import partition_key, partition_of
 from optipmb_service.cluster.store import Fenced, StoreError, load_newest
-from optipmb_service.stream.checkpoint import Checkpoint, CheckpointError, decode_checkpoint, encode_checkpoint
+from optipmb_service.stream.checkpoint import (
+    Checkpoint,
+    CheckpointError,
+    decode_checkpoint,
+    encode_checkpoint,
+    numbers_in,
+    seal,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from optipmb_service.cluster.member import Member
     from optipmb_service.cluster.store import LeaseStore
+    from optipmb_service.stream.values import Incarnation
 
 log = structlog.get_logger("optipmb_service")
 
@@ -48,6 +56,8 @@ FAILED_NS: Final = 60 * 1_000_000_000
 
 DAY_S: Final = 86_400.0
 EXPIRE_EVERY_NS: Final = 3600 * 1_000_000_000
+FIRST_EXPIRY_NS: Final = 600 * 1_000_000_000
+"""Time after the start in which streams come back whose checkpoints seem old: the process was off, or a clock wrong."""
 
 MAX_FAILED: Final = 1024
 """Streams whose failure is remembered."""
@@ -93,7 +103,7 @@ class CheckpointWriter:
         off: str | None = None,
     ) -> None:
         self._keep_s = keep_s
-        self._expires_ns = time.monotonic_ns()
+        self._expires_ns = time.monotonic_ns() + FIRST_EXPIRY_NS
         self._report = report
         self._store = store
         self.durable = off is None
@@ -155,12 +165,12 @@ class CheckpointWriter:
         stream: str,
         restore: Callable[[Checkpoint], _T],
         then: Callable[[_T | None], None],
-        refused: Callable[[CheckpointError], None] = lambda _: None,
+        unread: Callable[[Incarnation], None] = lambda _: None,
     ) -> None:
         """Call `then` with what `restore` makes of the newest checkpoint of a stream, None without one.
 
-        `refused` is called before with the error of each that cannot be read. All are called on another thread, soon:
-        the tracking thread does not wait for the store.
+        `unread` is called before with the numbers that a stream has used whose checkpoints cannot be read, or have
+        expired. All are called on another thread, soon: the tracking thread does not wait for the store.
         """
         if not self.durable:
             then(None)
@@ -169,7 +179,7 @@ class CheckpointWriter:
         def read() -> None:
             restored = None
             try:
-                restored = self._recalled(stream, restore, refused)
+                restored = self._recalled(stream, restore, unread)
             except Exception:
                 log.exception("internal_error", stream=stream)  # the stream begins without it
             try:
@@ -186,7 +196,7 @@ class CheckpointWriter:
             self._pending.pop(stream, None)
 
     def _recalled(
-        self, stream: str, restore: Callable[[Checkpoint], _T], refused: Callable[[CheckpointError], None]
+        self, stream: str, restore: Callable[[Checkpoint], _T], unread: Callable[[Incarnation], None]
     ) -> _T | None:
         """Return what `restore` makes of the newest whole checkpoint of a stream; None when there is none.
 
@@ -196,7 +206,8 @@ class CheckpointWriter:
 
         def torn(error: CheckpointError) -> None:
             log.warning("checkpoint_torn", stream=stream, reason=str(error))
-            refused(error)
+            if error.incarnation is not None:
+                unread(error.incarnation)
 
         with self._lock:
             pending, fence = self._pending.get(stream) or self._writing.get(stream) or (None, None)
@@ -204,18 +215,23 @@ class CheckpointWriter:
             return restore(pending)
         while True:
             try:
-                return load_newest(
+                restored = load_newest(
                     self._store,
                     stream,
                     lambda data: restore(decode_checkpoint(data)),
                     CheckpointError,
                     torn,
                 )
+                if restored is None and (numbers := self._store.numbers(stream)) is not None:
+                    with contextlib.suppress(CheckpointError):
+                        unread(numbers_in(numbers))
             except StoreError as error:
                 self._failed(error)
                 waits = self._store.remote and self._member.fence(stream) is not None
                 if not waits or self._ended.wait(RETRY_S):
                     return None
+            else:
+                return restored
 
     def close(self, timeout: float) -> bool:
         """Write the pending checkpoints and end, within so long (s); to be called when nothing is tracked any more.
@@ -293,9 +309,10 @@ class CheckpointWriter:
         try:
             encoded = self._encoded({stream: checkpoint for stream, (checkpoint, _) in mine.items()}) if mine else {}
             fenced = {
-                stream: Fenced(partition_key(partition_of(stream)), fence, data)
+                stream: Fenced(partition_key(partition_of(stream)), fence, data, seal(b"", checkpoint.incarnation))
                 for stream, data in encoded.items()
-                if (fence := mine[stream][1]) is not None
+                for checkpoint, fence in [mine[stream]]
+                if fence is not None
             }
             lost = self._store.save(fenced) if fenced else ()
         except Exception as error:

@@ -24,6 +24,7 @@ import numpy as np
 import optipmb_schemas as schemas
 
 import optipmb
+from optipmb.zones import ZoneState
 from optipmb_service.stream import convert
 from optipmb_service.stream.arrivals import Arrivals
 from optipmb_service.stream.checkpoint import Checkpoint
@@ -124,7 +125,8 @@ class Session:
         limits, transition = self._policy.jump_limits, self._transition(parameters)
         self._timeline: Timeline = FusedTimeline(limits) if fused else StreamTimeline(limits, {"": ()})
         name = transition.name(None, incarnation.starts)
-        start = FilterState(transition.no_objects(incarnation.next_id), name, incarnation.starts)
+        zones = ZoneState(numbers=incarnation.events) if incarnation.events else None
+        start = FilterState(transition.no_objects(incarnation.next_id), name, incarnation.starts, zones=zones)
         self._window = ReorderWindow(start, transition)
         self._restored = False
         self.arrivals = Arrivals(self._policy)
@@ -393,7 +395,7 @@ class Session:
     def zone_counts(self) -> schemas.Events | None:
         """Return the counts of all zones after the newest frame; None: there is none, or no zone."""
         head = self._window.head
-        if (last := head.last) is None or head.zones is None:
+        if (last := head.last) is None or head.zones is None or not self._policy.zones:
             return None
         header: dict[str, Any] = {"stream": self.stream, "session": head.session, "labels": self.parameters.labels}
         header |= {"epoch": last.epoch, "seq": last.seq, "stamp_ns": last.stamp_ns, "sensor": last.sensor or None}
@@ -452,8 +454,7 @@ class Session:
     @property
     def incarnation(self) -> Incarnation:
         """The ids that it used, for a later session of the stream."""
-        head = self._window.head
-        return Incarnation(head.starts, head.density.next_id, self.run)
+        return self._window.head.incarnation(self.run)
 
     def state(self, *, shed: int = 0, queue: int = 0, closed: bool = False) -> schemas.SessionState:
         """Return the state as the message that answers a query.

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from optipmb.rows import record
 from optipmb_service.stream.timeline import Cursor, FrameId, Order, Placement, Verdict
-from optipmb_service.stream.values import MAX_LABELS, Count, Epoch, Reached, Whole
+from optipmb_service.stream.values import MAX_LABELS, Count, Epoch, Incarnation, Reached, Whole
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -135,6 +135,11 @@ class FilterState:
     def reached(self) -> Reached:
         """How far the stream has come with it."""
         return self.starts, self.last.stamp_ns if self.last else 0, self.session
+
+    def incarnation(self, run: int) -> Incarnation:
+        """Return the numbers that a later session continues after a run."""
+        events = {} if self.zones is None else self.zones.numbers
+        return Incarnation(self.starts, self.density.next_id, run, events)
 
     def begun_anew(self, density: optipmb.Density, session: str) -> FilterState:
         """Return the state in which the next incarnation of the density begins: no classes were reported yet."""

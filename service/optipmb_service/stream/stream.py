@@ -109,7 +109,7 @@ class Stream:
         """Incarnation of the earlier session while one is being opened, else None."""
         self._restore_only = False
         self._unread = Incarnation()
-        """The highest ids of sessions whose checkpoints are of another version."""
+        """The highest numbers of sessions whose checkpoints are of another format, or have expired."""
         self._closing = False
         self._asking: list[Callable[[], None]] = []
         self._armed_ns: int | None = None
@@ -515,7 +515,7 @@ class Stream:
         def restore(checkpoint: Checkpoint) -> Session:
             now_ns = time.monotonic_ns()
             if self._unread != Incarnation():
-                raise CheckpointError("older than one of another version, whose ids would be given out again")
+                raise CheckpointError("older than one of another format, whose ids would be given out again")
             taken[:] = [checkpoint]
             if checkpoint.fused is not self.fused:
                 raise CheckpointError(f"of {'several streams' if checkpoint.fused else 'one stream'}, by `fuse` then")
@@ -523,10 +523,8 @@ class Stream:
                 checkpoint, now_ns, self._policy, fence=fence or 1, instance=streams.instance, tracker=streams.tracker
             )
 
-        def refused(error: CheckpointError) -> None:
-            if (unread := error.incarnation) is not None:
-                starts, next_id = max(self._unread.starts, unread.starts), max(self._unread.next_id, unread.next_id)
-                self._unread = Incarnation(starts, next_id)
+        def unread(incarnation: Incarnation) -> None:
+            self._unread = self._unread.after(incarnation)
 
         def load(restored: Session | None) -> None:
             def loaded(packets: list[Packet]) -> None:
@@ -539,7 +537,7 @@ class Stream:
                 checkpoint = taken[-1] if restored and taken else None
                 streams.log.fetch(self.name, checkpoint, loaded, self.backlog.recover)
 
-        streams.checkpoints.recall(self.name, restore, load, refused)
+        streams.checkpoints.recall(self.name, restore, load, unread)
 
     def _on_loaded(self, restored: Session | None, fence: int | None) -> None:
         """Begin a session, or go on with the one that was kept, unless the stream was lost."""
@@ -579,17 +577,14 @@ class Stream:
         return session
 
     def _new(self, incarnation: Incarnation, fence: int | None) -> Session:
+        numbers = incarnation.after(self._unread)
         session = Session(
             self.name,
             self._streams.profiles.of(self.name),
             self._policy,
             fused=self.fused,
             instance=self._streams.instance,
-            incarnation=Incarnation(
-                max(incarnation.starts, self._unread.starts),
-                max(incarnation.next_id, self._unread.next_id),
-                total(incarnation.run, fence or 0),
-            ),
+            incarnation=replace(numbers, run=total(numbers.run, fence or 0)),
             tracker=self._streams.tracker,
         )
         log.info("session_opened", stream=self.name, profile=session.parameters.name)

@@ -339,7 +339,11 @@ class Transition:
         )
         zones, tracks.events = self._zones(before, result.tracks, frame_id.stamp_ns)
         second = None if before.last is None else before.last.stamp_ns // SECOND
-        if zones is not None and (frame.revision or begun or second != frame_id.stamp_ns // SECOND):
+        if (
+            self._policy.zones
+            and zones is not None
+            and (frame.revision or begun or second != frame_id.stamp_ns // SECOND)
+        ):
             tracks.counts = {one.name: zones.counts.get(one.name, {}) for one in self._policy.zones}
         unknown = self._unknown(message, sensor.reported) if ignored else {}
         repaired = int(result.diagnostics.repaired)
@@ -369,8 +373,10 @@ class Transition:
         """Return what is known of the zones after a frame, and its events."""
         zones = self._policy.zones
         ended: tuple[Event, ...] = ()
-        if not zones:
-            return None, ()
+        if not zones:  # their numbers go on when they come back
+            return before.zones and (
+                ZoneState(numbers=before.zones.numbers) if before.zones.zones else before.zones
+            ), ()
         state = adapted(zones, before.zones or ZoneState())
         if state.session != before.session:
             state, ended = end(zones, state)

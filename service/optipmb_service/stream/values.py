@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -134,11 +134,23 @@ class Incarnation:
         starts: incarnations of the density so far.
         next_id: the next track id.
         run: see `Session.run`; of the next session, higher than any that may have published before.
+        events: number of the last event of each zone and kind.
     """
 
     starts: int = 0
     next_id: int = 1
     run: int = 0
+    events: Mapping[str, int] = field(default_factory=dict)
+
+    def after(self, other: Incarnation) -> Incarnation:
+        """Return the numbers that follow both."""
+        zones = self.events.keys() | other.events.keys()
+        return Incarnation(
+            max(self.starts, other.starts),
+            max(self.next_id, other.next_id),
+            max(self.run, other.run),
+            {zone: max(self.events.get(zone, 0), other.events.get(zone, 0)) for zone in sorted(zones)},
+        )
 
 
 @dataclass(slots=True)

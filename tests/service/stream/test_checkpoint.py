@@ -21,6 +21,7 @@ from optipmb_service.stream.checkpoint import (
     CheckpointError,
     decode_checkpoint,
     encode_checkpoint,
+    numbers_in,
     seal,
     state_bytes,
 )
@@ -30,6 +31,7 @@ from router import SECOND, Sensor
 from sessions import Merged, chained, feed, problems, tracks
 
 import optipmb
+from optipmb.zones import ZoneState
 
 NUSCENES = optipmb.load_profile("nuscenes")
 SENSOR = Sensor()
@@ -230,22 +232,34 @@ def test_any_changed_byte_is_noticed() -> None:
             decode_checkpoint(bytes(changed))
 
 
-@pytest.mark.parametrize("version", [0, VERSION + 1, 2**16 - 1])
+@pytest.mark.parametrize("version", [1, VERSION + 1, 2**16 - 1])
 def test_another_version_is_refused_by_number(version: int) -> None:
-    """What another release wrote is not guessed at: the error names both versions, what to do, and the next ids."""
+    """What another release wrote is not guessed at: the error names both formats, what to do, and all numbers."""
     checkpoint = example().snapshot()
+    zones = ZoneState(numbers={"gate/entered": 7})
+    checkpoint = replace(checkpoint, run=3, head=replace(checkpoint.head, zones=zones))
     data = encode_checkpoint(checkpoint)
     start = MAGIC + version.to_bytes(2, "big") + data[len(MAGIC) + 2 : HEAD - DIGEST]
     other = start + hashlib.sha256(start + data[HEAD:]).digest()[:DIGEST] + data[HEAD:]
-    expected = f"version {version}: expected {VERSION}, the only one of this release; start the release that wrote it"
+    expected = f"format {version}: expected {VERSION}, the only one of this release; start the release that wrote it"
     with pytest.raises(CheckpointError, match=expected) as refused:
         decode_checkpoint(other)
-    assert refused.value.incarnation == Incarnation(checkpoint.head.starts, checkpoint.head.density.next_id)
+    wanted = Incarnation(checkpoint.head.starts, checkpoint.head.density.next_id, 3, {"gate/entered": 7})
+    assert refused.value.incarnation == wanted == numbers_in(seal(b"", wanted))
+
+
+def test_the_format_is_named_before_the_digest_is_compared() -> None:
+    """Bytes of another layout are those of another format, and not torn ones."""
+    data = MAGIC + (1).to_bytes(2, "big") + bytes(500)
+    with pytest.raises(CheckpointError, match=r"format 1: expected .*; torn or changed") as refused:
+        decode_checkpoint(data)
+    assert refused.value.incarnation is None
 
 
 def altered(change: Any) -> Checkpoint:
     """Read a checkpoint whose body was changed and sealed again."""
-    body = msgpack.unpackb(encode_checkpoint(example().snapshot())[HEAD:])
+    data = encode_checkpoint(example().snapshot())
+    body = msgpack.unpackb(data[HEAD + 4 + int.from_bytes(data[HEAD : HEAD + 4], "big") :])
     change(body)
     return decode_checkpoint(seal(msgpack.packb(body), Incarnation()))
 
@@ -337,6 +351,17 @@ def golden() -> Session:
         one.on_points(SENSOR.points(seq, count=5), 0)
         feed(one, [seq], SENSOR)
     return one
+
+
+def test_the_head_of_the_first_format_is_read() -> None:
+    """What a file of the first release says before its body is read for ever, without what a release has of formats."""
+    data = GOLDEN.read_bytes()
+    magic, version, starts, next_id, digest = struct.unpack_from(">8sHQQ16s", data)
+    (length,) = struct.unpack_from(">I", data, 42)
+    assert (magic, version, starts, next_id) == (b"OPTIPMB\0", 4, 1, 2)
+    assert digest == hashlib.sha256(data[:26] + data[42:]).digest()[:16]
+    assert msgpack.unpackb(data[46 : 46 + length]) == {"run": 0, "events": {}}
+    assert numbers_in(data) == Incarnation(starts, next_id)
 
 
 def test_the_bytes_of_the_version_are_read() -> None:

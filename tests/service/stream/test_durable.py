@@ -111,9 +111,53 @@ def test_a_restart_goes_on(start: Callable[..., Any], tmp_path: Path) -> None:
     assert (after.digest, after.session, after.frames) == (before.digest, before.session, 20)
 
 
+def test_numbers_outlive_an_expired_checkpoint(start: Callable[..., Any], tmp_path: Path) -> None:
+    """After longer than `keep_days` the session is a new one, its track ids and runs go on, and so once more."""
+    ids: list[set[int]] = []
+    runs, sessions = [0], set()
+    for expired in range(3):
+        service, endpoint = start(store=str(tmp_path))
+        with Node(endpoint) as node:
+            node.send(*(SENSOR.detections(seq) for seq in range(5)))
+            tracks = node.tracks(SENSOR.stream, 5)
+        assert service.stop()
+        ids.append({int(one) for message in tracks for one in message.id})
+        assert min(ids[-1]) > max([0, *(one for known in ids[:-1] for one in known)])
+        assert tracks[0].delivery is not None
+        runs.append(tracks[0].delivery.run)
+        sessions.add(tracks[0].session)
+        store = SqliteStore(tmp_path / STORE_FILE, lambda: time.time() + 40 * 86_400)
+        assert (store.expire(30 * 86_400), store.expire(30 * 86_400)) == (1, 0), expired
+        store.close()
+    assert runs == sorted(set(runs))
+    assert len(sessions) == 3
+
+
+def test_nothing_expires_at_a_start(start: Callable[..., Any], tmp_path: Path) -> None:
+    """A service that was off for long, or whose clock is wrong, has its sessions: only later does it forget any."""
+    other, settings = (
+        Sensor(stream="site/node/other"),
+        {"store": str(tmp_path), "checkpoint_s": 0.05, "keep_days": 1e-9},
+    )
+    service, endpoint = start(**settings)
+    with Node(endpoint) as node:
+        node.send(*(SENSOR.detections(seq) for seq in range(5)))
+        before = node.tracks(SENSOR.stream, 5)
+    assert service.stop()
+    service, endpoint = start(**settings)
+    store = SqliteStore(tmp_path / STORE_FILE)
+    with Node(endpoint) as node:
+        node.send(other.detections(0))
+        until(lambda: store.load(other.stream) is not None, "a round that might have expired others")
+        node.send(SENSOR.detections(5))
+        after = node.tracks(SENSOR.stream, 1)
+    assert {one.session for one in after} == {before[0].session}
+    store.close()
+
+
 def test_what_no_cache_holds_is_not_waited_for(start: Callable[..., Any], tmp_path: Path) -> None:
     """Fault 1: after a restart frames wait for those missing until the caches have answered, and no longer."""
-    options = {"store": str(tmp_path), "recovery_wait_s": 600.0}
+    options = {"store": str(tmp_path), "recovery_wait_s": 60.0}
     service, endpoint = start(**options)
     with Node(endpoint) as node:
         publisher = zenoh.ext.declare_advanced_publisher(

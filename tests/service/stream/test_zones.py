@@ -108,6 +108,22 @@ def test_a_zone_that_was_changed_begins_anew_and_the_others_go_on() -> None:
     assert [(one.how, one.n) for one in rest if one.zone == "yard"] == [("appeared", n) for n in (4, 5, 6)]
 
 
+def test_numbers_go_on_when_all_zones_come_back() -> None:
+    """Neither sessions without zones in between, nor another session, nor a checkpoint that went, begin them anew."""
+    before, session = in_order()
+    for policy, frames in ((Policy(), range(40, 50)), (POLICY, range(50, 60))):
+        session = Session.restore(decode_checkpoint(encode_checkpoint(session.snapshot())), 0, policy)
+        outputs = feed(session, frames, SENSOR)
+        assert policy.zones or not any(one.events or one.counts for one in outputs if isinstance(one, Tracked))
+    again = Session(SENSOR.stream, PROFILE, POLICY, incarnation=session.incarnation)
+    for events in (final(outputs), final(feed(again, range(60, 70), SENSOR))):
+        entered = [one.n for one in events if (one.zone, one.kind) == ("yard", "entered")]
+        assert entered == [
+            1 + max(one.n for one in before if (one.zone, one.kind) == ("yard", "entered")) + k for k in range(3)
+        ]
+        before = events
+
+
 def test_sessions_without_zones_have_none_in_their_checkpoints() -> None:
     """Their bytes are unchanged."""
     _, session = in_order(Policy())
