@@ -1,14 +1,19 @@
 """The entry of `optipmb-service` and of `python -m optipmb_service`."""
 
+import os
+import signal
 import sys
-
-from optipmb_service.app import health_command
 
 
 def main() -> None:
     """Run the command line; `health` without loading anything of the tracker: containers ask every few seconds."""
     if sys.argv[1:2] == ["health"]:
+        from optipmb_service.app import health_command  # noqa: PLC0415 - nothing else needs it so early
+
         sys.exit(health_command.main(sys.argv[2:]))
+    # Before all imports, which take a second: process 1 of a container gets no signal that it does not handle.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: os._exit(0))  # nothing has begun
     try:
         from optipmb_service.app import cli  # noqa: PLC0415 - a second that `health` can do without
     except ModuleNotFoundError as error:

@@ -469,7 +469,7 @@ class Settings(BaseSettings):
     site_mb_s: int = Field(default=0, ge=0, le=100_000)
     """megabytes a second of one site; 0: no limit"""
     keep_days: float = Field(default=30.0, ge=0, le=36_500)
-    """checkpoints of a stream silent for this long are deleted; 0: never"""
+    """checkpoints of a stream silent for this long are deleted, but not its last ids; 0: never"""
     idle_s: float = Field(default=600.0, gt=0)
     """a session without messages for this long is freed"""
     cluster: Servers = ()

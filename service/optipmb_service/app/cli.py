@@ -10,6 +10,7 @@ import asyncio
 import json
 import os
 import shutil
+import signal
 import sys
 import sysconfig
 from importlib import import_module
@@ -304,6 +305,8 @@ def copy_command(
     settings: Annotated[Path | None, typer.Option(metavar="FILE", help="Settings, a TOML file.")] = None,
 ) -> None:
     """Copy the sessions of this machine's folder into a cluster, before its members start; their ids go on there."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_DFL)  # an interrupted copy is no success
     given: dict[str, Any] = {"settings": settings, "cluster": cluster, "store": store and str(store)}
     loaded = _begin(_load(given))
     _needed("optipmb_service.cluster.jetstream", "cluster")

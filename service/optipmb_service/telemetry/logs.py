@@ -58,9 +58,9 @@ EVENTS: Final = {
     "session_closed": "A session was freed: `idle` for long, by a `query`, `moved` elsewhere, lacking `memory`,"
     " `evicted` for a stream of another site, or `superseded` by another instance.",
     "checkpoint_torn": "A checkpoint cannot be read, for `reason`: it is set aside, the one before it is used."
-    " Where `reason` names another version, start the release that wrote it.",
+    " Where `reason` names another format, start the release that wrote it; without it the ids go on all the same.",
     "checkpoint_refused": "A checkpoint was not written: another instance has taken the stream over.",
-    "checkpoints_expired": "Checkpoints older than `keep_days` were deleted.",
+    "checkpoints_expired": "Checkpoints older than `keep_days` were deleted; their ids are kept.",
     "checkpoint_failed": "The checkpoint of one stream cannot be made: a bug, report it."
     " The stream continues, other checkpoints are written; the state is `degraded`.",
     "store_failed": "Checkpoints cannot be written (disk full, read-only): tracking goes on, the state is `degraded`.",

@@ -4,6 +4,8 @@ import contextlib
 import faulthandler
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -19,6 +21,7 @@ from routers import free_endpoint, open_router
 from service_process import ServiceProcess
 from structlog.testing import capture_logs
 
+NAMESPACE = ("unshare", "--pid", "--fork", "--kill-child")
 HANGING = Path(__file__).parents[2] / "support" / "hanging"
 SENSOR = Sensor()
 GRACE_S = 0.5
@@ -165,3 +168,37 @@ async def test_where_no_thread_can_be_started_the_end_is_asked_for(monkeypatch: 
         assert steps.unfinished(1.0)
     assert asked.is_set()
     assert [one["event"] for one in logs] == ["end_unbounded", "stop_asked", "step_hangs"]
+
+
+def caught(pid: int) -> bool:
+    """Whether a process has a handler of its own for SIGTERM."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    mask = next(int(line.split()[1], 16) for line in lines if line.startswith("SigCgt"))
+    return bool(mask >> (signal.SIGTERM - 1) & 1)
+
+
+@pytest.mark.parametrize("alone", [True, False], ids=["alone", "process 1"])
+@pytest.mark.parametrize("options", [(), ("--workers", "2"), ("mqtt",)], ids=lambda one: " ".join(one) or "run")
+def test_a_signal_before_the_imports_ends_the_process(*, options: tuple[str, ...], alone: bool) -> None:
+    """Handlers are there before numpy is, also as process 1, which gets no other signals: status 0, nothing printed."""
+    if not alone and subprocess.run([*NAMESPACE, "true"], check=False, timeout=60, capture_output=True).returncode:
+        pytest.skip("no namespace may be made here")
+    command = [*(() if alone else NAMESPACE), sys.executable, "-m", "optipmb_service", *options]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        try:
+            children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+            ends = time.monotonic() + 60.0
+            while not (pids := [process.pid] if alone else [int(one) for one in children.read_text().split()]) or not (
+                caught(pids[0]) and Path(f"/proc/{pids[0]}/cmdline").read_bytes().startswith(sys.executable.encode())
+            ):
+                assert time.monotonic() < ends
+                assert process.poll() is None
+            os.kill(pids[0], signal.SIGSTOP)
+            loaded = Path(f"/proc/{pids[0]}/maps").read_text()
+            os.kill(pids[0], signal.SIGTERM)
+            os.kill(pids[0], signal.SIGCONT)
+            out, errors = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert (process.returncode, out, errors) == (0, b"", b"")
+    assert "numpy" not in loaded
