@@ -35,6 +35,9 @@ PLACE: Final = {"lat": 9, "lon": 9, "alt": 3, "heading": 1}
 """Fields of a place, and their decimals."""
 
 CONFIRMED_EXISTENCE: Final = 0.5
+EXACT: Final = 2**53
+"""Numbers from here on are texts: JavaScript would round them."""
+
 YEARS_NS: Final = (946_684_800 * 10**9, 4_102_444_800 * 10**9)  # 2000 and 2100
 
 Lat = Annotated[float, Meta(description="Latitude in degrees (WGS84), 9 decimals. Absent: the site has no place.")]
@@ -82,7 +85,7 @@ class _Frame(Struct, frozen=True, tag_field="type", kw_only=True):
     stamp_ns: Annotated[str, Meta(description="The same in nanoseconds of the sensor's clock, as text.")]
     session: Annotated[str, Meta(description="32 hexadecimal digits. When it changes, earlier tracks have ended.")]
     epoch: Annotated[str, Meta(description="Start of the publisher, 32 hexadecimal digits.")]
-    seq: Annotated[int, Meta(description="Number of the frame in its epoch.")]
+    seq: Annotated[int | str, Meta(description="Number of the frame in its epoch; from 2^53 on as text.")]
     revision: Annotated[int, Meta(description="Above 0: replaces what was sent for the same epoch and seq.")]
     run: Annotated[int, Meta(description="A higher one replaces what was sent for the same epoch and seq.")]
     skipped: (
@@ -95,6 +98,10 @@ class EdgeTracks(_Frame, frozen=True, tag="tracks", kw_only=True):
 
     objects: Annotated[list[EdgeTrack], Meta(description="The tracks, ordered by id.")]
     predicted_to_ns: Annotated[str, Meta(description="Time of the states with `predict`, as text.")] | UnsetType = UNSET
+    frame_age_s: Annotated[float, Meta(description="Seconds since the frame came, when this was sent.")] | UnsetType = (
+        UNSET
+    )
+    stale: Annotated[bool, Meta(description="Whether that is more than `stale_s`.")] | UnsetType = UNSET
 
 
 class EdgeEvent(_Frame, frozen=True, tag="event", kw_only=True, rename={"name": "class"}):
@@ -116,6 +123,7 @@ class EdgeEvent(_Frame, frozen=True, tag="event", kw_only=True, rename={"name": 
     lat: Lat | UnsetType = UNSET
     lon: Lon | UnsetType = UNSET
     alt: Alt | UnsetType = UNSET
+    event_id: Annotated[str, Meta(description="Where a reader goes on: `after`. Absent over MQTT.")] | UnsetType = UNSET
 
 
 class EdgeZones(_Frame, frozen=True, tag="zones", kw_only=True):
@@ -127,7 +135,14 @@ class EdgeZones(_Frame, frozen=True, tag="zones", kw_only=True):
     ]
 
 
-FRAMES: Final = (EdgeTracks, EdgeEvent, EdgeZones)
+class EdgeMissed(Struct, frozen=True, tag_field="type", tag="missed"):
+    """What a reader of events that comes again, or is too slow, cannot get any more."""
+
+    stream: Annotated[str, Meta(description="The pattern of its streams.")]
+    events: Annotated[int | None, Meta(description="So many events; null: not known, compare `n`.")]
+
+
+KINDS: Final = (EdgeTracks, EdgeEvent, EdgeZones, EdgeMissed)
 
 
 class Selection(Struct, frozen=True):
@@ -241,6 +256,21 @@ def problem_json(problem: Problem) -> bytes:
     return b'{"type":"problem",' + encode_json(problem)[1:]
 
 
+def missed_json(stream: str, events: int | None) -> bytes:
+    """Return a text that says how many events of a pattern a reader cannot get."""
+    return msgspec.json.encode(EdgeMissed(stream, events))
+
+
+def with_age(text: bytes, age_s: float, *, stale: bool) -> bytes:
+    """Return the text of a frame with its age."""
+    return text[:-1] + b',"frame_age_s":%.3f,"stale":%b}' % (age_s, b"true" if stale else b"false")
+
+
+def with_event_id(text: bytes, event_id: str) -> bytes:
+    """Return the text of an event with the id after which a reader goes on."""
+    return text[:-1] + b',"event_id":"%b"}' % event_id.encode()
+
+
 def with_skipped(text: bytes, skipped: int) -> bytes:
     """Return a text that says how many others were left out before it."""
     return text[:-1] + b',"skipped":%d}' % skipped if skipped else text
@@ -249,7 +279,7 @@ def with_skipped(text: bytes, skipped: int) -> bytes:
 def schemas() -> dict[str, dict[str, Any]]:
     """Return the JSON Schemas (draft 2020-12) of all texts, by name."""
     found = {}
-    for kind in FRAMES:
+    for kind in KINDS:
         definitions = msgspec.json.schema(kind)["$defs"]
         found[kind.__name__] = definitions.pop(kind.__name__) | ({"$defs": definitions} if definitions else {})
     problem = Problem.model_json_schema()
@@ -271,7 +301,7 @@ def _about(message: Tracks | Events) -> dict[str, Any]:
         "stamp_ns": str(message.stamp_ns),
         "session": message.session,
         "epoch": message.epoch.hex(),
-        "seq": message.seq,
+        "seq": message.seq if message.seq < EXACT else str(message.seq),
         "revision": message.revision,
         "run": 0 if message.delivery is None else message.delivery.run,
     }

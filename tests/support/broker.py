@@ -13,6 +13,7 @@ import pytest
 from routers import free_endpoint
 
 CONNECT, CONNACK, PUBLISH, PUBACK, DISCONNECT = 0x10, 0x20, 0x30, 0x40, 0xE0
+NOT_ALLOWED, TAKEN_OVER = 135, 142
 
 
 @dataclass(frozen=True)
@@ -30,10 +31,17 @@ class Broker:
     Attributes:
         versions: the versions of the protocol that it knows: 4 is 3.1.1.
         silent: whether it confirms nothing.
+        most: size of the largest packet that it takes, 0: any; a larger one ends the connection.
+        says_most: whether it says so.
+        denied: ends of topics that it refuses.
     """
 
     versions: tuple[int, ...] = (4, 5)
     silent: bool = False
+    most: int = 0
+    says_most: bool = True
+    denied: tuple[str, ...] = ()
+    connections: int = 0
     messages: list[Message] = field(default_factory=list)
     wills: list[str] = field(default_factory=list)
     refused: list[int] = field(default_factory=list)
@@ -51,6 +59,12 @@ class Broker:
             writer.close()
         await asyncio.sleep(0)
 
+    def take_over(self) -> None:
+        """End the connections, as for another client of the same name."""
+        for writer in self._writers:
+            writer.write(bytes([DISCONNECT, 1, TAKEN_OVER]))
+            writer.close()
+
     def of(self, end: str) -> list[bytes]:
         return [one.payload for one in self.messages if one.topic.endswith(end)]
 
@@ -66,13 +80,18 @@ class Broker:
             while True:
                 kind = (await reader.readexactly(1))[0]
                 body = await reader.readexactly(await _length(reader))
+                if self.most and len(body) > self.most:
+                    break
                 if kind == CONNECT:
+                    self.connections += 1
                     version = body[6]
                     if version not in self.versions:
                         self.refused.append(version)
                         writer.write(bytes([CONNACK, 3, 0, 0x84, 0]))
                         break
-                    writer.write(bytes([CONNACK, 3, 0, 0, 0] if version == 5 else [CONNACK, 2, 0, 0]))
+                    says = b"\x27" + self.most.to_bytes(4) if self.most and self.says_most else b""
+                    about = bytes([0, 0, len(says)]) + says if version == 5 else bytes(2)
+                    writer.write(bytes([CONNACK, len(about)]) + about)
                 elif kind & 0xF0 == PUBLISH:
                     self._take(kind, body, version, writer)
                 elif kind == DISCONNECT:
@@ -83,8 +102,14 @@ class Broker:
         qos = kind >> 1 & 3
         end = 2 + int.from_bytes(body[:2], "big")
         topic, rest = body[2:end].decode(), body[end:]
+        is_denied = topic.endswith(self.denied)
         if qos and not self.silent:
-            writer.write(bytes([PUBACK, 2]) + rest[:2])
+            number = rest[:2]
+            writer.write(
+                bytes([PUBACK, 3]) + number + bytes([NOT_ALLOWED]) if is_denied else bytes([PUBACK, 2]) + number
+            )
+        if is_denied:
+            return
         rest = rest[2:] if qos else rest
         payload = rest[1 + rest[0] :] if version == 5 else rest
         self.messages.append(Message(topic, payload, qos, bool(kind & 1)))

@@ -3,6 +3,7 @@
 import contextlib
 import fnmatch
 import http.client
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -43,6 +44,7 @@ class Session:
         self.cache: list[tuple[str, Message]] = []
         self.instances: list[str] = ["one"]
         self.statuses: list[Message] = []
+        self.problems: list[Problem] = []
         self.gate = threading.Event()
         self.gate.set()
         self.arrived: Callable[[], object] = lambda: None
@@ -93,6 +95,9 @@ class Session:
         assert pattern == KEYS.all_alive()
         assert timeout
         return [KEYS.alive(one) for one in self.instances]
+
+    def publish_problem(self, problem: Problem) -> None:
+        self.problems.append(problem)
 
     def linked(self) -> bool:
         return True
@@ -231,11 +236,17 @@ def publication(message: Message) -> Publication:
     return Publication(key_of(message), encode(message), encoding_of(message), {})
 
 
+def plain(text: bytes | str) -> bytes:
+    """Return a text without what depends on when it was sent: the age of its frame, the id of its event."""
+    text = text.encode() if isinstance(text, str) else text
+    return re.sub(rb',"frame_age_s":[0-9.]+,"stale":(true|false)|,"event_id":"[0-9a-f]+-[0-9]+"', b"", text)
+
+
 @contextlib.contextmanager
-def asked(address: str, path: str, **headers: str) -> Iterator[http.client.HTTPResponse]:
+def asked(address: str, path: str, method: str = "GET", **headers: str) -> Iterator[http.client.HTTPResponse]:
     """Ask for something; the answer's body is still to be read."""
     host, _, port = address.rpartition(":")
     with contextlib.closing(http.client.HTTPConnection(host, int(port), timeout=DEADLINE_S)) as connection:
-        connection.request("GET", path, headers={"connection": "close", **headers})
+        connection.request(method, path, headers={"connection": "close", **headers})
         with connection.getresponse() as response:
             yield response

@@ -2,6 +2,11 @@
 
 Topics are the keys of the network. It keeps nothing and reads nothing from the broker. While the broker is away, events
 and the newest counts wait; tracks and problems do not, because they would be out of date.
+
+A message that the broker cannot take is left out, and named, so that it does not block the others: one above the size
+that the broker says (MQTT 5), one that it refuses, and one that ends the connection twice while no other is under way.
+To know which one that is, a message that is larger than those that its topic has had on a connection is confirmed
+(QoS 1), also where its topic is not.
 """
 
 from __future__ import annotations
@@ -9,36 +14,47 @@ from __future__ import annotations
 import asyncio
 import collections
 import contextlib
-from typing import TYPE_CHECKING, Final
+import time
+from dataclasses import dataclass
+from math import inf
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 from urllib.parse import urlsplit
 
-import aiomqtt
+import optipmb_schemas as schemas
 import structlog
-from aiomqtt.exceptions import MqttConnectError
 from optipmb_client.errors import ClientError
 from optipmb_schemas.certificates import context_of
 from optipmb_schemas.json_form import Selection
+from paho.mqtt import client as paho
+from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode, MQTTProtocolVersion
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
 from optipmb_service.app import lifecycle
 from optipmb_service.app.lifecycle import places_of, say_ready, settle
-from optipmb_service.edge.readers import Feeds, Reader, Text, Wish
+from optipmb_service.edge.readers import Bounds, Feeds, Reader, Text, Wish
 from optipmb_service.telemetry.health import Reporter
 from optipmb_service.telemetry.metrics import MQTT_METRICS
 
 if TYPE_CHECKING:
+    import ssl
+
     from optipmb_service.app.lifecycle import StopRequest
     from optipmb_service.edge.readers import Publication
     from optipmb_service.settings import Settings
     from optipmb_service.telemetry.health import ProcessHealth
     from optipmb_service.zenoh.client import Client
 
+T = TypeVar("T")
+
 log = structlog.get_logger("optipmb_service")
 
 PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
 EVENTS: Final = 10_000
-"""Events that wait while the broker is away; then the oldest are lost, and `n` shows the gap."""
+"""Events of a stream that wait while the broker is away; then the oldest are lost, and `n` shows the gap."""
+
+EVENT_BYTES: Final = 32 * 2**20
+"""The same of all streams, in bytes."""
 
 TOGETHER: Final = 8
 """Messages on their way to the broker at once."""
@@ -54,6 +70,125 @@ QOS: Final = {"tracks": 0, "problems": 0, "events": 1, "zones": 1}
 RETAINED: Final = "zones"
 KEPT: Final = frozenset({"events"})  # topics of the network that wait for the broker
 OLD: Final = frozenset({1, 132})  # how brokers of 3.1.1, and of 5, refuse the version of the protocol
+TAKEN_OVER: Final = 142
+STRIKES: Final = 2  # connections that a message may end while it is alone under way
+
+TOO_LARGE: Final = "Packet too large"
+ENDED: Final = "ended the connection"
+FORGET_S: Final = 600.0
+"""Time after which what was left out because it ended connections is tried again."""
+
+HEAD_BYTES: Final = 64
+"""At most so many bytes of a published packet are neither topic nor payload."""
+
+
+class LinkError(Exception):
+    """There is no connection to the broker, or it has ended.
+
+    Attributes:
+        code: reason code of the broker; 0: it gave none.
+    """
+
+    def __init__(self, reason: str, code: int = 0) -> None:
+        super().__init__(reason)
+        self.code = code
+
+
+class Link:
+    """One connection to the broker. To be made and used on one loop; the callbacks come on a thread of paho's.
+
+    Args:
+        client: not connected yet.
+    """
+
+    def __init__(self, client: paho.Client) -> None:
+        self._client = client
+        self._loop = loop = asyncio.get_running_loop()
+        self._under_way: dict[int, asyncio.Future[str]] = {}
+        self.opened: asyncio.Future[int] = loop.create_future()
+        """Size of the largest packet that the broker takes; 0: it says none."""
+        self.ended: asyncio.Future[LinkError] = loop.create_future()
+        client.on_connect = lambda _c, _d, _f, reason, properties: self._call(self._connected, reason, properties)
+        client.on_disconnect = lambda _c, _d, _f, reason, _p: self._call(self._disconnected, reason)
+        client.on_publish = lambda _c, _d, number, reason, _p: self._call(self._published, number, reason)
+
+    async def open(self, host: str, port: int) -> int:
+        """Connect; return the size of the largest packet that the broker takes, 0 without one.
+
+        Raises:
+            LinkError: there is no connection.
+        """
+        try:
+            await asyncio.to_thread(self._client.connect, host, port)
+        except OSError as error:
+            raise LinkError(str(error)) from None
+        self._client.loop_start()
+        return await self._answer(self.opened, ANSWER_S)
+
+    async def publish(self, topic: str, payload: bytes, qos: int, *, retain: bool, seconds: float = ANSWER_S) -> str:
+        """Publish; return why the broker refuses it, empty if it takes it. Without QoS that is not known.
+
+        Raises:
+            LinkError: the connection has ended, or the broker does not confirm.
+        """
+        properties = None
+        if self._client.protocol == MQTTProtocolVersion.MQTTv5:
+            properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
+            properties.ContentType = "application/json"
+        sent = self._client.publish(topic, payload, qos, retain, properties)
+        confirmed: asyncio.Future[str] = self._loop.create_future()
+        if sent.rc != MQTTErrorCode.MQTT_ERR_SUCCESS:  # it has ended; why is known in a moment
+            return await self._answer(confirmed, LAST_S)
+        self._under_way[sent.mid] = confirmed
+        try:
+            return await self._answer(confirmed, seconds)
+        finally:
+            del self._under_way[sent.mid]
+
+    async def close(self) -> None:
+        """Disconnect."""
+        self._client.disconnect()
+        await asyncio.to_thread(self._client.loop_stop)
+
+    async def _answer(self, answer: asyncio.Future[T], seconds: float) -> T:
+        await asyncio.wait((answer, self.ended), timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
+        if answer.done():
+            return answer.result()
+        raise self.ended.result() if self.ended.done() else LinkError("the broker does not answer")
+
+    def _call(self, function: Any, *arguments: Any) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(function, *arguments)
+
+    def _connected(self, reason: Any, properties: Any) -> None:
+        if reason.is_failure:
+            self._end(LinkError(f"the broker refuses the connection: {reason}", reason.value))
+        elif not self.opened.done():
+            self.opened.set_result(getattr(properties, "MaximumPacketSize", 0))
+
+    def _disconnected(self, reason: Any) -> None:
+        self._end(LinkError(f"disconnected: {reason}", reason.value))
+
+    def _end(self, error: LinkError) -> None:
+        if not self.ended.done():
+            self.ended.set_result(error)
+
+    def _published(self, number: int, reason: Any) -> None:
+        if (confirmed := self._under_way.get(number)) is not None and not confirmed.done():
+            confirmed.set_result(str(reason) if reason.is_failure else "")
+
+
+@dataclass
+class Unsent:
+    """A message that the broker has not taken yet, and the connections that it ended."""
+
+    text: Text
+    payload: bytes
+    strikes: int = 0
+
+
+TAKEN_OVER_S: Final = 30.0
+"""Pause after another client of this name has taken the connection."""
 
 
 class Bridge(Reporter):
@@ -71,121 +206,179 @@ class Bridge(Reporter):
         super().__init__(client)
         self.connected = False
         self.published: collections.Counter[str] = collections.Counter()
+        self.refused: collections.Counter[str] = collections.Counter()
         self._keys = client.keys
         self._why = "not connected yet"
         self._mqtt = settings.mqtt
-        self._alive = f"{settings.prefix}/mqtt/{settings.instance}/alive"
+        self._instance = settings.instance
         self._identifier = f"optipmb-{settings.instance}"
-        self._version = aiomqtt.ProtocolVersion.V5
+        self._alive = f"{settings.prefix}/mqtt/{settings.instance}/alive"
+        self._version = MQTTProtocolVersion.MQTTv5
+        self._tls: ssl.SSLContext | None = None
         try:
             user = settings.mqtt.credentials.read_text("utf-8").strip() if settings.mqtt.credentials else ""
-            self._tls = context_of(settings.mqtt.tls) if settings.mqtt.broker.startswith("mqtts") else None
+            if settings.mqtt.broker.startswith("mqtts"):
+                self._tls = context_of(settings.mqtt.tls)
         except (OSError, ValueError) as error:
             raise ClientError(f"settings mqtt.credentials, mqtt.tls: {error}") from error
         self._user, _, self._password = user.partition(":")
         self._wish = Wish(
             settings.mqtt.streams, frozenset(settings.mqtt.topics), Selection(confirmed=True), settings.mqtt.tracks_hz
         )
-        self._reader = Reader(self._wish, EVENTS)
-        self._feeds = Feeds(client, places_of(settings))
-        self._unsent: list[Text] = []
+        self._reader = Reader(self._wish, settings.stale_s)
+        self._client = client
+        self._feeds = Feeds(client, places_of(settings), Bounds(EVENTS, inf, EVENT_BYTES))
+        self._lost = 0
+        self._unsent: list[Unsent] = []
+        self._most = 0  # bytes of a packet that the broker takes; 0: it does not say
+        self._largest: dict[str, int] = {}  # confirmed on this connection, by topic
+        self._refusing: dict[str, str] = {}  # why the newest message was refused, by topic
+        self._impossible: dict[str, tuple[int, float]] = {}  # size that ended connections, and when, by topic
 
     @property
     def lost(self) -> int:
-        """Events that were lost while the broker was away."""
-        return self._reader.lost_events
+        """Events that were lost while the broker was away, or that it did not take."""
+        return self._reader.lost_events + self._lost
 
     @property
     def skipped(self) -> int:
         """Messages that newer ones replaced before the broker took them."""
-        return self._reader.outbox.left_out - self._reader.lost_events
+        return self._reader.outbox.left_out
 
     @property
     def failure(self) -> str:
-        """Why nothing can be received or published; empty while it can."""
-        return self.unlinked or ("" if self.connected else f"mqtt: {self._why}")
+        """Why nothing can be received or published, or not everything; empty while it can."""
+        if self.unlinked or not self.connected:
+            return self.unlinked or f"mqtt: {self._why}"
+        for topic, reason in tuple(self._refusing.items())[:1]:
+            return f"mqtt: {len(self._refusing)} topics are refused, as {topic}: {reason}"
+        return ""
 
     async def run(self) -> None:
         """Publish until it is cancelled; connect again and again."""
-        await asyncio.to_thread(self._feeds.join, self._wish.keys(self._keys), self._receive)
-        task = asyncio.current_task()
+        keys = self._wish.keys(self._keys)
+        await asyncio.to_thread(self._feeds.join, keys, self._receive)
+        self._reader.read(self._feeds.logs(keys))
+        pause_s = RETRY_S
         while True:
+            link = self._link()
             try:
-                async with self._broker() as broker:
-                    await self._serve(broker)
-            except aiomqtt.MqttError as error:
-                if task is not None and task.cancelling():  # it was raised by what the end does
-                    return
-                if str(error) != self._why:
-                    log.warning("mqtt_disconnected", broker=self._mqtt.broker, reason=str(error))
-                self._why = str(error)
-                if isinstance(error, MqttConnectError) and getattr(error.rc, "value", error.rc) in OLD:
-                    self._version = aiomqtt.ProtocolVersion.V311
+                await self._serve(link)
+            except LinkError as error:
+                why, pause_s = str(error), RETRY_S
+                if error.code == TAKEN_OVER:  # they would take it from each other again and again
+                    why, pause_s = f"duplicate_name: another client is {self._identifier}, too; {error}", TAKEN_OVER_S
+                if why != self._why:
+                    log.warning("mqtt_disconnected", broker=self._mqtt.broker, reason=why)
+                self._why = why
+                if error.code in OLD:
+                    self._version = MQTTProtocolVersion.MQTTv311
             finally:
                 self.connected = False
-            await asyncio.sleep(RETRY_S)
+                await link.close()
+            await asyncio.sleep(pause_s)
 
-    async def _serve(self, broker: aiomqtt.Client) -> None:
-        await broker.publish(self._alive, b"1", qos=1, retain=True)
+    async def _serve(self, link: Link) -> None:
+        broker = urlsplit(self._mqtt.broker)
+        self._most = await link.open(broker.hostname or "", broker.port or PORTS[broker.scheme])
+        self._largest.clear()
+        self._note(self._alive, await link.publish(self._alive, b"1", 1, retain=True))
         self.connected, self._why = True, ""
-        log.info("mqtt_connected", broker=self._mqtt.broker, protocol=self._version.name)
-        # Nothing is subscribed to: the iterator ends with the connection, which a publish that waits does not.
-        tasks = {asyncio.create_task(self._publish(broker)), asyncio.create_task(_until_lost(broker))}
+        log.info("mqtt_connected", broker=self._mqtt.broker, protocol=self._version.name, most_bytes=self._most)
+        publishing = asyncio.create_task(self._publish(link))
         try:
-            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            for task in done:
-                task.result()
+            await asyncio.wait((publishing, link.ended), return_when=asyncio.FIRST_COMPLETED)
         except asyncio.CancelledError:  # a connection that is closed in order has no last will
-            await broker.publish(self._alive, b"0", qos=1, retain=True, timeout=LAST_S)
+            with contextlib.suppress(LinkError):
+                await link.publish(self._alive, b"0", 1, retain=True, seconds=LAST_S)
+            if self._unsent:
+                log.warning("mqtt_unsent", messages=len(self._unsent))
             raise
         finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.wait(tasks)
+            publishing.cancel()
+            await asyncio.wait((publishing,))
+        if publishing.cancelled():
+            raise link.ended.result()
+        publishing.result()
 
-    def _broker(self) -> aiomqtt.Client:
-        broker = urlsplit(self._mqtt.broker)
-        return aiomqtt.Client(
-            broker.hostname or "",
-            broker.port or PORTS[broker.scheme],
-            username=self._user or None,
-            password=self._password or None,
-            identifier=self._identifier,
-            protocol=self._version,
-            will=aiomqtt.Will(self._alive, b"0", qos=1, retain=True),
-            tls_context=self._tls,
-            timeout=ANSWER_S,
+    def _link(self) -> Link:
+        client = paho.Client(
+            CallbackAPIVersion.VERSION2, self._identifier, protocol=self._version, reconnect_on_failure=False
         )
+        client.connect_timeout = ANSWER_S
+        if self._user:
+            client.username_pw_set(self._user, self._password or None)
+        if self._tls is not None:
+            client.tls_set_context(self._tls)
+        client.will_set(self._alive, b"0", 1, retain=True)
+        return Link(client)
 
     def _receive(self, one: Publication) -> None:
         """Take a message, on any thread."""
         if self.connected or one.topic in KEPT:
             self._reader.receive(one)
 
-    async def _publish(self, broker: aiomqtt.Client) -> None:
-        """Publish waiting messages, a few at once; repeat unconfirmed ones."""
-        outbox, properties = self._reader.outbox, None
-        if self._version is aiomqtt.ProtocolVersion.V5:
-            properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
-            properties.ContentType = "application/json"
-
-        async def publish(one: Text) -> None:
-            topic, retain = f"{self._keys.prefix}/{one.stream}/{one.topic}", one.topic == RETAINED
-            await broker.publish(topic, one.make(), QOS[one.topic], retain, properties)
-            self.published[one.topic] += 1
-
+    async def _publish(self, link: Link) -> None:
+        """Publish waiting messages, a few at once; those that an ended connection left, one by one."""
         while True:
-            if not self._unsent and (taken := await outbox.take()) is not None:
-                self._unsent.append(taken[0])
-            while len(self._unsent) < TOGETHER and (text := outbox.take_now()) is not None:
-                self._unsent.append(text[0])
-            await asyncio.gather(*map(publish, self._unsent))  # they go out in this order
-            self._unsent.clear()
+            while self._unsent:
+                await self._send(link, self._unsent[0], alone=True)
+                del self._unsent[0]
+            self._unsent.append(_unsent(await self._reader.take_text()))
+            while len(self._unsent) < TOGETHER and (taken := self._reader.take_now()) is not None:
+                self._unsent.append(_unsent(taken))
+            # They go out in this order.
+            sent = await asyncio.gather(*(self._send(link, one) for one in self._unsent), return_exceptions=True)
+            self._unsent = [one for one, result in zip(self._unsent, sent, strict=True) if result is not None]
+            for error in sent:
+                if error is not None:
+                    raise error
+
+    async def _send(self, link: Link, one: Unsent, *, alone: bool = False) -> None:
+        """Publish a message, or leave it out, if the broker cannot take it."""
+        kind, size = one.text.topic, len(one.payload)
+        topic = f"{self._keys.prefix}/{one.text.stream}/{kind}"
+        packet = size + len(topic) + HEAD_BYTES
+        ended_at, at = self._impossible.get(topic, (inf, 0.0))
+        if self._most and packet > self._most:
+            self._leave_out(one, topic, TOO_LARGE, f"packets of at most {self._most} bytes, as the broker says")
+        elif size >= ended_at and time.monotonic() - at < FORGET_S:
+            self._leave_out(one, topic, ENDED, f"less than {ended_at} bytes, with which it ended connections")
+        elif one.strikes >= STRIKES:
+            self._impossible[topic] = size, time.monotonic()
+            self._leave_out(one, topic, ENDED, f"a message that does not end the connection {STRIKES} times")
+        else:
+            is_known = size <= self._largest.get(topic, -1)
+            try:
+                reason = await link.publish(topic, one.payload, QOS[kind] if is_known else 1, retain=kind == RETAINED)
+            except (LinkError, asyncio.CancelledError):
+                one.strikes += alone and link.ended.done()
+                raise
+            self._note(topic, reason)
+            if not reason:
+                self.published[kind] += 1
+                self._largest[topic] = max(size, self._largest.get(topic, 0))
+
+    def _note(self, topic: str, reason: str) -> None:
+        """Note why the broker refuses a message of a topic; empty if it takes it."""
+        if not reason:
+            self._refusing.pop(topic, None)
+            return
+        self.refused[reason] += 1
+        self._lost += topic.endswith("/events")
+        if self._refusing.get(topic) != reason:
+            log.warning("mqtt_refused", topic=topic, reason=reason)
+        self._refusing[topic] = reason
+
+    def _leave_out(self, one: Unsent, topic: str, reason: str, expected: str) -> None:
+        if self._refusing.get(topic) != reason:
+            error = schemas.MessageError("too_large", topic, expected, f"{len(one.payload)} bytes")
+            self._client.publish_problem(schemas.Problem.of(error, stream=one.text.stream, instance=self._instance))
+        self._note(topic, reason)
 
 
-async def _until_lost(broker: aiomqtt.Client) -> None:
-    async for _ in broker.messages:
-        pass
+def _unsent(taken: tuple[Text, int]) -> Unsent:
+    return Unsent(taken[0], taken[0].make())
 
 
 async def run(settings: Settings) -> int:

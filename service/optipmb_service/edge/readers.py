@@ -11,8 +11,11 @@ import asyncio
 import collections
 import contextlib
 import threading
+import time
 from dataclasses import dataclass
 from functools import cached_property, partial
+from itertools import takewhile
+from math import inf
 from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
 
 import optipmb_schemas as schemas
@@ -26,7 +29,7 @@ from optipmb_service.zenoh.client import SharedSubscriptions, Turns
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-    from optipmb_client.incoming import Answer
+    from optipmb_client.incoming import Answer, Arrival
     from optipmb_client.zenoh.handles import Reading
     from optipmb_client.zenoh.session import Session
     from optipmb_schemas.json_form import Place
@@ -46,9 +49,13 @@ PERIOD_S: Final = 7.5
 WAITING: Final = 256
 """Messages between Zenoh and the thread of a subscription without recovery."""
 
-EVENTS: Final = 1000
-"""Events that wait for a reader; one that is slower is to come again."""
+IDLE_LOGS: Final = 16
+"""Subscriptions to events that are kept without readers."""
 
+BEGINNING: Final = "0"
+"""Id of a reader of events that has none yet, and wants all that are kept."""
+
+DIGITS: Final = 20
 PROBLEMS: Final = 16
 
 QUERY_S: Final = 2.0
@@ -133,14 +140,22 @@ class Outbox(Generic[T]):
             TimeoutError: none has come in so long.
         """
         while (taken := self.take_now()) is None:
+            if not await self.wait(seconds):
+                return None
+        return taken
+
+    async def wait(self, seconds: float | None = None) -> bool:
+        """Wait for an item; False when nothing follows.
+
+        Raises:
+            TimeoutError: none has come in so long.
+        """
+        while True:
             with self._lock:
-                if self._waiting:
-                    continue
-                if self._closed:
-                    return None
+                if self._waiting or self._closed:
+                    return bool(self._waiting)
                 self._changed.clear()
             await asyncio.wait_for(self._changed.wait(), seconds)
-        return taken
 
     def take_now(self) -> tuple[T, int] | None:
         """Return the next item, and how many were left out before it; None when none waits."""
@@ -200,12 +215,18 @@ class Publication:
 
     Attributes:
         topic: the last part of its key.
+
+    Args:
+        live: whether it has just come, and is not from a cache.
     """
 
-    def __init__(self, key: str, payload: bytes, encoding: str, places: Mapping[str, Place]) -> None:
+    def __init__(
+        self, key: str, payload: bytes, encoding: str, places: Mapping[str, Place], *, live: bool = True
+    ) -> None:
         self.topic = key.rpartition("/")[2]
         self.payload = payload
         self.encoding = encoding
+        self.arrived = time.monotonic() if live else None
         self._places = places
         self._texts: dict[Selection, bytes] = {}
 
@@ -219,16 +240,20 @@ class Publication:
         """Place of its site."""
         return self._places.get(self.message.stream.partition("/")[0])
 
-    def tracks(self, selection: Selection = EVERYTHING) -> bytes:
-        """Return the selection of its tracks as JSON."""
+    @property
+    def age_s(self) -> float:
+        """Seconds since it came, or since it was published if it is from a cache."""
+        if self.arrived is not None:
+            return time.monotonic() - self.arrived
+        delivery = self.message.delivery
+        return 0.0 if delivery is None else max(0.0, (time.time_ns() - delivery.published_ns) / 1e9)
+
+    def tracks(self, selection: Selection, stale_s: float) -> bytes:
+        """Return the selection of its tracks as JSON, with their age."""
         if selection not in self._texts:
             self._texts[selection] = json_form.tracks_json(self.message, selection, self.place)
-        return self._texts[selection]
-
-    @cached_property
-    def events(self) -> list[bytes]:
-        """Its events as JSON."""
-        return json_form.event_json(self.message, self.place)
+        age_s = self.age_s
+        return json_form.with_age(self._texts[selection], age_s, stale=age_s > stale_s)
 
     @cached_property
     def zones(self) -> bytes | None:
@@ -251,6 +276,105 @@ class Text(NamedTuple):
     topic: str
     stream: str
     make: Callable[[], bytes]
+    event_id: str = ""
+
+
+class Bounds(NamedTuple):
+    """What an event log keeps at most: events of one stream, for how long, and bytes in all."""
+
+    events: int = 1000
+    seconds: float = 600.0
+    size: int = 4 * 2**20
+
+
+BOUNDS: Final = Bounds()
+
+
+class Event(NamedTuple):
+    """An event in a log; `at` is the monotonic time at which it came."""
+
+    number: int
+    at: float
+    stream: str
+    text: bytes
+
+
+class EventLog:
+    """The newest events of one subscription, numbered as they come, from which readers take. For any threads.
+
+    A reader that comes again goes on after the last event that it has, and learns how many it cannot get any more.
+
+    Args:
+        final: whether it holds events when they do not change any more, each once, or as they are published.
+    """
+
+    def __init__(self, bounds: Bounds, *, final: bool) -> None:
+        self._bounds = bounds
+        self._is_final = final
+        self._name = f"{time.time_ns():x}"
+        self._lock = threading.Lock()
+        self._held: dict[str, FinalEvents] = collections.defaultdict(FinalEvents)
+        self._kept: dict[int, Event] = {}
+        self._numbers: dict[str, collections.deque[int]] = {}
+        self._size = 0
+        self._last = 0
+        self._entered = False
+
+    def add(self, one: Publication) -> None:
+        """Add the events of a message, or those that it makes final."""
+        message: schemas.Events = one.message
+        with self._lock:
+            for each in self._held[message.stream].take(message) if self._is_final else [message]:
+                for text in json_form.event_json(each, one.place):
+                    self._last += 1
+                    self._kept[self._last] = Event(self._last, time.monotonic(), message.stream, text)
+                    self._size += len(text)
+                    numbers = self._numbers.setdefault(message.stream, collections.deque())
+                    numbers.append(self._last)
+                    if len(numbers) > self._bounds.events:
+                        self._drop(numbers[0])
+            self._expire()
+
+    def enter(self, after: str) -> int | None:
+        """Return the number after which a reader begins, by the id that it has; None where that is not known here.
+
+        The first reader begins with what the services still had when it came; others without an id begin now.
+        """
+        name, _, number = after.partition("-")
+        with self._lock:
+            begins, self._entered = self._last if self._entered else 0, True
+            if not after:
+                return begins
+            if after == BEGINNING:
+                return 0
+            if name != self._name or not (number.isascii() and number.isdigit() and len(number) < DIGITS):
+                return None
+            return min(int(number), self._last)
+
+    def after(self, number: int) -> tuple[list[Event], int]:
+        """Return the events after a number, and how many there were that are kept no longer."""
+        with self._lock:
+            self._expire()
+            found = list(takewhile(lambda one: one.number > number, reversed(self._kept.values())))
+            return found[::-1], self._last - number - len(found)
+
+    def id_of(self, number: int) -> str:
+        """Return the id by which a reader goes on after an event."""
+        return f"{self._name}-{number}"
+
+    def _expire(self) -> None:
+        until = time.monotonic() - self._bounds.seconds
+        while self._kept and (self._size > self._bounds.size or next(iter(self._kept.values())).at < until):
+            self._drop(next(iter(self._kept)))
+
+    def _drop(self, number: int) -> None:
+        """Drop an event, the oldest of its stream."""
+        event = self._kept.pop(number)
+        self._size -= len(event.text)
+        numbers = self._numbers[event.stream]
+        numbers.popleft()
+        if not numbers:
+            del self._numbers[event.stream]
 
 
 @dataclass(frozen=True)
@@ -265,6 +389,8 @@ class Wish:
     """Whether it gets events when they do not change any more, each once, or as they are published."""
     predict: bool = False
     """Whether it gets tracks at a fixed rate, predicted to now."""
+    after: str = ""
+    """Id of the last event that it has; those since are sent, too."""
 
     def keys(self, keys: schemas.Keys) -> list[str]:
         """Return the keys to subscribe to.
@@ -274,7 +400,16 @@ class Wish:
         """
         named = {"zones": "events", "tracks": "now" if self.predict else "tracks"}
         topics = {named.get(topic, topic) for topic in self.topics}
-        return [keys.matching(one, topic) for topic in sorted(topics) for one in self.streams]  # type: ignore[arg-type]
+        try:
+            return [keys.matching(one, topic) for topic in sorted(topics) for one in self.streams]  # type: ignore[arg-type]
+        except schemas.MessageError as error:
+            raise schemas.MessageError(error.code, "stream", error.expected, error.received) from None
+
+
+Logs = dict[bool, EventLog]
+"""The final events of a subscription (True), and all as they are published."""
+
+Shared = SharedSubscriptions["Callable[[Publication], None]", Publication]
 
 
 class Reader:
@@ -282,30 +417,80 @@ class Reader:
 
     Args:
         wish: its streams and topics.
-        events: how many events may wait; beyond, the oldest are lost.
+        stale_s: a stream without frames for so long is said to be stale, once.
     """
 
-    def __init__(self, wish: Wish, events: int = EVENTS) -> None:
-        self.outbox: Outbox[Text] = Outbox()
-        self.lost_events = 0
-        self._events = events
-        self._held: dict[str, FinalEvents] = collections.defaultdict(FinalEvents)
+    def __init__(self, wish: Wish, stale_s: float) -> None:
+        self.outbox: Outbox[Text | None] = Outbox()  # None: a log has events
+        self._stale_s = stale_s
+        self._lock = threading.Lock()
+        self._newest: dict[str, Publication] = {}
+        self._numbers: dict[EventLog, int] = {}
+        self._events: collections.deque[Text] = collections.deque()
+        self._missed = 0
         self.want(wish)
 
     def want(self, wish: Wish) -> None:
         """Change its streams and topics."""
         self._wish, self._pace = wish, Pace(wish.max_rate_hz, predict=wish.predict)
+        with self._lock:
+            self._newest.clear()
 
-    async def take(self, seconds: float | None = None) -> bytes | None:
-        """Return the next text; None when events were lost, and the reader is to come again.
+    def read(self, logs: Iterable[Logs]) -> str:
+        """Read events from these logs, and return the id after which it begins in the last of them."""
+        wish, before, self._numbers = self._wish, self._numbers, {}
+        event_id = ""
+        for log in (each[wish.final] for each in logs if "events" in wish.topics):
+            number = before.get(log) if not wish.after else None  # it goes on where it was
+            if number is None:
+                self._events.clear()
+                if (number := log.enter(wish.after)) is None:
+                    self._events.append(self._missing(None))
+            self._numbers[log] = number or 0
+            event_id = log.id_of(number or 0)
+        self.outbox.replace(None, 0)
+        return event_id
+
+    @property
+    def lost_events(self) -> int:
+        """Events that it was too slow for."""
+        return self._missed + sum(log.after(number)[1] for log, number in tuple(self._numbers.items()))
+
+    async def take(self, seconds: float | None = None) -> tuple[bytes, str]:
+        """Return the next text, and its id if it is an event.
 
         Raises:
             TimeoutError: none has come in so long.
         """
-        taken = await self.outbox.take(seconds)
-        if taken is None or self.lost_events:
-            return None
-        return json_form.with_skipped(taken[0].make(), taken[1])
+        text, skipped = await self.take_text(seconds)
+        made = text.make()
+        if text.event_id:
+            made = json_form.with_event_id(made, text.event_id)
+        return json_form.with_skipped(made, skipped), text.event_id
+
+    async def take_text(self, seconds: float | None = None) -> tuple[Text, int]:
+        """Return the next text, and how many were left out before it. Raises TimeoutError as `take` does."""
+        ends = inf if seconds is None else time.monotonic() + seconds
+        while (taken := self.take_now()) is None:
+            with self._lock:
+                oldest = next(iter(self._newest.values()), None)
+            stale = inf if oldest is None else time.monotonic() + self._stale_s - oldest.age_s
+            until = min(ends, stale)
+            try:
+                await self.outbox.wait(None if until == inf else max(0.0, until - time.monotonic()))
+            except TimeoutError:
+                if ends <= stale:
+                    raise
+        return taken
+
+    def take_now(self) -> tuple[Text, int] | None:
+        """Return the next text, and how many were left out before it; None when none waits."""
+        skipped = 0
+        while (taken := self.outbox.take_now()) is not None:
+            skipped += taken[1]
+            if (text := taken[0] or self._event()) is not None:
+                return text, skipped
+        return None if (text := self._stale()) is None else (text, 0)
 
     def receive(self, one: Publication) -> None:
         """Take a message, on any thread."""
@@ -314,23 +499,50 @@ class Reader:
             return
         stream, size, put = message.stream, len(one.payload), self.outbox.put
         if one.topic in {"tracks", "now"}:
+            with self._lock:
+                self._newest.pop(stream, None)
+                self._newest[stream] = one  # behind those that came before
             if self._pace.passes(stream, message.predicted_to_ns or message.stamp_ns):
-                put(f"tracks {stream}", Text("tracks", stream, partial(one.tracks, self._wish.selection)), size)
+                put(f"tracks {stream}", self._tracks(one), size)
         elif one.topic == "problems":
             text = Text("problems", stream, partial(json_form.problem_json, message))
             put(f"problems {stream}", text, size, PROBLEMS)
         elif one.topic == "events":
-            for event in self._due(one) if "events" in topics else ():
-                text = Text("events", stream, partial(bytes, event))
-                self.lost_events += put("events", text, len(event), self._events)
+            if "events" in topics:
+                self.outbox.replace(None, 0)
             if "zones" in topics and (counts := one.zones) is not None:
                 put(f"zones {stream}", Text("zones", stream, partial(bytes, counts)), len(counts))
 
-    def _due(self, one: Publication) -> list[bytes]:
-        if not self._wish.final:
-            return one.events
-        due = self._held[one.message.stream].take(one.message)
-        return [text for message in due for text in json_form.event_json(message, one.place)]
+    def _tracks(self, one: Publication) -> Text:
+        return Text("tracks", one.message.stream, partial(one.tracks, self._wish.selection, self._stale_s))
+
+    def _stale(self) -> Text | None:
+        """Return the newest tracks of a stream that has just become stale."""
+        with self._lock:
+            one = next(iter(self._newest.values()), None)
+            if one is None or one.age_s <= self._stale_s:
+                return None
+            del self._newest[one.message.stream]
+        return self._tracks(one)
+
+    def _event(self) -> Text | None:
+        """Return the next event of the logs, or how many it was too slow for; None when there is none."""
+        for log, number in () if self._events else tuple(self._numbers.items()):
+            found, missed = log.after(number)
+            if missed:
+                self._missed += missed
+                self._events.append(self._missing(missed))
+            for each in found:
+                self._events.append(Text("events", each.stream, partial(bytes, each.text), log.id_of(each.number)))
+            self._numbers[log] = number + missed + len(found)
+        if not self._events:
+            return None
+        self.outbox.replace(None, 0)  # the other streams have their turns
+        return self._events.popleft()
+
+    def _missing(self, events: int | None) -> Text:
+        pattern = self._wish.streams[0]
+        return Text("events", pattern, partial(json_form.missed_json, pattern, events))
 
 
 class Feeds:
@@ -339,14 +551,17 @@ class Feeds:
     Args:
         session: on the network.
         places: of sites.
+        bounds: of the events of each subscription.
     """
 
-    def __init__(self, session: Session, places: Mapping[str, Place]) -> None:
+    def __init__(self, session: Session, places: Mapping[str, Place], bounds: Bounds = BOUNDS) -> None:
         self.session = session
         self._places = places
+        self._bounds = bounds
         self._turns = Turns(BURST, PERIOD_S)
-        self._shared: SharedSubscriptions[Callable[[Publication], None], Publication]
-        self._shared = SharedSubscriptions(self._subscribe, _deliver, KEPT)
+        self._logs: dict[str, Logs] = {}
+        self._shared: Shared = SharedSubscriptions(self._subscribe, _deliver, KEPT)
+        self._events: Shared = SharedSubscriptions(self._subscribe_events, _deliver, IDLE_LOGS, bounds.seconds)
 
     def join(self, keys: Iterable[str], receive: Callable[[Publication], None]) -> Callable[[], None]:
         """Hand over publications under key expressions until the result is called, which may be twice; may wait.
@@ -356,16 +571,38 @@ class Feeds:
         """
         with contextlib.ExitStack() as joined:
             for key in keys:
-                joined.callback(self._shared.join(key, receive))
+                shared = self._events if key.endswith("/events") else self._shared
+                joined.callback(shared.join(key, receive))
             return joined.pop_all().close
 
-    def _subscribe(self, key: str, receive: Callable[[Publication], None]) -> Reading:
-        """Subscribe: to events with recovery and history, to other topics without."""
+    def logs(self, keys: Iterable[str]) -> list[Logs]:
+        """Return the events of the joined ones of these keys."""
+        return [logs for key in keys if (logs := self._logs.get(key)) is not None]
+
+    def _subscribe_events(self, key: str, receive: Callable[[Publication], None]) -> contextlib.ExitStack:
+        """Subscribe to events, with recovery and history, and keep them."""
         self._turns.take()
-        if key.endswith("/events"):
-            return self.session.subscribe(
-                key, lambda one: receive(Publication(one.key, one.payload, one.encoding, self._places)), history=True
-            )
+        logs = {final: EventLog(self._bounds, final=final) for final in (True, False)}
+
+        def read(one: Arrival) -> None:
+            publication = Publication(one.key, one.payload, one.encoding, self._places)
+            if publication.message is not None:
+                for log in logs.values():
+                    log.add(publication)
+            receive(publication)
+
+        def forget() -> None:
+            if self._logs.get(key) is logs:  # else it has been subscribed to again
+                del self._logs[key]
+
+        self._logs[key] = logs
+        with contextlib.ExitStack() as closing:
+            closing.callback(forget)
+            closing.callback(self.session.subscribe(key, read, history=True).close)
+            return closing.pop_all()
+
+    def _subscribe(self, key: str, receive: Callable[[Publication], None]) -> Reading:
+        self._turns.take()
 
         def read(sample: Any) -> None:
             receive(Publication(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding), self._places))
@@ -379,7 +616,7 @@ class Feeds:
             TransportError: the network cannot be used.
         """
         answers = self.session.query(f"{key}/@adv/**?_max={most}", timeout=QUERY_S)
-        return [Publication(one.key, one.payload, one.encoding, self._places) for one in answers if one.ok]
+        return [Publication(one.key, one.payload, one.encoding, self._places, live=False) for one in answers if one.ok]
 
 
 async def listed(session: Session, keys: schemas.Keys, pattern: str) -> list[tuple[str, schemas.SessionSummary]]:

@@ -1,7 +1,7 @@
 """JSON over HTTP: the newest tracks and counts by GET, all of them as server-sent events and over a WebSocket.
 
-Readers share subscriptions and are counted here, apart from other requests. Each has a bounded queue: one that is too
-slow gets the newest frame of each stream, and of events it may lose none: then it has to come again.
+Readers share subscriptions and are counted here, apart from other requests. One that is too slow gets the newest frame
+of each stream. Events are kept for a while, for slow readers and for those who come again.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
+from dataclasses import replace
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Protocol
 
@@ -25,24 +26,25 @@ from optipmb_service.edge.access import ANYBODY, Caller, NotAllowedError, name_b
 from optipmb_service.edge.readers import Feeds, Reader, Wish, listed
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Iterable, Mapping
+    from collections.abc import AsyncIterator, Callable, Iterable, Mapping, Sequence
 
     from optipmb_schemas.json_form import Place
     from starlette.requests import HTTPConnection, Request
     from starlette.types import Receive, Scope, Send
 
-    from optipmb_service.edge.readers import Publication
+    from optipmb_service.edge.readers import Logs, Publication
     from optipmb_service.settings import Settings
     from optipmb_service.telemetry.health import ProcessHealth
 
 POLL_S: Final = 0.1  # a reader hears so soon that the service ends
 KEEP_ALIVE_S: Final = 5.0  # period of signs of life of a silent stream, for proxies in between
-RETRY_MS: Final = 15_000  # a reader whose stream cannot be subscribed to comes back after so long
+EVENT_STREAM: Final = "text/event-stream"
 PROTOCOL: Final = "optipmb.v1"  # subprotocol of the WebSocket
 BEARER: Final = "bearer."  # a second subprotocol with the token of a browser, which can set no header
 NAMES: Final = 256
 RECENT: Final = 32  # newest messages of events, of more than a second, among which one has counts
 TRY_AGAIN, MALFORMED = 1013, 1008  # why a WebSocket was closed
+STREAMING: Final = {"cache-control": "no-store, no-transform", "x-accel-buffering": "no"}  # for proxies
 HEADERS: Final = {"cache-control": "no-store", "x-content-type-options": "nosniff", "referrer-policy": "no-referrer"}
 
 
@@ -81,8 +83,11 @@ class Source(Protocol):
     def receive(self, one: Publication) -> None:
         """Take a message, on any thread."""
 
-    async def take(self, seconds: float | None = None) -> bytes | None:
-        """Return the next text; None at its end. Raises TimeoutError."""
+    def read(self, logs: list[Logs]) -> str:
+        """Read events from these logs, and return the id after which it begins."""
+
+    async def take(self, seconds: float | None = None) -> tuple[bytes, str]:
+        """Return the next text, and its id if it is an event. Raises TimeoutError."""
 
 
 class Readers:
@@ -101,6 +106,7 @@ class Readers:
         self._most = settings.http_clients
         self._names = token_names("http_tokens", settings.http_tokens) if settings.http_tokens else None
         self._reads = settings.readable_by
+        self.stale_s = settings.stale_s
         self.count = 0
         self._feeds: Feeds | None = None
 
@@ -149,70 +155,77 @@ class Readers:
         return leave
 
     @contextlib.asynccontextmanager
-    async def joined(self, keys: Iterable[str], source: Source) -> AsyncIterator[None]:
-        """Hand over the publications of keys meanwhile.
+    async def joined(self, keys: Sequence[str], source: Source) -> AsyncIterator[str]:
+        """Hand over the publications of keys meanwhile; gives the id after which the reader of events begins.
 
         Raises:
-            TransportError: the network cannot be used.
+            TransportError: the network cannot be used, or too many keys were asked for.
         """
-        loop = asyncio.get_running_loop()
-        joining = loop.run_in_executor(None, self.feeds().join, tuple(keys), source.receive)
+        loop, feeds = asyncio.get_running_loop(), self.feeds()
+        joining = loop.run_in_executor(None, feeds.join, keys, source.receive)
         try:
             leave = await asyncio.shield(joining)
         except asyncio.CancelledError:
             joining.add_done_callback(_undo)  # the reader has gone; the thread subscribes all the same
             raise
         try:
-            yield
+            yield source.read(feeds.logs(keys))
         finally:
             loop.run_in_executor(None, leave)  # not awaited: the reader's task may be cancelled
 
-    def stream(
-        self, keys: Iterable[str], source: Callable[[], Source], headers: Mapping[str, str], pause_s: float = 0.0
+    async def stream(
+        self,
+        request: Request,
+        keys: Sequence[str],
+        source: Callable[[], Source],
+        headers: Mapping[str, str],
+        pause_s: float = 0.0,
     ) -> Response:
         """Return an answer with the texts of a reader as server-sent events.
 
         Raises:
             NoRoomError: there are too many readers.
+            TransportError: the network cannot be used, or too many keys were asked for.
         """
-        return _Counted(self._lines(keys, source, pause_s), self.enter(), headers)
+        headers = {**headers, **STREAMING}
+        if request.method == "HEAD":
+            return Response(headers=headers, media_type=EVENT_STREAM)
+        async with contextlib.AsyncExitStack() as ended:
+            ended.callback(self.enter())
+            reader = source()
+            begins = await ended.enter_async_context(self.joined(keys, reader))
+            return _Stream(self._lines(reader, begins, pause_s), ended.pop_all(), headers)
 
-    async def _lines(self, keys: Iterable[str], source: Callable[[], Source], pause_s: float) -> AsyncIterator[bytes]:
-        reader = source()
-        try:
-            async with self.joined(keys, reader):
-                heard = time.monotonic()
-                yield b": hello\n\n"  # the headers go with the first piece: the reader knows that it is connected
-                while self._health.state() != "stopping":
-                    try:
-                        text = await reader.take(POLL_S)
-                    except TimeoutError:
-                        if time.monotonic() - heard > KEEP_ALIVE_S:
-                            heard = time.monotonic()
-                            yield b": silent\n\n"
-                        continue
-                    if text is None:
-                        return
+    async def _lines(self, reader: Source, begins: str, pause_s: float) -> AsyncIterator[bytes]:
+        heard = time.monotonic()
+        # The headers go with the first piece: the reader knows that it is connected.
+        yield b": hello\n%b\n" % (f"id: {begins}\n".encode() if begins else b"")
+        while self._health.state() != "stopping":
+            try:
+                text, event_id = await reader.take(POLL_S)
+            except TimeoutError:
+                if time.monotonic() - heard > KEEP_ALIVE_S:
                     heard = time.monotonic()
-                    yield b"data: %b\n\n" % text
-                    await asyncio.sleep(pause_s)
-        except TransportError as error:
-            yield f"retry: {RETRY_MS}\n: {error}\n\n".encode()
+                    yield b": silent\n\n"
+                continue
+            heard = time.monotonic()
+            yield b"%bdata: %b\n\n" % (f"id: {event_id}\n".encode() if event_id else b"", text)
+            await asyncio.sleep(pause_s)
 
 
-class _Counted(StreamingResponse):
-    """Events for one reader; calls `leave` when they end, however they do."""
+class _Stream(StreamingResponse):
+    """Server-sent events for one reader; closes `ended` when they end, however they do."""
 
-    def __init__(self, lines: AsyncIterator[bytes], leave: Callable[[], None], headers: Mapping[str, str]) -> None:
-        super().__init__(lines, media_type="text/event-stream", headers=headers)
-        self._leave = leave
+    def __init__(
+        self, lines: AsyncIterator[bytes], ended: contextlib.AsyncExitStack, headers: Mapping[str, str]
+    ) -> None:
+        super().__init__(lines, media_type=EVENT_STREAM, headers=headers)
+        self._ended = ended
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer."""
-        try:
+        async with self._ended:
             await super().__call__(scope, receive, send)
-        finally:
-            self._leave()
 
 
 def _undo(joining: asyncio.Future[Callable[[], None]]) -> None:
@@ -237,6 +250,11 @@ class _Asked(Struct, frozen=True):
     fields: Names = frozenset()
     events: Literal["final", "now"] = "final"
     predict: bool = False
+    after: str = ""
+
+
+PARAMETERS: Final = _Asked.__struct_fields__
+SELECTION: Final = frozenset({"stream", "classes", "confirmed", "min_existence", "fields", "predict"})
 
 
 class _Incoming(Struct, forbid_unknown_fields=True):
@@ -245,32 +263,54 @@ class _Incoming(Struct, forbid_unknown_fields=True):
     subscribe: dict[str, Any]
 
 
+def parameters_of(connection: HTTPConnection, known: Iterable[str]) -> dict[str, str]:
+    """Return the parameters of a request.
+
+    Raises:
+        MessageError: one is not known, or given twice; with its name as path.
+    """
+    pairs, names = connection.query_params.multi_items(), sorted(known)
+    found = dict(pairs)
+    for name in found:
+        if name not in names:
+            raise schemas.MessageError("invalid_value", name, f"one of {', '.join(names)}", "another parameter")
+        if (count := sum(each == name for each, _ in pairs)) > 1:
+            raise schemas.MessageError("invalid_value", name, "one value, with commas for several", f"{count} of them")
+    return found
+
+
 def wish_of(parameters: Mapping[str, Any]) -> Wish:
     """Return what a reader asks for.
 
     Raises:
         MessageError: a parameter is wrong; with its name as path.
     """
-    known = _Asked.__struct_fields__
+    lists = {"topics", "classes", "fields"}
     values = {
-        name: value.split(",") if name in {"topics", "classes", "fields"} and isinstance(value, str) else value
+        name: value.split(",") if name in lists and isinstance(value, str) else value
         for name, value in parameters.items()
     }
-    for name in values.keys() - set(known):
-        raise schemas.MessageError("invalid_value", name, f"one of {', '.join(known)}", "another parameter")
+    for name in values.keys() - set(PARAMETERS):
+        raise schemas.MessageError("invalid_value", name, f"one of {', '.join(PARAMETERS)}", "another parameter")
     if "stream" not in values:
         raise schemas.MessageError("missing_field", "stream", "a pattern, as garage/*/*", "nothing")
+    for name in lists & values.keys():
+        if isinstance(values[name], list) and not all(values[name]):
+            raise schemas.MessageError("invalid_value", name, "names; leave it out for the default", "an empty name")
     try:
         asked = msgspec.convert(values, _Asked, strict=False)
     except msgspec.ValidationError as error:
         expected, _, path = str(error).rpartition(" - at `$.")
         path = path.rstrip("`")
-        received = ascii(values[path.partition("[")[0]])[:80]
+        name = path.partition("[")[0]
+        received = ascii(values[name])[:80]
+        path = name if isinstance(parameters[name], str) else path  # as it was written: with commas, or as a list
         raise schemas.MessageError("invalid_value", path, expected.removeprefix("Expected "), received) from None
     if wrong := asked.fields - FIELDS:
         raise schemas.MessageError("invalid_value", "fields", f"of {', '.join(sorted(FIELDS))}", ascii(min(wrong))[:80])
     selection = Selection(asked.classes, asked.confirmed, asked.min_existence, asked.fields)
-    return Wish((asked.stream,), asked.topics, selection, asked.max_rate_hz, asked.events == "final", asked.predict)
+    rate, final = asked.max_rate_hz, asked.events == "final"
+    return Wish((asked.stream,), asked.topics, selection, rate, final, asked.predict, asked.after)
 
 
 class Api:
@@ -288,8 +328,8 @@ class Api:
     async def streams(self, request: Request) -> Response:
         """Answer with the sessions of a pattern, or of all streams that the caller may read."""
         caller = await self._readers.caller(request)
-        pattern = request.query_params.get("stream", caller.pattern)
-        self._readers.keys.matching(pattern, "tracks")
+        pattern = parameters_of(request, ["stream"]).get("stream", caller.pattern)
+        Wish((pattern,), frozenset({"tracks"})).keys(self._readers.keys)
         caller.may_read(pattern)
         found = await listed(self._readers.feeds().session, self._readers.keys, pattern)
         texts = [b'{"instance":"%b",%b' % (name.encode(), schemas.encode_json(one)[1:]) for name, one in found]
@@ -297,15 +337,15 @@ class Api:
 
     async def tracks(self, request: Request) -> Response:
         """Answer with the newest frame of each stream."""
-        _, wish = await self._asked(request)
+        _, wish = await self._asked(request, SELECTION)
         if wish.predict:
             raise schemas.MessageError("invalid_value", "predict", "0 here: `stream` and `ws` predict", "1")
         (key,) = wish.keys(self._readers.keys)
-        return _array([one.tracks(wish.selection) for one in await self._newest(key)])
+        return _array([one.tracks(wish.selection, self._readers.stale_s) for one in await self._newest(key)])
 
     async def zones(self, request: Request) -> Response:
         """Answer with the newest counts of the zones of each stream."""
-        _, wish = await self._asked(request)
+        _, wish = await self._asked(request, ["stream"])
         key = self._readers.keys.matching(wish.streams[0], "events")
         newest = await self._newest(key, RECENT, lambda one: one.zones is not None)
         return _array([one.zones or b"" for one in newest])
@@ -313,14 +353,16 @@ class Api:
     async def stream(self, request: Request) -> Response:
         """Answer with server-sent events."""
         _, wish = await self._asked(request)
-        return self._readers.stream(wish.keys(self._readers.keys), lambda: Reader(wish), HEADERS)
+        wish = replace(wish, after=request.headers.get("last-event-id", wish.after))
+        keys = wish.keys(self._readers.keys)
+        return await self._readers.stream(request, keys, lambda: Reader(wish, self._readers.stale_s), HEADERS)
 
     async def socket(self, websocket: WebSocket) -> None:
         """Serve a WebSocket."""
         caller, wish = await self._asked(websocket)
         leave = self._readers.enter()
         try:
-            reader = Reader(wish)
+            reader = Reader(wish, self._readers.stale_s)
             async with contextlib.AsyncExitStack() as joined:
                 await joined.enter_async_context(self._readers.joined(wish.keys(self._readers.keys), reader))
                 await websocket.accept(PROTOCOL if PROTOCOL in websocket.scope["subprotocols"] else None)
@@ -357,10 +399,10 @@ class Api:
                     await websocket.close(TRY_AGAIN, str(error)[:100])
                     return
 
-    async def _asked(self, connection: HTTPConnection) -> tuple[Caller, Wish]:
+    async def _asked(self, connection: HTTPConnection, known: Iterable[str] = PARAMETERS) -> tuple[Caller, Wish]:
         """Return the caller and a wish that it may read."""
         caller = await self._readers.caller(connection)
-        wish = wish_of(connection.query_params)
+        wish = wish_of(parameters_of(connection, known))
         wish.keys(self._readers.keys)
         caller.may_read(wish.streams[0])
         return caller, wish
@@ -388,6 +430,5 @@ def _array(texts: Iterable[bytes]) -> Response:
 async def _send(websocket: WebSocket, reader: Reader) -> None:
     """Send the texts of a reader, each when the one before has gone."""
     with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # it has gone
-        while (text := await reader.take()) is not None:
-            await websocket.send_text(text.decode())
-        await websocket.close(TRY_AGAIN, "events were lost: the reader is too slow")
+        while True:
+            await websocket.send_text((await reader.take())[0].decode())

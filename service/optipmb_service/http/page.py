@@ -19,6 +19,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from optipmb_service.edge.readers import Outbox, Publication
+from optipmb_service.http.api import parameters_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from optipmb_schemas.json_form import Place
     from starlette.requests import Request
 
+    from optipmb_service.edge.readers import Logs
     from optipmb_service.http.api import Readers
     from optipmb_service.telemetry.health import ProcessHealth
 
@@ -54,19 +56,20 @@ def page(health: ProcessHealth, readers: Readers, places: Mapping[str, Place]) -
     """Return the routes of the page."""
 
     async def status(request: Request) -> Response:
+        parameters_of(request, ())
         (await readers.caller(request)).may_read("*/*/*")
         if (found := await asyncio.to_thread(health.status)) is None:
             return JSONResponse({"state": health.state()}, headers=HEADERS)
         return Response(schemas.encode_json(found), media_type="application/json", headers=HEADERS)
 
     async def live(request: Request) -> Response:
-        stream = request.query_params.get("stream", "")
+        stream = parameters_of(request, ["stream"]).get("stream", "")
         tracks = readers.keys.tracks(stream)
         seen = health.detections_of(stream)
         (await readers.caller(request)).may_read(seen)
         detections = readers.keys.all("detections").replace("*/*/*", seen)
         place = places.get(stream.partition("/")[0])
-        return readers.stream((tracks, detections), lambda: Live(place), HEADERS, PERIOD_S)
+        return await readers.stream(request, (tracks, detections), lambda: Live(place), HEADERS, PERIOD_S)
 
     files = [Route(path, _file(name)) for path, name in FILES.items()]
     return [*files, Route("/status", status), Route("/live", live)]
@@ -100,13 +103,17 @@ class Live:
             kept = kept[:-1]
         self._detections = kept  # they are shown with the next tracks
 
-    async def take(self, seconds: float | None = None) -> bytes | None:
+    def read(self, logs: list[Logs]) -> str:  # noqa: ARG002 - it draws no events
+        """Read no events."""
+        return ""
+
+    async def take(self, seconds: float | None = None) -> tuple[bytes, str]:
         """Return the next drawing. Raises TimeoutError where none has come in so long."""
         while True:
-            if (taken := await self._tracks.take(seconds)) is None:
-                return None
-            if (text := live_frame(taken[0], *self._detections, place=self._place)) is not None:
-                return text
+            await self._tracks.wait(seconds)
+            taken = self._tracks.take_now()
+            if taken is not None and (text := live_frame(taken[0], *self._detections, place=self._place)) is not None:
+                return text, ""
 
 
 def live_frame(tracks: Publication, *detections: Publication, place: Place | None = None) -> bytes | None:

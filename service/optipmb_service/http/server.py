@@ -9,6 +9,7 @@ of the settings are answered, others are not. Probes and Prometheus ask by names
 
 from __future__ import annotations
 
+import asyncio
 import ipaddress
 import socket
 import threading
@@ -24,13 +25,13 @@ from starlette.middleware.cors import CORSMiddleware
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route
 from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.websockets.wsproto_impl import WSProtocol
 
-from optipmb_service.http.api import STATUS, Api, Readers, refuse
+from optipmb_service.http.api import STATUS, Api, Readers, parameters_of, refuse
 from optipmb_service.http.page import page
 from optipmb_service.telemetry.metrics import CONTENT_TYPE
 
 if TYPE_CHECKING:
-    import asyncio
     from collections.abc import Callable, Mapping
 
     from optipmb_schemas.json_form import Place
@@ -47,6 +48,8 @@ HEAD_S: Final = 5.0  # longest time from the begin of a connection until its fir
 KEEP_ALIVE_S: Final = 5
 HEAD_BYTES: Final = 16 * 1024
 MESSAGE_BYTES: Final = 4096  # largest message of a WebSocket's client
+SEND_S: Final = 30.0  # a connection whose peer takes nothing for so long is aborted
+SEND_BYTES: Final = 2**16  # what the system holds for a connection, so that it is soon known
 PING_S: Final = 20.0  # period of pings, and longest wait for their answers
 
 UNAVAILABLE: Final = 503
@@ -92,7 +95,8 @@ def application(
     def metrics(_: Request) -> Response:
         return Response(health.metrics.text(), media_type=CONTENT_TYPE, headers={"cache-control": "no-store"})
 
-    def asyncapi(_: Request) -> Response:
+    def asyncapi(request: Request) -> Response:
+        parameters_of(request, ())
         return Response(interface(), media_type="application/json", headers={"cache-control": "no-store"})
 
     routes: list[BaseRoute] = [Route("/healthz", alive), Route("/readyz", ready), Route("/metrics", metrics)]
@@ -181,6 +185,7 @@ class Server:
             self._socket = socket.create_server((host, int(port)), family=family, backlog=CONNECTIONS)
         except OSError as error:
             raise ClientError(f"cannot listen on {address} for HTTP: {error.strerror or error}") from error
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BYTES)  # connections inherit it
         bound = self._socket.getsockname()
         self.address = f"[{bound[0]}]:{bound[1]}" if family == socket.AF_INET6 else f"{bound[0]}:{bound[1]}"
         self._server = uvicorn.Server(
@@ -195,7 +200,7 @@ class Server:
                 timeout_keep_alive=KEEP_ALIVE_S,
                 timeout_graceful_shutdown=GRACE_S,
                 h11_max_incomplete_event_size=HEAD_BYTES,
-                ws="wsproto",
+                ws=_Socket,
                 ws_max_size=MESSAGE_BYTES,
                 ws_ping_interval=PING_S,
                 ws_ping_timeout=PING_S,
@@ -212,7 +217,35 @@ class Server:
         self._socket.close()
 
 
-class _Connection(H11Protocol):
+class _Bounded(asyncio.Protocol):
+    """A connection that is aborted when its peer takes nothing for `SEND_S`."""
+
+    loop: asyncio.AbstractEventLoop
+    transport: asyncio.Transport
+    _limit: asyncio.TimerHandle | None = None
+
+    def pause_writing(self) -> None:
+        super().pause_writing()
+        self._limit = self.loop.call_later(SEND_S, self.transport.abort)
+
+    def resume_writing(self) -> None:
+        self._end_limit()
+        super().resume_writing()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._end_limit()
+        super().connection_lost(exc)
+
+    def _end_limit(self) -> None:
+        if self._limit is not None:
+            self._limit.cancel()
+
+
+class _Socket(_Bounded, WSProtocol):
+    """A WebSocket."""
+
+
+class _Connection(_Bounded, H11Protocol):
     """A connection that ends when its first request does not come, or when others need its place.
 
     Where all places are taken, the connection that has been idle for the longest time is closed; where all are busy,

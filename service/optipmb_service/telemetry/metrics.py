@@ -242,9 +242,12 @@ SERVICE_METRICS: Final = PROCESS_METRICS | NETWORK_METRICS | COUNTED_METRICS | P
 
 MQTT_METRICS: Final = {
     "mqtt_connected": _gauge("1 while there is a connection to the broker.", lambda b: b.connected),
-    "mqtt_published_total": _counter("Messages that the broker has taken.", lambda b: b.published, "topic"),
+    "mqtt_published_total": _counter(
+        "Messages that the broker has taken; with QoS 0, those that were sent.", lambda b: b.published, "topic"
+    ),
+    "mqtt_refused_total": _counter("Messages that the broker did not take.", lambda b: b.refused, "reason"),
     "mqtt_skipped_total": _counter("Messages replaced by newer ones before the broker took them.", lambda b: b.skipped),
-    "mqtt_events_lost_total": _counter("Events lost while the broker was away.", lambda b: b.lost),
+    "mqtt_events_lost_total": _counter("Events lost while the broker was away, or refused.", lambda b: b.lost),
 }
 """Metrics of the bridge to MQTT."""
 

@@ -78,11 +78,12 @@ class IdlePool(Generic[R]):
     """Subscriptions and publishers that are not used at the moment, by key; may be used by any threads.
 
     They are kept for the next user because Zenoh never gives back the number of a key. They are closed after
-    `IDLE_S`, and the oldest of more than `most` at once.
+    `idle_s` (`IDLE_S`), and the oldest of more than `most` at once.
     """
 
-    def __init__(self, most: int) -> None:
+    def __init__(self, most: int, idle_s: float | None = None) -> None:
         self._most = most
+        self._idle_s = IDLE_S if idle_s is None else idle_s
         self._lock = threading.Lock()
         self._idle: dict[Hashable, tuple[float, R]] = {}
         self._is_timed = False
@@ -92,11 +93,11 @@ class IdlePool(Generic[R]):
         with self._lock:
             if key in self._idle:
                 return False
-            self._idle[key] = time.monotonic() + IDLE_S, resource
+            self._idle[key] = time.monotonic() + self._idle_s, resource
             if len(self._idle) > self._most:
                 self._end_in(0.0)
             elif not self._is_timed:
-                self._end_in(IDLE_S)
+                self._end_in(self._idle_s)
         return True
 
     def take(self, key: Hashable) -> R | None:
@@ -127,7 +128,7 @@ class IdlePool(Generic[R]):
             if timed:
                 self._is_timed = False
                 if self._idle:
-                    self._end_in(IDLE_S)
+                    self._end_in(self._idle_s)
         for resource in resources:
             resource.close()
 
@@ -139,7 +140,7 @@ M = TypeVar("M")
 class _Feed(Generic[L]):
     def __init__(self) -> None:
         self.listeners: tuple[L, ...] = ()
-        self.subscription: Reading | None = None
+        self.subscription: _Closable | None = None
 
     def close(self) -> None:
         if self.subscription is not None:
@@ -153,19 +154,21 @@ class SharedSubscriptions(Generic[L, M]):
         subscribe: opens a subscription, which calls its second argument with each message.
         receive: called for each message with the listeners, on a thread of the subscription.
         most: subscriptions that are kept without listeners.
+        idle_s: for how long, if it is not `IDLE_S`.
     """
 
     def __init__(
         self,
-        subscribe: Callable[[str, Callable[[M], None]], Reading],
+        subscribe: Callable[[str, Callable[[M], None]], _Closable],
         receive: Callable[[tuple[L, ...], M], None],
         most: int,
+        idle_s: float | None = None,
     ) -> None:
         self._subscribe = subscribe
         self._receive = receive
         self._lock = threading.Lock()
         self._feeds: dict[str, _Feed[L]] = {}
-        self._idle: IdlePool[_Feed[L]] = IdlePool(most)
+        self._idle: IdlePool[_Feed[L]] = IdlePool(most, idle_s)
 
     def join(self, key: str, listener: L) -> Callable[[], None]:
         """Add a listener until the result is called, which may be twice. Raises as `subscribe` does."""

@@ -7,14 +7,16 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from broker import Broker, mosquitto
 from optipmb_client.errors import ClientError
 from optipmb_schemas.json_form import Selection, event_json, problem_json, tracks_json, zones_json
 from optipmb_service.settings import MqttSettings, Settings
-from watched import PROBLEM, STREAM, Session, events, settled, tracks
+from watched import PROBLEM, STREAM, Session, events, plain, settled, tracks
 
-aiomqtt = pytest.importorskip("aiomqtt")
+paho = pytest.importorskip("paho.mqtt.client")
+CallbackAPIVersion = pytest.importorskip("paho.mqtt.enums").CallbackAPIVersion
 mqtt = pytest.importorskip("optipmb_service.app.mqtt")
 
 TOPIC = f"optipmb/v1/{STREAM}"
@@ -51,7 +53,10 @@ def session(monkeypatch: pytest.MonkeyPatch) -> Session:
 
 @pytest.mark.parametrize("versions", [(5,), (4,)])
 async def test_topics_are_keys_and_payloads_the_texts_of_readers(session: Session, versions: tuple[int, ...]) -> None:
-    """Each with its quality of service; in MQTT 3.1.1 where the broker refuses 5."""
+    """Each with its quality of service; in MQTT 3.1.1 where the broker refuses 5.
+
+    The first of a topic is confirmed, so that it is known whether the broker takes it.
+    """
     async with Broker(versions) as broker, bridging(session, broker, tracks_hz=0) as bridge:
         assert bridge.state == "degraded"
         await until(lambda: bridge.connected)
@@ -59,17 +64,22 @@ async def test_topics_are_keys_and_payloads_the_texts_of_readers(session: Sessio
         session.publish(tracks(1), events(1, 2), settled(2), PROBLEM)
         await broker.wait(1, "/problems")
         await broker.wait(1, "/zones")
-        found = {(one.topic, one.qos, one.retain): one.payload for one in broker.messages}
+        await until(lambda: bridge.published.total() == 5)
+        session.publish(tracks(2), PROBLEM)
+        await broker.wait(2, "/tracks")
+        await broker.wait(2, "/problems")
+        found = {(one.topic, one.qos, one.retain): plain(one.payload) for one in broker.messages}
         assert found == {
             (ALIVE, 1, True): b"1",
-            (f"{TOPIC}/tracks", 0, False): tracks_json(tracks(1), CONFIRMED),
+            (f"{TOPIC}/tracks", 1, False): tracks_json(tracks(1), CONFIRMED),
+            (f"{TOPIC}/tracks", 0, False): tracks_json(tracks(2), CONFIRMED),
             (f"{TOPIC}/events", 1, False): event_json(events(1, 2))[1],
             (f"{TOPIC}/zones", 1, True): zones_json(events(1)),
-            (f"{TOPIC}/problems", 0, False): problem_json(PROBLEM),
+            **{(f"{TOPIC}/problems", qos, False): problem_json(PROBLEM) for qos in (0, 1)},
         }
         assert broker.of("/events") == event_json(events(1, 2))
-        await until(lambda: bridge.published.total() == 5)
-        assert dict(bridge.published) == {"tracks": 1, "events": 2, "zones": 1, "problems": 1}
+        await until(lambda: bridge.published.total() == 7)
+        assert dict(bridge.published) == {"tracks": 2, "events": 2, "zones": 1, "problems": 2}
         assert broker.refused == ([] if 5 in versions else [5])
     assert broker.of("/alive") == [b"1", b"0"]
 
@@ -110,9 +120,11 @@ async def test_the_oldest_events_are_lost_where_too_many_wait(
     async with bridging(session, broker) as bridge:
         await asyncio.to_thread(session.wait, 3)
         session.publish(events(1, 5), settled(2))
-        assert bridge.lost == 2
+        await until(lambda: bridge.lost == 2)
         async with broker:
-            assert [json.loads(one)["n"] for one in await broker.wait(3, "/events")] == [1002, 1003, 1004]
+            missed, *found = [json.loads(one) for one in await broker.wait(4, "/events")]
+            assert missed == {"type": "missed", "stream": "*/*/*", "events": 2}
+            assert [one["n"] for one in found] == [1002, 1003, 1004]
 
 
 async def test_settings_choose_streams_topics_and_the_rate(session: Session) -> None:
@@ -134,6 +146,76 @@ async def test_files_that_cannot_be_read_end_the_start(session: Session, tmp_pat
             pass
 
 
+async def published(session: Session, broker: Broker, bridge: Any, seq: int) -> set[str]:
+    """Publish a frame of many objects, one of few, and an event; return the topics of what came."""
+    await until(lambda: bridge.connected)
+    broker.messages.clear()
+    many = tracks(seq, count=400).model_copy(update={"confirmed": np.ones(400, np.int64)})
+    session.publish(many, tracks(seq, "garage/rig/few"), events(seq), settled(seq + 1))
+    await broker.wait(1, "/events")
+    await broker.wait(1, "few/tracks")
+    return {one.topic for one in broker.messages}
+
+
+@pytest.mark.parametrize(("says", "version", "connections"), [(True, 5, 1), (False, 5, 4), (False, 4, 5)])
+async def test_a_message_that_the_broker_cannot_take_blocks_no_other(
+    session: Session, *, says: bool, version: int, connections: int
+) -> None:
+    """It is left out and named with its stream, topic and size.
+
+    At once where the broker says its limit; else after it has ended two connections alone, and then so is what is as
+    large.
+    """
+    broker = Broker((version,), most=20_000, says_most=says)
+    async with broker, bridging(session, broker, tracks_hz=0) as bridge:
+        assert f"{TOPIC}/tracks" not in await published(session, broker, bridge, 1)
+        await until(lambda: bridge.refused.total() > 0)
+        (problem,) = session.problems
+        assert (problem.stream, problem.code, problem.path) == (STREAM, "too_large", f"{TOPIC}/tracks")
+        assert int(problem.received.removesuffix(" bytes")) > 20_000
+        assert bridge.state == "degraded"
+        assert f"{TOPIC}/tracks" in bridge.failure
+        assert f"{TOPIC}/tracks" not in await published(session, broker, bridge, 3)
+        await until(lambda: bridge.refused.total() > 1)
+        assert broker.connections == connections
+        session.publish(tracks(5))
+        await broker.wait(1, f"{STREAM}/tracks")
+        await until(lambda: bridge.state == "ready")
+        assert bridge.lost == 0
+
+
+async def test_what_the_broker_refuses_is_not_published(session: Session) -> None:
+    """By the reason codes of MQTT 5, also of topics whose later messages are not confirmed."""
+    async with (
+        Broker(denied=("/tracks", "/events")) as broker,
+        bridging(session, broker, tracks_hz=0) as bridge,
+    ):
+        await until(lambda: bridge.connected)
+        session.publish(tracks(1), tracks(2, "garage/rig/b"), events(1, 2), settled(2))
+        await broker.wait(1, "/zones")
+        await until(lambda: bridge.refused.total() == 4)
+        assert dict(bridge.refused) == {"Not authorized": 4}
+        assert (dict(bridge.published), bridge.lost) == ({"zones": 1}, 2)
+        assert bridge.state == "degraded"
+        assert "3 topics are refused" in bridge.failure
+        assert "Not authorized" in bridge.failure
+        broker.denied = ()
+        session.publish(tracks(3), tracks(3, "garage/rig/b"), events(3), settled(4))
+        await until(lambda: bridge.state == "ready")
+
+
+async def test_two_bridges_of_one_name_say_so(session: Session) -> None:
+    """The one whose connection is taken over names the reason, and waits before it comes again."""
+    async with Broker() as broker, bridging(session, broker) as bridge:
+        await until(lambda: bridge.connected)
+        broker.take_over()
+        await until(lambda: not bridge.connected)
+        assert "duplicate_name: another client is optipmb-one" in bridge.failure
+        assert "Session taken over" in bridge.failure
+        await asyncio.sleep(20 * mqtt.RETRY_S)
+        assert broker.connections == 1
+
+
 async def test_a_real_broker_keeps_counts_and_says_who_is_gone(session: Session, tmp_path: Path) -> None:
     """Mosquitto gives late subscribers the newest counts; when the bridge dies, its last will."""
     with mosquitto(tmp_path) as address:
@@ -142,16 +224,18 @@ async def test_a_real_broker_keeps_counts_and_says_who_is_gone(session: Session,
             session.publish(tracks(1), events(1, 2), settled(2))
             await until(lambda: bridge.published.total() == 4)
             port = int(address.rpartition(":")[2])
-            async with aiomqtt.Client("127.0.0.1", port, protocol=aiomqtt.ProtocolVersion.V5) as client:
-                await client.subscribe("optipmb/v1/#", qos=1)
-                held = {}
-                async for message in client.messages:
-                    held[str(message.topic)] = message.payload
-                    if len(held) == 2:
-                        break
-                assert held == {ALIVE: b"1", f"{TOPIC}/zones": zones_json(events(1))}
-                session.publish(events(3, zones=None), settled(4))
-                async for message in client.messages:
-                    assert (str(message.topic), message.payload) == (f"{TOPIC}/events", event_json(events(3))[0])
-                    assert message.properties.ContentType == "application/json"
-                    break
+            held: dict[str, Any] = {}
+            client = paho.Client(CallbackAPIVersion.VERSION2, protocol=paho.MQTTv5)
+            client.on_message = lambda _client, _data, message: held.update({message.topic: message})
+            client.connect("127.0.0.1", port)
+            client.subscribe("optipmb/v1/#", qos=1)
+            client.loop_start()
+            await until(lambda: len(held) == 2)
+            payloads = {topic: message.payload for topic, message in held.items()}
+            assert payloads == {ALIVE: b"1", f"{TOPIC}/zones": zones_json(events(1))}
+            session.publish(events(3, zones=None), settled(4))
+            await until(lambda: f"{TOPIC}/events" in held)
+            assert held[f"{TOPIC}/events"].payload == event_json(events(3))[0]
+            assert held[f"{TOPIC}/events"].properties.ContentType == "application/json"
+            client.disconnect()
+            client.loop_stop()

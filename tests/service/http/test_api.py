@@ -3,10 +3,13 @@
 import contextlib
 import hashlib
 import http.client
+import itertools
 import json
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from socket import SO_RCVBUF, SOL_SOCKET
+from socket import create_connection as create_socket
 from typing import Any
 
 import pytest
@@ -16,18 +19,31 @@ from optipmb_schemas import (
     ServiceStatus,
     SessionSummary,
 )
-from optipmb_schemas.json_form import event_json, problem_json, tracks_json, with_skipped, zones_json
-from optipmb_service.edge.readers import EVENTS, Publication, Reader, Wish
-from optipmb_service.http import application
+from optipmb_schemas.json_form import event_json, problem_json, tracks_json, zones_json
+from optipmb_service.edge.readers import BURST, Bounds, Feeds, Publication, Reader, Wish
+from optipmb_service.http import application, server
 from optipmb_service.settings import Settings
 from readers import received, texts
 from router import until
-from watched import KEYS, PROBLEM, STREAM, Session, Watched, asked, events, key_of, publication, served, tracks
+from watched import (
+    KEYS,
+    PROBLEM,
+    STREAM,
+    Session,
+    Watched,
+    asked,
+    delivery,
+    events,
+    key_of,
+    plain,
+    served,
+    settled,
+    tracks,
+)
 from websocket import (
     ABNF,
     WebSocket,
     WebSocketBadStatusException,
-    WebSocketConnectionClosedException,
     create_connection,
 )
 
@@ -96,13 +112,13 @@ def test_get_stream_and_socket_give_the_same_text(session: Session, address: str
     query = f"stream={ALL}&confirmed=0"
     with lines(address, query) as events, socket(address, query) as connection:
         session.publish(message)
-        text = next(events)
-        assert received(connection) == text.decode()
+        text = plain(next(events))
+        assert plain(received(connection)) == text
         assert session.subscriptions[0][0] == f"{KEYS.prefix}/{ALL}/tracks"
         assert len(session.subscriptions) == 1, "they share it"
     assert text == tracks_json(message)
     with asked(address, f"/api/v1/tracks?{query}") as response:
-        assert response.read() == b"[%b]" % text
+        assert plain(response.read()) == b"[%b]" % text
     chosen = get(address, f"tracks?stream={ALL}&fields=position,class&classes=car,dog&min_existence=0.3")[1]
     assert chosen[0]["objects"] == [{"id": 0, "class": "car", "position": [0.0, 0.143, 0.286]}]
     assert get(address, f"tracks?stream={ALL}&min_existence=0.4")[1][0]["objects"] == []
@@ -113,7 +129,7 @@ def test_all_topics_come_on_one_connection(session: Session, address: str) -> No
     expected = [*event_json(events(1, 2)), zones_json(events(1)), problem_json(PROBLEM)]
     with socket(address, f"stream={STREAM}&topics=events,zones,problems&events=now") as connection:
         session.publish(tracks(1), events(1, 2), PROBLEM)
-        found = sorted(str(received(connection)).encode() for _ in expected)
+        found = sorted(plain(received(connection)) for _ in expected)
         assert found == sorted(text for text in expected if text is not None)
     with lines(address, f"stream={STREAM}&topics=zones") as found_texts:
         session.publish(events(2, 3))
@@ -160,24 +176,43 @@ def test_streams_are_those_of_all_services(session: Session, address: str) -> No
     ("query", "path"),
     [
         ("", "stream"),
-        ("stream=garage", "pattern"),
+        ("stream=garage", "stream"),
         (f"stream={ALL}&min_existence=2", "min_existence"),
         (f"stream={ALL}&max_rate_hz=nan", "max_rate_hz"),
         (f"stream={ALL}&confirmed=maybe", "confirmed"),
-        (f"stream={ALL}&topics=tracks,points", "topics[1]"),
+        (f"stream={ALL}&topics=tracks,points", "topics"),
+        (f"stream={ALL}&classes=", "classes"),
+        (f"stream={ALL}&stream=garage/rig/*", "stream"),
         (f"stream={ALL}&fields=colour", "fields"),
         (f"stream={ALL}&class=car", "class"),
         (f"stream={ALL}&events=soon", "events"),
     ],
 )
 def test_a_bad_parameter_is_refused_with_its_path(address: str, query: str, path: str) -> None:
-    """The same for every way to read; a WebSocket before its handshake."""
+    """The same for every way to read, with the name as it was written; a WebSocket before its handshake."""
     for way in ("tracks", "zones", "stream"):
         status, answer = get(address, f"{way}?{query}")
         assert (status, answer["path"]) == (http.client.BAD_REQUEST, path)
         assert answer["error"].startswith(f"{path}: expected ")
     status, body = refused(address, query)
     assert (status, json.loads(body)["path"]) == (http.client.BAD_REQUEST, path)
+
+
+def test_no_parameter_is_ignored(address: str) -> None:
+    """Every path refuses those that it does not know, also those of other paths."""
+    paths = (
+        "api/v1/streams?class=car",
+        "api/v1/asyncapi.json?class=car",
+        f"live?stream={STREAM}&class=car",
+        "status?class=1",
+    )
+    ways = ("tracks", "max_rate_hz=2"), ("tracks", "events=now"), ("zones", "classes=car"), ("streams", "fields=yaw")
+    for path in (*paths, *(f"api/v1/{way}?stream={ALL}&{query}" for way, query in ways)):
+        with asked(address, f"/{path}") as response:
+            assert (response.status, path) == (http.client.BAD_REQUEST, path)
+            assert (
+                json.loads(response.read())["path"] == path.rpartition("&" if "&" in path else "?")[2].partition("=")[0]
+            )
 
 
 def test_the_newest_tracks_are_not_predicted(address: str) -> None:
@@ -293,60 +328,225 @@ def test_a_service_that_starts_has_nothing_to_read(watched: Watched, address: st
     assert get(address, f"tracks?stream={ALL}")[0] == refused(address, f"stream={ALL}")[0] == 503
 
 
-async def test_a_slow_reader_gets_the_newest_of_each_stream() -> None:
+STALE_S = 30.0
+
+
+def reader_of(session: Session, bounds: Bounds | None = None, stale_s: float = STALE_S, **wish: Any) -> Reader:
+    """Return a reader that has joined."""
+    network: Any = session
+    feeds = Feeds(network, {}, bounds or Bounds())
+    reader = Reader(Wish((ALL,), **wish), stale_s)
+    keys = Wish((ALL,), **wish).keys(KEYS)
+    feeds.join(keys, reader.receive)
+    reader.read(feeds.logs(keys))
+    return reader
+
+
+async def taken(reader: Reader, seconds: float = 0.01) -> list[dict[str, Any]]:
+    """Return all texts that wait."""
+    found = []
+    with contextlib.suppress(TimeoutError):
+        while True:
+            found.append(json.loads((await reader.take(seconds))[0]))
+    return found
+
+
+async def test_a_slow_reader_gets_the_newest_of_each_stream(session: Session) -> None:
     """Between two reads all but the newest frame of each stream are left out, and counted in the next text."""
-    reader = Reader(Wish((ALL,), frozenset({"tracks"})))
+    reader = reader_of(session, topics=frozenset({"tracks"}))
     for seq in range(5):
-        for stream in (STREAM, "garage/rig/b"):
-            reader.receive(publication(tracks(seq, stream)))
-    assert await reader.take() == with_skipped(tracks_json(tracks(4)), 8)
-    assert await reader.take() == tracks_json(tracks(4, "garage/rig/b"))
-    with pytest.raises(TimeoutError):
-        await reader.take(0.01)
+        session.publish(*(tracks(seq, stream) for stream in (STREAM, "garage/rig/b")))
+    found = await taken(reader)
+    assert [(one["stream"], one["seq"], one.get("skipped")) for one in found] == [
+        (STREAM, 4, 8),
+        ("garage/rig/b", 4, None),
+    ]
 
 
-async def test_the_rate_is_bounded_in_sensor_time() -> None:
+async def test_the_rate_is_bounded_in_sensor_time(session: Session) -> None:
     """Frames that come sooner are left out; a correction of one that was sent is sent."""
-    reader = Reader(Wish((ALL,), frozenset({"tracks"}), max_rate_hz=5.0))
+    reader = reader_of(session, topics=frozenset({"tracks"}), max_rate_hz=5.0)
     sent = []
     for seq in (0, 1, 2, 3, 2):
-        reader.receive(publication(tracks(seq)))
-        with contextlib.suppress(TimeoutError):
-            sent.append(json.loads(await reader.take(0.01) or b"")["seq"])
+        session.publish(tracks(seq))
+        sent += [one["seq"] for one in await taken(reader)]
     assert sent == [0, 2, 2]
 
 
-async def test_events_come_once_when_they_are_final_or_as_they_are_published() -> None:
+async def test_a_stream_that_stopped_is_said_to_be_stale(session: Session) -> None:
+    """Its newest frame comes again, once, with its age; also one that the reader's rate had left out."""
+    reader = reader_of(session, topics=frozenset({"tracks"}), max_rate_hz=5.0, stale_s=0.2)
+    session.publish(tracks(0), tracks(1))
+    found = await taken(reader, 1.0)
+    assert [(one["seq"], one["stale"], one["frame_age_s"] > 0.2) for one in found] == [
+        (0, False, False),
+        (1, True, True),
+    ]
+    session.publish(tracks(2))
+    assert [one["stale"] for one in await taken(reader, 1.0)] == [False, True]
+
+
+def test_the_newest_frame_has_its_age(session: Session, address: str) -> None:
+    """A cache of a stream that stopped still has its last frame: the answer says how old it is."""
+    age_ns = 27 * 10**9
+    message = tracks(3)
+    old = delivery(0, time.time_ns() - age_ns)
+    session.cache = [(key_of(message), message.model_copy(update={"delivery": old}))]
+    (found,) = get(address, f"tracks?stream={ALL}")[1]
+    assert found["stale"]
+    assert 27 <= found["frame_age_s"] < 27 + DEADLINE_S
+
+
+async def test_events_come_once_when_they_are_final_or_as_they_are_published(session: Session) -> None:
     """A revision replaces events that are not final; a reader of all events gets both."""
-    final, now = (Reader(Wish((ALL,), frozenset({"events"}), final=final)) for final in (True, False))
     corrected = events(1, 3, revision=1)
     published = [events(1, 2), corrected, events(5, 1, final_ns=5)]
-    for reader in (final, now):
-        for message in published:
-            reader.receive(publication(message))
-    assert [await final.take() for _ in range(3)] == event_json(corrected)
-    with pytest.raises(TimeoutError):
-        await final.take(0.01)
-    assert [await now.take() for _ in range(6)] == [text for message in published for text in event_json(message)]
+    both = [reader_of(session, topics=frozenset({"events"}), final=final) for final in (True, False)]
+    session.publish(*published)
+    for reader, messages in zip(both, ([corrected], published), strict=True):
+        texts = [text for message in messages for text in event_json(message)]
+        assert [plain((await reader.take())[0]) for _ in texts] == texts
+        assert await taken(reader) == []
 
 
-async def test_a_reader_that_loses_events_has_to_come_again() -> None:
-    """So many events wait, of all streams together; with one more, the reader ends."""
-    reader = Reader(Wish((ALL,), frozenset({"events"}), final=False))
-    reader.receive(publication(events(1, EVENTS)))
-    assert json.loads(await reader.take() or b"")["n"] == 1000
-    reader.receive(publication(events(2, 1)))
-    assert json.loads(await reader.take() or b"")["n"] == 1001
-    reader.receive(publication(events(3, 2)))
-    assert await reader.take() is None
+async def test_a_reader_of_events_that_is_too_slow_learns_how_many_it_missed(session: Session) -> None:
+    """So many of each stream are kept for it."""
+    reader = reader_of(session, Bounds(events=3), topics=frozenset({"events"}), final=False)
+    session.publish(events(1, 5), events(2, 1, "garage/rig/b"))
+    found = await taken(reader)
+    assert (found[0], [one["n"] for one in found[1:]]) == (
+        {"type": "missed", "stream": ALL, "events": 2},
+        [1002, 1003, 1004, 2000],
+    )
+    assert reader.lost_events == 2
 
 
-def test_a_socket_that_loses_events_is_closed(session: Session, address: str) -> None:
-    """A client that reads nothing is closed with the code for trying again later."""
+def read_events(address: str, query: str, count: int, **headers: str) -> list[tuple[str, Any]]:
+    """Return so many server-sent events with their ids; without any, the id after which they begin."""
+    found, event_id, ends = [], "", time.monotonic() + DEADLINE_S
+    with asked(address, f"/api/v1/stream?{query}", **headers) as response:
+        while len(found) < max(count, 1):
+            name, _, value = response.readline().decode().rstrip().partition(": ")
+            if name == "id":
+                event_id = value
+            if name == "data" or (name == "id" and not count):
+                found.append((event_id, json.loads(value) if count else None))
+            assert time.monotonic() < ends, "nothing but keep-alives"
+    return found
+
+
+@pytest.mark.parametrize("way", ["final", "now"])
+def test_a_reader_that_comes_again_gets_the_events_since(session: Session, address: str, way: str) -> None:
+    """By the id of the last event that it has: as a browser gives it, as a parameter, or in `subscribe`."""
+    query = f"stream={STREAM}&topics=events&events={way}"
+    ((begins, _),) = read_events(address, query, 0)
+    session.publish(events(1, 2), settled(2))
+    (_, first), (after, second) = read_events(address, query, 2, **{"last-event-id": begins})
+    assert [first["n"], second["n"]] == [1000, 1001]
+    assert second["event_id"] == after
+    session.publish(events(3, 2), settled(4), events(5, 1), settled(6))
+    since = [3000, 3001, 5000]
+    assert [one["n"] for _, one in read_events(address, query, 3, **{"last-event-id": after})] == since
+    with socket(address, f"{query}&after={after}") as connection:
+        assert [json.loads(received(connection))["n"] for _ in since] == since
+    with socket(address, f"stream={STREAM}") as connection:
+        asked_for = {"stream": STREAM, "topics": ["events"], "events": way, "after": after}
+        connection.send(json.dumps({"subscribe": asked_for}))
+        assert [json.loads(received(connection))["n"] for _ in since] == since
+    with socket(address, f"{query}&after=0") as connection:
+        assert [json.loads(received(connection))["n"] for _ in range(5)] == [1000, 1001, *since]
+
+
+def test_a_reader_with_an_id_of_another_process_gets_all_that_is_kept(session: Session, address: str) -> None:
+    """It learns first that events may be missing, and sees by their numbers which."""
+    query = f"stream={STREAM}&topics=events"
+    read_events(address, query, 0)
+    session.publish(events(1, 2), settled(2))
+    found = [one for _, one in read_events(address, query, 3, **{"last-event-id": "12ab-7"})]
+    assert found[0] == {"type": "missed", "stream": STREAM, "events": None}
+    assert [one["n"] for one in found[1:]] == [1000, 1001]
+
+
+def test_a_thousand_events_of_a_stream_are_kept(session: Session, address: str) -> None:
+    """A reader that comes again later learns how many more there were."""
+    query = f"stream={STREAM}&topics=events&events=now"
+    ((begins, _),) = read_events(address, query, 0)
+    session.publish(*(events(seq, 100) for seq in range(1, 12)))
+    found = [one for _, one in read_events(address, query, 1001, **{"last-event-id": begins})]
+    assert found[0] == {"type": "missed", "stream": STREAM, "events": 100}
+    assert [one["n"] for one in found[1:]] == [1000 * seq + at for seq in range(2, 12) for at in range(100)]
+
+
+def test_a_slow_socket_loses_no_event(session: Session, address: str) -> None:
+    """A client that reads late gets the newest tracks, and all events in order."""
     small = ((SOL_SOCKET, SO_RCVBUF, 4096),)
     with socket(address, f"stream={STREAM}&topics=events,tracks&confirmed=0&events=now", sockopt=small) as connection:
         for seq in range(30):
-            session.publish(tracks(seq, count=2000), events(seq, 100))
-        assert closed(connection) == 1013
-        with pytest.raises((WebSocketConnectionClosedException, OSError)):
-            received(connection)
+            session.publish(tracks(seq, count=2000), events(seq, 30))
+        found: list[int] = []
+        while len(found) < 900:
+            found += [one["n"] for one in [json.loads(received(connection))] if one["type"] == "event"]
+        assert found == [1000 * seq + at for seq in range(30) for at in range(30)]
+
+
+@pytest.mark.parametrize("path", [f"api/v1/stream?stream={STREAM}", f"live?stream={STREAM}"])
+def test_other_methods_than_get_hold_no_place(session: Session, address: str, path: str) -> None:
+    """HEAD is answered with the headers of the stream, which proxies pass on at once; OPTIONS is not allowed."""
+    for _ in range(10):
+        with asked(address, f"/{path}", "HEAD") as response:
+            assert (response.status, response.read()) == (OK, b"")
+            assert response.getheader("x-accel-buffering") == "no"
+            assert "no-transform" in (response.getheader("cache-control") or "")
+        with asked(address, f"/{path}", "OPTIONS") as response:
+            assert response.status == http.client.METHOD_NOT_ALLOWED
+    assert session.subscriptions == []
+
+
+@pytest.mark.parametrize("way", ["stream", "socket"])
+def test_a_reader_that_takes_nothing_loses_its_place(
+    session: Session, address: str, monkeypatch: pytest.MonkeyPatch, way: str
+) -> None:
+    """After `SEND_S` its connection is aborted, so that another one may read."""
+    monkeypatch.setattr(server, "SEND_S", 0.2)
+    query = f"stream={STREAM}&confirmed=0"
+    head = (
+        ""
+        if way == "stream"
+        else "upgrade: websocket\r\nsec-websocket-version: 13\r\nsec-websocket-key: MTIzNDU2Nzg5MDEyMzQ1Ng==\r\n"
+    )
+    path = f"/api/v1/{'stream' if way == 'stream' else 'ws'}?{query}"
+    host, _, port = address.rpartition(":")
+
+    def welcomed() -> bool:
+        session.publish(tracks(next(numbers), count=5000))
+        with asked(address, f"/api/v1/stream?{query}") as response:
+            return response.status == OK
+
+    numbers = itertools.count()
+    with contextlib.ExitStack() as stack:
+        for _ in range(4):
+            frozen = stack.enter_context(create_socket((host, int(port))))
+            connection = "close" if way == "stream" else "upgrade"
+            frozen.sendall(f"GET {path} HTTP/1.1\r\nhost: a\r\nconnection: {connection}\r\n{head}\r\n".encode())
+            assert b" 200 " in (line := frozen.recv(4096)) or b" 101 " in line
+        assert not welcomed()
+        until(welcomed, "a frozen reader has gone")
+
+
+def test_too_many_patterns_are_refused_with_the_reason(session: Session, watched: Watched) -> None:
+    """503 before anything of the stream is sent; those who read what is subscribed to go on."""
+    with served(watched, http_clients=4) as address:
+        for number in range(BURST):
+            with asked(address, f"/api/v1/stream?stream=garage/rig/s{number}") as response:
+                assert response.status == OK
+        with asked(address, "/api/v1/stream?stream=garage/rig/further") as response:
+            assert response.status == http.client.SERVICE_UNAVAILABLE
+            assert "too many new streams" in json.loads(response.read())["error"]
+        with asked(address, f"/api/v1/stream?stream=garage/rig/s{BURST - 1}") as response:
+            assert response.status == OK
+
+
+def test_numbers_that_javascript_would_round_are_texts() -> None:
+    """Sequence numbers from 2^53 on."""
+    for seq, found in ((2**53 - 1, 2**53 - 1), (2**53, str(2**53))):
+        assert json.loads(tracks_json(tracks(1).model_copy(update={"seq": seq})))["seq"] == found
