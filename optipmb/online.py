@@ -415,7 +415,18 @@ def _columns(boxes: Any, arrays: Mapping[str, ArrayLike]) -> dict[str, Any]:
         columns["center"][:, 2] = np.nan
     if missing := [name for name in BOXES if name not in columns]:
         raise FrameError(missing[0], f"a column for each of {', '.join(BOXES)}", f"the columns {', '.join(given)}")
-    return {name: values if isinstance(values, list) else np.asarray(values) for name, values in columns.items()}
+    columns = {name: _nested(values) for name, values in columns.items()}
+    if isinstance(columns["label"], list):
+        columns["label"] = [getattr(one, "value", one) for one in columns["label"]]  # of an enumeration
+    return columns
+
+
+def _nested(values: Any) -> Any:
+    """Return a column of objects, as data frames hold lists and members of an enumeration, as a list."""
+    if isinstance(values, list):
+        return values
+    array = np.asarray(values)
+    return [_nested(one) if isinstance(one, np.ndarray) else one for one in array] if array.dtype == object else array
 
 
 def _named(boxes: Any) -> dict[str, Any]:

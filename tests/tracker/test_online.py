@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from datetime import UTC, datetime
+from enum import Enum
 from importlib.metadata import version
 from types import SimpleNamespace
 from typing import Any
@@ -17,6 +18,10 @@ import optipmb
 
 OTHER = {"l": "length", "w": "width", "h": "height", "yaw": "heading", "score": "confidence", "class": "category"}
 BOX = {"center": [[0.0, 0.0, 0.8]], "size": [[4.5, 1.9, 1.6]], "yaw": [0.0], "score": [0.9]}
+
+
+class Kind(str, Enum):  # noqa: UP042  as code for Python 3.10 has it
+    CAR = "car"
 
 
 def flat(k: int, name: Any = "car") -> dict[str, list[Any]]:
@@ -63,6 +68,9 @@ def test_names_places_lists_arrays_and_tables_are_one() -> None:
         ],
         [{OTHER.get(name, name): values for name, values in one.items()} for one in frames],
         [{**BOX, "center": [[float(k), 0.0, 0.8]], "label": ["vehicle.car"]} for k in range(4)],
+        [pa.table({**BOX, "center": [[float(k), 0.0, 0.8]], "label": ["car"]}) for k in range(4)],
+        [flat(k, Kind.CAR) for k in range(4)],
+        [{name: np.array(values, np.object_) for name, values in flat(k, Kind.CAR).items()} for k in range(4)],
     ):
         other = run(others)[-1]
         assert other.center.tobytes() == first.center.tobytes()

@@ -54,7 +54,7 @@ def open_dataset(
             only truth, poses and clouds are read.
         options: Of the data set. kitti: `clouds`, `poses`, `split`, `submission`; nuscenes: `clouds`, `z_bottom`,
             `submission`; scene: the fields of `SceneOptions`; mcap: none; rosbag: `points`, `odometry`, `fixed_frame`,
-            `keep_input` and `class.NAME`; table: `optipmb_tools.datasets.table.OPTIONS`. For table and mcap
+            `keep_input`, `invalid` and `class.NAME`; table: `optipmb_tools.datasets.table.OPTIONS`. For table and mcap
             also `fuse`: the sensors of a recording share a density. For all `origin`: as of `Georeference.parse`.
 
     Raises:

@@ -3,7 +3,7 @@
 A frame is a message of detections, at the stamp of its header. Its cloud is the one with the same stamp. Its pose is
 the pose of its frame in the fixed frame, from tf and, for frames that have no parent there, from odometry. Tracks are
 in the fixed frame. There is no truth. What a bag leaves open is chosen by options: `points`, `odometry`, `fixed_frame`,
-and `class.NAME=OTHER` for names of classes.
+`class.NAME=OTHER` for names of classes, and `invalid=skip` to leave out objects with values that are not allowed.
 
 Tracks can be written as a bag: one MCAP file with objects, detections with ids, and markers, as all of ROS 2 reads
 them. Their topics begin with the topic of the detections: `…/tracks` and, below it, `detections`, `markers`,
@@ -127,10 +127,10 @@ class Bag:
             raise DatasetError(f"{self.path} {raw.topic}", "a header", f"{len(raw.data)} bytes without one") from error
         return Stamped(second * 10**9 + rest, frame.removeprefix("/"))
 
-    def wrong(self, raw: Raw, error: MessageError) -> DatasetError:
+    def wrong(self, raw: Raw, error: MessageError, remedy: str = "") -> DatasetError:
         """Return an error that says which message of the bag is wrong."""
         place = f"{self.path} {raw.topic}, received at {raw.received_ns} ns"
-        return DatasetError(f"{place}: {error.path}" if error.path else place, error.expected, error.received)
+        return DatasetError(f"{place}: {error.path}" if error.path else place, error.expected + remedy, error.received)
 
     def _reader(self) -> Reader:
         what = "a bag of ROS 2 (a folder with metadata.yaml, or an .mcap or .db3 file)"
@@ -366,24 +366,37 @@ _CLASS = "class."
 class RosbagSequence(DataSequence):
     """One topic of detections."""
 
-    def __init__(self, bag: Bag, plan_: Plan, classes: Mapping[str, str], *, covariance: bool) -> None:
+    def __init__(self, bag: Bag, plan_: Plan, classes: Mapping[str, str], *, covariance: bool, skip: bool) -> None:
         self.name = plan_.topic.strip("/").replace("/", ".")
         self.plan = plan_
         self.bag = bag
         self.has_clouds: bool = bool(plan_.clouds)
-        self.notes = plan_.notes
         self.poses: list[Pose] = [frame.pose for frame in plan_.frames]
         self._classes = classes
         self._covariance = covariance
+        self._skip = skip
 
     def __len__(self) -> int:
         return len(self.plan.frames)
 
     @cached_property
+    def _content(self) -> tuple[tuple[str, ...], list[MessageError]]:
+        """Class names of all frames, and errors of the objects that are left out."""
+        left_out: list[MessageError] = []
+        names = (name for raw in self.bag.messages((self.plan.topic,)) for name in self._boxes(raw, left_out).labels)
+        return tuple(dict.fromkeys(names)), left_out
+
+    @cached_property
+    def notes(self) -> list[str]:  # type: ignore[override]  # with --option invalid=skip all messages are read for it
+        """Messages and objects that are left out."""
+        if not self._skip or not (errors := self._content[1]):
+            return self.plan.notes
+        return [*self.plan.notes, f"{len(errors)} objects on {self.plan.topic} are left out, the first: {errors[0]}"]
+
+    @property
     def labels(self) -> tuple[str, ...]:
         """Class names of all frames."""
-        messages = self.bag.messages((self.plan.topic,))
-        return tuple(dict.fromkeys(name for raw in messages for name in self._boxes(raw).labels))
+        return self._content[0]
 
     def frames(self) -> Iterator[DetectionFrame]:
         """Yield every frame in the order of the stamps. Messages between a frame and its cloud are kept."""
@@ -397,7 +410,7 @@ class RosbagSequence(DataSequence):
             stamp_ns = self.bag.header(raw).stamp_ns
             if raw.topic == self.plan.topic:
                 if (stamp_ns, raw.received_ns) in known:
-                    boxes[stamp_ns, raw.received_ns] = self._boxes(raw)
+                    boxes[stamp_ns, raw.received_ns] = self._boxes(raw, [])
             elif stamp_ns in self.plan.clouds:
                 clouds[stamp_ns] = raw
             while index < len(due) and due[index] in boxes and self._complete(due[index][0], clouds):
@@ -422,11 +435,13 @@ class RosbagSequence(DataSequence):
             cloud=None if cloud is None or pose is None else Cloud(partial(self._points, cloud), *pose),
         )
 
-    def _boxes(self, raw: Raw) -> Boxes:
+    def _boxes(self, raw: Raw, left_out: list[MessageError]) -> Boxes:
         try:
-            return boxes_of(self.bag.read(raw), self._classes, covariance=self._covariance)
+            message = self.bag.read(raw)
+            errors = left_out if self._skip else None
+            return boxes_of(message, self._classes, covariance=self._covariance, left_out=errors)
         except MessageError as error:
-            raise self.bag.wrong(raw, error) from error
+            raise self.bag.wrong(raw, error, " (--option invalid=skip leaves such objects out)") from error
 
     def _points(self, raw: Raw) -> Points:
         try:
@@ -440,8 +455,8 @@ class RosbagDataset(Dataset):
 
     Args:
         path: The folder or file.
-        options: `points`, `odometry`, `fixed_frame`, `class.NAME`, `keep_input`, and `covariance`: whether the
-            covariances of positions in the detections are taken for their accuracy.
+        options: `points`, `odometry`, `fixed_frame`, `class.NAME`, `keep_input`, `invalid`, and `covariance`: whether
+            the covariances of positions in the detections are taken for their accuracy.
 
     Raises:
         DatasetError: It cannot be read, has no detections, or an option is not known.
@@ -455,10 +470,14 @@ class RosbagDataset(Dataset):
         self._classes = {name.removeprefix(_CLASS): texts.pop(name) for name in list(texts) if name.startswith(_CLASS)}
         self._keep_input = texts.pop("keep_input", "0") not in {"0", "False"}
         self._covariance = texts.pop("covariance", "0") not in {"0", "False"}
+        invalid = texts.pop("invalid", "refuse")
+        if invalid not in {"skip", "refuse"}:
+            raise DatasetError("--option invalid", "skip or refuse", repr(invalid))
+        self._skip = invalid == "skip"
         known = set(Choice.__dataclass_fields__)
         for name in texts:
             if name not in known:
-                allowed = f"one of {', '.join(sorted(known))}, keep_input, covariance, class.NAME"
+                allowed = f"one of {', '.join(sorted(known))}, keep_input, covariance, invalid, class.NAME"
                 raise DatasetError(f"option {name}", allowed, "an unknown option")
         self._bag = Bag(path)
         self._sequences: dict[str, RosbagSequence] = {}
@@ -478,7 +497,9 @@ class RosbagDataset(Dataset):
             transforms = read_transforms(self._bag, self._choice)
             for name in new:
                 made = plan(self._bag, self._topics[name], transforms, self._choice)
-                self._sequences[name] = RosbagSequence(self._bag, made, self._classes, covariance=self._covariance)
+                self._sequences[name] = RosbagSequence(
+                    self._bag, made, self._classes, covariance=self._covariance, skip=self._skip
+                )
         return [self._sequences[name] for name in wanted]
 
     def write(self, out: Path, sequence: DataSequence, tracks: Mapping[int, Tracks]) -> Path:

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from optipmb_schemas.errors import invalid
+from optipmb_schemas.errors import MessageError, invalid
 from optipmb_schemas.ros2.tracks import CLASS_NAMES, DETECTION_ARRAY
 from optipmb_schemas.ros2.types import AUTOWARE
 
@@ -70,7 +70,13 @@ def frame_of(header: Any) -> str:
     return str(header.frame_id).removeprefix("/")
 
 
-def boxes_of(message: Any, classes: Mapping[str, str] | None = None, *, covariance: bool = False) -> Boxes:
+def boxes_of(
+    message: Any,
+    classes: Mapping[str, str] | None = None,
+    *,
+    covariance: bool = False,
+    left_out: list[MessageError] | None = None,
+) -> Boxes:
     """Return the objects of a message of one of the types `DETECTIONS`.
 
     Of several classes of an object the likeliest counts. The score is `hypothesis.score`, or, in Autoware's messages,
@@ -81,13 +87,20 @@ def boxes_of(message: Any, classes: Mapping[str, str] | None = None, *, covarian
         classes: names of classes by those in the message; others stay as they are.
         covariance: whether the covariances of positions are read. One of zeros is unknown, and so is one that a message
             of Autoware says it does not have.
+        left_out: gets the errors of objects that cannot be used, which are left out; None: the first one is raised.
 
     Raises:
         MessageError: a value is not allowed; the path names it.
     """
-    rows = [_of_vision(i, one) for i, one in enumerate(message.detections)] if hasattr(message, "detections") else None
-    if rows is None:
-        rows = [_of_autoware(i, one) for i, one in enumerate(message.objects)]
+    vision = hasattr(message, "detections")
+    rows: list[_Row] = []
+    for i, one in enumerate(message.detections if vision else message.objects):
+        try:
+            rows.append(_of_vision(i, one) if vision else _of_autoware(i, one))
+        except MessageError as error:
+            if left_out is None:
+                raise
+            left_out.append(error)
     names = [(classes or {}).get(row.label, row.label) for row in rows]
     labels = tuple(dict.fromkeys(names))
     velocity = np.array([row.velocity for row in rows], dtype=np.float64).reshape(-1, 2)
