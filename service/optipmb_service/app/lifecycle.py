@@ -418,7 +418,7 @@ async def run(
 
 
 async def run_client(settings: Settings, serve: Callable[[StopRequest, ProcessHealth, Client], Awaitable[None]]) -> int:
-    """Do the same with a connection to a router, which is closed at the end."""
+    """Run a process as `run` does, with a connection to a router that is closed at the end."""
 
     async def connected(asked: StopRequest, health: ProcessHealth) -> bool | None:
         log.info("connecting", endpoints=settings.connect)

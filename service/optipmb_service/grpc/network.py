@@ -189,7 +189,7 @@ class Network:
         return await asyncio.to_thread(self._cached, key, self._tracks)
 
     async def recent_events(self, key: str) -> list[schemas.Events]:
-        """Do the same for events."""
+        """Return the recent events of a key; raises as `recent`."""
         return await asyncio.to_thread(self._cached, key, partial(self._decoded, schemas.Events))
 
     def _cached(self, key: str, read: Callable[[Answer], T | None]) -> list[T]:

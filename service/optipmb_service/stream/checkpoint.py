@@ -147,7 +147,7 @@ def state_bytes(checkpoint: Checkpoint) -> bytes:
 
 
 def digest_of(checkpoint: Checkpoint) -> str:
-    """Return 32 hexadecimal digits over all that later tracks depend on, which counts of messages are no part of."""
+    """Return 32 hexadecimal digits, the digest of the state that later tracks depend on: no counts of messages."""
     return hashlib.blake2b(state_bytes(checkpoint), digest_size=DIGEST).hexdigest()
 
 

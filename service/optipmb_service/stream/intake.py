@@ -171,7 +171,7 @@ class Intake:
         self._wake.set()
 
     def handed_over(self, timeout: float) -> bool:
-        """Wait until who has the partitions that were left has asked, at most so long (s); False when that was it."""
+        """Wait until the next members have asked for the partitions left here; False after `timeout` seconds."""
         with self._given:
             return self._given.wait_for(lambda: not self._owed, timeout)
 

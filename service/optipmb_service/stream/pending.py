@@ -132,7 +132,7 @@ class SensorQueue:
     def timeline(self) -> Timeline:
         """The timeline of the past with the frames held."""
         if self._behind:
-            # Frames of other sensors were processed, of which the timeline with those held knows nothing.
+            # Other sensors' frames were processed since: judge the held ones again, on the new timeline.
             self._behind = False
             for one in self.held:
                 self._timeline = self._timeline.judge(one.frame_id)[1]

@@ -591,7 +591,7 @@ class Stream:
         return session
 
     def _configured(self, session: Session) -> str | None:
-        """Return the profile of the settings where the session tracks with another one, or with other values."""
+        """Return the name of the configured profile if the session tracks with other parameters, else None."""
         wanted, in_force = self._streams.profiles.of(self.name), session.parameters
         same = in_force is wanted or in_force.model_copy(update={"horizons": wanted.horizons}) == wanted
         return None if same else wanted.name

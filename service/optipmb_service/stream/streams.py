@@ -447,7 +447,7 @@ class Streams:
             stream.durable = checkpoint.base.reached
 
     def keep_now(self) -> None:
-        """Do the same in the calling thread, when the tracking thread has ended."""
+        """Give all changed states to the checkpoint writer, after the tracking thread has ended."""
         for stream in self.tracking():
             stream.keep()
 

@@ -280,11 +280,11 @@ class Timeline:
         return number_of(self.seen.get(frame_id.sensor, ()), frame_id.epoch) >= 0
 
     def note(self, frame_id: FrameId) -> Timeline:
-        """Remember that a frame came which is not to be processed, so that it is not looked at again."""
+        """Return it with a frame that is refused: its repetition is a duplicate."""
         return replace(self, seen=self._remember(frame_id))
 
     def settle(self, base: FilterState, gone: Sequence[FrameId]) -> Timeline:
-        """Return it with a later beginning of the window: `gone` are the frames that fell out of it."""
+        """Return it with the window after `base`, without the frames `gone`."""
         left = self.frame_ids[len(gone) :]
         if self.frame_ids[: len(gone)] != gone:  # rarely: mostly the oldest go
             other = frozenset(gone)

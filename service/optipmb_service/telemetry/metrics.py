@@ -55,7 +55,7 @@ class MetricFamily:
     Attributes:
         kind: as Prometheus has it.
         meaning: its help text.
-        read: returns its value, or the values by labels; None: there is none. Takes what the table is read from.
+        read: takes the source of the table; returns the value, or the values by labels, or None.
         labels: their names.
     """
 
