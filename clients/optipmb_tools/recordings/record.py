@@ -6,6 +6,7 @@ restarts: they explain the tracks. Parameters of a session that ended before the
 """
 
 import concurrent.futures
+import math
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -26,6 +27,7 @@ SMALL_QUEUE = 16_384
 CLOUD_QUEUE = 64  # a cloud has a few megabytes
 FLUSH_S = 1.0
 PARAMETERS_S = 2.0
+ANSWERS_S = 4.0  # how long the end waits for answers: each of a thousand sessions may have a question open
 
 
 @dataclass(frozen=True)
@@ -98,8 +100,9 @@ def record(
             for inbox in inboxes.values():
                 inbox.close()
             for thread in threads:
-                thread.join()
-            task.questions.shutdown()  # waits for answers
+                thread.join()  # it ends when the messages that wait are in the file
+            task.answers_end = time.monotonic() + ANSWERS_S
+            task.questions.shutdown()
         if task.failure is not None:
             raise task.failure
         count()
@@ -118,6 +121,7 @@ class _Task:
         self._offset_ns = time.time_ns() - time.monotonic_ns()
         self._sessions: dict[str, str] = {}
         self._lock = threading.Lock()
+        self.answers_end = math.inf  # monotonic
         self.questions = concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="parameters")
         self.streams: dict[str, dict[str, int]] = {}
         self.failure: OSError | None = None
@@ -140,10 +144,11 @@ class _Task:
 
     def _ask(self, stream: str, session: str) -> None:
         prefix = self._keys.prefix
+        patience_s = min(PARAMETERS_S, self.answers_end - time.monotonic())
+        if patience_s <= 0.0:
+            return
         try:
-            answer = set_parameters(
-                self._connection, stream, SessionParameters(), prefix=prefix, patience_s=PARAMETERS_S
-            )
+            answer = set_parameters(self._connection, stream, SessionParameters(), prefix=prefix, patience_s=patience_s)
         except ClientError:
             return  # the service has gone; its messages are recorded all the same
         if answer.session == session:  # others are of no session, or of a later one

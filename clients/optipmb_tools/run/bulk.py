@@ -254,6 +254,7 @@ def run(
         while waiting and len(running) < executor.width:
             place, number = waiting.popleft()
             running[executor.submit(tasks[place])] = place, number
+        # A task ends with its recording, or its process; nothing else could say that it takes too long.
         for future in concurrent.futures.wait(running, return_when=concurrent.futures.FIRST_COMPLETED).done:
             place, number = running.pop(future)
             try:

@@ -82,7 +82,7 @@ class RayCluster(Executor):
         return future
 
     def take(self, future: Future[Any]) -> Any:
-        """Unpack the value."""
+        """Unpack the value, which is there; a task whose cluster is gone has an error of Ray's."""
         try:
             return pickle.loads(future.result())  # noqa: S301  our own task wrote it
         except RayTaskError as error:  # before or after the task: this package is not there, or is another

@@ -41,7 +41,7 @@ KEPT_PROBLEMS = 20
 
 @dataclass(frozen=True)
 class Pace:
-    """How fast frames are sent."""
+    """How fast frames are sent, and how long a replay waits; at a `speed` it takes the time between the stamps."""
 
     speed: float | None = None  # multiple of the recorded rate; None: as fast as tracks come back
     window: int = 8  # frames in flight at most when `speed` is None

@@ -129,7 +129,7 @@ class ServiceProcess:
         finally:  # also when a second interrupt comes while waiting
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.killpg(process.pid, signal.SIGKILL)
-            status = process.wait()
+            status = process.wait()  # it has ended or is killed
         return status
 
     def _check_running(self) -> None:
