@@ -12,7 +12,7 @@ KITTI = --dataset kitti --root $(DATA)/kitti --detections pointrcnn
 NUSCENES = --dataset nuscenes --root $(DATA)/nuscenes --detections centerpoint
 
 FUZZ_TARGETS := fuzz-messages fuzz-checkpoints fuzz-protobuf
-.PHONY: help kernels dist docs release demo test accuracy alone bounds ray bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests check lowest paths pythons repeat schemas wheel clean tune ablate
+.PHONY: help kernels dist docs release demo test accuracy alone bounds ray bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests check mutants lowest paths pythons repeat schemas wheel clean tune ablate
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
 	@echo "make install a virtual environment with everything, and compiled kernels"
@@ -20,6 +20,7 @@ help:
 	@echo "make wheel   build the wheel, install it alone into an empty environment, and use it there"
 	@echo "make check   lint, types, and the tests nearest to what changed since SINCE=main, in less than a minute"
 	@echo "make accuracy  hold the figures of accuracy on KITTI and nuScenes, where their data are"
+	@echo "make mutants  make N=25 small faults by SEED=1 in a copy, and print which ones the nearest tests miss"
 	@echo "make alone   run the tests that measure memory, latency and outages, one after the other"
 	@echo "make bounds  call the tracker with every kernel compiled with bounds checks, which takes a minute"
 	@echo "make ray     track on Ray clusters, with workers and a node killed, which takes a minute"
@@ -116,6 +117,11 @@ check: $(VENV)/.installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python tests/nearest.py $(SINCE)
+
+# Small faults at random places, in a copy of the tree: which ones do the nearest tests miss?
+SEED ?= 1
+mutants: kernels
+	$(BIN)/python tests/mutants.py $(SEED) $(if $(filter command line,$(origin N)),$(N),25)
 
 # Both wheels, once for all that install them.
 dist: $(VENV)/.installed

@@ -16,6 +16,11 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = (".", "schemas", "service", "clients", "tests/support", "benchmarks", "docker")
 """Folders that imports are looked up in."""
+WHOLE = {
+    "optipmb": "tests/tracker/test_oracle.py",
+    "service/optipmb_service/stream": "tests/service/stream/test_recorded.py",
+}
+"""Tests that compare whole runs with what was computed otherwise or recorded: they are near to all of a folder."""
 SLOW = ("e2e", "docker")
 """Tests of whole systems run only when they changed themselves."""
 MANY = 8
@@ -23,11 +28,8 @@ MANY = 8
 
 
 def main(since: str) -> int:
-    tests = sorted(ROOT.glob("tests/*/**/test_*.py"))
-    changed = _changed(since)
-    imports = {path: _imports(path) for path in _modules() | set(tests)}
-    near = _nearest(changed, imports, {path for path in tests if path.relative_to(ROOT / "tests").parts[0] not in SLOW})
-    chosen = sorted(near | (changed & set(tests)))
+    tests, changed = _tests(), _changed(since)
+    chosen = sorted(nearest(changed) | (changed & tests))
     if not chosen:
         print("no test is near to what changed")
         return 0
@@ -35,6 +37,19 @@ def main(since: str) -> int:
     options = ["-q", "-n", "2", "--dist", "worksteal", "-m", "not bounds and not ray"]
     command = [sys.executable, "-m", "pytest", *options, *map(str, chosen)]
     return subprocess.run(command, cwd=ROOT, check=False).returncode
+
+
+def nearest(changed: set[Path]) -> set[Path]:
+    """Return the files of tests nearest to modules, but for those of whole systems."""
+    tests = _tests()
+    imports = {path: _imports(path) for path in _modules() | tests}
+    quick = {path for path in tests if path.relative_to(ROOT / "tests").parts[0] not in SLOW}
+    whole = {ROOT / test for folder, test in WHOLE.items() if any((ROOT / folder) in path.parents for path in changed)}
+    return _nearest(changed, imports, quick) | whole
+
+
+def _tests() -> set[Path]:
+    return set(ROOT.glob("tests/*/**/test_*.py"))
 
 
 def _changed(since: str) -> set[Path]:

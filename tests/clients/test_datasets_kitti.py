@@ -1,5 +1,6 @@
 """The reader of the KITTI tracking benchmark, on small written roots and on the real data."""
 
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -7,6 +8,8 @@ import numpy as np
 import pytest
 from boxes import points_in_box
 from commands import run_here
+from hypothesis import given
+from hypothesis import strategies as st
 from optipmb_tools.camera import sensor_from_kitti
 from optipmb_tools.datasets import DatasetError, open_dataset
 from optipmb_tools.datasets.kitti import (
@@ -20,6 +23,7 @@ from optipmb_tools.datasets.kitti import (
 )
 from optipmb_tools.geometry import rotation_of, stack_poses
 from real_data import kitti_root
+from scipy.spatial.transform import Rotation
 
 ROW = "0,2,10,20,30,40,{score},1.5,1.6,4.0,1.0,1.7,20.0,-1.5,-1.6"
 POSE = "1 0 0 0 0 1 0 0 0 0 1 {z}"
@@ -243,8 +247,8 @@ def test_both_spellings_of_calibration_files_are_read(tmp_path: Path) -> None:
         read_calibration(tmp_path / "c.txt")
 
 
-def oxts_packet(latitude: float, longitude: float, altitude: float, yaw: float) -> str:
-    fields = [latitude, longitude, altitude, 0.0, 0.0, yaw, *[0.0] * 24]
+def oxts_packet(latitude: float, longitude: float, altitude: float, yaw: float, *tilt: float) -> str:
+    fields = [latitude, longitude, altitude, *(tilt or (0.0, 0.0)), yaw, *[0.0] * 24]
     return " ".join(f"{value:.12f}" for value in fields)
 
 
@@ -273,6 +277,23 @@ def test_oxts_packets_give_the_way_driven(tmp_path: Path) -> None:
     swung = np.array([-imu[1], imu[0]]) - imu[:2]
     np.testing.assert_allclose(poses[2][:3, 3], [-swung[1], 0.0, 10.0 + swung[0]], atol=1e-6)
     np.testing.assert_allclose(poses[2][:3, 2], [-1.0, 0.0, 0.0], atol=1e-9)  # it looks to the left now
+
+
+@given(st.tuples(*[st.floats(-1.5, 1.5)] * 3))
+def test_roll_and_pitch_of_oxts_turn_about_the_axes_of_the_vehicle(angles: tuple[float, float, float]) -> None:
+    """A pose is turned by yaw about z, then by pitch about the new y, then by roll about the new x."""
+    yaw, pitch, roll = angles
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "calib.txt").write_text(CALIBRATION)
+        packets = [oxts_packet(49.0, 8.0, 100.0, 0.0), oxts_packet(49.0, 8.0, 100.0, yaw, roll, pitch)]
+        (folder / "oxts.txt").write_text("\n".join(packets) + "\n")
+        calibration = read_calibration(folder / "calib.txt")
+        turned = read_oxts(folder / "oxts.txt", calibration)[1][:3, :3]
+    assert calibration.velodyne_from_imu is not None
+    camera_from_imu = (calibration.rectified_from_velodyne @ calibration.velodyne_from_imu)[:3, :3]
+    expected = camera_from_imu @ Rotation.from_euler("ZYX", angles).as_matrix() @ np.linalg.inv(camera_from_imu)
+    np.testing.assert_allclose(turned, expected, atol=1e-9)
 
 
 def test_a_sequence_with_oxts_needs_no_pose_file(tmp_path: Path) -> None:

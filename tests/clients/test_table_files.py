@@ -84,13 +84,13 @@ def test_dates_are_stamps_in_every_format(
 
 
 def test_the_day_is_found_where_a_number_exceeds_twelve(tmp_path: Path) -> None:
-    """13/01/2025 has the day first and 01/13/2025 the month; 03/01/2025 is refused with the option."""
+    """13/01/2025 has the day first and 01/13/2025 the month; 12/01/2025 and 01/12/2025 are refused with the option."""
     found = []
     for text in ("13/01/2025 10:00:00", "01/13/2025 10:00:00"):
         (tmp_path / "d.csv").write_text(f"t,x\n03/01/2025 10:00:00,1\n{text},2\n")
         found.append(read_table(tmp_path / "d.csv")["t"].astype("datetime64[D]").astype(str).tolist())
     assert found == [["2025-01-03", "2025-01-13"], ["2025-03-01", "2025-01-13"]]
-    (tmp_path / "d.csv").write_text("t,x\n03/01/2025 10:00:00,1\n")
+    (tmp_path / "d.csv").write_text("t,x\n12/01/2025 10:00:00,1\n01/12/2025 10:00:00,1\n")
     with pytest.raises(DatasetError, match="--option date=dmy"):
         read_table(tmp_path / "d.csv")
 

@@ -131,6 +131,24 @@ def test_what_waits_for_a_takeover_is_bounded(arrivals: list[tuple[int, bool, fl
     assert budget.used == 0
 
 
+@pytest.mark.parametrize("recovered", [False, True])
+@pytest.mark.parametrize("room", [3, 6])
+def test_clouds_of_a_takeover_go_first(room: int, *, recovered: bool) -> None:
+    """When there is no room a session gives up its clouds, then its oldest frames, wherever they came from."""
+    backlog = live(held=ByteBudget(room * PACKET_BYTES))
+    backlog.open()
+    packets = [packet(number, size=0, frame=frame) for number in range(5) for frame in (True, False)]
+    if recovered:
+        backlog.recover(packets)
+    else:
+        for one in packets:
+            backlog.push(one)
+    backlog.go_live()
+    left = taken(backlog)
+    assert numbers([one for one in left if one.frame]) == list(range(max(0, 5 - room), 5))
+    assert len(left) == room
+
+
 def test_what_was_missed_goes_before_what_waits() -> None:
     """Packets from the log or a cache, then packets received while the session was opened, then newer ones."""
     backlog = live()
