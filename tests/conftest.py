@@ -26,8 +26,8 @@ OTHERS = {
 }
 """Files whose tests `make test` leaves to `make alone` and `make accuracy`, by their marker."""
 
-# The same examples in every run, and fifty, unless a test says otherwise; `--hypothesis-profile default` looks at more.
-hypothesis.settings.register_profile("same", derandomize=True, deadline=None, database=None, max_examples=50)
+# The same thirty examples in every run, unless a test says otherwise; `--hypothesis-profile default` looks at more.
+hypothesis.settings.register_profile("same", derandomize=True, deadline=None, database=None, max_examples=30)
 hypothesis.settings.load_profile("same")
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from optipmb_tools.evaluation.cases import Rules, prepare
 from optipmb_tools.evaluation.gospa import GospaResult, evaluate_gospa
 
-PATIENT = settings(deadline=None, max_examples=60)  # other work on the machine may make any example slow
+PATIENT = settings(deadline=None, max_examples=30)  # other work on the machine may make any example slow
 
 
 def gospa_of(

@@ -15,7 +15,7 @@ from optipmb_tools.evaluation.cases import Case, Rules, counted, hota_2d_rules, 
 from optipmb_tools.evaluation.evaluate import evaluate_figures, load_recordings
 from optipmb_tools.evaluation.hota import NOTHING, HotaResult, evaluate_hota
 
-PATIENT = settings(deadline=None, max_examples=60)  # other work on the machine may make any example slow
+PATIENT = settings(deadline=None, max_examples=30)  # other work on the machine may make any example slow
 NEAR = Rules("distance", 2.0)
 
 

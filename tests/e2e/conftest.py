@@ -3,13 +3,11 @@
 from collections.abc import Iterator
 
 import pytest
-from optipmb_tools.run.service_process import ServiceProcess
-
-START_S = 240.0  # the first start on a machine compiles
+from service_process import ServiceProcess
 
 
 @pytest.fixture(scope="module")
 def service() -> Iterator[ServiceProcess]:
-    with ServiceProcess() as process:
-        process.wait_until_ready(START_S)
+    with ServiceProcess("--instance", "garage") as process:
+        process.wait_ready()
         yield process

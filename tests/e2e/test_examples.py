@@ -11,8 +11,8 @@ from typing import IO
 import pytest
 from optipmb_client import Publisher
 from optipmb_client.zenoh import DEFAULT_ENDPOINT
-from optipmb_tools.run.service_process import ServiceProcess
 from real_data import REPOSITORY
+from service_process import ServiceProcess
 from without_numpy import command
 
 EXAMPLES = REPOSITORY / "examples"

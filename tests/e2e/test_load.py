@@ -4,7 +4,7 @@ import json
 
 import pytest
 from commands import optipmb, result_of, run_here
-from optipmb_tools.run.service_process import ServiceProcess
+from service_process import ServiceProcess
 
 STREAMS, RATE, SECONDS = 3, 20, 2
 

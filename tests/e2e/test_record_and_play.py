@@ -19,8 +19,8 @@ from optipmb_tools.cli import run
 from optipmb_tools.datasets import Dataset, DatasetError, open_dataset
 from optipmb_tools.recordings.files import RecordingFile
 from optipmb_tools.run.replay import Pace, Replaying, replay
-from optipmb_tools.run.service_process import ServiceProcess
 from real_data import REPOSITORY, kitti_root
+from service_process import ServiceProcess
 
 FRAMES = 15
 VALUES = {"frames": FRAMES, "vehicles": 8, "pedestrians": 2}
@@ -36,7 +36,7 @@ PATIENT = {"OPTIPMB_CLOUD_WAIT_S": "5"}
 def service() -> Iterator[ServiceProcess]:
     """A service with its own router, whose frames wait for their clouds."""
     with ServiceProcess(environment=PATIENT) as process:
-        process.wait_until_ready(DEADLINE_S)
+        process.wait_ready()
         yield process
 
 
@@ -120,7 +120,7 @@ def recorded_replay(service: ServiceProcess, folder: Path, dataset: "Dataset", *
 def play_into_another(path: Path, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Play a recording into a service that knows nothing, and record that; all tracks must be the same bytes."""
     with ServiceProcess(environment=PATIENT) as fresh:
-        fresh.wait_until_ready()
+        fresh.wait_ready()
         with recording(fresh, folder / "again.mcap") as process:
             result = result_of(
                 run_here(capsys, "play", path, "--as-recorded", "--connect", fresh.endpoint, "--json"),
@@ -212,7 +212,7 @@ def test_tracks_that_differ_are_reported(
 def test_a_stream_that_was_tracked_before_is_reported(incident: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Played twice under the recorded name, ids go on from the first time: status 1, and why, in one line."""
     with ServiceProcess(environment=PATIENT) as fresh:
-        fresh.wait_until_ready()
+        fresh.wait_ready()
         again = ("play", incident, "--as-recorded", "--connect", fresh.endpoint)
         done = run_here(capsys, *again)
         assert (done.returncode, done.stderr) == (0, "")

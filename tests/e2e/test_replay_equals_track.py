@@ -12,10 +12,10 @@ from optipmb_service.stream.session import Session
 from optipmb_service.stream.values import Tracked
 from optipmb_tools.datasets import open_dataset
 from optipmb_tools.recordings.files import RecordingWriter
-from optipmb_tools.run.service_process import ServiceProcess
 from optipmb_tools.run.tracking import track_whole
 from real_data import kitti_root
 from router import Sensor
+from service_process import ServiceProcess
 
 from optipmb import load_profile
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from commands import kill, result_of, run_here, start
 from optipmb_client import Subscriber
-from optipmb_tools.run.service_process import ServiceProcess
+from service_process import ServiceProcess
 
 
 def test_streams_at_work_are_shown(service: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -26,7 +26,7 @@ def test_streams_at_work_are_shown(service: ServiceProcess, tmp_path: Path, caps
         finally:
             kill(replay)
     (status,) = result["services"]
-    assert status["instance"] == service.instance
+    assert status["instance"] == "garage"
     (session,) = [session for session in status["sessions"] if session["stream"] == stream]
     assert session["profile"] == received.tracks.profile
     assert 0.0 < session["rate_hz"] < 40.0

@@ -118,7 +118,7 @@ def test_other_fields_of_a_block_are_ignored() -> None:
     assert decode(cloud(extended), Points).xyz.sum() == 6
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(name=st.text("abc", min_size=1, max_size=40), rows=st.integers(2000, 4000))
 def test_large_arrays_are_views_of_the_payload(name: str, rows: int) -> None:
     """An array in the form of `encode` is decoded without a copy, aligned and read-only, at any place in it."""

@@ -185,7 +185,7 @@ def test_fields_that_are_there_twice_or_unknown(examples: dict[str, Message], na
             assert not check(written(tree).replace(packed, changed), type(examples[name]))
 
 
-@settings(max_examples=200)
+@settings(max_examples=100)
 @given(data=st.data())
 def test_every_number(examples: dict[str, Message], data: st.DataObject) -> None:
     """Numbers at and beyond the ends of every range, in any place."""
@@ -215,7 +215,7 @@ def written_with(example: Message, data: st.DataObject) -> bytes:
     return written(tree)
 
 
-@settings(max_examples=200)
+@settings(max_examples=100)
 @given(data=st.data())
 def test_damaged_bytes(examples: dict[str, Message], data: st.DataObject) -> None:
     """Bytes flipped, cut and put in: a message that is read equals the one by the models."""

@@ -61,7 +61,7 @@ def test_random_bytes(payload: bytes, kind: type[Message]) -> None:
         attempt(payload, kind, encoding=encoding)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(data=st.data(), kind=kinds, in_json=st.booleans())
 def test_damaged_messages(
     examples: dict[str, Message], data: st.DataObject, kind: type[Message], *, in_json: bool
@@ -119,7 +119,7 @@ def put(value: Any, path: tuple[Any, ...], new: Any) -> Any:
     return copy
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(data=st.data(), kind=kinds, form=st.sampled_from(["blocks", "lists", "json"]))
 def test_values_of_other_types(
     examples: dict[str, Message], data: st.DataObject, kind: type[Message], form: str

@@ -45,6 +45,7 @@ def server() -> socket.socket:
 
     def end() -> None:
         asking.close()
+        process.kill()  # it may still load; what was forked belongs to others
         process.wait(60)
 
     atexit.register(end)

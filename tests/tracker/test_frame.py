@@ -211,7 +211,7 @@ def test_the_order_of_detections_does_not_matter_in_sensor_coordinates(seed: int
         assert density_bytes(one) == density_bytes(other)
 
 
-@settings(max_examples=50)
+@settings(max_examples=30)
 @given(yaw=st.lists(st.floats(-1e4, 1e4), min_size=2, max_size=2), sign=st.sampled_from([1.0, -1.0]))
 def test_the_identity_moves_nothing(yaw: list[float], sign: float) -> None:
     """A frame under the pose that is the identity is the frame without one, to the last bit."""

@@ -65,7 +65,7 @@ def test_iou_is_symmetric_and_moves_with_the_world(
 
 @pytest.mark.parametrize("group", [[0, 1, 2], [0, 1, 0]])
 @pytest.mark.parametrize("mixed", [False, True])
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_suppression_is_the_greedy_one_per_group(seed: int, *, mixed: bool, group: list[int]) -> None:
     """A box goes when a better KEPT one of its group overlaps it by more than the threshold of its class."""
     rng = np.random.default_rng(seed)
@@ -101,7 +101,7 @@ def naive_counts(cloud: optipmb.PointCloud, center: Array, size: Array, yaw: Arr
 
 
 @pytest.mark.parametrize("boxes", [1, 3, 200])
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_points_in_boxes_counts_every_point(seed: int, boxes: int) -> None:
     """Counts equal the naive ones for any pose of the sensor and any heap of boxes."""
     rng = np.random.default_rng(seed)
@@ -138,7 +138,7 @@ def test_points_that_are_not_finite_are_in_no_box() -> None:
     assert optipmb.points_in_boxes(cloud, np.zeros((1, 3)), np.ones((1, 3)), np.zeros(1))[0] == 1
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_points_at_the_faces_of_boxes_fall_into_their_cells(seed: int) -> None:
     """Each point has the cell that plain numpy computes, a cell of the box on whose face it lies, to the last bit."""
     rng = np.random.default_rng(seed)
@@ -163,7 +163,7 @@ def test_points_at_the_faces_of_boxes_fall_into_their_cells(seed: int) -> None:
     assert not occupied[NOWHERE]
 
 
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=30)
 @given(seed=st.integers(0, 10_000), spread=st.sampled_from([0.0, 1.0, 1e3, 1e5]))
 def test_points_in_boxes_holds_far_from_the_origin(seed: int, spread: float) -> None:
     """Boxes and sensor may stand at map coordinates; a box may be a speck among giants."""

@@ -520,7 +520,7 @@ def test_of_three_servers_one_may_be_lost(tmp_path: Path, monkeypatch: pytest.Mo
             store.close(5.0)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(count=st.integers(1, 5), seed=st.integers(0, 10**6))
 def test_no_partition_ever_has_two_owners(count: int, seed: int) -> None:
     """Fault 17: members are frozen, cut off, left without answers and ended, in any order, their clocks apart.

@@ -333,7 +333,7 @@ def test_more_may_be_added() -> None:
     assert checkpoint.head.counts.astray == 0
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.binary(max_size=400))
 def test_any_body_is_read_or_refused(body: bytes) -> None:
     """For any bytes under a good seal, nothing but `CheckpointError` is raised."""

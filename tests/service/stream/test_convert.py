@@ -77,7 +77,7 @@ def made(function: Any, *arguments: Any, **named: Any) -> Any:
     ]
 
 
-@settings(deadline=None, max_examples=300)  # the first call compiles
+@settings(deadline=None, max_examples=150)  # the first call compiles
 @given(message=messages(), sent=st.booleans())
 def test_a_checked_message_is_the_frame_that_make_frame_makes_of_it(*, message: schemas.Detections, sent: bool) -> None:
     """Whether it was constructed or decoded: every array the same to the last bit, and read-only, or the same error."""

@@ -19,7 +19,7 @@ import optipmb
 
 NUSCENES = optipmb.load_profile("nuscenes")
 POLICY = Policy(rewind_ns=3600 * SECOND, rewind_frames=10_000, late_clouds=True)
-SEEDS = int(os.environ.get("OPTIPMB_TEST_SEEDS", "6"))
+SEEDS = int(os.environ.get("OPTIPMB_TEST_SEEDS", "4"))
 
 
 class Disturbed(RuleBasedStateMachine):

@@ -39,7 +39,7 @@ def spoiled(checkpoint: Checkpoint, spoil: np.random.Generator, weight: float, s
     return replace(checkpoint, base=state, window=(), head=state)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     weight=st.sampled_from([1e-300, 1e-200, 1e-30, 0.5, 1.0]),
@@ -81,7 +81,7 @@ def told(found: optipmb.Tracks, paths: optipmb.PredictedPaths | None = None) -> 
     ).tracks
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(data=st.data(), count=st.integers(0, 3))
 def test_a_message_that_is_made_without_its_checks_would_pass_them(data: st.DataObject, count: int) -> None:
     """For any numbers in the tracks, near every bound of the message, it is valid or not made."""
