@@ -36,6 +36,11 @@ Columns: TypeAlias = dict[str, NDArray[Any]]
 
 SUFFIXES: Final = (".csv", ".tsv", ".parquet", ".jsonl", ".ndjson", ".feather", ".arrow")
 """Formats that are read and written."""
+NO_VALUE: Final = (
+    *("", "nan", "NaN", "NAN", "NA", "N/A", "n/a", "#N/A", "<NA>"),
+    *("null", "NULL", "Null", "None", "NONE", "nil", "\\N", "?", "-", "--"),
+)
+"""Texts that stand for no value."""
 _READ_ONLY: Final = (".json", ".txt")
 _TEXT: Final = (".csv", ".tsv", ".txt")
 _PICKLES: Final = (".pkl", ".pickle")
@@ -266,7 +271,7 @@ def _read_text(pa: Any, path: Path, kind: str, options: Mapping[str, str]) -> An
     data, separator = _normal_text(path, _text(path, options), kind)
 
     def parsed(decimal: str, *texts: str, threads: bool = True) -> Any:
-        null = ["", "nan", "NaN", "NA", "null", "None"]
+        null = list(NO_VALUE)
         types = dict.fromkeys(texts, pa.string())
         convert = csv.ConvertOptions(
             null_values=null, strings_can_be_null=True, decimal_point=decimal, column_types=types
@@ -486,13 +491,27 @@ def read_frames(folder: Path) -> list[_Record]:
         DatasetError: A file is wrong; says where.
     """
     files = frame_files(folder)
-    found = [re.findall(r"\d+", file.stem) for file in files]
-    number = [int(digits[-1]) for digits in found if digits]
-    if len(set(number)) < len(files):
-        number = list(range(len(files)))
+    number = frame_numbers(files)
     name = "timestamp" if min(number) >= _STAMPS else "frame"
     read = _kitti_frame if files[0].suffix == ".txt" else read_json
     return split_boxes([{name: n} | one for n, file in sorted(zip(number, files, strict=True)) for one in read(file)])
+
+
+def frame_numbers(files: Sequence[Path]) -> list[int]:
+    """Return the number of each file: the one that differs among their names, or the smallest of those in one order.
+
+    Raises:
+        DatasetError: Several numbers differ in orders of their own, none does, or other parts of the names do.
+    """
+    parts = [re.split(r"(\d+)", file.stem) for file in files]
+    columns = np.array([[int(one) for one in part[1::2]] for part in parts if part[::2] == parts[0][::2]], dtype=object)
+    alike = columns.T.tolist() if len(columns) == len(files) else []
+    varying = [one for one in alike if len(set(one)) > 1 or len(files) == 1]
+    orders = {tuple(sorted(range(len(files)), key=one.__getitem__)) for one in varying if len(set(one)) == len(files)}
+    if len(orders) != 1 or any(len(set(one)) < len(files) for one in varying):
+        expected = "a file for each frame, whose names differ in its number alone"
+        raise DatasetError(files[0].parent, expected, f"{files[0].name} … {files[-1].name}")
+    return min(varying, key=max)
 
 
 def _kitti_frame(path: Path) -> list[_Record]:

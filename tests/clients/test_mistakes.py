@@ -67,7 +67,7 @@ MISTAKES: list[tuple[str, Any, list[str], int, str]] = [
     ("logits as scores", boxes(score=np.tile([4.0, 3.0, -1.0], FRAMES)), [], 0, "scores look like logits (-1 to 4)"),
     ("percent as scores", boxes(score=np.tile([90.0, 80.0, 70.0], FRAMES)), [], 0, "scores look like percent"),
     ("rows backwards in time", {k: v[::-1] for k, v in boxes().items()}, [], 0, "results in"),
-    ("a column missing", boxes(yaw=None), [], 2, "expected a column yaw (--option column.yaw=NAME)"),
+    ("a column missing", boxes(l=None), [], 2, "expected a column l (--option column.l=NAME)"),
     (
         "text for a number",
         boxes(x=np.array(["a", *["1.0"] * (ROWS - 1)])),

@@ -10,6 +10,8 @@ import typer
 from optipmb_tools.commands.options import AsJson, DataOptions, plain_table, print_json, print_table
 from optipmb_tools.datasets.interface import class_like
 from optipmb_tools.datasets.motion import headings_along
+from optipmb_tools.datasets.table.findings import Finding
+from optipmb_tools.files import DatasetError
 
 # Kinds of objects that a profile for unknown detectors tells apart
 KINDS = ("car", "truck", "bus", "trailer", "pedestrian", "bicycle", "motorcycle")
@@ -25,21 +27,31 @@ def check(data: DataOptions, *, as_json: AsJson = False) -> None:
     """Show how your data are read, without tracking: optipmb check detections.csv.
 
     Units, rate, classes, headings against the motion of the boxes, suspicious rows, and the options that read them
-    otherwise. Status 1: track would refuse the data; the findings marked as wrong say why.
+    otherwise. Status 1: track would refuse the data; the findings marked as WRONG say why. Where tracks may be wrong, a
+    finding is doubtful; where none is, the last line of the findings is "all right".
     """
     name, root = data.named()
+    chosen: Many[DataSequence] = []
+    findings: list[dict[str, Any]] = []
     if name == "table" and root is not None:
         from optipmb_tools.datasets.table import TableDataset  # noqa: PLC0415  packages of an extra
 
         options = {option: str(value) for option, value in data.options(name).items()}
-        table = TableDataset(root, options, lenient=True)
-        chosen = list(table.sequences(data.sequences or ["all"]))
-        findings: list[dict[str, Any]] = [asdict(one) for one in table.findings]
+        found: list[Finding] = []
+        try:
+            chosen = list(
+                TableDataset(root, options, lenient=True, findings=found).sequences(data.sequences or ["all"])
+            )
+        except DatasetError as error:
+            if error.path.startswith("--"):
+                raise
+            found.append(Finding("data", str(error), wrong=True))
+        findings = [asdict(one) for one in found]
     else:
         chosen = data.open().sequences
         share, moves = headings_along(chosen)
         text = f"{share:.0%} of {moves} moves are along the heading" if moves else "no box moves far enough to compare"
-        findings = [{"topic": "yaw", "text": text, "option": "", "wrong": False}]
+        findings = [asdict(Finding("yaw", text))]
     recordings = [_recording(one) for one in chosen]
     classes = _classes(chosen)
     wrong = any(one["wrong"] for one in findings)
@@ -82,12 +94,16 @@ def _classes(sequences: "Many[DataSequence]") -> list[dict[str, Any]]:
 def _print(findings: "Many[dict[str, Any]]", *tables: "Many[dict[str, Any]]") -> None:
     table = plain_table(("", "finding", "change with"), folded=("finding", "change with"))
     for one in findings:
-        mark = "WRONG " if one["wrong"] else ""
+        mark = "WRONG " if one["wrong"] else "doubtful: " if one["doubt"] else ""
         table.add_row(one["topic"], mark + one["text"], one["option"])
     print_table(table)
+    if not any(one["wrong"] or one["doubt"] for one in findings):
+        print_table("all right")
     for rows in tables:
+        if not rows:
+            continue
         print_table("")
-        names = [name.replace("_", " ") for name in rows[0]] if rows else []
+        names = [name.replace("_", " ") for name in rows[0]]
         table = plain_table(names[:1], names[1:], folded=names[:1])
         for row in rows:
             table.add_row(*("-" if value is None else str(value) for value in row.values()))

@@ -1,7 +1,8 @@
 """Motion of boxes from frame to frame: evidence about headings, velocities and poses before anything is tracked.
 
 Boxes of neighbouring frames are linked where each is the nearest of its class to the other and no third one is nearly
-as near. A move is a chain of such links over `LEAST_MOVE` metres; its direction does not depend on any heading.
+as near. A move is a chain of such links over `LEAST_MOVE` metres and over `STEADY` times the scatter of the object's
+boxes about its path: jitter is no motion. Its direction does not depend on any heading.
 """
 
 import itertools
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from optipmb_tools.datasets.evidence import Evidence
 from optipmb_tools.geometry import Bools, Floats, Ints, stack_poses, to_world, wrap_angle
 
 if TYPE_CHECKING:
@@ -23,17 +25,24 @@ LONGEST_CHAIN: Final = 15
 LONGEST_STEP_S: Final = 2.0
 REACH: Final = (1.0, 40.0, 12.0)  # longest link: metres, plus metres per second of the step, up to a limit
 DISTINCT: Final = 1.5  # a second box of the class must be so many times as far away
+STEADY: Final = 8.0
 SURE_MOVES: Final = 10
 LEAST_ALONG: Final = 0.3
-"""Moves from which headings are refused or doubted, and the share along them below which they are doubted."""
+"""Moves from which headings are doubted, and the share along them below which they are."""
 MOST_FRAMES: Final = 600
+LEAST_FRAMES: Final = 60  # of each recording, if there are several
 MOST_BOXES: Final = 300  # boxes of a frame that are looked at; bounds the work
 SAME_DIRECTION: Final = np.deg2rad(20.0)  # largest angle between a heading and a move along it
-CREW: Final = 4  # links from which neighbouring frames tell a common motion
-MOST: Final = 0.5  # share of the links of two frames that make one rigid motion
-RIGID: Final = 0.3  # largest distance in metres of a box from where that motion takes it
-COMMON_SPEED: Final = 2.0
-LEAST_STEP: Final = 0.4  # speed in m/s and step in metres from which a common motion is none of noise
+CREW: Final = 4  # places from which two frames tell a common motion; any two places fit a turn and a shift
+MOST: Final = 0.5  # share of the others that make one rigid motion with them
+RIGID: Final = 0.4  # largest distance in metres of a box from where that motion takes it
+COMMON_STEP: Final = 4.0
+COMMON_S: Final = 1.5  # median step in metres from which a motion tells rigid ones from traffic; longest time for it
+LIKE: Final = 0.25  # least score of the boxes at one place, by their largest, from which none is a weaker guess
+MOST_ALONE: Final = 0.9  # share of frames with one box, and of boxes that come back, of objects that report one by one
+LONGEST_ALONE_S: Final = 30.0
+LONGEST_RETURN: Final = 60.0
+LEAST_LOOK: Final = 10.0  # longest time and way in metres to the next report; least range of a look at one object
 LARGEST_OVERLAP: Final = 2.5  # distance in metres from which the centres of two boxes of a class are two places
 
 
@@ -45,8 +54,8 @@ class Moves:
     end: Ints  # (K,) row of the same object's box at the end
     step: Floats  # (K, 2) displacement, m
     duration: Floats  # (K,) s
-    common: float
-    """Share of pairs of neighbouring frames most of whose boxes make one rigid motion, faster than `COMMON_SPEED`."""
+    object: Ints  # (K,) number of the object, which has one for each unbroken chain of links
+    common: Evidence  # pairs of frames most of whose boxes make one rigid motion
 
     def __len__(self) -> int:
         return len(self.start)
@@ -62,7 +71,8 @@ class Moves:
 
     def take(self, rows: Bools) -> "Moves":
         """Return the chosen moves."""
-        return Moves(self.start[rows], self.end[rows], self.step[rows], self.duration[rows], self.common)
+        floats, numbers = (self.step[rows], self.duration[rows]), self.object[rows]
+        return Moves(self.start[rows], self.end[rows], *floats, numbers, self.common)
 
 
 def find_moves(key: Ints, seconds: Floats, xy: Floats, kind: Ints) -> Moves:
@@ -76,21 +86,60 @@ def find_moves(key: Ints, seconds: Floats, xy: Floats, kind: Ints) -> Moves:
     """
     order = np.lexsort((seconds, key))
     starts = np.flatnonzero(np.r_[True, (np.diff(key[order]) != 0) | (np.diff(seconds[order]) > 0.0)])
-    frames = np.split(order, starts[1:])[:MOST_FRAMES] if len(order) else []
-    following = np.full(len(key), -1, dtype=np.int64)
-    pairs = common = 0
+    most = max(LEAST_FRAMES, MOST_FRAMES // max(1, len(np.unique(key))))
+    frames: list[Ints] = []
+    recording, taken = -1, 0
+    for frame in np.split(order, starts[1:]) if len(order) else []:
+        recording, taken = int(key[frame[0]]), taken + 1 if key[frame[0]] == recording else 0
+        if taken < most and len(frames) < MOST_FRAMES:
+            frames.append(frame[:MOST_BOXES])
+    following, chain = np.full(len(key), -1, dtype=np.int64), np.arange(len(key))
     for before, after in itertools.pairwise(frames):
         passed = seconds[after[0]] - seconds[before[0]]
-        if key[before[0]] != key[after[0]] or passed > LONGEST_STEP_S:
+        if key[before[0]] == key[after[0]] and passed <= LONGEST_STEP_S:
+            first, second = _linked(before, after, xy, kind, passed)
+            following[first], chain[second] = second, chain[first]
+    least = np.maximum(LEAST_MOVE, STEADY * _scatter(following, chain, seconds, xy))
+    start, end = _chains(following, xy, least)
+    common = _common(frames, key, seconds, xy, chain)
+    return Moves(start, end, xy[end] - xy[start], seconds[end] - seconds[start], chain[start], common)
+
+
+def _scatter(following: Ints, chain: Ints, seconds: Floats, xy: Floats) -> Floats:
+    """Return the scatter (B,) of each object's boxes about its path in metres; the median where it is not known."""
+    first = np.flatnonzero(following >= 0)
+    first = first[following[following[first]] >= 0]
+    middle = following[first]
+    last = following[middle]
+    part = ((seconds[middle] - seconds[first]) / (seconds[last] - seconds[first]))[:, None]
+    off = xy[middle] - xy[first] * (1.0 - part) - xy[last] * part
+    square = (off**2).sum(axis=1) / (1.0 + part**2 + (1.0 - part) ** 2)[:, 0]
+    count = np.bincount(chain[middle], minlength=len(chain))
+    mean = np.sqrt(np.bincount(chain[middle], square, len(chain)) / np.maximum(count, 1))
+    usual = float(np.median(mean[count > 0])) if count.any() else 0.0
+    return np.where(count > 0, mean, usual)[chain]
+
+
+def _common(frames: list[Ints], key: Ints, seconds: Floats, xy: Floats, chain: Ints) -> Evidence:
+    """Return how many of the pairs of frames that are far enough apart show one motion of most places."""
+    found: list[bool] = []
+    for number, before in enumerate(frames):
+        for after in frames[number + 1 :]:
+            if key[before[0]] != key[after[0]] or seconds[after[0]] - seconds[before[0]] > COMMON_S:
+                break
+            _, mine, other = np.intersect1d(chain[before], chain[after], return_indices=True)
+            first, second = xy[before[mine]], xy[after[other]]
+            if len(first) < CREW:
+                break
+            if np.median(np.linalg.norm(second - first, axis=1)) >= COMMON_STEP:
+                away = np.linalg.norm(first[:, None] - first[None], axis=2) < LARGEST_OVERLAP
+                single = ~np.tril(away, -1).any(axis=1)  # one place may have several boxes
+                if single.sum() >= CREW:
+                    found.append(_move_together(first[single], second[single]))
+                break
+        else:
             continue
-        first, second = _linked(before[:MOST_BOXES], after[:MOST_BOXES], xy, kind, passed)
-        following[first] = second
-        if len(first) >= CREW:
-            pairs += 1
-            common += _move_together(xy[first], xy[second], max(COMMON_SPEED * passed, LEAST_STEP))
-    start, end = _chains(following, xy)
-    duration = seconds[end] - seconds[start]
-    return Moves(start, end, xy[end] - xy[start], duration, common / pairs if pairs else 0.0)
+    return Evidence(sum(found), len(found))
 
 
 def headings_along(sequences: "Iterable[DataSequence]") -> tuple[float, int]:
@@ -127,8 +176,8 @@ def _linked(before: Ints, after: Ints, xy: Floats, kind: Ints, passed: float) ->
     return before[found], after[nearest[found]]
 
 
-def _move_together(first: Floats, second: Floats, least: float) -> bool:
-    """Return whether most places (L, 2) make one rigid motion that moves them by `least` metres or more.
+def _move_together(first: Floats, second: Floats) -> bool:
+    """Return whether most places (L, 2) make one rigid motion.
 
     The motion is fitted by least squares, without the worse half of the places after the first fit.
     """
@@ -139,26 +188,26 @@ def _move_together(first: Floats, second: Floats, least: float) -> bool:
         turn = vt.T @ np.diag([1.0, np.sign(np.linalg.det(vt.T @ u.T))]) @ u.T
         rest = np.linalg.norm((first - a) @ turn.T + b - second, axis=1)
         fit = rest <= np.median(rest)
-    moved = float(np.median(np.linalg.norm(second - first, axis=1)))
-    return moved > least and float(np.mean(rest < RIGID)) >= MOST
+    return bool((rest < RIGID).sum() - 2 >= MOST * (len(first) - 2))
 
 
-def _chains(following: Ints, xy: Floats) -> tuple[Ints, Ints]:
-    """Return the rows of the boxes at the ends of each chain that is long enough."""
+def _chains(following: Ints, xy: Floats, least: Floats) -> tuple[Ints, Ints]:
+    """Return the rows of the boxes at the ends of each chain that is as long as its object's `least`."""
     start = end = np.flatnonzero(following >= 0)
     ended: list[tuple[Ints, Ints]] = []
     for _ in range(LONGEST_CHAIN):
         end = following[end]
         start, end = start[end >= 0], end[end >= 0]
-        far = np.linalg.norm(xy[end] - xy[start], axis=1) >= LEAST_MOVE
+        far = np.linalg.norm(xy[end] - xy[start], axis=1) >= least[start]
         ended.append((start[far], end[far]))
         start, end = start[~far], end[~far]
     return np.concatenate([one for one, _ in ended]), np.concatenate([one for _, one in ended])
 
 
-def overlapping(frame: Ints, xy: Floats, size: Floats, kind: Ints) -> Bools:
-    """Return the boxes (B,) that share their place with another one of their frame and class.
+def overlapping(frame: Ints, xy: Floats, size: Floats, kind: Ints, score: Floats) -> Bools:
+    """Return the boxes (B,) that share their place with another one of their frame and class, of like score.
 
+    A detector without suppression gives many boxes of an object, of scores from high to low: these are none.
     Of frames with more than `MOST_BOXES` boxes a part is looked at, and no more than `MOST_FRAMES` frames.
     """
     found = np.zeros(len(frame), dtype=np.bool_)
@@ -168,6 +217,37 @@ def overlapping(frame: Ints, xy: Floats, size: Floats, kind: Ints) -> Bools:
     for rows in np.split(order, starts[1:])[:MOST_FRAMES] if len(order) else []:
         some = rows[: MOST_BOXES * (1 + len(rows) // MOST_BOXES) : 1 + len(rows) // MOST_BOXES]
         away = np.linalg.norm(xy[some][:, None] - xy[some][None], axis=2)
-        away[kind[some][:, None] != kind[some][None]] = np.inf
-        found[some] = (away < near[some][:, None]).sum(axis=1) > 1
+        close = (away < near[some][:, None]) & (kind[some][:, None] == kind[some][None])
+        least = np.where(close, score[some][None], np.inf).min(axis=1)
+        most = np.where(close, score[some][None], 0.0).max(axis=1)
+        found[some] = (close.sum(axis=1) > 1) & (least > LIKE * most)
     return found
+
+
+def reported_alone(key: Ints, seconds: Floats, xy: Floats, kind: Ints) -> float | None:
+    """Return how far in metres the boxes (B,) of an object are apart where objects report one by one; None otherwise.
+
+    Then nearly every frame has one box, the next box is elsewhere, and a later one is where motion would take it.
+    """
+    order = np.lexsort((seconds, key))
+    order = order[:MOST_FRAMES]
+    if len(order) < LEAST_FRAMES // 2:
+        return None
+    time, place, mine = seconds[order], xy[order], key[order]
+    again = np.diff(mine) == 0
+    if np.mean((np.diff(time) > 0.0)[again]) < MOST_ALONE:
+        return None
+    away = np.linalg.norm(place[:, None] - place[None], axis=2)
+    passed = time[None] - time[:, None]
+    same = (mine[:, None] == mine[None]) & (kind[order][:, None] == kind[order][None]) & (passed > 0.0)
+    reach = REACH[0] + REACH[1] * passed
+    back = same & (away <= np.minimum(reach, LONGEST_RETURN)) & (passed <= LONGEST_ALONE_S)
+    following = np.where(back.any(axis=1), np.argmax(back, axis=1), -1)
+    found = np.flatnonzero(following >= 0)
+    jumps = (
+        np.linalg.norm(np.diff(place, axis=0), axis=1)[again]
+        > reach[np.arange(len(order) - 1), np.arange(1, len(order))][again]
+    )
+    if np.mean(jumps) < MOST or len(found) < MOST_ALONE * len(order) or not len(jumps):
+        return None
+    return float(max(2.0 * np.quantile(away[found, following[found]], 0.95), LEAST_LOOK))

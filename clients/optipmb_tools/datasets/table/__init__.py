@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from optipmb_schemas import Tracks
+from optipmb_schemas import FieldOfView, Tracks
 
 from optipmb_tools.datasets.interface import (
     DETECTION_COLUMNS,
@@ -26,8 +26,9 @@ from optipmb_tools.datasets.interface import (
     Truth,
     chosen,
 )
-from optipmb_tools.datasets.table.rows import ALIASES, NO_ID, Boxes, read_tables
-from optipmb_tools.datasets.table.values import Finding, Reading
+from optipmb_tools.datasets.table.columns import ALIASES
+from optipmb_tools.datasets.table.findings import Finding, Reading
+from optipmb_tools.datasets.table.rows import NO_ID, Boxes, read_tables
 from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Bools, Floats, Ints, Pose, stack_poses, to_world
 from optipmb_tools.results.output import track_columns
@@ -36,6 +37,7 @@ from optipmb_tools.table_files import SUFFIXES, line_of, read_table, tables_in, 
 # Options, besides `column.MEANING=NAME` and `class.NAME=NAME`; `tracks` are tables that are yet to be read by them
 OPTIONS: Final = (
     *("time", "rate", "group", "yaw", "heading", "quaternion", "sizes", "axes", "velocity", "score", "invalid"),
+    *("missing", "size_factor"),
     *("poses", "truth", "tracks", "decimal", "encoding", "date", "origin"),
 )
 GAP: Final = 1.5
@@ -224,6 +226,7 @@ class TableSequence(DataSequence):
         self._boxes = boxes
         self._truth = truth
         self._origin = origin
+        self.alone = boxes.alone is not None
         rows = np.flatnonzero(boxes.frame_key == key)
         self._stamps, first, frame = np.unique(boxes.frame_stamp[rows], return_index=True, return_inverse=True)
         self.times: NDArray[Any] = boxes.frame_time[rows[first]]
@@ -270,7 +273,12 @@ class TableSequence(DataSequence):
             label = self._label[self._start[index] : self._start[index + 1]]
             known = (name for name in DETECTION_COLUMNS if name != "label" and getattr(boxes, name) is not None)
             columns = {name: getattr(boxes, name)[rows] for name in known}
-            yield DetectionFrame(index, stamp_ns, self.poses[index], self.labels, label, **columns)
+            pose, view = self.poses[index], None
+            if boxes.alone is not None and len(rows) == 1:
+                pose = Pose(columns["center"][0], IDENTITY.quaternion)
+                columns["center"] = np.where(np.isnan(columns["center"]), np.nan, 0.0)
+                view = _view(boxes.alone)
+            yield DetectionFrame(index, stamp_ns, pose, self.labels, label, field_of_view=view, **columns)
 
     def truth(self) -> Truth | None:
         """Return the objects of the table of truth, at the stamps of these frames.
@@ -281,6 +289,12 @@ class TableSequence(DataSequence):
         return None if self._truth is None else truth_at(self.name, self._stamps, self.numbers, *self._truth)
 
 
+def _view(reach: float) -> FieldOfView:
+    """Return a look at everything up to a distance in metres."""
+    half, quarter = np.array([-np.pi, np.pi]), np.array([-0.5 * np.pi, 0.5 * np.pi])
+    return FieldOfView(azimuth=half, elevation=quarter, range=np.array([0.0, reach]))
+
+
 class TableDataset(Dataset):
     """The recordings of a table, or of all tables of a folder.
 
@@ -288,6 +302,7 @@ class TableDataset(Dataset):
         path: the file or folder.
         options: see `OPTIONS`.
         lenient: Whether errors become findings (`Reading`), where nothing is to be tracked.
+        findings: Gets the assumptions and errors, also of a table that cannot be read.
 
     Raises:
         DatasetError: A file, a column, a value or an option is wrong.
@@ -297,7 +312,14 @@ class TableDataset(Dataset):
     name = "table"
     profile = "auto"
 
-    def __init__(self, path: Path, options: Mapping[str, str] | None = None, *, lenient: bool = False) -> None:
+    def __init__(
+        self,
+        path: Path,
+        options: Mapping[str, str] | None = None,
+        *,
+        lenient: bool = False,
+        findings: list[Finding] | None = None,
+    ) -> None:
         options = dict(options or {})
         for name in options:
             role = name.removeprefix("column.")
@@ -312,17 +334,15 @@ class TableDataset(Dataset):
         shared, tracks = TableOptions(options), options.pop("tracks", None)
         others = read_objects(Path(truth), _tables(Path(truth)), shared) if truth is not None else []
         notes += [note for one in others for note in one.notes]
-        reading = Reading(path, options, lenient, named=shared.named)
+        reading = Reading(path, options, lenient, named=shared.named, findings=[] if findings is None else findings)
         tables = read_tables(files, reading, scored=True)
-        self.findings: tuple[Finding, ...] = tuple(reading.findings)  # assumptions and errors
-        notes += [f"{path}: {note}" for note in reading.notes]
         origin = min(int(boxes.frame_stamp.min(initial=0)) for _, boxes in tables)
         if not any(len(boxes.frame_stamp) for _, boxes in tables):
             raise DatasetError(path, "rows", "none")
         for file, boxes in tables:
             own = [ObjectTable(file, boxes, options)] if boxes.id is not None else []
             if not len(boxes.frame_stamp):
-                notes.append(f"{file}: no rows, a recording without frames")
+                reading.doubt("rows", f"{file.name}: no rows, a recording without frames")
             for key in dict.fromkeys(boxes.frame_key.tolist()) or boxes.keys:
                 name = _plain(".".join(part for part in (_stem(file), key) if part))
                 if len(files) == 1 and key:
@@ -333,8 +353,10 @@ class TableDataset(Dataset):
                 if name in self._sequences:
                     raise DatasetError(file, "names of recordings that differ", f"{name!r} twice")
                 self._sequences[name] = sequence
-                notes += _gaps(sequence)
+                _note_gaps(reading, sequence)
                 shared.recordings |= {name, key}
+        _refuse_single_frames(reading, list(self._sequences.values()))
+        notes += [f"{path}: {note}" for note in reading.notes]
         if tracks is None:
             shared.check()
         self.notes: tuple[str, ...] = tuple(dict.fromkeys(notes))
@@ -380,18 +402,21 @@ def _truth_of(tables: Sequence[ObjectTable], key: str, file: Path) -> tuple[Obje
     return None
 
 
-def _gaps(sequence: TableSequence) -> list[str]:
-    """Return a note if frames seem to be missing: without a row, an empty frame is unknown."""
+def _refuse_single_frames(reading: Reading, sequences: Sequence[TableSequence]) -> None:
+    """Refuse recordings that have one frame each: nothing can be followed in them."""
+    if len(sequences) > 1 and all(len(one) == 1 for one in sequences):
+        names = ", ".join(sequences[0].key_columns)
+        each = f"{names}: a column that differs in each frame names no recordings" if names else "a file each"
+        received = f"{len(sequences)} recordings of one frame"
+        reading.refuse("time", f"recordings of several frames, {each}", received, "--option column.recording=none")
+
+
+def _note_gaps(reading: Reading, sequence: TableSequence) -> None:
+    """Note frames that seem to be missing: without a row, an empty frame is unknown."""
     steps = np.diff(sequence.stamps)
-    if not len(steps):
-        return []
-    period = float(np.median(steps))
+    period = float(np.median(steps)) if len(steps) else 0.0
     missing = int(np.sum(np.round(steps[steps > GAP * period] / period) - 1)) if period else 0
-    if not missing:
-        return []
-    return [
-        (
-            f"{sequence.name}: {missing} frames at {1e9 / period:.3g} Hz have no row; "
-            "if nothing was detected in them, a row with their stamp and nothing else says so"
-        )
-    ]
+    if missing and not sequence.alone:
+        text = f"{sequence.name}: {missing} frames at {1e9 / period:.3g} Hz have no row"
+        how = "if nothing was detected in them, a row with their stamp and nothing else says so"
+        reading.doubt("time", f"{text}; {how}")

@@ -1,11 +1,8 @@
-"""Tables of boxes, one row per box: read, checked, in nanoseconds, metres and radians with z up.
-
-The meaning of a column is found by its name: names are compared in lower case, with every run of other characters as
-one underscore, and without a unit at the end (`yaw_deg`, `x [m]`). Units in names are kept.
-"""
+"""Tables of boxes, one row per box: read, checked, in nanoseconds, metres and radians with z up."""
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -14,179 +11,53 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optipmb_tools.datasets.interface import georeference_of
-from optipmb_tools.datasets.motion import SAME_DIRECTION, Moves, find_moves, overlapping
-from optipmb_tools.datasets.table.values import (
+from optipmb_tools.datasets.motion import Moves, find_moves, overlapping, reported_alone
+from optipmb_tools.datasets.table.columns import NOTHING, Column, find_columns, normalised, turn_of
+from optipmb_tools.datasets.table.findings import Reading, is_number
+from optipmb_tools.datasets.table.times import (
     COUNTED_HZ,
+    CROWDED,
     SECONDS,
-    Reading,
-    frame_starts,
-    group_stamps,
+    Stamps,
     median_step,
+    read_frames,
+    read_stamps,
+    refuse_gap,
+)
+from optipmb_tools.datasets.table.values import (
+    FULL_TURN,
+    LARGEST_SIZE,
+    is_moving,
+    no_angle,
     read_angle,
     read_axes,
     read_digits,
     read_heading,
     read_scores,
     read_sizes,
-    read_stamps,
     read_turn,
     read_velocity,
 )
 from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Bools, Floats, Ints
-from optipmb_tools.table_files import BOX_LISTS, Columns, read_table
+from optipmb_tools.table_files import NO_VALUE, Columns, frame_numbers, read_table
 
 NO_CLASS: Final = "object"  # class of all boxes of a table without classes
 NO_ID: Final = -1  # id of a box that has none
 _UNIT: Final = 1e-3
 _MOST_SHOWN: Final = 6
-_CROWDED: Final = 0.5  # share of boxes that share their place with another one from which their stamps cannot be right
 _LONGEST: Final = 30.0  # boxes that are longer, in metres, are suspicious
+_LOOKED_AT: Final = 200  # texts of a column that tell whether it has numbers
+_TILTED: Final = 1 / 12  # of a turn: largest angle about x and y of a box that stands upright
+_TWICE: Final = 0.25  # share of boxes at the place of another one from which objects are reported twice
 LEAST_VARIANCE: Final = 1e-8
 LARGEST_VARIANCE: Final = 1e8  # variances of a position along any axis, m^2, as `Detections` have them
 _POSE: Final = ("pose_x", "pose_y", "pose_z")
 _TURNS: Final = ("w", "x", "y", "z")
-
-
-@dataclass(frozen=True)
-class Column:
-    """A column of a table."""
-
-    name: str  # as the table has it
-    unit: str | None  # in its name: `deg`, `rad`, `s`, `ms`, `us`, `ns`
-    base: str  # its name without the unit, normalised
-
-
-def _vector(bases: str, part: str, place: int) -> tuple[str, ...]:
-    found: list[str] = []
-    for base in bases.split():
-        found += [f"{base}_{part}", f"{part}_{base}", f"{base}{part}", f"{base}_{place}"]
-    return tuple(found)
-
-
-_CENTER: Final = "center centre pos position loc location translation xyz c p t bbox box"
-_SIZE: Final = "size dim dims dimension dimensions extent extents lwh box_size"
-_SPEED: Final = "v vel velocity speed"
-_POSE_NAMES: Final = "pose ego sensor_pose ego_pose ego_translation pose_translation ego_position sensor_position"
-_TURN: Final = "pose ego sensor_pose ego_pose ego_rotation pose_rotation"
-_BOX_TURN: Final = "q quat quaternion rotation rot orientation"
-
-
-def _extent(axis: str, letter: str, word: str, place: int) -> tuple[str, ...]:
-    return tuple(name for part in (axis, letter, word) for name in _vector(_SIZE, part, place))
-
-
-def _turn(bases: str, part: str, place: int) -> tuple[str, ...]:
-    return (*(f"{base}_q{part}" for base in bases.split()), *_vector(bases, part, place))
-
-
-ALIASES: Final[Mapping[str, tuple[str, ...]]] = {
-    "stamp": ("stamp", "t", "time", "timestamp", "ts", "sec", "secs", "seconds", "nanoseconds", "sim_time", "datetime",
-              "header_stamp", "header_timestamp"),
-    "nanosec": ("nanosec", "nanosecs", "nsec", "nsecs", "nanoseconds"),
-    "frame": ("frame", "frame_id", "frame_index", "frame_idx", "frame_number", "frame_no", "frame_nr"),
-    "x": ("x", "cx", "px", "x_center", "tx", *_vector(_CENTER, "x", 0)),
-    "y": ("y", "cy", "py", "y_center", "ty", *_vector(_CENTER, "y", 1)),
-    "z": ("z", "cz", "pz", "z_center", "tz", *_vector(_CENTER, "z", 2)),
-    "lat": ("lat", "latitude"),
-    "lon": ("lon", "lng", "longitude"),
-    "alt": ("alt", "altitude"),
-    "l": ("l", "length", "box_length", "dx", *_extent("x", "l", "length", 0)),
-    "w": ("w", "width", "box_width", "dy", *_extent("y", "w", "width", 1)),
-    "h": ("h", "height", "box_height", "dz", *_extent("z", "h", "height", 2)),
-    "yaw": ("yaw", "heading", "theta", "yaw_angle", "heading_angle", "rotation_z", "rot_z", "rz", "rotation_y", "ry",
-            "rot", "rotation", "orientation", "angle"),
-    "qw": ("qw", *_vector(_BOX_TURN, "w", 0)),
-    "qx": ("qx", *_vector(_BOX_TURN, "x", 1)),
-    "qy": ("qy", *_vector(_BOX_TURN, "y", 2)),
-    "qz": ("qz", *_vector(_BOX_TURN, "z", 3)),
-    "score": ("score", "confidence", "conf", "prob", "probability", "detection_score", "det_score", "tracking_score",
-              "score_3d", "scores_3d", "pred_score", "pred_scores", "scores"),
-    "class": ("class", "class_name", "cls", "label", "label_name", "category", "category_name", "type", "object_type",
-              "obj_type", "class_id", "label_id", "classification", "object_class", "name", "tracking_name",
-              "detection_name", "label_3d", "labels_3d", "pred_label", "pred_labels", "names", "labels"),
-    "vx": _vector(_SPEED, "x", 0),
-    "vy": _vector(_SPEED, "y", 1),
-    "cov_xx": ("cov_xx", "cov_x_x", "covariance_xx", "covariance_x_x", "var_x", "variance_x", "x_var", "x_variance"),
-    "cov_xy": ("cov_xy", "cov_x_y", "covariance_xy", "covariance_x_y"),
-    "cov_yy": ("cov_yy", "cov_y_y", "covariance_yy", "covariance_y_y", "var_y", "variance_y", "y_var", "y_variance"),
-    "id": ("id", "track_id", "object_id", "obj_id", "tracking_id", "instance_id", "instance",
-           "instance_token", "track", "track_uuid", "object_uuid", "instance_uuid", "uuid", "track_label"),
-    "recording": ("recording", "recording_id", "sequence", "sequence_id", "sequence_name", "scene", "scene_name",
-                  "scene_id", "session", "log", "log_id", "run", "run_id", "drive", "segment", "bag", "stream"),
-    "sensor": ("sensor", "sensor_id", "sensor_name", "node", "lidar", "device"),
-    "pose_x": _vector(_POSE_NAMES, "x", 0),
-    "pose_y": _vector(_POSE_NAMES, "y", 1),
-    "pose_z": _vector(_POSE_NAMES, "z", 2),
-    "pose_yaw": ("pose_yaw", "ego_yaw", "sensor_yaw", "pose_heading", "ego_heading"),
-    "pose_qw": _turn(_TURN, "w", 0),
-    "pose_qx": _turn(_TURN, "x", 1),
-    "pose_qy": _turn(_TURN, "y", 2),
-    "pose_qz": _turn(_TURN, "z", 3),
-}  # fmt: skip
-"""Names of each column, the most telling first."""
-
-_LISTED: Final = ("x", "y", "z", "l", "w", "h", "yaw", "vx", "vy")  # meanings of the numbers of a list of `BOX_LISTS`
-_UNITS: Final[Mapping[str, str]] = {
-    "deg": "deg", "degree": "deg", "degrees": "deg", "rad": "rad", "radian": "rad", "radians": "rad",
-    "s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "us": "us", "usec": "us",
-    "ns": "ns", "nsec": "ns", "nsecs": "ns", "nanosec": "ns", "nanosecs": "ns", "nanoseconds": "ns",
-}  # fmt: skip
-_LENGTHS: Final = {"m", "meter", "meters", "metre", "metres", "mps"}
-
-
-def find_columns(names: Iterable[str], chosen: Mapping[str, str]) -> dict[str, Column]:
-    """Return the column of each meaning among `names`; `chosen` are meanings whose column the user has named."""
-    known = [_normalised(name) for name in names]
-    taken: dict[str, Column] = {}
-    used = set(chosen.values())
-    for role in ALIASES:
-        aliases = _names_of(role)
-        if role in chosen:
-            unit = next((one.unit for one in known if one.name == chosen[role]), None)
-            taken[role] = Column(chosen[role], unit, "")
-            continue
-        fitting = [one for one in known if one.base in aliases and one.name not in used]
-        if role == "nanosec":
-            bases = {
-                one.base for one in known if "stamp" in taken and one.name == taken["stamp"].name and one.unit == "s"
-            }
-            parts = [one for one in known if bases and _is_second_half(one)]
-            fitting = [Column(one.name, "ns", aliases[0]) for one in parts if one.base in bases or one.base in aliases]
-        if fitting:
-            best = min(fitting, key=lambda one: (aliases.index(one.base), _is_second_half(one)))
-            taken[role] = best
-            used.add(best.name)
-    return taken
-
-
-def _names_of(role: str) -> tuple[str, ...]:
-    """Return the names of a meaning, the most telling first; those in lists of boxes come before flat columns."""
-    if role not in _LISTED:
-        return ALIASES[role]
-    place = _LISTED.index(role)
-    first, last = ([f"{name}_{place}" for name in lists] for lists in (BOX_LISTS, ("bbox", "box")))
-    return (*first, *ALIASES[role], *last)
-
-
-def _is_second_half(column: Column) -> bool:
-    """Tell whether a column may be the rest of a stamp, as `stamp.nanosec` of `stamp.sec`; `stamp_ns` is not."""
-    return column.unit == "ns" and not _plain(column.name).endswith("ns")
-
-
-def _plain(name: str) -> str:
-    words = re.sub(r"([a-z0-9])([A-Z])", r"\1_\2", re.sub(r"3D(?![a-z])", "3d", name))
-    return re.sub(r"[^a-z0-9]+", "_", words.lower()).strip("_")
-
-
-def _normalised(name: str) -> Column:
-    base = _plain(name)
-    head, _, tail = base.rpartition("_")
-    if head and tail in _UNITS:
-        return Column(name, _UNITS[tail], head)
-    if base in _UNITS and base not in {"s", "ms", "us", "ns"}:
-        return Column(name, _UNITS[base], base)
-    return Column(name, None, head if head and tail in _LENGTHS else base)
+_NUMBERED: Final = re.compile(r"(.*[^\W\d_])[\W_]+(\d+)")  # a class and the number of an object of it
+_PIXELS: Final = re.compile(
+    r"(.*_)?(px|pixels?|image|img|u|v|bb|xmin|ymin|xmax|ymax|x1|y1|x2|y2|bbox_(left|top|width|height))(_.*)?"
+)
 
 
 @dataclass(frozen=True)
@@ -199,6 +70,7 @@ class Boxes:
     """(R, 7) translation and quaternion, world from sensor; None where boxes are in the world frame."""
     frame_time: NDArray[Any]  # (R,) time as the table has it
     frame_number: NDArray[Any] | None  # (R,) number of the frame as the table has it; None where it has none
+    alone: float | None  # range in metres around the box of a frame in which others were seen; None: everywhere
     row: Ints  # (B,) row of each box, counted from 0
     center: Floats  # (B, 3)
     size: Floats  # (B, 3); NaN in a table that has neither l nor w
@@ -242,10 +114,12 @@ def read_tables(
         DatasetError: A column is missing or a value is not allowed; names the line.
         ClientError: pyarrow is not installed.
     """
-    tables = loaded or {path: read_table(path, reading.options) for path in paths}
+    tables = dict(loaded or {path: read_table(path, reading.options) for path in paths})
+    frames = _is_frame_each(reading, tables)
     groups: dict[tuple[str, ...], list[Path]] = {}
     for path, columns in tables.items():
-        groups.setdefault(tuple(sorted(columns)), []).append(path)
+        roles = _columns_of(reading, columns).items()
+        groups.setdefault(tuple(sorted(f"{role} {one.name}" for role, one in roles)), []).append(path)
     found: dict[Path, Boxes] = {}
     for members in groups.values():
         lengths = [len(next(iter(tables[path].values()), ())) for path in members]
@@ -256,39 +130,73 @@ def read_tables(
         if not columns:
             raise DatasetError(members[0], "a first line with the names of the columns", "no column")
         judged = reading if any(lengths) else replace(reading, findings=[])  # rows that are not there tell nothing
-        boxes = _Table(judged, columns).read(scored=scored)
+        boxes = _Table(judged, columns, frames=frames).read(scored=scored)
+        if frames:
+            return [(reading.path, boxes)]
         found |= {path: boxes.rows(start, end) for path, start, end in zip(members, starts, ends, strict=True)}
     return [(path, found[path]) for path in paths]
 
 
+def _is_frame_each(reading: Reading, tables: dict[Path, Columns]) -> bool:
+    """Tell whether the tables of a folder are frames of one recording; those without stamps get their file's number."""
+    filled = {path: columns for path, columns in tables.items() if len(next(iter(columns.values()), ()))}
+    found = {path: _columns_of(reading, columns) for path, columns in filled.items()}
+    if len(filled) < 2 or any("recording" in one for one in found.values()):  # noqa: PLR2004  of one nothing is joined
+        return False
+    for role in ("stamp", "frame"):
+        if all(role in one for one in found.values()):
+            times = [np.unique(columns[found[path][role].name]) for path, columns in filled.items()]
+            if max(map(len, times)) > 1 or len(np.unique(np.concatenate(times))) == 1:
+                return False
+            order = sorted(zip((one[0] for one in times), filled, strict=True))
+            tables |= {path: tables.pop(path) for _, path in order}  # in the order of time
+            return True
+    if any(one.keys() & {"stamp", "frame"} for one in found.values()) or not reading.path.is_dir():
+        return False
+    numbers = frame_numbers(list(tables))
+    for (path, columns), number in zip(tables.items(), numbers, strict=True):
+        tables[path] = {**columns, "frame": np.full(len(next(iter(columns.values()), ())), number)}
+    return True
+
+
 def _joined(tables: Sequence[Columns]) -> Columns:
-    """Return tables with the same columns as one; a column is text where it is text in one of them."""
+    """Return the columns that all of some tables have as one; a column is text where it is text in one of them."""
     filled = [one for one in tables if len(next(iter(one.values()), ()))] or list(tables[:1])
     if len(filled) == 1:
         return filled[0]
     joined: Columns = {}
-    for name in filled[0]:
+    for name in (one for one in filled[0] if all(one in other for other in filled)):
         parts = [one[name] for one in filled]
         kinds = {part.dtype.kind for part in parts}
         if len(kinds) > 1 and kinds != {"i", "f"}:
-            texts = [part.astype(np.str_) for part in parts]
-            parts = [np.where(np.isin(part, ("nan", "NaT")), "", part) for part in texts]
+            parts = [np.where(np.isin(one := part.astype(np.str_), ("nan", "NaT")), "", one) for part in parts]
         joined[name] = np.concatenate(parts)
     return joined
 
 
+def _columns_of(reading: Reading, columns: Columns) -> dict[str, Column]:
+    """Return the column of each meaning, as the user says or by names and values."""
+    chosen = {key.removeprefix("column."): name for key, name in reading.options.items() if key.startswith("column.")}
+    for role, name in chosen.items():
+        reading.name(f"column.{role}", [*columns, NOTHING], "a column", name)
+    taken = {role: name for role, name in chosen.items() if name in columns or name == NOTHING}
+    return find_columns(columns, taken, [name for name, one in columns.items() if _has_no_number(one)])
+
+
 class _Table:
-    def __init__(self, reading: Reading, columns: Columns) -> None:
+    def __init__(self, reading: Reading, columns: Columns, *, frames: bool = False) -> None:
         self._reading = reading
-        self._time = replace(reading, lenient=False)  # without stamps nothing can be found
+        self._frames = frames  # whether each of the files is a frame
+        self._time = reading.strict()  # without stamps nothing can be found
         self._columns = columns
         self._rows = len(next(iter(columns.values())))
-        chosen = {
-            key.removeprefix("column."): name for key, name in reading.options.items() if key.startswith("column.")
-        }
-        for role, name in chosen.items():
-            reading.name(f"column.{role}", columns, "a column", name)
-        self._found = find_columns(columns, {role: name for role, name in chosen.items() if name in columns})
+        marks = [text.strip() for text in reading.options.get("missing", "").split(",") if text.strip()]
+        if wrong := [text for text in marks if not is_number(text)]:
+            raise DatasetError("--option missing", "numbers, with commas between them", repr(wrong[0]))
+        self._marks = [float(text) for text in marks]
+        self._found = _columns_of(reading, columns)
+        turn = None if "yaw" in self._found else turn_of(map(normalised, columns))
+        self._turn_of, self._turn_columns = turn or ("", [])
 
     def _numbers(self, role: str, otherwise: float | None = None) -> Floats:
         """Return a column of numbers, NaN where there is none."""
@@ -300,12 +208,20 @@ class _Table:
                 have = f"the columns {', '.join(self._columns)}"
                 raise DatasetError(self._reading.path, f"a column {role} (--option column.{role}=NAME)", have)
             return np.full(self._rows, otherwise)
-        values = self._columns[column.name]
-        if values.dtype.kind not in "if":
-            bad = np.array([not _is_number(text) for text in values.tolist()], dtype=np.bool_)
-            self._reading.first(role, bad, f"a number in column {column.name}", values)
-            values = np.array([float(text) if text and _is_number(text) else np.nan for text in values.tolist()])
-        return values.astype(np.float64)
+        return self._read_numbers(role, column.name)
+
+    def _read_numbers(self, role: str, name: str) -> Floats:
+        values = self._columns[name]
+        if values.dtype.kind not in "iuf":
+            texts = ["" if text.strip() in NO_VALUE else text for text in values.tolist()]
+            bad = np.array([not is_number(text) for text in texts], dtype=np.bool_)
+            expected = f"a number in column {name} (--option invalid=skip leaves such rows out)"
+            if not self._reading.skips:
+                self._reading.first(role, bad, expected, values)
+            values = np.array([float(text or "nan") if is_number(text) else np.nan for text in texts])
+            values[bad] = np.inf
+        numbers = values.astype(np.float64)
+        return np.where(np.isin(numbers, self._marks), np.nan, numbers) if self._marks else numbers
 
     def _unit(self, role: str) -> str | None:
         return self._found[role].unit if role in self._found else None
@@ -314,20 +230,23 @@ class _Table:
         reading, found = self._reading, self._found
         key, key_columns, keys = self._keys()
         file = np.searchsorted([first for _, first in reading.files], np.arange(self._rows), side="right")
-        series = np.unique(key, return_inverse=True)[1] * (len(reading.files) + 1) + file
-        stamp, time, time_column = self._stamps(series)
+        series = np.unique(key, return_inverse=True)[1] * (len(reading.files) + 1) + file * (not self._frames)
+        stamps = self._stamps(series)
         center = self._centers()
         centres = not {"l", "w"} & found.keys()
+        self._refuse_pixels(centres=centres)
         ends = (("l", 1.0 if centres else None), ("w", 1.0 if centres else None), ("h", 1.5))
         size = np.column_stack([self._numbers(role, without) for role, without in ends])
-        yaw, yaw_unit = self._yaw(otherwise=None if scored and not centres else 0.0)
+        yaw, yaw_unit = self._yaw(scored=scored)
         turned = yaw_unit != "none"
         score = self._numbers("score", 1.0)
-        names, id_ = self._names(), self._ids()
-        points = scored and centres  # not even the height is taken for granted
-        self._note_missing(scored=scored, points=points, boxes=turned and not centres)
+        names, id_ = self._names(stamps.ns), self._ids()
+        self._note_missing(scored=scored, points=scored and centres, boxes=turned and not centres)
         empty = np.isnan(center[:, :2]).all(axis=1) & (centres | np.isnan(size[:, :2]).all(axis=1))
-        kept = self._valid(np.asarray(~empty), center, size, yaw, score, names)
+        kept = np.asarray(~(empty | stamps.skipped))
+        if scored:
+            self._leave_out(kept, self._doubled(stamps.ns, center), "that another one repeats")
+        kept = self._valid(kept, center, size, yaw, yaw_unit, score, names)
         if "score" in found and scored:
             score[kept] = read_scores(reading, score[kept], np.flatnonzero(kept))
             self._leave_out(kept, np.isnan(score), "with a score that is none")
@@ -337,48 +256,90 @@ class _Table:
         center, size, yaw, names = center[row], size[row], yaw[row], names[row]
         kind = np.unique(names, return_inverse=True)[1].astype(np.int64)
         stated = centres or found["l"].base == "l" or found["l"].base.endswith(("_l", "length"))
-        size = read_sizes(reading, size, names, stated=stated)
-        camera = read_axes(reading, center)
-        if camera:
+        if not centres:
+            size = read_sizes(reading, size, names, stated=stated)
+        if read_axes(reading, center):
             yaw = yaw if yaw_unit in {"quaternion", "none"} else read_angle(reading, "yaw", yaw, yaw_unit)
             center, size, yaw = _from_camera(center, size, yaw)
             yaw_unit = "rad"
         read_digits(reading, center)
-        plane, sides = center[:, :2], size
-        stamp = self._grouped(stamp, series, row, lambda frame: overlapping(frame, plane, sides, kind), scored=scored)
+        stamps = self._framed(stamps, series, row, center, size, kind, score, scored=scored)
+        stamp = stamps.ns
+        refuse_gap(reading, stamp, series)
         pose = self._poses(stamp)
-        moves = find_moves(series[row], stamp[row] / 1e9, _world(center, row, pose)[:, :2], kind)
-        motion = _Motion(row, pose, moves)
+        world = _world(center, row, pose)[:, :2]
+        motion = _Motion(row, pose, find_moves(series[row], stamp[row] / 1e9, world, kind))
         yaw = self._heading(motion, size, yaw, yaw_unit if turned else "none", strict=scored)
-        velocity = self._velocity(motion, row)
-        if reading.lenient:
-            self._suspicious(size, center, stamp[row])
-            pairs = (role if role == one.name else f"{role} from {one.name}" for role, one in found.items())
-            reading.note("columns", f"columns found: {', '.join(pairs)}")
-        unused = [name for name in self._columns if name not in {one.name for one in found.values()}]
-        if unused:
-            more = f" and {len(unused) - _MOST_SHOWN} more" if len(unused) > _MOST_SHOWN else ""
-            reading.note("columns", f"columns not used: {', '.join(unused[:_MOST_SHOWN])}{more}")
+        looks = scored and pose is None and "sensor" not in found
+        alone = reported_alone(series[row], stamp[row] / 1e9, world, kind) if looks else None
+        if alone is not None:
+            text = f"objects report one by one: a frame is a look at {alone:.3g} m around its box"
+            reading.doubt("time", text, "--option group=SECONDS joins them")
+        self._note_columns(size)
+        no_height = scored and centres and self._height not in found  # not even that is taken for granted
         return Boxes(
             frame_stamp=stamp,
             frame_key=key,
             frame_pose=pose,
-            frame_time=time,
-            frame_number=self._columns[found["frame"].name] if "frame" in found else None,
+            frame_time=stamps.time,
+            frame_number=self._frame_numbers(),
+            alone=alone,
             row=row,
-            center=np.insert(plane, 2, np.nan, axis=1) if points and self._height not in found else center,
+            center=np.insert(center[:, :2], 2, np.nan, axis=1) if no_height else center,
             size=np.full_like(size, np.nan) if centres else size,
             yaw=yaw if turned else np.full_like(yaw, np.nan),
-            velocity=velocity,
+            velocity=self._velocity(motion, row),
             position_covariance=None if covariance is None else covariance[row],
             score=score[row],
             name=names,
             id=None if id_ is None else id_[row],
-            time_column=time_column,
+            time_column=stamps.column,
             key_columns=key_columns,
             sensor_column=found["sensor"].name if "sensor" in found else "",
             keys=keys,
         )
+
+    def _doubled(self, stamp: Ints, center: Floats) -> Bools:
+        """Return the rows that are equal to another one in all columns."""
+        order = np.lexsort((center[:, 1], center[:, 0], stamp))
+        same = (np.diff(stamp[order]) == 0) & (np.diff(center[order, :2], axis=0) == 0.0).all(axis=1)
+        first, second = order[:-1][same], order[1:][same]
+        equal = np.ones(len(first), dtype=np.bool_)
+        for one in self._columns.values():
+            a, b = one[first], one[second]
+            equal &= (a == b) | ((a != a) & (b != b))  # noqa: PLR0124  NaN differs from itself
+        again = np.zeros(self._rows, dtype=np.bool_)
+        again[second[equal]] = True
+        return again
+
+    def _refuse_pixels(self, *, centres: bool) -> None:
+        """Refuse boxes of an image."""
+        found = self._found
+        named = [name for name in self._columns if _PIXELS.fullmatch(normalised(name).base)]
+        flat = {"w", "h"} <= found.keys() and "l" not in found
+        if "z" in found or not (flat or (centres and named)) or "lat" in found:
+            return
+        received = f"{', '.join(named or [found['w'].name, found['h'].name])} and no length: boxes in pixels?"
+        expected = (
+            "boxes in metres, with z up; of a camera the places on the ground, which need neither size nor heading "
+            "(docs/points.md)"
+        )
+        self._reading.refuse("sizes", expected, received, "--option column.l=NAME")
+
+    def _note_columns(self, size: Floats) -> None:
+        if self._reading.lenient:
+            long = int((size[:, :2] > _LONGEST).any(axis=1).sum())
+            if long:
+                self._reading.note("rows", f"{long} boxes are longer than {_LONGEST:g} m")
+            pairs = (role if role == one.name else f"{role} from {one.name}" for role, one in self._found.items())
+            self._reading.note("columns", f"columns found: {', '.join(pairs)}")
+        used = {one.name for one in self._found.values()} | set(self._turn_columns)
+        unused = [name for name in self._columns if name not in used]
+        stems = {name.rpartition(".")[0] for name in used} - {""}
+        unused.sort(key=lambda name: name.rpartition(".")[0] not in stems)  # the rest of a group that is used in part
+        if unused:
+            more = f" and {len(unused) - _MOST_SHOWN} more" if len(unused) > _MOST_SHOWN else ""
+            self._reading.note("columns", f"columns not used: {', '.join(unused[:_MOST_SHOWN])}{more}")
 
     def _note_missing(self, *, scored: bool, points: bool, boxes: bool) -> None:
         """Note assumptions about missing columns."""
@@ -404,28 +365,38 @@ class _Table:
             center[:, 2] = self._numbers("z", 0.0)
         return center
 
-    def _stamps(self, series: Ints) -> tuple[Ints, NDArray[Any], str]:
-        """Return the stamps (R,) in nanoseconds, the times as the table has them, and the name of their column."""
+    def _stamps(self, series: Ints) -> Stamps:
         reading, found = self._reading, self._found
-        rate = _positive(reading.options, "rate", "frames per second")
+        rate = reading.positive("rate", "frames per second")
         column = found.get("stamp")
+        skipped = np.zeros(self._rows, dtype=np.bool_)
         if column is None or (rate is not None and "frame" in found):
             return self._counted(series, rate)
         values = self._columns[column.name]
         missing = np.isnat(values) if values.dtype.kind == "M" else values != values  # noqa: PLR0124  NaN differs from itself
-        self._time.first("time", missing, f"a stamp in column {column.name}", values)
+        if values.dtype.kind == "U":
+            missing = np.isin(np.char.strip(values), NO_VALUE)
+        if missing.any() and not missing.all() and reading.skips:
+            skipped = missing
+            near = np.maximum.accumulate(np.where(missing, 0, np.arange(self._rows)))
+            values = values[np.where(missing[near], np.flatnonzero(~missing)[0], near)]
+        else:
+            expected = f"a stamp in column {column.name} (--option invalid=skip leaves such rows out)"
+            self._time.first("time", missing, expected, values)
         if values.dtype.kind == "M":
             reading.note("time", f"stamps are dates in column {column.name}")
-            return values.astype("datetime64[ns]").astype(np.int64), values, column.name
-        if values.dtype.kind not in "if":
-            bad = np.array([not _is_number(text) or not text for text in values.tolist()], dtype=np.bool_)
+            return Stamps(values.astype("datetime64[ns]").astype(np.int64), values, column.name, skipped)
+        if values.dtype.kind not in "iuf":
+            bad = np.array([not is_number(text) for text in values.tolist()], dtype=np.bool_)
             expected = f"stamps in column {column.name}: numbers, or dates as YYYY-MM-DD HH:MM:SS.ffffff"
-            self._time.first("time", bad if bad.any() else ~bad, expected, values)
-            values = np.zeros(self._rows)
+            self._time.first("time", bad, expected, values)
+            texts = [text.strip() for text in values.tolist()]
+            integers = all(text.lstrip("+-").isdigit() for text in texts)  # such as nanoseconds beside an empty cell
+            values = np.array(
+                [int(text) for text in texts] if integers else texts, dtype=np.int64 if integers else np.float64
+            )
         if rate is not None:
-            return np.round(values * (1e9 / rate)).astype(np.int64), values, column.name
-        if self._rows and "frame" in found and "nanosec" not in found:
-            values = self._first_of_frames(values, series)
+            return Stamps(np.round(values * (1e9 / rate)).astype(np.int64), values, column.name, skipped)
         if "nanosec" in found:
             whole = np.asarray(values == np.floor(values))
             self._time.first("time", ~whole, f"whole seconds in column {column.name}", values)
@@ -433,24 +404,16 @@ class _Table:
             self._time.first("time", ~np.isfinite(part), f"nanoseconds in column {found['nanosec'].name}", part)
             reading.note("time", f"stamps are {column.name} + {found['nanosec'].name}")
             stamp = values.astype(np.int64) * 1_000_000_000 + part.astype(np.int64)
-            return stamp, stamp, "stamp_ns"
-        return read_stamps(reading, values, series, column.unit), values, column.name
+            return Stamps(stamp, stamp, "stamp_ns", skipped)
+        stamp = read_stamps(reading, values, series, column.unit, self._frame_numbers())
+        return Stamps(stamp, values, column.name, skipped)
 
-    def _first_of_frames(self, values: NDArray[Any], series: Ints) -> NDArray[Any]:
-        """Return the first time of each row's frame, where the frames of the table follow each other in time."""
-        number = np.unique(self._columns[self._found["frame"].name], return_inverse=True)[1]
-        frame = np.unique(series * len(values) + number, return_inverse=True)[1]
-        order = np.lexsort((frame, values, series))
-        begins = np.r_[True, np.diff(frame[order]) != 0]
-        first = np.empty_like(values)
-        first[order] = values[order][np.flatnonzero(begins)[np.cumsum(begins) - 1]]
-        if int(begins.sum()) > frame.max() + 1 or np.array_equal(first, values):
-            return values
-        column = self._found["frame"].name
-        self._reading.note("time", f"stamps differ within a frame: each has the first one of its {column}")
-        return first
+    def _frame_numbers(self) -> NDArray[Any] | None:
+        """Return the numbers of the frames, if the table has several."""
+        values = self._columns[self._found["frame"].name] if "frame" in self._found else None
+        return None if values is None or (len(values) > 1 and (values == values[0]).all()) else values
 
-    def _counted(self, series: Ints, rate: float | None) -> tuple[Ints, NDArray[Any], str]:
+    def _counted(self, series: Ints, rate: float | None) -> Stamps:
         """Return what `_stamps` does from the numbers of frames."""
         reading, column = self._reading, self._found.get("frame")
         if column is None:
@@ -466,38 +429,50 @@ class _Table:
             reading.note("time", text, "--option rate=HZ")
         else:
             reading.note("time", f"column {column.name} counts frames, {rate:g} a second")
-        return np.round(numbers * (1e9 / rate)).astype(np.int64), self._columns[column.name], column.name
+        stamp = np.round(numbers * (1e9 / rate)).astype(np.int64)
+        return Stamps(stamp, self._columns[column.name], column.name, np.zeros(self._rows, dtype=np.bool_))
 
-    def _grouped(self, stamp: Ints, series: Ints, row: Ints, overlap: Callable[[Ints], Bools], *, scored: bool) -> Ints:
-        """Return the stamps (R,) of frames: equal for boxes of a frame that have stamps of their own."""
+    def _framed(
+        self,
+        stamps: Stamps,
+        series: Ints,
+        row: Ints,
+        center: Floats,
+        size: Floats,
+        kind: Ints,
+        score: Floats,
+        *,
+        scored: bool,
+    ) -> Stamps:
+        """Return the stamps of frames; refuse frames most of whose boxes stand at the places of others."""
         reading = self._reading
 
-        def crowded(stamps: Ints) -> float:
-            place = np.unique(stamps[row], return_inverse=True)[1]
-            frame = np.unique(series[row] * len(stamps) + place, return_inverse=True)[1].astype(np.int64)
-            return float(np.mean(overlap(frame))) if len(row) else 0.0
+        def overlaps(stamp: Ints) -> Bools:
+            place = np.unique(stamp[row], return_inverse=True)[1]
+            frame = np.unique(series[row] * len(stamp) + place, return_inverse=True)[1].astype(np.int64)
+            return overlapping(frame, center[:, :2], size, kind, score[row])
 
-        asked = _positive(reading.options, "group", "seconds", zero=True)
-        if asked is not None:
-            return group_stamps(stamp, series, asked * 1e9) if asked else stamp
-        found = frame_starts(stamp, series)
-        if found is not None and crowded(found) < 0.5 * _CROWDED:
-            apart = (stamp - found).max() / 1e9
-            frames = len(np.unique(found))
-            text = f"stamps differ by up to {apart:.3g} s within a frame: grouped into {frames} frames"
-            reading.note("time", text, "--option group=SECONDS, 0 for none")
-            return found
-        share = crowded(stamp) if scored else 0.0
-        if share > _CROWDED:
-            most = int(np.unique(stamp[row], return_counts=True)[1].max())
+        def crowd(stamp: Ints) -> float:
+            return float(np.mean(overlaps(stamp))) if len(row) else 0.0
+
+        column = self._found.get("frame")
+        numbers = None if column is None or column.name == stamps.column else self._frame_numbers()
+        name = "" if column is None else column.name
+        stamps = read_frames(reading, stamps, series, numbers, crowd, name)
+        share = crowd(stamps.ns) if scored else 0.0
+        if share > CROWDED:
+            most = int(np.unique(stamps.ns[row], return_counts=True)[1].max())
             received = f"{share:.0%} of the boxes at the place of another one, up to {most} boxes a stamp"
             text = "have stamps lost digits, or were frames merged?"
             if "time" in reading.options:
-                reading.note("time", f"{received}: {text}")
+                reading.doubt("time", f"{received}: {text}")
             else:
                 option = "--option time=UNIT, if the stamps are right"
                 reading.refuse("time", f"boxes apart from each other under one stamp; {text}", received, option)
-        return stamp
+        elif share > _TWICE:
+            text = f"{share:.0%} of the boxes stand at the place of another one of their frame and class"
+            reading.doubt("rows", f"{text}: objects are reported twice, by two detectors or before suppression?")
+        return stamps
 
     def _keys(self) -> tuple[NDArray[np.str_], tuple[str, ...], dict[str, tuple[str, ...]]]:
         names = tuple(self._found[role].name for role in ("recording", "sensor") if role in self._found)
@@ -507,40 +482,61 @@ class _Table:
         joined = [".".join(row) for row in zip(*parts, strict=True)]
         return np.array(joined, dtype=np.str_), names, dict(zip(joined, zip(*parts, strict=True), strict=True))
 
-    def _yaw(self, otherwise: float | None) -> tuple[Floats, str | None]:
+    def _yaw(self, *, scored: bool) -> tuple[Floats, str | None]:
         """Return headings as the table has them, and the unit that is stated for them; `none` where there are none."""
-        quaternion = self._quaternion("q", "yaw") if "yaw" not in self._found else None
-        if quaternion is None:
-            return self._numbers("yaw", otherwise), self._unit("yaw") if "yaw" in self._found else "none"
-        w, x, y, z = quaternion.T
-        return np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z), "quaternion"
+        if "yaw" in self._found:
+            return self._numbers("yaw"), self._unit("yaw")
+        quaternion = None if self._turn_of in {"angles", "matrix"} else self._quaternion("q", "yaw")
+        if quaternion is not None:
+            w, x, y, z = quaternion.T
+            return np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z), "quaternion"
+        parts = (
+            np.column_stack([self._read_numbers("yaw", name) for name in self._turn_columns])
+            if self._turn_columns
+            else None
+        )
+        if parts is None:
+            return np.full(self._rows, np.nan if scored else 0.0), "none"
+        if self._turn_of == "matrix":
+            return np.arctan2(parts[:, 3], parts[:, 0]), "quaternion"
+        upright = 1 if self._reading.options.get("axes") == "camera" else 2
+        turn = 360.0 if np.nanmax(np.abs(parts), initial=0.0) > FULL_TURN else 2.0 * np.pi
+        if self._turn_of == "part" or (np.abs(np.delete(parts, upright, axis=1)) > _TILTED * turn).any():
+            expected = "a column yaw (--option column.yaw=NAME), a quaternion, a matrix, or angles of upright boxes"
+            raise DatasetError(self._reading.path, expected, f"the numbers {', '.join(self._turn_columns)}")
+        column = self._turn_columns[upright]
+        self._reading.note(
+            "yaw", f"yaw is {column}, as boxes stand upright by the other angles", "--option column.yaw=NAME"
+        )
+        return parts[:, upright], normalised(column).unit
 
     def _quaternion(self, prefix: str, topic: str) -> Floats | None:
         """Return quaternions w x y z (R, 4); None where the table has none."""
         roles = [f"{prefix}{part}" for part in _TURNS]
-        if not all(role in self._found for role in roles):
+        if not {roles[0], roles[3]} <= self._found.keys():
             return None
-        parts = np.column_stack([self._numbers(role) for role in roles])
         named = not self._found[roles[0]].base[-1:].isdigit()
+        if not named and not set(roles) <= self._found.keys():
+            return None
+        parts = np.column_stack([self._numbers(role, 0.0) for role in roles])  # about z alone w and z are enough
         return read_turn(self._reading, topic, parts, named=named)
 
     def _heading(self, motion: "_Motion", size: Floats, yaw: Floats, unit: str | None, *, strict: bool) -> Floats:
         reading, moves = self._reading, motion.moves
         long = moves.take(size[moves.start, :2].max(axis=1) > 1.3 * size[moves.start, :2].min(axis=1))
         unposed = motion.pose is None
-        moving = unposed and moves.common > _CROWDED
         found = yaw
         if unit != "none":
-            found = read_heading(reading, yaw, unit, long, motion.carry, strict=strict and not moving)
+            moving = unposed and is_moving(yaw, long)
+            found = read_heading(reading, yaw, unit, long, motion.carry, strict=strict, moving=moving)
+            unknown = int(np.isnan(found).sum())
+            if unknown:
+                reading.note("yaw", f"{unknown} of {len(found)} boxes have no heading: it is unknown")
         if unposed:
             reading.note("pose", "no columns for the pose of the sensor: boxes are assumed to be in the world frame")
-            if moving and (
-                not len(long) or float(np.mean(np.abs(long.turn(found[long.start])) < SAME_DIRECTION)) < _FORWARD
-            ):
-                text = (
-                    f"the sensor seems to move, boxes share a motion in {moves.common:.0%} of the frames: add its poses"
-                )
-                reading.note("pose", text, "pose columns, or --option poses=FILE")
+            if unit != "none" and is_moving(found, long):
+                text = f"the sensor seems to move, boxes share a motion in {moves.common.share:.0%} of the frames"
+                reading.doubt("pose", f"{text}: add its poses", "pose columns, or --option poses=FILE")
         return found
 
     def _velocity(self, motion: "_Motion", row: Ints) -> Floats | None:
@@ -556,15 +552,7 @@ class _Table:
             velocity = _rotated(motion.pose[row, 3:] * _INVERSE, flat)[:, :2]
         return velocity
 
-    def _suspicious(self, size: Floats, center: Floats, stamp: Ints) -> None:
-        long = int((size[:, :2] > _LONGEST).any(axis=1).sum())
-        if long:
-            self._reading.note("rows", f"{long} boxes are longer than {_LONGEST:g} m")
-        again = len(stamp) - len(np.unique(np.column_stack([stamp, center]), axis=0))
-        if again:
-            self._reading.note("rows", f"{again} boxes stand where another one of their stamp does")
-
-    def _names(self) -> NDArray[np.str_]:
+    def _names(self, stamp: Ints) -> NDArray[np.str_]:
         column = self._found.get("class")
         if column is None:
             names = np.full(self._rows, NO_CLASS)
@@ -574,6 +562,7 @@ class _Table:
             if values.dtype.kind == "f":  # numbers with an empty cell
                 values = np.where(np.isnan(values), "", np.char.mod("%g", values))
             names = np.char.strip(values.astype(np.str_))
+            names = self._without_numbers(np.where(np.isin(names, NO_VALUE), "", names), stamp)
         renamed = {
             key.removeprefix("class."): name for key, name in self._reading.options.items() if key.startswith("class.")
         }
@@ -587,6 +576,25 @@ class _Table:
         new = {one: renamed[folded[one.lower()]] if one.lower() in folded else one for one in have}
         return np.array([new[name] for name in names.tolist()], dtype=np.str_)
 
+    def _without_numbers(self, names: NDArray[np.str_], stamp: Ints) -> NDArray[np.str_]:
+        """Return the classes of names that are a class and the number of an object, as `car:12`; else the names."""
+        split = {name: _NUMBERED.fullmatch(name) for name in np.unique(names).tolist() if name}
+        classes = {name: match[1] for name, match in split.items() if match}
+        if len(classes) < len(split) or len(set(classes.values())) == len(classes):
+            return names
+        found = np.array([classes.get(name, name) for name in names.tolist()])
+
+        def most(values: NDArray[np.str_]) -> int:
+            return max(Counter(zip(stamp.tolist(), values.tolist(), strict=True)).values())
+
+        if most(names) > 1 or most(found) == 1:  # a class may have several boxes in a frame, an object has one
+            return names
+        column = self._found["class"].name
+        self._reading.note(
+            "class", f"column {column} has classes and numbers of objects: {names[0]} is of class {found[0]}"
+        )
+        return found
+
     def _ids(self) -> Ints | None:
         column = self._found.get("id")
         if column is None:
@@ -594,9 +602,9 @@ class _Table:
         values = self._columns[column.name]
         if values.dtype.kind == "i":
             return values.astype(np.int64)
-        texts = values.astype(np.str_)
+        texts = np.char.strip(values.astype(np.str_))
         numbers = np.unique(texts, return_inverse=True)[1].astype(np.int64)
-        return np.where(np.isin(texts, ("", "nan", "-1", "-1.0")), NO_ID, numbers)
+        return np.where(np.isin(texts, (*NO_VALUE, "-1", "-1.0")), NO_ID, numbers)
 
     def _poses(self, stamp: Ints) -> Floats | None:
         """Return the poses (R, 7) of the table, or of another one at its stamps."""
@@ -625,7 +633,7 @@ class _Table:
     def trajectory(self) -> tuple[Ints, Floats]:
         """Return the stamps (P,) and poses (P, 7) of a table of poses, in the order of time."""
         series = np.zeros(self._rows, dtype=np.int64)
-        stamp, _, _ = self._stamps(series)
+        stamp = self._stamps(series).ns
         prefix = "" if "x" in self._found else "pose_"
         ends = (("x", None), ("y", None), ("z", 0.0))
         translation = np.column_stack([self._numbers(f"{prefix}{axis}", without) for axis, without in ends])
@@ -654,7 +662,7 @@ class _Table:
         fine = unknown | ((least >= LEAST_VARIANCE) & (np.maximum(xx, yy) <= LARGEST_VARIANCE))
         expected = f"variances of x and y from {LEAST_VARIANCE:g} to {LARGEST_VARIANCE:g} m^2 along every axis, or none"
         bad = np.asarray(kept & ~fine)
-        if self._reading.chosen("invalid", ("skip", "refuse")) != "skip":
+        if not self._reading.skips:
             self._reading.first("covariance", bad, expected, np.column_stack((xx, xy, yy)))
         self._leave_out(kept, bad, "with covariances that are none")
         covariance = np.zeros((self._rows, 3, 3))
@@ -671,25 +679,33 @@ class _Table:
             kept &= ~bad
 
     def _valid(
-        self, kept: Bools, center: Floats, size: Floats, yaw: Floats, score: Floats, names: NDArray[np.str_]
+        self,
+        kept: Bools,
+        center: Floats,
+        size: Floats,
+        yaw: Floats,
+        unit: str | None,
+        score: Floats,
+        names: NDArray[np.str_],
     ) -> Bools:
         """Return the rows with a box that can be used; refuse one that cannot, unless the user leaves them out."""
-        skip = self._reading.chosen("invalid", ("skip", "refuse")) == "skip"
         good = kept.copy()
-        known = np.asarray(names != "", dtype=np.bool_)
+        marks = "" if "missing" in self._reading.options else ", missing=NUMBER names a mark for no value"
         for what, values, fine in (
             ("finite x, y and z", center, np.isfinite(center).all(axis=1)),
             ("positive length, width and height", size, (np.isfinite(size) & (size > 0.0)).all(axis=1)),
-            ("finite yaw", yaw, np.isfinite(yaw)),
+            (f"sizes up to {LARGEST_SIZE:g} m", size, (size <= LARGEST_SIZE).all(axis=1)),
+            ("finite yaw", yaw, ~np.isinf(yaw)),
+            ("a yaw within a turn", yaw, ~no_angle(self._reading, yaw, unit)),
             ("finite score", score, np.isfinite(score)),
-            ("class", names, known),
+            ("class", names, np.asarray(names != "", dtype=np.bool_)),
         ):
             bad = kept & ~fine
-            if not skip:
-                expected = f"{what} (--option invalid=skip leaves such rows out)"
+            if not self._reading.skips:
+                expected = f"{what} (--option invalid=skip leaves such rows out{marks})"
                 self._reading.first("rows", bad, expected, values)
             good &= fine
-        self._leave_out(kept, ~good, "with values that are missing, not finite or not positive")
+        self._leave_out(kept, ~good, "with values that are missing, not finite or out of range")
         return good
 
 
@@ -710,7 +726,6 @@ class _Motion:
         return np.asarray(np.arctan2(turned[:, 1], turned[:, 0]), dtype=np.float64)
 
 
-_FORWARD: Final = 0.8  # share of forward moves from which traffic shares a motion, not the sensor
 _LEAST_TURN: Final = 1e-6
 _INVERSE: Final = np.array([1.0, -1.0, -1.0, -1.0])
 
@@ -764,18 +779,9 @@ def _poses_at(reading: Reading, path: Path, stamp: Ints) -> Floats:
     return np.column_stack([pose[before, :3] * (1.0 - part) + pose[after, :3] * part, turn])
 
 
-def _positive(options: Mapping[str, str], name: str, what: str, *, zero: bool = False) -> float | None:
-    text = options.get(name)
-    if text is None:
-        return None
-    if not _is_number(text) or not (0.0 < float(text) < float("inf") or (zero and float(text) == 0.0)):
-        raise DatasetError(f"--option {name}", f"{what}, a positive number", repr(text))
-    return float(text)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text or "nan")
-    except ValueError:
+def _has_no_number(values: NDArray[Any]) -> bool:
+    """Tell whether a column has texts, none of which is a number."""
+    if values.dtype.kind != "U":
         return False
-    return True
+    texts = [text for text in values[:_LOOKED_AT].tolist() if text.strip() not in NO_VALUE]
+    return bool(texts) and not any(map(is_number, texts))

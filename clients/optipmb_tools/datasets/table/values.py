@@ -1,44 +1,51 @@
 """Units and conventions of the values of a table, found for a whole recording at once.
 
-An option of the user holds, then what the name of a column says, then the evidence of the values: the time between
-frames, the directions in which boxes move, the classes. Each assumption is a finding; a contradiction is refused with
-the option that resolves it. Results: nanoseconds, metres, radians, z up.
+Each rule counts what agrees with each way to read the values: the directions in which boxes move, the classes, the
+ranges. `Reading.decide` compares the counts. Results: metres, radians, z up.
 """
 
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
+from optipmb_tools.datasets.evidence import Evidence
 from optipmb_tools.datasets.interface import class_like
-from optipmb_tools.datasets.motion import LEAST_ALONG, SAME_DIRECTION, SURE_MOVES, Moves
-from optipmb_tools.files import DatasetError
-from optipmb_tools.geometry import Floats, Ints, wrap_angle
-from optipmb_tools.table_files import line_of
+from optipmb_tools.datasets.motion import LEAST_ALONG, MOST, SAME_DIRECTION, Moves
+from optipmb_tools.datasets.table.findings import HALF, Claim, Reading
+from optipmb_tools.geometry import Bools, Floats, Ints, wrap_angle
 
-SECONDS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-DATED: Final = (1e8, 4.2e9)  # seconds since 1970 that are taken for a date: 1973 to 2103
-PERIODS: Final = (0.005, 10.0)  # shortest and longest time between frames that is plausible, s
-COUNTED_HZ: Final = 10.0  # default rate of frames that are counted and not stamped
-APART: Final = 3.0  # ratio of the shortest step between frames to the longest step inside of one
 UPRIGHT: Final = 0.3  # largest x and y of the quaternion of a box that stands upright
 FULL_TURN: Final = 6.4
+LARGEST_DEGREES: Final = 360.5
+LARGEST_RADIANS: Final = 4.0 * np.pi
 PERCENT: Final = 100.0
 SPREAD: Final = 8.0
 LOGIT: Final = 30.0  # beyond it a sigmoid is 0 or 1 in six decimals; scores beyond it are no logits
 ROUNDING: Final = 1e-3  # scores up to so much above 1 are 1
-FEW: Final = 0.05  # share of scores outside 0 to 1 up to which they are mistakes and not of another kind
+FEW: Final = 0.05  # share of values outside of a range up to which they are mistakes and not of another kind
+NOISE: Final = 0.1  # difference of two shares that tells nothing
 ENOUGH_MOVES: Final = 5  # moves from which headings are compared with motion
-AGREED: Final = 0.5  # share of moves along headings of another convention from which it is likely
-DOUBTFUL: Final = 0.7
-CERTAIN: Final = 0.8
-"""Headings are in degrees where fewer moves than the first share are along them in radians, more than the second go
-forward along them in degrees."""
+REFUSED_MOVES: Final = 80  # moves of several objects from which headings are refused
+FORWARD: Final = 0.8  # share of forward moves from which traffic shares a motion, not the sensor
 SINGLE: Final = 0.1
 FAR: Final = 1e5  # coordinates in metres beyond which single precision loses centimetres
-
+LARGEST_SIZE: Final = 500.0  # m: longer than any ship
+LONGER: Final = 1.3  # ratio of the longest side of a vehicle to the next one
+SLOW: Final = 0.5  # differences of velocities up to it say nothing, m/s
+LONG: Final = ("car", "truck", "bus", "trailer")
+USUAL: Final[Mapping[str, tuple[tuple[float, float], ...]]] = {
+    "car": ((3.0, 6.0), (1.4, 2.4), (1.2, 2.4)),
+    "bus": ((6.0, 20.0), (2.2, 3.5), (2.4, 4.5)),
+    "pedestrian": ((0.25, 1.4), (0.25, 1.2), (1.2, 2.2)),
+    "bicycle": ((1.2, 2.3), (0.3, 1.0), (0.9, 2.1)),
+}
+"""Shortest and longest length, width and height of classes whose sizes differ little, m."""
+FACTORS: Final = {"1": "", "2": "halves", "0.5": "doubled", "0.01": "centimetres", "0.001": "millimetres",
+                  "0.0254": "inches", "0.3048": "feet"}  # fmt: skip
+_SIDES: Final = {"l": "length", "w": "width", "h": "height"}
+_UNITS: Final = {"deg": "degrees", "rad": "radians"}
 # Axis from which a heading is measured, counter-clockwise if not said otherwise -> (sign, offset) of the yaw
 HEADINGS: Final[Mapping[str, tuple[float, float]]] = {
     "x": (1.0, 0.0),
@@ -52,195 +59,43 @@ HEADINGS: Final[Mapping[str, tuple[float, float]]] = {
 }
 
 
-@dataclass(frozen=True)
-class Finding:
-    """An assumption about a recording, or an error in it."""
-
-    topic: str  # `time`, `yaw`, `scores` …
-    text: str  # one line
-    option: str = ""  # that changes it
-    wrong: bool = False  # whether `optipmb track` refuses the recording for it
-
-
-@dataclass
-class Reading:
-    """Files of a recording, options of the user, and findings.
-
-    Attributes:
-        path: The file, or the folder of several.
-        options: Options of the data set.
-        lenient: Errors become findings; the reader goes on as if nothing were known.
-        files: Each file with the first of its rows; empty: all rows are in `path`.
-        named: Options `column.*` and `class.*`, with the error if they name nothing in the tables read so far.
-    """
-
-    path: Path
-    options: Mapping[str, str]
-    lenient: bool = False
-    files: tuple[tuple[Path, int], ...] = ()
-    findings: list[Finding] = field(default_factory=list)
-    named: dict[str, DatasetError | None] = field(default_factory=dict)
-
-    @property
-    def notes(self) -> list[str]:
-        """The findings, a line each."""
-        return [f"{one.text} ({one.option})" if one.option else one.text for one in self.findings]
-
-    def note(self, topic: str, text: str, option: str = "") -> None:
-        """Report an assumption, once."""
-        finding = Finding(topic, text, option)
-        if finding not in self.findings:
-            self.findings.append(finding)
-
-    def refuse(self, topic: str, expected: str, received: str, option: str = "", row: int | None = None) -> None:
-        """Raise a `DatasetError`; with `lenient`, add a finding."""
-        path, line = (self.path, None) if row is None else self.place(row)
-        if not self.lenient:
-            raise DatasetError(path, f"{expected} ({option})" if option else expected, received, line=line)
-        where = "" if line is None else f"{path.name}:{line}: "
-        self.findings.append(Finding(topic, f"{where}expected {expected}, received {received}", option, wrong=True))
-
-    def name(self, option: str, known: Collection[str], expected: str, name: str) -> None:
-        """Record whether a table has the column or class that an option names."""
-        error = DatasetError(f"--option {option}", f"{expected}: {', '.join(known)}", repr(name))
-        if name in known or name.lower() in map(str.lower, known):
-            self.named[option] = None
-        self.named.setdefault(option, error)
-
-    def place(self, row: int) -> tuple[Path, int]:
-        """Return the file of a row and its line there, counted from 1."""
-        path, first = next((one for one in reversed(self.files) if one[1] <= row), (self.path, 0))
-        return path, line_of(path, row - first, self.options)
-
-    def chosen(self, name: str, known: Mapping[str, object] | tuple[str, ...]) -> str | None:
-        """Return the value of an option; None where it is not given.
-
-        Raises:
-            DatasetError: It is not one of `known`.
-        """
-        value = self.options.get(name)
-        if value is not None and value not in known:
-            raise DatasetError(f"--option {name}", " or ".join(known), repr(value))
-        return value
-
-    def first(self, topic: str, bad: np.ndarray, expected: str, values: np.ndarray, option: str = "") -> None:
-        """Refuse the first row that is `bad`."""
-        if bad.any():
-            row = int(np.flatnonzero(bad)[0])
-            value = values[row]
-            shown = repr(value.item()) if isinstance(value, np.str_) else str(value)
-            self.refuse(topic, expected, shown, option, row)
-
-
-def median_step(numbers: np.ndarray, key: Ints) -> float:
-    """Return the median time between the frames of a recording (R,), 0 where it has no two.
-
-    Stamps that differ within a frame count as one.
-    """
-    steps = _steps(numbers, key)
-    longest = _longest_inside(steps)
-    return float(np.median(steps[steps > longest])) if len(steps) else 0.0
-
-
-def frame_starts(stamp: Ints, key: Ints) -> Ints | None:
-    """Return the first stamp (R,) of each row's frame where the rows of a frame differ in stamp; None otherwise."""
-    longest = _longest_inside(_steps(stamp, key))
-    return group_stamps(stamp, key, longest) if longest else None
-
-
-def group_stamps(stamp: Ints, key: Ints, longest: float) -> Ints:
-    """Return the first stamp of each stamp's frame; neighbouring stamps up to `longest` apart are of one frame."""
-    order = np.lexsort((stamp, key))
-    ordered = stamp[order]
-    begins = np.r_[True, (np.diff(key[order]) != 0) | (np.diff(ordered) > longest)]
-    found = np.empty_like(stamp)
-    found[order] = ordered[np.flatnonzero(begins)[np.cumsum(begins) - 1]]
-    return found
-
-
-def _steps(numbers: np.ndarray, key: Ints) -> np.ndarray:
-    order = np.lexsort((numbers, key))
-    steps = np.diff(numbers[order])[np.diff(key[order]) == 0]
-    return np.asarray(steps[steps > 0])
-
-
-def _longest_inside(steps: np.ndarray) -> float:
-    """Return the longest step between stamps of one frame; 0 where frames have one stamp.
-
-    The widest gap of the sorted steps divides steps inside of frames from steps between frames: the next longer step is
-    at least three times as long, and many steps are on either side.
-    """
-    ordered = np.sort(steps)
-    count = len(ordered)
-    low, high = int(0.3 * count), count - max(4, count // 100)
-    if high <= low:
-        return 0.0
-    ratio = ordered[low + 1 : high + 1] / ordered[low:high]
-    place = int(np.argmax(ratio))
-    return float(ordered[low + place]) if ratio[place] >= APART else 0.0
-
-
-def read_stamps(reading: Reading, numbers: np.ndarray, key: Ints, unit: str | None) -> Ints:
-    """Return stamps (R,) in nanoseconds of times (R,) of recordings `key` (R,); `unit` is in the name of the column.
-
-    Raises:
-        DatasetError: The values count frames, or no unit fits them.
-    """
-    asked = reading.chosen("time", SECONDS)
-    period = median_step(numbers, key)
-    fitting = [name for name, size in SECONDS.items() if PERIODS[0] <= period * size <= PERIODS[1]]
-    dated = [name for name, size in SECONDS.items() if DATED[0] <= float(numbers.max(initial=0)) * size <= DATED[1]]
-    stated, how = asked or unit, ""
-    if stated is None:
-        both = [name for name in fitting if name in dated]
-        counts = period == 1.0 and not dated and bool(np.all(numbers == np.round(numbers)))
-        found = both or fitting or dated or (["s"] if not period else [])
-        how = ", by their date" if both or not fitting else ""
-        if counts or len(found) != 1:
-            what = "whole numbers in steps of 1, which may count frames" if counts else f"steps of {period:g}"
-            reading.refuse("time", "a unit of time", what, "--option time=s, ms, us or ns, or rate=HZ")
-        stated = found[0] if found else "s"
-    elif asked is None and period and not (0.2 * PERIODS[0] <= period * SECONDS[stated] <= 6.0 * PERIODS[1]):
-        for other in fitting[:1]:
-            expected = f"frames at a plausible rate: in {_WORDS[stated]}, as the column's name says, {period:g} apart"
-            reading.refuse(
-                "time", expected, f"steps that fit {_WORDS[other]}", f"--option time={other}, or time={stated}"
-            )
-    rate = f"frames at {1.0 / (period * SECONDS[stated]):.3g} Hz" if period else "one stamp"
-    reading.note("time", f"stamps are in {_WORDS[stated]}{how}: {rate}", "" if asked else "--option time=UNIT")
-    if numbers.dtype.kind == "i":
-        return numbers * round(SECONDS[stated] * 1e9)
-    return np.round(numbers * (SECONDS[stated] * 1e9)).astype(np.int64)
-
-
-_WORDS: Final = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
-
-
 def read_angle(reading: Reading, name: str, values: Floats, unit: str | None) -> Floats:
     """Return the angles of a pose in radians; the unit follows from the name of the column and their range."""
     chosen = reading.chosen("yaw", ("degrees", "radians")) or _UNITS.get(unit or "")
-    most = float(np.abs(values).max(initial=0.0))
     if chosen is None:
+        most = float(np.nanmax(np.abs(values), initial=0.0))
         chosen = "degrees" if most > FULL_TURN else "radians"
         reading.note("pose", f"{name} is taken for {chosen} (up to {most:.4g})", "--option yaw=degrees, radians")
     return np.deg2rad(values) if chosen == "degrees" else values
 
 
-_UNITS: Final = {"deg": "degrees", "rad": "radians"}
+def no_angle(reading: Reading, values: Floats, unit: str | None) -> Bools:
+    """Return which values (R,) of a column of headings are beyond any angle, such as marks for no value."""
+    stated = reading.options.get("yaw") or _UNITS.get(unit or "")
+    size = np.abs(np.nan_to_num(values, posinf=0.0, neginf=0.0))
+    radians = stated == "radians" or (stated is None and (size > FULL_TURN).sum() <= FEW * len(size))
+    return np.asarray(size > (LARGEST_RADIANS if radians else LARGEST_DEGREES), dtype=np.bool_)
 
 
 def read_turn(reading: Reading, topic: str, parts: Floats, *, named: bool) -> Floats:
     """Return quaternions (R, 4) as w, x, y, z from `parts`, in the order of the columns unless these are `named`."""
-    order = reading.chosen("quaternion", ("wxyz", "xyzw"))
-    if order is None and not named and len(parts):
-        level = np.nanmax(np.abs(parts), axis=0) < UPRIGHT
-        looks_xyzw, looks_wxyz = bool(level[0] and level[1]), bool(level[1] and level[2])
-        if looks_xyzw and looks_wxyz:
-            expected = "quaternions whose order is told by upright boxes"
-            reading.refuse(topic, expected, "boxes that all have one of two headings", "--option quaternion=wxyz, xyzw")
-        order = "xyzw" if looks_xyzw else "wxyz"
-        how = "as boxes then stand upright" if looks_xyzw != looks_wxyz else "which nothing contradicts"
-        reading.note(topic, f"quaternions are in the order {' '.join(order)}, {how}", "--option quaternion=wxyz, xyzw")
+    asked = reading.chosen("quaternion", ("wxyz", "xyzw"))
+    if asked is None and named:
+        return parts
+    level = np.abs(parts[np.isfinite(parts).all(axis=1)]) < UPRIGHT
+    claims = [
+        Claim(
+            order,
+            Evidence(float(level[:, places].all(axis=1).sum()), len(level)),
+            f"quaternions are in the order {' '.join(order)}",
+            "--option quaternion=wxyz, xyzw",
+        )
+        for order, places in (("wxyz", [1, 2]), ("xyzw", [0, 1]))
+    ]
+    if asked is None and len(level) and min(one.evidence.share for one in claims) == 1.0:
+        expected = "quaternions whose order is told by upright boxes"
+        reading.refuse(topic, expected, "boxes that all have one of two headings", claims[0].option)
+    order = reading.decide(topic, claims, "boxes then stand upright", asked=asked)
     return parts[:, [3, 0, 1, 2]] if order == "xyzw" else parts
 
 
@@ -252,8 +107,9 @@ def read_heading(
     carry: Callable[[Floats, Ints], Floats],
     *,
     strict: bool,
+    moving: bool,
 ) -> Floats:
-    """Return headings (B,) in radians, counter-clockwise from x.
+    """Return headings (B,) in radians, counter-clockwise from x; NaN where unknown.
 
     Args:
         reading: Gets the findings.
@@ -262,37 +118,59 @@ def read_heading(
         moves: Moves of the boxes, in the world.
         carry: Returns headings in the world from headings (K,) and the rows (K,) of their boxes.
         strict: Whether headings that disagree with the motion are refused, and not only noted.
+        moving: Whether the sensor moves and has no poses: then motion says little about headings.
     """
     asked = reading.chosen("yaw", ("degrees", "radians"))
     zero = reading.chosen("heading", HEADINGS)
     stated = asked or ("radians" if unit == "quaternion" else _UNITS.get(unit or ""))
-    units = [stated] if stated else ["radians", "degrees"]
-    most = float(np.abs(values).max(initial=0.0))
-    if len(units) > 1 and most > FULL_TURN:
-        units = ["degrees"]
-    readings = {(one, axis): _radians(values, one, axis) for one in units for axis in HEADINGS}
-    shares = {one: _shares(yaw, moves, carry) for one, yaw in readings.items()} if len(moves) >= ENOUGH_MOVES else {}
-    axis, found = zero or "x", units[0]
-    what = {"quaternion": "yaw is that of quaternions"}.get(unit or "", "yaw is in {}")
-    option = "" if asked or unit else "--option yaw=degrees, radians"
-    if not shares:
-        text = f"{what.format(found)} (up to {most:.4g}); too few boxes move to compare headings with motion"
-        reading.note("yaw", text, option)
-        return readings[found, axis]
-    best = max((one for one in HEADINGS if one != axis), key=lambda one: shares[found, one])
-    if len(units) > 1 and shares["radians", axis][0] < DOUBTFUL and shares["degrees", axis][1] >= CERTAIN:
-        found = "degrees"  # within some degrees of x: then all objects go forward in one direction
-    share, other = shares[found, axis][0], shares["radians" if len(units) > 1 else found, best][0]
-    text = f"{share:.0%} of {len(moves)} moves are along it"
-    likely = other >= (AGREED if found == units[0] else CERTAIN)
-    if strict and zero is None and len(moves) >= SURE_MOVES and likely and (share < 0.5 * other or found != units[0]):
-        text += f" in {found}, {other:.0%} if it is measured from {best.replace('-clockwise', ' clockwise')}"
-        choice = f"--option heading={best}, or heading=x to keep it"
-        reading.refuse("yaw", "headings along the motion of the boxes", text, choice)
-        return readings[found, axis]
-    doubt = "headings and motion disagree: " if share < LEAST_ALONG else ""
-    reading.note("yaw", f"{what.format(found)}: {doubt}{text}", option)
-    return readings[found, axis]
+    size = np.abs(values[np.isfinite(values)])
+    if stated is None and len(size) and np.mean(size > FULL_TURN) > FEW:
+        stated = "degrees"
+    moves = moves.take(np.isfinite(values[moves.start]))
+    count = len(moves) if len(moves) >= ENOUGH_MOVES else 0
+    sure = count >= REFUSED_MOVES and len(np.unique(moves.object)) > 1
+
+    def along(one: str, axis: str) -> tuple[Evidence, Evidence]:
+        """Return the moves along the headings in either sense, and those forward."""
+        off = np.abs(moves.turn(carry(_radians(values[moves.start], one, axis), moves.start)))
+        near = off < SAME_DIRECTION
+        both = near | (off > np.pi - SAME_DIRECTION)
+        return Evidence(float(both.sum()) * bool(count), count), Evidence(float(near.sum()) * bool(count), count)
+
+    axis = zero or "x"
+    claims = [Claim("radians", along("radians", axis)[0]), Claim("degrees", along("degrees", axis)[1])]
+    claims += [Claim("radians", along("radians", one)[0]) for one in HEADINGS]
+    found = stated or reading.decide("yaw", claims)  # small degrees: all objects go forward in one direction
+    text = "yaw is that of quaternions" if unit == "quaternion" else f"yaw is in {found}"
+    if not count:
+        most = float(size.max(initial=0.0))
+        text += f" (up to {most:.4g}); too few boxes move to compare headings with motion"
+    shares = {one: tuple(part.share for part in along(found, one)) for one in HEADINGS if one != axis}
+    near = max(both for both, _ in shares.values()) - NOISE
+    other = max((one for one in shares if shares[one][0] >= near), key=lambda one: shares[one][1])
+    what = f"if it is measured from {other.replace('-clockwise', ' clockwise')}"
+    option = f"--option heading={other}, or heading=x to keep it"
+    claims = [
+        Claim(axis, along(found, axis)[0], text, "" if asked or unit else "--option yaw=degrees, radians"),
+        Claim(other, along(found, other)[0], what, option, "refused" if strict and not moving else "doubt", sure),
+    ]
+    reading.decide(
+        "yaw",
+        claims,
+        "moves are along it",
+        clash="headings and motion disagree",
+        expected="headings along the motion of the boxes",
+        asked=zero,
+        least=LEAST_ALONG if sure else 0.0,
+    )
+    if claims[0].evidence.share > HALF and not moving:  # along a grid of streets only the sense differs
+        claims = [
+            Claim(one, along(found, one)[1], f"if it is {one}", f"--option heading={one}", "doubt") for one in HEADINGS
+        ]
+        claims.sort(key=lambda one: one.value != axis)
+        claims[0] = replace(claims[0], text="")
+        reading.decide("yaw", claims, "moves are forward", clash="many boxes drive backwards", asked=zero)
+    return _radians(values, found, axis)
 
 
 def _radians(values: Floats, unit: str, axis: str) -> Floats:
@@ -300,11 +178,12 @@ def _radians(values: Floats, unit: str, axis: str) -> Floats:
     return wrap_angle(sign * (np.deg2rad(values) if unit == "degrees" else values) + offset)
 
 
-def _shares(yaw: Floats, moves: Moves, carry: Callable[[Floats, Ints], Floats]) -> tuple[float, float, float]:
-    """Return the shares of moves along the headings and forward along them, and how near the others are, for ties."""
-    off = np.abs(moves.turn(carry(yaw[moves.start], moves.start)))
-    aligned = np.minimum(off, np.pi - off) < SAME_DIRECTION
-    return float(np.mean(aligned)), float(np.mean(off < SAME_DIRECTION)), -float(np.mean(off))
+def is_moving(yaw: Floats, moves: Moves) -> bool:
+    """Return whether a sensor without poses moves: places keep their distances, and boxes are not driving forward."""
+    off = np.abs(moves.turn(yaw[moves.start]))
+    off = off[np.isfinite(off)]
+    forward = float(np.mean(off < SAME_DIRECTION)) if len(off) >= ENOUGH_MOVES else 1.0
+    return moves.common.bounds[0] > MOST and forward < FORWARD
 
 
 def read_velocity(
@@ -322,47 +201,72 @@ def read_velocity(
     speed = np.hypot(*given.T)
     course = carry(np.arctan2(given[:, 1], given[:, 0]), known.start)
     along = {"sensor": speed[:, None] * np.column_stack([np.cos(course), np.sin(course)]), "world": given}
-    off = {axes: float(np.median(np.linalg.norm(one - known.velocity, axis=1))) for axes, one in along.items()}
-    option = "--option velocity=sensor, world" if posed else ""
-    axes = asked or ("world" if posed and off["world"] < 0.5 * off["sensor"] and off["sensor"] > SLOW else "sensor")
-    real = float(np.median(np.hypot(*known.step.T) / known.duration))
-    if off[axes] > max(2.0 * SLOW, 0.5 * real):
-        text = f"velocities and motion disagree: {np.median(speed):.3g} m/s on average, boxes move at {real:.3g} m/s"
-        reading.note("velocity", f"{text}; another unit, or relative to the sensor?", option)
-    elif posed:
-        reading.note("velocity", f"velocities are along the axes of the {axes}, as boxes move", "" if asked else option)
-    return axes
-
-
-SLOW: Final = 0.5  # differences of velocities up to it say nothing, m/s
+    real = np.hypot(*known.velocity.T)
+    off = {axes: np.linalg.norm(one - known.velocity, axis=1) for axes, one in along.items()}
+    claims = [
+        Claim(
+            axes,
+            Evidence(float((off[axes] + 0.5 * SLOW < off[other]).sum()), len(known) * posed),
+            f"velocities are along the axes of the {axes}, as boxes move" if posed else "",
+            "--option velocity=sensor, world",
+        )
+        for axes, other in (("sensor", "world"), ("world", "sensor"))
+    ]
+    axes = reading.decide("velocity", claims, asked=asked)
+    fits = off[axes] < np.maximum(2.0 * SLOW, 0.5 * real)
+    clash = f"velocities and motion disagree: {np.median(speed):.3g} m/s on average, boxes move at"
+    clash += f" {np.median(real):.3g} m/s; another unit, or relative to the sensor?"
+    claims = [Claim(axes, Evidence(float(fits.sum()), len(known)))]
+    return reading.decide("velocity", claims, "moves have the velocity of their box", clash=clash, least=HALF)
 
 
 def read_sizes(reading: Reading, sizes: Floats, names: np.ndarray, *, stated: bool) -> Floats:
     """Return length, width, height of sizes (B, 3) in the order of the columns, whose names may be `stated`.
 
-    The order follows from vehicles, whose median length exceeds their width by far, and is height, width, length when
-    the longest comes last.
+    The order is that in which vehicles are longer than wide and high; height, width, length where the longest is last.
     """
-    order = reading.chosen("sizes", ("lwh", "wlh", "hwl"))
-    if order is None:
-        long = {name for name in np.unique(names).tolist() if class_like(name, LONG)}
-        vehicles = sizes[np.isin(names, list(long))]
-        median = np.median(vehicles, axis=0) if len(vehicles) else np.array([3.0, 2.0, 1.0])
-        longest = int(np.argmax(median))
-        looks = ("lwh", "wlh", "hwl")[longest] if median[longest] > 1.5 * np.median(median) else "lwh"
-        words = ", ".join(_SIDES[letter] for letter in looks)
-        if looks != "lwh" and stated:
-            reading.note("sizes", f"sizes look like {words}, not as their columns are named", f"--option sizes={looks}")
-            looks = "lwh"
-        elif looks != "lwh" or not stated:
-            how = f"as the {'/'.join(sorted(long))} boxes have them" if len(vehicles) else "which nothing contradicts"
-            reading.note("sizes", f"sizes are {words}, {how}", "--option sizes=lwh, wlh, hwl")
-        order = looks
-    return sizes[:, [order.index(letter) for letter in "lwh"]]
+    asked = reading.chosen("sizes", ("lwh", "wlh", "hwl"))
+    kinds = {name: class_like(name, tuple(USUAL)) or class_like(name, LONG) for name in np.unique(names).tolist()}
+    long = [name for name, kind in kinds.items() if kind in LONG]
+    vehicles = sizes[np.isin(names, long)]
+    with np.errstate(invalid="ignore"):
+        longest = np.where(vehicles.max(axis=1, initial=0.0) > LONGER * np.median(vehicles, axis=1), 1.0, 0.0)
+        side = np.argmax(np.nan_to_num(vehicles), axis=1)
+    claims = []
+    for place, order in enumerate(("lwh", "wlh", "hwl")):
+        words = ", ".join(_SIDES[letter] for letter in order)
+        how = f"as the {'/'.join(sorted(long))} boxes have them" if long else "which nothing contradicts"
+        text = f"sizes are {words}, {how}"
+        if stated and place:
+            text = f"sizes look like {words}, not as their columns are named"
+        evidence = Evidence(float((longest * (side == place)).sum()), len(vehicles))
+        shown = "" if stated and not place else text
+        option = f"--option sizes={order}" if stated else "--option sizes=lwh, wlh, hwl"
+        claims.append(Claim(order, evidence, shown, option, "doubt" if stated else "taken"))
+    order = reading.decide("sizes", claims, asked=asked)
+    found = sizes[:, [order.index(letter) for letter in "lwh"]]
+    factor = reading.positive("size_factor", "a factor of sizes")
+    if factor is None:
+        _check_sizes(reading, found, names, kinds)
+    return found * (factor or 1.0)
 
 
-LONG: Final = ("car", "truck", "bus", "trailer")
-_SIDES: Final = {"l": "length", "w": "width", "h": "height"}
+def _check_sizes(reading: Reading, sizes: Floats, names: np.ndarray, kinds: Mapping[str, str | None]) -> None:
+    """Doubt sizes that would be usual ones of their classes if they were multiplied by a factor."""
+    usual = {name: USUAL[kind] for name, kind in kinds.items() if kind is not None and kind in USUAL}
+    rows = np.isin(names, list(usual)) & np.isfinite(sizes).all(axis=1)
+    found, place = np.unique(names[rows], return_inverse=True)
+    bounds = np.array([usual[name] for name in found.tolist()]).reshape(-1, 3, 2)[place]
+    claims = []
+    for factor, unit in FACTORS.items():
+        size = sizes[rows] * float(factor)
+        fits = ((size >= bounds[:, :, 0]) & (size <= bounds[:, :, 1])).all(axis=1)
+        option = f"--option size_factor={factor}"
+        claims.append(
+            Claim(factor, Evidence(float(fits.sum()), len(size)), f"as {unit}" if unit else "", option, "doubt")
+        )
+    clash = f"sizes are not usual ones of {', '.join(sorted(usual))}"
+    reading.decide("sizes", claims, "boxes have a usual size", clash=clash)
 
 
 def read_axes(reading: Reading, center: Floats) -> bool:
@@ -428,7 +332,7 @@ def read_scores(reading: Reading, scores: Floats, rows: Ints) -> Floats:
         reading.note("score", f"{int(rounded.sum())} scores up to {scores[rounded].max():.9g} are taken for 1")
         scores = np.where(rounded, 1.0, scores)
     wrong = (scores < 0.0) | (scores > 1.0)
-    if wrong.any() and reading.options.get("invalid") != "skip":
+    if wrong.any() and not reading.skips:
         place = int(np.flatnonzero(wrong)[0])
         option = "--option invalid=skip leaves such rows out; score=logit, percent reads others"
         reading.refuse("score", "a score from 0 to 1", f"{scores[place]:g}", option, int(rows[place]))

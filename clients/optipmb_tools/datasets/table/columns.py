@@ -1,0 +1,200 @@
+"""Meanings of the columns of a table, found by their names.
+
+Names are compared in lower case, with every run of other characters as one underscore, and without a unit at the end
+(`yaw_deg`, `x [m]`). Units in names are kept. A column that is one of a group (`rotation.x`, `rotation.y` …) has a
+meaning only in a reading that uses the whole group.
+"""
+
+import re
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from optipmb_tools.table_files import BOX_LISTS
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table."""
+
+    name: str  # as the table has it
+    unit: str | None  # in its name: `deg`, `rad`, `s`, `ms`, `us`, `ns`
+    base: str  # its name without the unit, normalised
+
+
+def _vector(bases: str, part: str, place: int) -> tuple[str, ...]:
+    found: list[str] = []
+    for base in bases.split():
+        found += [f"{base}_{part}", f"{part}_{base}", f"{base}{part}", f"{base}_{place}"]
+    return tuple(found)
+
+
+_CENTER: Final = "center centre centroid pos position loc location translation 3d_location xyz c p t bbox box"
+_SIZE: Final = "size dim dims dimension dimensions extent extents 3d_dimensions scale lwh box_size"
+_SPEED: Final = "v vel velocity speed"
+_POSE_NAMES: Final = "pose ego sensor_pose ego_pose ego_translation pose_translation ego_position sensor_position"
+_TURN: Final = "pose ego sensor_pose ego_pose ego_rotation pose_rotation"
+_BOX_TURN: Final = "q quat quaternion rotation rotations rot orientation"
+
+
+def _extent(axis: str, letter: str, word: str, place: int) -> tuple[str, ...]:
+    return tuple(name for part in (axis, letter, word) for name in _vector(_SIZE, part, place))
+
+
+def _turn(bases: str, part: str, place: int) -> tuple[str, ...]:
+    return (*(f"{base}_q{part}" for base in bases.split()), *_vector(bases, part, place))
+
+
+ALIASES: Final[Mapping[str, tuple[str, ...]]] = {
+    "stamp": ("stamp", "t", "time", "timestamp", "ts", "sec", "secs", "seconds", "nanoseconds", "sim_time", "datetime",
+              "header_stamp", "header_timestamp"),
+    "nanosec": ("nanosec", "nanosecs", "nsec", "nsecs", "nanoseconds"),
+    "frame": ("frame", "frame_id", "frame_index", "frame_idx", "frame_number", "frame_no", "frame_nr"),
+    "x": ("x", "cx", "px", "x_center", "tx", *_vector(_CENTER, "x", 0)),
+    "y": ("y", "cy", "py", "y_center", "ty", *_vector(_CENTER, "y", 1)),
+    "z": ("z", "cz", "pz", "z_center", "tz", *_vector(_CENTER, "z", 2)),
+    "lat": ("lat", "latitude"),
+    "lon": ("lon", "lng", "longitude"),
+    "alt": ("alt", "altitude"),
+    "l": ("l", "length", "box_length", "dx", *_extent("x", "l", "length", 0)),
+    "w": ("w", "width", "box_width", "dy", *_extent("y", "w", "width", 1)),
+    "h": ("h", "height", "box_height", "dz", *_extent("z", "h", "height", 2)),
+    "yaw": ("yaw", "heading", "theta", "yaw_angle", "heading_angle", "rotation_z", "rot_z", "rz", "rotation_y", "ry",
+            "rot", "rotation", "orientation", "angle"),
+    "qw": ("qw", *_vector(_BOX_TURN, "w", 0)),
+    "qx": ("qx", *_vector(_BOX_TURN, "x", 1)),
+    "qy": ("qy", *_vector(_BOX_TURN, "y", 2)),
+    "qz": ("qz", *_vector(_BOX_TURN, "z", 3)),
+    "score": ("score", "confidence", "conf", "prob", "probability", "detection_score", "det_score", "tracking_score",
+              "score_3d", "scores_3d", "pred_score", "pred_scores", "scores"),
+    "class": ("class", "class_name", "cls", "label", "label_name", "category", "category_name", "type", "object_type",
+              "obj_type", "class_id", "label_id", "classification", "object_class", "name", "tracking_name",
+              "detection_name", "label_3d", "labels_3d", "pred_label", "pred_labels", "names", "labels"),
+    "vx": _vector(_SPEED, "x", 0),
+    "vy": _vector(_SPEED, "y", 1),
+    "cov_xx": ("cov_xx", "cov_x_x", "covariance_xx", "covariance_x_x", "var_x", "variance_x", "x_var", "x_variance"),
+    "cov_xy": ("cov_xy", "cov_x_y", "covariance_xy", "covariance_x_y"),
+    "cov_yy": ("cov_yy", "cov_y_y", "covariance_yy", "covariance_y_y", "var_y", "variance_y", "y_var", "y_variance"),
+    "id": ("id", "track_id", "object_id", "obj_id", "tracking_id", "instance_id", "instance",
+           "instance_token", "track", "track_uuid", "object_uuid", "instance_uuid", "uuid", "track_label"),
+    "recording": ("recording", "recording_id", "sequence", "sequence_id", "sequence_name", "scene", "scene_name",
+                  "scene_id", "session", "log", "log_id", "run", "run_id", "drive", "segment", "bag", "stream"),
+    "sensor": ("sensor", "sensor_id", "sensor_name", "node", "lidar", "device"),
+    "pose_x": _vector(_POSE_NAMES, "x", 0),
+    "pose_y": _vector(_POSE_NAMES, "y", 1),
+    "pose_z": _vector(_POSE_NAMES, "z", 2),
+    "pose_yaw": ("pose_yaw", "ego_yaw", "sensor_yaw", "pose_heading", "ego_heading"),
+    "pose_qw": _turn(_TURN, "w", 0),
+    "pose_qx": _turn(_TURN, "x", 1),
+    "pose_qy": _turn(_TURN, "y", 2),
+    "pose_qz": _turn(_TURN, "z", 3),
+}  # fmt: skip
+"""Names of each column, the most telling first."""
+
+_LISTED: Final = ("x", "y", "z", "l", "w", "h", "yaw", "vx", "vy")  # meanings of the numbers of a list of `BOX_LISTS`
+_UNITS: Final[Mapping[str, str]] = {
+    "deg": "deg", "degree": "deg", "degrees": "deg", "rad": "rad", "radian": "rad", "radians": "rad",
+    "s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "us": "us", "usec": "us",
+    "ns": "ns", "nsec": "ns", "nsecs": "ns", "nanosec": "ns", "nanosecs": "ns", "nanoseconds": "ns",
+}  # fmt: skip
+_WORDS: Final = {"stamp", "class", "id", "recording", "sensor"}  # meanings whose values may be words
+_PART: Final = re.compile(
+    rf"({'|'.join((*_BOX_TURN.split(), 'r', 'euler', 'rpy', 'ypr', 'matrix'))})_?(q?[wxyz]|\d(?:_?\d)?)"
+)
+"""Base of a column that may be one of several numbers of an orientation."""
+_LENGTHS: Final = {"m", "meter", "meters", "metre", "metres", "mps"}
+
+
+def find_columns(names: Iterable[str], chosen: Mapping[str, str], texts: Collection[str] = ()) -> dict[str, Column]:
+    """Return the column of each meaning among `names`.
+
+    Args:
+        names: Of all columns.
+        chosen: Meanings whose column the user has named.
+        texts: Columns without any number, which are no quantities whatever their name.
+    """
+    known = [normalised(name) for name in names]
+    taken: dict[str, Column] = {}
+    used = set(chosen.values())
+    for role in ALIASES:
+        aliases = _names_of(role)
+        if chosen.get(role) == NOTHING:
+            continue
+        if role in chosen:
+            unit = next((one.unit for one in known if one.name == chosen[role]), None)
+            taken[role] = Column(chosen[role], unit, "")
+            continue
+        fitting = [
+            one
+            for one in known
+            if one.base in aliases and one.name not in used and (role in _WORDS or one.name not in texts)
+        ]
+        if role == "yaw" and turn_of(known) is not None:
+            fitting = [one for one in fitting if not _PART.fullmatch(one.base)]
+        if role == "nanosec":
+            bases = {
+                one.base for one in known if "stamp" in taken and one.name == taken["stamp"].name and one.unit == "s"
+            }
+            parts = [one for one in known if bases and _is_second_half(one)]
+            fitting = [Column(one.name, "ns", aliases[0]) for one in parts if one.base in bases or one.base in aliases]
+        if fitting:
+            best = min(fitting, key=lambda one: (aliases.index(one.base), _is_second_half(one)))
+            taken[role] = best
+            used.add(best.name)
+    return taken
+
+
+def _names_of(role: str) -> tuple[str, ...]:
+    """Return the names of a meaning, the most telling first; those in lists of boxes come before flat columns."""
+    if role not in _LISTED:
+        return ALIASES[role]
+    place = _LISTED.index(role)
+    first, last = ([f"{name}_{place}" for name in lists] for lists in (BOX_LISTS, ("bbox", "box")))
+    return (*first, *ALIASES[role], *last)
+
+
+def _is_second_half(column: Column) -> bool:
+    """Tell whether a column may be the rest of a stamp, as `stamp.nanosec` of `stamp.sec`; `stamp_ns` is not."""
+    return column.unit == "ns" and not _plain(column.name).endswith("ns")
+
+
+def _plain(name: str) -> str:
+    words = re.sub(r"([a-z0-9])([A-Z])", r"\1_\2", re.sub(r"3D(?![a-z])", "3d", name))
+    return re.sub(r"[^a-z0-9]+", "_", words.lower()).strip("_")
+
+
+def normalised(name: str) -> Column:
+    """Return a column by its name, with the unit that the name has."""
+    base = _plain(name)
+    head, _, tail = base.rpartition("_")
+    if head and tail in _UNITS:
+        return Column(name, _UNITS[tail], head)
+    if base in _UNITS and base not in {"s", "ms", "us", "ns"}:
+        return Column(name, _UNITS[base], base)
+    return Column(name, None, head if head and tail in _LENGTHS else base)
+
+
+def turn_of(known: Iterable[Column]) -> tuple[str, list[str]] | None:
+    """Return the kind and the columns of an orientation that has several numbers, if there is one.
+
+    `quaternion` columns are named or in a list; `angles` are about x, y and z; a `matrix` is by rows.
+    """
+    groups: dict[str, dict[str, str]] = {}
+    for one in known:
+        if match := _PART.fullmatch(one.base):
+            groups.setdefault(match[1], {})[match[2].removeprefix("q").replace("_", "")] = one.name
+    for stem, parts in groups.items():
+        members = [parts[part] for part in sorted(parts)]
+        if {"z", "w"} <= parts.keys() or parts.keys() == set("0123"):
+            return "quaternion", members
+        if len(parts) == len(_AXES) and parts.keys() in ({"x", "y", "z"}, set("012")):
+            return "angles", members[::-1] if stem == "ypr" else members
+        if len(parts) == len(_AXES) ** 2:
+            return "matrix", members
+        if len(parts) > 1:
+            return "part", members
+    return None
+
+
+_AXES: Final = "xyz"
+NOTHING: Final = "none"  # name that a user gives for a meaning that no column has

@@ -1,0 +1,296 @@
+"""Stamps of a table: their unit, what they count from, and which of them belong to one frame."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optipmb_tools.datasets.table.findings import HALF, Reading
+from optipmb_tools.geometry import Bools, Ints
+
+SECONDS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_WORDS: Final = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+DATED: Final = (1e8, 4.2e9)  # seconds since 1970 that are taken for a date: 1973 to 2103
+PERIODS: Final = (0.005, 10.0)  # shortest and longest time between frames that is plausible, s
+COUNTED_HZ: Final = 10.0  # default rate of frames that are counted and not stamped
+APART: Final = 3.0  # ratio of the shortest step between frames to the longest step inside of one
+CROWDED: Final = 0.5  # share of boxes that share their place with another one from which their stamps cannot be right
+NEAR: Final = 5.0  # steps of a counter from its end to its beginning, where it wraps
+LONGEST_GAP: Final = 60.0  # s; a longer one than this and than all other steps together is a fault of a stamp
+UNITS_APART: Final = 100.0  # ratio of steps, many of either length, from which stamps have two units
+_WRAPS: Final = (
+    *(2.0**bits for bits in (16, 24, 31, 32)),
+    *(size * 10.0**power for size in (1, 60, 3600, 86400, 604800) for power in (0, 3, 6, 9)),
+)
+"""Ends of counters: of bits, a second, a minute, an hour, a day and a week, in any unit."""
+_TURN: Final = 40.0  # what hhmmss counts too much at the turn of a minute
+_YEARS: Final = (1970, 2100)
+_CLOCK: Final = (24, 60, 60)
+
+
+@dataclass(frozen=True)
+class Stamps:
+    """Times of the rows of a table."""
+
+    ns: Ints  # (R,)
+    time: NDArray[Any]  # (R,) as the table has it
+    column: str  # its name
+    skipped: Bools  # (R,) rows without a stamp, which are left out
+
+
+def median_step(numbers: np.ndarray, key: Ints) -> float:
+    """Return the median time between the frames of a recording (R,), 0 where it has no two.
+
+    Stamps that differ within a frame count as one.
+    """
+    steps = _steps(numbers, key)
+    longest = _longest_inside(steps)
+    return float(np.median(steps[steps > longest])) if len(steps) else 0.0
+
+
+def frame_starts(stamp: Ints, key: Ints) -> Ints | None:
+    """Return the row (R,) of the first stamp of each row's frame where the rows of a frame differ; None otherwise."""
+    longest = _longest_inside(_steps(stamp, key))
+    return group_stamps(stamp, key, longest) if longest else None
+
+
+def group_stamps(stamp: Ints, key: Ints, longest: float, *, whole: bool = False) -> Ints:
+    """Return the row (R,) of the first stamp of each stamp's frame.
+
+    Neighbouring stamps up to `longest` apart are of one frame; with `whole`, so are its first and its last one.
+    """
+    order = np.lexsort((stamp, key))
+    ordered, new = stamp[order], np.diff(key[order]) != 0
+    begins = np.r_[True, new | (np.diff(ordered) > longest)]
+    if whole:
+        start = 0
+        ends = np.flatnonzero(np.r_[new, True]) + 1
+        while start < len(order):
+            begins[start] = True
+            end = int(ends[np.searchsorted(ends, start, side="right")])
+            after = start + int(np.searchsorted(ordered[start:end], ordered[start] + longest, side="right"))
+            begins[start + 1 : after] = False
+            start = after
+    return _first_rows(order, begins)
+
+
+def rows_of_frames(stamp: np.ndarray, number: NDArray[Any], key: Ints) -> Ints | None:
+    """Return the row (R,) of the first stamp of each row's frame by the numbers of frames.
+
+    None where frames do not follow each other in time, or where each has one stamp.
+    """
+    frame = np.unique(key * len(stamp) + np.unique(number, return_inverse=True)[1], return_inverse=True)[1]
+    order = np.lexsort((frame, stamp, key))
+    begins = np.r_[True, np.diff(frame[order]) != 0]
+    first = _first_rows(order, begins)
+    return None if int(begins.sum()) > frame.max() + 1 or np.array_equal(stamp[first], stamp) else first
+
+
+def _first_rows(order: Ints, begins: Bools) -> Ints:
+    found = np.empty_like(order)
+    found[order] = order[np.flatnonzero(begins)[np.cumsum(begins) - 1]]
+    return found
+
+
+def _steps(numbers: np.ndarray, key: Ints) -> np.ndarray:
+    order = np.lexsort((numbers, key))
+    steps = np.diff(numbers[order])[np.diff(key[order]) == 0]
+    return np.asarray(steps[steps > 0])
+
+
+def _longest_inside(steps: np.ndarray) -> float:
+    """Return the longest step between stamps of one frame; 0 where frames have one stamp.
+
+    The widest gap of the sorted steps divides steps inside of frames from steps between frames: the next longer step is
+    at least three times as long, and many steps are on either side.
+    """
+    ordered = np.sort(steps)
+    count = len(ordered)
+    low, high = int(0.3 * count), count - max(4, count // 100)
+    if high <= low:
+        return 0.0
+    ratio = ordered[low + 1 : high + 1] / ordered[low:high]
+    place = int(np.argmax(ratio))
+    return float(ordered[low + place]) if ratio[place] >= APART else 0.0
+
+
+def read_stamps(reading: Reading, numbers: np.ndarray, key: Ints, unit: str | None, frame: NDArray[Any] | None) -> Ints:
+    """Return stamps (R,) in nanoseconds of times (R,) of recordings `key` (R,); `unit` is in the name of the column.
+
+    `frame` (R,) are the numbers of the frames, if the table has them.
+
+    Raises:
+        DatasetError: The values count frames, or no unit fits them.
+    """
+    asked = reading.chosen("time", SECONDS)
+    if asked is None and len(numbers) and (read := _calendar(reading, numbers, unit)) is not None:
+        return unwrapped(reading, read, key)
+    numbers = unwrapped(reading, numbers, key)
+    first = None if frame is None else rows_of_frames(numbers, frame, key)
+    period = median_step(numbers if first is None else numbers[first], key)
+    fitting = [name for name, size in SECONDS.items() if PERIODS[0] <= period * size <= PERIODS[1]]
+    dated = [name for name, size in SECONDS.items() if DATED[0] <= float(numbers.max(initial=0)) * size <= DATED[1]]
+    stated, how = asked or unit, ""
+    if stated is None:
+        both = [name for name in fitting if name in dated]
+        counts = period == 1.0 and not dated and bool(np.all(numbers == np.round(numbers)))
+        found = both or fitting or dated or (["s"] if not period else [])
+        how = ", by their date" if both or not fitting else ""
+        if counts or len(found) != 1:
+            what = "whole numbers in steps of 1, which may count frames" if counts else f"steps of {period:g}"
+            reading.refuse("time", "a unit of time", what, "--option time=s, ms, us or ns, or rate=HZ")
+        stated = found[0] if found else "s"
+    elif asked is None and period and not (0.2 * PERIODS[0] <= period * SECONDS[stated] <= 6.0 * PERIODS[1]):
+        for other in fitting[:1]:
+            expected = f"frames at a plausible rate: in {_WORDS[stated]}, as the column's name says, {period:g} apart"
+            reading.refuse(
+                "time", expected, f"steps that fit {_WORDS[other]}", f"--option time={other}, or time={stated}"
+            )
+    rate = f"frames at {1.0 / (period * SECONDS[stated]):.3g} Hz" if period else "one stamp"
+    reading.note("time", f"stamps are in {_WORDS[stated]}{how}: {rate}", "" if asked else "--option time=UNIT")
+    if numbers.dtype.kind in "iu":
+        return numbers.astype(np.int64) * round(SECONDS[stated] * 1e9)
+    return np.round(numbers * (SECONDS[stated] * 1e9)).astype(np.int64)
+
+
+def _calendar(reading: Reading, numbers: np.ndarray, unit: str | None) -> Ints | None:
+    """Return stamps in nanoseconds of numbers whose digits are YYYYMMDDhhmmss or hhmmss, with any decimals."""
+    for decimals in range(10) if numbers.dtype.kind in "iu" else (0,):
+        whole = numbers // 10**decimals
+        part = (numbers - whole * 10**decimals) / 10**decimals
+        day, clock = (whole // 10**6).astype(np.int64), (whole % 10**6).astype(np.int64)
+        fields = np.column_stack((clock // 10**4, clock // 100 % 100, clock % 100))
+        if (numbers < 0).any() or (fields >= _CLOCK).any():
+            continue
+        seconds = fields @ np.array([3600, 60, 1])
+        dated = bool(np.all((day // 10**4 >= _YEARS[0]) & (day // 10**4 <= _YEARS[1])))
+        if dated:
+            texts = [f"{one // 10**4}-{one // 100 % 100:02d}-{one % 100:02d}" for one in day.tolist()]
+            try:
+                seconds = seconds + np.array(texts, dtype="datetime64[s]").astype(np.int64)
+            except ValueError:
+                continue
+        elif day.any() or decimals % 3 or unit not in {None, "s"} or not _turns_minutes(whole + part, seconds + part):
+            continue
+        text = f"stamps are {'YYYYMMDD' * dated}hhmmss, as their digits say"
+        reading.note("time", text, "--option time=UNIT")
+        found: Ints = seconds * 1_000_000_000 + np.round(part * 1e9).astype(np.int64)
+        return found
+    return None
+
+
+def _turns_minutes(digits: np.ndarray, seconds: np.ndarray) -> bool:
+    """Tell whether digits hhmmss (R,) go on by 41 at the turn of each minute, where `seconds` (R,) go on evenly."""
+    raw, read = np.unique(digits), np.unique(seconds)
+    steps = np.diff(read)
+    if len(raw) != len(read) or not len(steps):
+        return False
+    usual, turns = float(np.median(steps)), np.diff(raw // 100) > 0
+    rarely = PERIODS[0] <= usual <= PERIODS[1] and 0.0 < usual * turns.sum() < HALF * steps.sum()
+    return rarely and bool(np.diff(raw)[turns].min() >= _TURN and steps[turns].max() <= NEAR * usual)
+
+
+def unwrapped(reading: Reading, numbers: np.ndarray, key: Ints) -> np.ndarray:
+    """Return times (R,) that go on where the counter of their clock begins again, as the order of the rows shows."""
+    found = numbers
+    for one in np.unique(key).tolist():
+        rows = np.flatnonzero(key == one)
+        values = numbers[rows]
+        steps = np.diff(values)
+        back = np.flatnonzero(steps < 0)
+        usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+        if not len(back) or not usual or len(back) > MOST_BACK:
+            continue
+        ends, begins = values[back], values[back + 1]
+        fitting = [w for w in _WRAPS if np.all((ends < w) & (ends > w - NEAR * usual) & (begins < NEAR * usual))]
+        path, line = reading.place(int(rows[back[0] + 1]))
+        if fitting and values.min() >= 0:
+            wraps = np.zeros(len(rows), dtype=numbers.dtype if numbers.dtype.kind == "f" else np.int64)
+            wraps[back + 1] = fitting[0]
+            found = found.astype(wraps.dtype)
+            found[rows] += np.cumsum(wraps)
+            reading.note(
+                "time", f"the clock begins again after {fitting[0]:.0f} at {path.name}:{line}: stamps go on there"
+            )
+        elif all(len(np.unique(part)) < len(part) for part in np.split(values, back + 1)):  # not object by object
+            text = f"stamps go back {len(back)} times in the order of the rows, first at {path.name}:{line}"
+            reading.doubt("time", f"{text}; rows are taken by their stamps", "a column recording, if it is another one")
+    return found
+
+
+MOST_BACK: Final = 3  # steps back of a table whose rows are in the order of time
+
+
+def refuse_gap(reading: Reading, stamp: Ints, key: Ints) -> None:
+    """Refuse a stamp that is further from the others of its recording than these are from each other."""
+    for one in np.unique(key).tolist():
+        rows = np.flatnonzero(key == one)
+        ordered = np.unique(stamp[rows])
+        steps = np.diff(ordered)
+        if len(steps) < 2:  # noqa: PLR2004  of two stamps none is the odd one
+            continue
+        low, high = np.quantile(steps, (0.2, 0.8)).tolist()
+        place = int(np.argmax(steps))
+        gap = int(steps[place])
+        rest = int(steps.sum()) - gap
+        if high <= UNITS_APART * low and (gap <= LONGEST_GAP * 1e9 or gap <= rest):
+            continue
+        before = stamp[rows] <= ordered[place]
+        few = rows[before if before.sum() < 0.5 * len(rows) else ~before]
+        count = f"{len(few)} of {len(rows)} rows are {gap / 1e9:.6g} s from the others, which span {rest / 1e9:.6g} s"
+        if "time" in reading.options:
+            reading.doubt("time", count)
+        else:
+            option = "--option time=UNIT, if the stamps are right"
+            reading.refuse("time", "stamps of one recording in one unit", count, option, int(few[0]))
+
+
+def read_frames(
+    reading: Reading,
+    stamps: Stamps,
+    series: Ints,
+    number: NDArray[Any] | None,
+    crowd: Callable[[Ints], float],
+    name: str,
+) -> Stamps:
+    """Return the stamps of frames: equal for boxes of a frame that have stamps of their own.
+
+    Args:
+        reading: Gets the findings.
+        stamps: Of the rows (R,).
+        series: (R,) recording of each row.
+        number: (R,) of frames; None without such a column.
+        crowd: Returns the share of boxes that share their place under stamps (R,).
+        name: Of the column of `number`.
+    """
+
+    def of(first: Ints) -> Stamps:
+        return Stamps(stamps.ns[first], stamps.time[first], stamps.column, stamps.skipped)
+
+    asked = reading.positive("group", "seconds", zero=True)
+    if asked is not None:
+        return of(group_stamps(stamps.ns, series, asked * 1e9, whole=True)) if asked else stamps
+    alone = crowd(stamps.ns)
+    by_number = None if number is None else rows_of_frames(stamps.ns, number, series)
+    for first, how in ((by_number, "number"), (frame_starts(stamps.ns, series), "step")):
+        if first is None:
+            continue
+        grouped = stamps.ns[first]
+        if crowd(grouped) > max(0.5 * CROWDED, alone):
+            if how == "number":
+                reading.doubt(
+                    "time",
+                    f"column {name} is not used: its frames hold boxes at one place",
+                    f"--option column.frame={name}",
+                )
+            continue
+        if how == "number":
+            reading.note("time", f"stamps differ within a frame: each has the first one of its {name}")
+        else:
+            apart, frames = (stamps.ns - grouped).max() / 1e9, len(np.unique(grouped))
+            text = f"stamps differ by up to {apart:.3g} s within a frame: grouped into {frames} frames"
+            reading.note("time", text, "--option group=SECONDS, 0 for none")
+        return of(first)
+    return stamps

@@ -1,0 +1,323 @@
+"""Tables of strangers: what is right is read, and what is wrong is refused or named with the remedy."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from commands import run_here
+from optipmb_tools.datasets import DatasetError
+from optipmb_tools.datasets.evidence import Evidence
+from optipmb_tools.datasets.table import TableDataset
+from optipmb_tools.datasets.table.findings import Finding
+from optipmb_tools.table_files import write_table
+from own_tables import boxes
+
+Table = dict[str, np.ndarray]
+CARS, PERIOD = 8, 0.1
+
+
+def street(seconds: float = 12.0, *, ray: float = 0.0, copies: int = 1, parked: int = 4, seed: int = 5) -> Table:
+    """Return cars on a grid of streets at 10 Hz around a sensor, some of them parked.
+
+    Args:
+        seconds: Length of the recording.
+        ray: Scatter of the range, as a part of it.
+        copies: Boxes of each car, with scores from high to low, as before suppression.
+        parked: Cars that stand.
+        seed: Of the noise.
+    """
+    rng = np.random.default_rng(seed)
+    frames = round(seconds / PERIOD)
+    course = np.resize([0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi], CARS) + rng.normal(0.0, 0.05, CARS)
+    speed = np.where(np.arange(CARS) < parked, 0.0, 8.0)
+    begin = np.column_stack([np.arange(CARS) * 9.0 - 30.0, np.tile([-25.0, 25.0], CARS // 2)])
+    t, car = np.repeat(np.arange(frames) * PERIOD, CARS * copies), np.tile(np.repeat(np.arange(CARS), copies), frames)
+    place = begin[car] + (speed[car] * t)[:, None] * np.column_stack([np.cos(course), np.sin(course)])[car]
+    place = place * (1.0 + ray * rng.normal(size=(len(t), 1))) + rng.normal(0.0, 0.03 * copies, (len(t), 2))
+    count = len(t)
+    return {
+        "t": t.round(6),
+        "x": place[:, 0],
+        "y": place[:, 1],
+        "z": np.full(count, 0.8),
+        "l": np.full(count, 4.5),
+        "w": np.full(count, 1.9),
+        "h": np.full(count, 1.6),
+        "yaw": course[car] + rng.normal(0.0, 0.02, count),
+        "score": 0.9 * np.resize([1.0, 0.6, 0.2, 0.05, 0.01][:copies], count),
+        "class": np.full(count, "car"),
+    }
+
+
+def looked(path: Path, columns: Table, **options: str) -> tuple[TableDataset, list[Finding]]:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_table(path, columns)
+    findings: list[Finding] = []
+    return TableDataset(path, options, lenient=True, findings=findings), findings
+
+
+def troubles(path: Path, columns: Table, **options: str) -> list[str]:
+    return [f"{one.text} {one.option}" for one in looked(path, columns, **options)[1] if one.wrong or one.doubt]
+
+
+@pytest.mark.parametrize("changed", [{}, {"ray": 0.03}, {"ray": 0.08}, {"copies": 5}, {"parked": 8}, {"parked": 0}])
+def test_right_tables_have_no_doubtful_finding(tmp_path: Path, changed: dict[str, Any]) -> None:
+    """Jitter along the ray is no motion, and boxes before suppression are no frames that were merged."""
+    assert troubles(tmp_path / "d.csv", street(**changed)) == []
+
+
+@pytest.mark.parametrize("changed", [{}, {"ray": 0.02}])
+@pytest.mark.parametrize(("name", "turn"), [("y", -0.5 * np.pi), ("-y", 0.5 * np.pi)])
+def test_wrong_headings_are_refused_beside_jitter(
+    tmp_path: Path, changed: dict[str, Any], name: str, turn: float
+) -> None:
+    """Headings that are measured from another axis are refused with its option, by which nothing is in doubt."""
+    columns = street(**changed)
+    columns["yaw"] = columns["yaw"] + turn
+    (found,) = troubles(tmp_path / "d.csv", columns)
+    assert f"--option heading={name}, or" in found
+    assert troubles(tmp_path / "d.csv", columns, heading=name) == []
+
+
+def test_an_object_reported_twice_hides_no_wrong_heading(tmp_path: Path) -> None:
+    """A car that is detected twice makes no moving sensor of headings from another axis, and is named."""
+    columns = street(parked=4)
+    twice = np.arange(len(columns["t"])) % CARS < 2
+    columns = {name: np.concatenate([one, one[twice]]) for name, one in columns.items()}
+    columns["x"][-int(twice.sum()) :] += 0.15
+    columns["yaw"] = columns["yaw"] - 0.5 * np.pi
+    found = troubles(tmp_path / "d.csv", columns)
+    assert any("heading=y" in one for one in found)
+    assert any("objects are reported twice" in one for one in found)
+
+
+def yaw_of(path: Path) -> np.ndarray:
+    (sequence,) = TableDataset(path).sequences(["all"])
+    return np.concatenate([frame.yaw for frame in sequence.frames()])
+
+
+def test_an_orientation_is_read_whole_or_refused(tmp_path: Path) -> None:
+    """Quaternions, three angles and matrices give the heading whatever the group is called; half of one is refused."""
+    columns = street(4.0)
+    yaw, zero = columns["yaw"], np.zeros(len(columns["t"]))
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    groups: dict[str, list[np.ndarray]] = {
+        "x y z w": [zero, zero, np.sin(yaw / 2), np.cos(yaw / 2)],
+        "z w": [np.sin(yaw / 2), np.cos(yaw / 2)],
+        "x y z": [zero, zero, yaw],
+        "0 1 2": [zero, zero, yaw],
+        "0 1 2 3 4 5 6 7 8": [cos, -sin, zero, sin, cos, zero, zero, zero, zero + 1],
+    }
+    for names, values in groups.items():
+        group = {f"rotation.{name}": one for name, one in zip(names.split(), values, strict=True)}
+        write_table(tmp_path / "d.parquet", {**{name: one for name, one in columns.items() if name != "yaw"}, **group})
+        turn = np.abs(np.exp(1j * yaw_of(tmp_path / "d.parquet")) - np.exp(1j * yaw))
+        assert turn.max() < 1e-6, names
+    tilted = {f"rotation.{name}": yaw for name in "xyz"}
+    write_table(tmp_path / "d.parquet", {**{name: one for name, one in columns.items() if name != "yaw"}, **tilted})
+    with pytest.raises(DatasetError, match=r"expected a column yaw \(--option column.yaw=NAME\)"):
+        yaw_of(tmp_path / "d.parquet")
+
+
+@pytest.mark.parametrize(
+    "name", ["{0}_lidar64.csv", "148_sj_{0}_16372.csv", "{0:06d}.csv", "{0}_{1}_1.csv"], ids=lambda one: one[:9]
+)
+@pytest.mark.parametrize("column", ["t", "yaw_rate"])
+def test_a_folder_with_a_table_for_each_frame_is_one_recording(tmp_path: Path, name: str, column: str) -> None:
+    """The stamps give the order of the frames, or the number that differs among the names, wherever it stands."""
+    columns = street(2.0)
+    for number, stamp in enumerate(np.unique(columns["t"]).tolist()):
+        rows = {key: one[columns["t"] == stamp] for key, one in columns.items()}
+        path = tmp_path / "in" / name.format(number, 1637218746 + number)
+        path.parent.mkdir(exist_ok=True)
+        write_table(path, {column if key == "t" else key: one for key, one in rows.items()})
+    (sequence,) = TableDataset(tmp_path / "in", {"rate": "10"} if column != "t" else {}).sequences(["all"])
+    x = np.array([frame.center[-1, 0] for frame in sequence.frames()])
+    assert len(sequence) == 20
+    assert np.abs(np.diff(x, 2)).max() < 0.3
+    assert np.diff(sequence.stamps) == pytest.approx(1e8, abs=300)
+
+
+def test_names_of_frames_in_two_orders_are_refused(tmp_path: Path) -> None:
+    """Frame and camera in a name give no order of time, nor do names without a number."""
+    columns = {name: one for name, one in street(0.1).items() if name != "t"}
+    for folder, names in (("a", ["1_0", "1_1", "2_0", "2_1"]), ("b", ["left", "right"])):
+        (tmp_path / folder).mkdir()
+        for name in names:
+            write_table(tmp_path / folder / f"{name}.csv", columns)
+        with pytest.raises(DatasetError, match="whose names differ in its number alone"):
+            TableDataset(tmp_path / folder)
+
+
+def test_recordings_of_one_frame_are_refused(tmp_path: Path) -> None:
+    """A column that differs in each frame names no recordings; `none` leaves it out."""
+    columns = {**street(2.0), "scene": np.char.mod("%d", np.round(street(2.0)["t"] * 10)).astype(np.str_)}
+    write_table(tmp_path / "d.csv", columns)
+    with pytest.raises(DatasetError, match="20 recordings of one frame"):
+        TableDataset(tmp_path / "d.csv")
+    assert len(TableDataset(tmp_path / "d.csv", {"column.recording": "none"}).sequences(["all"])[0]) == 20
+
+
+def index(columns: Table) -> np.ndarray:
+    return np.round(columns["t"] / PERIOD).astype(np.int64)
+
+
+CLOCKS = {
+    "2^32 us": lambda k: (4_292_967_296 + k * 100_000) % 2**32,
+    "an hour": lambda k: (3595.0 + k * 0.1) % 3600.0,
+    "a minute": lambda k: (55.0 + k * 0.1).round(6) % 60.0,
+}
+
+
+@pytest.mark.parametrize("name", CLOCKS)
+def test_a_clock_that_begins_again_goes_on(tmp_path: Path, name: str) -> None:
+    """Stamps go on where their counter wraps, as the order of the rows shows, and a line says so."""
+    columns = street(9.0)
+    columns["t"] = CLOCKS[name](index(columns))
+    dataset, findings = looked(tmp_path / "d.csv", columns)
+    assert np.diff(dataset.sequences(["all"])[0].stamps) == pytest.approx(1e8, abs=300)
+    assert any("the clock begins again" in one.text for one in findings)
+
+
+@pytest.mark.parametrize("digits", ["%Y%m%d%H%M%S%f", "%H%M%S.%f", "%H%M%S%f"])
+def test_digits_of_a_calendar_are_stamps(tmp_path: Path, digits: str) -> None:
+    """Numbers as 20260301115958123 and 115958.123 are read as dates and times of day across a minute."""
+    columns = street(9.0)
+    stamps = np.datetime64("2026-03-01T11:59:55.000") + index(columns) * np.timedelta64(100, "ms")
+    texts = [one.strftime(digits)[:-3] for one in stamps.astype(object).tolist()]
+    columns["t"] = np.array(texts, dtype=np.float64 if "." in digits else np.int64)
+    dataset, findings = looked(tmp_path / "d.csv", columns)
+    assert np.diff(dataset.sequences(["all"])[0].stamps) == pytest.approx(1e8, abs=300)
+    assert any("hhmmss, as their digits say" in one.text for one in findings)
+
+
+@pytest.mark.parametrize("rows", [slice(400, 401), slice(480, None)])
+def test_a_stamp_far_from_all_others_is_refused(tmp_path: Path, rows: slice) -> None:
+    """One frame that is a year ahead, and stamps half of which have another unit, are refused with the row."""
+    columns = street(12.0)
+    columns["t"][rows] = columns["t"][rows] * 1000.0 if rows.stop is None else columns["t"][rows] + 3.2e7
+    place = f"d.csv:{rows.start + 2}: expected stamps of one recording"
+    assert sum(place in one for one in troubles(tmp_path / "d.csv", columns)) == 1
+
+
+def test_a_name_of_a_frame_of_reference_is_no_number_of_a_frame(tmp_path: Path) -> None:
+    """A column `frame_id` of texts, or with one number in all rows, changes nothing."""
+    for name in ("velodyne", 7):
+        columns = {**street(4.0), "frame_id": np.full(len(street(4.0)["t"]), name)}
+        dataset, _ = looked(tmp_path / "d.csv", columns)
+        assert len(dataset.sequences(["all"])[0]) == 40
+
+
+@pytest.mark.parametrize("factor", [2.0, 0.01, 0.3048])
+def test_sizes_by_a_factor_are_doubted_with_the_option(tmp_path: Path, factor: float) -> None:
+    """Halves of sizes, centimetres and feet are named; by the option sizes are those of cars."""
+    columns = street(4.0)
+    for name in "lwh":
+        columns[name] = columns[name] / factor
+    (found,) = troubles(tmp_path / "d.csv", columns)
+    assert f"--option size_factor={factor:g}" in found
+    dataset, findings = looked(tmp_path / "d.csv", columns, size_factor=str(factor))
+    assert not any(one.doubt for one in findings)
+    assert next(dataset.sequences(["all"])[0].frames()).size[0] == pytest.approx([4.5, 1.9, 1.6])
+
+
+@pytest.mark.parametrize(("column", "mark"), [("yaw", 511), ("yaw", -999), ("yaw", 3600), ("l", 9999), ("w", -999)])
+def test_marks_for_no_value_are_refused_or_left_out(tmp_path: Path, column: str, mark: int) -> None:
+    """A number that is no angle and no size is refused with its line; an option leaves its row out or names it."""
+    columns = street(4.0)
+    columns[column][10] = mark
+    (found, *_) = troubles(tmp_path / "d.csv", columns)
+    assert "d.csv:12: expected" in found
+    assert "missing=NUMBER" in found
+    assert troubles(tmp_path / "d.csv", columns, invalid="skip") == []
+    if column == "yaw":
+        dataset, _ = looked(tmp_path / "d.csv", columns, missing=str(mark))
+        yaw = np.concatenate([frame.yaw for frame in dataset.sequences(["all"])[0].frames()])
+        assert np.isnan(yaw).sum() == 1
+
+
+def test_boxes_may_lack_their_headings(tmp_path: Path) -> None:
+    """Headings are unknown where the column or a cell is missing, and one line says so."""
+    for yaw in (None, np.where(np.arange(len(street(4.0)["t"])) % 3 == 0, np.nan, street(4.0)["yaw"])):
+        columns = {**street(4.0), "yaw": yaw}
+        dataset, findings = looked(tmp_path / "d.csv", {name: one for name, one in columns.items() if one is not None})
+        given = np.concatenate([frame.yaw for frame in dataset.sequences(["all"])[0].frames()])
+        assert np.isnan(given).sum() == (len(given) if yaw is None else np.isnan(yaw).sum())
+        assert sum("unknown" in one.text for one in findings) == 1
+
+
+def test_a_class_with_the_number_of_an_object_is_a_class(tmp_path: Path) -> None:
+    """`car:3` is of class `car`; classes that differ in a number alone stay as they are."""
+    columns = street(4.0)
+    number = np.arange(len(columns["t"])) % CARS
+    columns["class"] = np.char.add("car:", number.astype(np.str_))
+    assert looked(tmp_path / "a.csv", columns)[0].sequences(["all"])[0].labels == ("car",)
+    columns["class"] = np.char.add("class_", (number % 2).astype(np.str_))
+    assert set(looked(tmp_path / "b.csv", columns)[0].sequences(["all"])[0].labels) == {"class_0", "class_1"}
+
+
+def test_boxes_of_an_image_are_refused(tmp_path: Path) -> None:
+    """Width and height without a length are an image's, whether or not there is a heading."""
+    plain = boxes(z=None, l=None)
+    rest = {name: one for name, one in plain.items() if name not in {"w", "h"}}
+    image = {"image_width": plain["w"] * 30.0, "image_height": plain["h"] * 30.0}
+    for columns in (plain, {**rest, **image}):
+        write_table(tmp_path / "d.csv", columns)
+        with pytest.raises(DatasetError, match=r"points\.md.*boxes in pixels\?"):
+            TableDataset(tmp_path / "d.csv")
+
+
+def test_objects_that_report_one_by_one_are_looks_at_each(tmp_path: Path) -> None:
+    """Frames of one box whose objects come back in turn look around their box; `group` bounds a frame in time."""
+    rng = np.random.default_rng(1)
+    t = np.sort(
+        np.concatenate([rng.uniform(0.0, 2.0) + np.arange(40) * 2.0 + rng.normal(0.0, 0.1, 40) for _ in range(5)])
+    )
+    ship = np.arange(200) % 5
+    columns = {
+        "t": t.round(3),
+        "x": 300.0 * np.cos(ship) + 4.0 * t,
+        "y": 300.0 * np.sin(ship),
+        "yaw": np.zeros(200),
+        "l": np.full(200, 12.0),
+        "w": np.full(200, 4.0),
+    }
+    dataset, findings = looked(tmp_path / "d.csv", columns)
+    assert any("objects report one by one" in one.text for one in findings)
+    frame = next(dataset.sequences(["all"])[0].frames())
+    assert frame.field_of_view is not None
+    assert frame.pose.translation[:2] == pytest.approx([columns["x"][0], columns["y"][0]])
+    stamps = looked(tmp_path / "d.csv", columns, group="2.3")[0].sequences(["all"])[0].stamps
+    assert 25 < len(stamps) < 45
+
+
+def test_rows_that_repeat_another_one_count_once(tmp_path: Path) -> None:
+    """A table in which each row stands twice has the boxes of the plain one."""
+    columns = {name: np.repeat(one, 2) for name, one in street(4.0).items()}
+    dataset, findings = looked(tmp_path / "d.csv", columns)
+    assert sum(len(frame) for frame in dataset.sequences(["all"])[0].frames()) == len(columns["t"]) // 2
+    assert any("rows that another one repeats are left out" in one.text for one in findings)
+
+
+def test_stronger_evidence_needs_numbers_and_a_difference() -> None:
+    """Two of two beat nothing, and a percent of a thousand is noise."""
+    assert not Evidence(2, 2).beats(Evidence(0, 2))
+    assert not Evidence(990, 1000).beats(Evidence(950, 1000))
+    assert Evidence(50, 50).beats(Evidence(20, 50))
+
+
+def test_check_ends_with_the_status_of_its_findings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A clean table is all right; one that track would refuse ends with 1 and is named once."""
+    right, wrong = tmp_path / "a.csv", tmp_path / "b.csv"
+    write_table(right, street())
+    write_table(wrong, {name: one for name, one in street(4.0).items() if name != "l"})
+    done = run_here(capsys, "check", right)
+    assert done.returncode == 0
+    assert "\nall right\n" in done.stdout
+    done = run_here(capsys, "check", wrong)
+    assert done.returncode == 1
+    assert done.stdout.count("WRONG") == 1
+    assert "all right" not in done.stdout
+    assert json.loads(run_here(capsys, "check", wrong, "--json").stdout)["findings"][-1]["wrong"] is True
