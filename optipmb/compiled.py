@@ -27,7 +27,6 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
 from contextlib import ExitStack, contextmanager, suppress
 from functools import cache, partial, wraps
 from pathlib import Path
@@ -60,8 +59,8 @@ def _digest() -> str:
 
 _SOURCES: Final = _digest()
 
-PROGRESS_S: Final = 5.0
-"""Time between two lines about the progress of a compilation."""
+STEPS: Final = 4
+"""Lines about the progress of a compilation where there is no terminal; on one, a line moves."""
 
 PROCESSES: Final = "OPTIPMB_COMPILE_PROCESSES"
 """Environment variable: how many processes compile; 0 compiles each kernel at its first call, in its own process."""
@@ -81,7 +80,7 @@ class _Progress(event.Listener):
         self.compiled: set[str] = set()
         self.built: set[str] | None = None
         """Kernels that helper processes compiled; None until one was missing."""
-        self.said_at: float | None = None
+        self.announced = False
         self.is_helper = False
         """Whether this process compiles for another one, which reads the names of the kernels."""
 
@@ -97,18 +96,22 @@ class _Progress(event.Listener):
 
     def announce(self) -> None:
         """Say that a compilation begins, once in a process."""
-        if self.said_at is None and not self.is_helper:
-            self.said_at = time.monotonic()
+        if not (self.announced or self.is_helper):
+            self.announced = True
             _log.warning("optipmb: compiling the tracker, once after an installation; it takes up to a minute")
 
     def count(self, name: str) -> None:
-        """Count a compiled kernel, with a line every few seconds."""
+        """Count a compiled kernel, and show how far it is."""
         self.compiled.add(name)
         if self.is_helper:
             print(name, flush=True)  # noqa: T201 - to that process
-        elif self.said_at is not None and time.monotonic() > self.said_at + PROGRESS_S:
-            self.said_at = time.monotonic()
-            _log.warning("optipmb: compiled %d of %d kernels", len(self.compiled), len(self.kernels | self.compiled))
+        elif self.announced:
+            done, count = len(self.compiled), len(self.kernels | self.compiled)
+            if sys.stderr is not None and sys.stderr.isatty():
+                end = "\n" if done == count else "\r"
+                print(f"optipmb: compiled {done} of {count} kernels ", end=end, file=sys.stderr, flush=True)  # noqa: T201 - moves
+            elif STEPS * done // count > STEPS * (done - 1) // count:
+                _log.warning("optipmb: compiled %d of %d kernels", done, count)
 
     @staticmethod
     def _name(event: Any) -> str:

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from html import escape
+from io import StringIO
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
@@ -56,6 +58,8 @@ KNOWN: Final = (*BOXES, *OTHERS, *(part for _, parts in FLAT for part in parts),
 SHOWN_ROWS: Final = 10
 """Tracks that the representation of `OnlineTracks` lists."""
 CLASS_COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#8C6D1F")
+HTML_COLUMNS: Final = ("id", "class", "x", "y", "z", "yaw", "vx", "vy", "existence", "age", "time_since_detection")
+"""Columns of the table that notebooks show."""
 NEAR_M: Final = 0.1
 """Least distance from a camera at which a box is projected."""
 
@@ -109,14 +113,42 @@ class OnlineTracks:
         return len(self.tracks)
 
     def __repr__(self) -> str:
-        lines = [f"OnlineTracks: {len(self)} tracks at {self.stamp_ns / 1e9:.3f} s"]
-        if len(self):
-            lines.append(f"{'id':>6} {'class':<12} {'x':>9} {'y':>9} {'vx':>7} {'vy':>7} {'existence':>9} confirmed")
-        for i in range(min(len(self), SHOWN_ROWS)):
+        shown = np.flatnonzero(self.confirmed)
+        lines = [f"OnlineTracks: {self.summary}"]
+        if len(shown):
+            lines.append(f"{'id':>6} {'class':<12} {'x':>9} {'y':>9} {'vx':>7} {'vy':>7} {'existence':>9}")
+        for i in shown[:SHOWN_ROWS]:
             (x, y, _), (vx, vy) = self.center[i], self.velocity[i]
             place = f"{self.id[i]:>6} {self.name[i]:<12} {x:>9.2f} {y:>9.2f} {vx:>7.2f} {vy:>7.2f}"
-            lines.append(f"{place} {self.existence[i]:>9.3f} {bool(self.confirmed[i])}")
-        return "\n".join([*lines, *([f"   ... {len(self) - SHOWN_ROWS} more"] if len(self) > SHOWN_ROWS else [])])
+            lines.append(f"{place} {self.existence[i]:>9.3f}")
+        return "\n".join([*lines, *([f"   ... {len(shown) - SHOWN_ROWS} more"] if len(shown) > SHOWN_ROWS else [])])
+
+    def _repr_html_(self) -> str:
+        """Return the confirmed tracks for a notebook: a drawing, where matplotlib is installed, and a table."""
+        shown = np.flatnonzero(self.confirmed)
+        columns = {name: values[shown].tolist() for name, values in self.columns().items() if name in HTML_COLUMNS}
+        rows = ("".join(f"<td>{_cell(value)}</td>" for value in row) for row in zip(*columns.values(), strict=True))
+        head = "".join(f"<th>{name}</th>" for name in columns)
+        table = f"<table><tr>{head}</tr>{''.join(f'<tr>{row}</tr>' for row in rows)}</table>"
+        return f"<p>{self.summary}</p>{self._drawing()}{table}"
+
+    @property
+    def summary(self) -> str:
+        """Count of the confirmed tracks, and the time."""
+        count = int(np.count_nonzero(self.confirmed))
+        rest = f", {len(self) - count} not confirmed" if count < len(self) else ""
+        return f"{count} tracks at {self.stamp_ns / 1e9:.3f} s{rest}"
+
+    def _drawing(self) -> str:
+        """Return `plot` as SVG, nothing without matplotlib."""
+        try:
+            from matplotlib.figure import Figure  # noqa: PLC0415 - an extra
+        except ImportError:
+            return ""
+        figure, text = Figure(), StringIO()
+        self.plot(figure.subplots())
+        figure.savefig(text, format="svg")
+        return text.getvalue()
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Return the tracks as flat columns (N,), named as the tables of the command `optipmb track`."""
@@ -231,11 +263,12 @@ class OnlineTracks:
         Raises:
             ImportError: matplotlib, of the extra `plot`, is not installed.
         """
-        try:
-            from matplotlib import pyplot as plt  # noqa: PLC0415 - an extra
-        except ImportError as error:
-            raise ImportError("plot needs matplotlib: pip install matplotlib") from error
-        axes = plt.gca() if axes is None else axes
+        if axes is None:
+            try:
+                from matplotlib import pyplot as plt  # noqa: PLC0415 - an extra
+            except ImportError as error:
+                raise ImportError("plot needs matplotlib: pip install matplotlib") from error
+            axes = plt.gca()
         outlines, named = self._outlines(), set()
         for i in np.flatnonzero(self.confirmed):
             colour, name = CLASS_COLOURS[self.label[i] % len(CLASS_COLOURS)], str(self.name[i])
@@ -261,7 +294,7 @@ class OnlineTracker:
     """Tracks one stream of frames.
 
     Args:
-        profile: parameters, or the name or file of a profile. `generic` suits road users of any detector;
+        profile: parameters, or the name or file of a profile. The default, `generic`, suits road users of any detector;
             `generic_parameters` makes parameters for other classes and rates.
         modules: which modules of the paper are on.
         unknown_classes: `refuse` raises for a detection of a class that the profile lacks, `leave out` counts it in
@@ -276,7 +309,7 @@ class OnlineTracker:
     """
 
     def __init__(
-        self, profile: Parameters | str, *, modules: Modules | None = None, unknown_classes: str = "refuse"
+        self, profile: Parameters | str = "generic", *, modules: Modules | None = None, unknown_classes: str = "refuse"
     ) -> None:
         if unknown_classes not in {"refuse", "leave out"}:
             raise FrameError("unknown_classes", "'refuse' or 'leave out'", repr(unknown_classes))
@@ -285,10 +318,15 @@ class OnlineTracker:
         self._names = np.asarray(self.parameters.labels, dtype=np.object_)
         self._leave_out = unknown_classes == "leave out"
         self.density: Density = self._tracker.initial()
+        self._latest = ""  # summary of the newest tracks
+
+    def __repr__(self) -> str:
+        return f"OnlineTracker: profile {self.parameters.name}, {self._latest or 'no frame yet'}"
 
     def reset(self) -> None:
         """Forget all tracks; no id is used again."""
         self.density = self._tracker.initial(self.density.next_id)
+        self._latest = ""
 
     def update(
         self,
@@ -324,11 +362,15 @@ class OnlineTracker:
         """
         if (t is None) == (stamp_ns is None):
             raise FrameError("t", "t (s) or stamp_ns (ns)", "both" if t is not None else "neither")
+        if stamp_ns is None:
+            stamp_ns = _stamp(t)
+            if stamp_ns < max(self.density.stamp_ns, 0):
+                raise FrameError("t", f"a time from {max(self.density.stamp_ns, 0) / 1e9:g} s on", str(t))
         columns = _columns(boxes, arrays)
         names, label, left_out = self._classes(columns.pop("label"))
         frame, missing = make_frame(
             self.parameters,
-            stamp_ns=_stamp(t) if stamp_ns is None else stamp_ns,
+            stamp_ns=stamp_ns,
             labels=names,
             label=label,
             pose=pose,
@@ -341,7 +383,7 @@ class OnlineTracker:
         tracks = result.tracks
         once = (tracks.age == tracks.time_since_detection) & (tracks.velocity == 0.0).all(axis=1)
         known = dict(tracks.columns()) | {"velocity": np.where(once[:, None], np.nan, tracks.velocity)}
-        return OnlineTracks(
+        online = OnlineTracks(
             stamp_ns=frame.stamp_ns,
             tracks=tracks,
             name=self._names[tracks.label].astype(np.str_),
@@ -352,6 +394,8 @@ class OnlineTracker:
             sensor_motion=result.density.sensor_motion,
             measured=np.full(len(tracks), 7, np.uint8) if result.measured is None else result.measured,
         )
+        self._latest = online.summary
+        return online
 
     def _classes(self, values: ArrayLike) -> tuple[tuple[str, ...], NDArray[np.int64], int]:
         """Return the names of the classes of a frame, which of them each detection is of, and how many are unknown."""
@@ -370,6 +414,10 @@ class OnlineTracker:
             if place >= 0 and self._names[place] == known[place]:
                 self._names[place] = name
         return names, label.astype(np.int64), len(rows)
+
+
+def _cell(value: object) -> str:
+    return escape(f"{value:.2f}" if isinstance(value, float) else str(value))
 
 
 def _stamp(t: Any) -> int:

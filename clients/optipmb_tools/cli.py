@@ -9,6 +9,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Iterable, Sequence
+from difflib import get_close_matches
 from importlib import import_module
 from importlib.metadata import version
 from types import FrameType
@@ -17,6 +18,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 from optipmb_client.errors import ClientError, UsageError
 from optipmb_schemas import MessageError
+from rich.markup import escape
 from typer.core import TyperCommand, TyperGroup
 
 from optipmb_tools.commands.options import MANY, RAY_ADDRESS, grouped
@@ -53,20 +55,53 @@ COMMANDS = {
 }
 FUNCTIONS = {"set": "set_profile", "warm-up": "warm_up"}
 
+# Arguments of each command, for the end of its help
+EXAMPLES = {
+    "demo": ("--live", "--out out/demo"),
+    "check": ("detections.csv", "detections.csv --option yaw=degrees"),
+    "track": ("detections.csv --out tracks.csv", "--dataset kitti --root KITTI --detections pointrcnn --out tracks"),
+    "replay": ("detections.csv --speed 1 --out tracks.csv", "bag --connect tcp/10.0.0.7:7447 --out tracks"),
+    "record": ("--out site.mcap", "--streams 'garage/*/*' --duration 60 --out garage.mcap"),
+    "play": ("site.mcap", "site.mcap --speed 1"),
+    "watch": ("--web", "site.mcap --save site.rrd"),
+    "evaluate": (
+        "detections.csv --truth truth.csv --tracks tracks.csv",
+        "--dataset kitti --root KITTI --tracks tracks --class Car",
+    ),
+    "tune": ("detections.csv --truth truth.csv --name mine", "--dataset kitti --root KITTI --name mine --trials 4"),
+    "ablate": ("--dataset kitti --root KITTI --detections pointrcnn", "--dataset scene --classes Car"),
+    "sweep": (
+        "--dataset scene --parameter detection=0.7,0.8,0.9",
+        "detections.csv --truth truth.csv --parameter gate=3,5",
+    ),
+    "plot": (
+        "detections.csv --tracks tracks.csv --out tracks.png",
+        "detections.csv --tracks tracks.csv --out tracks.gif",
+    ),
+    "status": ("", "--watch"),
+    "tracks": ("garage/robot-1/lidar --last 10", "garage/robot-1/lidar --last 60 --out tracks.csv"),
+    "profiles": ("", "generic --copy mine.toml"),
+    "load": ("--streams 10 --seconds 30", "--streams 100 --rate 10"),
+    "set": ("garage/robot-1/lidar --profile kitti", "garage/robot-1/lidar --profile kitti --restart"),
+    "move": ("garage/robot-1/lidar --to 1", "garage/robot-1/lidar --to 0 --instance host-7"),
+    "drain": ("", "host-7 --undo"),
+    "warm-up": ("", "--json"),
+}
+
 # The option parser's error for a wrong option: the base of its public subclass, as it has no public name itself.
 _OptionError: Any = typer.BadParameter.__base__
 
 
 class _Command(TyperCommand):
     def get_params(self, ctx: Any) -> list[Any]:  # the context and the parameters have no public types
-        return _without_types_of_flags(super().get_params(ctx))
+        return _shown_as_written(super().get_params(ctx))
 
 
 class _Commands(TyperGroup):
     """The commands; the module of one is imported when it is called, or listed in the help."""
 
     def get_params(self, ctx: Any) -> list[Any]:  # as above
-        return _without_types_of_flags(super().get_params(ctx))
+        return _shown_as_written(super().get_params(ctx))
 
     def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002  as click calls it
         return list(COMMANDS)
@@ -79,13 +114,28 @@ class _Commands(TyperGroup):
         paragraphs = inspect.cleandoc(command.__doc__ or "").split("\n\n")
         text = "\n\n".join(" ".join(part.split()) for part in paragraphs)
         alone = typer.Typer(add_completion=False)
-        alone.command(cmd_name, cls=_Command, help=text)(grouped(command))
+        lines = (f"optipmb {cmd_name} {arguments}".strip() for arguments in EXAMPLES[cmd_name])
+        epilog = "Examples:\n\n" + "\n\n".join(map(escape, lines))
+        alone.command(cmd_name, cls=_Command, help=escape(text), epilog=epilog)(grouped(command))
         return typer.main.get_command(alone)
 
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return the command that the first word names; for an unknown one, the error names those like it."""
+        try:
+            return super().resolve_command(ctx, args)
+        except _OptionError as error:
+            if alike := get_close_matches(args[0], COMMANDS, n=1):
+                error.message += f" Did you mean {alike[0]}?"
+            else:
+                error.message += " optipmb help lists the commands."
+            raise
 
-def _without_types_of_flags(parameters: list[Any]) -> list[Any]:
-    """Remove the type of flags from the help, because a flag takes no value."""
+
+def _shown_as_written(parameters: list[Any]) -> list[Any]:
+    """Show brackets of the help as they are, and no type of flags, because a flag takes no value."""
     for one in parameters:
+        if getattr(one, "help", None) and "\\[" not in one.help:  # the help asks several times
+            one.help = escape(one.help)
         if getattr(one, "is_flag", False):
             one.metavar = ""
     return parameters
@@ -95,7 +145,6 @@ app = typer.Typer(
     name="optipmb",
     cls=_Commands,
     help="Track objects in 3D: offline, or through a tracking service.",
-    add_completion=False,
 )
 
 
@@ -125,8 +174,8 @@ def run(arguments: Sequence[str]) -> int:
     try:
         words = [one for place, one in enumerate(arguments) if one != "--debug" or place > end]
         return _run(words)
-    except (KeyboardInterrupt, typer.Abort):
-        return _fail(INTERRUPTED, "interrupted")
+    except (KeyboardInterrupt, typer.Abort) as error:
+        return _fail(INTERRUPTED, f"interrupted{': ' if error.args else ''}{error}")
     except Exception as error:  # noqa: BLE001  the last handler: no traceback reaches a user who did not ask for it
         status, text = _line_of(error, " ".join(arguments[:1]))
         if debug:
@@ -137,6 +186,8 @@ def run(arguments: Sequence[str]) -> int:
 def _run(arguments: list[str]) -> int:
     words = filled(spread(arguments, MANY), "--ray", RAY_ADDRESS, "local")
     words = filled(words, "--submission", re.compile(r"\d*\.?\d+"), "default")
+    if words[:1] == ["help"]:
+        words = [*words[1:], "--help"]
     return int(app(words or ["--help"], prog_name="optipmb", standalone_mode=False) or 0)
 
 

@@ -181,12 +181,9 @@ def write_whole(path: Path, content: bytes | Iterable[str]) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def remove_unfinished(paths: Iterable[Path]) -> None:
-    """Remove temporary files that killed writers of these files left in their folders."""
-    names: dict[Path, set[str]] = {}
-    for path in paths:
-        names.setdefault(path.parent, set()).add(path.name)
-    for folder, finished in names.items():
-        for entry in folder.glob(".*"):
-            if entry.name[1:].rpartition(".")[0] in finished:
-                entry.unlink(missing_ok=True)
+def remove_unfinished(folder: Path, names: Iterable[str]) -> None:
+    """Remove temporary files that killed writers of files with these stems left in a folder."""
+    stems = set(names)
+    for entry in folder.glob(".*"):
+        if entry.name[1:].rpartition(".")[0].rpartition(".")[0] in stems:
+            entry.unlink(missing_ok=True)

@@ -157,7 +157,7 @@ class Selection(Struct, frozen=True):
         """Return which rows of the tracks (N,) are wanted."""
         rows: NDArray[np.bool_] = tracks.existence >= self.min_existence
         if self.confirmed:
-            rows &= is_confirmed(tracks)
+            rows &= shown(tracks)
         if self.classes:
             rows &= np.isin(tracks.label, [at for at, name in enumerate(tracks.labels) if name in self.classes])
         return rows
@@ -166,11 +166,18 @@ class Selection(Struct, frozen=True):
 EVERYTHING: Final = Selection()
 
 
-def is_confirmed(tracks: Tracks) -> NDArray[np.bool_]:
-    """Return which tracks (N,) are confirmed; without such a column, probable tracks that were seen twice."""
-    if tracks.confirmed is not None:
-        return np.asarray(tracks.confirmed > 0)
-    return np.asarray((tracks.existence > CONFIRMED_EXISTENCE) & (tracks.age > 0.0))
+def shown(tracks: Tracks) -> NDArray[np.bool_]:
+    """Return which tracks (N,) people are shown, and all counts count: the confirmed ones."""
+    return shown_rows(tracks.confirmed, tracks.existence, tracks.age)
+
+
+def shown_rows(
+    confirmed: NDArray[Any] | None, existence: NDArray[np.float64], age: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Return as `shown` by columns (N,); without `confirmed`, probable tracks that were detected twice."""
+    if confirmed is not None:
+        return np.asarray(confirmed > 0)
+    return np.asarray((existence > CONFIRMED_EXISTENCE) & (age > 0.0))
 
 
 def tracks_json(tracks: Tracks, selection: Selection = EVERYTHING, place: Place | None = None) -> bytes:
@@ -194,7 +201,7 @@ def tracks_json(tracks: Tracks, selection: Selection = EVERYTHING, place: Place 
     columns: dict[str, Iterable[Any]] = {
         "id": tracks.id[rows].tolist(),
         "class": map(tracks.labels.__getitem__, tracks.label[rows].tolist()),
-        "confirmed": is_confirmed(tracks)[rows].tolist(),
+        "confirmed": shown(tracks)[rows].tolist(),
         **{name: np.round(column[rows], DIGITS).tolist() for name, column in numbers.items()},
         **dict(zip(PLACE, _placed(tracks.center[rows], yaw[rows], place), strict=True)),
     }

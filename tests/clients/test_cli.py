@@ -1,6 +1,10 @@
 """The command line: options with several values, one-line errors, exit statuses, signals."""
 
+import contextlib
 import json
+import os
+import pty
+import re
 import signal
 import subprocess
 import sys
@@ -13,7 +17,7 @@ from commands import optipmb, run_here, start
 from fake_service import Behaviour, FakeService
 from hypothesis import given
 from hypothesis import strategies as st
-from optipmb_tools.cli import run, spread
+from optipmb_tools.cli import COMMANDS, EXAMPLES, run, spread
 from pyarrow import parquet
 from routers import free_endpoint
 
@@ -233,6 +237,74 @@ def test_an_error_that_no_code_foresaw_is_one_line(
     assert bool(before) == ("Traceback" in err) == bool(debug)
 
 
+def test_ctrl_c_on_a_terminal_says_what_is_written(tmp_path: Path) -> None:
+    """Status 130, one line with the recordings that are written, and no half-written file."""
+    begin = "import fcntl, os, sys, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); os.execv(sys.argv[1], sys.argv[1:])"
+    words = ["track", "--dataset", "scene", "--option", "frames=200", "--option", "clouds=0", "--jobs", "1"]
+    words += ["--sequences", *(f"{k:04}" for k in range(20)), "--out", str(tmp_path)]
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-c", begin, sys.executable, "-m", "optipmb_tools", *words],
+        stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True,
+    )  # fmt: skip
+    os.close(theirs)
+    shown = b""
+    with os.fdopen(ours, "r+b", buffering=0) as terminal:
+        while b"0000: 200 frames" not in shown:
+            shown += terminal.read(4096)
+        terminal.write(b"\x03")
+        with contextlib.suppress(OSError):  # a terminal without programs
+            while part := terminal.read(4096):
+                shown += part
+    assert process.wait(60) == 130
+    last = shown.decode().splitlines()[-1]
+    done = int(re.search(r"interrupted: (\d+) of 20 recordings are in", last)[1])  # type: ignore[index]  # it is there
+    assert sorted(path.name for path in tmp_path.iterdir())[:done] == [f"{k:04}.txt" for k in range(done)]
+    assert not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_examples_of_the_help_can_be_called(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each help ends with two of them, whose options the command has."""
+    assert run(["help", command]) == 0
+    shown = capsys.readouterr().out
+    for words in EXAMPLES[command]:
+        assert f"optipmb {command} {words}".strip() in " ".join(shown.split())
+        options = re.findall(r"--[a-z-]+", words)
+        assert all(re.search(rf"^│ (\*  )?.*{one}\b", shown, re.MULTILINE) for one in options), (words, shown)
+
+
+@pytest.mark.parametrize(
+    ("word", "text"), [("trak", "Did you mean track?"), ("xyz", "optipmb help lists the commands")]
+)
+def test_a_mistyped_command_is_corrected(word: str, text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """The error names the command that is most like it, or the help."""
+    assert run([word]) == 2
+    assert text in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_a_shell_completes_commands(shell: str) -> None:
+    """The script of `--show-completion` asks the program, which knows commands and options."""
+    asked = {"_OPTIPMB_COMPLETE": f"complete_{shell}", "COMP_WORDS": "optipmb tra", "COMP_CWORD": "1"}
+    asked |= {"_TYPER_COMPLETE_ARGS": "optipmb tra", "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
+    program = [sys.executable, "-c", "from optipmb_tools.__main__ import main; main()"]
+    done = subprocess.run(program, env=os.environ | asked, capture_output=True, text=True, timeout=120, check=False)
+    assert {"track", "tracks"} <= set(re.findall(r"\w+", done.stdout))
+
+
+def test_assumptions_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Detections and truth alike say each assumption once; `--verbose` has a line for each, with its option."""
+    table = tmp_path / "boxes.csv"
+    rows = [f"0.{k},{k},2,0,4,2,1,0,0.9,car,1" for k in range(8)]
+    table.write_text("\n".join(["time,x,y,z,length,width,height,yaw,score,class,id", *rows]))
+    words = ["evaluate", str(table), "--truth", str(table), "--tracks", str(table), "--iou", "0.5"]
+    (line, *_) = run_here(capsys, *words).stderr.splitlines()
+    assert line.count("stamps are in seconds") == 1
+    assert line.endswith("(--verbose says more)")
+    assert "--option time=UNIT" in run_here(capsys, *words, "--verbose").stderr
+
+
 def test_a_closed_pipe_is_no_error(endpoint: str, tmp_path: Path) -> None:
     """`optipmb ... | head -0` leaves no traceback."""
     with FakeService(endpoint):
@@ -252,8 +324,8 @@ def test_tracks_are_evaluated_and_drawn(tmp_path: Path, capsys: pytest.CaptureFi
     assert run(["track", *data, "--out", str(tmp_path), "--json"]) == 0
     capsys.readouterr()
     assert run(["evaluate", *data, *tracks]) == 0
-    head, *rows = capsys.readouterr().out.splitlines()
-    assert head.split()[:4] == ["class", "score", "≥", "MOTA"]
+    _, _, head, *rows = capsys.readouterr().out.splitlines()
+    assert head.split()[:3] == ["class", "tracks", "MOTA"]
     assert [row.split()[0] for row in rows[:6] if not row.startswith(" ")] == ["Car", "Pedestrian", "Cyclist"]
     assert run(["evaluate", *data, *tracks, "--class", "Car", "Cyclist", "--iou", "0.25", "--json"]) == 0
     classes = json.loads(capsys.readouterr().out)["classes"]

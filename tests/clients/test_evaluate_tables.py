@@ -78,6 +78,22 @@ def counts(done: Any, name: str = "car") -> tuple[float | None, int, int, int]:
 RIGHT = (100.0, FRAMES * CARS, 0, 0)
 
 
+def test_the_tracks_that_are_shown_are_the_confirmed_ones(bench: Bench) -> None:
+    """The first row counts confirmed rows alone, `--all` adds the others; other people's tables have one kind."""
+    found = cars(confirmed=np.tile([1, 0], FRAMES), score=np.full(FRAMES * CARS, 0.9))
+    values = result_of(bench.evaluate(cars(), found))["classes"]["car"]
+    assert (values["confirmed"]["TP"], values["all"]["TP"]) == (FRAMES, FRAMES * CARS)
+    assert values["hota_centre"]["confirmed"]["HOTA"] < values["hota_centre"]["all"]["HOTA"]
+    tables = [bench.folder / "d.csv", "--truth", bench.folder / "truth.csv", "--tracks"]
+    for tracks, words, rows in (
+        ("tracks.csv", (), ["confirmed", "≥"]),
+        ("tracks.csv", ("--all",), ["confirmed", "≥", "all"]),
+        ("truth.csv", (), ["all", "≥"]),
+    ):
+        lines = bench.run("evaluate", *tables, bench.folder / tracks, *words).stdout.splitlines()[3:]
+        assert [line.split()[at] for at, line in zip((1, 0, 0), lines[: len(rows)], strict=False)] == rows
+
+
 def test_the_unit_of_time_reaches_truth_and_own_tracks(bench: Bench) -> None:
     """Microseconds from 0 with `time=us` are tracked and evaluated alike."""
     data = bench.table("d.csv", cars(scale=1e6, id=None, score=np.full(FRAMES * CARS, 0.9)))

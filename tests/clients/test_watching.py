@@ -60,6 +60,7 @@ def tracks(seq: int, ids: list[int], covariance: np.ndarray | None = None) -> Tr
         yaw=0.5,
         velocity=[2.0, 1.0],
         existence=0.75,
+        confirmed=np.ones(len(ids), np.int64),
         score=np.linspace(0.9, 0.1, len(ids)),
         covariance=np.eye(6) if covariance is None else covariance,
     )

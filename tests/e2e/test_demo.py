@@ -2,9 +2,11 @@
 
 import json
 import os
+import signal
 import struct
 import subprocess
 import sys
+import urllib.request
 from pathlib import Path
 
 import pytest
@@ -50,3 +52,19 @@ def test_demo_tells_what_it_does(tmp_path: Path, capsys: pytest.CaptureFixture[s
         "comparing",
     ]
     assert all(len(line) < 120 for line in done.stderr.splitlines())
+
+
+def test_the_live_demo_shows_tracks_until_ctrl_c() -> None:
+    """It prints the address of a page whose stream has tracks, opens no browser without a display, and ends with 0."""
+    environment = {name: value for name, value in os.environ.items() if name not in {"DISPLAY", "WAYLAND_DISPLAY"}}
+    command = [sys.executable, "-m", "optipmb_tools", "demo", "--live", "--frames", "20"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment) as demo:
+        try:
+            assert demo.stdout is not None
+            page, _, stream = demo.stdout.readline().removeprefix("live page: ").strip().partition("#")
+            with urllib.request.urlopen(f"{page}live?stream={stream}", timeout=60) as answer:  # noqa: S310 - of the demo
+                assert any(b'"tracks":[[' in answer.readline() for _ in range(20))
+        finally:
+            demo.send_signal(signal.SIGINT)
+            _, shown = demo.communicate(timeout=60)
+    assert (demo.returncode, "Traceback" in shown) == (0, False), shown

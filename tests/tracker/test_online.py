@@ -109,9 +109,23 @@ def test_the_representation_lists_tracks() -> None:
     tracks = run([flat(k) for k in range(3)])[-1]
     head, names, row = repr(tracks).splitlines()
     assert head == "OnlineTracks: 1 tracks at 0.200 s"
-    assert names.split() == ["id", "class", "x", "y", "vx", "vy", "existence", "confirmed"]
+    assert names.split() == ["id", "class", "x", "y", "vx", "vy", "existence"]
     assert row.split()[:2] == ["1", "car"]
     assert {"id", "center", "covariance", "confirmed"} <= set(dir(tracks))
+
+
+def test_a_notebook_shows_confirmed_tracks() -> None:
+    """The tracker says profile, time and tracks; tracks are a drawing and a table, without those that are not shown."""
+    tracker = optipmb.OnlineTracker()
+    assert repr(tracker) == "OnlineTracker: profile generic, no frame yet"
+    weak = {name: [*values, *values] for name, values in flat(0).items()} | {"x": [0.0, 30.0], "score": [0.9, 0.2]}
+    for k in range(4):
+        tracks = tracker.update(weak, t=0.1 * k)
+    assert repr(tracker) == "OnlineTracker: profile generic, 1 tracks at 0.300 s, 1 not confirmed"
+    page = tracks._repr_html_()
+    assert "1 tracks at 0.300 s, 1 not confirmed" in page
+    assert page.count("<tr>") == 2
+    assert "<svg" in page
 
 
 def test_an_unknown_velocity_is_not_a_number() -> None:
@@ -152,7 +166,9 @@ def test_nothing_detected_is_a_frame() -> None:
         ({**flat(0), "w": [0.0]}, {"t": 1.0}, r"size\[0\]\[1\]: expected a positive length"),
         ({**flat(0), "x": [float("nan")]}, {"t": 1.0}, r"center\[0\]\[0\]: expected a finite number"),
         ({**flat(0), "score": [3.0]}, {"t": 1.0}, r"score\[0\]"),
-        (flat(0), {"t": 0.1}, "stamp_ns: expected a stamp from"),
+        (flat(0), {"t": 0.1}, "t: expected a time from 0.5 s on, received 0.1"),
+        (flat(0), {"t": -1}, "t: expected a time from 0.5 s on"),
+        (flat(0), {"stamp_ns": 1}, "stamp_ns: expected a stamp from"),
     ],
 )
 def test_what_is_wrong_is_named_and_changes_nothing(boxes: Any, when: dict[str, float], text: str) -> None:

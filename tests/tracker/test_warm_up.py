@@ -167,7 +167,7 @@ def test_a_compilation_is_announced_once_with_its_progress(setting: str) -> None
     Without optimization nothing can be cached: no other processes compile.
     """
     program = (
-        "import optipmb.compiled as compiled; compiled.PROGRESS_S = 0.0\n"
+        "import optipmb.compiled as compiled; compiled.STEPS = 1000\n"
         "import numpy as np, optipmb; optipmb.bev_iou(np.zeros((1, 5)), np.zeros((1, 5)))"
     )
     with tempfile.TemporaryDirectory() as cache:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def check(data: DataOptions, *, as_json: AsJson = False) -> None:
-    """Show how your data are read, without tracking: optipmb check detections.csv.
+    """Show how your data are read, without tracking.
 
     Units, rate, classes, headings against the motion of the boxes, suspicious rows, and the options that read them
     otherwise. Status 1: track would refuse the data; the findings marked as WRONG say why. Where tracks may be wrong, a

@@ -10,6 +10,7 @@ import typer
 from optipmb_client.errors import UsageError
 
 from optipmb_tools.commands.options import (
+    All,
     AsJson,
     Data,
     JobOptions,
@@ -79,9 +80,10 @@ def evaluate(
     ] = None,
     how: MatchingOptions,
     jobs: EvaluationJobs,
+    every: All = False,
     as_json: AsJson = False,
 ) -> None:
-    """Compare result files with the truth, per class.
+    """Compare result files with the truth, per class: first the tracks that are shown, the confirmed ones.
 
     CLEAR MOT figures, HOTA of centres in the plane, GOSPA and OSPA; of KITTI, AB3DMOT's protocol and the HOTA of image
     boxes. Tracks that were written with --full are tested for calibration too.
@@ -99,7 +101,7 @@ def evaluate(
     names = tuple(one if one in opened.labels else spelt.get(one.lower(), one) for one in classes or opened.labels)
     note = cache(warn)  # prints each assumption once
     with jobs.executor(opened.frames, max(1, len(names))) as executor:
-        reports = {str(one): _evaluated(opened, one, names, how, executor, note) for one in tracks}
+        reports = {str(one): _evaluated(opened, one, names, how, executor, note, every=every) for one in tracks}
     for tables in (one.tables for one in opened.sequences if hasattr(one, "tables")):
         tables.check()
     report = {"command": "evaluate", "dataset": opened.name, "sequences": opened.names}
@@ -130,6 +132,8 @@ def _evaluated(
     how: MatchingOptions,
     executor: bulk.Executor,
     note: Callable[[str], None],
+    *,
+    every: bool,
 ) -> _Evaluated:
     from optipmb_tools.commands.tables import clear_table, figure_tables, nuscenes_table  # noqa: PLC0415  as above
     from optipmb_tools.evaluation import evaluate_files  # noqa: PLC0415  as above
@@ -158,7 +162,7 @@ def _evaluated(
         parts = {one.name: _figures(one) for one in results}
         best = {} if opened.name == "kitti" else {one.name: one.sweep.thresholds[one.sweep.best] for one in results}
         if opened.name != "kitti" or how.distance is not None:  # AB3DMOT's protocol gives them at its own threshold
-            head = [clear_table(results, metres=how.iou is None)]
+            head = [clear_table(results, metres=how.iou is None, every=every)]
     here = opened.sequences if executor.here else None
     executor.start(figures_of, Evaluation(asked, tuple(opened.names), tracks, settings, names, here))
     tasks = [(name, best.get(name)) for name in names]
@@ -170,7 +174,7 @@ def _evaluated(
     average = class_average(figures) if overall else None
     if average is not None:
         overall["overall"]["hota_centre"] = average
-    tables = (*head, *figure_tables(figures, how.cutoff, average))
+    tables = (*head, *figure_tables(figures, how.cutoff, average, every=every))
     return _Evaluated({**overall, "classes": by_class}, figures, tables)
 
 
@@ -178,6 +182,7 @@ def _figures(result: "ClassResult") -> dict[str, Any]:
     best = result.sweep.best
     return {
         "all": result.total.summary(),
+        "confirmed": None if result.confirmed is None else result.confirmed.summary(),
         "best": {"score": result.sweep.thresholds[best], **result.sweep.results[best].summary()},
         "sequences": {name: single.summary() for name, single in result.sequences.items()},
     }

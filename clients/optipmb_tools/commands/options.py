@@ -74,6 +74,7 @@ Ray = Annotated[
         show_default=False,
     ),
 ]
+All = Annotated[bool, typer.Option("--all", help="Also tracks that are not confirmed.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
@@ -129,6 +130,7 @@ class DatasetOptions:
             help="Option of the dataset: frames=50 of a scene, yaw=degrees of a table.",
         ),
     ] = None
+    verbose: Annotated[bool, typer.Option("--verbose", help="Say all that is assumed about the data.")] = False
     truth: Path | None = field(default=None, init=False)
 
     def named(self) -> tuple[str, Path | None]:
@@ -169,8 +171,12 @@ class DatasetOptions:
         name, root = self.named()
         opened = open_dataset(name, root, self.detections, **self.options(name) | more)
         chosen = list(opened.sequences(self.sequences or ["all"]))
-        for note in (*opened.notes, *(note for one in chosen for note in one.notes)):
-            warn(note)
+        notes = [*opened.notes, *(note for one in chosen for note in one.notes)]
+        if self.verbose or len(notes) == 1:
+            for note in notes:
+                warn(note)
+        elif notes:
+            warn(in_short(notes))
         return Data(opened, chosen)
 
 
@@ -235,13 +241,23 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
     def call(**values: Any) -> None:
         for name, group in groups.items():
             values[name] = group(**{one.name: values.pop(one.name) for one in members[name]})
-        command(**values)
+        try:
+            command(**values)
+        except KeyboardInterrupt:  # the parser would end without a word
+            raise typer.Abort from None
 
     spread = [one for name, whole in given.items() for one in members.get(name, [whole])]
     own = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in spread]
     call.__dict__["__signature__"] = inspect.Signature(own)
     call.__name__, call.__doc__ = command.__name__, command.__doc__
     return call
+
+
+def in_short(notes: Sequence[str]) -> str:
+    """Return the first clause of each note, `PLACE: TEXT: MORE (--option NAME=VALUE)`, once, as one line."""
+    texts = (note.partition(": ")[2] or note for note in notes)
+    clauses = dict.fromkeys(re.split(r": | \(--|; ", text)[0] for text in texts)
+    return f"{', '.join(clauses)} (--verbose says more)"
 
 
 def _option(text: str) -> tuple[str, float | str]:

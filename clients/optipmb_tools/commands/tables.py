@@ -4,7 +4,7 @@ Shares are printed in percent, distances in metres; a dash stands for a figure t
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rich.console import Group, RenderableType
 from rich.table import Table
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from optipmb_tools.evaluation.evaluate import ClassFigures
     from optipmb_tools.evaluation.nuscenes import NuScenesScores
 
+T = TypeVar("T")
+
 _CLEAR = ("MOTA", "MOTP", "precision", "recall", "GT", "FP", "FN", "IDS", "FRAG")
 _PROTOCOL = ("sAMOTA", "AMOTA", "AMOTP", "score", "MOTA", "MOTP", "recall", "precision", "IDS", "FRAG", "FP", "FN")
 _SHARES = ("MT", "ML")
@@ -24,20 +26,26 @@ _NUSCENES = ("amota", "amotp", "recall", "mota", "motp", "gt", "tp", "fp", "fn",
 _HOTA = ("HOTA", "DetA", "AssA")
 _DIRECTIONS = ("along", "across", "height", "heading", "length", "width", "tall")
 _GOSPA = ("GOSPA", "localisation", "missed", "false", "OSPA")
-SCORE = "score ≥"
+SETS = "tracks"  # which of them a row is about
 
 
-def clear_table(results: "Sequence[ClassResult]", *, metres: bool) -> RenderableType:
+def clear_table(results: "Sequence[ClassResult]", *, metres: bool, every: bool) -> RenderableType:
     """Return the CLEAR MOT figures; MOTP is in metres or in percent."""
-    table = _empty(("class", SCORE, *_CLEAR))
-    for result in results:
-        best = result.sweep.best
-        for name, threshold, figures in (
-            (result.name, "all", result.total.summary()),
-            ("", f"{result.sweep.thresholds[best]:.3f}", result.sweep.results[best].summary()),
-        ):
-            table.add_row(name, threshold, *_cells(figures, _CLEAR, metres=metres))
-    return table
+    table = _empty(("class", SETS, *_CLEAR))
+    for one in results:
+        best = one.sweep.best
+        sets = _named_sets(one.confirmed, one.total, one.sweep.results[best], one.sweep.thresholds[best], every=every)
+        for place, (which, figures) in enumerate(sets.items()):
+            cells = _cells(figures.summary(), _CLEAR, metres=metres)
+            table.add_row("" if place else one.name, which, *cells)
+    return _titled("Confirmed tracks; those from the score on that gives the highest MOTA", table)
+
+
+def _named_sets(confirmed: T | None, everything: T, best: T | None, least: float, *, every: bool) -> dict[str, T]:
+    """Return the sets of tracks that have a row: those that are shown, those from a score on, and the rest if asked."""
+    sets = {"confirmed": confirmed, f"≥ {least:.3f}": best, "all": everything if every or confirmed is None else None}
+    first = ("all",) if confirmed is None else ()
+    return {name: found for name in (*first, *sets) if (found := sets[name]) is not None}
 
 
 def nuscenes_table(scores: "NuScenesScores", names: Sequence[str]) -> RenderableType:
@@ -52,7 +60,11 @@ def nuscenes_table(scores: "NuScenesScores", names: Sequence[str]) -> Renderable
 
 
 def figure_tables(
-    figures: "Sequence[ClassFigures]", cutoff: float, average: "Mapping[str, Mapping[str, float | None]] | None" = None
+    figures: "Sequence[ClassFigures]",
+    cutoff: float,
+    average: "Mapping[str, Mapping[str, float | None]] | None" = None,
+    *,
+    every: bool = False,
 ) -> Iterator[RenderableType]:
     """Yield the tables of all other figures that there are, with HOTA's average over classes where it is given."""
     if any(one.ab3dmot for one in figures):
@@ -61,8 +73,8 @@ def figure_tables(
             _protocol(figures),
         )
     yield _titled(
-        f"All tracks, and those from that score on: HOTA in percent; means over frames in metres, cut-off {cutoff:g} m",
-        _sets(figures, average or {}),
+        f"HOTA of the same tracks in percent, GOSPA and OSPA in metres, cut off at {cutoff:g} m",
+        _sets(figures, average or {}, every=every),
     )
     if any(one.calibration for one in figures):
         yield _titled(
@@ -75,11 +87,11 @@ def figure_tables(
 
 
 def comparison_tables(trackers: "Mapping[str, Sequence[ClassFigures]]") -> Iterator[RenderableType]:
-    """Yield a table for each class with the figures of several trackers, all their tracks counted."""
+    """Yield a table for each class with the figures of the tracks that several trackers show."""
     for name in dict.fromkeys(one.name for figures in trackers.values() for one in figures):
         table = _empty(("tracks", *_HOTA, "LocA", *_GOSPA))
         for place, figures in trackers.items():
-            for one in (one.everything for one in figures if one.name == name):
+            for one in (one.shown for one in figures if one.name == name):
                 table.add_row(
                     place,
                     *_cells(one.hota.summary(), (*_HOTA, "LocA")),
@@ -97,18 +109,21 @@ def _protocol(figures: "Sequence[ClassFigures]") -> Table:
     return table
 
 
-def _sets(figures: "Sequence[ClassFigures]", average: "Mapping[str, Mapping[str, float | None]]") -> Table:
+def _sets(
+    figures: "Sequence[ClassFigures]", average: "Mapping[str, Mapping[str, float | None]]", *, every: bool
+) -> Table:
     image = any(one.everything.hota_2d for one in figures)
-    heads = [*(f"2D {name}" for name in _HOTA if image), *(f"centre {name}" for name in (*_HOTA, "LocA")), *_GOSPA]
-    table = _empty(("class", SCORE, *heads))
+    centre = "centre " if image else ""
+    heads = [*(f"2D {name}" for name in _HOTA if image), *(f"{centre}{name}" for name in (*_HOTA, "LocA")), *_GOSPA]
+    table = _empty(("class", SETS, *heads))
     for one in figures:
-        for place, part in enumerate((one.everything, one.best)):
-            if part is None:
-                continue
+        least = one.best.threshold if one.best else 0.0
+        sets = _named_sets(one.confirmed, one.everything, one.best, least, every=every)
+        for place, (which, part) in enumerate(sets.items()):
             flat = part.hota_2d.summary() if part.hota_2d else dict.fromkeys(_HOTA)
             table.add_row(
                 "" if place else one.name,
-                f"{part.threshold:.3f}" if place else "all",
+                which,
                 *(_cells(flat, _HOTA) if image else ()),
                 *_cells(part.hota.summary(), (*_HOTA, "LocA")),
                 *_cells(part.gospa.summary(), _GOSPA),
@@ -176,7 +191,7 @@ def _reliability(figures: "Sequence[ClassFigures]") -> Table:
 def _empty(columns: Sequence[str]) -> Table:
     table = Table(box=None, pad_edge=False)
     for name in columns:
-        table.add_column(name, justify="left" if name in {"class", "tracks", SCORE, ""} else "right", no_wrap=True)
+        table.add_column(name, justify="left" if name in {"class", SETS, "IoU", ""} else "right", no_wrap=True)
     return table
 
 

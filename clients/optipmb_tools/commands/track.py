@@ -25,6 +25,7 @@ from optipmb_tools.commands.options import (
     say,
     warn,
 )
+from optipmb_tools.files import remove_unfinished
 from optipmb_tools.table_files import is_table
 from optipmb_tools.views.progress import FrameProgress
 
@@ -93,7 +94,7 @@ def track(
     trace: Annotated[bool, typer.Option("--trace", help="With --dump: also print where the error was raised.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Track your data on this machine, without a service: optipmb track detections.csv --out tracks.csv.
+    """Track your data on this machine, without a service.
 
     From a bag of ROS 2, --out FILE.mcap makes a bag with the tracks as TrackedObjects, Detection3DArray and markers.
 
@@ -118,10 +119,9 @@ def track(
     chosen = opened.sequences
     name = how.profile or opened.dataset.profile
     parameters = profiles.profile_for(name, chosen)
-    for doubt in profiles.doubts(parameters, chosen):
-        warn(doubt)
-    if name == profiles.AUTO:
-        warn(f"profile auto: {parameters.provenance}")
+    notes = [f"profile auto: {parameters.provenance}"] if name == profiles.AUTO and data.verbose else []
+    for note in (*profiles.doubts(parameters, chosen), *notes):
+        warn(note)
     sensors = profiles.read_sensors(how.sensors)
     results = []
     failed = None
@@ -144,9 +144,15 @@ def track(
                     _say_result(result)
     except tracking.RecordingsFailed as error:
         failed = error
+    except KeyboardInterrupt:
+        remove_unfinished(how.out, opened.names)
+        done = 0 if is_table(how.out) else len(results)
+        raise typer.Abort(f"{done} of {len(chosen)} recordings are in {how.out}") from None
     reasons = {} if failed is None else {name: one.reason for name, one in failed.failures.items()}
     shown = {"command": "track", "dataset": opened.name, "profile": name, "out": how.out, "sequences": results}
-    report({**shown, "failed": reasons}, f"results in {how.out}", as_json=as_json)
+    rows, unconfirmed = (sum(getattr(one, name) for one in results) for name in ("rows", "unconfirmed_rows"))
+    text = f"results in {how.out}" + (f" ({unconfirmed} of {rows} rows are not confirmed)" if unconfirmed else "")
+    report({**shown, "failed": reasons}, text, as_json=as_json)
     if failed is not None:
         raise failed
     _complain(results, parameters.name)
@@ -155,9 +161,7 @@ def track(
 def _say_result(result: "TrackedSequence") -> None:
     rate = result.frames / max(result.seconds, 1e-9)
     step = f", step p50 {result.step.p50_ms:.2f} ms p99 {result.step.p99_ms:.2f} ms" if result.step else ""
-    others = result.tracks - result.confirmed
-    counts = f"{result.confirmed} tracks" + (f" and {others} never confirmed" if others else "")
-    say(f"{result.name}: {result.frames} frames, {counts}, {rate:.0f} frames/s{step}")
+    say(f"{result.name}: {result.frames} frames, {result.tracks} tracks, {rate:.0f} frames/s{step}")
 
 
 def _complain(results: "list[TrackedSequence]", profile: str) -> None:
@@ -179,7 +183,7 @@ def _complain(results: "list[TrackedSequence]", profile: str) -> None:
         from optipmb_tools.results.nuscenes import NUSCENES_MAX_BOXES  # noqa: PLC0415  of one format
 
         warn(f"{cut} boxes in {samples} samples are not written: a sample of nuScenes has {NUSCENES_MAX_BOXES} at most")
-    if not any(one.tracks for one in results):
+    if not any(one.rows for one in results):
         if detections:
             warn(f"no tracks came of {detections} detections: do their scores and rate fit profile {profile}?")
         raise typer.Exit(1)

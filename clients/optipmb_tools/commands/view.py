@@ -13,7 +13,7 @@ import typer
 from optipmb_client.errors import UsageError
 from optipmb_schemas import Density, Detections, Keys, Message, MessageError, Points, Problem, Topic, Tracks, decode
 
-from optipmb_tools.commands.options import AsJson, LabelledOptions, report, say
+from optipmb_tools.commands.options import All, AsJson, LabelledOptions, report, say
 from optipmb_tools.commands.service_options import ServiceOptions, speed_of
 from optipmb_tools.extras import needed
 from optipmb_tools.table_files import SUFFIXES
@@ -200,10 +200,13 @@ def plot(
         ),
     ],
     out: Annotated[Path, typer.Option("--out", help="The PNG file, or a GIF file of a moving picture.")],
-    score: Annotated[float | None, typer.Option(help="Least mean score of a track; default: the best one.")] = None,
+    score: Annotated[
+        float | None, typer.Option(help="Least mean score of a track, in the place of its confirmation.")
+    ] = None,
+    every: All = False,
     as_json: AsJson = False,
 ) -> None:
-    """Draw the tracks of one sequence from above, with misses and confused ids where the truth is known."""
+    """Draw the confirmed tracks of one sequence from above, with misses and confused ids where the truth is known."""
     tables = ("table", "pyarrow") if any(one and one.suffix in SUFFIXES for one in (data.data, *tracks)) else ()
     needed("optipmb plot", ",".join(("plot", *tables[:1])), "matplotlib", "scipy", *tables[1:])
     from optipmb_tools.evaluation import default_rules, evaluate_files  # noqa: PLC0415  loads the solvers of scipy
@@ -218,6 +221,6 @@ def plot(
     known = sequence.truth() is not None
     rules = default_rules(opened.name)
     results = [evaluate_files([sequence], one, opened.labels, rules) if known else [] for one in tracks]
-    draw_results(out, sequence, tracks, results, score)
+    draw_results(out, sequence, tracks, results, score, every=every)
     shown = {"command": "plot", "dataset": opened.name, "sequence": sequence.name, "picture": out}
     report(shown, f"picture in {out}", as_json=as_json)

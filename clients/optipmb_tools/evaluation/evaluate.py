@@ -37,6 +37,12 @@ class ClassResult:
     total: ClearResult  # all tracks, all sequences
     sequences: dict[str, ClearResult]  # all tracks, by sequence
     sweep: Sweep  # all sequences, over thresholds on the mean score of a track
+    confirmed: ClearResult | None  # tracks that are shown, all sequences; None where the files do not tell
+
+    @property
+    def shown(self) -> ClearResult:
+        """Figures of the tracks that are shown."""
+        return self.confirmed or self.total
 
 
 def evaluate_files(
@@ -59,16 +65,20 @@ def evaluate_files(
         DatasetError: a sequence has no truth, or its result file is missing or wrong.
     """
     cases: dict[str, list[Case]] = {name: [] for name in names}
+    confirmed: dict[str, list[Case]] = {name: [] for name in names}
     pairs = read_compared(sequences, results, names, warn)
     for sequence, (truth, table) in zip(sequences, pairs, strict=True):
         local = truth.to_sensor(sequence.poses)
         for name in names:
             cases[name].append(prepare(local, table, name, rules, sequence.name))
+            if table.confirmed is not None:
+                confirmed[name].append(prepare(local, table.shown, name, rules, sequence.name))
     found = []
     for name, parts in cases.items():
         if any(len(part.truth_id) or len(part.track_id) for part in parts):
             single = {case.sequence: clear(case, rules) for case in parts}
-            found.append(ClassResult(name, combine(single.values()), single, sweep(parts, rules)))
+            shown = combine(clear(case, rules) for case in confirmed[name]) if confirmed[name] else None
+            found.append(ClassResult(name, combine(single.values()), single, sweep(parts, rules), shown))
     return found
 
 
@@ -109,12 +119,18 @@ class ClassFigures:
     ab3dmot: tuple[Ab3dmotResult, ...]  # one for each limit; KITTI only
     everything: TrackFigures  # of all tracks
     best: TrackFigures | None  # of the tracks from the best threshold on
+    confirmed: TrackFigures | None  # of the tracks that are shown; None where the files do not tell
     calibration: CalibrationResult | None  # where the tracks were kept with all columns
     errors: ErrorResult | None  # likewise
 
+    @property
+    def shown(self) -> TrackFigures:
+        """Figures of the tracks that are shown."""
+        return self.confirmed or self.everything
+
     def summary(self) -> dict[str, object]:
         """Return the figures by name; None where missing."""
-        parts = {"all": self.everything, "best": self.best}
+        parts = {"all": self.everything, "best": self.best, "confirmed": self.confirmed}
         return {
             "ab3dmot": {f"{result.limit:g}": result.summary() for result in self.ab3dmot},
             "hota_2d": {key: one.hota_2d.summary() if one and one.hota_2d else None for key, one in parts.items()},
@@ -201,26 +217,31 @@ def evaluate_figures(
     compared = [(len(one.sequence), one.truth.labelled) for one in recordings]
     frames = [count if mask is None else int(mask.sum()) for count, mask in compared]
     whole = [(one.sequence, one.truth, one.tracks, one.full) for one in recordings if one.full is not None]
+    told = any(one.tracks.confirmed is not None for one in recordings)
 
     def of_class(name: str) -> ClassFigures:
-        def cases(rules: Rules) -> list[Case]:
-            return [prepare(one.truth, one.tracks, name, rules, one.sequence.name) for one in recordings]
+        def cases(rules: Rules, *, shown: bool = False) -> list[Case]:
+            tables = [one.tracks.shown if shown else one.tracks for one in recordings]
+            parts = zip(recordings, tables, strict=True)
+            return [prepare(one.truth, table, name, rules, one.sequence.name) for one, table in parts]
 
         def local_cases(rules: Rules) -> list[Case]:
             return [prepare(truth, tracks, name, rules, sequence) for truth, tracks, sequence in local]
 
         image, centres, sets = local_cases(hota_2d_rules()), cases(near), cases(far)
 
-        def from_score(threshold: float) -> TrackFigures:
-            # The benchmark of nuScenes sums up scores in another order: a track at its own threshold is kept anyway.
-            parts = ([case.from_score(threshold - _ROUNDING) for case in one] for one in (image, centres, sets))
-            flat, plane, kept = parts
+        def of_cases(threshold: float, flat: list[Case], plane: list[Case], kept: list[Case]) -> TrackFigures:
             return TrackFigures(
                 threshold=threshold,
                 hota_2d=evaluate_hota(flat, hota_2d_rules()) if flat else None,
                 hota=evaluate_hota(plane, near),
                 gospa=evaluate_gospa(zip(kept, frames, strict=True), far, settings.order),
             )
+
+        def from_score(threshold: float) -> TrackFigures:
+            # The benchmark of nuScenes sums up scores in another order: a track at its own threshold is kept anyway.
+            parts = ([case.from_score(threshold - _ROUNDING) for case in one] for one in (image, centres, sets))
+            return of_cases(threshold, *parts)
 
         boxes = local_cases(ab3dmot_rules(min(settings.limits)))
         protocol = tuple(evaluate_ab3dmot(boxes, limit) for limit in settings.limits if local)
@@ -230,6 +251,7 @@ def evaluate_figures(
             ab3dmot=protocol,
             everything=from_score(-np.inf),
             best=from_score(threshold) if np.isfinite(threshold) else None,
+            confirmed=of_cases(-np.inf, [], cases(near, shown=True), cases(far, shown=True)) if told else None,
             calibration=evaluate_calibration([part[1:] for part in whole], name, near) if whole else None,
             errors=evaluate_errors(whole, name, near) if whole else None,
         )

@@ -140,6 +140,7 @@ def _from_table(path: Path, sequence: DataSequence) -> ResultTable:
         score=boxes.score[rows],
         box2d=np.full((len(rows), 4), np.nan),
         notes=(*table.notes, *notes),
+        confirmed=None if table.confirmed is None else table.confirmed[boxes.row[rows]],
     )
 
 

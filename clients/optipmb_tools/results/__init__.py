@@ -41,7 +41,8 @@ class BoxTable:
     def take(self, rows: Ints | Bools) -> Self:
         """Return the chosen rows."""
         columns = [field.name for field in fields(self) if field.name not in _NOT_OF_ROWS]
-        return replace(self, **{name: getattr(self, name)[rows] for name in columns})
+        taken: dict[str, Any] = {name: one[rows] for name in columns if (one := getattr(self, name)) is not None}
+        return replace(self, **taken)
 
     def of_class(self, name: str) -> Self:
         """Return the rows of one class."""
@@ -70,6 +71,12 @@ class ResultTable(BoxTable):
     score: Floats  # (R,)
     box2d: Floats  # (R, 4) x1 y1 x2 y2 in pixels; NaN where there is no image
     notes: tuple[str, ...] = ()  # assumptions about them, a line each
+    confirmed: Bools | None = None  # (R,) None where the file does not tell
+
+    @property
+    def shown(self) -> Self:
+        """The rows that are shown, the confirmed ones; all where the file does not tell."""
+        return self if self.confirmed is None else self.take(self.confirmed)
 
 
 def column_shape(name: str) -> tuple[int, ...]:
@@ -98,7 +105,9 @@ class FullTable(ResultTable):
 
 
 # In the order of the message
-_COLUMNS: Final = tuple(name for name in Tracks.arrays if name in {field.name for field in fields(FullTable)})
+_COLUMNS: Final = tuple(
+    name for name in Tracks.arrays if name in {field.name for field in fields(FullTable)} - {"confirmed"}
+)
 
 
 def full_table(labels: tuple[str, ...], tracks: Mapping[int, Any]) -> FullTable:

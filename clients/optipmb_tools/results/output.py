@@ -11,20 +11,19 @@ request the upper triangle of the covariance of (x, y, v, phi, omega, a) follows
 seconds, radians. The same tracks always give the same bytes.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
 import numpy as np
 from optipmb_schemas import Tracks
+from optipmb_schemas.json_form import shown
 
 from optipmb_tools.results import full_path, stacked, write_full
 from optipmb_tools.table_files import Columns, is_table, write_table
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from optipmb_tools.datasets.interface import DataSequence, Dataset, Georeference
 
 _STATE: Final = ("x", "y", "v", "phi", "omega", "a")
@@ -70,7 +69,7 @@ def track_columns(
     columns["yaw"] = stacked(parts, "yaw")
     columns |= dict(zip(("vx", "vy"), np.where(unknown[:, None], np.nan, velocity).T, strict=True))
     columns |= {name: stacked(parts, name) for name in ("yaw_rate", "acceleration", "score", "existence")}
-    columns["confirmed"] = np.concatenate([np.empty(0, np.int64), *map(_confirmed, parts)])
+    columns["confirmed"] = np.concatenate([np.empty(0, np.int64), *(shown(one).astype(np.int64) for one in parts)])
     columns |= {"age": age, "time_since_detection": unseen}
     detection: list[float] = []
     for index, part in zip(order, parts, strict=True):
@@ -86,9 +85,20 @@ def track_columns(
     return columns
 
 
-def _confirmed(tracks: Tracks) -> "NDArray[np.int64]":
-    """Return which tracks are confirmed, 1 or 0: all, where the service does not tell."""
-    return np.ones(len(tracks.id), np.int64) if tracks.confirmed is None else np.asarray(tracks.confirmed, np.int64)
+class TrackCounts(NamedTuple):
+    """Counts of the tracks of a sequence."""
+
+    tracks: int  # that are shown in some frame
+    rows: int  # a track in a frame
+    unconfirmed_rows: int
+
+    @classmethod
+    def of(cls, frames: Iterable[Tracks]) -> Self:
+        """Count the tracks of frames."""
+        parts = [(one.id, shown(one)) for one in frames]
+        confirmed = [ids[rows] for ids, rows in parts]
+        rows = sum(len(ids) for ids, _ in parts)
+        return cls(len({number for one in confirmed for number in one.tolist()}), rows, rows - sum(map(len, confirmed)))
 
 
 @dataclass(frozen=True)
@@ -154,11 +164,6 @@ class Results:
         if here:
             self._taken[sequence.name] = written
         return here
-
-    @property
-    def files(self) -> list[Path]:
-        """Result files so far."""
-        return [written for written in self._taken.values() if isinstance(written, Path)]
 
     def close(self, sequences: "Sequence[DataSequence]") -> None:
         """Write the table in the order of the names, or the file of a benchmark that holds all sequences.

@@ -26,7 +26,7 @@ from optipmb_client.subscriber import Subscriber
 from optipmb_schemas import PREFIX, Problem, SessionParameters, Tracks
 
 from optipmb_tools.datasets import DataSequence, Dataset, DetectionFrame, selected_frames
-from optipmb_tools.results.output import Latency, Results, horizons_for, latency
+from optipmb_tools.results.output import Latency, Results, TrackCounts, horizons_for, latency
 
 FrameId: TypeAlias = tuple[bytes, int]  # epoch and sequence number
 
@@ -73,7 +73,7 @@ class ReplayedSequence:
     returned: int
     clouds: int
     clouds_missed: int
-    tracks: int
+    tracks: int  # that are shown in some frame
     seconds: float
     latency: Latency | None
     latencies_ns: tuple[int, ...]
@@ -308,7 +308,7 @@ class _Replay:
             returned=len(self.results),
             clouds=len(self.with_cloud),
             clouds_missed=sum(not self.results[index].cloud_used for index in self.with_cloud & self.results.keys()),
-            tracks=len({number for tracks in self.results.values() for number in tracks.id.tolist()}),
+            tracks=TrackCounts.of(self.results.values()).tracks,
             seconds=seconds,
             latency=latency(self.exchange.latencies),
             latencies_ns=tuple(self.exchange.latencies),

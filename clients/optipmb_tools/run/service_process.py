@@ -60,7 +60,7 @@ class ServiceProcess:
         grace_s: float = 5.0,
     ) -> None:
         self.instance = f"local-{secrets.token_hex(4)}"
-        self.endpoint = f"tcp/127.0.0.1:{_free_port()}"
+        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         self._grace_s = grace_s
         self._log = log
         self._command = [sys.executable, "-c", _BOOTSTRAP, str(os.getpid())]
@@ -142,7 +142,7 @@ class ServiceProcess:
         return "it printed: " + " | ".join(line.strip() for line in lines) if lines else "it printed nothing"
 
 
-def _free_port() -> int:
+def free_port() -> int:
     """Return a free port below the ephemeral range, which the system would give away before the child binds it."""
     while True:
         port = _FIRST_PORT + secrets.randbelow(_EPHEMERAL_PORT - _FIRST_PORT)

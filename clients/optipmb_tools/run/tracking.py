@@ -38,7 +38,7 @@ from optipmb import (
 from optipmb.parameters import ALIKE
 from optipmb_tools.datasets import DataSequence, Dataset, DatasetArguments, DetectionFrame, selected_frames
 from optipmb_tools.files import remove_unfinished
-from optipmb_tools.results.output import Latency, Results, horizons_for, latency
+from optipmb_tools.results.output import Latency, Results, TrackCounts, horizons_for, latency
 from optipmb_tools.run.bulk import Executor, Failed, Here, in_order, run
 from optipmb_tools.table_files import Columns
 
@@ -206,8 +206,9 @@ class TrackedSequence:
     left_out: dict[str, int]  # detections of each class that the profile lacks, or that are below its score filter
     estimated: int  # frames in which the motion of the sensor was estimated
     cut: tuple[int, int]  # boxes above the limit of a benchmark in a sample, and such samples
-    tracks: int
-    confirmed: int  # tracks that were confirmed in some frame
+    tracks: int  # that are shown in some frame
+    rows: int  # a track in a frame
+    unconfirmed_rows: int
     seconds: float
     step: Latency | None  # durations of the tracker's steps
 
@@ -277,8 +278,7 @@ def _track_one(job: _Job, name: str) -> tuple[TrackedSequence, Path | Columns]:
         found.left_out,
         found.estimated,
         (sum(beyond), len(beyond)),
-        len({number for one in found.tracks.values() for number in one.id.tolist()}),
-        len({number for one in found.tracks.values() for number in one.id[one.confirmed == 1].tolist()}),
+        *TrackCounts.of(found.tracks.values()),
         found.seconds,
         latency(found.steps_ns),
     ), written
@@ -346,6 +346,6 @@ def track(
         raise failures[names[0]].error()
     results.close(sequences)
     if not executor.here:
-        remove_unfinished(results.files)
+        remove_unfinished(out, names)
     if failures:
         raise RecordingsFailed(failures, len(names))

@@ -18,7 +18,6 @@ from optipmb_schemas.installation import install_command
 from optipmb_tools.datasets import DataSequence, DetectionFrame, Truth
 from optipmb_tools.geometry import Floats, Ints, box_corners, rotation_of, stack_poses, to_world
 from optipmb_tools.results import ResultTable
-from optipmb_tools.table_files import is_table, read_table
 from optipmb_tools.views.colours import colour_of
 
 if TYPE_CHECKING:
@@ -372,6 +371,7 @@ def draw_results(
     score: float | None = None,
     *,
     numbered: bool = False,
+    every: bool = False,
 ) -> None:
     """Draw the result files of a sequence from above.
 
@@ -380,9 +380,10 @@ def draw_results(
         sequence: The tracked sequence.
         folders: Where its result files are, or tables of tracks: one for each tracker.
         results: Figures of the classes of each tracker; their misses and identity changes are marked.
-        score: Least mean score of the tracks that are shown; default: the best threshold of each class by `results`,
-            without results the tracks that were confirmed.
+        score: Least mean score of the tracks that are shown; default: confirmed tracks; where the files do not tell,
+            those from the best threshold of each class by `results` on.
         numbered: Number the tracks that are shown from 1; default: their ids.
+        every: Whether to draw all tracks.
 
     Raises:
         DatasetError: There is no such result file, or it is wrong.
@@ -397,9 +398,12 @@ def draw_results(
     for folder, name, own in zip(folders, names, results, strict=True):
         table = read_tracks(folder, sequence).to_world(sequence.poses)
         best = [result.sweep.results[result.sweep.best] for result in own]
-        if not own and score is None:
-            table = _confirmed(table, folder)
-        table = _from_score(table, own, score)
+        if every:
+            best = [result.total for result in own]
+        elif score is None and table.confirmed is not None:
+            table, best = table.shown, [result.shown for result in own]
+        else:
+            table = _from_score(table, own, score)
         if numbered:
             known, which = np.unique(table.id, return_inverse=True)
             number = {identity: place + 1 for place, identity in enumerate(known.tolist())}
@@ -412,16 +416,6 @@ def draw_results(
         animate_tracks(picture, sequence, panels[0].tracks, sequence.truth())
     else:
         draw_tracks(picture, sequence, panels, sequence.truth())
-
-
-def _confirmed(table: ResultTable, file: Path) -> ResultTable:
-    """Return the tracks that were confirmed in some frame: all, where the file does not tell."""
-    if not (file.is_file() and is_table(file)):
-        return table
-    columns = read_table(file)
-    if not {"id", "confirmed"} <= columns.keys():
-        return table
-    return table.take(np.isin(table.id, columns["id"][columns["confirmed"] == 1]))
 
 
 def _from_score(table: ResultTable, results: "Sequence[ClassResult]", score: float | None) -> ResultTable:

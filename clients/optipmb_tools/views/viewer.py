@@ -19,6 +19,7 @@ from optipmb_client.errors import ConnectionFailed
 from optipmb_client.incoming import Arrival, Inbox
 from optipmb_client.zenoh import Connection
 from optipmb_schemas import PREFIX, Density, Detections, Keys, Message, Points, Tracks
+from optipmb_schemas.json_form import shown
 
 from optipmb_tools.geometry import Floats, rotation_of, shown_boxes
 from optipmb_tools.views.colours import rgb_of
@@ -106,7 +107,7 @@ class View:
             self._recording.log(f"{message.stream}/cloud", rr.Points3D(points, colors=_by_height(points), radii=0.03))
 
     def _show_tracks(self, all_tracks: Tracks) -> None:
-        tracks = _confirmed(all_tracks)
+        tracks = _shown(all_tracks)
         name, n = tracks.stream, len(tracks.id)
         if self._followed in {None, name}:
             middle = tracks.center[:, :2].mean(axis=0) if n else np.zeros(2)
@@ -260,11 +261,9 @@ def _to_world(message: Detections | Points, points: Floats) -> tuple[Floats, flo
     return points @ rotation.T + message.pose.translation, float(np.arctan2(rotation[1, 0], rotation[0, 0]))
 
 
-def _confirmed(tracks: Tracks) -> Tracks:
-    """Return the confirmed tracks of a frame: all, where the service does not tell."""
-    if tracks.confirmed is None or bool((tracks.confirmed > 0).all()):
-        return tracks
-    rows = tracks.confirmed > 0
+def _shown(tracks: Tracks) -> Tracks:
+    """Return the tracks of a frame that are shown."""
+    rows = shown(tracks)
     columns = {name: column[rows] for name in tracks.arrays if (column := getattr(tracks, name)) is not None}
     return tracks.model_copy(update=columns)
 

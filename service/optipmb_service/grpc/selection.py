@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, get_args
 import numpy as np
 import optipmb_schemas as schemas
 from optipmb_client.merging import FinalEvents
-from optipmb_schemas.json_form import CONFIRMED_EXISTENCE
+from optipmb_schemas.json_form import shown_rows
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf.convert import column, select
@@ -72,10 +72,8 @@ class Selection:
             wanted = [number for number, name in enumerate(tracks.labels) if name in self._classes]
             rows &= np.isin(column(tracks.label), wanted)
         if self._confirmed:
-            if tracks.HasField("confirmed"):
-                rows &= column(tracks.confirmed) > 0
-            else:
-                rows &= (existence > CONFIRMED_EXISTENCE) & (column(tracks.age) > 0.0)
+            confirmed = column(tracks.confirmed) if tracks.HasField("confirmed") else None
+            rows &= shown_rows(confirmed, existence, column(tracks.age))
         if self._area is not None:
             rows &= _inside(column(tracks.center)[:, :2], self._area)
         return rows

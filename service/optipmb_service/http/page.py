@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import optipmb_schemas as schemas
+from optipmb_schemas.json_form import shown
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
@@ -137,7 +138,7 @@ def live_frame(tracks: Publication, *detections: Publication, place: Place | Non
             np.ones(len(message.id)) if message.heading_confidence is None else message.heading_confidence,
         ]
     )
-    confirmed = np.ones(len(rows), np.bool_) if message.confirmed is None else message.confirmed > 0
+    confirmed = shown(message)
     numbers = np.round(rows[confirmed][:_MOST], 3).tolist()
     heads = zip(message.id[confirmed].tolist(), message.label[confirmed].tolist(), numbers, strict=False)
     sensor, found = _seen(detections)

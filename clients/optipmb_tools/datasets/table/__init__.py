@@ -32,7 +32,7 @@ from optipmb_tools.datasets.table.rows import NO_ID, Boxes, read_tables
 from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Bools, Floats, Ints, Pose, stack_poses, to_world
 from optipmb_tools.results.output import track_columns
-from optipmb_tools.table_files import SUFFIXES, line_of, read_table, tables_in, write_table
+from optipmb_tools.table_files import SUFFIXES, Columns, line_of, read_table, tables_in, write_table
 
 # Options, besides `column.MEANING=NAME` and `class.NAME=NAME`; `tracks` are tables that are yet to be read by them
 OPTIONS: Final = (
@@ -72,6 +72,7 @@ class ObjectTable:
     boxes: Boxes
     options: Mapping[str, str]
     notes: tuple[str, ...] = ()
+    confirmed: Bools | None = None  # (R,) of every row; None without such a column
 
     def at(self, key: str, stamps: Ints, numbers: NDArray[Any] | None) -> tuple[Ints, Ints, Bools, list[str]]:
         """Return the boxes of a recording at the frames of a sequence.
@@ -148,7 +149,11 @@ def read_objects(path: Path, files: Sequence[Path], tables: TableOptions) -> lis
     reading = Reading(path, options, named=tables.named)
     found = read_tables(files, reading, scored=False, loaded=columns)
     notes = () if written else tuple(f"{path}: {note}" for note in reading.notes)
-    return [ObjectTable(file, boxes, options, notes) for file, boxes in found]
+    return [ObjectTable(file, boxes, options, notes, _confirmed(columns[file])) for file, boxes in found]
+
+
+def _confirmed(columns: Columns) -> Bools | None:
+    return np.isin(columns["confirmed"].astype(str), ("1", "1.0", "True", "true")) if "confirmed" in columns else None
 
 
 def _is_written(file: Path) -> bool:
