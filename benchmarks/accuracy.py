@@ -20,7 +20,7 @@ from greedy import greedy_tracks
 from kalman import HABITS, kalman_tracks
 from optipmb_tools.datasets import open_dataset
 from optipmb_tools.evaluation.errors import evaluate_errors
-from optipmb_tools.tuning.clips import Clip, Degradation, degrade, load, of_class, track_clip
+from optipmb_tools.tuning.clips import Clip, load, of_class, track_clip
 from optipmb_tools.tuning.scoring import plain_figures, rules_of, scorer_of
 from optipmb_tools.tuning.values import only
 
@@ -76,7 +76,6 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--root", type=Path, required=True, help="folder with kitti/ and nuscenes/")
-    parser.add_argument("--degrade", action="store_true", help="of detections made worse, as `optipmb tune` does")
     given = parser.parse_args()
     out = csv.writer(sys.stdout, lineterminator="\n")
     out.writerow(("detector", "class", "tracker", *SHOWN, "backward %", "of the detections"))
@@ -88,8 +87,6 @@ def main() -> None:
         every = [load(one, optipmb.load_profile(dataset), rules) for one in sequences]
         for name in names:
             clips = [of_class(clip, name, rules) for clip in every]
-            if given.degrade:
-                clips = [degrade(clip, Degradation(), 0) for clip in clips]
             scorer = scorer_of(dataset, name, sequences)
             for way, run in ways(dataset, detections, name):
                 found = plain_figures(scorer.figures([scorer.measure(clip, run(clip)) for clip in clips]))

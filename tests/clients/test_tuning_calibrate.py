@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_tools.datasets import open_dataset
-from optipmb_tools.tuning.calibrate import calibrate, measured_calibration, rank
+from optipmb_tools.tuning.calibrate import calibrate, measured_calibration
 from optipmb_tools.tuning.clips import Clip, load, of_class, track_clip
 from optipmb_tools.tuning.scoring import rules_of, scorer_of
-from optipmb_tools.tuning.values import only, with_calibration, with_values
+from optipmb_tools.tuning.values import only, with_calibration
 from tuning_cases import Habits, recorded
 
 import optipmb
@@ -88,20 +88,6 @@ def test_whatever_the_detector_a_calibration_is_valid(seed: int, found: float, f
     assert told is not None
     assert 0.0 < told.existence[0] <= told.existence[-1] < 1.0
     assert list(told.evidence) == sorted(set(told.evidence))
-
-
-def test_tracks_are_ranked_by_the_score_that_the_tracker_gives() -> None:
-    """Paper's score, evidence and the mean of both: the figures match tracks with these scores."""
-    clips = clips_of(range(3), Habits(false=2.0))
-    told = with_calibration(CARS, "Car", calibrate(clips, SCORER, CARS, 0.8))
-    rows = rank(clips, SCORER, told, "combination")
-    for row, weight in ((rows[0], 0.0), (rows[-2], 0.5), (rows[-1], 1.0)):
-        parameters = with_values(told, "Car", {"calibration.score_of_evidence": weight})
-        wanted = SCORER.figures([SCORER.measure(clip, track_clip(clip, parameters)) for clip in clips])
-        assert row.figures == wanted
-    assert [rows[i].score for i in (0, -2, -1)] == ["x_s", "(x_s + evidence) / 2", "evidence"]
-    assert rows[0].gain == 0.0
-    assert all(one.error >= 0.0 for one in rows)
 
 
 def test_a_missed_track_has_no_detection() -> None:

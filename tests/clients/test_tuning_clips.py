@@ -1,4 +1,4 @@
-"""What tuning works on: the same tracks and figures as everywhere else, and detections made worse by a seed."""
+"""What tuning works on: the same tracks and figures as everywhere else."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +13,7 @@ from optipmb_tools.evaluation.nuscenes import NuScenesConfig, evaluate_nuscenes,
 from optipmb_tools.results.kitti import read_kitti_results
 from optipmb_tools.run import profiles
 from optipmb_tools.run.tracking import Tracking, track
-from optipmb_tools.tuning.clips import Clip, Degradation, degrade, load, of_class, track_clip
+from optipmb_tools.tuning.clips import Clip, load, of_class, track_clip
 from optipmb_tools.tuning.scoring import rules_of, scorer_of
 from optipmb_tools.tuning.values import only
 from real_data import kitti_root, nuscenes_root
@@ -115,28 +115,3 @@ def test_figures_of_nuscenes_are_the_official_ones_of_its_result_file(tmp_path: 
             assert found["AMOTA"] == pytest.approx(wanted.amota, abs=rounding)
             assert found["MOTA"] == pytest.approx(wanted.best.mota, abs=rounding)
             assert (found["FP"], found["FN"], found["IDS"]) == (wanted.best.fp, wanted.best.fn, wanted.best.ids)
-
-
-def test_degraded_detections_are_a_matter_of_the_seed() -> None:
-    """The same seed gives the same bytes, another seed or copy others."""
-    clip, how = clip_of(Habits(velocity=0.3)), Degradation()
-    first, again = degrade(clip, how, 1), degrade(clip, how, 1)
-    for one, other in zip(first.frames, again.frames, strict=True):
-        assert all(np.array_equal(getattr(one, key), getattr(other, key), equal_nan=True) for key in _COLUMNS)
-    for other in (degrade(clip, how, 2), degrade(clip, how, 1, copy=1)):
-        assert not np.array_equal(first.frames[0].center, other.frames[0].center)
-
-
-def test_degraded_detections_are_as_much_worse_as_asked() -> None:
-    """A tenth is lost, places scatter as given, scores stay in (0, 1] and truth stays."""
-    clip = load(recorded(Habits(), frames=200), PARAMETERS, rules_of("scene"))
-    worse = degrade(clip, Degradation(drop=0.1, position=0.3), 0)
-    before, after = (sum(len(frame.score) for frame in one.frames) for one in (clip, worse))
-    assert after / before == pytest.approx(0.9, abs=0.01)
-    shifts = []
-    for one, other in zip(clip.frames, worse.frames, strict=True):
-        place = np.searchsorted(one.source, other.source)
-        shifts.append(other.center[:, :2] - one.center[place, :2])
-        assert ((other.score > 0.0) & (other.score <= 1.0)).all()
-    assert np.concatenate(shifts).std() == pytest.approx(0.3, rel=0.03)
-    assert worse.truth is clip.truth

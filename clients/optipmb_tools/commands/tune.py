@@ -1,7 +1,6 @@
 """`optipmb tune`: from detections and labels to a parameter profile."""
 
 from dataclasses import dataclass
-from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -30,7 +29,7 @@ from optipmb_tools.views.progress import TrialDisplay
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from optipmb_tools.tuning import Curves, Estimate, Refined
+    from optipmb_tools.tuning import Curves, Estimate, Tuned
 
 SHOWN = ("sAMOTA", "AMOTA", "MOTA", "MOTP", "HOTA", "IDS", "FP", "FN", "GT")
 LEAST_SHOWN = 100  # boxes of tracks from which a tenth of the probabilities is shown
@@ -55,12 +54,10 @@ class TuneOptions:
         ),
     ] = None
     metric: Annotated[str, typer.Option(help=f"What is maximised: {', '.join(METRICS)}.")] = "combination"
-    trials: Annotated[int, typer.Option(min=1, help="Trials of the search on all sequences.")] = 120
-    folds: Annotated[int, typer.Option(min=0, help="Groups of sequences that are left out in turn; 0: none.")] = 3
-    fold_trials: Annotated[
-        int | None, typer.Option(min=1, help="Trials of the search without a group; default: half of --trials.")
-    ] = None
-    degrade: Annotated[int, typer.Option(min=0, help="Degraded copies of the detections beside the plain ones.")] = 1
+    trials: Annotated[int, typer.Option(min=1, help="Trials of the search.")] = 120
+    folds: Annotated[
+        int, typer.Option(min=0, help="Groups of sequences, of which the first is held out; 0: none is.")
+    ] = 3
     everything: Annotated[bool, typer.Option("--all", help="Search the parameters of the paper's table too.")] = False
     seed: Annotated[int, typer.Option(min=0, help="Seed of every random choice.")] = 0
 
@@ -104,9 +101,7 @@ def tune(data: LabelledOptions, *, how: TuneOptions, jobs: TuneJobs, as_json: As
     plan = tuning.Plan(
         metric=how.metric,
         trials=how.trials,
-        fold_trials=how.fold_trials or max(1, how.trials // 2),
         folds=how.folds,
-        copies=how.degrade,
         seed=how.seed,
         everything=how.everything,
     )
@@ -116,8 +111,8 @@ def tune(data: LabelledOptions, *, how: TuneOptions, jobs: TuneJobs, as_json: As
         results: Mapping[str, Any] = {name: one.to_json() for name, one in tuned.items()}
         print_json({"command": "tune", "profile": out / "tuned.toml", "classes": results})
         return
-    for refined in tuned.values():
-        print_table(_report(refined))
+    for result in tuned.values():
+        print_table(_report(result))
     say(f"profile in {out / 'tuned.toml'}")
 
 
@@ -159,49 +154,42 @@ def _share(value: float) -> str:
     return f"{100.0 * value:.1f} %"
 
 
-def _report(refined: "Refined") -> Group:
-    figures = _table(refined.name, *SHOWN)
-    copies = ("", *(f", degraded {i + 1}" for i in range(refined.plan.copies)))
-    for title, rows in (
-        ("before", refined.before),
-        ("cross-validated", refined.crossed),
-        ("after (on the tuning data)", refined.after),
+def _report(tuned: "Tuned") -> Group:
+    figures = _table(tuned.name, *SHOWN)
+    for title, one in (
+        ("before", tuned.before),
+        ("after (on the tuning data)", tuned.after),
+        (f"held out ({' '.join(tuned.held_out)}), before", tuned.held_out_before),
+        (f"held out ({' '.join(tuned.held_out)}), after", tuned.held_out_after),
     ):
-        for copy, row in zip(copies, rows.figures if rows else (), strict=False):
-            figures.add_row(title + copy, *cells_of(row, SHOWN))
-    for fold in refined.folds:
-        figures.add_row(f"without {' '.join(fold.sequences)}: before", *cells_of(fold.before.figures[0], SHOWN))
-        figures.add_row(f"without {' '.join(fold.sequences)}: after", *cells_of(fold.after.figures[0], SHOWN))
-    changes = _table("changed", "from", "to", "gain", "+-", "gains")
-    for one in refined.changes:
-        gains = f"{one.positive} of {one.groups}"
-        changes.add_row(one.path, str(one.start), str(one.value), f"{one.gain:.5f}", f"{one.error:.5f}", gains)
-    ranking = _table("tracks ranked by", refined.plan.metric, "gain", "+-", "sAMOTA", "AMOTA", "MOTA")
-    for score in refined.ranking:
-        shown = (score.value, score.gain, score.error, *(score.figures[name] for name in ("sAMOTA", "AMOTA", "MOTA")))
-        ranking.add_row(score.score, *(f"{value:.4f}" if isfinite(value) else "-" for value in shown))
-    return Group(
-        figures, Text(), changes, Text(_objective(refined)), Text(), ranking, Text(_calibration(refined)), Text()
-    )
+        if one is not None:
+            figures.add_row(title, *cells_of(one.figures, SHOWN))
+    changes = _table("changed", "from", "to")
+    for change in tuned.changes:
+        changes.add_row(change.path, str(change.start), str(change.value))
+    return Group(figures, Text(), changes, Text(_objective(tuned)), Text(), Text(_calibration(tuned)), Text())
 
 
-def _calibration(refined: "Refined") -> str:
+def _calibration(tuned: "Tuned") -> str:
     """Say how well existence and covariance are calibrated."""
-    found = refined.calibration
+    found = tuned.calibration
     low, high = found.interval
     shown = "  ".join(
         f"{one.predicted:.2f} -> {one.observed:.2f} ({one.count})" for one in found.deciles if one.count >= LEAST_SHOWN
     )
-    whose = "each with the calibration of the others" if len(refined.sequences) > 1 else "that gave the calibration"
+    whose = (
+        "each with the calibration of the others"
+        if len(tuned.sequences + tuned.held_out) > 1
+        else "that gave the calibration"
+    )
     return (
         f"sequences, {whose}: NEES {found.mean:.2f} ({low:.2f} to {high:.2f}, objects being independent), "
         f"{100.0 * found.coverage:.1f} % of errors in the 95 % ellipse; existence predicted -> observed: {shown}"
     )
 
 
-def _objective(refined: "Refined") -> str:
-    text = f"{refined.plan.metric}: before {refined.before.value:.4f}, after {refined.after.value:.4f}"
-    if refined.crossed is None:
-        return f"{text}; no sequences were left out, so how much of it holds elsewhere is not known"
-    shown = ", ".join(f"{fold.gain:+.4f}" for fold in refined.folds)
-    return f"{text}, cross-validated {refined.crossed.value:.4f}; gains on what was left out: {shown}"
+def _objective(tuned: "Tuned") -> str:
+    text = f"{tuned.plan.metric}: before {tuned.before.value:.4f}, after {tuned.after.value:.4f}"
+    if tuned.held_out_before is None or tuned.held_out_after is None:
+        return f"{text}; no sequences were held out, so how much of it holds elsewhere is not known"
+    return f"{text}; held out {tuned.held_out_before.value:.4f} and {tuned.held_out_after.value:.4f}"

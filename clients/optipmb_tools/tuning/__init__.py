@@ -1,9 +1,9 @@
 """Tuning: from a detector's results and labels to a parameter profile; ablation and parameter sweeps."""
 
 from optipmb_tools.tuning.estimate import Estimate
-from optipmb_tools.tuning.refine import Plan, Refined
 from optipmb_tools.tuning.run import Curves, Source, calibrate_scores, estimate_all, tune_all
 from optipmb_tools.tuning.scoring import Figures, plain_figures
+from optipmb_tools.tuning.study import Plan, Tuned
 from optipmb_tools.tuning.values import value_of
 from optipmb_tools.tuning.variants import Row, Variant, ablation, measure_variants, sweep, write_sweep
 
@@ -12,9 +12,9 @@ __all__ = [
     "Estimate",
     "Figures",
     "Plan",
-    "Refined",
     "Row",
     "Source",
+    "Tuned",
     "Variant",
     "ablation",
     "calibrate_scores",

@@ -1,4 +1,4 @@
-"""The calibration of one class (`optipmb.calibration`) from training data, and the score that ranks its tracks best.
+"""The calibration of one class (`optipmb.calibration`) from training data.
 
 Everything is tracked once for each memory that is tried. Then, of the tracks by their evidence:
 
@@ -13,15 +13,10 @@ Everything is tracked once for each memory that is tried. Then, of the tracks by
   is the motion of the label from half a second before to half a second after.
 
 Centres within two metres match, as in `optipmb_tools.evaluation.calibration`.
-
-Benchmarks rank a track by the mean of its scores, on which the averages over recalls and the best threshold depend. The
-same tracks are ranked by several scores that are known when a frame is published: the score of the paper,
-x_s = [1 - exp(-x_len)] z_s; the mean of the detections' scores so far; the existence probability; the product and the
-mean of it and x_s; the evidence, and the mean of it and x_s.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import reduce
 from operator import add
 
@@ -31,10 +26,9 @@ from scipy.optimize import brentq, isotonic_regression
 from optipmb import Calibration, Parameters
 from optipmb_tools.evaluation.calibration import NORMAL_95, CalibrationResult, calibration, rows_of, sample
 from optipmb_tools.geometry import Bools, Floats, Ints, wrap_angle
-from optipmb_tools.results import FullTable
 from optipmb_tools.tuning.clips import Clip, track_clip
-from optipmb_tools.tuning.scoring import Figures, Scorer, folds_of, metric, standard_error, without_folds
-from optipmb_tools.tuning.values import rounded, with_calibration, with_values
+from optipmb_tools.tuning.scoring import Scorer, folds_of
+from optipmb_tools.tuning.values import rounded, with_calibration
 
 MEMORIES = (0.3, 0.5, 0.7, 0.8)  # tried for the weight that evidence keeps over a nominal period
 MISSED = 1.0  # log odds that a miss counts for against a track
@@ -274,69 +268,3 @@ def _added(error: Floats, variance: Floats) -> float:
     if excess(0.0) <= 0.0:
         return 0.0
     return float(brentq(excess, 0.0, _WIDEST)) if excess(_WIDEST) < 0.0 else _WIDEST
-
-
-@dataclass(frozen=True)
-class Ranking:
-    """Figures of tracks that are ranked by one score."""
-
-    score: str
-    figures: Figures
-    value: float
-    gain: float  # of the objective over x_s
-    error: float  # standard error of the gain
-
-
-def rank(clips: Sequence[Clip], scorer: Scorer, parameters: Parameters, objective: str) -> tuple[Ranking, ...]:
-    """Return how well each score ranks the same tracks, of parameters with a calibration."""
-    probe = with_values(parameters, scorer.name, {"calibration.score_of_evidence": 1.0})
-    tracked = [track_clip(clip, probe) for clip in clips]
-    scores_of = [_scores(clip, full, parameters.nominal_period) for clip, full in zip(clips, tracked, strict=True)]
-    scores = {
-        name: [replace(tracks, score=one[name]) for tracks, one in zip(tracked, scores_of, strict=True)]
-        for name in scores_of[0]
-    }
-    objects = [len(set(clip.truth.id[~clip.truth.ignored].tolist())) for clip in clips]
-    parts = without_folds(range(len(clips)), objects)
-    found: list[Ranking] = []
-    first: Floats | None = None
-    for name, tables in scores.items():
-        measured = [scorer.measure(clip, table) for clip, table in zip(clips, tables, strict=True)]
-        figures = [scorer.figures([measured[i] for i in part]) for part in parts]
-        values = np.array(
-            [metric(objective, one, sum(objects[i] for i in part)) for one, part in zip(figures, parts, strict=True)]
-        )
-        first = values if first is None else first
-        gains = values - first
-        found.append(Ranking(name, figures[0], float(values[0]), float(gains[0]), standard_error(gains)))
-    return tuple(found)
-
-
-def _scores(clip: Clip, full: FullTable, period: float) -> dict[str, Floats]:
-    detected = np.zeros(len(full))
-    known = {
-        (index, source): score
-        for index, frame in enumerate(clip.frames)
-        for source, score in zip(frame.source.tolist(), frame.score.tolist(), strict=True)
-    }
-    for row in np.flatnonzero(full.detection >= 0).tolist():
-        detected[row] = known[int(full.frame[row]), int(full.detection[row])]
-    paper = (1.0 - np.exp(-1.0 - full.age / period)) * detected
-    return {
-        "x_s": paper,
-        "mean": _mean_so_far(full, detected),
-        "existence": full.existence,
-        "x_s * existence": paper * full.existence,
-        "(x_s + existence) / 2": 0.5 * (paper + full.existence),
-        "(x_s + evidence) / 2": 0.5 * (paper + full.score),
-        "evidence": full.score,
-    }
-
-
-def _mean_so_far(full: FullTable, values: Floats) -> Floats:
-    """Return for each row the mean of its track's values until then."""
-    order = np.lexsort((full.frame, full.id))
-    mean = np.empty(len(values))
-    for rows in np.split(order, np.flatnonzero(np.diff(full.id[order])) + 1) if len(order) else []:
-        mean[rows] = np.cumsum(values[rows]) / np.arange(1, len(rows) + 1)
-    return mean

@@ -4,7 +4,6 @@ Conventions: frames are in the world frame, made once by `optipmb.make_frame`; s
 the sensor frame of each row's frame, where KITTI compares, and in the world frame.
 """
 
-import zlib
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,13 +12,12 @@ from optipmb import Frame, Modules, Parameters, Tracker, Tracks
 from optipmb_tools.camera import Camera
 from optipmb_tools.datasets import DataSequence, DatasetError, Truth
 from optipmb_tools.evaluation import Rules
-from optipmb_tools.geometry import Floats, Ints, stack_poses, to_sensor, wrap_angle
+from optipmb_tools.geometry import Floats, Ints, stack_poses, to_sensor
 from optipmb_tools.results import FullTable, full_table
 from optipmb_tools.results.kitti import LEAST_SHOWN
 from optipmb_tools.run.tracking import tracker_frame
 
 _DETECTION_COLUMNS = ("center", "size", "yaw", "velocity", "score", "source", "position_covariance")
-_LEAST_SCORE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -82,54 +80,6 @@ def of_class(clip: Clip, name: str, rules: Rules) -> Clip:
         frames.append(replace(frame, label=np.zeros(len(chosen), dtype=np.int64), labels=(name,), **columns))
     rows = np.isin(clip.truth.names, (name, *rules.neighbours.get(name, ())))
     return replace(clip, labels=(name,), frames=tuple(frames), truth=clip.truth.take(rows), world=clip.world.take(rows))
-
-
-@dataclass(frozen=True)
-class Degradation:
-    """How much worse the detections of a degraded copy are."""
-
-    drop: float = 0.1  # share of the detections that are lost
-    position: float = 0.1  # standard deviation of the noise added to x and to y, m
-    heading: float = 0.05  # of the noise added to the heading, rad
-    velocity: float = 0.2  # of the noise added to each component of a known velocity, m/s
-    score: float = 0.5  # of the noise added to the logit of the score
-
-
-def degrade(clip: Clip, degradation: Degradation, seed: int, copy: int = 0) -> Clip:
-    """Return a clip with worse detections; `copy` counts several copies of the same seed.
-
-    A detector is better on the sequences that it was trained on than anywhere else. The same seed and the same
-    detections give the same copy.
-    """
-    rng = np.random.Generator(np.random.PCG64([seed, copy, zlib.crc32("/".join((clip.name, *clip.labels)).encode())]))
-    return replace(clip, frames=tuple(_worse(frame, degradation, rng) for frame in clip.frames))
-
-
-def _worse(frame: Frame, degradation: Degradation, rng: np.random.Generator) -> Frame:
-    # Every number is drawn for every detection, so that one more of them changes no other.
-    count = len(frame.score)
-    kept = np.flatnonzero(rng.random(count) >= degradation.drop)
-    shift = degradation.position * rng.standard_normal((count, 2))
-    turn = degradation.heading * rng.standard_normal(count)
-    drift = degradation.velocity * rng.standard_normal((count, 2))
-    blur = degradation.score * rng.standard_normal(count)
-    center = frame.center.copy()
-    center[:, :2] += shift
-    with np.errstate(divide="ignore"):  # a score of one has the logit infinity and stays one
-        logit = np.log(frame.score) - np.log1p(-frame.score) + blur
-    score = np.clip(0.5 * (1.0 + np.tanh(0.5 * logit)), _LEAST_SCORE, 1.0)
-    return Frame(
-        stamp_ns=frame.stamp_ns,
-        center=center[kept],
-        size=frame.size[kept],
-        yaw=wrap_angle(frame.yaw + turn)[kept],
-        velocity=(frame.velocity + drift)[kept],
-        score=score[kept],
-        label=frame.label[kept],
-        source=frame.source[kept],
-        labels=frame.labels,
-        cloud=frame.cloud,
-    )
 
 
 def track_clip(

@@ -2,7 +2,7 @@
 
 In the output folder: `estimate.json` and `estimated.toml` (without tracking), `calibrated.toml` (the profile with the
 curves of scores alone, where a reference was given), `trials.db` (every trial, to continue from), `report.json`
-(figures, folds, changed values) and `tuned.toml`, the profile. The same data, options and versions give the same bytes
+(figures, changed values) and `tuned.toml`, the profile. The same data, options and versions give the same bytes
 of all but `trials.db`.
 """
 
@@ -19,10 +19,10 @@ from optipmb import Parameters, ScoreCalibration
 from optipmb_tools.datasets import DataSequence, DatasetArguments
 from optipmb_tools.files import write_whole
 from optipmb_tools.run.bulk import Executor
-from optipmb_tools.tuning.clips import Clip, Degradation, degrade, load, of_class
+from optipmb_tools.tuning.clips import Clip, load, of_class
 from optipmb_tools.tuning.estimate import Estimate, estimate, pair_all, score_curve
-from optipmb_tools.tuning.refine import Plan, Refined, refine
 from optipmb_tools.tuning.scoring import Objective, rules_of, scorer_of
+from optipmb_tools.tuning.study import Plan, Tuned, tune
 from optipmb_tools.tuning.values import only, with_classes, with_score_calibration, with_values, write_profile
 from optipmb_tools.views.progress import TrialDisplay
 
@@ -148,7 +148,7 @@ def tune_all(
     display: TrialDisplay,
     name: str | None = None,
     executor: Executor | None = None,
-) -> dict[str, Refined]:
+) -> dict[str, Tuned]:
     """Tune every class, and write `report.json` and `tuned.toml`, a profile with a name of one's own or the old one's.
 
     Raises:
@@ -164,19 +164,14 @@ def tune_all(
             "detections": source.detections,
             "detected": _sum(source.of_class(label)),
         }
-        clips = source.of_class(label)
-        copies = [[degrade(clip, Degradation(), plan.seed, i) for clip in clips] for i in range(plan.copies)]
-        objective = Objective([clips, *copies], scorer, plan.metric, executor, display.note)
-        results[label] = refine(objective, parameters, plan, out / "trials.db", context, display)
+        objective = Objective(source.of_class(label), scorer, plan.metric, executor, display.note)
+        results[label] = tune(objective, parameters, plan, out / "trials.db", context, display)
     _write_json(out / "report.json", {name: one.to_json() for name, one in results.items()})
     scope = "all parameters" if plan.everything else "noise, birth spread, area, forgetting"
-    held_out = (
-        f"{plan.folds} groups left out in turn" if any(one.folds for one in results.values()) else "none left out"
-    )
+    held_out = "; ".join(" ".join(one.held_out) for one in results.values() if one.held_out) or "none"
     provenance = (
         f"{_from(parameters, name)}\n{_by('tune')}: {source.title}; classes {' '.join(source.classes)}; {scope}; metric"
-        f" {plan.metric}; {plan.trials} trials; {held_out}, {plan.fold_trials} trials each; detections plain and in"
-        f" {plan.copies} degraded copies; seed {plan.seed}."
+        f" {plan.metric}; {plan.trials} trials; held out {held_out}; seed {plan.seed}."
     )
     tables = {name: one.parameters for name, one in results.items()}
     title = name or _named(parameters, "tuned")

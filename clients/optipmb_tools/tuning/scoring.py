@@ -5,15 +5,11 @@ with 3D overlap for KITTI and with the distance of centres up to two metres else
 benchmark. All single figures are those at the threshold with the highest MOTA, `threshold`; HOTA is computed of centres
 in the plane, `HOTA, all` of all tracks.
 
-The score of a candidate is the mean of the metric over all variants of the detections. A gain over other parameters is
-the difference of the scores over all sequences. Its standard error comes from the jackknife (Efron, 1982): the
-difference is taken again without each of five folds of whole sequences, since objects of one sequence have much in
-common. A search subtracts this margin, so that it leaves the start only for values that help in most places. Tracking
-one sequence is a task; the same parameters give the same score with any executor.
+The score of a candidate is the metric over all its sequences. Tracking one sequence is a task; the same parameters give
+the same score with any executor.
 """
 
 import math
-from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -35,7 +31,7 @@ from optipmb_tools.evaluation.nuscenes import (
     pair,
     prepare_scene,
 )
-from optipmb_tools.geometry import Bools, Floats, to_sensor
+from optipmb_tools.geometry import Bools, to_sensor
 from optipmb_tools.results import ResultTable
 from optipmb_tools.results.nuscenes import NUSCENES_CLASSES
 from optipmb_tools.run.bulk import Executor, Here, values
@@ -54,10 +50,6 @@ METRICS: Mapping[str, str] = {
 }
 _SINGLE = {"samota": "sAMOTA", "amota": "AMOTA", "mota": "MOTA", "hota": "HOTA"}
 _SWITCH = 0.1
-MARGIN_FOLDS = 5  # folds of sequences for the standard error
-MARGIN = 1.0  # standard errors that are subtracted from a gain
-_REMEMBERED = 6
-_NOTHING = 1e-9
 
 
 def metric(name: str, figures: Figures, objects: int) -> float:
@@ -199,42 +191,11 @@ def folds_of(weights: Sequence[int], count: int) -> list[tuple[int, ...]]:
     return [tuple(sorted(fold)) for fold in folds]
 
 
-def without_folds(clips: Sequence[int], weights: Sequence[int]) -> list[tuple[int, ...]]:
-    """Return the sequences, and then the sequences without each of the folds for the standard error."""
-    folds = folds_of([weight if i in clips else 0 for i, weight in enumerate(weights)], MARGIN_FOLDS)
-    return [tuple(clips), *(tuple(i for i in clips if i not in fold) for fold in folds)]
-
-
-def standard_error(gains: Floats) -> float:
-    """Return the jackknife's standard error of a gain; 0 where there are too few sequences to tell.
-
-    Gains are of all sequences, then of the sequences without each fold.
-    """
-    count = len(gains) - 1
-    return math.sqrt((count - 1) * float(np.var(gains[1:]))) if count else 0.0
-
-
-@dataclass(frozen=True)
-class Gain:
-    """Gain of one set of parameters over another."""
-
-    value: float  # score of the first, over all sequences
-    gain: float
-    error: float  # standard error of the gain
-    positive: int  # in how many of `groups` choices of sequences, each without one fold, there is a gain
-    groups: int
-
-    @property
-    def score(self) -> float:
-        """Score less the margin."""
-        return self.value - MARGIN * self.error
-
-
 class Objective:
-    """Sequences of one class, in one or more variants of their detections, and the score of candidates on them.
+    """Sequences of one class, and the score of candidates on them.
 
     Args:
-        variants: the same sequences once or several times: plain, degraded.
+        clips: the sequences.
         scorer: compares tracks with the truth.
         metric: one of `METRICS`.
         executor: where they are tracked; by default in this process.
@@ -243,88 +204,38 @@ class Objective:
 
     def __init__(
         self,
-        variants: Sequence[Sequence[Clip]],
+        clips: Sequence[Clip],
         scorer: Scorer,
         metric: str,
         executor: Executor | None = None,
         note: Callable[[str], None] = lambda _: None,
     ) -> None:
-        self.variants = variants
+        self.clips = clips
         self.scorer = scorer
         self.metric = metric
-        self.names = tuple(clip.name for clip in variants[0])
-        own = [clip.truth.take(clip.truth.names == scorer.name) for clip in variants[0]]
+        own = [clip.truth.take(clip.truth.names == scorer.name) for clip in clips]
         self.boxes = tuple(int((~truth.ignored).sum()) for truth in own)
         """Truth boxes of each sequence that count."""
         self._objects = [len(set(truth.id[~truth.ignored].tolist())) for truth in own]
-        self._known: OrderedDict[tuple[str, int, int], Measured] = OrderedDict()
-        self._scores: dict[tuple[str, tuple[int, ...]], Floats] = {}
         self._note = note
         self._executor = executor or Here()
-        self._executor.start(_measure, (variants, scorer))
+        self._executor.start(_measure, (clips, scorer))
         warm_up()
 
-    def measure(
-        self, parameters: Parameters, clips: Sequence[int], variants: Sequence[int] | None = None
-    ) -> list[list[Measured]]:
-        """Track some sequences and measure the tracks, for each variant, or each of some."""
-        key = parameters.model_dump_json()
-        chosen = range(len(self.variants)) if variants is None else variants
-        wanted = [(key, variant, clip) for variant in chosen for clip in clips]
-        missing = [place for place in wanted if place not in self._known]
-        tasks = [_Task(self.names[clip], variant, clip, parameters) for _, variant, clip in missing]
-        found: list[Measured] = values(self._executor, tasks, lambda task: f"sequence {task.name}", self._note)
-        self._known.update(zip(missing, found, strict=True))
-        for place in wanted:
-            self._known.move_to_end(place)
-        result = [[self._known[(key, variant, clip)] for clip in clips] for variant in chosen]
-        while len(self._known) > _REMEMBERED * len(self.variants) * len(self.names):
-            self._known.popitem(last=False)
-        return result
+    def figures(self, parameters: Parameters, clips: Sequence[int]) -> Figures:
+        """Return the figures of some sequences, tracked with some parameters."""
+        tasks = [(clip, parameters) for clip in clips]
+        measured: list[Measured] = values(
+            self._executor, tasks, lambda task: f"sequence {self.clips[task[0]].name}", self._note
+        )
+        return self.scorer.figures(measured)
 
-    def figures(self, measured: Sequence[Sequence[Measured]]) -> tuple[Figures, ...]:
-        """Return the figures of each variant."""
-        return tuple(self.scorer.figures(one) for one in measured)
-
-    def value(self, figures: Sequence[Figures], clips: Sequence[int]) -> float:
-        """Return the mean of the metric over the variants."""
-        objects = sum(self._objects[i] for i in clips)
-        return sum(metric(self.metric, one, objects) for one in figures) / len(figures)
-
-    def plain_value(self, parameters: Parameters, clips: Sequence[int]) -> float:
-        """Return the metric of the detections as they are."""
-        return self.value(self.figures(self.measure(parameters, clips, (0,))), clips)
-
-    def gain(self, parameters: Parameters, over: Parameters, clips: Sequence[int]) -> Gain:
-        """Return the gain of parameters over others, on some sequences."""
-        found = self._values(parameters, clips)
-        gains = found - self._values(over, clips)
-        positive = int((gains[1:] > _NOTHING).sum())
-        return Gain(float(found[0]), float(gains[0]), standard_error(gains), positive, len(gains) - 1)
-
-    def _values(self, parameters: Parameters, clips: Sequence[int]) -> Floats:
-        """Return the scores on the sequences and on the sequences without each fold."""
-        key = parameters.model_dump_json(), tuple(clips)
-        if key not in self._scores:
-            measured, place = self.measure(parameters, clips), {clip: i for i, clip in enumerate(clips)}
-            parts = without_folds(clips, self.boxes)
-            chosen = ([[variant[place[i]] for i in part] for variant in measured] for part in parts)
-            values = [self.value(self.figures(one), part) for one, part in zip(chosen, parts, strict=True)]
-            self._scores[key] = np.array(values)
-        return self._scores[key]
+    def value(self, figures: Figures, clips: Sequence[int]) -> float:
+        """Return the metric of figures of some sequences."""
+        return metric(self.metric, figures, sum(self._objects[i] for i in clips))
 
 
-@dataclass(frozen=True)
-class _Task:
-    """One sequence in one variant, with some parameters."""
-
-    name: str
-    variant: int
-    clip: int
-    parameters: Parameters
-
-
-def _measure(shared: tuple[Sequence[Sequence[Clip]], Scorer], task: _Task) -> Measured:
-    variants, scorer = shared
-    clip = variants[task.variant][task.clip]
-    return scorer.measure(clip, track_clip(clip, task.parameters))
+def _measure(shared: tuple[Sequence[Clip], Scorer], task: tuple[int, Parameters]) -> Measured:
+    clips, scorer = shared
+    clip, parameters = task
+    return scorer.measure(clips[clip], track_clip(clips[clip], parameters))
