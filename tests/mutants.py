@@ -19,6 +19,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from nearest import ROOT, nearest
@@ -32,8 +33,7 @@ PACKAGES = (
 )
 COPIED = ("schemas", "service", "clients", "tests", "docs", "examples", "benchmarks", "docker", "node")
 FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+?)(?: - .*)?$", re.MULTILINE)
-REPEATS = 8
-"""Tests that fail without the fault, too, and are left out, one after the other."""
+REPEATS = 8  # tests that fail without the fault, too, and are left out, one after the other
 
 COMPARISONS = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
@@ -50,10 +50,8 @@ class Fault:
     line: int
     before: str
     after: str
-    text: str
-    """The module as it is."""
-    wrong: str
-    """The module with the fault."""
+    text: str  # of the module
+    wrong: str  # of the module with the fault
 
     def __str__(self) -> str:
         return f"{self.path.relative_to(ROOT)}:{self.line}: {self.before}  ->  {self.after}"
@@ -61,7 +59,7 @@ class Fault:
 
 def mutated(node: ast.AST) -> ast.expr | None:
     """Return an expression with a small fault, None where there is none to make."""
-    wrong = copy.deepcopy(node)
+    wrong = copy.copy(node)  # only its own fields are replaced
     match wrong:
         case ast.Compare(ops=[one]):
             wrong.ops = [COMPARISONS[type(one)]()]
@@ -73,7 +71,9 @@ def mutated(node: ast.AST) -> ast.expr | None:
             return wrong.operand
         case ast.Constant(value=int(value)) if not isinstance(value, bool):
             return ast.Constant(value + 1)
-        case ast.Call(args=[first, second, *rest]) if not isinstance(first, ast.Starred | ast.Constant):
+        case ast.Call(func=function, args=[first, second, *rest]) if not isinstance(
+            first, ast.Starred | ast.Constant
+        ) and ast.unparse(function) not in {"max", "min"}:
             wrong.args = [second, first, *rest]
         case _:
             return None
@@ -112,6 +112,7 @@ def faults() -> list[tuple[Path, int]]:
     return places
 
 
+@cache
 def _expressions_of(path: Path) -> list[ast.expr]:
     functions = [
         node
