@@ -47,10 +47,12 @@ if TYPE_CHECKING:
 
 MOST: Final = 64
 """Objects nearest to the sensor, and detections of the highest scores, that are compared: the work is bounded."""
-CREW: Final = 5
+CREW: Final = 4
 """Objects that a motion has to bring together with detections, and"""
-SHARE: Final = 0.5
+SHARE: Final = 0.35
 """their share of all, before a sensor is taken to move; half of both while it moves."""
+SURE: Final = 0.5
+"""Existence from which an object is compared."""
 NEAR: Final = 0.6
 """Distance, m, up to which an object and a detection are together."""
 CELL: Final = 0.75
@@ -62,8 +64,12 @@ MOST_ANGLES: Final = 32
 """Cells along an axis and angles to either side: no motion beyond them is found."""
 STILL: Final = 0.15
 """Mean distance of the objects to detections, from 0 to 1, below which a sensor stands: nothing is looked for."""
-LEAST_MOTION: Final = (0.25, 1.0)
-"""Mean motion of the objects, m and m/s, from which a sensor may be taken to move."""
+LEAST_MOTION: Final = 0.15
+"""Mean motion of the objects, m, from which a sensor may be taken to move."""
+NEARER: Final = 0.05
+"""Share of their distance to detections by which a motion has to bring objects nearer."""
+KEPT: Final = 0.95
+"""Part of the evidence for a motion that stays over a tenth of a second without more."""
 FASTEST: Final = (30.0, 0.6)
 """Speed, m/s, and turn rate, rad/s, that a motion is looked for up to."""
 CHANGE: Final = (6.0, 1.5)
@@ -124,7 +130,7 @@ def follow_sensor(density: Density, frame: Frame, table: ClassTable) -> Density:
     if dt > LONGEST_S or (frame.pose is not None and not frame.pose.is_identity):
         return unknown
     objects = density.bernoulli
-    recent = np.flatnonzero((objects.seen_ns == density.stamp_ns) & (objects.existence >= SHARE))
+    recent = np.flatnonzero((objects.seen_ns == density.stamp_ns) & (objects.existence >= SURE))
     rows = recent[np.argsort(np.hypot(*objects.mean[recent, :2].T), kind="stable")[:MOST]]
     best = np.argsort(-frame.score, kind="stable")[:MOST]
     start, target = np.ascontiguousarray(objects.mean[rows, :2]), np.ascontiguousarray(frame.center[best, :2])
@@ -138,7 +144,7 @@ def follow_sensor(density: Density, frame: Frame, table: ClassTable) -> Density:
             still = math.hypot(found[0], found[1]) < STANDING[0] * dt and abs(found[2]) < STANDING[1] * dt
             return unknown if still else _carried(density, found, dt)
     found = _begun(pairs, dt)
-    after = unknown if found is None else _weighed(density, pairs, ahead, free, found, dt, table)
+    after = _fading(density, dt) if found is None else _weighed(density, pairs, ahead, free, found, dt, table)
     if found is not None and after.sensor_motion is not None:
         return _carried(after if before is not None else _over_ground(after, found, dt, frame), found, dt)
     if before is not None and together(pairs, np.zeros(3)).sum() < SHARE * len(rows):
@@ -163,10 +169,10 @@ def _begun(pairs: Pairs, dt: float) -> Array | None:
     if few or apart.sum() < STILL * len(start) or np.hypot(*start.T).mean() > FARTHEST:
         return None
     found, count, cost = common_motion(pairs, np.zeros(3), FASTEST[0] * dt, FASTEST[1] * dt, 0.0)
-    if count < max(CREW, SHARE * len(start)) or cost > 0.5 * apart.sum():
+    if count < max(CREW, SHARE * len(start)) or cost > (1.0 - NEARER) * apart.sum():
         return None
     size = np.hypot(*(taken(start, found) - start)[together(pairs, found) > 0.0].T)
-    clear = size.mean() >= max(LEAST_MOTION[0], LEAST_MOTION[1] * dt)
+    clear = size.mean() >= LEAST_MOTION
     return found if clear and _drives(found, dt) else None
 
 
@@ -186,8 +192,15 @@ def _weighed(
     if before is not None:
         off = rate - before[:3]
         if math.hypot(off[0], off[1]) < 1.0 + CHANGE[0] * dt and abs(off[2]) < 0.1 + CHANGE[1] * dt:
-            evidence, seconds = evidence + before[3], seconds + before[4]
+            evidence, seconds = evidence + before[3] * KEPT ** (10.0 * dt), seconds + before[4]
     return replace(density, sensor=read_only(np.array([*rate, max(evidence, 0.0), seconds])))
+
+
+def _fading(density: Density, dt: float) -> Density:
+    """Return a density with less evidence of a motion that was not found again."""
+    if density.sensor is None or density.sensor_motion is not None:
+        return density if density.sensor is None else replace(density, sensor=None)
+    return replace(density, sensor=read_only(density.sensor * [1.0, 1.0, 1.0, KEPT ** (10.0 * dt), 1.0]))
 
 
 def _drives(motion: Array, dt: float) -> bool:
