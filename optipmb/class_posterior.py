@@ -12,8 +12,9 @@ neighbouring frames err together. So old labels lose weight by lambda per nomina
 
 Lambda_cd is the probability that the label of an object of class c is d: 1 - kappa_c for d = c, kappa_c / (G - 1) for
 the others of the group. With a score of s the label is of the object with probability s, and else of chance. The
-likelihood of a detection hypothesis is p(d) times the likelihood of the position. The paper's class gate is the case
-of a group of one: pi = p(d) = 1.
+likelihood of a detection hypothesis is p(d) of s = 1 times the likelihood of the position: of two boxes of a vehicle,
+the one with its label is nearer however low the scores. The paper's class gate is the case of a group of one: pi = p(d)
+= 1.
 
 The class that a track reports, and whose parameters it has, is its last one until another of the group is
 `CHANGE_ODDS` times as probable: alternating labels do not make it alternate.
@@ -95,12 +96,12 @@ def label_probability(pi: Array, d: int, s: float, confusion: Array, classes: Cl
 def weigh_by_class(
     row: Index, measurement: Index, log_likelihood: Array, measurements: Measurements, groups: Groups, classes: Classes
 ) -> None:
-    """Add ln p(d) to the log-likelihoods of pairs; classes without a group stay as they are."""
+    """Add ln p(d), of a certain label, to the log-likelihoods of pairs; classes without a group stay as they are."""
     for k in range(row.shape[0]):
         m = measurement[k]
         d = measurements.label[m]
         if classes[d].group_size > 1:
-            p = label_probability(groups.probability[row[k]], d, measurements.score[m], groups.confusion, classes)
+            p = label_probability(groups.probability[row[k]], d, 1.0, groups.confusion, classes)
             log_likelihood[k] += np.log(p)
 
 

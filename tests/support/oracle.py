@@ -222,7 +222,7 @@ class Oracle:
     def _log_likelihood(self, component: Bernoulli | Poisson, z: Measurement) -> float:
         position = self.classes[z.label].measurement_noise.position
         value = log_likelihood(z.xy, component.mean, component.covariance, position)
-        return value + (math.log(component.pi @ self._called(z)) if isinstance(component, Bernoulli) else 0.0)
+        return value + (math.log(component.pi @ self._called(z, 1.0)) if isinstance(component, Bernoulli) else 0.0)
 
     def _suppressed_together(self, one: int, other: int) -> bool:
         """Whether eta_iou compares detections of two classes: both are of one group, and suppressed in it."""
@@ -234,18 +234,18 @@ class Oracle:
         group = self.classes[label].group
         return [c for c, one in enumerate(self.classes) if c == label or one.group == group is not None]
 
-    def _called(self, z: Measurement) -> Array:
+    def _called(self, z: Measurement, s: float) -> Array:
         """p(d | c) of the classes c of the group of a measurement: s Lambda_cd + (1 - s) / G."""
         group = self._group(z.label)
         if len(group) == 1:
             return np.ones(1)
         kappa = np.array([self.classes[c].class_confusion for c in group])
         meant = np.where([c == z.label for c in group], 1 - kappa, kappa / (len(group) - 1))
-        return z.score * meant + (1 - z.score) / len(group)
+        return s * meant + (1 - s) / len(group)
 
     def _follow_class(self, b: Bernoulli, z: Measurement) -> None:
         """Bayes; the class reported changes to one that is three times as probable."""
-        likely, group = b.pi * self._called(z), self._group(z.label)
+        likely, group = b.pi * self._called(z, z.score), self._group(z.label)
         b.pi = likely / likely.sum()
         best = int(np.argmax(b.pi))
         if b.pi[best] >= 3 * b.pi[group.index(b.label)]:
@@ -344,7 +344,7 @@ class Oracle:
             b.evidence = follow_evidence(self.classes[z.label], 0.0, 1.0, z.score)
             b.heading_odds, b.mean, b.covariance = follow_sign(self.classes[z.label], 0.0, 1.0, z, b.mean, b.covariance)
             b.id, b.detection, b.measurement = self.next_id, z.source, z
-            b.pi = self._called(z) / self._called(z).sum()
+            b.pi = self._called(z, z.score) / self._called(z, z.score).sum()
             self.bernoulli.append(b)
             self.next_id += 1
 

@@ -93,7 +93,7 @@ def test_the_posterior_is_bayes_rule(seed: int) -> None:
 
 @SEEDS
 def test_pairs_weigh_by_what_the_detector_calls_them(seed: int) -> None:
-    """The gate is open to the group; ln p(d), p(d) = sum_c pi_c p(d | c), is added to ln N with R of the label."""
+    """The gate is open to the group; ln p(d), p(d) = sum_c pi_c Lambda_cd, is added to ln N with R of the label."""
     rng = np.random.default_rng(seed)
     confusion = ClassTable.of(motor(class_confusion=0.2)).confusion
     label, measured, score = rng.integers(0, 4, 20), rng.integers(0, 4, 30), rng.uniform(0.1, 1, 30)
@@ -111,11 +111,12 @@ def test_pairs_weigh_by_what_the_detector_calls_them(seed: int) -> None:
     z = Measurements(position, UNGROUPED, UNGROUPED, UNGROUPED, score, measured, measured)
     weigh_by_class(row, measurement, found, z, Groups(pi, confusion), classes)
     for n, m, value in zip(row, measurement, found, strict=True):
-        p = pi[n] @ likelihoods(confusion, measured[m], score[m])
+        p = pi[n] @ likelihoods(confusion, measured[m], 1.0)
         variance, away = 1 + noise[measured[m]] ** 2, mean[n, :2] - position[m]
         normal = -np.log(2 * np.pi * variance) - 0.5 * away @ away / variance
         assert value == pytest.approx(normal + np.log(p), rel=1e-12)
         if label[n] != 1:
+            p = pi[n] @ likelihoods(confusion, measured[m], score[m])
             assert label_probability(pi[n], measured[m], score[m], confusion, classes) == pytest.approx(p, rel=1e-12)
 
 
