@@ -29,8 +29,8 @@ REMEMBERED_S: Final = 2.0
 """How long an object is kept without a detection."""
 DETECTION_S: Final = 0.5
 """Time that the detection probability holds for: what hides an object hides it about so long."""
-SHOWN_S: Final = 0.4
-"""How long a track is shown without a detection; two frames at least."""
+SHOWN_S: Final = 0.3
+"""How long a track is shown without a detection: in whole frames, rounded up."""
 EVIDENCE: Final = tuple(round(-3.0 + 0.5 * k, 1) for k in range(13))
 EXISTENCE: Final = tuple(round(1.0 / (1.0 + math.exp(0.56 - 1.82 * e)), 3) for e in EVIDENCE)
 
@@ -69,7 +69,7 @@ def _of_class(kind: str, period: float) -> dict[str, Any]:
         **({"group": "vehicle", "suppress_in_group": False} if kind in {"car", "truck"} else {}),
         "score_filter": 0.05,
         "announce_score": 0.15,
-        "birth_score": 0.5,
+        "birth_score": 0.4 if agile else 0.5,
         "nms_iou": 0.05,
         "survival": 1.0,
         "gate": gate,
@@ -84,7 +84,7 @@ def _of_class(kind: str, period: float) -> dict[str, Any]:
         "poisson_steps": 2,
         "extract_new": 0.7,
         "extract_known": 0.8,
-        "extract_misses": max(2, round(SHOWN_S / period)),
+        "extract_misses": 1 + max(1, math.ceil(SHOWN_S / period - 0.1)),
         "max_misses": max(4, round(REMEMBERED_S / period)),
         "min_existence": 1e-4,  # objects are kept for their time, not for their misses
         "heading_sign": {"speed": 1.0 if agile or two_wheeled else 4.0},  # vehicles reverse at up to 4 m/s
