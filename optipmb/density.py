@@ -200,6 +200,7 @@ BINS: Final = 26
 COUNTS: Final = 5
 SLOTS: Final = 3
 SLOT: Final = BINS + 2
+SCATTER: Final = 3
 """Shapes of `SelfCalibration`; a slot has looks and ticks of 0.1 ms behind the bins."""
 NO_BIN: Final = -1
 
@@ -212,18 +213,21 @@ LEAST_MOVED_S: Final = 0.25
 
 @record
 class SelfCalibration:
-    """Counts of the detections of a stream by score.
+    """Counts of the detections of a stream by score, and how they scatter about tracks.
 
     Attributes:
         classes: (C, `COUNTS`, `BINS`) of the classes.
         objects: (N, `SLOTS`, `SLOT`) uint16 of each detected object: detections by bin, looks and ticks of its slots,
             the oldest first.
+        scatter: (C, `SCATTER`) of the classes: pairs of a sure track and its detection, and the sums of the squared
+            scatter of those detections along and across the heading, m^2.
         components: (J,) int64 bin of the detection of each Poisson component, `NO_BIN` where it is not known.
     """
 
     classes: Array
     objects: NDArray[np.uint16]
     components: Index
+    scatter: Array
 
     @classmethod
     def of(cls, density: Density) -> SelfCalibration:
@@ -234,6 +238,7 @@ class SelfCalibration:
             np.zeros((len(density.labels), COUNTS, BINS)),
             np.zeros((len(density.bernoulli), SLOTS, SLOT), np.uint16),
             np.full(len(density.poisson), NO_BIN, np.int64),
+            np.zeros((len(density.labels), SCATTER)),
         )
 
 
@@ -376,6 +381,7 @@ def _shapes(classes: int, objects: int, components: int) -> dict[str, tuple[tupl
         "classes": ((classes, COUNTS, BINS), np.float64),
         "objects": ((objects, SLOTS, SLOT), np.uint16),
         "components": ((components,), np.int64),
+        "scatter": ((classes, SCATTER), np.float64),
     }
 
 

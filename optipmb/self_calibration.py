@@ -19,6 +19,16 @@ The curve of a class is the isotonic regression of the shares over the log odds 
 in each bin whose scores are right. Its largest value is `MOST`. It depends on frames of the past alone, and
 the state is part of the density. Counts fade from `MASS` detections on.
 
+Noise is learned in the same way. Of a confirmed track of at least `SURE_S` that was detected in the frame before, the
+innovation nu and the residual epsilon of a detection, z less the predicted and the updated position, give its scatter
+along and across the heading:
+
+    sigma^2 = mean of nu epsilon        E[nu epsilon] = R where the filter is right
+
+with `PRIOR_PAIRS` pairs of the profile's noise. The scatter is R of the class, and R' of the published box. The errors
+of a detector last, too: the offset of a box from its object, which no filter sees, is 1.5 to 2.5 times the scatter with
+each of five detectors. `LASTING_RATIO` times the scatter is added to the published covariance.
+
 A threshold never excludes the upper half of the scores of a class. Detections that are filtered out teach nothing, so
 that otherwise a detector of low scores would remain silent for ever.
 """
@@ -32,7 +42,8 @@ import numpy as np
 
 from optipmb.calibration import log_odds
 from optipmb.compiled import kernel
-from optipmb.density import BINS, COUNTS, NO_BIN, SLOT, SLOTS, SelfCalibration
+from optipmb.density import BINS, COUNTS, NO_BIN, PHI, SLOT, SLOTS, SelfCalibration, X, Y, objects_in
+from optipmb.frame import PLAIN
 from optipmb.predict import rows_within
 from optipmb.rows import read_only
 from optipmb.undetected import AGED, MARKED
@@ -42,6 +53,7 @@ if TYPE_CHECKING:
 
     from optipmb.density import Density, Moment
     from optipmb.frame import Frame
+    from optipmb.preprocess import Measurements
     from optipmb.rows import Array, Index
     from optipmb.table import Classes, ClassTable
     from optipmb.tracker import Update
@@ -75,6 +87,18 @@ FULL_SLOT: Final = 10.0
 LEAST_SHARE, MOST_SHARE, PRIOR_RECALL = 0.4, 0.87, 0.95
 BEST: Final = 0.2
 """Share of the detections of a class whose scores are the best."""
+
+PAIRS, ALONG, ACROSS = range(3)
+"""Columns of the scatter of a class."""
+PRIOR_PAIRS: Final = 50.0
+SURE_S: Final = 1.0
+LEAST_NOISE, MOST_NOISE = 0.02, 2.0
+"""Bounds of a learned standard deviation, m."""
+OUTLYING: Final = 9.0
+"""Squared standard deviations that a pair counts for at most: a half-hidden object jumps."""
+LASTING_RATIO: Final = 1.7
+LEAST_PART: Final = 0.25
+"""Part of the profile's variance that R keeps, so that a box that jumps stays of its track."""
 
 
 @kernel
@@ -276,6 +300,88 @@ def learn(
     return classes, kept_slots, bins_after
 
 
+@kernel
+def learned(own: Array, axis: int, prior: float) -> float:
+    """Return the variance of a class along an axis by its row of the scatter (3,), with that of the profile, m^2."""
+    variance: float = (PRIOR_PAIRS * prior + own[axis]) / (PRIOR_PAIRS + own[PAIRS])
+    return min(max(variance, LEAST_NOISE * LEAST_NOISE), MOST_NOISE * MOST_NOISE)
+
+
+@kernel
+def use_scatter(scatter: Array, table: Classes) -> None:
+    """Write the learned noise, R, R_x and the lasting errors, to the rows of a table."""
+    for c in range(scatter.shape[0]):
+        own = table[c]
+        if scatter[c, PAIRS] == 0.0:
+            continue
+        measured = own.noise_position * own.noise_position
+        reported = measured
+        if own.reported_position > 0.0:
+            reported = 1.0 / (1.0 / own.reported_position + 1.0 / measured)
+        along, across = learned(scatter[c], ALONG, reported), learned(scatter[c], ACROSS, reported)
+        reported = 0.5 * (along + across)
+        measured = 0.5 * (learned(scatter[c], ALONG, measured) + learned(scatter[c], ACROSS, measured))
+        measured = max(measured, LEAST_PART * own.noise_position * own.noise_position)
+        own.noise_position = math.sqrt(measured)
+        own.reported_position = 1.0 / (1.0 / reported - 1.0 / measured) if reported < measured else 0.0
+        for k in range(own.knots):
+            own.knot_along[k] = math.sqrt(lasting(scatter[c], ALONG, own.knot_along[k]))
+            own.knot_across[k] = math.sqrt(lasting(scatter[c], ACROSS, own.knot_across[k]))
+
+
+@kernel
+def lasting(own: Array, axis: int, prior: float) -> float:
+    """Return the variance of the lasting error along an axis, m^2, with the standard deviation of the profile, m."""
+    total = PRIOR_PAIRS * prior * prior + LASTING_RATIO * LASTING_RATIO * own[axis]
+    variance: float = total / (PRIOR_PAIRS + own[PAIRS])
+    return min(variance, MOST_NOISE * MOST_NOISE)
+
+
+@kernel
+def learn_scatter(
+    scatter: Array,
+    prior_words: Array,
+    words: Array,
+    hits: tuple[Index, Index],
+    position: Array,
+    moment: tuple[int, int],
+    table: Classes,
+) -> Array:
+    """Return the scatter (C, 3) with the pairs of a frame.
+
+    Arguments of its own:
+        prior_words, words: arrays of the predicted and the updated `Bernoullis`.
+        hits: `row` and `measurement` of the updated ones, as in `optipmb.tracker.Update`.
+        position: (M, 2) or (M, 5) of the measurements.
+        moment: stamps of the frame and of the one before.
+    """
+    out, prior, objects = scatter.copy(), objects_in(prior_words), objects_in(words)
+    (row, measurement), (stamp_ns, before_ns) = hits, moment
+    for k in range(row.shape[0]):
+        n, m, c = row[k], measurement[k], objects.label[k]
+        if n < 0 or m < 0 or not prior.confirmed[n] or prior.seen_ns[n] != before_ns:
+            continue
+        if stamp_ns - prior.born_ns[n] < SURE_S * 1e9:
+            continue
+        if position.shape[1] > PLAIN and (position[m, 2] != 1.0 or position[m, 4] != 1.0):
+            continue  # with a covariance of its own
+        cos, sin = math.cos(objects.mean[k, PHI]), math.sin(objects.mean[k, PHI])
+        usual = table[c].noise_position ** 2
+        nu_x, nu_y = position[m, 0] - prior.mean[n, X], position[m, 1] - prior.mean[n, Y]
+        e_x, e_y = position[m, 0] - objects.mean[k, X], position[m, 1] - objects.mean[k, Y]
+        along = (cos * nu_x + sin * nu_y) * (cos * e_x + sin * e_y)
+        across = (cos * nu_y - sin * nu_x) * (cos * e_y - sin * e_x)
+        out[c, PAIRS] += 1.0
+        out[c, ALONG] += min(max(along, 0.0), OUTLYING * learned(scatter[c], ALONG, usual))
+        out[c, ACROSS] += min(max(across, 0.0), OUTLYING * learned(scatter[c], ACROSS, usual))
+    for c in range(out.shape[0]):
+        if out[c, PAIRS] > MASS:
+            kept = MASS / out[c, PAIRS]
+            for s in range(out.shape[1]):
+                out[c, s] *= kept
+    return out
+
+
 class Scores(NamedTuple):
     """The scores of a frame.
 
@@ -296,11 +402,19 @@ def calibrated(density: Density, frame: Frame, table: ClassTable) -> tuple[Score
     """Return the calibrated scores of a frame, and parameters whose thresholds they may be compared with."""
     own, table = SelfCalibration.of(density), table.copy()
     meant = read_only(calibrate(own.classes, frame.score, frame.label, table.classes))
+    use_scatter(own.scatter, table.classes)
     return Scores(density, frame.score, meant, frame.label), table
 
 
 def followed(
-    scores: Scores, prior: Density, posterior: Density, update: Update, rows: Index, moment: Moment, table: ClassTable
+    scores: Scores,
+    prior: Density,
+    posterior: Density,
+    update: Update,
+    measurements: Measurements,
+    rows: Index,
+    moment: Moment,
+    table: ClassTable,
 ) -> SelfCalibration:
     """Return the counts after a frame, and write the scores of the detector to the objects of the new posterior.
 
@@ -321,4 +435,6 @@ def followed(
     counts = own.classes.copy(), own.objects, bins
     detections = scores.given, scores.label, rows
     found = learn(counts, (old.id, old.label), after, prior.poisson.label, fate, detections, moment.dt)
-    return SelfCalibration(*found)
+    words, stamps = (prior.bernoulli.words, objects.words), (moment.stamp_ns, moment.before_ns)
+    scatter = learn_scatter(own.scatter, *words, (update.row, hit), measurements.position, stamps, table.classes)
+    return SelfCalibration(*found, scatter)

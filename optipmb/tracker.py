@@ -300,7 +300,7 @@ class Tracker:
         next_id, labels, sensor = prior.next_id + born, density.labels, density.sensor
         posterior = Density(moment.stamp_ns, next_id, objects, poisson, labels, misses, pi, sensor=sensor)
         if scores is not None:
-            own = followed(scores, predicted, posterior, after, chosen, moment, table)
+            own = followed(scores, predicted, posterior, after, z, chosen, moment, table)
             posterior = replace(posterior, self_calibration=own)
 
         # Track extraction

@@ -10,24 +10,35 @@ import pytest
 from class_rows import class_rows
 
 import optipmb
-from optipmb.density import BINS, COUNTS, NO_BIN, SLOT, SLOTS
+from optipmb.density import BINS, COUNTS, NO_BIN, PHI, SCATTER, SLOT, SLOTS, Bernoullis
 from optipmb.self_calibration import (
+    ALONG,
     BIN,
     DETECTIONS,
     GIVEN,
     HITS,
     LASTING,
+    LASTING_RATIO,
+    LEAST_NOISE,
+    LEAST_PART,
     LOOKS,
     LOWEST,
     MASS,
+    MOST_NOISE,
     OF_LOOKS,
+    OUTLYING,
     PRIOR,
+    PRIOR_PAIRS,
     RISE,
     TICKS,
     bin_of,
     calibrate,
+    lasting,
     learn,
+    learn_scatter,
+    learned,
     needed_shares,
+    use_scatter,
 )
 from optipmb.undetected import AGED, MARKED
 
@@ -197,6 +208,95 @@ def test_frames_are_counted_as_plain_python_counts(seed: int) -> None:
             assert own[-1, TICKS] == round(1e4 * plain.seconds[one])
 
 
+@SEEDS
+def test_scatter_is_summed_over_sure_pairs_as_in_numpy(seed: int) -> None:
+    """Tracks that are confirmed, a second old and detected twice in a row; a pair counts for nine variances at most."""
+    rng, count, second = np.random.default_rng(seed), 40, 10**9
+    now, before = 20 * second, 19 * second
+    prior = Bernoullis.of(np.zeros(count * Bernoullis.width)).replaced(
+        mean=rng.normal(0.0, 0.5, (count, 6)),
+        confirmed=rng.random(count) < 0.8,
+        seen_ns=np.where(rng.random(count) < 0.8, before, before - second),
+        born_ns=rng.choice([now - second // 2, now - second, now - 2 * second], count),
+    )
+    row = np.r_[np.sort(rng.choice(count, 30, replace=False)), [-1, -1]]
+    objects = Bernoullis.of(np.zeros(32 * Bernoullis.width)).replaced(
+        mean=rng.normal(0.0, 0.5, (32, 6)), label=rng.integers(0, 2, 32)
+    )
+    measurement = np.where(rng.random(32) < 0.9, rng.permutation(32), -1)
+    own = np.where(rng.random(32) < 0.2, 2.0, 1.0)
+    position = np.column_stack((rng.normal(0.0, 0.5, (32, 2)), own, np.zeros(32), own))
+    scatter, noise = np.array([[10.0, 0.5, 0.2], [MASS, 50.0, 400.0]]), np.array([0.3, 0.25])
+    hits, rows = (row, measurement), class_rows(2, noise_position=noise)
+    found = learn_scatter(scatter, prior.words, objects.words, hits, position, (now, before), rows)
+
+    k = np.flatnonzero((row >= 0) & (measurement >= 0))
+    n, m = row[k], measurement[k]
+    sure = prior.confirmed[n] & (prior.seen_ns[n] == before) & (now - prior.born_ns[n] >= second) & (own[m] == 1.0)
+    k, n, m = k[sure], n[sure], m[sure]
+    axis, c = np.exp(-1j * objects.mean[k, PHI]), objects.label[k]
+    nu, residual = (((position[m, :2] - one[:, :2]) @ [1, 1j]) * axis for one in (prior.mean[n], objects.mean[k]))
+    most = OUTLYING * (PRIOR_PAIRS * noise[:, None] ** 2 + scatter[:, 1:]) / (PRIOR_PAIRS + scatter[:, :1])
+    products = np.column_stack((nu.real * residual.real, nu.imag * residual.imag))
+    wanted = scatter.copy()
+    np.add.at(wanted, c, np.column_stack((np.ones(len(k)), np.clip(products, 0.0, most[c]))))
+    wanted *= np.minimum(1.0, MASS / wanted[:, :1])
+    assert len(k) > 2
+    np.testing.assert_allclose(found, wanted, rtol=1e-12)
+
+
+def test_learned_noise_goes_to_the_state_the_box_and_the_covariance() -> None:
+    """R and R' are the scatter, with the profile's for fifty pairs; a class without pairs keeps its own."""
+    scatter = np.array([[150.0, 12.0, 6.0], [0.0, 0.0, 0.0], [1e3, 1e-3, 1e-3], [1e3, 1e5, 1e5]])
+    curve = np.zeros((4, 32))
+    curve[:, :2] = [0.15, 0.2]
+    left = 1.0 / (1.0 / 0.06**2 - 1.0 / 0.3**2)
+    columns = {"noise_position": 0.3, "reported_position": left, "knots": 2, "knot_along": curve, "knot_across": curve}
+    rows = class_rows(4, **columns)
+    use_scatter(scatter, rows)
+    for own, one in zip(rows, scatter, strict=True):
+        if not one[0]:
+            assert own == class_rows(4, **columns)[1]
+            continue
+
+        def mean(prior: float, one: Array = one) -> float:
+            variances = np.clip((50.0 * prior**2 + one[1:]) / (50.0 + one[0]), LEAST_NOISE**2, MOST_NOISE**2)
+            assert learned(one, ALONG, prior**2) == pytest.approx(variances[0], rel=1e-12)
+            return float(variances.mean())
+
+        measured, reported = max(mean(0.3), LEAST_PART * 0.3**2), mean(0.06)
+        assert own["noise_position"] ** 2 == pytest.approx(measured, rel=1e-12)
+        of_box = 1.0 / (1.0 / own["reported_position"] + 1.0 / measured) if own["reported_position"] else measured
+        assert of_box == pytest.approx(min(reported, measured), rel=1e-9)
+        for s, name in ((1, "knot_along"), (2, "knot_across")):
+            variance = (50.0 * curve[0, :2] ** 2 + LASTING_RATIO**2 * one[s]) / (50.0 + one[0])
+            np.testing.assert_allclose(own[name][:2] ** 2, np.minimum(variance, MOST_NOISE**2), rtol=1e-12)
+            assert lasting(one, s, 0.15) == pytest.approx(min(variance[0], MOST_NOISE**2), rel=1e-12)
+
+
+@pytest.mark.parametrize("noise", [0.15, 0.4])
+def test_white_noise_is_learned_and_smoothed(noise: float) -> None:
+    """Of objects at constant velocity: the scatter is the noise to a quarter, and tracks are nearer than boxes."""
+    rng, tracker = np.random.default_rng(0), optipmb.OnlineTracker(PARAMETERS)
+    start, velocity = np.array([[10.0, -20.0], [40.0, 10.0], [0.0, 30.0]]), np.array([[8.0, 0.0], [-12, 3], [5, 5]])
+    errors = []
+    for k in range(200):
+        place = start + 0.1 * k * velocity
+        off = noise * rng.standard_normal((3, 2))
+        yaw, size = np.arctan2(velocity[:, 1], velocity[:, 0]), [[4.5, 1.9, 1.6]] * 3
+        center = np.column_stack((place + off, np.zeros(3)))
+        tracks = tracker.update(t=0.1 * k, center=center, size=size, yaw=yaw, score=[0.9] * 3, label=["car"] * 3)
+        if k >= 80:
+            own = tracks.detection
+            errors.append(((tracks.center[:, :2] - place[own]) ** 2).sum(axis=1) / (off[own] ** 2).sum())
+    assert np.sqrt(np.mean(np.sum(errors, axis=1))) < 0.75
+    calibration = tracker.density.self_calibration
+    assert calibration is not None
+    pairs, along, across = calibration.scatter[0]
+    assert np.sqrt((along + across) / (2.0 * pairs)) == pytest.approx(noise, rel=0.25)
+    assert calibration.scatter.shape == (2, SCATTER)
+
+
 CLASSES = ("car", "pedestrian")
 PARAMETERS = optipmb.generic_parameters(CLASSES, 0.1)
 
@@ -273,7 +373,7 @@ def test_wrong_counts_are_refused_by_name() -> None:
     """Another shape or type, negative or endless counts, bins that there are not; the tracker refuses misfits too."""
     density = run(PARAMETERS, street(5))[-1].density
     columns = optipmb.columns_of(density)
-    for part in ("classes", "objects", "components"):
+    for part in ("classes", "objects", "components", "scatter"):
         name = f"calibration.{part}"
         good = columns[name]
         beyond = [] if part == "objects" else [-2 - good, np.full_like(good, 10**12)]  # in slots it fits
