@@ -20,6 +20,7 @@ from optipmb_client.merging import FinalEvents, Merging, Novelty
 __all__ = ["EventSubscriber", "Missed", "Received", "Statistics", "Subscriber"]
 
 REMEMBERED = 65_536  # frames whose repetition is recognised
+RECOVERED_NS = 500_000_000  # delay of tracks that do not come at their time
 MISSED = 1024  # ranges of lost frames that are kept
 
 _Message = TypeVar("_Message", bound=Message)
@@ -29,7 +30,9 @@ _Message = TypeVar("_Message", bound=Message)
 class Received:
     """Tracks, and the monotonic time (`time.monotonic_ns`) at which they arrived on this machine.
 
-    `corrects` says whether they replace earlier tracks of the same frame. `traceparent` is the W3C trace context in
+    `corrects` says whether they replace earlier tracks of the same frame. `recovered` says that they do not come at
+    their time: half a second later than others of the stream did, as those that were lost on the way, or with `history`
+    from before the subscription, by the clocks of both machines. `traceparent` is the W3C trace context in
     which the service published them; empty where it records no traces, and over gRPC.
     """
 
@@ -37,6 +40,7 @@ class Received:
     monotonic_ns: int
     corrects: bool = False
     traceparent: str = ""
+    recovered: bool = False
 
 
 @dataclass(frozen=True)
@@ -93,6 +97,8 @@ class _Subscription:
         prefix: str,
         connection: "Link | None",
         opened: Callable[[], Link],
+        *,
+        history: bool,
     ) -> None:
         Keys(prefix).matching(pattern, "tracks")  # checks both
         self._counts = collections.Counter[str]()
@@ -100,7 +106,7 @@ class _Subscription:
         self._own = opened() if connection is None else None
         link = connection or self._own
         assert link is not None  # noqa: S101  one of the two is there: said for the type checker
-        self._subscription = link.subscribe_streams(pattern, self._inbox, *topics, prefix=prefix)
+        self._subscription = link.subscribe_streams(pattern, self._inbox, *topics, prefix=prefix, history=history)
 
     def __enter__(self) -> Self:
         return self
@@ -163,7 +169,7 @@ class EventSubscriber(_Subscription):
         self._final = final
         self._streams: dict[str, FinalEvents] = collections.defaultdict(FinalEvents)
         opened = partial(linked, connect, config=config, timeout=connect_timeout)
-        super().__init__(pattern, ("events",), queue, prefix, connection, opened)
+        super().__init__(pattern, ("events",), queue, prefix, connection, opened, history=True)
 
     def __iter__(self) -> Iterator[Events]:
         """Iterate over the messages until `timeout` or `close`."""
@@ -182,9 +188,10 @@ class Subscriber(_Subscription):
     inserts it and publishes the tracks of the frames behind it again, with a higher `revision`: the latest one
     of a frame holds. `corrections=False` leaves these out, for programs that act on new frames alone.
 
-    A subscriber that comes late first gets what the service keeps of each stream, some seconds.
-    A program that is too slow loses the oldest waiting messages, never anybody else's; `statistics` counts them, and
-    `missed` names the frames.
+    Tracks come from now on; those that are lost on the way are recovered while the stream goes on. With `history` a
+    subscriber that comes late first gets what the service keeps of each stream, some seconds, also of streams that have
+    ended. A program that is too slow loses the oldest waiting messages, never anybody else's; `statistics` counts
+    them, and `missed` names the frames.
 
     Args:
         pattern: Name of a stream, `site/node/sensor`, or a pattern with `*` in the place of names: `garage/*/*`.
@@ -194,6 +201,7 @@ class Subscriber(_Subscription):
         on_problem: Called with each `Problem` that the service reports for these streams (refused messages and the
             like), by the thread that iterates.
         corrections: Whether messages that replace earlier ones are given out too.
+        history: Give out first what was published before.
         predict: Receive tracks predicted to now, at a fixed rate, of the streams in the setting `outputs`: each
             message replaces the one before, and none is kept for late subscribers.
         queue: Number of messages that may wait.
@@ -215,6 +223,7 @@ class Subscriber(_Subscription):
         timeout: float | None = None,
         on_problem: Callable[[Problem], None] | None = None,
         corrections: bool = True,
+        history: bool = False,
         predict: bool = False,
         queue: int = 1024,
         config: str | Path | None = None,
@@ -231,7 +240,9 @@ class Subscriber(_Subscription):
         tracks: Topic = "now" if predict else "tracks"
         topics: tuple[Topic, ...] = (tracks,) if on_problem is None else (tracks, "problems")
         opened = partial(linked, connect, config=config, timeout=connect_timeout)
-        super().__init__(pattern, topics, queue, prefix, connection, opened)
+        self._fastest_ns: dict[str, int] = {}
+        self._began_ns = time.time_ns() if history else 0
+        super().__init__(pattern, topics, queue, prefix, connection, opened, history=history)
 
     def __iter__(self) -> Iterator[Tracks]:
         """Iterate over the messages until `timeout` or `close`."""
@@ -260,7 +271,18 @@ class Subscriber(_Subscription):
                 self._counts["corrected"] += corrects
                 if novelty is Novelty.NEW or (corrects and self._corrections):
                     self._counts["delivered"] += 1
-                    return Received(tracks, arrival.monotonic_ns, corrects, arrival.traceparent)
+                    recovered = self._is_recovered(tracks, arrival.monotonic_ns)
+                    return Received(tracks, arrival.monotonic_ns, corrects, arrival.traceparent, recovered)
+
+    def _is_recovered(self, tracks: Tracks, arrived_ns: int) -> bool:
+        if tracks.delivery is None:
+            return False
+        published_ns = tracks.delivery.published_ns
+        took_ns = arrived_ns - published_ns  # of two clocks: only differences mean something
+        if published_ns < self._began_ns:
+            return True
+        fastest_ns = self._fastest_ns[tracks.stream] = min(took_ns, self._fastest_ns.get(tracks.stream, took_ns))
+        return took_ns - fastest_ns > RECOVERED_NS
 
     @property
     def missed(self) -> tuple[Missed, ...]:

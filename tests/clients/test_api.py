@@ -18,8 +18,10 @@ from optipmb_client import Connection, ConnectionFailed, EventSubscriber, Publis
 from optipmb_client.incoming import Inbox
 from optipmb_client.links import Link
 from optipmb_schemas import (
+    Delivery,
     Detections,
     Events,
+    Keys,
     Message,
     MessageError,
     Points,
@@ -385,6 +387,35 @@ def received(subscriber: Subscriber, count: int) -> list[Tracks]:
     """Return `count` messages and all further ones until the subscriber's timeout."""
     first = [subscriber.receive(DEADLINE_S) for _ in range(count)]
     return [*(one.tracks for one in first if one is not None), *subscriber]
+
+
+def test_old_tracks_come_where_they_are_asked_for(endpoint: str, link: Connection) -> None:
+    """By default those from now on, of no stream that has ended; with history all that is kept, marked as recovered."""
+    others = [tracks_message("garage/robot-2/lidar", seq) for seq in range(3)]
+    keys, encoding = Keys(), encoding_of(others[0])
+    times = dict.fromkeys(("received_ns", "queue_ms", "decode_ms", "step_ms"), 1)
+    delivery = {"delivery": Delivery(instance="one", published_ns=time.time_ns(), **times)}
+    with Connection(endpoint) as service:
+        silent = service.cached_sender(keys.tracks("garage/robot-2/lidar"), encoding, cache=10)
+        sender = service.cached_sender(keys.tracks(STREAM), encoding, cache=10)
+        for message in others:
+            silent.put(encode(message))
+        for seq in range(5):
+            sender.put(encode(tracks(seq, **delivery)))
+        with (
+            Subscriber("garage/*/*", connection=link, timeout=2.0) as subscriber,
+            Subscriber("garage/*/*", connection=link, timeout=2.0, history=True) as late,
+        ):
+            kept = [late.receive(DEADLINE_S) for _ in range(8)]
+            assert [one.recovered for one in kept if one and one.tracks.stream == STREAM] == [True] * 5
+            now = {"delivery": delivery["delivery"].model_copy(update={"published_ns": time.time_ns()})}
+            for seq in range(5, 8):
+                sender.put(encode(tracks(seq, **now)))
+            found = [subscriber.receive(DEADLINE_S) for _ in range(3)]
+            assert [(one.tracks.seq, one.recovered) for one in found if one] == [(5, False), (6, False), (7, False)]
+            assert [one.tracks.seq for one in (late.receive(DEADLINE_S) for _ in range(3)) if one] == [5, 6, 7]
+            assert subscriber.receive(1.5) is None  # nor do heartbeats bring any
+            assert subscriber.missed == ()
 
 
 @pytest.mark.parametrize("pattern", ["garage/*", "garage/**", "a/b/c/d", "gar*/a/b", "$*/a/b", ""])

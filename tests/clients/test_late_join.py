@@ -93,6 +93,27 @@ def test_a_gap_is_asked_for_once() -> None:
     assert (one.received, one.asked) == ([0, 1, 2, 3, 4, 6, 7, "a/b", 5, 8], [])
 
 
+def test_what_was_published_before_is_left_out() -> None:
+    """What comes waits until the newest samples of the caches are known; a publisher that is not among them is new."""
+    one, other = Joined(), Entity(eid=8)
+    one.join = LateJoin(
+        lambda sample: one.received.append(sample.source_info and sample.source_info.source_sn),
+        lambda *query: one.asked.append(query),
+        waits=True,
+    )
+    one.take(3, 4, 5, 6)
+    one.take(0, 1, source=other)
+    assert (one.received, one.asked) == ([], [])
+    one.join.begin([sample(4)])
+    one.take(2, 9)
+    assert (one.received, [selector for selector, _, _ in one.asked]) == (
+        [5, 6, 0, 1],
+        ["a/b/@adv/pub/abc/7/**?_sn=7..8"],
+    )
+    one.answer(8, 7)
+    assert one.received[4:] == [7, 8, 9]
+
+
 def test_what_no_cache_holds_is_said_to_be_lost() -> None:
     """Before the sample behind it, with its key; not what the cache still has, nor repetitions."""
     one, found = Joined(), list[object]()

@@ -335,7 +335,7 @@ def test_a_service_that_comes_late_recovers_what_it_missed(tmp_path: Path) -> No
         with network.service() as service, Party(network.config(VIEWER)) as viewer:
             service.wait_ready()
             assert viewer.wait_for_frames(FRAMES) == FRAMES
-            with Subscriber(LIDAR, config=network.config(NODE), timeout=60) as late:
+            with Subscriber(LIDAR, config=network.config(NODE), history=True, timeout=60) as late:
                 assert [message.seq for message in itertools.islice(late, FRAMES)] == list(range(FRAMES))
             service.process.kill()
         with network.service("spare") as spare, Party(network.config(VIEWER)) as viewer:

@@ -74,9 +74,13 @@ class GrpcConnection:
         publishing = Publishing(self._channels, stream, cache, cache_clouds, self._timeout)
         return GrpcSender(publishing, "detections"), GrpcSender(publishing, "points")
 
-    def subscribe_streams(self, pattern: str, inbox: Inbox, *topics: Topic, prefix: str) -> GrpcSubscription:
+    def subscribe_streams(
+        self, pattern: str, inbox: Inbox, *topics: Topic, prefix: str, history: bool
+    ) -> GrpcSubscription:
         """Move topics of a pattern of streams into an inbox: tracks or `now`, perhaps with problems, or events."""
-        return GrpcSubscription(self._channels, pattern, inbox, Keys(prefix), topics=topics, timeout=self._timeout)
+        return GrpcSubscription(
+            self._channels, pattern, inbox, Keys(prefix), topics=topics, history=history, timeout=self._timeout
+        )
 
     def query(self, key: str, payload: bytes = b"", encoding: str = "", *, timeout: float = 2.0) -> tuple[Answer, ...]:
         """Ask at the key of a query about a stream: its state, its parameters, a reset.

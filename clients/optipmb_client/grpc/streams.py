@@ -224,6 +224,7 @@ class GrpcSubscription(ResumedCall):
         inbox: for the messages.
         keys: of the network, for the names of arrivals.
         topics: tracks or tracks predicted to now, perhaps with problems, or events.
+        history: whether kept messages come at the first call, too.
         timeout: seconds to wait until it is in force.
 
     Raises:
@@ -232,16 +233,25 @@ class GrpcSubscription(ResumedCall):
     """
 
     def __init__(
-        self, channels: Channels, pattern: str, inbox: Inbox, keys: Keys, *, topics: Sequence[Topic], timeout: float
+        self,
+        channels: Channels,
+        pattern: str,
+        inbox: Inbox,
+        keys: Keys,
+        *,
+        topics: Sequence[Topic],
+        history: bool,
+        timeout: float,
     ) -> None:
         self._events = "events" in topics
         super().__init__(channels, "SubscribeEvents" if self._events else "Subscribe", f"subscribe {pattern}")
         request: Any = pb.SubscribeRequest(
-            pattern=pattern, queue=QUEUE, history=True, problems="problems" in topics, predict="now" in topics
+            pattern=pattern, queue=QUEUE, problems="problems" in topics, predict="now" in topics
         )
         if self._events:
-            request = pb.SubscribeEventsRequest(pattern=pattern, final=False, history=True)
-        self._request = request.SerializeToString()
+            request = pb.SubscribeEventsRequest(pattern=pattern, final=False)
+        self._request = request
+        self._request.history = history
         self._inbox = inbox
         self._keys = keys
         self._open("subscription", timeout)
@@ -251,12 +261,13 @@ class GrpcSubscription(ResumedCall):
         self._end()
 
     def _requests(self) -> Iterator[bytes]:
-        return iter((self._request,))
+        return iter((self._request.SerializeToString(),))
 
     def _began(self) -> None:
         self._call.initial_metadata()  # it is in force
         if self._call.is_active():
             self._settled.set()
+            self._request.history = True  # of the next call, for what is lost in between
 
     def _ended(self) -> None:
         if not self._over.is_set():

@@ -99,20 +99,21 @@ class Connection:
         """Open what sends the detections and the clouds of a stream, each keeping the newest for recovery."""
         return self._session.senders(Keys(prefix), stream, cache=cache, cache_clouds=cache_clouds)
 
-    def subscribe(self, pattern: str, inbox: Inbox) -> Reading:
+    def subscribe(self, pattern: str, inbox: Inbox, *, history: bool = True) -> Reading:
         """Move all that is published under `pattern` into `inbox`; losses are recovered from the publishers' caches.
 
-        What those caches hold from before the subscription comes first. (Recovery would bring it anyhow, at the first
-        heartbeat of a publisher: for it a late subscriber is one that has lost everything so far.)
+        With `history`, what those caches hold from before the subscription comes first.
         """
-        return self._session.subscribe(pattern, inbox.put, history=True)
+        return self._session.subscribe(pattern, inbox.put, history=history)
 
-    def subscribe_streams(self, pattern: str, inbox: Inbox, *topics: Topic, prefix: str) -> contextlib.ExitStack:
+    def subscribe_streams(
+        self, pattern: str, inbox: Inbox, *topics: Topic, prefix: str, history: bool
+    ) -> contextlib.ExitStack:
         """Move topics of a pattern of streams into an inbox: tracks or `now`, perhaps with problems, or events."""
         self._session.require(CACHED * len(topics))
         subscriptions = contextlib.ExitStack()
         for topic in topics:
-            subscriptions.callback(self.subscribe(Keys(prefix).matching(pattern, topic), inbox).close)
+            subscriptions.callback(self.subscribe(Keys(prefix).matching(pattern, topic), inbox, history=history).close)
         return subscriptions
 
     def query(self, key: str, payload: bytes = b"", encoding: str = "", *, timeout: float = 2.0) -> tuple[Answer, ...]:

@@ -15,7 +15,7 @@ import itertools
 import queue
 import threading
 import time
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Iterable
 from dataclasses import dataclass
 from typing import Any, Final, Generic, TypeVar
 
@@ -48,11 +48,13 @@ class _Publisher(Generic[_S]):
     Attributes:
         key: where it publishes.
         due: the number after the highest that was handed over.
+        begin: the first number that is handed over.
         waiting: the samples that wait for the answer of its cache; None: none does.
     """
 
     key: str
     due: int = 0
+    begin: int = 0
     waiting: list[_S] | None = None
 
 
@@ -163,6 +165,7 @@ class LateJoin(Generic[_S]):
             raise.
         lost: called with a key just before a sample is handed over behind others that no cache holds any more. It must
             not raise.
+        waits: whether nothing is handed over before `begin` is called.
     """
 
     def __init__(
@@ -171,18 +174,45 @@ class LateJoin(Generic[_S]):
         ask: Callable[[str, Callable[[_S], None], Callable[[bool], None]], object],
         answered: Callable[[str], object] = lambda _: None,
         lost: Callable[[str], object] = lambda _: None,
+        *,
+        waits: bool = False,
     ) -> None:
         self._lost = lost
+        self._early: list[_S] | None = [] if waits else None
         self._receive = receive
         self._ask = ask
         self._on_answered = answered
         self._publishers: dict[_Source, _Publisher[_S]] = {}
         self._waiting_bytes = 0
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._closed = False
+
+    def begin(self, newest: Iterable[_S]) -> None:
+        """Hand over what came, and what comes from now on, without what publishers had published until now.
+
+        Args:
+            newest: the newest sample of each publisher that was there.
+        """
+        with self._lock:
+            early, self._early = self._early or (), None
+            for sample in newest:
+                if (info := sample.source_info) is not None and not self._closed:
+                    publisher = self._added((str(info.source_id.zid), info.source_id.eid), str(sample.key_expr))
+                    publisher.due = publisher.begin = info.source_sn + 1
+            for sample in early:
+                self._take(sample)
 
     def take(self, sample: _S) -> None:
         """Take a sample that the subscriber has received; to be called by one thread at a time."""
+        with self._lock:
+            if self._early is not None:
+                self._early.append(sample)
+                if len(self._early) >= MAX_WAITING:
+                    self.begin(())
+                return
+        self._take(sample)
+
+    def _take(self, sample: _S) -> None:
         info = sample.source_info
         if info is None:  # of a publisher without a cache
             with self._lock:
@@ -195,6 +225,8 @@ class LateJoin(Generic[_S]):
             if self._closed:
                 return
             publisher = self._publishers.get(source) or self._added(source, str(sample.key_expr))
+            if number < publisher.begin:
+                return
             waiting = publisher.waiting
             if waiting is None and number <= publisher.due:  # mostly: in order, and nothing waits
                 self._receive(sample)

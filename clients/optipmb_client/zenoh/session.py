@@ -217,11 +217,11 @@ class Session:
 
     # Receiving
 
-    def subscribe(self, key: str, receive: Callable[[Arrival], object], *, history: bool = False) -> Reading:
+    def subscribe(self, key: str, receive: Callable[[Arrival], object], *, history: bool | None = None) -> Reading:
         """Hand over all that is published under `key`, on a thread of its own.
 
         Losses are recovered from the publishers' caches. What those caches hold from before comes first: with
-        `history` at once, else with the next message or heartbeat of a publisher.
+        `history` at once, with None when a publisher is heard of, and not at all with False.
         """
         after_loss: set[str] = set()
 
@@ -237,7 +237,7 @@ class Session:
                 self._failed(key)
 
         queries: CacheQueries[Sample] = CacheQueries(self.ask)
-        late_join: LateJoin[Sample] = LateJoin(hand_over, queries.ask, lost=after_loss.add)
+        late_join: LateJoin[Sample] = LateJoin(hand_over, queries.ask, lost=after_loss.add, waits=history is False)
 
         def ended() -> None:
             queries.close()
@@ -245,6 +245,9 @@ class Session:
 
         samples: Channel[Sample] = Channel(SUBSCRIBED)
         declared = self.listen(key, samples.put, recovers=True, history=EVERYTHING if history else None)
+        if history is False:  # what is published from now on follows what the caches have now
+            newest: list[Sample] = []
+            queries.ask(f"{key}/@adv/pub/**?_max=1", newest.append, lambda _: late_join.begin(newest))
         return self._read(key, declared, samples, late_join.take, ended)
 
     def read_newest(self, key: str, receive: Callable[[Sample], None], *, most: int = 1) -> Reading:

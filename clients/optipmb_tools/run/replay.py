@@ -98,7 +98,7 @@ class Exchange:
         self.problems: collections.deque[Problem] = collections.deque(maxlen=KEPT_PROBLEMS)
         self.problem_count = 0
         self.subscriber = Subscriber(
-            stream, connection=link, on_problem=self._note, queue=4 * frames + 64, prefix=prefix
+            stream, connection=link, on_problem=self._note, history=True, queue=4 * frames + 64, prefix=prefix
         )
         self._pace = pace
         self._on_frame = on_frame

@@ -282,7 +282,7 @@ class Client(Session):
             with contextlib.suppress(TransportError):  # at the end: the session is closed
                 self.put(self.keys.problems(problem.stream), schemas.encode(problem), schemas.encoding_of(problem))
 
-    def subscribe(self, key: str, receive: Callable[[Arrival], object], *, history: bool = False) -> Reading:
+    def subscribe(self, key: str, receive: Callable[[Arrival], object], *, history: bool | None = None) -> Reading:
         """Hand over publications under a key expression, as `Session` does.
 
         Raises:
