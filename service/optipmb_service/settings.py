@@ -298,6 +298,8 @@ class ZoneSettings(BaseModel):
 
     streams: Patterns
     """patterns of streams (as `garage/*/fused`); each session that matches counts for itself"""
+    geo: bool = False
+    """points are latitude and longitude in degrees, by the place of the stream's site in `sites`"""
     polygon: Shape = ()
     """3 to 1000 corners, m; closed by itself, without crossing itself"""
     line: Shape = Field(default=(), validate_default=True)
@@ -315,8 +317,6 @@ class ZoneSettings(BaseModel):
     """an object that was not detected for longer has left"""
     dwell_s: tuple[Annotated[float, Field(gt=0, le=1e8)], ...] = ()
     """times inside after which there is an event"""
-    geo: bool = False
-    """points are latitude and longitude in degrees, by the place of the stream's site in `sites`"""
 
     @field_validator("polygon", "line")
     @classmethod
@@ -326,7 +326,10 @@ class ZoneSettings(BaseModel):
         if value:
             from optipmb.zones import Zone  # noqa: PLC0415 - compiles kernels
 
-            shape: dict[str, Any] = {str(info.field_name): value}
+            points = value
+            if info.data.get("geo"):  # also around 180° of longitude neighbours are near each other
+                points = tuple((lat, (lon - value[0][1] + 180) % 360) for lat, lon in value)
+            shape: dict[str, Any] = {str(info.field_name): points}
             try:
                 Zone("zone", **shape)
             except ValueError as error:

@@ -1,6 +1,7 @@
 """The page of a real service, seen by a real browser while detections come in."""
 
 import contextlib
+import hashlib
 import json
 import math
 import threading
@@ -110,13 +111,12 @@ def test_the_page_shows_live_tracks_and_survives_a_restart(chrome: Chrome, tmp_p
 def shown_moving(chrome: Chrome) -> None:
     """The first track has the colour of its id where it is, and is somewhere else a second later."""
     wait(chrome, "!dirty && trails.get(frame.tracks[0][ID]).length > 5")
-    (r, g, b, alpha), index = chrome.execute_script(
+    (r, g, b, alpha), name = chrome.execute_script(
         "const t = frame.tracks[0]; dirty = true; draw(); const [x, y] = toScreen(t[X], t[Y]);"
         "const copy = new OffscreenCanvas(1, 1).getContext('2d', {willReadFrequently: true});"
-        "copy.drawImage(canvas, -x, -y); return [[...copy.getImageData(0, 0, 1, 1).data], t[ID]]"
+        "copy.drawImage(canvas, -x, -y); return [[...copy.getImageData(0, 0, 1, 1).data], colour(t[ID])]"
     )
-    colours = ["0072B2", "D55E00", "009E73", "CC79A7", "56B4E9", "E69F00", "8C6D1F"]
-    want = bytes.fromhex(colours[index % 7])
+    want = bytes.fromhex(name.removeprefix("#"))
     assert alpha > 128
     assert max(abs(a - w) for a, w in zip((r, g, b), want, strict=True)) < 140
     assert (r, g, b) != (255, 255, 255)
@@ -148,6 +148,44 @@ def phone(chrome: Chrome) -> None:
     assert chrome.execute_script("return document.documentElement.scrollWidth") <= 390
     assert chrome.execute_script("return canvas.clientHeight") > 300
     shown_moving(chrome)
+
+
+ZONES = """
+[zones.yard]
+streams = ["yard/*/*"]
+polygon = [[85, 35], [115, 35], [115, 65], [85, 65]]
+min_s = 0
+[zones.gate]
+streams = ["yard/*/*"]
+line = [[100, 55], [100, 68]]
+"""
+
+
+def test_the_page_takes_a_token_and_shows_zones(chrome: Chrome, tmp_path: Path) -> None:
+    """Without the token it asks for it, and shows nothing; in the dark it is dark; after the last frame it says so."""
+    (tmp_path / "zones.toml").write_text(ZONES)
+    (tmp_path / "tokens.json").write_text(json.dumps({hashlib.sha256(b"secret").hexdigest(): "viewer/map"}))
+    environment = {"OPTIPMB_HTTP_TOKENS": str(tmp_path / "tokens.json")}
+    options = ("--listen", ENDPOINT, "--http", HTTP, "--settings", str(tmp_path / "zones.toml"))
+    size(chrome, 1280, 800)
+    with ServiceProcess(*options, listen=False, environment=environment) as process:
+        process.wait_ready()
+        with publishing(CARS, "car", 4.0):
+            chrome.get("about:blank")
+            chrome.get(BASE)
+            wait(chrome, "at('state').textContent === 'token needed' && !at('token').hidden")
+            assert chrome.execute_script("return [frame, at('none').hidden]") == [None, True]
+            chrome.find_element("id", "secret").send_keys("secret\n")
+            wait(chrome, "at('state').textContent === 'ready' && at('token').hidden")
+            wait(chrome, "at('zones').rows.length === 2 && at('events').children.length > 2")
+            assert chrome.execute_script("return at('zones').rows[1].cells[0].textContent") == "yard"
+            wait(chrome, "at('streams').rows[0].cells[5].textContent === 'now'")
+            dark = {"features": [{"name": "prefers-color-scheme", "value": "dark"}]}
+            for features, is_dark in ((dark, True), ({"features": []}, False)):
+                chrome.execute_cdp_cmd("Emulation.setEmulatedMedia", features)
+                wait(chrome, f"(parseInt(ink.ground.trim().slice(1, 3), 16) < 64) === {str(is_dark).lower()}")
+        wait(chrome, "at('caption').textContent.includes('no frame for')")
+        wait(chrome, "at('streams').rows[0].cells[5].textContent.endsWith('s ago')")
 
 
 def test_streams_of_workers_are_shown_and_workers_end_with_their_parent() -> None:

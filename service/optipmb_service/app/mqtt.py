@@ -1,6 +1,7 @@
 """The bridge to an MQTT broker as a process of its own: publishes tracks, events, counts and problems as JSON.
 
-Topics are the keys of the network. It keeps nothing and reads nothing from the broker. While the broker is away, events
+Topics are the keys of the network. It keeps nothing, and reads from the broker only which
+counts it has kept. While the broker is away, events
 and the newest counts wait; tracks and problems do not, because they would be out of date.
 
 A message that the broker cannot take is left out, and named, so that it does not block the others: one above the size
@@ -22,7 +23,7 @@ from urllib.parse import urlsplit
 
 import optipmb_schemas as schemas
 import structlog
-from optipmb_client.errors import ClientError
+from optipmb_client.errors import ClientError, ConnectionFailed
 from optipmb_schemas.certificates import context_of
 from optipmb_schemas.json_form import Selection
 from paho.mqtt import client as paho
@@ -110,6 +111,9 @@ class Link:
         self.ended: asyncio.Future[LinkError] = loop.create_future()
         client.on_connect = lambda _c, _d, _f, reason, properties: self._call(self._connected, reason, properties)
         client.on_disconnect = lambda _c, _d, _f, reason, _p: self._call(self._disconnected, reason)
+        self.retained: asyncio.Queue[str] = asyncio.Queue()
+        """Topics of subscriptions that the broker has kept a message of."""
+        client.on_message = lambda _c, _d, one: self._call(self._heard, one.topic, one.retain)
         client.on_publish = lambda _c, _d, number, reason, _p: self._call(self._published, number, reason)
 
     async def open(self, host: str, port: int) -> int:
@@ -145,6 +149,10 @@ class Link:
         finally:
             del self._under_way[sent.mid]
 
+    def subscribe(self, pattern: str) -> None:
+        """Have the broker name the topics of a pattern that it has kept messages of."""
+        self._client.subscribe(pattern, 1)
+
     async def close(self) -> None:
         """Disconnect."""
         self._client.disconnect()
@@ -172,6 +180,10 @@ class Link:
     def _end(self, error: LinkError) -> None:
         if not self.ended.done():
             self.ended.set_result(error)
+
+    def _heard(self, topic: str, retain: bool) -> None:  # noqa: FBT001 - as paho has it
+        if retain:
+            self.retained.put_nowait(topic)
 
     def _published(self, number: int, reason: Any) -> None:
         if (confirmed := self._under_way.get(number)) is not None and not confirmed.done():
@@ -286,6 +298,7 @@ class Bridge(Reporter):
         self.connected, self._why = True, ""
         log.info("mqtt_connected", broker=self._mqtt.broker, protocol=self._version.name, most_bytes=self._most)
         publishing = asyncio.create_task(self._publish(link))
+        clearing = asyncio.create_task(self._clear(link))
         try:
             await asyncio.wait((publishing, link.ended), return_when=asyncio.FIRST_COMPLETED)
         except asyncio.CancelledError:  # a connection that is closed in order has no last will
@@ -296,10 +309,23 @@ class Bridge(Reporter):
             raise
         finally:
             publishing.cancel()
-            await asyncio.wait((publishing,))
+            clearing.cancel()
+            await asyncio.wait((publishing, clearing))
         if publishing.cancelled():
             raise link.ended.result()
         publishing.result()
+
+    async def _clear(self, link: Link) -> None:
+        """Clear kept counts of streams whose zones are gone: the services know the stream, and have no counts of it."""
+        for pattern in self._wish.streams if RETAINED in self._wish.topics else ():
+            link.subscribe(f"{self._keys.prefix}/{pattern.replace('*', '+')}/{RETAINED}")
+        while True:
+            topic = await link.retained.get()
+            stream = topic.removeprefix(f"{self._keys.prefix}/").removesuffix(f"/{RETAINED}")
+            with contextlib.suppress(LinkError, ConnectionFailed, schemas.MessageError):  # another time
+                answers = await asyncio.to_thread(self._client.query, self._keys.query(stream, "zones"))
+                if answers and not any(one.ok for one in answers):
+                    await link.publish(topic, b"", 1, retain=True)
 
     def _link(self) -> Link:
         client = paho.Client(

@@ -28,8 +28,9 @@ if TYPE_CHECKING:
     from optipmb_schemas.json_form import Place
     from starlette.requests import Request
 
-    from optipmb_service.edge.readers import Logs
+    from optipmb_service.edge.readers import EventLog, Logs
     from optipmb_service.http.api import Readers
+    from optipmb_service.settings import Settings
     from optipmb_service.telemetry.health import ProcessHealth
 
 PERIOD_S: Final = 0.1  # a viewer gets no more than one frame in this time
@@ -50,10 +51,11 @@ TYPES: Final = {"html": "text/html", "js": "text/javascript", "css": "text/css"}
 
 _SENSORS: Final = 8  # detections of so many sensors are kept for a viewer of tracks that several share
 _BYTES: Final = 2**22  # and so many bytes of them, or one message
+_EVENTS: Final = 8  # newest events in one frame
 _MOST: Final = 1000  # tracks, and detections, in one frame at most
 
 
-def page(health: ProcessHealth, readers: Readers, places: Mapping[str, Place]) -> list[Route]:
+def page(health: ProcessHealth, readers: Readers, settings: Settings, places: Mapping[str, Place]) -> list[Route]:
     """Return the routes of the page."""
 
     async def status(request: Request) -> Response:
@@ -65,15 +67,26 @@ def page(health: ProcessHealth, readers: Readers, places: Mapping[str, Place]) -
 
     async def live(request: Request) -> Response:
         stream = parameters_of(request, ["stream"]).get("stream", "")
-        tracks = readers.keys.tracks(stream)
+        keys = [readers.keys.tracks(stream)]
         seen = health.detections_of(stream)
         (await readers.caller(request)).may_read(seen)
-        detections = readers.keys.all("detections").replace("*/*/*", seen)
+        keys.append(readers.keys.all("detections").replace("*/*/*", seen))
         place = places.get(stream.partition("/")[0])
-        return await readers.stream(request, (tracks, detections), lambda: Live(place), HEADERS, PERIOD_S)
+        zones = []
+        if settings.zones_of(stream):
+            zones = await asyncio.to_thread(_shapes, settings, stream)
+            keys.append(readers.keys.events(stream))
+        return await readers.stream(request, keys, lambda: Live(place, zones), HEADERS, PERIOD_S)
 
     files = [Route(path, _file(name)) for path, name in FILES.items()]
     return [*files, Route("/status", status), Route("/live", live)]
+
+
+def _shapes(settings: Settings, stream: str) -> list[dict[str, Any]]:
+    """Return the polygons and lines of a stream, in its world frame."""
+    site = settings.sites.get(stream.partition("/")[0])
+    zones = {name: settings.zones[name].zone(name, site) for name in settings.zones_of(stream)}
+    return [{"name": name, "polygon": one.polygon or None, "line": one.line or None} for name, one in zones.items()]
 
 
 def _file(name: str) -> Callable[[Request], Response]:
@@ -89,8 +102,11 @@ def _file(name: str) -> Callable[[Request], Response]:
 class Live:
     """Queue of the page: the newest tracks of a stream, drawn when they are taken, with the newest detections."""
 
-    def __init__(self, place: Place | None) -> None:
+    def __init__(self, place: Place | None, zones: Sequence[dict[str, Any]] = ()) -> None:
         self._place = place
+        self._zones = zones
+        self._counts: bytes | None = None
+        self._events: EventLog | None = None
         self._tracks: Outbox[Publication] = Outbox()
         self._detections: tuple[Publication, ...] = ()
 
@@ -99,13 +115,18 @@ class Live:
         if one.topic == "tracks":
             self._tracks.put("", one, len(one.payload))
             return
+        if one.topic == "events":
+            self._counts = (one.message and one.zones) or self._counts
+            return
         kept = (one, *self._detections)[:_SENSORS]
         while len(kept) > 1 and sum(len(each.payload) for each in kept) > _BYTES:
             kept = kept[:-1]
         self._detections = kept  # they are shown with the next tracks
 
-    def read(self, logs: list[Logs]) -> str:  # noqa: ARG002 - it draws no events
-        """Read no events."""
+    def read(self, logs: list[Logs]) -> str:
+        """Show the newest events of the last one of these logs, as they are published."""
+        for log in logs:
+            self._events = log[False]
         return ""
 
     async def take(self, seconds: float | None = None) -> tuple[bytes, str]:
@@ -114,7 +135,15 @@ class Live:
             await self._tracks.wait(seconds)
             taken = self._tracks.take_now()
             if taken is not None and (text := live_frame(taken[0], *self._detections, place=self._place)) is not None:
-                return text, ""
+                return self._with_zones(text), ""
+
+    def _with_zones(self, text: bytes) -> bytes:
+        if not self._zones:
+            return text
+        events = [] if self._events is None else [one.text for one in self._events.after(0)[0][-_EVENTS:]]
+        shapes = json.dumps(self._zones, separators=(",", ":")).encode()
+        parts = text[:-1], shapes, self._counts or b"null", b",".join(events)
+        return b'%b,"zones":%b,"counts":%b,"events":[%b]}' % parts
 
 
 def live_frame(tracks: Publication, *detections: Publication, place: Place | None = None) -> bytes | None:
@@ -177,7 +206,10 @@ def _seen(publications: Sequence[Publication]) -> tuple[list[float] | None, list
 
 
 def _placed(message: schemas.Detections) -> tuple[list[float] | None, list[list[float]]]:
-    """Return x, y, heading of the sensor, where it is known, and x, y of the detections, in the world frame."""
+    """Return x, y, heading of the sensor, where it is known, and x, y of the detections, in the world frame.
+
+    A pose that is the origin itself says no more than that there are none.
+    """
     center, sensor = message.center[:_MOST], None
     if message.pose is not None:
         w, x, y, z = message.pose.quaternion
@@ -188,7 +220,8 @@ def _placed(message: schemas.Detections) -> tuple[list[float] | None, list[list[
             ]
         )
         place = message.pose.translation[:2]
-        sensor = np.round([*place, np.arctan2(rows[1, 0], rows[0, 0])], 3).tolist()
+        found = np.round([*place, np.arctan2(rows[1, 0], rows[0, 0])], 3)
+        sensor = found.tolist() if found.any() else None
         if message.frame == "sensor":
             center = center @ rows.T + place
     return sensor, np.round(center[:, :2], 2).tolist()

@@ -102,7 +102,11 @@ def application(
     routes: list[BaseRoute] = [Route("/healthz", alive), Route("/readyz", ready), Route("/metrics", metrics)]
     places = places or {}
     readers = Readers(health, settings, places)
-    routes += [Route("/api/v1/asyncapi.json", asyncapi), *Api(readers).routes(), *page(health, readers, places)]
+    routes += [
+        Route("/api/v1/asyncapi.json", asyncapi),
+        *Api(readers).routes(),
+        *page(health, readers, settings, places),
+    ]
     refusals: dict[Any, Any] = dict.fromkeys(STATUS, refuse)
     answers: ASGIApp = Starlette(routes=routes, exception_handlers=refusals)
     if settings.http_origins:

@@ -239,3 +239,26 @@ async def test_a_real_broker_keeps_counts_and_says_who_is_gone(session: Session,
             assert held[f"{TOPIC}/events"].properties.ContentType == "application/json"
             client.disconnect()
             client.loop_stop()
+
+
+async def test_counts_of_zones_that_are_gone_are_cleared(session: Session, tmp_path: Path) -> None:
+    """The broker still has them; streams that no service answers for keep theirs."""
+    streams = (STREAM, "garage/rig/without", "garage/rig/unknown")
+    session.counted = [events(1), events(1, stream=streams[1], zones=None)]
+    with mosquitto(tmp_path) as address:
+        port = int(address.rpartition(":")[2])
+        client = paho.Client(CallbackAPIVersion.VERSION2, protocol=paho.MQTTv5)
+        async with bridging(Session(), address) as first:
+            await until(lambda: first.connected)  # the broker has started
+        client.connect("127.0.0.1", port)
+        client.loop_start()
+        for stream in streams:
+            client.publish(f"optipmb/v1/{stream}/zones", b"{}", 1, retain=True).wait_for_publish(60)
+        changed: dict[str, bytes] = {}
+        client.on_message = lambda _client, _data, message: changed.update({message.topic: message.payload})
+        client.subscribe("optipmb/v1/+/+/+/zones", 1)
+        async with bridging(session, address):
+            await until(lambda: changed.get(f"optipmb/v1/{streams[1]}/zones") == b"")
+        assert [changed[f"optipmb/v1/{stream}/zones"] for stream in streams] == [b"{}", b"", b"{}"]
+        client.disconnect()
+        client.loop_stop()

@@ -20,7 +20,7 @@ from optipmb_service.zenoh import client
 from readers import texts
 from router import until
 from tracks_message import tracks_message
-from watched import KEYS, Session, Watched, asked, key_of, publication, served
+from watched import KEYS, Session, Watched, asked, events, key_of, publication, served
 
 from optipmb import Georeference
 
@@ -237,6 +237,27 @@ def test_a_frame_holds_what_is_drawn() -> None:
     assert json.loads(both)["detections"] == [[9.0, 25.0], [5.0, 1.0]]
     assert json.loads(both)["sensor"] == [10.0, 20.0, 1.571]
     assert live_frame(Publication(key_of(tracks(1)), b"\xc1", "", {})) is None
+
+
+def test_a_pose_at_the_origin_is_no_sensor() -> None:
+    """Publishers without poses send it: nothing is drawn where no sensor is known to be."""
+    pose = Pose(translation=[0.0, 0.0, 0.0], quaternion=[1.0, 0.0, 0.0, 0.0])
+    text = live_frame(publication(tracks(1)), publication(DETECTIONS.model_copy(update={"pose": pose})))
+    assert json.loads(text or b"")["sensor"] is None
+
+
+def test_zones_of_a_stream_come_with_its_frames(watched: Watched, session: Session) -> None:
+    """Their shapes, the newest counts and the newest events; other streams have none."""
+    zone = {"streams": [STREAM], "line": [[0.0, 0.0], [1.0, 0.0]]}
+    with served(watched, zones={"gate": zone}) as address:
+        with looking(address) as frames:
+            session.publish(events(1, 20, STREAM), tracks(1))
+            frame = next(frames)
+        assert frame["zones"] == [{"name": "gate", "polygon": None, "line": zone["line"]}]
+        assert frame["counts"]["zones"]["gate"]["car"]["inside"] == 1
+        assert [one["n"] for one in frame["events"]] == list(range(1012, 1020))
+        with asked(address, "/live?stream=yard/hall/lidar"):
+            assert not any("hall" in key and key.endswith("/events") for key, _ in session.subscriptions)
 
 
 async def test_only_the_newest_is_kept() -> None:

@@ -5,10 +5,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from optipmb_client.merging import FinalEvents
 from optipmb_schemas import Events, Problem, decode
-from optipmb_service.settings import SettingsInvalidError, ZoneSettings, load
+from optipmb_service.settings import SettingsInvalidError, SiteSettings, ZoneSettings, load
 from optipmb_service.stream.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
 from optipmb_service.stream.profiles import Profiles
 from optipmb_service.stream.session import Session
@@ -328,6 +329,17 @@ def test_points_in_latitude_and_longitude_are_those_of_the_site() -> None:
     elsewhere = Reader()
     elsewhere.serve(range(20), sensor=Sensor("other/node/lidar"), zones=zones, sites={"site": site})
     assert not elsewhere.messages
+
+
+def test_a_zone_across_the_date_line_is_one_zone() -> None:
+    """A polygon with a notch has the same shape in the world at 180° of longitude as at 0°."""
+    notched = [(0.0, -0.1), (0.0, 0.1), (-0.1, 0.1), (-0.1, 0.05), (-0.05, 0.05), (-0.05, -0.1)]
+    shapes = []
+    for origin in (0.0, 180.0):
+        corners = tuple((lat - 17.0, (lon + origin + 180.0) % 360.0 - 180.0) for lat, lon in notched)
+        zone = ZoneSettings(streams=("a/*/*",), geo=True, polygon=corners)
+        shapes.append(zone.zone("one", SiteSettings(origin=(-17.0, origin, 0.0))).polygon)
+    assert shapes[1] == pytest.approx(np.array(shapes[0]), abs=1e-5)
 
 
 def test_a_session_has_at_most_256_zones(tmp_path: Path) -> None:

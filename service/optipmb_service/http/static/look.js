@@ -2,8 +2,12 @@
 // World frame: metres, x to the right, y up, seen from above. Nothing is drawn but when something has changed.
 "use strict";
 
-const COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#8C6D1F"]; // Okabe and Ito
-const TRAIL_S = 5, ASK_MS = 2000, AGAIN_MS = 1000, SILENT_MS = 3000, EDGE = 44, SLOW = 0.3, KNOWN = 0.95, NAMED = 4; // NAMED: pixels per metre from which classes are written
+const COLOURS = [ // of Okabe and Ito, as they are, darker and lighter
+  "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#8C6D1F",
+  "#00487A", "#93400A", "#006B4E", "#8A4F72", "#2F7FB5", "#A06E00", "#5E4914",
+  "#5BA7D6", "#EE9157", "#4FC39F", "#E0A9C8", "#93D0F2", "#F2C14D", "#B99A4F"];
+const DARK = matchMedia("(prefers-color-scheme: dark)");
+const TRAIL_S = 5, ASK_MS = 2000, AGAIN_MS = 1000, SILENT_MS = 2000, EDGE = 44, SLOW = 0.3, KNOWN = 0.95, NAMED = 4; // NAMED: pixels per metre from which classes are written
 const ID = 0, LABEL = 1, X = 2, Y = 3, LENGTH = 4, WIDTH = 5, YAW = 6, VX = 7, VY = 8, EXISTENCE = 9, SCORE = 10, AGE = 11, MISSED = 12, FACING = 13;
 
 const at = (id) => document.getElementById(id);
@@ -12,23 +16,41 @@ const canvas = at("canvas"), pen = canvas.getContext("2d");
 const view = { x: 0, y: 0, scale: 6, follow: true }; // centre in metres, pixels per metre
 const fingers = new Map(); // pointer id -> [x, y]
 let chosen = decodeURIComponent(location.hash.slice(1));
+let asking = 0, token = sessionStorage.getItem("token") || "", ink = {};
 let frame = null, trails = new Map(), names = [], selected = null, source = null, came = 0, dirty = true, moved = 0, fitted = false;
 
 // What the service says
 
 async function ask() {
-  let status = null;
+  let status = null, refusal = "no answer";
   try {
-    const answer = await fetch("status", { cache: "no-store" });
+    const answer = await get("status");
     if (answer.ok) status = await answer.json();
+    else if (answer.status === 401) refusal = "token needed";
+    else if (answer.status === 403) refusal = "no right to see the status";
   } catch { /* it does not answer: shown below, and asked again */ }
-  const silent = source !== null && performance.now() - came > SILENT_MS;
-  const state = status === null ? "no answer" : silent && frame !== null ? `${status.state}, stream silent` : status.state;
+  const state = status === null ? refusal : frame !== null && isStale() ? `${status.state}, stream silent` : status.state;
   at("state").textContent = state;
   at("state").className = `pill ${state === "ready" ? "good" : status === null ? "bad" : ""}`;
+  at("token").hidden = refusal !== "token needed";
+  if (status === null) at("none").hidden = refusal !== "no answer";
+  if (isStale()) dirty = true; // its age
   if (status !== null && status.sessions) list(status); // while it starts there are none
-  setTimeout(ask, document.hidden ? 5 * ASK_MS : ASK_MS);
+  clearTimeout(asking);
+  asking = setTimeout(ask, document.hidden ? 5 * ASK_MS : ASK_MS);
 }
+
+function get(path, options = {}) {
+  return fetch(path, { cache: "no-store", headers: token ? { authorization: `Bearer ${token}` } : {}, ...options });
+}
+
+at("token").onsubmit = (event) => {
+  event.preventDefault();
+  token = at("secret").value.trim();
+  sessionStorage.setItem("token", token);
+  if (chosen) listen();
+  ask();
+};
 
 function list(status) {
   at("instance").textContent = `${status.instance} ${status.version}`;
@@ -36,7 +58,7 @@ function list(status) {
   at("streams").replaceChildren(...status.sessions.map((one) => {
     const row = document.createElement("tr"), button = made("button", one.stream);
     button.onclick = () => choose(one.stream);
-    for (const content of [button, one.state, one.rate_hz.toFixed(1), one.latency_p50_ms.toFixed(1), one.tracks]) row.insertCell().append(content);
+    for (const content of [button, one.state, one.rate_hz.toFixed(1), one.latency_p50_ms.toFixed(1), one.tracks, heard(one.age_s)]) row.insertCell().append(content);
     row.setAttribute("aria-selected", one.stream === chosen);
     const silent = one.silent || [];
     if (one.sensors && one.sensors.length > 0) button.title = one.sensors.map((name) => silent.includes(name) ? `${name}: silent` : name).join("\n");
@@ -62,6 +84,10 @@ function inWords(problem) { // as `optipmb status` has it
   return reason === "publisher" ? `publisher restarted, ${gap}` : `session restarted (${reason}), ${gap}`;
 }
 
+function heard(seconds) {
+  return seconds === undefined || seconds === null ? "" : seconds * 1e3 < SILENT_MS ? "now" : ago(seconds);
+}
+
 function ago(seconds) {
   if (seconds < 1) return "just now";
   const [size, unit] = [[86400, "d"], [3600, "h"], [60, "min"], [1, "s"]].find(([size]) => seconds >= size);
@@ -71,26 +97,61 @@ function ago(seconds) {
 // One stream
 
 function choose(stream) {
-  if (source !== null) source.close();
   if (stream !== chosen) history.replaceState(null, "", `#${encodeURIComponent(stream)}`);
   chosen = stream;
   frame = selected = null;
   trails = new Map();
   fitted = false;
   for (const row of at("streams").rows) row.setAttribute("aria-selected", row.cells[0].textContent === stream);
+  showZones();
   listen();
 }
 
-function listen() {
+async function listen() { // by fetch, because EventSource sends no token
+  if (source !== null) source.abort();
+  const mine = source = new AbortController();
   came = performance.now();
-  source = new EventSource(`live?stream=${encodeURIComponent(chosen)}`);
-  const mine = source;
-  source.onmessage = (event) => receive(JSON.parse(event.data));
-  source.onerror = () => { // also when the service restarts: try until it is back
-    mine.close();
-    if (mine === source) setTimeout(() => mine === source && listen(), AGAIN_MS);
-  };
   dirty = true;
+  try {
+    const answer = await get(`live?stream=${encodeURIComponent(chosen)}`, { signal: mine.signal });
+    if (answer.ok) {
+      const reader = answer.body.pipeThrough(new TextDecoderStream()).getReader();
+      for (let text = ""; ;) {
+        const { done, value } = await reader.read();
+        if (done) break;
+        const lines = (text + value).split("\n");
+        text = lines.pop();
+        for (const line of lines) if (line.startsWith("data: ") && mine === source) receive(JSON.parse(line.slice(6)));
+      }
+    }
+  } catch { /* also when the service restarts: try until it is back */ }
+  if (mine === source) setTimeout(() => mine === source && listen(), AGAIN_MS);
+}
+
+function isStale() {
+  return performance.now() - came > SILENT_MS;
+}
+
+// Zones of the stream: counts and newest events
+
+const sum = (counts, name) => Object.values(counts || {}).reduce((all, one) => all + (one[name] || 0), 0);
+
+function showZones() {
+  const zones = (frame && frame.zones) || [], counts = (frame && frame.counts && frame.counts.zones) || {};
+  at("zones-part").hidden = zones.length === 0;
+  at("zones").replaceChildren(...zones.map(({ name, line }) => {
+    const row = document.createElement("tr"), one = counts[name];
+    const cells = line ? ["", `${sum(one, "to_left")} to the left`, `${sum(one, "to_right")} to the right`]
+      : [sum(one, "inside"), sum(one, "entered"), sum(one, "left")];
+    for (const content of [name, ...cells]) row.insertCell().append(content);
+    return row;
+  }));
+  at("events").replaceChildren(...((frame && frame.events) || []).slice().reverse().map((event) => {
+    const how = event.how || event.direction || (event.dwell_s ? `${event.dwell_s} s` : "");
+    const item = made("li", ` ${event.zone} ${event.kind} ${how} ${event.class} ${event.id}`);
+    if (event.at) item.prepend(made("time", event.at.slice(11, 19)));
+    return item;
+  }));
 }
 
 function receive(next) {
@@ -109,6 +170,7 @@ function receive(next) {
   const first = !fitted;
   if (first) fit();
   if (view.follow || (first && fitted)) [view.x, view.y] = middle();
+  showZones();
   dirty = true;
 }
 
@@ -133,7 +195,16 @@ function middle() {
 const toScreen = (x, y) => [canvas.clientWidth / 2 + (x - view.x) * view.scale, canvas.clientHeight / 2 - (y - view.y) * view.scale];
 const toWorld = (px, py) => [view.x + (px - canvas.clientWidth / 2) / view.scale, view.y - (py - canvas.clientHeight / 2) / view.scale];
 
-const sure = (score) => 0.3 + 0.7 * score; // how strongly a track is drawn
+const sure = (score) => (0.3 + 0.7 * score) * (isStale() ? 0.35 : 1); // how strongly a track is drawn
+const colour = (id) => COLOURS[id % COLOURS.length];
+
+function paint() { // the colours of the page, light or dark
+  const style = getComputedStyle(document.documentElement);
+  for (const name of ["ink", "faint", "grid", "ground", "veil", "zone"]) ink[name] = style.getPropertyValue(`--${name}`);
+  dirty = true;
+}
+DARK.onchange = paint;
+paint();
 
 function line(points, colour, width, dash = []) {
   pen.beginPath();
@@ -146,7 +217,7 @@ function line(points, colour, width, dash = []) {
 
 function cross(x, y) {
   const reach = 3 / view.scale;
-  for (const way of [-reach, reach]) line([[x - reach, y - way], [x + reach, y + way]], "#777", 1.2);
+  for (const way of [-reach, reach]) line([[x - reach, y - way], [x + reach, y + way]], ink.faint, 1.2);
 }
 
 function corners(x, y, length, width, yaw) {
@@ -168,11 +239,12 @@ function draw() {
   pen.clearRect(0, 0, wide, high);
   grid(wide, high, true);
   if (frame !== null) {
+    for (const zone of frame.zones || []) area(zone);
     for (const [x, y] of frame.detections) cross(x, y);
     const shown = new Map(frame.tracks.map((track) => [track[ID], track[SCORE]]));
     for (const [id, trail] of trails) {
       pen.globalAlpha = shown.has(id) ? sure(shown.get(id)) : 0.25; // a track that has ended fades
-      line(trail, COLOURS[id % COLOURS.length], 1.5);
+      line(trail, colour(id), 1.5);
     }
     names = [];
     for (const track of frame.tracks) box(track);
@@ -189,45 +261,67 @@ function grid(wide, high, lines) { // the lines below everything, the axes above
   const [left, top] = toWorld(0, 0), [right, bottom] = toWorld(wide, high);
   pen.font = "12px system-ui, sans-serif";
   if (!lines) {
-    pen.fillStyle = "#ffffffd8";
+    pen.fillStyle = ink.veil;
     pen.fillRect(0, 0, EDGE, high);
     pen.fillRect(0, high - 22, wide, 22);
-    pen.fillStyle = "#444";
+    pen.fillStyle = ink.faint;
   }
   for (let x = Math.ceil(left / step) * step; x <= right; x += step) {
     const [px] = toScreen(x, 0);
-    if (lines) line([[x, top], [x, bottom]], "#e8e8e8", 1);
+    if (lines) line([[x, top], [x, bottom]], ink.grid, 1);
     else if (px > EDGE + 12 && px < wide - 48) { pen.textAlign = "center"; pen.fillText(+x.toFixed(3), px, high - 7); }
   }
   for (let y = Math.ceil(bottom / step) * step; y <= top; y += step) {
     const [, py] = toScreen(0, y);
-    if (lines) line([[left, y], [right, y]], "#e8e8e8", 1);
+    if (lines) line([[left, y], [right, y]], ink.grid, 1);
     else if (py > 24 && py < high - 26) { pen.textAlign = "right"; pen.fillText(+y.toFixed(3), EDGE - 6, py + 4); }
   }
   if (lines) return;
   pen.textAlign = "right";
   pen.fillText("x (m)", wide - 8, high - 7);
   pen.fillText("y (m)", EDGE - 6, 16);
+  pen.fillStyle = ink.ink; // the scale: as long as one step of the grid
+  const left0 = EDGE + 14, below = high - 34, long = step * view.scale;
+  pen.fillRect(left0, below, long, 2);
+  for (const end of [left0, left0 + long - 2]) pen.fillRect(end, below - 4, 2, 8);
+  pen.textAlign = "center";
+  pen.fillText(`${+step.toPrecision(3)} m`, left0 + long / 2, below - 7);
+}
+
+function area({ name, polygon, line: path }) {
+  const points = polygon ? [...polygon, polygon[0]] : path;
+  line(points, ink.zone, polygon ? 1.5 : 3, polygon ? [6, 4] : []);
+  if (polygon) {
+    pen.globalAlpha = 0.08;
+    pen.fillStyle = ink.zone;
+    pen.fill();
+    pen.globalAlpha = 1;
+  }
+  const [px, py] = toScreen(...points.reduce((a, b) => (a[1] > b[1] ? a : b)));
+  pen.font = "12px system-ui, sans-serif";
+  pen.textAlign = "left";
+  pen.fillStyle = ink.zone;
+  pen.fillText(name, px + 4, py - 5);
 }
 
 function box(track) {
-  const [x, y] = [track[X], track[Y]], colour = COLOURS[track[ID] % COLOURS.length], bold = track[ID] === selected;
+  const [x, y] = [track[X], track[Y]], tint = colour(track[ID]), bold = track[ID] === selected;
   const around = corners(x, y, track[LENGTH], track[WIDTH], track[YAW]);
   const front = [(around[0][0] + around[1][0]) / 2, (around[0][1] + around[1][1]) / 2];
   pen.globalAlpha = bold ? 1 : sure(track[SCORE]);
-  line([...around, around[0], around[1]], colour, bold ? 3 : 1.6, track[MISSED] > 0 ? [4, 3] : []);
+  line([...around, around[0], around[1]], tint, bold ? 3 : 1.6, track[MISSED] > 0 ? [4, 3] : []);
   pen.globalAlpha *= 0.5 * track[EXISTENCE];
-  pen.fillStyle = colour;
+  pen.fillStyle = tint;
   pen.fill();
   pen.globalAlpha = bold ? 1 : sure(track[SCORE]);
-  line([[x, y], front], colour, 1.6, track[FACING] < KNOWN ? [2, 3] : []); // dotted: it may face the other way
-  if (Math.hypot(track[VX], track[VY]) > SLOW) arrow(x, y, x + track[VX], y + track[VY], colour);
-  const [px, py] = toScreen(...around.reduce((a, b) => (a[1] > b[1] ? a : b)));
+  line([[x, y], front], tint, 1.6, track[FACING] < KNOWN ? [2, 3] : []); // dotted: it may face the other way
+  if (Math.hypot(track[VX], track[VY]) > SLOW) arrow(x, y, x + track[VX], y + track[VY], tint);
+  const px = toScreen(x, y)[0], py = toScreen(x, Math.max(...around.map(([, top]) => top)))[1]; // above its middle
   pen.textAlign = "center";
   pen.font = `${bold ? "bold " : ""}12px system-ui, sans-serif`;
   pen.lineWidth = 3;
   pen.setLineDash([]);
-  pen.strokeStyle = "#ffffffd0";
+  pen.strokeStyle = ink.veil;
   const name = bold || view.scale > NAMED ? `${track[ID]} ${frame.labels[track[LABEL]]}` : track[ID];
   let above = py - 4;
   const wide = pen.measureText(name).width, taken = ([x, y, w]) => Math.abs(x - px) < (w + wide) / 2 && Math.abs(y - above) < 12;
@@ -235,7 +329,7 @@ function box(track) {
   if (bold || !names.some(taken)) {
     names.push([px, above, wide]);
     pen.strokeText(name, px, above);
-    pen.fillStyle = "#222";
+    pen.fillStyle = ink.ink;
     pen.fillText(name, px, above);
   }
   pen.globalAlpha = 1;
@@ -250,14 +344,14 @@ function arrow(x0, y0, x1, y1, colour) {
 
 function sensor(x, y, yaw) {
   const size = 11 / view.scale, c = Math.cos(yaw), s = Math.sin(yaw);
-  line([[1, 0], [-0.7, 0.6], [-0.3, 0], [-0.7, -0.6], [1, 0]].map(([a, b]) => [x + size * (a * c - b * s), y + size * (a * s + b * c)]), "#fff", 2);
-  pen.fillStyle = "#222";
+  line([[1, 0], [-0.7, 0.6], [-0.3, 0], [-0.7, -0.6], [1, 0]].map(([a, b]) => [x + size * (a * c - b * s), y + size * (a * s + b * c)]), ink.ground, 2);
+  pen.fillStyle = ink.ink;
   pen.fill();
 }
 
 function tell() {
   at("caption").textContent = frame === null ? (chosen ? `${chosen}: waiting for tracks` : "")
-    : `${chosen} · ${frame.profile} · ${frame.tracks.length} tracks${frame.unconfirmed ? ` and ${frame.unconfirmed} not confirmed` : ""}, ${frame.detections.length} detections`;
+    : `${chosen} · ${frame.profile} · ${frame.tracks.length} tracks${frame.unconfirmed ? ` and ${frame.unconfirmed} not confirmed` : ""}, ${frame.detections.length} detections${isStale() ? ` · no frame for ${ago((performance.now() - came) / 1e3).replace(" ago", "")}` : ""}`;
   const track = frame && frame.tracks.find((one) => one[ID] === selected);
   at("details").hidden = !track;
   if (!track) return;
