@@ -152,11 +152,12 @@ def write_cars(path: Path) -> None:
 def csv_in_and_out(base: Path, wheel: Path, _node: Path) -> None:
     """A table to a table: with pip, and with pipx and uv, which give a command an environment of its own."""
     place = Environment(base, "table", f"{wheel}[client]")
-    for line in sorted(set(re.findall(r"pip (install (?:'\..*?'|\..*?)(?=[ `\n]))", README))):
+    for line in sorted(set(re.findall(r"pip (install -e (?:'\..*?'|\..*?)(?=[ `\n]))", README))):
         place.run("pip", *shlex.split(line), "--dry-run", "--no-deps", "--ignore-installed", folder=ROOT)
         said(f"  pip {line}: can be installed")
-    write_cars(place.work / "detections.csv")
-    command = blocks(README, "sh", "track detections.csv").splitlines()[-1].split()
+    (place.work / "examples").mkdir()
+    write_cars(place.work / "examples" / "crossing.csv")
+    command = blocks(README, "sh", "track examples/crossing.csv").splitlines()[-1].split()
     hint = place.run(*command, status=1).strip().rpartition("not installed: ")[2]
     place.run(*shlex.split(hint), "--quiet", "--disable-pip-version-check")
     said(f"  {hint}: {place.megabytes:.0f} MB beside Python and pip")
@@ -182,7 +183,9 @@ def python(base: Path, wheel: Path, _node: Path) -> None:
     """The library alone, with the lines of the README."""
     place = Environment(base, "library", wheel)
     said(f"  import optipmb: {place.import_ms('optipmb'):.0f} ms of processor time")
-    (place.work / "mine.py").write_text(blocks(README, "python", "OnlineTracker"))
+    (place.work / "first.py").write_text(blocks(README, "python", "OnlineTracker()"))
+    checked("tracks at 0.000 s" in place.run("python", "first.py"), "expected the tracks of the first frame")
+    (place.work / "mine.py").write_text(blocks(README, "python", 'OnlineTracker("kitti")'))
     printed = timed("the first tracks", lambda: place.run("python", "mine.py"))
     checked("'car'" in printed.splitlines()[-1], f"expected a car, received {printed}")
 

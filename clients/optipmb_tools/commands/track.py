@@ -62,6 +62,10 @@ class TrackOptions:
     keep_input: Annotated[
         bool, typer.Option("--keep-input", help="Of a bag, with --out FILE.mcap: also copy what is in it.")
     ] = False
+    view: Annotated[
+        Path | None,
+        typer.Option("--view", help="Also write the confirmed tracks of one recording as a page for a browser: .html."),
+    ] = None
     submission: Annotated[
         str | None,
         typer.Option(metavar="[SCORE]", help="Write a submission; of KITTI confirmed tracks from this mean score on."),
@@ -72,6 +76,9 @@ class TrackOptions:
         out = self.out
         if self.sensors is not None and not self.fuse:
             raise UsageError(f"--sensors {self.sensors}: expected --fuse, for one sensor has --profile alone")
+        if self.view is not None and (self.view.suffix != ".html" or len(data.sequences) > 1):
+            count = len(data.sequences)
+            raise UsageError(f"--view {self.view}: expected a file .html of one recording, received {count} recordings")
         if self.submission is not None and (self.full or is_table(out)):
             raise UsageError("--submission: expected a folder as --out, and no --full: the files are for the benchmark")
         if out.suffix != ".mcap":
@@ -134,7 +141,9 @@ def track(
                 opened.dataset,
                 chosen,
                 how.out,
-                tracking.Tracking(parameters, how.classes or (), full=how.full, smooth=how.smooth, sensors=sensors),
+                tracking.Tracking(
+                    *(parameters, how.classes or ()), full=how.full, smooth=how.smooth, sensors=sensors, view=how.view
+                ),
                 executor=executor,
                 on_frame=progress.advance,
                 note=lambda text: progress.note(f"optipmb: {text}"),
@@ -152,7 +161,7 @@ def track(
     shown = {"command": "track", "dataset": opened.name, "profile": name, "out": how.out, "sequences": results}
     rows, unconfirmed = (sum(getattr(one, name) for one in results) for name in ("rows", "unconfirmed_rows"))
     text = f"results in {how.out}" + (f" ({unconfirmed} of {rows} rows are not confirmed)" if unconfirmed else "")
-    report({**shown, "failed": reasons}, text, as_json=as_json)
+    report({**shown, "failed": reasons}, text, *([f"page in {how.view}"] if how.view else []), as_json=as_json)
     if failed is not None:
         raise failed
     _complain(results, parameters.name)

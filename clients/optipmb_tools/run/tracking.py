@@ -223,6 +223,7 @@ class Tracking:
     full: bool = False  # also write all columns of the tracks
     smooth: bool = False  # estimate states from all frames of their track (`optipmb_tools.run.smoothing`)
     sensors: Sensors = ALIKE  # how frames that name their sensor are used
+    view: Path | None = None  # page of the tracks, of one sequence
 
 
 @dataclass(frozen=True)
@@ -263,6 +264,10 @@ def _track_one(job: _Job, name: str) -> tuple[TrackedSequence, Path | Columns]:
     options: dict[str, Any] = {"sensors": how.sensors, "smooth": how.smooth, "on_frame": job.on_frame}
     found = track_whole(how.parameters, sequence, how.classes, how.modules, **options)
     written = Results(dataset, job.out, full=how.full).write(sequence, found.tracks)
+    if how.view is not None:
+        from optipmb_tools.views.page import write_page  # noqa: PLC0415  only where it is asked for
+
+        write_page(how.view, name, found.tracks)
     beyond = []
     if dataset.name == "nuscenes" and isinstance(written, Path):
         from optipmb_tools.results.nuscenes import NUSCENES_MAX_BOXES  # noqa: PLC0415  of one format
