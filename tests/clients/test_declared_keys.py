@@ -50,7 +50,7 @@ def test_what_was_opened_early_is_heard_to_the_last(connection: Connection) -> N
     early = connection.cached_sender("early", "", cache=1)
 
     def come_and_go() -> None:
-        kinds = itertools.cycle((_cached, _plain, _plain_cached, _subscribed))
+        kinds = itertools.chain((_cached, _plain, _plain_cached, _subscribed) * 500, itertools.repeat(_plain))
         for number, opened in zip(range(MOST_KEYS), kinds, strict=False):
             opened(connection, f"passing/{number}").close()
 
