@@ -39,13 +39,81 @@ if TYPE_CHECKING:
 MOST_ALLOWED: Final = 60
 """Characters of allowed values beyond which they are in the column of the meaning, which is wider."""
 
+TASKS: Final = (
+    ("port, address, network interface, IP", "`listen`, `connect`, `http`, `grpc`, `router`"),
+    (
+        "TLS, certificates, password, token, user",
+        "`zenoh_config`, `grpc_tls`, `grpc_names`, `grpc_tokens`, `http_tokens`, `cluster_tls`, `cluster_credentials`",
+    ),
+    ("detector, KITTI, nuScenes, classes, score threshold", "`profile`, `profiles`; see [Tuning](tuning.md)"),
+    (
+        "latency, delay, waiting for LiDAR clouds",
+        "`cloud_wait_s`, `cloud_memory_s`, `has_points` in [Messages](messages.md#detections)",
+    ),
+    ("late frames, out of order, clock jumps, timestamps", "`rewind_s`, `gap_limit_s`, `late_clouds`, `stale_s`"),
+    ("several sensors, fusion", "`fuse`, `fused`, `sensors`; see [Several sensors](fusion.md)"),
+    ("RAM, memory limit, out of memory", "`memory_mb`, `stream_mb`, `standby_mb`, `queue_frames`, `queue_clouds`"),
+    ("CPU, cores, processes, overload", "`workers`, `max_pairs`, `step_limit_s`, `stuck_s`"),
+    (
+        "quotas, rate limit, number of streams",
+        "`max_sessions`, `node_sessions`, `node_rate`, `node_mb_s`, `site_sessions`, `site_rate`, `site_mb_s`",
+    ),
+    ("sessions that nobody uses", "`idle_s`, `keep_days`"),
+    ("message too large, maximum size", "`limits.max_bytes`, `limits.max_points`, `limits.max_detections`"),
+    (
+        "save state, disk, checkpoint, crash, restart",
+        "`store`, `checkpoint_s`, `keep_days`, `recovery_wait_s`, `restart_keys`",
+    ),
+    (
+        "high availability, failover, cluster, NATS",
+        "`cluster`, `lease_s`, `standby_s`, `log_s`, `log_tracks_s`, `log_mb`, `log_tracks_mb`",
+    ),
+    ("shutdown, Docker stop, Kubernetes", "`grace_s`, `http` (`/healthz`, `/readyz`)"),
+    ("log level, JSON logs", "`log_level`, `log_format`"),
+    ("Prometheus, Grafana, monitoring", "`http`, `http_streams`"),
+    ("OpenTelemetry, Jaeger, tracing, spans", "`traces`; see [Traces](operation.md#traces)"),
+    ("ROS, ROS 2, topics, tf", "`ros2`; see [ROS 2](ros2.md)"),
+    ("name of the service, several services on one network", "`instance`, `prefix`"),
+    (
+        "browser, web page, JSON, WebSocket, readers",
+        "`http`, `http_hosts`, `http_origins`, `http_clients`; see [JSON](json.md)",
+    ),
+    ("gRPC clients", "`grpc`, `grpc_calls`, `grpc_connections`; see [gRPC](grpc.md)"),
+    ("MQTT broker", "`mqtt`; see [MQTT](json.md#mqtt)"),
+    ("zones, lines, counting, alarms", "`zones`; see [Zones](zones.md)"),
+    ("latitude, longitude, map", "`sites`; see [Latitude and longitude](operation.md#latitude-and-longitude)"),
+    ("output at a fixed rate, prediction to now", "`outputs`; see [Fixed rate](fixed-rate.md)"),
+    ("localisation, poses, jumps of the pose", "`max_speed`, `jumps`"),
+    ("clouds on one host", "`shared_memory`"),
+)
+"""Settings by what somebody looks for; each setting is in one row at least."""
+
 _TABLE: Final = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 def page(text: str) -> str:
     """Return a page with its tables made anew."""
-    tables = {"settings": settings(), "problems": problems(), "events": events(), "metrics": metrics()}
+    tables = {
+        "tasks": tasks(),
+        "settings": settings(),
+        "problems": problems(),
+        "events": events(),
+        "metrics": metrics(),
+    }
     return _TABLE.sub(lambda match: f"{match[1]}{tables[match[2]]}{match[3]}", text)
+
+
+def tasks() -> str:
+    """Return the table of settings by task.
+
+    Raises:
+        ValueError: a setting is in no row, or a row has another name.
+    """
+    named = {name.partition(".")[0] for _, text in TASKS for name in re.findall(r"`([a-z0-9_.]+)`", text)}
+    wrong = named - {"has_points"} ^ Settings.model_fields.keys()
+    if wrong:
+        raise ValueError(f"rows of tasks and settings differ: {', '.join(sorted(wrong))}")
+    return _table(("task", "settings"), TASKS)
 
 
 def settings() -> str:

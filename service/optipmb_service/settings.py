@@ -657,7 +657,7 @@ class Loaded:
     settings: Settings
     sources: dict[str, Source]
     unknown: tuple[str, ...] = ()
-    """Environment variables that look like settings and are none."""
+    """Environment variables that look like settings and are none, with the ones that may have been meant."""
 
 
 def load(
@@ -694,6 +694,8 @@ def load(
         message = first["msg"].removeprefix("Value error, ")
         if first["type"] == "extra_forbidden":
             message = f"unknown setting{_near(first['loc'])}"
+        elif isinstance(first["input"], str | int | float):
+            message = f"{message[:1].lower()}{message[1:]}; received {first['input']!r}"
         raise SettingsInvalidError(f"setting {path}{where}: {message}") from error
     if not settings.endpoints and not settings.connect:
         raise SettingsInvalidError("setting listen: neither an endpoint to listen on nor one to connect to")
@@ -708,8 +710,8 @@ def load(
             "setting workers: with zenoh_config, a router of its own: start `optipmb-service router` and connect to it"
         )
     known = {f"{PREFIX}{name.upper()}" for name in Settings.model_fields} | {f"{PREFIX}COMPILE_PROCESSES"}  # tracker's
-    unknown = (name for name in os.environ if name.startswith(PREFIX) and name.split("__")[0] not in known)
-    return Loaded(settings, sources, tuple(sorted(unknown)))
+    unknown = sorted(name for name in os.environ if name.startswith(PREFIX) and name.split("__")[0] not in known)
+    return Loaded(settings, sources, tuple(f"{name}{_near_variable(name)}" for name in unknown))
 
 
 def missing_files(settings: Settings) -> list[str]:
@@ -722,6 +724,11 @@ def missing_files(settings: Settings) -> list[str]:
         for name, value in named.items()
         if value is not None and (name in FILES or value.endswith(".toml")) and not Path(value).exists()
     ]
+
+
+def _near_variable(name: str) -> str:
+    near = _near((name.removeprefix(PREFIX).lower().partition("__")[0],))
+    return near and f"; did you mean {PREFIX}{near.rpartition(' ')[2].upper()}"
 
 
 def _near(place: tuple[int | str, ...]) -> str:

@@ -130,6 +130,8 @@ class Connection:
         advice = "; ".join(ends) or "is optipmb-service running there?"
         if found and not ends:
             advice = "is optipmb-service running there, and does its TLS certificate hold?"
+        if not found and any(one.startswith(("tls/", "quic/")) for one in endpoints):
+            advice = "TLS needs certificates: name them in a Zenoh configuration, and give that as `config`"
         return ConnectionFailed(
             f"nothing answers at {self.where} (waited {timeout:g} s); {advice}",
             endpoints=endpoints,

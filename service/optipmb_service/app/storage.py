@@ -52,13 +52,18 @@ def open_store(settings: Settings, private: Path | None) -> tuple[LeaseStore, st
     if folder is not None:
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            return SqliteStore(folder / STORE_FILE), None
+            store = SqliteStore(folder / STORE_FILE)
+            kept = len(store.streams())
         except (OSError, StoreError) as error:
             if in_use(folder / STORE_FILE):
                 raise StoreError(str(error)) from error
             # Tracking without memory is better than none; the status says that it is so.
             log.error("store_failed", error=str(error))  # noqa: TRY400 - the text says all
             why = str(error)
+        else:
+            if private is None and kept:
+                log.info("sessions_stored", sessions=kept, folder=str(folder), hint="OPTIPMB_STORE=none keeps nothing")
+            return store, None
     return SqliteStore(private and private / STORE_FILE), why
 
 

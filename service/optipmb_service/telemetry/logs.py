@@ -46,6 +46,7 @@ EVENTS: Final = {
     "leases_gone": "The store has lost its records, as by a purge in NATS; the member writes its own again.",
     "store_deleted": "A `file` of the store was deleted while in use, and was made again with all that it held.",
     "peer_lost": "A connection is lost. A client reconnects and recovers what the caches hold.",
+    "sessions_stored": "The `folder` has so many `sessions` of earlier runs: their streams continue, with their ids.",
     "session_opened": "A stream's first valid message came, or parameters were set for it.",
     "session_restored": "A session continues from its checkpoint; missed frames are requested from publishers.",
     "profile_differs": "A session continues with the `profile` of its checkpoint, and the settings name `configured`,"

@@ -170,7 +170,16 @@ def test_a_misspelt_variable_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None
     """A variable that looks like a setting and is none is reported, unless it is the tracker's."""
     monkeypatch.setenv("OPTIPMB_COMPILE_PROCESSES", "1")
     monkeypatch.setenv("OPTIPMB_CLOUD_WAIT", "1")
-    assert load().unknown == ("OPTIPMB_CLOUD_WAIT",)
+    assert load().unknown == ("OPTIPMB_CLOUD_WAIT; did you mean OPTIPMB_CLOUD_WAIT_S?",)
+
+
+@pytest.mark.parametrize(
+    ("value", "says"), [("x", "a valid number.*received 'x'"), (-1, "greater than 0; received -1")]
+)
+def test_a_wrong_setting_is_named_with_what_was_received(value: object, says: str) -> None:
+    """The error has the setting, where it is from, what was expected and what was received."""
+    with pytest.raises(SettingsInvalidError, match=rf"setting gap_limit_s \(from the option\): .*{says}"):
+        load(None, {"gap_limit_s": value})
 
 
 def test_a_variable_in_a_table_leaves_the_rest_of_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
