@@ -20,6 +20,7 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
+import load
 import optipmb_schemas as schemas
 from optipmb_service.app.worker import warm_up
 from optipmb_service.stream import convert
@@ -32,7 +33,6 @@ from optipmb_service.telemetry.logs import configure
 from optipmb_service.telemetry.metrics import Metrics
 from optipmb_service.telemetry.problem_reporter import ProblemReporter
 from optipmb_service.zenoh.inputs import Packet
-from optipmb_tools.run import load
 
 import optipmb
 

@@ -13,8 +13,8 @@ until grep -q ready "$folder/out"; do kill -0 $service; sleep 0.2; done
 echo "load of the machine before: $(cut -d " " -f 1 /proc/loadavg)"
 status=0
 for load in "--streams 40 --rate 10 --objects 40" "--streams 10 --rate 10 --objects 40 --points 30000"; do
-  echo "optipmb load $load --seconds $seconds"
-  "$bin/optipmb" load --connect "$endpoint" $load --seconds "$seconds" --latency-ms 20 || status=$?
+  echo "load.py $load --seconds $seconds"
+  "$bin/python" benchmarks/load.py --connect "$endpoint" $load --seconds "$seconds" --latency-ms 20 || status=$?
 done
 for process in $service $(pgrep -P $service || true); do
   echo "process $process: $(grep VmRSS "/proc/$process/status" | tr -s "\t " " ")"

@@ -2,7 +2,7 @@
 
 python benchmarks/members.py [--rates HZ,HZ,...] [--objects N] [--streams N] [--seconds S] [--turns N]
 
-In turns with one member and with two: a NATS server, a router, the members, and `optipmb load`, which sends at the same
+In turns with one member and with two: a NATS server, a router, the members, and `load.py`, which sends at the same
 rate however much is tracked. Frames are counted by the members.
 """
 
@@ -40,7 +40,7 @@ def measured(arguments: argparse.Namespace, count: int, rate: float) -> str:
         def frames() -> int:
             return sum(node.ask(KEYS.status(f"m{index}"), ServiceStatus).frames for index in range(count))
 
-        command = [str(Path(sys.executable).with_name("optipmb")), "load", "--connect", cluster.router.endpoint]
+        command = [sys.executable, str(Path(__file__).with_name("load.py")), "--connect", cluster.router.endpoint]
         load = {"streams": arguments.streams, "rate": rate / arguments.streams, "objects": arguments.objects}
         options = [f"--{name}={value}" for name, value in (load | {"seconds": 10 * arguments.seconds}).items()]
         quiet = subprocess.DEVNULL

@@ -1,7 +1,7 @@
 """How long a user waits for tracks: `pytest benchmarks/test_service.py -s`, in milliseconds from `put` to arrival.
 
 A service process with its own router on this machine, sensors at 10 Hz with 40 objects each, their frames spread over
-the period as independent sensors' are; sent by what `optipmb load` is made of. Time counts from just before `put` in
+the period as independent sensors' are; sent as by `benchmarks/load.py`. Time counts from just before `put` in
 the publisher to the arrival of the tracks in a subscriber of the same process; encoding the frame is not in it.
 Throughput is in frames per second, when a window of 8 is kept full, as a replay does.
 """
@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from gateway import GatewayProcess
+from load import Load, generated, run_load
 from optipmb_client import Connection, Publisher, Subscriber
-from optipmb_tools.run.load import Load, generated, run_load
 from router import Node, Sensor
 from service_process import ServiceProcess
 

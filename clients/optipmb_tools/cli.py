@@ -47,7 +47,6 @@ COMMANDS = {
     "status": "service",
     "tracks": "service",
     "profiles": "profiles",
-    "load": "load",
     "set": "service",
     "move": "service",
     "drain": "service",

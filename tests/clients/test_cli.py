@@ -188,7 +188,7 @@ def test_tracking_a_table_loads_nothing_else(tmp_path: Path) -> None:
     code = (
         "import sys; from optipmb_tools.cli import run; "
         f"status = run(['track', {str(table)!r}, '--out', {str(tmp_path / 'out')!r}]); "
-        "others = ('optuna', 'optipmb_tools.tuning', 'optipmb_tools.run.load', 'optipmb_tools.datasets.scene', "
+        "others = ('optuna', 'optipmb_tools.tuning', 'optipmb_tools.datasets.scene', "
         "'optipmb_tools.datasets.kitti', 'optipmb_tools.datasets.nuscenes', 'optipmb_tools.commands.replay'); "
         "ours = [one for one in sys.modules if one.partition('.')[0].startswith('optipmb')]; "
         "sys.exit(','.join(sorted(set(others) & set(sys.modules))) or (ours if len(ours) > 70 else status))"

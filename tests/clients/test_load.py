@@ -4,12 +4,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
-from commands import run_here
 from hypothesis import given
 from hypothesis import strategies as st
+from load import FIRST, Run, chain, draw_runs, find_limit, generated, head, message, table_of
 from optipmb_schemas import Detections, Points, decode
-from optipmb_tools.run.load import FIRST, Run, chain, draw_runs, find_limit, generated, head, message, table_of
 
 RUN = Run(
     streams=2, rate=10.0, objects=40.0, points=0.0, seconds=10.0, sent=200, received=200, repeated=0, cloudless=0,
@@ -67,11 +65,3 @@ def test_runs_are_shown(tmp_path: Path) -> None:
     assert table_of(runs, 20.0).row_count == 2
     draw_runs(tmp_path / "folder" / "load.png", runs, 20.0)
     assert (tmp_path / "folder" / "load.png").read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize("options", [("--streams", "0"), ("--dataset", "none"), ("--rate", "fast")])
-def test_wrong_use_is_one_line(options: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
-    """A wrong option ends with status 2 and one line."""
-    result = run_here(capsys, "load", *options)
-    assert result.returncode == 2
-    assert result.stderr.count("\n") == 1

@@ -1,9 +1,10 @@
-"""`optipmb load` against a real service: both count the same."""
+"""A load on a real service: both count the same."""
 
 import json
 
 import pytest
-from commands import optipmb, result_of, run_here
+from commands import result_of, run_here
+from load import main
 from service_process import ServiceProcess
 
 STREAMS, RATE, SECONDS = 3, 20, 2
@@ -12,9 +13,8 @@ STREAMS, RATE, SECONDS = 3, 20, 2
 def test_a_load_counts_exactly(service: ServiceProcess, capsys: pytest.CaptureFixture[str]) -> None:
     """Every frame sent comes back, with its cloud; the service has tracked as many, and keeps no session afterwards."""
     options = ("--streams", STREAMS, "--rate", RATE, "--seconds", SECONDS, "--objects", 5, "--points", 1000)
-    result = optipmb("load", "--connect", service.endpoint, *options, "--json")
-    assert result.returncode == 0, result.stderr
-    (run,) = json.loads(result.stdout)["runs"]
+    assert main(["--connect", service.endpoint, *map(str, options), "--json"]) == 0
+    (run,) = json.loads(capsys.readouterr().out)["runs"]
     frames = STREAMS * RATE * SECONDS
     assert (run["sent"], run["received"], run["lost"], run["repeated"], run["cloudless"]) == (frames, frames, 0, 0, 0)
     assert 0 < run["p50_ms"] <= run["p99_ms"] <= run["max_ms"]
@@ -27,6 +27,5 @@ def test_a_load_counts_exactly(service: ServiceProcess, capsys: pytest.CaptureFi
 def test_a_latency_that_is_not_held_is_reported(service: ServiceProcess, capsys: pytest.CaptureFixture[str]) -> None:
     """A limit that nothing can hold ends with status 1."""
     options = ("--streams", 1, "--rate", 20, "--seconds", 1, "--latency-ms", 0.1)
-    result = run_here(capsys, "load", "--connect", service.endpoint, *options)
-    assert result.returncode == 1
-    assert "not held" in result.stdout
+    assert main(["--connect", service.endpoint, *map(str, options)]) == 1
+    assert "not held" in capsys.readouterr().out

@@ -10,10 +10,10 @@ from statistics import median
 
 import pytest
 from fleet import Fleet
+from load import Load, Run, generated, run_load
 from optipmb_client import Connection
 from optipmb_client.sessions import find_services
 from optipmb_schemas import Detections, Keys, ServiceStatus, encode, encoding_of
-from optipmb_tools.run.load import Load, Run, generated, run_load
 from router import Sensor
 
 import optipmb

@@ -1,4 +1,4 @@
-"""Load on a running service: how many frames it carries, and how long their tracks take.
+"""Load on a running service: how many frames it carries, and how long their tracks take: `python benchmarks/load.py`.
 
 Frames are encoded once, so that a message costs one copy while the load runs. Stream, epoch, number and stamp stand at
 the start of every message and take the same number of bytes in all of them (stream names are of one length, numbers
@@ -7,12 +7,15 @@ ones join without a jump.
 
 Time counts from just before the detections of a frame are handed to the network to the arrival of its tracks in this
 process. Frames of different streams are spread evenly over the period, as from independent sensors. The load
-also measures itself: frames that it sends late, and the processor time that it takes, are part of the result.
+also measures itself: frames that it sends late, and the processor time that it takes, are part of the result. The
+status is 1 when frames were lost, or the latency that was asked for was not held.
 """
 
+import argparse
 import contextlib
 import itertools
 import secrets
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -26,14 +29,15 @@ from numpy.typing import NDArray
 from optipmb_client.errors import ServiceRefused, ServiceUnavailable
 from optipmb_client.incoming import Arrival, Inbox
 from optipmb_client.sessions import close_session, set_parameters
-from optipmb_client.zenoh import Connection
+from optipmb_client.zenoh import DEFAULT_ENDPOINT, Connection
 from optipmb_client.zenoh.handles import Sender
 from optipmb_schemas import PREFIX, Detections, Keys, Points, Pose, SessionParameters, encode, encoding_of
-from rich.table import Table
-
-from optipmb_tools.datasets import Cloud, DataSequence, DetectionFrame
+from optipmb_tools.commands.options import print_json, print_table, say
+from optipmb_tools.datasets import Cloud, DataSequence, DetectionFrame, open_dataset
 from optipmb_tools.extras import needed
 from optipmb_tools.views.colours import COLOURS
+from optipmb_tools.views.progress import FrameProgress
+from rich.table import Table
 
 FIRST = 2**32  # number of the first frame: from here on msgpack writes nine bytes
 STREAM_BYTES = 24  # length of the names of streams
@@ -152,7 +156,7 @@ def _body(message: Detections | Points) -> bytes:
     """Return a message without its head, but with the byte before the head put first."""
     payload, start = encode(message), head(**_ANY)
     at = payload.index(start)
-    assert at == 1, "the header is not what a message starts with"  # noqa: S101  a fact of the codec
+    assert at == 1, "the header is not what a message starts with"
     return payload[:at] + payload[at + len(start) :]
 
 
@@ -430,3 +434,56 @@ def draw_runs(path: Path, runs: Sequence[Run], latency_ms: float | None = None) 
     axes.legend(fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the command."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--connect", default=DEFAULT_ENDPOINT, help="endpoint of the service")
+    parser.add_argument("--streams", type=int, default=10, help="sensors")
+    parser.add_argument("--rate", type=float, default=10.0, help="frames per second of each")
+    parser.add_argument("--objects", type=int, default=40, help="objects in a generated frame")
+    parser.add_argument("--points", type=int, default=0, help="points of a generated cloud; 0: no clouds")
+    parser.add_argument("--dataset", help="recorded frames in the place of generated")
+    parser.add_argument("--root", type=Path, help="folder of the dataset")
+    parser.add_argument("--detections", help="detector of the dataset")
+    parser.add_argument("--no-clouds", dest="clouds", action="store_false", help="without recorded clouds")
+    parser.add_argument("--profile", help="of the sessions")
+    parser.add_argument("--seconds", type=float, default=20.0, help="how long one run takes")
+    parser.add_argument("--find-limit", action="store_true", help="look for the highest rate that holds")
+    parser.add_argument("--latency-ms", type=float, help="what 99 of 100 frames must not exceed; 20 with --find-limit")
+    parser.add_argument("--plot", type=Path, help="picture of latency against throughput, a file")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    given = parser.parse_args(arguments)
+    latency_ms = given.latency_ms or (20.0 if given.find_limit else None)
+    material: Frames | None = None
+    if given.dataset is not None:
+        dataset = open_dataset(given.dataset, given.root, given.detections)
+        material = recorded(dataset.sequences(["all"]), clouds=given.clouds)
+
+    def measure(at: float) -> Run:
+        frames = generated(given.objects, given.points, at) if material is None else material
+        one = Load(given.streams, at, given.seconds, given.profile)
+        with (
+            Connection(given.connect) as connection,
+            FrameProgress(f"load at {at:.1f} Hz", one.frames * given.streams) as progress,
+        ):
+            return run_load(connection, one, frames, on_frame=progress.advance)
+
+    searched = given.find_limit and latency_ms
+    highest, runs = find_limit(measure, given.rate, latency_ms) if searched else (None, [measure(given.rate)])
+    if given.plot is not None:
+        draw_runs(given.plot, runs, latency_ms)
+    if given.json:
+        rows = [{**vars(run), "lost": run.lost, "throughput": run.throughput} for run in runs]
+        print_json({"latency_ms": latency_ms, "highest_hz": highest, "runs": rows})
+    else:
+        print_table(table_of(runs, latency_ms))
+        if highest is not None:
+            say(f"highest rate that holds {latency_ms:g} ms: {highest:.1f} Hz each")
+    held = highest != 0 if highest is not None else not runs[0].lost and runs[0].holds(latency_ms or float("inf"))
+    return 0 if held else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
