@@ -479,7 +479,6 @@ def encoded(message: Message) -> bytes:
 
 
 def _head(count: int) -> bytes:
-    """Return the head of a map."""
     return bytes([0x80 | count]) if count < _SMALL_MAP else b"\xde" + count.to_bytes(2, "big")
 
 

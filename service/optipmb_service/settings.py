@@ -131,7 +131,6 @@ class LimitSettings(BaseModel):
     """detections of one frame"""
 
     def limits(self) -> Limits:
-        """Return the limits for the decoder."""
         return Limits(**self.model_dump())
 
 
@@ -167,7 +166,6 @@ class Ros2Stream(BaseModel):
 
     @property
     def tracks_topic(self) -> str:
-        """Topic of the tracks."""
         return self.tracks or f"{self.detections}/tracks"
 
 
@@ -266,7 +264,6 @@ class FusedSettings(BaseModel):
 
     @property
     def site(self) -> str:
-        """The site of all its streams."""
         return self.streams[0].partition("/")[0]
 
 
@@ -582,7 +579,6 @@ class Settings(BaseSettings):
         return next((one for pattern, one in self.outputs.items() if fnmatchcase(session, pattern)), None)
 
     def zone(self, name: str, site: str) -> Zone:
-        """Return a zone as it is in the world of a site."""
         return self.zones[name].zone(name, self.sites.get(site))
 
     @property
@@ -592,7 +588,6 @@ class Settings(BaseSettings):
 
     @property
     def endpoints(self) -> tuple[str, ...]:
-        """Endpoints to listen on."""
         if self.listen is not None:
             return self.listen
         return (DEFAULT_LISTEN,) if self.is_router else ()

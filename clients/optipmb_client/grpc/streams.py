@@ -143,7 +143,6 @@ class _Waiting:
 
     @property
     def number(self) -> int:
-        """Number of the oldest."""
         return self._messages[0][0]
 
     def append(self, message: _Numbered) -> None:

@@ -144,7 +144,6 @@ def _by_class(rows: "Many[Row]") -> "list[tuple[str, list[Figures]]]":
 
 
 def cells_of(figures: "Figures", names: "Many[str]") -> list[str]:
-    """Return figures as the cells of a table."""
     from optipmb_tools.evaluation.figures import number  # noqa: PLC0415  as above
 
     return [number(figures[name]) for name in names]

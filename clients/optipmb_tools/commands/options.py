@@ -92,12 +92,10 @@ class Data:
 
     @property
     def frames(self) -> int:
-        """Frames of all sequences."""
         return sum(map(len, self.sequences))
 
     @property
     def names(self) -> list[str]:
-        """Names of the sequences."""
         return [sequence.name for sequence in self.sequences]
 
     @property

@@ -27,7 +27,6 @@ class PaceOptions:
     ] = 30.0
 
     def pace(self) -> Pace:
-        """Return the pace that is asked for."""
         return Pace(speed_of(self.speed), self.window, self.patience, self.wait)
 
 

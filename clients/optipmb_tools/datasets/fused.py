@@ -98,7 +98,6 @@ class FusedDataset(Dataset):
 
     @cached_property
     def profile(self) -> str:
-        """Profile of the data set itself."""
         return self._dataset.profile
 
     def sequences(self, names: Sequence[str]) -> Sequence[DataSequence]:

@@ -75,7 +75,6 @@ class DetectionFrame:
         return {name: getattr(self, name) for name in DETECTION_COLUMNS}
 
     def take(self, rows: Ints | Bools) -> "DetectionFrame":
-        """Return the frame with the chosen detections."""
         return replace(self, **{name: values[rows] for name, values in self.columns.items() if values is not None})
 
 
@@ -316,5 +315,4 @@ class Preloaded(DataSequence):
         return iter(self._frames)
 
     def truth(self) -> Truth | None:
-        """Return the annotations."""
         return self._truth

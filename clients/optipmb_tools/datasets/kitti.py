@@ -90,7 +90,6 @@ class KittiSequence(DataSequence):
 
     @cached_property
     def calibration(self) -> Calibration:
-        """Calibration of the recording."""
         return read_calibration(self._dataset.text("calib", self.name))
 
     @property
@@ -265,7 +264,6 @@ class KittiDataset(Dataset):
         return self.detector
 
     def text(self, kind: str, sequence: str) -> Path:
-        """Return the path of one of the text files of a sequence."""
         return self.base / kind / f"{sequence}.txt"
 
     def present(self) -> list[str]:

@@ -70,7 +70,6 @@ class Moves:
         return wrap_angle(np.arctan2(self.step[:, 1], self.step[:, 0]) - yaw)
 
     def take(self, rows: Bools) -> "Moves":
-        """Return the chosen moves."""
         floats, numbers = (self.step[rows], self.duration[rows]), self.object[rows]
         return Moves(self.start[rows], self.end[rows], *floats, numbers, self.common)
 

@@ -128,7 +128,6 @@ class Bag:
         return Stamped(second * 10**9 + rest, frame.removeprefix("/"))
 
     def wrong(self, raw: Raw, error: MessageError, remedy: str = "") -> DatasetError:
-        """Return an error that says which message of the bag is wrong."""
         place = f"{self.path} {raw.topic}, received at {raw.received_ns} ns"
         return DatasetError(f"{place}: {error.path}" if error.path else place, error.expected + remedy, error.received)
 

@@ -125,7 +125,6 @@ class ClassFigures:
 
     @property
     def shown(self) -> TrackFigures:
-        """Figures of the tracks that are shown."""
         return self.confirmed or self.everything
 
     def summary(self) -> dict[str, object]:

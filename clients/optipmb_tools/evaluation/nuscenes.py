@@ -75,7 +75,6 @@ class TrackBoxes:
         return len(self.frame)
 
     def take(self, rows: Ints | Bools) -> "TrackBoxes":
-        """Return the chosen rows."""
         return TrackBoxes(self.frame[rows], self.id[rows], self.label[rows], self.center[rows], self.score[rows])
 
 

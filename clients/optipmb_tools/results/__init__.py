@@ -39,13 +39,11 @@ class BoxTable:
         return np.asarray(self.labels, dtype=np.str_)[self.label] if self.labels else np.empty(0, dtype=np.str_)
 
     def take(self, rows: Ints | Bools) -> Self:
-        """Return the chosen rows."""
         columns = [field.name for field in fields(self) if field.name not in _NOT_OF_ROWS]
         taken: dict[str, Any] = {name: one[rows] for name in columns if (one := getattr(self, name)) is not None}
         return replace(self, **taken)
 
     def of_class(self, name: str) -> Self:
-        """Return the rows of one class."""
         return self.take(np.isin(self.label, [i for i, label in enumerate(self.labels) if label == name]))
 
     def to_world(self, poses: Sequence[PoseLike]) -> Self:

@@ -174,7 +174,6 @@ _END = "\n}}\n"
 
 
 def scene_file(out: Path, scene: str) -> Path:
-    """Return the path of the file of one scene."""
     return out / "scenes" / f"{scene}.json"
 
 

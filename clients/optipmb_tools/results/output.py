@@ -94,7 +94,6 @@ class TrackCounts(NamedTuple):
 
     @classmethod
     def of(cls, frames: Iterable[Tracks]) -> Self:
-        """Count the tracks of frames."""
         parts = [(one.id, shown(one)) for one in frames]
         confirmed = [ids[rows] for ids, rows in parts]
         rows = sum(len(ids) for ids, _ in parts)

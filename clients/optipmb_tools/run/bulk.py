@@ -109,17 +109,14 @@ class Here(Executor):
     here = True
 
     def start(self, function: Function, shared: Any) -> None:
-        """Keep the call."""
         self._call = function, shared
 
     def submit(self, task: Any) -> Future[Any]:
-        """Run the task."""
         future: Future[Any] = Future()
         future.set_result(attempt(*self._call, task))
         return future
 
     def take(self, future: Future[Any]) -> Any:
-        """Return the value."""
         return future.result()
 
 

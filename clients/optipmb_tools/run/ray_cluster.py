@@ -77,7 +77,6 @@ class RayCluster(Executor):
         self._task = ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(_run)
 
     def submit(self, task: Any) -> Future[Any]:
-        """Give the task to Ray."""
         future: Future[Any] = self._task.remote([self._call], str(Path.cwd()), version("optipmb"), task).future()
         return future
 

@@ -97,7 +97,6 @@ class ServiceProcess:
 
     @property
     def process(self) -> subprocess.Popen[bytes]:
-        """The running process."""
         if self._process is None:
             raise ServiceUnavailable("the service has not been started")
         return self._process

@@ -69,7 +69,6 @@ class Source:
         return cls(dataset, detections or "", sequences, clips, wanted)
 
     def of_class(self, name: str) -> list[Clip]:
-        """Return the clips with one class only."""
         return [of_class(clip, name, rules_of(self.dataset)) for clip in self.clips]
 
     @property

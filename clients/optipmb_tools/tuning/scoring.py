@@ -166,7 +166,6 @@ def rules_of(dataset: str) -> Rules:
 
 
 def scorer_of(dataset: str, name: str, sequences: Sequence[DataSequence]) -> Scorer:
-    """Return the scorer of a class of a dataset."""
     scorer = Scorer(name, rules_of(dataset), default_rules(dataset, "distance"))
     scenes = [sequence for sequence in sequences if isinstance(sequence, NuScenesSequence)]
     if not scenes or len(scenes) < len(sequences):
@@ -231,7 +230,6 @@ class Objective:
         return self.scorer.figures(measured)
 
     def value(self, figures: Figures, clips: Sequence[int]) -> float:
-        """Return the metric of figures of some sequences."""
         return metric(self.metric, figures, sum(self._objects[i] for i in clips))
 
 

@@ -25,7 +25,6 @@ def rounded(value: float) -> float:
 
 
 def value_of(parameters: Parameters, name: str, path: str) -> Value:
-    """Return one value of a class."""
     found: Any = parameters.classes[name]
     for part in path.split("."):
         found = getattr(found, part)
@@ -77,7 +76,6 @@ def with_heading_sign(parameters: Parameters, name: str) -> Parameters:
 
 
 def only(parameters: Parameters, name: str) -> Parameters:
-    """Return the parameters with one class only."""
     document = parameters.model_dump()
     return _parsed({**document, "classes": {name: document["classes"][name]}})
 

@@ -263,7 +263,6 @@ class FoxgloveServer:
             self._channels[topic].log(one.payload, log_time=stamp_ns)
 
     def close(self) -> None:
-        """Stop serving."""
         for channel in self._channels.values():
             channel.close()
         self._server.stop()

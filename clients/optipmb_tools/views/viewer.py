@@ -262,7 +262,6 @@ def _to_world(message: Detections | Points, points: Floats) -> tuple[Floats, flo
 
 
 def _shown(tracks: Tracks) -> Tracks:
-    """Return the tracks of a frame that are shown."""
     rows = shown(tracks)
     columns = {name: column[rows] for name in tracks.arrays if (column := getattr(tracks, name)) is not None}
     return tracks.model_copy(update=columns)

@@ -153,7 +153,6 @@ def _frame(code: int) -> str:
 
 
 def _block(array: pb.Array) -> dict[str, Any]:
-    """Return an array as the block that msgpack has."""
     return {"dtype": _DTYPE_NAMES.get(array.dtype, array.dtype), "shape": list(array.shape), "data": array.data}
 
 

@@ -177,7 +177,6 @@ class Transforms:
         return _compose(_inverse(self._to(common, down, stamp_ns)), result)
 
     def _to(self, ancestor: str, chain: list[str], stamp_ns: int) -> Transform:
-        """Return ancestor from chain[0]."""
         result: Transform | None = None
         for frame in chain[: chain.index(ancestor)]:
             step = self._edges[frame].at(frame, stamp_ns)

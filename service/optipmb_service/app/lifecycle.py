@@ -84,7 +84,6 @@ class Deadline:
         self._ends = time.monotonic() + seconds
 
     def left(self) -> float:
-        """Return the seconds that are left."""
         return max(0.0, self._ends - time.monotonic())
 
 
@@ -232,7 +231,6 @@ class StopRequest:
             self.restarts = True
 
     def ask(self, reason: str) -> None:
-        """Ask for the end."""
         self.restarts = False
         if not self.bound.begin():  # before anything that may block, as a log without a reader
             log.warning("end_unbounded")

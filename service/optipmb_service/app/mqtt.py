@@ -154,7 +154,6 @@ class Link:
         self._client.subscribe(pattern, 1)
 
     async def close(self) -> None:
-        """Disconnect."""
         self._client.disconnect()
         await asyncio.to_thread(self._client.loop_stop)
 

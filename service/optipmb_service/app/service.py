@@ -283,7 +283,6 @@ class Service(Reporter):
         return tuple(summaries)
 
     def report_certificate(self, why: str) -> None:
-        """Report that a certificate has ended."""
         self._report("certificate", expected="certificates that hold", received=why, message=why)
 
     def _report_returned(self, token: str, due: int, newest: int) -> None:

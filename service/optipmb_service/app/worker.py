@@ -64,7 +64,6 @@ class Parent:
         threading.Thread(target=read, name="parent", daemon=True).start()
 
     def say(self, event: str) -> None:
-        """Write an event."""
         try:
             print(json.dumps({"event": event}), flush=True)  # noqa: T201 - the parent reads it
         except BrokenPipeError:

@@ -96,7 +96,6 @@ class Worker:
         self._process: Process | None = None
 
     def set(self, state: State) -> None:
-        """Change the state."""
         self.state = state
         self._changed()
 
@@ -173,7 +172,6 @@ class Supervisor:
         return self.began
 
     async def end(self) -> None:
-        """Tell the workers to end."""
         for worker in self.workers:
             worker.end()
         await asyncio.sleep(0.0)  # only the loop's next turn closes their stdin

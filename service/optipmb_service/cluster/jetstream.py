@@ -109,7 +109,6 @@ class JetStream:
         self._call(self._set_aside(stream, reason))
 
     def close(self, timeout: float) -> None:
-        """Close the connection."""
         self._connection.close(timeout)
 
     def _call(self, work: Coroutine[Any, Any, _T], count: int = 1) -> _T:

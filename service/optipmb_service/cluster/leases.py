@@ -51,7 +51,6 @@ MAX_ENDED: Final = 1024  # members that have ended and are remembered
 
 @lru_cache(65_536)  # as many streams as are known at once; asked about all of them whenever one comes or goes
 def partition_of(stream: str) -> int:
-    """Return the partition of a stream."""
     return int.from_bytes(blake2b(stream.encode(), digest_size=8).digest()) % PARTITIONS
 
 
@@ -66,7 +65,6 @@ def partition_key(partition: int) -> str:
 
 
 def wish_key(partition: int) -> str:
-    """Return the key of the record of who is to have a partition."""
     return f"wish/{partition}"
 
 

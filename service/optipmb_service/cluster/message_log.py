@@ -109,7 +109,6 @@ class LogMessage(NamedTuple):
 
     @property
     def headers(self) -> dict[str, str]:
-        """Its headers in the log."""
         return {ID: self.id, FRAME: self._frame, ENCODING: self.encoding}
 
     @property
@@ -354,7 +353,6 @@ class LogReader:
         self._log.connection.start(self._tracks(stream, from_ns, take, end))
 
     def close(self, timeout: float) -> None:
-        """Close the connection."""
         self._log.connection.close(timeout)
 
     async def _missed(self, wanted: Missed, take: Callable[[list[LogMessage]], None], again_s: Sequence[float]) -> None:

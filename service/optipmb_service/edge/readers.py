@@ -237,7 +237,6 @@ class Publication:
 
     @property
     def place(self) -> Place | None:
-        """Place of its site."""
         return self._places.get(self.message.stream.partition("/")[0])
 
     @property

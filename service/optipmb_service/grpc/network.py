@@ -69,13 +69,11 @@ class Item:
 
     @classmethod
     def of_tracks(cls, tracks: EncodedTracks, selection: Selection = EVERYTHING) -> Item:
-        """Return a selection of tracks as a response."""
         payload = selection.of(tracks.message()).SerializeToString() if selection.key else tracks.payload
         return cls(tracks.stream, b"".join((_TRACKS, varint(len(payload)), payload)), tracks)
 
     @classmethod
     def of_problem(cls, problem: schemas.Problem) -> Item:
-        """Return a problem as a response."""
         response = pb.SubscribeResponse(problem=convert.to_proto(problem))
         return cls(problem.stream, response.SerializeToString(), problem=(problem.code, problem.path))
 

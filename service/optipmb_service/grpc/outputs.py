@@ -221,7 +221,6 @@ def _newest(publications: Iterable[EncodedTracks]) -> list[EncodedTracks]:
 
 
 def _refusal(problem: schemas.Problem) -> EndCall:
-    """Return the end of a call that a service refused."""
     code: Any = problem.code if problem.code in schemas.CODES else "invalid_value"
     error = schemas.MessageError(code, problem.path, problem.expected, problem.received)
     if problem.code in schemas.CODES:

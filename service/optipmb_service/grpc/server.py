@@ -139,7 +139,6 @@ class Server:
         self.address = self._listen(settings)
 
     async def start(self) -> None:
-        """Serve."""
         await self._server.start()
         self._watching = asyncio.create_task(self._watch())
 

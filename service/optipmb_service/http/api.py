@@ -223,7 +223,6 @@ class _Stream(StreamingResponse):
         self._ended = ended
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer."""
         async with self._ended:
             await super().__call__(scope, receive, send)
 
@@ -320,7 +319,6 @@ class Api:
         self._readers = readers
 
     def routes(self) -> list[Route | WebSocketRoute]:
-        """Return the routes."""
         answers = {"streams": self.streams, "tracks": self.tracks, "zones": self.zones, "stream": self.stream}
         gets = [Route(f"/api/v1/{name}", answer) for name, answer in answers.items()]
         return [*gets, WebSocketRoute("/api/v1/ws", self.socket)]

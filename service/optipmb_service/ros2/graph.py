@@ -56,7 +56,6 @@ class Qos:
     depth: int = 10
 
     def token(self) -> str:
-        """Return the text in a token."""
         reliability = "" if self.reliable else _BEST_EFFORT
         durability = _TRANSIENT_LOCAL if self.transient_local else ""
         return f"{reliability}:{durability}:,{self.depth}:,:,:,,"
@@ -117,7 +116,6 @@ class Node:
     number: int = 0
 
     def token(self) -> str:
-        """Return the key of its token."""
         where = f"{_SPACE}/{self.domain}/{self.session}/{self.number}/{self.number}/{_NODE}"
         return f"{where}/%/{mangled(self.namespace)}/{self.name}"
 
@@ -140,7 +138,6 @@ class Endpoint:
         return f"{self.node.namespace.rstrip('/')}/{self.node.name}"
 
     def token(self) -> str:
-        """Return the key of its token."""
         node = self.node
         where = f"{_SPACE}/{node.domain}/{node.session}/{node.number}/{self.entity}/{self.kind}"
         what = f"{mangled(self.topic)}/{dds_type(self.type)}/{self.hash}/{self.qos.token()}"

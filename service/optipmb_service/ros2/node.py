@@ -68,7 +68,6 @@ class Ros2Node:
     # ROS
 
     def endpoint(self, kind: str, topic: str, type_name: str, qos: graph.Qos) -> graph.Endpoint:
-        """Return an endpoint of this node that is to be declared."""
         self._entities += 1
         return graph.Endpoint(self._node, self._entities, kind, topic, type_name, self.types.hash_of(type_name), qos)
 

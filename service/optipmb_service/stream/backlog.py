@@ -355,7 +355,6 @@ class Backlog:
 
     @property
     def clouds_waiting(self) -> bool:
-        """Whether clouds wait in the queue."""
         return bool(self._clouds)
 
     @property

@@ -301,7 +301,6 @@ class _Zones(BaseModel):
     session: str
 
     def state(self) -> ZoneState:
-        """Return the state of the zones."""
         tracks = {number: one._replace(known=int.from_bytes(known, "big")) for number, known, one in self.tracks}
         counts = {zone: {name: dict(one) for name, one in by_name.items()} for zone, by_name in self.counts.items()}
         return ZoneState(tracks, counts, self.numbers, self.zones, self.session)

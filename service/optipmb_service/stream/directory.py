@@ -176,12 +176,10 @@ class StreamDirectory:
         return found
 
     def announced(self) -> set[str]:
-        """Return the streams that this instance is to announce."""
         with self._lock:
             return {stream for stream, known in self._streams.items() if known.announced}
 
     def announces(self, stream: str) -> bool:
-        """Whether this instance announces a stream."""
         known = self._streams.get(stream)
         return known is not None and known.announced
 

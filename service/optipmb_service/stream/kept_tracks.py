@@ -89,7 +89,6 @@ class TracksRange:
         return self._to_ns is None or latest_ns <= self._to_ns + LATE_NS
 
     def messages(self) -> list[_Published]:
-        """Return the messages by their stamps."""
         return sorted(self._frames.values(), key=lambda one: (one.stamp_ns, one.sensor, one.seq))
 
     def _cut(self) -> None:

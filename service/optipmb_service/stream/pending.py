@@ -83,7 +83,6 @@ class PendingFrame:
 
     @property
     def message(self) -> schemas.Detections:
-        """Its detections."""
         return self.inputs[0]
 
     @property

@@ -134,7 +134,6 @@ class Fusion:
 
     @classmethod
     def of(cls, settings: Settings) -> Fusion:
-        """Return what settings say."""
         return cls(settings.fuse, {name: one.streams for name, one in settings.fused_sessions.items()})
 
     def session_of(self, stream: str) -> str:

@@ -301,7 +301,6 @@ class StreamQueries:
         )
 
     def _nothing(self, stream: str, state: Literal["new", "closed"]) -> schemas.SessionState:
-        """Return the state of a stream that has no session."""
         profile = self._streams.profiles.of(stream).name
         return schemas.SessionState(stream=stream, session=NO_SESSION, state=state, profile=profile)
 

@@ -82,7 +82,6 @@ class Log:
         self._reader.tracks(stream, from_ns, take, end)
 
     def close(self, timeout: float) -> None:
-        """Close the connection."""
         self._reader.close(timeout)
 
     def _packets(self, messages: Iterable[LogMessage]) -> list[Packet]:
@@ -150,7 +149,6 @@ class LogCheck:
         return None if waits else self._next_ns
 
     def begin(self, now_ns: int) -> None:
-        """Begin a read."""
         self.under_way = True
         self._next_ns = now_ns + self._pause_ns
         self._pause_ns = min(2 * self._pause_ns, MOST_PAUSES * self._silent_ns)

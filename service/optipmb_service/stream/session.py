@@ -379,7 +379,6 @@ class Session:
 
     @property
     def parameters(self) -> optipmb.Parameters:
-        """The profile."""
         return self._window.transition.parameters
 
     @property
@@ -448,7 +447,6 @@ class Session:
 
     @property
     def cloud_wait_s(self) -> float:
-        """The longest wait for a cloud."""
         return self._policy.cloud_wait_ns / SECOND
 
     @property
@@ -498,7 +496,6 @@ class Session:
         return Transition(self.stream, parameters, self._make, self._policy)
 
     def _limit_wait(self, cloud_wait_ns: int) -> None:
-        """Set the longest wait for a cloud."""
         if self._fused:  # a frame that waited for its cloud must still find its place
             cloud_wait_ns = min(cloud_wait_ns, self._policy.rewind_ns // 2)
         self._policy = replace(self._policy, cloud_wait_ns=cloud_wait_ns)

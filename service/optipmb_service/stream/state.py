@@ -190,7 +190,6 @@ class ProcessedFrame:
 
     @property
     def order(self) -> Order:
-        """The key by which frames are processed."""
         return self.place.order(self.frame_id)
 
     @property

@@ -721,7 +721,6 @@ class Stream:
         return None if session is None else self._counts.state(session)
 
     def totals(self) -> MessageCounters:
-        """Return the counts of messages since the stream was made."""
         return self._counts.totals()
 
     def summary(self, now_ns: int) -> schemas.SessionSummary | None:

@@ -377,7 +377,6 @@ class StreamTimeline(Timeline):
 
     @property
     def _before(self) -> Cursor:
-        """The cursor up to the window."""
         return self.base.get("") or Cursor()
 
     def _jump_ns(self, frame_id: FrameId) -> int:
@@ -629,7 +628,6 @@ def _placed(frame_id: FrameId, generation: int) -> Placement:
 
 
 def _latest(jumped: Mapping[str, JumpedFrames], most: int) -> dict[str, JumpedFrames]:
-    """Return the newest ones."""
     return dict(tuple(jumped.items())[-most:])
 
 

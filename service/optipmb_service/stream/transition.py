@@ -116,7 +116,6 @@ class Transition:
         return digest.hexdigest()
 
     def parameters_of(self, sensor: str) -> optipmb.Parameters:
-        """Return the parameters of the frames of a sensor."""
         return self._used(sensor)[0]
 
     def _used(self, sensor: str) -> tuple[optipmb.Parameters, optipmb.Tracker]:
@@ -135,7 +134,6 @@ class Transition:
         return self._trackers[index]
 
     def no_objects(self, next_id: int) -> optipmb.Density:
-        """Return an empty density."""
         return optipmb.Density.empty(self.parameters.labels, next_id)
 
     def step(

@@ -54,7 +54,6 @@ class ReorderWindow:
 
     @property
     def frames(self) -> tuple[ProcessedFrame, ...]:
-        """The frames of the window in the order of processing."""
         return tuple(self._frames)
 
     def state(self, number: int) -> FilterState:

@@ -131,7 +131,6 @@ def _announced(
 
 
 def _leads_to(worlds: Worlds, number: int, motion: optipmb.Relocation) -> bool:
-    """Return whether a motion is the kept one into a world."""
     return worlds.since(number - 1)[:1] == (motion,)
 
 

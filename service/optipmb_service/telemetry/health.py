@@ -114,7 +114,6 @@ class ProcessHealth:
         return "; ".join(one.failure for one in (self.tls, self._service) if one is not None and one.failure)
 
     def state(self) -> str:
-        """Return the state of the process."""
         if self._ending:
             return "stopping"
         state = self._service.state if self._began else "starting"

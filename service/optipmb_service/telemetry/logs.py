@@ -286,7 +286,6 @@ class _Library(logging.Handler):
     """Logs the warnings of libraries, which use Python's own logging."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Log one of them."""
         ours = record.name.startswith("optipmb")
         structlog.get_logger("optipmb_service").warning(
             "tracker_message" if ours else "traces_failed", text=record.getMessage()

@@ -288,7 +288,6 @@ class Durations:
         self.sum_s = 0.0
 
     def observe(self, seconds: float) -> None:
-        """Count a duration."""
         self._counts[bisect_left(SECONDS, seconds)] += 1
         self.sum_s += seconds
 

@@ -135,7 +135,6 @@ class MessageCounters(Counters):
     clouds_shed: int = 0
 
     def __add__(self, other: MessageCounters) -> MessageCounters:
-        """Return the sums."""
         return MessageCounters(
             **{one.name: total(getattr(self, one.name), getattr(other, one.name)) for one in fields(MessageCounters)}
         )

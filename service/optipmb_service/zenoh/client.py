@@ -107,7 +107,6 @@ class IdlePool(Generic[R]):
         return resource
 
     def close(self) -> None:
-        """Close all resources."""
         with self._lock:
             left, self._idle = self._idle, {}
         for _, resource in left.values():

@@ -57,7 +57,6 @@ class StreamPublisher:
         self.publish_now = (now or sender).put
 
     def release(self) -> None:
-        """Withdraw all of it."""
         for one in self._declared:
             one.close()
 
