@@ -140,6 +140,31 @@ def test_a_folder_with_a_table_for_each_frame_is_one_recording(tmp_path: Path, n
     assert np.diff(sequence.stamps) == pytest.approx(1e8, abs=300)
 
 
+def label(tool: str, yaw: float) -> Any:
+    """Return a frame of a car as a tool for labels writes it."""
+    place, turn = {"x": 5.0, "y": 2.0, "z": 0.8}, {"x": 0.0, "y": 0.0, "z": yaw}
+    if tool == "sustech":
+        psr = {"position": place, "rotation": turn, "scale": {"x": 4.5, "y": 1.9, "z": 1.6}}
+        return [{"obj_id": "1", "obj_type": "car", "psr": psr}]
+    if tool == "labelcloud":
+        sides = {"length": 4.5, "width": 1.9, "height": 1.6}
+        return {"folder": "a", "objects": [{"name": "car", "centroid": place, "dimensions": sides, "rotations": turn}]}
+    sides = {"h": 1.6, "w": 1.9, "l": 4.5}
+    return [{"type": "car", "3d_dimensions": sides, "3d_location": place, "rotation": yaw}]
+
+
+@pytest.mark.parametrize("tool", ["sustech", "labelcloud", "dair"])
+def test_frames_of_tools_for_labels_are_read(tmp_path: Path, tool: str) -> None:
+    """JSON files without stamps, a file for each frame, are one recording with the boxes of their tool."""
+    for number in range(12):
+        (tmp_path / f"{number}.json").write_text(json.dumps(label(tool, 0.4)))
+    (sequence,) = TableDataset(tmp_path, {"rate": "10"}).sequences(["all"])
+    frame = next(sequence.frames())
+    assert len(sequence) == 12
+    assert [*frame.center[0], *frame.size[0], frame.yaw[0]] == pytest.approx([5.0, 2.0, 0.8, 4.5, 1.9, 1.6, 0.4])
+    assert frame.labels == ("car",)
+
+
 def test_names_of_frames_in_two_orders_are_refused(tmp_path: Path) -> None:
     """Frame and camera in a name give no order of time, nor do names without a number."""
     columns = {name: one for name, one in street(0.1).items() if name != "t"}

@@ -102,6 +102,7 @@ _PART: Final = re.compile(
     rf"({'|'.join((*_BOX_TURN.split(), 'r', 'euler', 'rpy', 'ypr', 'matrix'))})_?(q?[wxyz]|\d(?:_?\d)?)"
 )
 """Base of a column that may be one of several numbers of an orientation."""
+_OTHER: Final = re.compile("ego|pose|sensor|camera|lidar|vehicle|header")  # what is not of a box
 _LENGTHS: Final = {"m", "meter", "meters", "metre", "metres", "mps"}
 
 
@@ -164,14 +165,31 @@ def _plain(name: str) -> str:
 
 
 def normalised(name: str) -> Column:
-    """Return a column by its name, with the unit that the name has."""
+    """Return a column by its name, with the unit that the name has.
+
+    Of a name with dots the last parts count where only they have a meaning, as in `psr.position.x`.
+    """
+    base, unit = _base(name)
+    path = name.split(".")
+    for start in range(1, 1 if _known(base) or _OTHER.match(base) else len(path)):
+        last, last_unit = _base(".".join(path[start:]))
+        if _known(last):
+            return Column(name, last_unit, last)
+    return Column(name, unit, base)
+
+
+def _known(base: str) -> bool:
+    return _PART.fullmatch(base) is not None or any(base in names for names in ALIASES.values())
+
+
+def _base(name: str) -> tuple[str, str | None]:
     base = _plain(name)
     head, _, tail = base.rpartition("_")
     if head and tail in _UNITS:
-        return Column(name, _UNITS[tail], head)
+        return head, _UNITS[tail]
     if base in _UNITS and base not in {"s", "ms", "us", "ns"}:
-        return Column(name, _UNITS[base], base)
-    return Column(name, None, head if head and tail in _LENGTHS else base)
+        return base, _UNITS[base]
+    return head if head and tail in _LENGTHS else base, None
 
 
 def turn_of(known: Iterable[Column]) -> tuple[str, list[str]] | None:
