@@ -10,6 +10,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from optipmb_schemas import MessageError
 
 
 class DatasetError(ValueError):
@@ -28,6 +29,7 @@ class DatasetError(ValueError):
         super().__init__(f"{place}: expected {expected}, received {received}")
 
 
+LARGEST: Final = 1e15  # numbers beyond it are none of a data set: their squares and nanoseconds overflow
 _FOREIGN: Final = {
     b"version https://git-lfs": "a pointer of Git LFS: git lfs pull fetches the file",
     b"<!doctype html": "a page of HTML, as a download gives that asks for a login",
@@ -56,14 +58,25 @@ def refuse_foreign(path: Path, what: str, data: bytes, *own: bytes) -> None:
 
 @contextlib.contextmanager
 def reading(path: Path | str) -> Iterator[None]:
-    """Name a file in the unexpected errors of the libraries that read it."""
+    """Name a file or folder in the unexpected errors that are raised while it is read."""
     try:
         yield
-    except DatasetError:
-        raise
     except Exception as error:
         error.add_note(f"{path} was being read")
         raise
+
+
+@contextlib.contextmanager
+def damage(path: Path | str, what: str) -> Iterator[None]:
+    """Report whatever a library raises over the bytes of a file as damage: their kinds are not documented."""
+    try:
+        yield
+    except (DatasetError, MessageError):
+        raise
+    except Exception as error:
+        if isinstance(error, OSError) and error.filename is not None:
+            raise
+        raise DatasetError(path, what, f"{type(error).__name__}: {error}") from error
 
 
 def unexpected(error: BaseException) -> str:
@@ -132,7 +145,7 @@ def read_rows(path: Path, what: str) -> list[tuple[int, list[str]]]:
 
 
 def numbers(path: Path, rows: Iterable[tuple[int, list[str]]], columns: int, what: str) -> NDArray[np.float64]:
-    """Return fields as finite numbers (R, columns).
+    """Return fields as finite numbers (R, columns) up to `LARGEST`.
 
     Raises:
         DatasetError: A line has another number of fields, or a field is not a finite number; names the line.
@@ -147,7 +160,7 @@ def numbers(path: Path, rows: Iterable[tuple[int, list[str]]], columns: int, wha
             values = np.array([fields for _, fields in taken], dtype=np.float64)
         except ValueError:
             values = np.array([[_number(path, line, field) for field in fields] for line, fields in taken])
-    bad = np.argwhere(~np.isfinite(values))
+    bad = np.argwhere(~(np.abs(values) <= LARGEST))
     if len(bad):
         row, column = bad[0]
         line, fields = taken[row]

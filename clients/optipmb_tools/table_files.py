@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from optipmb_tools.extras import needed
 from optipmb_tools.files import (
     DatasetError,
+    damage,
     decode_text,
     numbers,
     read_rows,
     read_text,
-    reading,
     refuse_foreign,
     write_whole,
 )
@@ -132,7 +132,7 @@ def read_table(path: Path, options: Mapping[str, str] | None = None) -> Columns:
             with path.open("rb") as file:
                 own = _OWN_COMPRESSED if path.suffix.lower() in _COMPRESSED else _OWN.get(kind, ())
                 refuse_foreign(path, f"a table ({kind})", file.read(64), *own)
-        with reading(path):
+        with damage(path, f"a table ({kind})"):
             table = _read(pa, path, kind, options)
             for name, column in zip(table.column_names, table.columns, strict=True):
                 for part, values in _parts(pa, str(name), column.combine_chunks()):
@@ -142,8 +142,6 @@ def read_table(path: Path, options: Mapping[str, str] | None = None) -> Columns:
     except OSError as error:  # pyarrow's errors of content are of this kind too
         found = "no such file" if isinstance(error, FileNotFoundError) else error.strerror or str(error)
         raise DatasetError(path, f"a table ({kind})", found) from error
-    except pa.ArrowException as error:
-        raise DatasetError(path, f"a table ({kind})", str(error)) from error
     return columns
 
 

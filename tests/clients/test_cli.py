@@ -11,14 +11,12 @@ import sys
 import time
 from pathlib import Path
 
-import pyarrow as pa
 import pytest
 from commands import optipmb, run_here, start
 from fake_service import Behaviour, FakeService
 from hypothesis import given
 from hypothesis import strategies as st
 from optipmb_tools.cli import COMMANDS, EXAMPLES, run, spread
-from pyarrow import parquet
 from routers import free_endpoint
 
 SMALL = ["--dataset", "scene", "--option", "frames=8", "--option", "vehicles=4", "--option", "clouds=0"]
@@ -223,17 +221,19 @@ def test_an_error_that_no_code_foresaw_is_one_line(
     debug: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The line names the error and the file that was being read, and asks for a report; --debug adds the traceback."""
-    path = tmp_path / "d.parquet"
-    parquet.write_table(pa.table({"t": [1.0]}), path)
+    path = tmp_path / "training"
+    (path / "calib").mkdir(parents=True)
 
-    def broken(*_: object) -> None:
+    def broken(*_: object, **__: object) -> None:
         raise KeyError("inside")
 
-    monkeypatch.setattr(parquet, "read_table", broken)
-    assert run(["check", str(path), *debug]) == 1
+    monkeypatch.setattr("optipmb_tools.datasets.kitti.KittiDataset", broken)
+    assert run(["check", str(tmp_path), *debug]) == 1
     err = capsys.readouterr().err
     *before, line = err.splitlines()
-    assert line.startswith(f"optipmb: unexpected KeyError: 'inside' ({path} was being read): please report this line")
+    assert line.startswith(
+        f"optipmb: unexpected KeyError: 'inside' ({tmp_path} was being read): please report this line"
+    )
     assert bool(before) == ("Traceback" in err) == bool(debug)
 
 

@@ -16,7 +16,7 @@ from optipmb_tools.datasets.interface import (
     selected_frames,
 )
 from optipmb_tools.extras import needed
-from optipmb_tools.files import DatasetError
+from optipmb_tools.files import DatasetError, reading
 from optipmb_tools.geometry import Pose
 from optipmb_tools.table_files import tables_in
 
@@ -78,7 +78,8 @@ def open_dataset(
         georeference = georeference_of(options["origin"])
     if name != "table":  # whose latitudes and longitudes need it
         options.pop("origin", None)
-    opened = _OPEN[name](place or Path(), detections, options)
+    with reading(place or name):
+        opened = _OPEN[name](place or Path(), detections, options)
     if fuse:
         from optipmb_tools.datasets.fused import FusedDataset  # noqa: PLC0415  of one format
 

@@ -98,6 +98,7 @@ _LEAST_SCORE = 1e-12
 LIDAR = "LIDAR_TOP"
 
 _CHUNK = 1 << 22
+_LATEST_US = 2**63 // 1000  # stamps are nanoseconds of 64 bits
 _LONGEST = 1 << 20
 _BETWEEN = re.compile(r"[\s,]*")
 _VISIBILITY = {"v0-40": 1, "v40-60": 2, "v60-80": 3, "v80-100": 4}
@@ -202,9 +203,12 @@ class NuScenesTables:
         names = {token: str(name) for token, name in read_table(self.folder, "scene", "token", "name")}
         samples: dict[str, list[tuple[int, str]]] = {token: [] for token in names}
         for token, stamp, scene in read_table(self.folder, "sample", "token", "timestamp", "scene_token"):
-            if scene not in samples:
+            if not isinstance(scene, str) or scene not in samples:
                 raise DatasetError(self.folder / "sample.json", "samples of known scenes", f"sample {token} of {scene}")
-            samples[scene].append((int(stamp), token))
+            if not isinstance(stamp, int) or not 0 <= stamp < _LATEST_US or not isinstance(token, str):
+                expected = "tokens, and stamps in whole microseconds"
+                raise DatasetError(self.folder / "sample.json", expected, f"{token!r:.60} at {stamp!r:.60}")
+            samples[scene].append((stamp, token))
         scenes = {}
         for scene, name in sorted(names.items(), key=lambda item: item[1]):
             ordered = sorted(samples[scene])

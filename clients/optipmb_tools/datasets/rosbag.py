@@ -26,7 +26,7 @@ from optipmb_schemas.ros2.tracks import TOPICS, messages
 from optipmb_schemas.ros2.transforms import TransformError, Transforms
 from optipmb_schemas.ros2.types import Types, own_types
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinitionFormat
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, ReaderError, StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 
 from optipmb_tools.camera import synthetic_camera
 from optipmb_tools.datasets.interface import (
@@ -37,7 +37,7 @@ from optipmb_tools.datasets.interface import (
     DetectionFrame,
     Points,
 )
-from optipmb_tools.files import DatasetError
+from optipmb_tools.files import DatasetError, damage
 from optipmb_tools.geometry import Pose
 from optipmb_tools.results.kitti import write_kitti_results
 
@@ -87,11 +87,9 @@ class Bag:
             chosen = [one for one in reader.connections if one.topic in topics]
             if not chosen:
                 return
-            try:
+            with damage(self.path, "whole messages"):
                 for connection, received_ns, data in reader.messages(chosen):
-                    yield Raw(connection.topic, received_ns, data)
-            except (ReaderError, EOFError, struct.error) as error:
-                raise DatasetError(self.path, "whole messages", str(error)) from error
+                    yield Raw(connection.topic, received_ns, bytes(data))
 
     def read(self, raw: Raw) -> Any:
         """Return a message.
@@ -100,13 +98,11 @@ class Bag:
             DatasetError: Its bytes are no message of the topic's type.
         """
         name = self.topics[raw.topic]
-        if name not in self._types:
-            try:
-                self._types[name] = Types({name: self._definitions[name]})
-            except MessageError as error:
-                raise self.wrong(raw, error) from error
         try:
-            return self._types[name].read(name, raw.data)
+            with damage(f"{self.path} {raw.topic}", f"messages of {name}"):
+                if name not in self._types:
+                    self._types[name] = Types({name: self._definitions[name]})
+                return self._types[name].read(name, raw.data)
         except MessageError as error:
             raise self.wrong(raw, error) from error
 
@@ -139,9 +135,9 @@ class Bag:
         except FileNotFoundError as error:
             received = "a folder without metadata.yaml" if self.path.is_dir() else "nothing"
             raise DatasetError(self.path, what, received) from error
-        except (ReaderError, EOFError, struct.error, TypeError) as error:
+        except Exception as error:
             hint = " (if the recorder was killed: mcap recover, or ros2 bag reindex)"
-            raise DatasetError(self.path, what, f"{error}{hint}") from error
+            raise DatasetError(self.path, what, f"{error or type(error).__name__}{hint}") from error
         return reader
 
 
@@ -438,13 +434,15 @@ class RosbagSequence(DataSequence):
         try:
             message = self.bag.read(raw)
             errors = left_out if self._skip else None
-            return boxes_of(message, self._classes, covariance=self._covariance, left_out=errors)
+            with damage(f"{self.bag.path} {raw.topic}", "messages of the topic's type"):
+                return boxes_of(message, self._classes, covariance=self._covariance, left_out=errors)
         except MessageError as error:
             raise self.bag.wrong(raw, error, " (--option invalid=skip leaves such objects out)") from error
 
     def _points(self, raw: Raw) -> Points:
         try:
-            return points_of(self.bag.read(raw))
+            with damage(f"{self.bag.path} {raw.topic}", "clouds"):
+                return points_of(self.bag.read(raw))
         except MessageError as error:
             raise self.bag.wrong(raw, error) from error
 
@@ -493,7 +491,8 @@ class RosbagDataset(Dataset):
                 wanted[dotted] = None
         new = [name for name in wanted if name not in self._sequences]
         if new:
-            transforms = read_transforms(self._bag, self._choice)
+            with damage(self._bag.path, "transforms and odometry"):
+                transforms = read_transforms(self._bag, self._choice)
             for name in new:
                 made = plan(self._bag, self._topics[name], transforms, self._choice)
                 self._sequences[name] = RosbagSequence(

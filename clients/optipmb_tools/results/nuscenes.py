@@ -28,7 +28,7 @@ import numpy as np
 from optipmb_schemas import Tracks
 
 from optipmb_tools.datasets.interface import class_like
-from optipmb_tools.files import DatasetError, read_text, write_whole
+from optipmb_tools.files import LARGEST, DatasetError, read_text, write_whole
 from optipmb_tools.geometry import Floats, Ints
 from optipmb_tools.results import ResultTable
 
@@ -75,9 +75,13 @@ class Submission:
             -1, _WIDTH
         )
         velocity = values[:, 12:14]
-        velocity[~np.isfinite(velocity).all(axis=1)] = np.nan
+        velocity[~(np.abs(velocity) <= LARGEST).all(axis=1)] = np.nan
         size, rotation = values[:, [5, 4, 6]], values[:, 7:11]
-        good = np.isfinite(values[:, :12]).all(axis=1) & (size > 0).all(axis=1) & (np.abs(rotation).max(axis=1) > 0)
+        good = (
+            (np.abs(values[:, :12]) <= LARGEST).all(axis=1)
+            & (size > 0).all(axis=1)
+            & (np.abs(rotation).max(axis=1) > 0)
+        )
         if not good.all():
             places = [f"results.{token}[{number}]" for token in tokens for number in range(len(self.rows[token]))]
             expected = f"finite numbers, a size above 0 and a rotation in {places[int(np.argmin(good))]}"

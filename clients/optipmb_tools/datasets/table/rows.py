@@ -20,6 +20,7 @@ from optipmb_tools.datasets.table.times import (
     SECONDS,
     Stamps,
     median_step,
+    nanoseconds,
     read_frames,
     read_stamps,
     refuse_gap,
@@ -38,7 +39,7 @@ from optipmb_tools.datasets.table.values import (
     read_turn,
     read_velocity,
 )
-from optipmb_tools.files import DatasetError
+from optipmb_tools.files import LARGEST, DatasetError
 from optipmb_tools.geometry import Bools, Floats, Ints
 from optipmb_tools.table_files import NO_VALUE, Columns, frame_numbers, read_table
 
@@ -396,7 +397,7 @@ class _Table:
                 [int(text) for text in texts] if integers else texts, dtype=np.int64 if integers else np.float64
             )
         if rate is not None:
-            return Stamps(np.round(values * (1e9 / rate)).astype(np.int64), values, column.name, skipped)
+            return Stamps(nanoseconds(reading, values, 1e9 / rate), values, column.name, skipped)
         if "nanosec" in found:
             whole = np.asarray(values == np.floor(values))
             self._time.first("time", ~whole, f"whole seconds in column {column.name}", values)
@@ -429,7 +430,7 @@ class _Table:
             reading.note("time", text, "--option rate=HZ")
         else:
             reading.note("time", f"column {column.name} counts frames, {rate:g} a second")
-        stamp = np.round(numbers * (1e9 / rate)).astype(np.int64)
+        stamp = nanoseconds(reading, numbers, 1e9 / rate)
         return Stamps(stamp, self._columns[column.name], column.name, np.zeros(self._rows, dtype=np.bool_))
 
     def _framed(
@@ -692,7 +693,7 @@ class _Table:
         good = kept.copy()
         marks = "" if "missing" in self._reading.options else ", missing=NUMBER names a mark for no value"
         for what, values, fine in (
-            ("finite x, y and z", center, np.isfinite(center).all(axis=1)),
+            ("finite x, y and z", center, (np.abs(center) <= LARGEST).all(axis=1)),
             ("positive length, width and height", size, (np.isfinite(size) & (size > 0.0)).all(axis=1)),
             (f"sizes up to {LARGEST_SIZE:g} m", size, (size <= LARGEST_SIZE).all(axis=1)),
             ("finite yaw", yaw, ~np.isinf(yaw)),

@@ -1,7 +1,7 @@
 """Stamps of a table: their unit, what they count from, and which of them belong to one frame."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -150,19 +150,32 @@ def read_stamps(reading: Reading, numbers: np.ndarray, key: Ints, unit: str | No
             )
     rate = f"frames at {1.0 / (period * SECONDS[stated]):.3g} Hz" if period else "one stamp"
     reading.note("time", f"stamps are in {_WORDS[stated]}{how}: {rate}", "" if asked else "--option time=UNIT")
-    if numbers.dtype.kind in "iu":
-        return numbers.astype(np.int64) * round(SECONDS[stated] * 1e9)
-    return np.round(numbers * (SECONDS[stated] * 1e9)).astype(np.int64)
+    return nanoseconds(reading, numbers, SECONDS[stated] * 1e9)
+
+
+def nanoseconds(reading: Reading, numbers: NDArray[Any], unit: float) -> Ints:
+    """Return stamps (R,) of times in units of so many nanoseconds.
+
+    Raises:
+        DatasetError: One is beyond 64 bits.
+    """
+    beyond = ~(np.abs(numbers.astype(np.float64)) < 2.0**63 / max(unit, 1.0))
+    replace(reading, lenient=False).first("time", beyond, "stamps that fit into 64 bits of nanoseconds", numbers)
+    if numbers.dtype.kind in "iu" and unit.is_integer():
+        return numbers.astype(np.int64) * int(unit)
+    return np.round(numbers * unit).astype(np.int64)
 
 
 def _calendar(reading: Reading, numbers: np.ndarray, unit: str | None) -> Ints | None:
     """Return stamps in nanoseconds of numbers whose digits are YYYYMMDDhhmmss or hhmmss, with any decimals."""
+    if not ((numbers >= 0) & (numbers < 2**63)).all():
+        return None
     for decimals in range(10) if numbers.dtype.kind in "iu" else (0,):
         whole = numbers // 10**decimals
         part = (numbers - whole * 10**decimals) / 10**decimals
         day, clock = (whole // 10**6).astype(np.int64), (whole % 10**6).astype(np.int64)
         fields = np.column_stack((clock // 10**4, clock // 100 % 100, clock % 100))
-        if (numbers < 0).any() or (fields >= _CLOCK).any():
+        if (fields >= _CLOCK).any():
             continue
         seconds = fields @ np.array([3600, 60, 1])
         dated = bool(np.all((day // 10**4 >= _YEARS[0]) & (day // 10**4 <= _YEARS[1])))
