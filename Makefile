@@ -94,21 +94,23 @@ tests: kernels
 	test -d tests/tracker/__pycache__ || $(BIN)/pytest --collect-only -qq >/dev/null
 	OPTIPMB_COMPILE_PROCESSES=0 $(BIN)/pytest -n $(JOBS) --max-worker-restart 0 --dist loadfile --no-loadscope-reorder -m "not accuracy and not alone and not bounds and not ray"
 
+# Whole recordings, outages and clusters take longer than the two minutes that other tests have.
+LONG := --timeout 500
 # The figures of accuracy that docs/tuning.md and docs/ablation.md give, on the KITTI and nuScenes data.
 accuracy: kernels
-	$(BIN)/pytest -n $(JOBS) --max-worker-restart 0 tests/clients -m accuracy
+	$(BIN)/pytest -n $(JOBS) --max-worker-restart 0 $(LONG) tests/clients -m accuracy
 
 # What measures memory, latency and outages, one test after the other.
 alone: kernels
-	$(BIN)/pytest tests/e2e tests/service/stream/test_memory.py -m alone
+	$(BIN)/pytest $(LONG) tests/e2e tests/service/stream/test_memory.py -m alone
 
 # Compiling all kernels a second time takes a minute; what is compiled is kept in .pytest_cache.
 bounds: $(VENV)/.installed
-	$(BIN)/pytest tests/tracker -m bounds
+	$(BIN)/pytest $(LONG) tests/tracker -m bounds
 
 # Clusters on this machine, with the machine for themselves.
 ray: kernels
-	$(BIN)/pytest tests/clients -m ray
+	$(BIN)/pytest $(LONG) tests/clients -m ray
 
 # For a developer: style, types, and the tests nearest to what changed since SINCE (a commit; files not committed count).
 SINCE ?= main

@@ -22,7 +22,7 @@ unset PYTHONPATH
 "$work/venv/bin/optipmb" warm-up
 # What packages of others warn of among themselves is theirs: the versions here are combined by nobody else.
 # One file or folder for each package of others that the product rests on.
-"$work/venv/bin/python" -m pytest -W ignore::DeprecationWarning -c "$root/pyproject.toml" --rootdir "$root" -o cache_dir="$work/cache" -q -n 3 --dist loadfile \
+"$work/venv/bin/python" -m pytest -W ignore::DeprecationWarning -c "$root/pyproject.toml" --rootdir "$root" -o cache_dir="$work/cache" -q -n 3 --dist loadfile --timeout 300 \
   "$root"/tests/e2e/test_processes.py "$root"/tests/service/zenoh "$root"/tests/service/http/test_http.py "$root"/tests/grpc/test_track.py "$root"/tests/service/stream/test_traces.py \
   "$root"/tests/tracker/test_oracle.py "$root"/tests/schemas/test_codec.py \
   "$root"/tests/clients/test_api.py "$root"/tests/clients/test_cli.py "$root"/tests/clients/test_mcap_files.py "$root"/tests/clients/test_tuning_search.py
