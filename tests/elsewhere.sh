@@ -25,6 +25,6 @@ unset PYTHONPATH
 "$work/venv/bin/python" -m pytest -W ignore::DeprecationWarning -c "$root/pyproject.toml" --rootdir "$root" -o cache_dir="$work/cache" -q -n 3 --dist loadfile --timeout 300 \
   "$root"/tests/e2e/test_processes.py "$root"/tests/service/zenoh "$root"/tests/service/http/test_http.py "$root"/tests/grpc/test_track.py "$root"/tests/service/stream/test_traces.py \
   "$root"/tests/tracker/test_oracle.py "$root"/tests/schemas/test_codec.py \
-  "$root"/tests/clients/test_api.py "$root"/tests/clients/test_cli.py "$root"/tests/clients/test_mcap_files.py "$root"/tests/clients/test_tuning_search.py
+  "$root"/tests/clients/test_api.py "$root"/tests/clients/test_cli.py "$root"/tests/clients/test_mcap_files.py "$root"/tests/clients/test_tuning_study.py
 "$work/venv/bin/python" --version
 echo "the wheel works there"
