@@ -324,7 +324,7 @@ def test_a_missing_stamp_among_long_ones_is_named_with_its_line(
     write_table(tmp_path / "d.csv", boxes(t=None, stamp_ns=texts))
     done = run_here(capsys, "track", tmp_path / "d.csv", "--out", tmp_path / "t.csv")
     assert done.returncode == 2
-    assert "d.csv:52: expected stamps in column stamp_ns" in done.stderr.splitlines()[-1]
+    assert "d.csv:52: expected a stamp in column stamp_ns" in done.stderr.splitlines()[-1]
 
 
 def test_json_lines_may_be_long_and_of_several_types(tmp_path: Path) -> None:
