@@ -25,6 +25,10 @@ CODES: Final = {
         "The sensor moves, and its frames have no pose: the motion is estimated; reported once per session.",
         "Send poses where they are known: tracks are in the axes of the sensor without them.",
     ),
+    "far": (
+        "Tracks are far from the origin of their site in `sites`, so their latitudes are wrong; reported once.",
+        "Send metres from that origin, not coordinates of a grid, such as UTM; or correct `origin`.",
+    ),
     "no_view": (
         "A sensor of a fused session with `sensors` has no `field_of_view`: it is taken to see all; reported once.",
         "Send one: objects that only other sensors see count as missed without it.",

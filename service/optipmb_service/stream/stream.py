@@ -21,6 +21,7 @@ import structlog
 from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_client.trace_context import attachment_of
 
+from optipmb_service.settings import FARTHEST
 from optipmb_service.stream.arrivals import Arrivals
 from optipmb_service.stream.checkpoint import CheckpointError, forgotten
 from optipmb_service.stream.persistence import save_dump
@@ -87,6 +88,7 @@ class Stream:
         self.meter = StreamMeter(time.monotonic_ns())
         self.sensors = Sensors(name, self.meter, fused=self.fused)
         self.log_check = LogCheck(streams.silent_ns)
+        self._is_far = False
         self._streams = streams
         self._policy = streams.policy_for(name)
         self.durable: Reached | None = None if streams.checkpoints.durable else (MAX_COUNT, 0, "")
@@ -300,6 +302,7 @@ class Stream:
         session = self.session
         for output in outputs:
             if isinstance(output, Tracked):
+                self._check_place(output)
                 self._send(output)
             elif isinstance(output, Begun):
                 if session and output.reason in {"first", "parameters"}:
@@ -433,6 +436,17 @@ class Stream:
                 if label not in session.parameters.labels:
                     expected = f"one of {', '.join(session.parameters.labels)} (profile {session.parameters.name})"
                     self.report("unknown_class", f"zones.{zone.name}.classes", expected, repr(label))
+
+    def _check_place(self, tracked: Tracked) -> None:
+        """Report, once, tracks that are far from the place of the site: as of coordinates of a grid, such as UTM."""
+        if self._is_far or not self._policy.has_place:
+            return
+        far = abs(tracked.estimates.center[:, :2]).max(axis=1, initial=0.0) > FARTHEST
+        if far.any():
+            self._is_far = True
+            expected = f"within {FARTHEST / 1e3:g} km of the origin of its site in `sites`"
+            x, y = tracked.estimates.center[far][0, :2]
+            self.report("far", "center", expected, f"{x:.0f}, {y:.0f} m")
 
     def _report_overload(self, stream: str, received: str) -> None:
         expected = f"at most {self._step_limit_ns / 1e9:g} s of processor time for a message"

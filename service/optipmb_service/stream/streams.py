@@ -292,7 +292,8 @@ class Streams:
         zones = (self._zone(name, site if known[name].geo else "") for name in names[:MOST])
         sensors = self.fusion.sensors_of(session, self.profiles.sensors)
         needs_view = bool(sensors.uses) or session in self.fusion.sites
-        return replace(self.policy, zones=tuple(zones), sensors=sensors, needs_view=needs_view)
+        has_place = site in self._settings.sites
+        return replace(self.policy, zones=tuple(zones), sensors=sensors, needs_view=needs_view, has_place=has_place)
 
     def fixed_rate_for(self, session: str) -> FixedRate | None:
         """Return the output of a session at a fixed rate; None: it has none."""

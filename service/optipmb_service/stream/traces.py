@@ -15,13 +15,16 @@ import structlog
 from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
 from opentelemetry.sdk.resources import OTELResourceDetector, Resource
 from opentelemetry.sdk.trace import TracerProvider
-from opentelemetry.sdk.trace.export import BatchSpanProcessor
+from opentelemetry.sdk.trace.export import BatchSpanProcessor, SpanExportResult
 from opentelemetry.trace import SpanKind, get_current_span, set_span_in_context
 from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import optipmb_schemas as schemas
     from opentelemetry.context import Context
+    from opentelemetry.sdk.trace import ReadableSpan
 
     from optipmb_service.stream.values import Tracked
     from optipmb_service.zenoh.inputs import Packet
@@ -40,6 +43,22 @@ class FrameTrace(NamedTuple):
     ended_ns: int
 
 
+class _Exporter(OTLPSpanExporter):
+    """Exporter that logs when the collector takes no spans, and when it does again."""
+
+    _fails = False
+
+    def export(self, spans: Sequence[ReadableSpan]) -> SpanExportResult:
+        result = super().export(spans)
+        fails = result is not SpanExportResult.SUCCESS
+        if fails and not self._fails:
+            log.warning("traces_lost", spans=len(spans))
+        elif self._fails and not fails:
+            log.info("traces_back")
+        self._fails = fails
+        return result
+
+
 class Traces:
     """Recorder of spans.
 
@@ -55,7 +74,7 @@ class Traces:
                 {"service.name": "optipmb-service", "service.instance.id": instance, "process.pid": os.getpid()}
             )
             provider = TracerProvider(resource=ours.merge(OTELResourceDetector().detect()), shutdown_on_exit=False)
-            provider.add_span_processor(BatchSpanProcessor(OTLPSpanExporter()))
+            provider.add_span_processor(BatchSpanProcessor(_Exporter()))
         self._provider = provider
         self._tracer = provider.get_tracer("optipmb_service")
         self._w3c = TraceContextTextMapPropagator()

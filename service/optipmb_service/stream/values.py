@@ -95,6 +95,7 @@ class Policy:
         zones: those whose events the session finds.
         sensors: how the frames of the sensors of a fused session are used.
         needs_view: whether a sensor without field of view is reported.
+        has_place: whether the setting `sites` has a place of its world frame.
         at_once: frames that are ready which one call takes through the tracker; the next calls take the others. More
             are taken only while more than `held_bytes` are held.
     """
@@ -119,6 +120,7 @@ class Policy:
     zones: tuple[Zone, ...] = ()
     sensors: optipmb.Sensors = ALIKE
     needs_view: bool = False
+    has_place: bool = False
 
     @property
     def jump_limits(self) -> JumpLimits:

@@ -80,6 +80,8 @@ EVENTS: Final = {
     "log_back": "The log can be written.",
     "log_unread": "The log could not be read for the session of `streams`: frames may be missing.",
     "log_cut": "A session missed more of the log than it takes at once: the oldest frames are left out.",
+    "traces_lost": "The collector does not answer, or refuses: `spans` are lost, until `traces_back`.",
+    "traces_back": "The collector takes spans again.",
     "traceparent_invalid": "A publisher sends the invalid trace context `received`: its frames begin new traces.",
     "traces_failed": "A `text` of OpenTelemetry: spans could not be sent, or there were too many; some are lost.",
     "stream_stale": "No frame for `stale_s`: check the publisher.",

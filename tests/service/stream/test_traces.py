@@ -297,3 +297,24 @@ def test_the_missing_extra_is_named(tmp_path: Path) -> None:
     assert "opentelemetry" in service.errors
     assert "[traces]" in service.errors
     assert len(service.errors.splitlines()) == 1
+
+
+def test_a_collector_that_does_not_take_spans_is_reported(
+    collector: Collector, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One line when it begins to fail, one when it takes them again."""
+    monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", f"http://127.0.0.1:{collector.server_port}")
+    monkeypatch.setenv("OTEL_BSP_SCHEDULE_DELAY", "20")
+    traces, message = Traces("test"), SENSOR.detections(0)
+    with structlog.testing.capture_logs() as logged:
+
+        def told() -> list[str]:
+            return [one["event"] for one in logged if one["event"] in {"traces_lost", "traces_back"}]
+
+        for count, status in enumerate((400, 400, 200)):
+            collector.status = status
+            traces.received(packet_of(message), message)
+            until(lambda: len(collector.requests) > count, "spans are sent")  # noqa: B023 - it is called here
+            until(lambda: len(told()) == (2 if status == 200 else 1), "it is logged")  # noqa: B023 - as above
+        traces.close(60.0)
+    assert told() == ["traces_lost", "traces_back"]

@@ -342,6 +342,20 @@ def test_a_zone_across_the_date_line_is_one_zone() -> None:
     assert shapes[1] == pytest.approx(np.array(shapes[0]), abs=1e-5)
 
 
+def test_tracks_far_from_their_site_are_reported_once() -> None:
+    """As of coordinates of a grid that were sent as metres from the origin; without a place nothing is wrong."""
+    for sites, codes in (({}, []), ({"site": {"origin": (48.265, 11.671, 489.0)}}, ["far"])):
+        reader = Reader()
+        streams = streams_of(reader, reporter=reader, tracker=optipmb.Tracker, zones={}, sites=sites)
+        for seq in range(10):
+            frame = SENSOR.detections(seq)
+            streams.receive(
+                packet_of(frame.model_copy(update={"center": frame.center + np.array([692_000, 5_348_000, 0])}))
+            )
+            reader.run()
+        assert [one.code for one in reader.problems] == codes
+
+
 def test_a_session_has_at_most_256_zones(tmp_path: Path) -> None:
     """A settings file may have more, of several streams; more of one pattern are refused, others are left out."""
     line = {"line": [(8.2, -30), (8.2, 30)]}
