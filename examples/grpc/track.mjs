@@ -9,6 +9,7 @@ const { TrackingService } = grpc.loadPackageDefinition(schema).optipmb.v1;
 const client = new TrackingService("127.0.0.1:50051", grpc.credentials.createInsecure());
 
 const epoch = randomBytes(16); // new at every start
+const start = BigInt(Date.now()) * 1_000_000n;
 const doubles = (shape, ...values) => ({ dtype: "DATA_TYPE_F8", shape, data: Buffer.from(Float64Array.from(values).buffer) });
 const integers = (...values) => ({ dtype: "DATA_TYPE_I4", shape: [values.length], data: Buffer.from(Int32Array.from(values).buffer) });
 
@@ -17,7 +18,7 @@ const frame = (seq) => ({
     stream: "garage/robot-1/camera",
     epoch,
     seq: String(seq),
-    stamp_ns: String(1_700_000_000_000_000_000n + BigInt(seq) * 100_000_000n),
+    stamp_ns: String(start + BigInt(seq) * 100_000_000n),
     frame: "FRAME_WORLD",
     labels: ["car"],
     label: integers(0),

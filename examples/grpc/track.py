@@ -2,6 +2,7 @@
 
 import os
 import struct
+import time
 
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf.tracking_pb2_grpc import TrackingServiceStub
@@ -9,6 +10,7 @@ from optipmb_schemas.protobuf.tracking_pb2_grpc import TrackingServiceStub
 import grpc
 
 EPOCH = os.urandom(16)  # new at every start
+START_NS = time.time_ns()
 
 
 def array(dtype: int, code: str, shape: list[int], *values: float) -> pb.Array:
@@ -23,7 +25,7 @@ def frame(seq: int) -> pb.TrackRequest:
             stream="garage/robot-1/lidar",
             epoch=EPOCH,
             seq=seq,
-            stamp_ns=1_700_000_000_000_000_000 + seq * 100_000_000,
+            stamp_ns=START_NS + seq * 100_000_000,
             frame=pb.FRAME_WORLD,
             labels=["car"],
             label=array(pb.DATA_TYPE_I8, "q", [1], 0),

@@ -157,6 +157,21 @@ def test_a_checkpoint_is_refused_for_its_fence(make: Make) -> None:
     assert one.load(STREAM) == data[1]
 
 
+def test_numbers_are_those_of_the_newest_checkpoint(make: Make) -> None:
+    """They are saved under its fence, and stay when all checkpoints are set aside."""
+    one, other = make(), make()
+    key = partition_key(partition_of(STREAM))
+    fence = one.put(Write(key, "a", 0))
+    assert fence is not None
+    assert one.numbers(STREAM) is None
+    for number in (b"1", b"2", b"2"):
+        assert one.save({STREAM: Fenced(key, fence, b"data", number)}) == frozenset()
+    assert other.save({STREAM: Fenced(key, fence + 100, b"data", b"3")}) == {STREAM}
+    while other.load(STREAM) is not None:
+        other.set_aside(STREAM, "torn")
+    assert other.numbers(STREAM) == b"2"
+
+
 def test_a_store_that_is_closed_or_cannot_be_reached_says_so(nats: NatsProcess) -> None:
     """Every call ends in time with the one error, which names the server and no password."""
     nowhere = JetStream(["nats://user:secret@127.0.0.1:9"], "test")
