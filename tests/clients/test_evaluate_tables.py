@@ -362,3 +362,10 @@ def test_a_table_of_several_sequences_that_are_named_by_digits_is_evaluated(benc
         found = result_of(bench.run("evaluate", *scenes, "--tracks", bench.folder / name, "--json", "--jobs", "1"))
         figures.append({label: one["all"]["MOTA"] for label, one in found["classes"].items()})
     assert figures[0] == figures[1]
+
+
+def test_truth_that_is_a_frame_late_is_named(bench: Bench) -> None:
+    """Tracks that fit the truth of the next frame much better get a note with both distances; others get none."""
+    late = bench.evaluate(cars(t=cars()["t"] + 0.1), cars())
+    assert "m from that of the frame after: does one of the two count frames from 1?" in late.stderr
+    assert "count frames from 1" not in bench.evaluate(cars(), cars()).stderr

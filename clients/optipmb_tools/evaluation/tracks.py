@@ -20,6 +20,10 @@ _OTHERS = ("Van", "Truck", "Person_sitting", "Person", "Tram")
 """Classes of KITTI that are no synonyms of evaluated ones."""
 
 
+_BETTER = 0.5  # share of the distance from which another frame fits much better
+_ENOUGH = 20  # boxes from which distances are compared
+
+
 def read_compared(
     sequences: Sequence[DataSequence], results: Path, names: Sequence[str], warn: Callable[[str], None] | None = None
 ) -> list[tuple[Truth, ResultTable]]:
@@ -47,6 +51,7 @@ def read_compared(
         known += (*true, *_OTHERS)
     renamed = _alike(true, known), _alike((label for _, tracks in pairs for label in tracks.labels), known)
     notes = [note for pair in pairs for one in pair for note in one.notes]
+    notes += _shifted(sequences, pairs)
     for owner, found in zip(("truth", "tracks"), renamed, strict=True):
         if other := [f"{label} as {name}" for label, name in found.items() if label != name]:
             notes.append(f"classes of the {owner}: {', '.join(other)}")
@@ -65,6 +70,32 @@ def read_compared(
         )
         for truth, tracks in pairs
     ]
+
+
+def _shifted(sequences: Sequence[DataSequence], pairs: Sequence[tuple[Truth, ResultTable]]) -> list[str]:
+    """Return a note for each sequence whose tracks fit the truth of a neighbouring frame much better."""
+    notes = []
+    for sequence, (truth, tracks) in zip(sequences, pairs, strict=True):
+        placed = tracks.to_world(sequence.poses)
+        here, before, after = (_apart(truth, placed, shift) for shift in (0, -1, 1))
+        if min(before, after) < _BETTER * here < np.inf:
+            other = "before" if before < after else "after"
+            text = (
+                f"{here:.2g} m from the truth of their frame, {min(before, after):.2g} m from that of the frame {other}"
+            )
+            notes.append(f"{sequence.name}: tracks lie {text}: does one of the two count frames from 1?")
+    return notes
+
+
+def _apart(truth: Truth, tracks: ResultTable, shift: int) -> float:
+    """Return the median distance of tracks from the nearest truth of the frame `shift` frames on, infinite if few."""
+    apart = [np.empty(0)]
+    for frame in np.unique(tracks.frame).tolist():
+        true, found = (one.center[one.frame == at, :2] for one, at in ((truth, frame + shift), (tracks, frame)))
+        if len(true) and len(found):
+            apart.append(np.linalg.norm(found[:, None] - true, axis=2).min(axis=1))
+    every = np.concatenate(apart)
+    return float(np.median(every)) if len(every) >= _ENOUGH else np.inf
 
 
 def _alike(labels: Iterable[str], known: Sequence[str]) -> dict[str, str]:
