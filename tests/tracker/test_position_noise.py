@@ -58,13 +58,16 @@ def bytes_of(results: list[optipmb.StepResult]) -> list[bytes]:
 
 @pytest.mark.parametrize("profile", ["kitti", "kitti-paper", "nuscenes", "nuscenes-paper", "generic"])
 def test_the_covariance_of_the_profile_changes_no_byte(profile: str) -> None:
-    """Detections whose covariance is R of their class, or unknown, give the density and tracks of those without."""
+    """Detections whose covariance is R of their class, or unknown, give the density and tracks of those without.
+
+    Where a profile learns R, only unknown ones do.
+    """
     parameters = optipmb.load_profile(profile)
     sigma = np.array([one.measurement_noise.position for one in parameters.classes.values()])
 
     def same(label: Any) -> Any:
         given = sigma[label][:, None, None] ** 2 * np.eye(3)
-        given[1::2] = np.nan
+        given[1 - parameters.self_calibration :: 2 - parameters.self_calibration] = np.nan
         return given
 
     expected = bytes_of(drive(parameters))
