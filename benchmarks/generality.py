@@ -247,7 +247,9 @@ def identity_f1(cases: Sequence[Case], threshold: float) -> float:
         if len(both):
             chosen = best_pairs(both[:, 0], both[:, 1], times.astype(np.float64))
             agreed += int(times[chosen].sum())
-        total += int((~case.ignored).sum() + (~case.excused).sum())
+        judged = ~case.excused  # and those that an object has, which would be excused without it
+        judged[case.track_row[counts]] = True
+        total += int((~case.ignored).sum() + judged.sum())
     return 2.0 * agreed / max(total, 1)
 
 

@@ -97,8 +97,8 @@ LEAST_NOISE, MOST_NOISE = 0.02, 2.0
 OUTLYING: Final = 9.0
 """Squared standard deviations that a pair counts for at most: a half-hidden object jumps."""
 LASTING_RATIO: Final = 1.7
-LEAST_PART: Final = 0.25
-"""Part of the profile's variance that R keeps, so that a box that jumps stays of its track."""
+LEAST_PART: Final = 1.0
+"""Part of the profile's variance that R has at least, so that the box of a half-hidden object stays with its track."""
 
 
 @kernel
