@@ -164,10 +164,9 @@ def read_heading(
         least=LEAST_ALONG if sure else 0.0,
     )
     if claims[0].evidence.share > HALF and not moving:  # along a grid of streets only the sense differs
-        claims = [
-            Claim(one, along(found, one)[1], f"if it is {one}", f"--option heading={one}", "doubt") for one in HEADINGS
-        ]
-        claims.sort(key=lambda one: one.value != axis)
+        other = axis.removesuffix("-clockwise") if axis.endswith("-clockwise") else f"{axis}-clockwise"
+        option = f"--option heading={other}, or heading={axis} to keep it"
+        claims = [Claim(one, along(found, one)[1], f"if it is {one}", option, "doubt") for one in (axis, other)]
         claims[0] = replace(claims[0], text="")
         reading.decide("yaw", claims, "moves are forward", clash="many boxes drive backwards", asked=zero)
     return _radians(values, found, axis)
