@@ -37,7 +37,7 @@ def street(frames: int = FRAMES, direction: float = 0.0, yaw: float | None = Non
 
 def tracked(capsys: pytest.CaptureFixture[str], data: Path, *options: str, name: str = "t.csv") -> tuple[Table, str]:
     out = data.parent / "out" / name
-    done = run_here(capsys, "track", data, "--out", out, *options)
+    done = run_here(capsys, "track", data, "--out", out, "--verbose", *options)
     assert done.returncode == 0, done.stderr
     return read_table(out), done.stderr
 

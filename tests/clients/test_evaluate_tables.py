@@ -271,7 +271,7 @@ def test_centres_without_sizes_have_the_figures_of_distances(bench: Bench, bare:
     """Tables without sizes and headings are compared by centres, and one line says so; overlaps are refused."""
     centres = cars(l=None, w=None, h=None, yaw=None)
     pair = (centres, cars()) if bare == "truth" else (cars(), centres)
-    done = bench.evaluate(*pair)
+    done = bench.evaluate(*pair, "--verbose")
     assert counts(done) == RIGHT
     assert f"{bare}.csv: no columns for the size or the heading: only centres can be compared" in done.stderr
     done = bench.evaluate(*pair, "--iou", "0.5")

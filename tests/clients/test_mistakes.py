@@ -97,7 +97,7 @@ def test_every_mistake_gets_its_sentence(
         path.write_text(content)
     elif content is not None:
         write_table(path, content)
-    assert run(["track", str(path), "--out", str(tmp_path / "t.csv"), *options]) == status
+    assert run(["track", str(path), "--out", str(tmp_path / "t.csv"), "--verbose", *options]) == status
     printed = capsys.readouterr()
     assert text in printed.err + printed.out
     if status == 2:

@@ -41,7 +41,7 @@ def test_the_page_prints_what_it_says() -> None:
 def test_a_table_of_points_is_tracked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Time, place, class and score are enough: each object keeps its id, and faces along its way."""
     write_table(tmp_path / "points.csv", boxes(**UNKNOWN))
-    done = run_here(capsys, "track", tmp_path / "points.csv", "--out", tmp_path / "t.csv")
+    done = run_here(capsys, "track", tmp_path / "points.csv", "--out", tmp_path / "t.csv", "--verbose")
     assert done.returncode == 0, done.stderr
     assert "no columns for the size or the heading: they are unknown" in done.stderr + done.stdout
     tracks = read_table(tmp_path / "t.csv")

@@ -17,6 +17,7 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 
 from optipmb_tools.datasets import DATASETS, DataSequence, Dataset, dataset_at, open_dataset
+from optipmb_tools.datasets.interface import Assumption
 from optipmb_tools.run.bulk import Executor, executor_for
 from optipmb_tools.table_files import SUFFIXES
 
@@ -170,11 +171,8 @@ class DatasetOptions:
         opened = open_dataset(name, root, self.detections, **self.options(name) | more)
         chosen = list(opened.sequences(self.sequences or ["all"]))
         notes = [*opened.notes, *(note for one in chosen for note in one.notes)]
-        if self.verbose or len(notes) == 1:
-            for note in notes:
-                warn(note)
-        elif notes:
-            warn(in_short(notes))
+        for note in notes if self.verbose else in_short(notes):
+            warn(note)
         return Data(opened, chosen)
 
 
@@ -251,11 +249,14 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
     return call
 
 
-def in_short(notes: Sequence[str]) -> str:
-    """Return the first clause of each note, `PLACE: TEXT: MORE (--option NAME=VALUE)`, once, as one line."""
-    texts = (note.partition(": ")[2] or note for note in notes)
-    clauses = dict.fromkeys(re.split(r": | \(--|; ", text)[0] for text in texts)
-    return f"{', '.join(clauses)} (--verbose says more)"
+def in_short(notes: Sequence[str]) -> list[str]:
+    """Return the first clauses of assumptions, `PLACE: TEXT: MORE (--option NAME=VALUE)`, as a line, then the rest."""
+    assumed = [note for note in notes if isinstance(note, Assumption)]
+    if len(assumed) <= 1:
+        return list(notes)
+    clauses = dict.fromkeys(re.split(r": | \(--|; ", note.partition(": ")[2])[0] for note in assumed)
+    others = [note for note in notes if not isinstance(note, Assumption)]
+    return [f"{', '.join(clauses)} (--verbose says more)", *others]
 
 
 def _option(text: str) -> tuple[str, float | str]:

@@ -121,6 +121,12 @@ class Truth(BoxTable):
         return cls(labels=labels, frame=frame, **unknown | known)
 
 
+class Assumption(str):
+    """A note that says how data are read, as they usually are; commands shorten several of them to one line."""
+
+    __slots__ = ()
+
+
 class DataSequence(ABC):
     """One recording, or one sensor of it.
 
@@ -128,7 +134,7 @@ class DataSequence(ABC):
     """
 
     name: str
-    notes: Sequence[str] = ()  # assumptions, a line each
+    notes: Sequence[str] = ()  # assumptions and doubts, a line each
 
     # Sensors of one recording can share a density (`optipmb_tools.datasets.fused`).
     recording: str = ""  # common to those sensors, and their name as one sequence

@@ -148,7 +148,7 @@ def read_objects(path: Path, files: Sequence[Path], tables: TableOptions) -> lis
         options = _UNITS | {name: value for name, value in options.items() if name in kept}
     reading = Reading(path, options, named=tables.named)
     found = read_tables(files, reading, scored=False, loaded=columns)
-    notes = () if written else tuple(f"{path}: {note}" for note in reading.notes)
+    notes = () if written else tuple(reading.notes)
     return [ObjectTable(file, boxes, options, notes, _confirmed(columns[file])) for file, boxes in found]
 
 
@@ -361,7 +361,7 @@ class TableDataset(Dataset):
                 _note_gaps(reading, sequence)
                 shared.recordings |= {name, key}
         _refuse_single_frames(reading, list(self._sequences.values()))
-        notes += [f"{path}: {note}" for note in reading.notes]
+        notes += reading.notes
         if tracks is None:
             shared.check()
         self.notes: tuple[str, ...] = tuple(dict.fromkeys(notes))

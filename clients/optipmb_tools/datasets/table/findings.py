@@ -12,6 +12,7 @@ from typing import Final, Literal
 import numpy as np
 
 from optipmb_tools.datasets.evidence import Evidence
+from optipmb_tools.datasets.interface import Assumption
 from optipmb_tools.files import DatasetError
 from optipmb_tools.table_files import line_of
 
@@ -68,8 +69,10 @@ class Reading:
 
     @property
     def notes(self) -> list[str]:
-        """The findings, a line each."""
-        return [f"{one.text} ({one.option})" if one.option else one.text for one in self.findings]
+        """The findings, a line each, behind the path."""
+        lines = [f"{one.text} ({one.option})" if one.option else one.text for one in self.findings]
+        kinds = [str if one.doubt or one.wrong else Assumption for one in self.findings]
+        return [kind(f"{self.path}: {line}") for kind, line in zip(kinds, lines, strict=True)]
 
     def add(self, finding: Finding) -> None:
         """Report a finding, once."""
