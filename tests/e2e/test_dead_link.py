@@ -34,7 +34,7 @@ def test_a_dead_link_loses_nothing(side: str) -> None:
         service.wait_ready()
         where = {"publisher": service.endpoint, "subscriber": service.endpoint} | {side: proxy.endpoint}
         with (
-            Subscriber(STREAM, where["subscriber"]) as tracks,
+            Subscriber(STREAM, where["subscriber"], history=True) as tracks,
             Publisher(STREAM, where["publisher"], frame="world") as publisher,
         ):
             for seq in range(FRAMES):
@@ -63,7 +63,7 @@ def test_what_is_lost_is_named() -> None:
             for one in messages[first:last]:
                 sender.put(encode(one))
 
-        with Subscriber(STREAM, connection=receiving, queue=8) as tracks:
+        with Subscriber(STREAM, connection=receiving, queue=8, history=True) as tracks:
 
             def take(seq: int) -> None:
                 until(lambda: (one := tracks.receive(1.0)) is not None and one.tracks.seq == seq, f"frame {seq} comes")

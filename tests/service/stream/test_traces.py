@@ -244,7 +244,7 @@ def test_a_trace_goes_through_processes(collector: Collector, options: tuple[str
     with ServiceProcess(*options, environment=variables) as service:
         service.wait_ready()
         with (
-            Subscriber(SENSOR.stream, service.endpoint, timeout=60) as subscriber,
+            Subscriber(SENSOR.stream, service.endpoint, timeout=60, history=True) as subscriber,
             Publisher(SENSOR.stream, service.endpoint, frame="world") as publisher,
         ):
             with tracer.start_as_current_span("detect") as span:
@@ -278,7 +278,7 @@ def test_a_collector_that_fails_is_logged_and_harms_nothing(collector: Collector
     with ServiceProcess(environment=variables) as service:
         service.wait_ready()
         with (
-            Subscriber(SENSOR.stream, service.endpoint, timeout=60) as subscriber,
+            Subscriber(SENSOR.stream, service.endpoint, timeout=60, history=True) as subscriber,
             Publisher(SENSOR.stream, service.endpoint, frame="world") as publisher,
         ):
             publisher.publish(stamp_ns=1, label=["car"], center=[[0, 0, 1]], score=[0.9])
