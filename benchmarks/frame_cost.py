@@ -23,12 +23,12 @@ from typing import TYPE_CHECKING, Any
 import load
 import optipmb_schemas as schemas
 from optipmb_service.app.worker import warm_up
-from optipmb_service.stream import convert
-from optipmb_service.stream import stream as stream_module
-from optipmb_service.stream.checkpoint import encode_checkpoint
-from optipmb_service.stream.session import Session
-from optipmb_service.stream.stream import Stream
-from optipmb_service.stream.streams import Streams
+from optipmb_service.session import convert
+from optipmb_service.session.checkpoint import encode_checkpoint
+from optipmb_service.session.session import Session
+from optipmb_service.streams import stream as stream_module
+from optipmb_service.streams.stream import Stream
+from optipmb_service.streams.streams import Streams
 from optipmb_service.telemetry.logs import configure
 from optipmb_service.telemetry.metrics import Metrics
 from optipmb_service.telemetry.problem_reporter import ProblemReporter

@@ -14,6 +14,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args, get_origin
 
+from optipmb_service.session.problems import CODES
 from optipmb_service.settings import (
     FusedSettings,
     LimitSettings,
@@ -26,7 +27,6 @@ from optipmb_service.settings import (
     SiteSettings,
     ZoneSettings,
 )
-from optipmb_service.stream.problems import CODES
 from optipmb_service.telemetry.logs import EVENTS
 from optipmb_service.telemetry.metrics import METRICS, NAMESPACE
 

@@ -18,7 +18,8 @@ SOURCES = (".", "schemas", "service", "clients", "tests/support", "benchmarks", 
 """Folders that imports are looked up in."""
 WHOLE = {
     "optipmb": "tests/tracker/test_oracle.py",
-    "service/optipmb_service/stream": "tests/service/stream/test_recorded.py",
+    "service/optipmb_service/session": "tests/service/stream/test_recorded.py",
+    "service/optipmb_service/streams": "tests/service/stream/test_recorded.py",
 }
 """Tests that compare whole runs with what was computed otherwise or recorded: they are near to all of a folder."""
 SLOW = ("e2e", "docker")

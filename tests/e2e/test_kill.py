@@ -13,8 +13,8 @@ import pytest
 from fleet import Fleet
 from optipmb_client import Connection
 from optipmb_client.incoming import Inbox
+from optipmb_service.session.values import Policy
 from optipmb_service.settings import ZoneSettings
-from optipmb_service.stream.values import Policy
 from real_data import kitti_root
 from recorded import KEYS, Replay, kitti
 from sessions import undisturbed

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from optipmb_schemas import Keys, ResetRequest
-from optipmb_service.stream.checkpoint import DIGEST, HEAD, MAGIC, VERSION
+from optipmb_service.session.checkpoint import DIGEST, HEAD, MAGIC, VERSION
 from router import Node, Sensor, plain
 from service_process import ServiceProcess
 from takeovers import expected

@@ -17,7 +17,7 @@ from optipmb_schemas.ros2.arrays import CLOUD
 from optipmb_schemas.ros2.tracks import HORIZONS, TOPICS, TRACKED
 from optipmb_schemas.ros2.types import own_types
 from optipmb_service.app import cli
-from optipmb_service.ros2 import graph
+from optipmb_service.edges.ros2 import graph
 from optipmb_tools.datasets import DataSequence, open_dataset
 from optipmb_tools.run.profiles import read_profile
 from optipmb_tools.run.tracking import track_whole

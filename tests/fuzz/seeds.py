@@ -6,8 +6,8 @@ import numpy as np
 import optipmb_schemas as schemas
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
-from optipmb_service.stream.checkpoint import HEAD, encode_checkpoint
-from optipmb_service.stream.session import Session
+from optipmb_service.session.checkpoint import HEAD, encode_checkpoint
+from optipmb_service.session.session import Session
 from router import Sensor
 from sessions import chained, feed
 

@@ -9,12 +9,12 @@ import optipmb_schemas as schemas
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf.convert import transcode
-from optipmb_service.edge.readers import Pace
-from optipmb_service.grpc.selection import Selection
-from optipmb_service.stream.checkpoint import CheckpointError, decode_checkpoint, encode_checkpoint, seal
-from optipmb_service.stream.convert import density_of
-from optipmb_service.stream.session import Session
-from optipmb_service.stream.values import Incarnation, Policy
+from optipmb_service.edges.grpc.selection import Selection
+from optipmb_service.edges.readers import Pace
+from optipmb_service.session.checkpoint import CheckpointError, decode_checkpoint, encode_checkpoint, seal
+from optipmb_service.session.convert import density_of
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import Incarnation, Policy
 from router import Sensor
 
 LIMITS = schemas.Limits(max_bytes=2**16, max_json_bytes=2**16, max_values=2**12)

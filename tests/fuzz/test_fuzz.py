@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from optipmb_service.stream.checkpoint import decode_checkpoint
+from optipmb_service.session.checkpoint import decode_checkpoint
 
 FOLDER = Path(__file__).parent
 

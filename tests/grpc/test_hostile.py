@@ -15,7 +15,7 @@ import pytest
 from gateway import EPOCH, GatewayProcess, connected, detections, frame, points, resident
 from optipmb_schemas import Points
 from optipmb_schemas.protobuf import tracking_pb2 as pb
-from optipmb_service.grpc.calls import varint
+from optipmb_service.edges.grpc.calls import varint
 from service_process import ServiceProcess
 
 CONNECTIONS = 2_000

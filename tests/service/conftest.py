@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from optipmb_service.app.service import Service
 from optipmb_service.settings import load
-from optipmb_service.stream.profiles import Profiles
+from optipmb_service.streams.profiles import Profiles
 from router import Node
 from routers import free_endpoint
 

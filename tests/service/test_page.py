@@ -10,8 +10,8 @@ import optipmb_service
 import pytest
 from optipmb_schemas import Code
 from optipmb_service.app import cli
+from optipmb_service.session.problems import CODES
 from optipmb_service.settings import LimitSettings, Ros2Settings, Ros2Stream, Settings, SiteSettings, load
-from optipmb_service.stream.problems import CODES
 from optipmb_service.telemetry.logs import EVENTS
 from reference import docstrings, main, page
 

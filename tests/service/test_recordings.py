@@ -17,11 +17,11 @@ import optipmb_schemas as schemas
 import pytest
 from fusing import FUSED
 from optipmb_service.cluster.leases import Change, partition_of
-from optipmb_service.stream.checkpoint import decode_checkpoint, encode_checkpoint
-from optipmb_service.stream.profiles import Profiles
-from optipmb_service.stream.queries import StreamQueries
-from optipmb_service.stream.session import Session
-from optipmb_service.stream.values import Output, Policy, Quarantined, RefusedError, Tracked
+from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import Output, Policy, Quarantined, RefusedError, Tracked
+from optipmb_service.streams.profiles import Profiles
+from optipmb_service.streams.queries import StreamQueries
 from optipmb_service.zenoh.inputs import Packet
 from registries import Around, packet_of, streams_of
 from router import SECOND

@@ -5,7 +5,7 @@ import re
 
 import pytest
 import ros2_client  # noqa: F401 - tells the SDK not to look for git
-from optipmb_service.ros2 import graph
+from optipmb_service.edges.ros2 import graph
 from zenoh_ros2_sdk.attachment import Attachment
 from zenoh_ros2_sdk.entity import EndpointEntity, EntityKind, NodeEntity
 from zenoh_ros2_sdk.keyexpr import endpoint_liveliness_keyexpr, node_liveliness_keyexpr, topic_keyexpr

@@ -21,7 +21,7 @@ from typing import Any
 
 LARGEST = 1 << 18
 FILES = 3
-SERVICE = ("optipmb_service.app.cli", "optipmb_service.app.worker", "optipmb_service.http.page")
+SERVICE = ("optipmb_service.app.cli", "optipmb_service.app.worker", "optipmb_service.edges.http.page")
 TASKS = Path("/proc/self/task")
 
 

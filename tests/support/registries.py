@@ -5,10 +5,10 @@ from collections.abc import Callable
 from typing import Any, Self
 
 from optipmb_schemas import Detections, Keys, Points, encode, encoding_of
+from optipmb_service.session.checkpoint import Checkpoint
 from optipmb_service.settings import Settings
-from optipmb_service.stream.checkpoint import Checkpoint
-from optipmb_service.stream.profiles import Profiles
-from optipmb_service.stream.streams import Streams
+from optipmb_service.streams.profiles import Profiles
+from optipmb_service.streams.streams import Streams
 from optipmb_service.telemetry.metrics import Metrics
 from optipmb_service.telemetry.problem_reporter import ProblemReporter
 from optipmb_service.zenoh.inputs import Packet

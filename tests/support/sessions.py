@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 from optipmb_schemas import Detections, Events, Points, Problem, Tracks, encode
-from optipmb_service.stream.checkpoint import digest_of
-from optipmb_service.stream.session import Session
-from optipmb_service.stream.values import Begun, Output, Policy, Quarantined, Tracked, events_of
+from optipmb_service.session.checkpoint import digest_of
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import Begun, Output, Policy, Quarantined, Tracked, events_of
 from router import Sensor
 
 import optipmb

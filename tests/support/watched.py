@@ -25,8 +25,8 @@ from optipmb_schemas import (
     encode,
     encoding_of,
 )
-from optipmb_service.edge.readers import Publication
-from optipmb_service.http import Server, application
+from optipmb_service.edges.http import Server, application
+from optipmb_service.edges.readers import Publication
 from optipmb_service.settings import Settings
 
 KEYS = Keys()

@@ -149,7 +149,7 @@ def run_command(**given: Unpack[Options]) -> None:
     if settings.grpc:
         _needed("grpc", "grpc")
     if settings.traces:
-        _needed("optipmb_service.stream.traces", "traces")
+        _needed("optipmb_service.streams.traces", "traces")
     if settings.workers > 1:
         from optipmb_service.app.workers import supervise  # noqa: PLC0415 - a process that tracks needs none
 
@@ -224,7 +224,7 @@ def router_command(**given: Unpack[RouterOptions]) -> None:
 def grpc_command(**given: Unpack[GatewayOptions]) -> None:
     """Run a gRPC gateway alone, a client of routers. Prints one line, `ready …`; SIGINT and SIGTERM end it."""
     settings = _client(given, grpc=DEFAULT_GRPC)
-    _needed("optipmb_service.grpc.server", "grpc")
+    _needed("optipmb_service.edges.grpc.server", "grpc")
     leave_or_restart(asyncio.run(run_gateway(settings)))
 
 

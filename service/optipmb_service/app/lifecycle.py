@@ -333,7 +333,7 @@ def _monitoring(settings: Settings, health: ProcessHealth) -> Iterator[None]:
         return
     from optipmb_schemas.asyncapi import document  # noqa: PLC0415 - as above
 
-    from optipmb_service.http import Server, application  # noqa: PLC0415 - a third of a second that only this needs
+    from optipmb_service.edges.http import Server, application  # noqa: PLC0415 - a third of a second that only this needs
 
     endpoint = (*settings.connect, *settings.endpoints)[0]
     interface = functools.partial(document, settings.prefix, endpoint, settings.http)
@@ -356,7 +356,7 @@ def grpc_edge(settings: Settings, client: Client, metrics: Metrics) -> Iterator[
         yield ""
         return
     try:
-        from optipmb_service.grpc.server import serving  # noqa: PLC0415 - an extra that only this needs
+        from optipmb_service.edges.grpc.server import serving  # noqa: PLC0415 - an extra that only this needs
     except ModuleNotFoundError as error:
         raise ClientError(f"gRPC needs {error.name}, which is not installed: {install_command('grpc')}") from error
     with serving(settings, client) as server:

@@ -18,8 +18,8 @@ from optipmb_service.app import lifecycle
 from optipmb_service.app.lifecycle import say_ready, settle
 from optipmb_service.app.storage import nats_access
 from optipmb_service.cluster.message_log import LogMessage, LogWriter, MessageLog, Retention
-from optipmb_service.stream.kept_tracks import order_of
-from optipmb_service.stream.problems import problem_of
+from optipmb_service.session.problems import problem_of
+from optipmb_service.streams.kept_tracks import order_of
 from optipmb_service.telemetry.health import Reporter
 from optipmb_service.telemetry.metrics import LOG_METRICS, PROBLEM_METRICS
 from optipmb_service.telemetry.problem_reporter import ProblemReporter

@@ -33,7 +33,7 @@ from paho.mqtt.properties import Properties
 
 from optipmb_service.app import lifecycle
 from optipmb_service.app.lifecycle import places_of, say_ready, settle
-from optipmb_service.edge.readers import Bounds, Feeds, Reader, Text, Wish
+from optipmb_service.edges.readers import Bounds, Feeds, Reader, Text, Wish
 from optipmb_service.telemetry.health import Reporter
 from optipmb_service.telemetry.metrics import MQTT_METRICS
 
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     import ssl
 
     from optipmb_service.app.lifecycle import StopRequest
-    from optipmb_service.edge.readers import Publication
+    from optipmb_service.edges.readers import Publication
     from optipmb_service.settings import Settings
     from optipmb_service.telemetry.health import ProcessHealth
     from optipmb_service.zenoh.client import Client

@@ -19,9 +19,9 @@ from optipmb_schemas.ros2.tracks import TOPICS
 
 from optipmb_service.app import lifecycle
 from optipmb_service.app.lifecycle import say_ready, unless
-from optipmb_service.ros2 import graph
-from optipmb_service.ros2.bridge import DIAGNOSTICS, Bridge
-from optipmb_service.ros2.node import Ros2Node
+from optipmb_service.edges.ros2 import graph
+from optipmb_service.edges.ros2.bridge import DIAGNOSTICS, Bridge
+from optipmb_service.edges.ros2.node import Ros2Node
 from optipmb_service.telemetry.health import BEAT_S, STUCK_S, Reporter
 
 if TYPE_CHECKING:

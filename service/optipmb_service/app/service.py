@@ -22,13 +22,13 @@ from optipmb_service import __version__
 from optipmb_service.app.lifecycle import CLOSE_S, HANDOVER_S, LAST_S, Deadline, Steps
 from optipmb_service.app.storage import open_log, open_store
 from optipmb_service.cluster.member import Member
-from optipmb_service.stream.intake import Intake
-from optipmb_service.stream.kept_tracks import TrackQuery
-from optipmb_service.stream.persistence import DAY_S, CheckpointWriter
-from optipmb_service.stream.problems import problem_of
-from optipmb_service.stream.queries import ServiceQueries, StreamQueries, members_of
-from optipmb_service.stream.streams import Scheduler, Streams
-from optipmb_service.stream.values import SECOND
+from optipmb_service.session.problems import problem_of
+from optipmb_service.session.values import SECOND
+from optipmb_service.streams.intake import Intake
+from optipmb_service.streams.kept_tracks import TrackQuery
+from optipmb_service.streams.persistence import DAY_S, CheckpointWriter
+from optipmb_service.streams.queries import ServiceQueries, StreamQueries, members_of
+from optipmb_service.streams.streams import Scheduler, Streams
 from optipmb_service.telemetry.health import Reporter
 from optipmb_service.telemetry.metrics import (
     NETWORK_METRICS,
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from optipmb_client.zenoh.session import KeyNumbers
 
     from optipmb_service.settings import Settings
-    from optipmb_service.stream.profiles import Profiles
+    from optipmb_service.streams.profiles import Profiles
     from optipmb_service.zenoh.client import Client
 
 log = structlog.get_logger("optipmb_service")
@@ -107,7 +107,7 @@ class Service(Reporter):
         self._log = open_log(settings)
         self._traces: Traces | None = None
         if settings.traces:
-            from optipmb_service.stream.traces import Traces  # noqa: PLC0415 - an extra that only this needs
+            from optipmb_service.streams.traces import Traces  # noqa: PLC0415 - an extra that only this needs
 
             self._traces = Traces(settings.instance)
         self._streams = Streams(

@@ -28,7 +28,7 @@ from optipmb_service.app import lifecycle
 from optipmb_service.app.lifecycle import grpc_edge, leave, say_ready, settle, unless, watch_keys
 from optipmb_service.app.service import Service
 from optipmb_service.settings import Settings
-from optipmb_service.stream.profiles import Profiles
+from optipmb_service.streams.profiles import Profiles
 from optipmb_service.telemetry import logs
 
 if TYPE_CHECKING:

@@ -33,8 +33,8 @@ from optipmb_service import __version__
 from optipmb_service.app import lifecycle
 from optipmb_service.app.lifecycle import LATE_S, RESTART, SLICE_S, grpc_edge, say_ready, unless, watch_keys
 from optipmb_service.cluster.leases import ALIVE, instance_of
-from optipmb_service.stream.profiles import Fusion
-from optipmb_service.stream.queries import TEXT, UNDRAINED, drain_asked, guarded, move_asked
+from optipmb_service.streams.profiles import Fusion
+from optipmb_service.streams.queries import TEXT, UNDRAINED, drain_asked, guarded, move_asked
 from optipmb_service.telemetry.health import BEAT_S, Reporter
 from optipmb_service.telemetry.metrics import NETWORK_METRICS
 from optipmb_service.zenoh.transport import Transport

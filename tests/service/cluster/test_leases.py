@@ -20,7 +20,7 @@ from optipmb_service.cluster.leases import LEFT_AT_ONCE, PARTITIONS, Change, par
 from optipmb_service.cluster.member import Member
 from optipmb_service.cluster.sqlite import SqliteStore
 from optipmb_service.cluster.store import ENDED, Fenced, LeaseStore, Record, StoreError, Write
-from optipmb_service.stream.persistence import CheckpointWriter
+from optipmb_service.streams.persistence import CheckpointWriter
 from router import until
 from structlog.testing import capture_logs
 

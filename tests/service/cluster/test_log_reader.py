@@ -13,11 +13,11 @@ from optipmb_schemas import Keys
 from optipmb_service.cluster import message_log
 from optipmb_service.cluster.message_log import LogMessage, LogReader, MessageLog, Retention
 from optipmb_service.cluster.store import Missed, Position
-from optipmb_service.stream.checkpoint import forgotten
-from optipmb_service.stream.profiles import Fusion
-from optipmb_service.stream.recovery import Log
-from optipmb_service.stream.session import Session
-from optipmb_service.stream.values import Policy
+from optipmb_service.session.checkpoint import forgotten
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import Policy
+from optipmb_service.streams.profiles import Fusion
+from optipmb_service.streams.recovery import Log
 from optipmb_service.zenoh.inputs import Packet
 from router import until
 

@@ -20,9 +20,9 @@ import pytest
 from optipmb_client.errors import ClientError
 from optipmb_schemas import Keys, ServiceStatus
 from optipmb_service.app.health_command import ask
-from optipmb_service.edge.readers import BURST
-from optipmb_service.http import Server, application
-from optipmb_service.http.server import CONNECTIONS, REQUESTS
+from optipmb_service.edges.http import Server, application
+from optipmb_service.edges.http.server import CONNECTIONS, REQUESTS
+from optipmb_service.edges.readers import BURST
 from optipmb_service.settings import Settings
 from optipmb_service.telemetry.metrics import NAMESPACE, SERVICE_METRICS
 from prometheus_client.parser import text_string_to_metric_families

@@ -12,9 +12,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from optipmb_schemas import Detections, Pose, Tracks, encode_json
-from optipmb_service.edge.readers import Publication
-from optipmb_service.http import application, page
-from optipmb_service.http.page import Live, live_frame
+from optipmb_service.edges.http import application, page
+from optipmb_service.edges.http.page import Live, live_frame
+from optipmb_service.edges.readers import Publication
 from optipmb_service.settings import Settings
 from optipmb_service.zenoh import client
 from readers import texts

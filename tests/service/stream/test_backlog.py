@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_service.stream.backlog import UNASKED_NS, UNLIMITED, Backlog, Bounds, ByteBudget
-from optipmb_service.stream.values import SECOND
+from optipmb_service.session.values import SECOND
+from optipmb_service.streams.backlog import UNASKED_NS, UNLIMITED, Backlog, Bounds, ByteBudget
 from optipmb_service.zenoh.inputs import PACKET_BYTES, Packet
 
 TOPICS = {True: "detections", False: "points"}

@@ -12,7 +12,7 @@ import optipmb_schemas as schemas
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_service.stream.checkpoint import (
+from optipmb_service.session.checkpoint import (
     DIGEST,
     HEAD,
     MAGIC,
@@ -25,8 +25,8 @@ from optipmb_service.stream.checkpoint import (
     seal,
     state_bytes,
 )
-from optipmb_service.stream.session import Session
-from optipmb_service.stream.values import Incarnation, Policy
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import Incarnation, Policy
 from router import SECOND, Sensor
 from sessions import Merged, chained, feed, problems, tracks
 

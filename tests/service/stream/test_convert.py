@@ -8,7 +8,7 @@ import optipmb_schemas as schemas
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from optipmb_service.stream import convert
+from optipmb_service.session import convert
 
 import optipmb
 

@@ -1,7 +1,7 @@
 """Which streams a discoverer announces that have no session."""
 
-from optipmb_service.stream.directory import BACK_NS, MAX_UNPROVEN_ANNOUNCED, QUEUED_NS, UNPROVEN_NS, StreamDirectory
-from optipmb_service.stream.values import SECOND
+from optipmb_service.session.values import SECOND
+from optipmb_service.streams.directory import BACK_NS, MAX_UNPROVEN_ANNOUNCED, QUEUED_NS, UNPROVEN_NS, StreamDirectory
 
 IDLE_NS = 600 * SECOND
 

@@ -18,9 +18,9 @@ from optipmb_service.app.storage import STORE_FILE
 from optipmb_service.cluster.leases import ALIVE, member_key
 from optipmb_service.cluster.sqlite import SqliteStore
 from optipmb_service.cluster.store import Fenced, StoreError, Write
-from optipmb_service.stream.persistence import CheckpointWriter
-from optipmb_service.stream.session import Session
-from optipmb_service.stream.stream import Stream
+from optipmb_service.session.session import Session
+from optipmb_service.streams.persistence import CheckpointWriter
+from optipmb_service.streams.stream import Stream
 from router import Node, Sensor, plain, until
 
 import optipmb

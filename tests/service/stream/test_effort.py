@@ -3,7 +3,7 @@
 from functools import partial
 
 import numpy as np
-from optipmb_service.stream.session import Session
+from optipmb_service.session.session import Session
 from router import Sensor
 from sessions import begun, feed, problems, tracks
 

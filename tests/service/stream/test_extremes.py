@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from optipmb_service.stream import convert
-from optipmb_service.stream.checkpoint import Checkpoint, decode_checkpoint, encode_checkpoint
-from optipmb_service.stream.session import Session
-from optipmb_service.stream.timeline import FrameId
+from optipmb_service.session import convert
+from optipmb_service.session.checkpoint import Checkpoint, decode_checkpoint, encode_checkpoint
+from optipmb_service.session.session import Session
+from optipmb_service.session.timeline import FrameId
 from router import Sensor
 from sessions import feed, tracks
 

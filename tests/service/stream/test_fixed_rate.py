@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import optipmb_service.stream.stream as module
+import optipmb_service.streams.stream as module
 import pytest
 from fusing import FRONT, FUSED, REAR
 from optipmb_schemas import Detections, Problem, Tracks, decode
+from optipmb_service.session.checkpoint import encode_checkpoint
 from optipmb_service.settings import SettingsInvalidError, load
-from optipmb_service.stream.checkpoint import encode_checkpoint
-from optipmb_service.stream.profiles import Profiles
-from optipmb_service.stream.stream import Stream
+from optipmb_service.streams.profiles import Profiles
+from optipmb_service.streams.stream import Stream
 from registries import Around, packet_of, streams_of
 from router import SECOND, Sensor
 

@@ -6,9 +6,9 @@ import numpy as np
 import optipmb_schemas as schemas
 from hypothesis import example, given
 from hypothesis import strategies as st
-from optipmb_service.stream.convert import tracks_of
-from optipmb_service.stream.timeline import FrameId
-from optipmb_service.stream.values import Tracked
+from optipmb_service.session.convert import tracks_of
+from optipmb_service.session.timeline import FrameId
+from optipmb_service.session.values import Tracked
 
 import optipmb
 

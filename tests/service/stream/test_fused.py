@@ -10,9 +10,9 @@ from fusing import FRONT, FUSED, REAR, SIDE, drive
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_schemas import Detections, Pose
-from optipmb_service.stream.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
-from optipmb_service.stream.session import Session
-from optipmb_service.stream.values import MAX_SENSORS, Policy
+from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import MAX_SENSORS, Policy
 from router import SECOND, Sensor
 from sessions import Failing, Merged, begun, chained, delayed, feed, problems, tracks
 
@@ -380,7 +380,7 @@ def test_a_session_that_was_closed_takes_any_clock(close: bool) -> None:  # noqa
     one = fused()
     given_to(one, IN_ORDER)
     if close:
-        from optipmb_service.stream.checkpoint import forgotten  # noqa: PLC0415 - of the closing alone
+        from optipmb_service.session.checkpoint import forgotten  # noqa: PLC0415 - of the closing alone
 
         one.reset()
         one = Session.restore(forgotten(one.snapshot()), 0, tracker=chained)

@@ -8,17 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import optipmb_service.stream.arrivals
-import optipmb_service.stream.directory
+import optipmb_service.session.arrivals
+import optipmb_service.streams.directory
 import pytest
 from fusing import FRONT, FUSED, REAR, drive
 from optipmb_schemas import Detections, Keys, SessionParameters, SessionState, Tracks, decode
 from optipmb_service.cluster.leases import partition_of
+from optipmb_service.session.checkpoint import digest_of
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import SECOND, Policy
 from optipmb_service.settings import SettingsInvalidError, load
-from optipmb_service.stream.checkpoint import digest_of
-from optipmb_service.stream.profiles import Fusion
-from optipmb_service.stream.session import Session
-from optipmb_service.stream.values import SECOND, Policy
+from optipmb_service.streams.profiles import Fusion
 from router import Node, Sensor, until
 from sessions import Merged, tracks
 
@@ -112,8 +112,8 @@ def test_a_sensor_that_is_heard_of_after_the_session_began_loses_no_frame(
     start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """While its token may be on its way, what a cache holds of another sensor goes no second ahead of its frames."""
-    monkeypatch.setattr(optipmb_service.stream.directory, "BACK_NS", 0)
-    monkeypatch.setattr(optipmb_service.stream.arrivals, "BACK_NS", 600 * SECOND)
+    monkeypatch.setattr(optipmb_service.streams.directory, "BACK_NS", 0)
+    monkeypatch.setattr(optipmb_service.session.arrivals, "BACK_NS", 600 * SECOND)
     frames = drive(40)
     service, endpoint = start(fuse=["site/node/*"], recovery_wait_s=60)
     with Node(endpoint) as node:
@@ -130,7 +130,7 @@ def test_a_sensor_that_is_heard_of_after_the_session_began_loses_no_frame(
         until(lambda: heard_of(REAR.stream) and reached(1), "the rear sensor is heard of")
         node.send(*(one for one in frames if one.stream == FRONT.stream))
         until(lambda: heard_of(FRONT.stream, REAR.stream), "the front sensor is heard of")
-        monkeypatch.setattr(optipmb_service.stream.arrivals, "BACK_NS", 0)
+        monkeypatch.setattr(optipmb_service.session.arrivals, "BACK_NS", 0)
         until(lambda: reached(80), "all are tracked")
         state = node.ask(KEYS.query(FUSED, "state"), SessionState)
     assert (state.digest, state.late, state.gaps) == (undisturbed(frames)[1], 0, 0)

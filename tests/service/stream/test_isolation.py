@@ -26,11 +26,11 @@ from optipmb_service.app.storage import STORE_FILE
 from optipmb_service.cluster.leases import PARTITIONS
 from optipmb_service.cluster.member import Member
 from optipmb_service.cluster.sqlite import SqliteStore
+from optipmb_service.session.session import Session
 from optipmb_service.settings import LimitSettings
-from optipmb_service.stream import persistence, queries
-from optipmb_service.stream.backlog import Backlog
-from optipmb_service.stream.persistence import CheckpointWriter
-from optipmb_service.stream.session import Session
+from optipmb_service.streams import persistence, queries
+from optipmb_service.streams.backlog import Backlog
+from optipmb_service.streams.persistence import CheckpointWriter
 from optipmb_service.telemetry.health import ProcessHealth
 from optipmb_service.telemetry.metrics import Metrics
 from optipmb_service.telemetry.stream_meter import MAX_COUNT
@@ -416,7 +416,7 @@ def test_the_first_frames_of_many_new_streams_wait_for_room(
 ) -> None:
     """Three times as many streams as may be new at once begin while a step does not end: each is tracked afterwards."""
     gated, most = Gated(), 16
-    monkeypatch.setattr("optipmb_service.stream.streams.MAX_UNPROVEN", most)
+    monkeypatch.setattr("optipmb_service.streams.streams.MAX_UNPROVEN", most)
 
     service, _ = start(tracker=gated.tracker)
     streams = service._streams

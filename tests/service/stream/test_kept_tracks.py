@@ -14,8 +14,8 @@ from commands import run_here
 from fake_service import tracks_of
 from optipmb_client import Connection, ServiceRefused, ServiceUnavailable, kept_tracks
 from optipmb_schemas import Keys, Limits, Tracks, TracksRequest, decode, encode, encoding_of
-from optipmb_service.stream import kept_tracks as service_tracks
-from optipmb_service.stream.kept_tracks import LATE_NS, TracksRange
+from optipmb_service.streams import kept_tracks as service_tracks
+from optipmb_service.streams.kept_tracks import LATE_NS, TracksRange
 from optipmb_tools.table_files import read_table
 from router import Node, Sensor, plain, until
 from routers import free_endpoint, open_client, open_router

@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from optipmb_service.stream.checkpoint import Checkpoint
+from optipmb_service.session.checkpoint import Checkpoint
 from registries import Around, packet_of, streams_of
 from router import Sensor
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import optipmb_schemas as schemas
 import pytest
-from optipmb_service.stream.backlog import MEGABYTE
-from optipmb_service.stream.session import Session
-from optipmb_service.stream.state import size_of
+from optipmb_service.session.session import Session
+from optipmb_service.session.state import size_of
+from optipmb_service.streams.backlog import MEGABYTE
 from optipmb_service.zenoh.transport import TRACKS_CACHE
 from registries import Around, streams_of
 from router import Node, Sensor

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import optipmb_schemas as schemas
 import pytest
-from optipmb_service.stream.checkpoint import decode_checkpoint, encode_checkpoint
-from optipmb_service.stream.session import Session
-from optipmb_service.stream.values import Tracked
+from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import Tracked
 from router import Sensor
 from sessions import Merged, feed, tracks
 

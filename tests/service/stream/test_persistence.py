@@ -7,9 +7,9 @@ from dataclasses import replace
 from lease_log import Alone
 from optipmb_service.cluster.sqlite import SqliteStore
 from optipmb_service.cluster.store import Fenced, StoreError
-from optipmb_service.stream.checkpoint import Checkpoint
-from optipmb_service.stream.persistence import CheckpointWriter
-from optipmb_service.stream.session import Session
+from optipmb_service.session.checkpoint import Checkpoint
+from optipmb_service.session.session import Session
+from optipmb_service.streams.persistence import CheckpointWriter
 from router import Sensor, until
 
 import optipmb

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from optipmb_client.errors import UsageError
-from optipmb_service.stream.checkpoint import decode_checkpoint, encode_checkpoint
-from optipmb_service.stream.persistence import DUMPS, MAX_DUMPS, save_dump
-from optipmb_service.stream.session import Session
-from optipmb_service.stream.values import Policy
+from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import Policy
+from optipmb_service.streams.persistence import DUMPS, MAX_DUMPS, save_dump
 from optipmb_tools.cli import run
 from optipmb_tools.run import dumps as client
 from router import Sensor

@@ -7,9 +7,9 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 from optipmb_schemas import Keys
+from optipmb_service.session.values import Incarnation
 from optipmb_service.settings import Settings
-from optipmb_service.stream.admission import Admission, victim_of
-from optipmb_service.stream.values import Incarnation
+from optipmb_service.streams.admission import Admission, victim_of
 from optipmb_service.telemetry.stream_meter import StreamMeter
 from router import SECOND, Node, Sensor, until
 

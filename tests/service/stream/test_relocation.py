@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from fusing import FUSED
 from optipmb_schemas import Detections, FieldOfView, Pose, Relocation, Tracks, decode, encode
-from optipmb_service.stream.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
-from optipmb_service.stream.session import Session
-from optipmb_service.stream.values import Output, Policy, Tracked
+from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import Output, Policy, Tracked
 from real_data import kitti_root
 from recorded import recording
 from router import SECOND, Sensor

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import sessions
 from optipmb_schemas import PATHS
-from optipmb_service.stream.checkpoint import decode_checkpoint, encode_checkpoint
-from optipmb_service.stream.session import Session
-from optipmb_service.stream.values import Incarnation, Output, Policy, RefusedError
+from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import Incarnation, Output, Policy, RefusedError
 from router import SECOND, Sensor, plain
 from sessions import begun, problems, tracks
 

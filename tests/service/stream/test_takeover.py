@@ -6,7 +6,7 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_service.cluster.leases import Change, partition_of
-from optipmb_service.stream.checkpoint import Checkpoint
+from optipmb_service.session.checkpoint import Checkpoint
 from registries import Around, packet_of, streams_of
 from router import Sensor
 

@@ -19,8 +19,8 @@ from opentelemetry.trace import SpanContext
 from optipmb_client import Publisher, Subscriber
 from optipmb_client.trace_context import attached, attachment_of
 from optipmb_schemas import Detections, Points, Tracks, decode
-from optipmb_service.stream.checkpoint import encode_checkpoint
-from optipmb_service.stream.traces import Traces
+from optipmb_service.session.checkpoint import encode_checkpoint
+from optipmb_service.streams.traces import Traces
 from registries import Around, packet_of, streams_of
 from router import Sensor, plain, until
 from service_process import ServiceProcess

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from optipmb_client.merging import FinalEvents
 from optipmb_schemas import Events, Problem, decode
+from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import Output, Policy, Tracked
 from optipmb_service.settings import SettingsInvalidError, SiteSettings, ZoneSettings, load
-from optipmb_service.stream.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
-from optipmb_service.stream.profiles import Profiles
-from optipmb_service.stream.session import Session
-from optipmb_service.stream.streams import Streams
-from optipmb_service.stream.values import Output, Policy, Tracked
+from optipmb_service.streams.profiles import Profiles
+from optipmb_service.streams.streams import Streams
 from registries import Around, packet_of, streams_of
 from router import SECOND, Sensor
 from sessions import feed

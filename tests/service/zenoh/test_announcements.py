@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 from optipmb_schemas import Keys
-from optipmb_service.stream.directory import StreamDirectory
+from optipmb_service.streams.directory import StreamDirectory
 from optipmb_service.zenoh.transport import ANNOUNCED, Announcements
 
 KEYS = Keys()

@@ -34,9 +34,9 @@ from optipmb_schemas import (
     encoding_of,
 )
 from optipmb_service.app.workers import QUERIES
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import Tracked
 from optipmb_service.settings import load
-from optipmb_service.stream.session import Session
-from optipmb_service.stream.values import Tracked
 from optipmb_service.zenoh.transport import Transport
 from router import Node, Sensor, plain, until
 from routers import free_endpoint, open_router

@@ -10,8 +10,8 @@ import optipmb_service.zenoh.transport
 import pytest
 from optipmb_schemas import Keys, Problem, SessionState, decode
 from optipmb_service.settings import Settings
-from optipmb_service.stream import queries
-from optipmb_service.stream.queries import ServiceQueries, StreamQueries
+from optipmb_service.streams import queries
+from optipmb_service.streams.queries import ServiceQueries, StreamQueries
 from optipmb_service.zenoh.inputs import Packet
 from optipmb_service.zenoh.transport import Transport
 from registries import Around, packet_of, streams_of

@@ -1,0 +1,432 @@
+"""JSON over HTTP: the newest tracks and counts by GET, all of them as server-sent events and over a WebSocket.
+
+Readers share subscriptions and are counted here, apart from other requests. One that is too slow gets the newest frame
+of each stream. Events are kept for a while, for slow readers and for those who come again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from dataclasses import replace
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Protocol
+
+import msgspec
+import optipmb_schemas as schemas
+from msgspec import Meta, Struct
+from optipmb_client.errors import ConnectionFailed as TransportError
+from optipmb_schemas.json_form import FIELDS, Selection
+from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.routing import Route, WebSocketRoute
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from optipmb_service.edges.access import ANYBODY, Caller, NotAllowedError, name_by, token_names
+from optipmb_service.edges.readers import Feeds, Reader, Wish, listed
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable, Iterable, Mapping, Sequence
+
+    from optipmb_schemas.json_form import Place
+    from starlette.requests import HTTPConnection, Request
+    from starlette.types import Receive, Scope, Send
+
+    from optipmb_service.edges.readers import Logs, Publication
+    from optipmb_service.settings import Settings
+    from optipmb_service.telemetry.health import ProcessHealth
+
+POLL_S: Final = 0.1  # a reader hears so soon that the service ends
+KEEP_ALIVE_S: Final = 5.0  # period of signs of life of a silent stream, for proxies in between
+EVENT_STREAM: Final = "text/event-stream"
+PROTOCOL: Final = "optipmb.v1"  # subprotocol of the WebSocket
+BEARER: Final = "bearer."  # a second subprotocol with the token of a browser, which can set no header
+NAMES: Final = 256
+RECENT: Final = 32  # newest messages of events, of more than a second, among which one has counts
+TRY_AGAIN, MALFORMED = 1013, 1008  # why a WebSocket was closed
+STREAMING: Final = {"cache-control": "no-store, no-transform", "x-accel-buffering": "no"}  # for proxies
+HEADERS: Final = {"cache-control": "no-store", "x-content-type-options": "nosniff", "referrer-policy": "no-referrer"}
+
+
+class NoTokenError(Exception):
+    """The token is missing or not valid."""
+
+
+class NoRoomError(Exception):
+    """There are as many readers as there may be."""
+
+
+STATUS: Final[dict[type[Exception], HTTPStatus]] = {
+    schemas.MessageError: HTTPStatus.BAD_REQUEST,
+    NoTokenError: HTTPStatus.UNAUTHORIZED,
+    NotAllowedError: HTTPStatus.FORBIDDEN,
+    NoRoomError: HTTPStatus.SERVICE_UNAVAILABLE,
+    TransportError: HTTPStatus.SERVICE_UNAVAILABLE,
+}
+
+
+async def refuse(connection: HTTPConnection, error: Exception) -> Response | None:
+    """Answer what cannot be answered otherwise: with the status of the error, its text and its path."""
+    status = next(status for kind, status in STATUS.items() if isinstance(error, kind))
+    body = {"error": str(error), "path": getattr(error, "path", "")}
+    headers = HEADERS | ({"www-authenticate": "Bearer"} if status == HTTPStatus.UNAUTHORIZED else {})
+    response = JSONResponse(body, status, headers)
+    if not isinstance(connection, WebSocket):
+        return response
+    await connection.send_denial_response(response)
+    return None
+
+
+class Source(Protocol):
+    """Queue of a reader."""
+
+    def receive(self, one: Publication) -> None:
+        """Take a message, on any thread."""
+
+    def read(self, logs: list[Logs]) -> str:
+        """Read events from these logs, and return the id after which it begins."""
+
+    async def take(self, seconds: float | None = None) -> tuple[bytes, str]:
+        """Return the next text, and its id if it is an event. Raises TimeoutError."""
+
+
+class Readers:
+    """Those who read now, by any path: a bounded number, with rights by their tokens.
+
+    Args:
+        health: of the process.
+        settings: of the process.
+        places: of sites.
+    """
+
+    def __init__(self, health: ProcessHealth, settings: Settings, places: Mapping[str, Place]) -> None:
+        self.keys = schemas.Keys(settings.prefix)
+        self._health = health
+        self._places = places
+        self._most = settings.http_clients
+        self._names = token_names("http_tokens", settings.http_tokens) if settings.http_tokens else None
+        self._reads = settings.readable_by
+        self.stale_s = settings.stale_s
+        self.count = 0
+        self._feeds: Feeds | None = None
+
+    def feeds(self) -> Feeds:
+        """Return the subscriptions.
+
+        Raises:
+            TransportError: there is no session yet.
+        """
+        session = self._health.session()
+        if session is None:
+            raise TransportError(f"the service is {self._health.state()}")
+        if self._feeds is None or self._feeds.session is not session:
+            self._feeds = Feeds(session, self._places)
+        return self._feeds
+
+    async def caller(self, connection: HTTPConnection) -> Caller:
+        """Return who asks.
+
+        Raises:
+            NoTokenError: the token is missing or not valid.
+        """
+        if self._names is None:
+            return Caller(ANYBODY)
+        metadata = dict(connection.headers)
+        for one in connection.scope.get("subprotocols", ()):
+            if one.startswith(BEARER):
+                metadata["authorization"] = f"Bearer {one[len(BEARER) :]}"
+        if not (name := await name_by(self._names, metadata)):
+            raise NoTokenError("the token is missing or not valid")
+        return Caller(name, self._reads(name))
+
+    def enter(self) -> Callable[[], None]:
+        """Count a reader until the result is called.
+
+        Raises:
+            NoRoomError: there are too many.
+        """
+        if self.count >= self._most:
+            raise NoRoomError(f"{self._most} readers are here already")
+        self.count += 1  # before anything is awaited: those who come together are counted one by one
+
+        def leave() -> None:
+            self.count -= 1
+
+        return leave
+
+    @contextlib.asynccontextmanager
+    async def joined(self, keys: Sequence[str], source: Source) -> AsyncIterator[str]:
+        """Hand over the publications of keys meanwhile; gives the id after which the reader of events begins.
+
+        Raises:
+            TransportError: the network cannot be used, or too many keys were asked for.
+        """
+        loop, feeds = asyncio.get_running_loop(), self.feeds()
+        joining = loop.run_in_executor(None, feeds.join, keys, source.receive)
+        try:
+            leave = await asyncio.shield(joining)
+        except asyncio.CancelledError:
+            joining.add_done_callback(_undo)  # the reader has gone; the thread subscribes all the same
+            raise
+        try:
+            yield source.read(feeds.logs(keys))
+        finally:
+            loop.run_in_executor(None, leave)  # not awaited: the reader's task may be cancelled
+
+    async def stream(
+        self,
+        request: Request,
+        keys: Sequence[str],
+        source: Callable[[], Source],
+        headers: Mapping[str, str],
+        pause_s: float = 0.0,
+    ) -> Response:
+        """Return an answer with the texts of a reader as server-sent events.
+
+        Raises:
+            NoRoomError: there are too many readers.
+            TransportError: the network cannot be used, or too many keys were asked for.
+        """
+        headers = {**headers, **STREAMING}
+        if request.method == "HEAD":
+            return Response(headers=headers, media_type=EVENT_STREAM)
+        async with contextlib.AsyncExitStack() as ended:
+            ended.callback(self.enter())
+            reader = source()
+            begins = await ended.enter_async_context(self.joined(keys, reader))
+            return _Stream(self._lines(reader, begins, pause_s), ended.pop_all(), headers)
+
+    async def _lines(self, reader: Source, begins: str, pause_s: float) -> AsyncIterator[bytes]:
+        heard = time.monotonic()
+        # The headers go with the first piece: the reader knows that it is connected.
+        yield b": hello\n%b\n" % (f"id: {begins}\n".encode() if begins else b"")
+        while self._health.state() != "stopping":
+            try:
+                text, event_id = await reader.take(POLL_S)
+            except TimeoutError:
+                if time.monotonic() - heard > KEEP_ALIVE_S:
+                    heard = time.monotonic()
+                    yield b": silent\n\n"
+                continue
+            heard = time.monotonic()
+            yield b"%bdata: %b\n\n" % (f"id: {event_id}\n".encode() if event_id else b"", text)
+            await asyncio.sleep(pause_s)
+
+
+class _Stream(StreamingResponse):
+    """Server-sent events for one reader; closes `ended` when they end, however they do."""
+
+    def __init__(
+        self, lines: AsyncIterator[bytes], ended: contextlib.AsyncExitStack, headers: Mapping[str, str]
+    ) -> None:
+        super().__init__(lines, media_type=EVENT_STREAM, headers=headers)
+        self._ended = ended
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        async with self._ended:
+            await super().__call__(scope, receive, send)
+
+
+def _undo(joining: asyncio.Future[Callable[[], None]]) -> None:
+    """Withdraw the subscriptions of a reader that has gone."""
+    if not joining.cancelled() and joining.exception() is None:
+        with contextlib.suppress(RuntimeError):  # the server ends, and so do its threads
+            joining.get_loop().run_in_executor(None, joining.result())
+
+
+Names = Annotated[frozenset[str], Meta(max_length=NAMES)]
+
+
+class _Asked(Struct, frozen=True):
+    """Parameters of all paths and of `subscribe`."""
+
+    stream: str
+    topics: frozenset[Literal["tracks", "events", "zones", "problems"]] = frozenset({"tracks"})
+    classes: Names = frozenset()
+    confirmed: bool = True
+    min_existence: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    max_rate_hz: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
+    fields: Names = frozenset()
+    events: Literal["final", "now"] = "final"
+    predict: bool = False
+    after: str = ""
+
+
+PARAMETERS: Final = _Asked.__struct_fields__
+SELECTION: Final = frozenset({"stream", "classes", "confirmed", "min_existence", "fields", "predict"})
+
+
+class _Incoming(Struct, forbid_unknown_fields=True):
+    """A message of a WebSocket's client."""
+
+    subscribe: dict[str, Any]
+
+
+def parameters_of(connection: HTTPConnection, known: Iterable[str]) -> dict[str, str]:
+    """Return the parameters of a request.
+
+    Raises:
+        MessageError: one is not known, or given twice; with its name as path.
+    """
+    pairs, names = connection.query_params.multi_items(), sorted(known)
+    found = dict(pairs)
+    for name in found:
+        if name not in names:
+            raise schemas.MessageError("invalid_value", name, f"one of {', '.join(names)}", "another parameter")
+        if (count := sum(each == name for each, _ in pairs)) > 1:
+            raise schemas.MessageError("invalid_value", name, "one value, with commas for several", f"{count} of them")
+    return found
+
+
+def wish_of(parameters: Mapping[str, Any]) -> Wish:
+    """Return what a reader asks for.
+
+    Raises:
+        MessageError: a parameter is wrong; with its name as path.
+    """
+    lists = {"topics", "classes", "fields"}
+    values = {
+        name: value.split(",") if name in lists and isinstance(value, str) else value
+        for name, value in parameters.items()
+    }
+    for name in values.keys() - set(PARAMETERS):
+        raise schemas.MessageError("invalid_value", name, f"one of {', '.join(PARAMETERS)}", "another parameter")
+    if "stream" not in values:
+        raise schemas.MessageError("missing_field", "stream", "a pattern, as garage/*/*", "nothing")
+    for name in lists & values.keys():
+        if isinstance(values[name], list) and not all(values[name]):
+            raise schemas.MessageError("invalid_value", name, "names; leave it out for the default", "an empty name")
+    try:
+        asked = msgspec.convert(values, _Asked, strict=False)
+    except msgspec.ValidationError as error:
+        expected, _, path = str(error).rpartition(" - at `$.")
+        path = path.rstrip("`")
+        name = path.partition("[")[0]
+        received = ascii(values[name])[:80]
+        path = name if isinstance(parameters[name], str) else path  # as it was written: with commas, or as a list
+        raise schemas.MessageError("invalid_value", path, expected.removeprefix("Expected "), received) from None
+    if wrong := asked.fields - FIELDS:
+        raise schemas.MessageError("invalid_value", "fields", f"of {', '.join(sorted(FIELDS))}", ascii(min(wrong))[:80])
+    selection = Selection(asked.classes, asked.confirmed, asked.min_existence, asked.fields)
+    rate, final = asked.max_rate_hz, asked.events == "final"
+    return Wish((asked.stream,), asked.topics, selection, rate, final, asked.predict, asked.after)
+
+
+class Api:
+    """Routes below `/api/v1`."""
+
+    def __init__(self, readers: Readers) -> None:
+        self._readers = readers
+
+    def routes(self) -> list[Route | WebSocketRoute]:
+        answers = {"streams": self.streams, "tracks": self.tracks, "zones": self.zones, "stream": self.stream}
+        gets = [Route(f"/api/v1/{name}", answer) for name, answer in answers.items()]
+        return [*gets, WebSocketRoute("/api/v1/ws", self.socket)]
+
+    async def streams(self, request: Request) -> Response:
+        """Answer with the sessions of a pattern, or of all streams that the caller may read."""
+        caller = await self._readers.caller(request)
+        pattern = parameters_of(request, ["stream"]).get("stream", caller.pattern)
+        Wish((pattern,), frozenset({"tracks"})).keys(self._readers.keys)
+        caller.may_read(pattern)
+        found = await listed(self._readers.feeds().session, self._readers.keys, pattern)
+        texts = [b'{"instance":"%b",%b' % (name.encode(), schemas.encode_json(one)[1:]) for name, one in found]
+        return _array(texts)
+
+    async def tracks(self, request: Request) -> Response:
+        """Answer with the newest frame of each stream."""
+        _, wish = await self._asked(request, SELECTION)
+        if wish.predict:
+            raise schemas.MessageError("invalid_value", "predict", "0 here: `stream` and `ws` predict", "1")
+        (key,) = wish.keys(self._readers.keys)
+        return _array([one.tracks(wish.selection, self._readers.stale_s) for one in await self._newest(key)])
+
+    async def zones(self, request: Request) -> Response:
+        """Answer with the newest counts of the zones of each stream."""
+        _, wish = await self._asked(request, ["stream"])
+        key = self._readers.keys.matching(wish.streams[0], "events")
+        newest = await self._newest(key, RECENT, lambda one: one.zones is not None)
+        return _array([one.zones or b"" for one in newest])
+
+    async def stream(self, request: Request) -> Response:
+        """Answer with server-sent events."""
+        _, wish = await self._asked(request)
+        wish = replace(wish, after=request.headers.get("last-event-id", wish.after))
+        keys = wish.keys(self._readers.keys)
+        return await self._readers.stream(request, keys, lambda: Reader(wish, self._readers.stale_s), HEADERS)
+
+    async def socket(self, websocket: WebSocket) -> None:
+        """Serve a WebSocket."""
+        caller, wish = await self._asked(websocket)
+        leave = self._readers.enter()
+        try:
+            reader = Reader(wish, self._readers.stale_s)
+            async with contextlib.AsyncExitStack() as joined:
+                await joined.enter_async_context(self._readers.joined(wish.keys(self._readers.keys), reader))
+                await websocket.accept(PROTOCOL if PROTOCOL in websocket.scope["subprotocols"] else None)
+                works = _send(websocket, reader), self._listen(websocket, caller, reader, joined)
+                tasks = [asyncio.create_task(work) for work in works]
+                try:
+                    done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+                finally:
+                    for task in tasks:
+                        task.cancel()
+                    await asyncio.wait(tasks)
+                for task in done:
+                    task.result()
+        finally:
+            leave()
+
+    async def _listen(
+        self, websocket: WebSocket, caller: Caller, reader: Reader, joined: contextlib.AsyncExitStack
+    ) -> None:
+        """Change what a reader wants as often as it says so, until it goes."""
+        while (message := await websocket.receive())["type"] != "websocket.disconnect":
+            try:
+                wish = wish_of(msgspec.json.decode(message.get("text") or "", type=_Incoming).subscribe)
+                keys = wish.keys(self._readers.keys)
+                caller.may_read(wish.streams[0])
+            except (msgspec.DecodeError, schemas.MessageError, NotAllowedError) as error:
+                await websocket.close(MALFORMED, str(error)[:100])
+                return
+            reader.want(wish)
+            async with joined.pop_all():  # the earlier subscriptions stay until the new ones are there
+                try:
+                    await joined.enter_async_context(self._readers.joined(keys, reader))
+                except TransportError as error:
+                    await websocket.close(TRY_AGAIN, str(error)[:100])
+                    return
+
+    async def _asked(self, connection: HTTPConnection, known: Iterable[str] = PARAMETERS) -> tuple[Caller, Wish]:
+        """Return the caller and a wish that it may read."""
+        caller = await self._readers.caller(connection)
+        wish = wish_of(parameters_of(connection, known))
+        wish.keys(self._readers.keys)
+        caller.may_read(wish.streams[0])
+        return caller, wish
+
+    async def _newest(
+        self, key: str, most: int = 1, fits: Callable[[Publication], bool] = lambda _: True
+    ) -> list[Publication]:
+        """Return the newest message of each stream, by stream, from its newest run."""
+        newest: dict[str, Publication] = {}
+        found = await asyncio.to_thread(self._readers.feeds().newest, key, most)
+        for one in sorted((one for one in found if one.message is not None and fits(one)), key=_order):
+            newest[one.message.stream] = one
+        return [newest[stream] for stream in sorted(newest)]
+
+
+def _order(one: Publication) -> tuple[int, int]:
+    delivery = one.message.delivery
+    return (0, 0) if delivery is None else (delivery.run, delivery.published_ns)
+
+
+def _array(texts: Iterable[bytes]) -> Response:
+    return Response(b"[%b]" % b",".join(texts), media_type="application/json", headers=HEADERS)
+
+
+async def _send(websocket: WebSocket, reader: Reader) -> None:
+    """Send the texts of a reader, each when the one before has gone."""
+    with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # it has gone
+        while True:
+            await websocket.send_text((await reader.take())[0].decode())

@@ -1,0 +1,284 @@
+"""HTTP for orchestrators, Prometheus and people: uvicorn on a thread with a loop of its own; neither side waits.
+
+Only requests by a name of this service are answered. A browser that was led to a page of a stranger can be made to ask
+a service of its own network: the stranger lets his name point to its address (DNS rebinding). Such a request carries
+the stranger's name. Addresses, names without a dot (`localhost`, a container, a host of the same network) and the names
+of the settings are answered, others are not. Probes and Prometheus ask by names with a domain
+(`tracker.site.svc.cluster.local`): their paths, which show no tracks, are answered under any name.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import socket
+import threading
+import time
+from typing import TYPE_CHECKING, Any, Final
+
+import uvicorn
+from optipmb_client.errors import ClientError
+from optipmb_schemas.asyncapi import document
+from starlette.applications import Starlette
+from starlette.datastructures import Headers
+from starlette.middleware.cors import CORSMiddleware
+from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.routing import BaseRoute, Route
+from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.websockets.wsproto_impl import WSProtocol
+
+from optipmb_service.edges.http.api import STATUS, Api, Readers, parameters_of, refuse
+from optipmb_service.edges.http.page import page
+from optipmb_service.telemetry.metrics import CONTENT_TYPE
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from optipmb_schemas.json_form import Place
+    from starlette.requests import Request
+    from starlette.types import ASGIApp, Receive, Scope, Send
+
+    from optipmb_service.settings import Settings
+    from optipmb_service.telemetry.health import ProcessHealth
+
+GRACE_S: Final = 1  # how long an answer under way may take at the end
+CONNECTIONS: Final = 256  # open connections; a further one closes an idle one
+REQUESTS: Final = 64  # requests answered at once, without probes and readers
+HEAD_S: Final = 5.0  # longest time from the begin of a connection until its first request is complete
+KEEP_ALIVE_S: Final = 5
+HEAD_BYTES: Final = 16 * 1024
+MESSAGE_BYTES: Final = 4096  # largest message of a WebSocket's client
+SEND_S: Final = 30.0  # a connection whose peer takes nothing for so long is aborted
+SEND_BYTES: Final = 2**16  # what the system holds for a connection, so that it is soon known
+PING_S: Final = 20.0  # period of pings, and longest wait for their answers
+
+UNAVAILABLE: Final = 503
+FORBIDDEN: Final = 403
+MISDIRECTED: Final = 421
+ANY: Final = "*"
+
+PROBES: Final = frozenset({"/healthz", "/readyz"})  # paths that are answered however many other requests are
+MONITORING: Final = PROBES | {"/metrics"}  # paths for programs, answered under any host name
+
+
+def application(
+    health: ProcessHealth,
+    settings: Settings,
+    places: Mapping[str, Place] | None = None,
+    interface: Callable[[], str] = document,
+) -> ASGIApp:
+    """Return the application: health, readiness, metrics, the JSON interface, and the page.
+
+    Args:
+        health: of the process.
+        settings: of the process.
+        places: of the world frames of sites that have one.
+        interface: returns the AsyncAPI document.
+
+    Raises:
+        ClientError: the tokens cannot be used.
+    """
+
+    # Coroutines: probes wait for no thread.
+    async def alive(_: Request) -> Response:
+        well = health.alive()
+        return _answer({"alive": well, "beat_age_s": round(health.beat_age_s(), 3)}, well=well)
+
+    async def ready(_: Request) -> Response:
+        well = health.ready()
+        body: dict[str, object] = {"ready": well, "state": health.state()}
+        if failure := health.failure():
+            body["failure"] = failure
+        return _answer(body, well=well)
+
+    # No coroutine: Starlette runs it on a thread, so that making the metrics of many streams delays no other answer.
+    def metrics(_: Request) -> Response:
+        return Response(health.metrics.text(), media_type=CONTENT_TYPE, headers={"cache-control": "no-store"})
+
+    def asyncapi(request: Request) -> Response:
+        parameters_of(request, ())
+        return Response(interface(), media_type="application/json", headers={"cache-control": "no-store"})
+
+    routes: list[BaseRoute] = [Route("/healthz", alive), Route("/readyz", ready), Route("/metrics", metrics)]
+    places = places or {}
+    readers = Readers(health, settings, places)
+    routes += [
+        Route("/api/v1/asyncapi.json", asyncapi),
+        *Api(readers).routes(),
+        *page(health, readers, settings, places),
+    ]
+    refusals: dict[Any, Any] = dict.fromkeys(STATUS, refuse)
+    answers: ASGIApp = Starlette(routes=routes, exception_handlers=refusals)
+    if settings.http_origins:
+        answers = CORSMiddleware(answers, allow_origins=settings.http_origins, allow_headers=["authorization"])
+    return _Guarded(answers, settings, readers)
+
+
+def _answer(body: dict[str, object], *, well: bool) -> Response:
+    return JSONResponse(body, status_code=200 if well else UNAVAILABLE, headers={"cache-control": "no-store"})
+
+
+class _Guarded:
+    """An application that answers known host names, and a bounded number of requests, without probes and readers.
+
+    A WebSocket is opened for programs, for pages of this service, and for pages of `http_origins`: a browser opens one
+    for the page of a stranger without asking.
+    """
+
+    def __init__(self, application: ASGIApp, settings: Settings, readers: Readers) -> None:
+        self._application = application
+        self._readers = readers
+        self._names = {name.lower().rstrip(".") for name in settings.http_hosts}
+        self._origins = settings.http_origins
+        self._requests = 0
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer, or refuse."""
+        answer: Any = self._application
+        is_socket, path = scope["type"] == "websocket", scope.get("path", "")
+        if path in PROBES and not is_socket:
+            await answer(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        if self._requests - self._readers.count >= REQUESTS:
+            answer = PlainTextResponse(f"{REQUESTS} requests are being answered; ask again", UNAVAILABLE)
+        elif (path not in MONITORING or is_socket) and not self._knows(headers.get("host", "")):
+            answer = PlainTextResponse("unknown host; see the setting http_hosts", MISDIRECTED)
+        elif is_socket and not self._welcomes(headers):
+            answer = PlainTextResponse("page of another origin; see the setting http_origins", FORBIDDEN)
+        self._requests += 1
+        try:
+            await answer(scope, receive, send)
+        finally:
+            self._requests -= 1
+
+    def _welcomes(self, headers: Headers) -> bool:
+        origin = headers.get("origin")
+        own = origin is None or origin.partition("://")[2] == headers.get("host")
+        return own or origin in self._origins or ANY in self._origins
+
+    def _knows(self, host: str) -> bool:
+        name = host.lower()
+        name = name[1:].partition("]")[0] if name.startswith("[") else name.partition(":")[0]
+        name = name.rstrip(".")
+        if ANY in self._names or name in self._names or "." not in name:
+            return bool(name) or ANY in self._names
+        try:
+            ipaddress.ip_address(name)
+        except ValueError:
+            return False
+        return True
+
+
+class Server:
+    """A running HTTP server; it listens when the constructor returns.
+
+    Args:
+        application: the application that it serves.
+        address: `host:port` or `[v6]:port`; port 0 takes any free one.
+
+    Raises:
+        ClientError: the address cannot be listened on.
+    """
+
+    def __init__(self, application: ASGIApp, address: str) -> None:
+        host, _, port = address.rpartition(":")
+        host = host.strip("[]")
+        try:
+            family = socket.getaddrinfo(host, int(port), type=socket.SOCK_STREAM)[0][0]
+            self._socket = socket.create_server((host, int(port)), family=family, backlog=CONNECTIONS)
+        except OSError as error:
+            raise ClientError(f"cannot listen on {address} for HTTP: {error.strerror or error}") from error
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BYTES)  # connections inherit it
+        bound = self._socket.getsockname()
+        self.address = f"[{bound[0]}]:{bound[1]}" if family == socket.AF_INET6 else f"{bound[0]}:{bound[1]}"
+        self._server = uvicorn.Server(
+            uvicorn.Config(
+                application,
+                loop="asyncio",
+                http=_Connection,
+                lifespan="off",
+                log_config=None,
+                access_log=False,
+                server_header=False,
+                timeout_keep_alive=KEEP_ALIVE_S,
+                timeout_graceful_shutdown=GRACE_S,
+                h11_max_incomplete_event_size=HEAD_BYTES,
+                ws=_Socket,
+                ws_max_size=MESSAGE_BYTES,
+                ws_ping_interval=PING_S,
+                ws_ping_timeout=PING_S,
+                ws_per_message_deflate=False,
+            )
+        )
+        self._thread = threading.Thread(target=self._server.run, args=([self._socket],), name="http", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the server; answers under way have a second. May be called twice."""
+        self._server.should_exit = True
+        self._thread.join(2 * GRACE_S)
+        self._socket.close()
+
+
+class _Bounded(asyncio.Protocol):
+    """A connection that is aborted when its peer takes nothing for `SEND_S`."""
+
+    loop: asyncio.AbstractEventLoop
+    transport: asyncio.Transport
+    _limit: asyncio.TimerHandle | None = None
+
+    def pause_writing(self) -> None:
+        super().pause_writing()
+        self._limit = self.loop.call_later(SEND_S, self.transport.abort)
+
+    def resume_writing(self) -> None:
+        self._end_limit()
+        super().resume_writing()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._end_limit()
+        super().connection_lost(exc)
+
+    def _end_limit(self) -> None:
+        if self._limit is not None:
+            self._limit.cancel()
+
+
+class _Socket(_Bounded, WSProtocol):
+    """A WebSocket."""
+
+
+class _Connection(_Bounded, H11Protocol):
+    """A connection that ends when its first request does not come, or when others need its place.
+
+    Where all places are taken, the connection that has been idle for the longest time is closed; where all are busy,
+    the one that has been busy for the longest time. So probes are always answered.
+    """
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as the base class has it
+        super().connection_made(transport)
+        self._since = time.monotonic()
+        self._head = self.loop.call_later(HEAD_S, self._end_without_request)
+        if len(self.connections) > CONNECTIONS:
+            others = [one for one in self.connections if one is not self and isinstance(one, _Connection)]
+            victim = min(others, key=lambda one: (one.is_busy, one._since))  # noqa: SLF001 - of the same class
+            self.connections.discard(victim)  # it is lost with the loop's next turn: others may come before
+            victim.transport.abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._head.cancel()
+        super().connection_lost(exc)
+
+    def on_response_complete(self) -> None:
+        self._since = time.monotonic()
+        super().on_response_complete()
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a request is being answered."""
+        return self.cycle is not None and not self.cycle.response_complete
+
+    def _end_without_request(self) -> None:
+        if self.headers is None:
+            self.transport.abort()  # type: ignore[unreachable]  # uvicorn types the headers as always there

@@ -1,5 +1,0 @@
-"""Health, metrics and the live page over HTTP."""
-
-from optipmb_service.http.server import Server, application
-
-__all__ = ["Server", "application"]

@@ -1,0 +1,430 @@
+"""Frames and clouds of one sensor awaiting processing.
+
+A frame is held for its point cloud and, while the session recovers, for frames before it that may still come. The queue
+has a timeline of the past with the frames held: a frame is judged by it when it arrives, and by the session's when its
+turn comes.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from array import array
+from bisect import insort
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any, Final
+
+import optipmb
+from optipmb_service.session.state import size_of
+from optipmb_service.session.timeline import JUMP_FRAMES, WINDOW, FusedTimeline, Order, Verdict
+from optipmb_service.session.values import SECOND
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Container, Iterator, Sequence
+
+    import optipmb_schemas as schemas
+
+    from optipmb_service.session.state import FilterState, Inputs
+    from optipmb_service.session.timeline import Decision, FrameId, Timeline
+    from optipmb_service.session.values import Policy
+
+    Judged = tuple[Timeline, Decision, Timeline]
+
+MAX_HELD: Final = 1024
+"""Frames held at once: more than come from a publisher's cache before its clouds do.
+
+Beyond it the oldest goes on without its cloud, and behind a gap.
+"""
+
+CHECKED_FRAMES: Final = 20
+"""Frames after which the advance of their stamps is looked at."""
+
+SHORTEST_STEP_NS: Final = SECOND // 1000
+"""Frames that are further apart by their stamps have a clock in nanoseconds."""
+
+SHORTEST_ARRIVAL_NS: Final = SECOND // 10
+"""Frames that all came within less time are from a cache: their arrival tells nothing."""
+
+UNITS: Final = {"microseconds": 10**3, "milliseconds": 10**6, "seconds": 10**9}
+
+STEADY: Final = (1.0, 5.0, math.radians(1.0), 0.5)
+"""How far a pose may be from where the motion of a sensor leads: m, m/s^2, rad and rad/s^2."""
+
+CERTAIN: Final = 3.0
+"""Factor by which the ratio of arrival and stamps may differ from that of a unit."""
+
+
+@dataclass(slots=True)
+class PendingFrame:
+    """Frame that arrived and is not processed yet.
+
+    Attributes:
+        frame_id: its identity.
+        detections: its detections as `schemas.encode` gives them.
+        inputs: its detections as the tracker reads them.
+        deadline_ns: until when it waits for its cloud (monotonic); None: it does not.
+        ticket: value that the caller gave with it.
+        judged: the timeline that it was judged by on arrival, the decision, and the timeline with it.
+        since_ns: when it arrived (monotonic).
+        points: its cloud, once its turn has come.
+        missed: whether it waited for a cloud in vain.
+    """
+
+    frame_id: FrameId
+    detections: bytes
+    inputs: Inputs
+    deadline_ns: int | None
+    ticket: Any
+    judged: Judged
+    since_ns: int
+    points: schemas.Points | None = None
+    missed: bool = False
+
+    @property
+    def message(self) -> schemas.Detections:
+        return self.inputs[0]
+
+    @property
+    def order(self) -> Order:
+        """The key by which frames are processed, as of its arrival."""
+        return self.judged[1].place.order(self.frame_id)
+
+    @property
+    def size(self) -> int:
+        """Bytes that it takes, nearly: its detections, and as many once more decoded."""
+        return size_of(self.detections) + len(self.detections)
+
+
+_order: Final = attrgetter("order")
+
+
+class SensorQueue:
+    """Frames of one sensor that wait, in the order in which they will be processed, and its clouds.
+
+    Args:
+        policy: how long frames wait; may be replaced.
+        timeline: of the past.
+    """
+
+    def __init__(self, policy: Policy, timeline: Timeline) -> None:
+        self.policy = policy
+        self._timeline = timeline
+        self._behind = False
+        self.clouds = CloudBuffer(policy.clouds, policy.cloud_bytes)
+        self.stamps = StampCheck()
+        self.poses = PoseCheck()
+        self._checksums = b"", array("I")
+        """Epoch of the newest publisher, and the checksums of its newest frames, by number."""
+        self._claim = b"", -1, 0, 0
+        """Epoch and number of the last frame of a publisher that another one has succeeded, how many came in a row, and
+        the stamp of the first of them."""
+        self.held: list[PendingFrame] = []
+        """The frames, in order."""
+        self.held_bytes = 0
+        """Bytes of the frames, nearly."""
+
+    def __len__(self) -> int:
+        return len(self.held)
+
+    @property
+    def timeline(self) -> Timeline:
+        """The timeline of the past with the frames held."""
+        if self._behind:
+            # Other sensors' frames were processed since: judge the held ones again, on the new timeline.
+            self._behind = False
+            for one in self.held:
+                self._timeline = self._timeline.judge(one.frame_id)[1]
+        return self._timeline
+
+    @timeline.setter
+    def timeline(self, timeline: Timeline) -> None:
+        self._timeline, self._behind = timeline, False
+
+    def judge(self, frame_id: FrameId) -> Judged:
+        """Return the timeline, its decision on a frame that arrived, and the timeline with the frame."""
+        timeline = self.timeline
+        return timeline, *timeline.judge(frame_id)
+
+    def cloud_deadline_ns(self, message: schemas.Detections, arrived_ns: int) -> int | None:
+        """Return until when (monotonic) a frame waits for its cloud; None: it does not.
+
+        A frame that does not say whether it has a cloud waits if one with a stamp close to its own came last.
+        """
+        has_points, newest_ns, policy = message.has_points, self.clouds.newest_ns, self.policy
+        if has_points is None:
+            has_points = newest_ns is not None and abs(message.stamp_ns - newest_ns) <= policy.cloud_memory_ns
+        return arrived_ns + policy.cloud_wait_ns if has_points and policy.cloud_wait_ns > 0 else None
+
+    def is_alive(self, frame_id: FrameId, decision: Decision) -> bool:
+        """Return whether a frame shows that a publisher is the one to track, though another one has succeeded it.
+
+        It has sent several frames in a row since the other one's last: for as long as a late frame may take, where the
+        other one has sent fewer; else for as long as stamps may be apart.
+        """
+        if decision.verdict is not Verdict.RETIRED:
+            if decision.verdict.admitted:
+                self._claim = b"", -1, 0, 0
+            return False
+        strayed = self.timeline.seen[frame_id.sensor][-1].mask.bit_count() < JUMP_FRAMES
+        span_ns = self.policy.rewind_ns if strayed else self.policy.gap_limit_ns
+        epoch, seq, count, since_ns = self._claim
+        if frame_id.epoch != epoch or frame_id.seq <= seq:
+            count, since_ns = 0, frame_id.stamp_ns
+        self._claim = frame_id.epoch, frame_id.seq, count + 1, since_ns
+        return count + 1 >= JUMP_FRAMES and frame_id.stamp_ns - since_ns >= span_ns
+
+    def reuses_number(self, frame_id: FrameId, detections: bytes, decision: Decision) -> bool:
+        """Return whether a frame that is refused has the number of another frame."""
+        epoch, checksums = self._checksums
+        known = checksums[frame_id.seq % WINDOW] if frame_id.epoch == epoch else 0
+        if decision.verdict is Verdict.DUPLICATE and known:
+            return known != zlib.crc32(detections)
+        # An earlier frame has no stamp beyond the newest one.
+        return decision.verdict in {Verdict.DUPLICATE, Verdict.LATE} and decision.place.jump_ns > 0
+
+    def remember(self, frame_id: FrameId, detections: bytes) -> None:
+        """Remember the bytes of a frame that came, to tell its repetition from another frame with its number."""
+        if frame_id.epoch != self._checksums[0]:
+            self._checksums = frame_id.epoch, array("I", bytes(array("I").itemsize * WINDOW))
+        self._checksums[1][frame_id.seq % WINDOW] = zlib.crc32(detections)
+
+    def add(self, frame: PendingFrame) -> None:
+        """Hold a frame, where it belongs."""
+        self.held_bytes += frame.size
+        insort(self.held, frame, key=_order)
+
+    def follow(self, past: Timeline, base: FilterState, gone: Sequence[FrameId]) -> None:
+        """Follow the session's timeline.
+
+        Args:
+            past: that timeline.
+            base: the state before its window.
+            gone: the frames that have left the window.
+        """
+        if gone and self.clouds.newest_ns is not None and base.last is not None:
+            self.clouds.forget_before(base.last.stamp_ns, self.policy.gap_limit_ns)
+        if not self.held:
+            self.timeline = past
+        elif isinstance(past, FusedTimeline):
+            self._timeline, self._behind = past, True  # judged when it is asked for: many are processed before that
+        elif gone:
+            self.timeline = self.timeline.settle(base, gone)
+
+    def unprocessed(self, used: Container[int]) -> list[tuple[schemas.Detections | schemas.Points, Any]]:
+        """Return clouds and frames that were not processed, frames with the ticket they came with.
+
+        Args:
+            used: of clouds, by `id`, that frames have had.
+        """
+        clouds = [(cloud, None) for cloud in self.clouds if id(cloud) not in used]
+        return [*clouds, *((one.message, one.ticket) for one in self.held)]
+
+    def clear(self) -> int:
+        """Drop all frames; return how many there were."""
+        count = len(self.held)
+        self.held.clear()
+        self.held_bytes = 0
+        return count
+
+    def take(self, now_ns: int | None, waits: Callable[[PendingFrame], bool]) -> PendingFrame | None:
+        """Return the next frame if it is ready, with its cloud, None otherwise.
+
+        Args:
+            now_ns: monotonic time; None: nothing waits any longer.
+            waits: whether a frame is held for others.
+        """
+        if not self.held:
+            return None
+        head, clouds = self.held[0], self.clouds
+        full = self.held_bytes > self.policy.held_bytes or len(self.held) > MAX_HELD
+        if now_ns is not None and not full and waits(head):
+            return None
+        points = self._cloud(head) if clouds.newest_ns is not None else None
+        head.missed = points is None and head.deadline_ns is not None
+        if head.missed and now_ns is not None and now_ns < (head.deadline_ns or 0):
+            # Once the buffer is full of later clouds, more waiting would cost the frames behind it theirs.
+            full = full or clouds.full_behind(head.frame_id.stamp_ns)
+            if not full:
+                return None
+        head.points = points
+        return self.pop()
+
+    def pop(self) -> PendingFrame:
+        """Remove the next frame and return it."""
+        head = self.held.pop(0)
+        self.held_bytes -= head.size
+        return head
+
+    def _cloud(self, head: PendingFrame) -> schemas.Points | None:
+        if head.message.has_points is False:
+            return None
+        frame_id = head.frame_id
+        return self.clouds.get(
+            frame_id.epoch, frame_id.stamp_ns, lambda one: self.timeline.knows(frame_id._replace(epoch=one))
+        )
+
+
+class CloudBuffer:
+    """Bounded buffer of the clouds of a sensor: one per epoch and stamp, the newest arrival holds; the oldest goes.
+
+    A publisher sends its clouds under the epoch of its detections. Clouds of an epoch in which the sensor has no
+    detections come from a program of their own and belong to the frame with their stamp.
+
+    Args:
+        most: number of clouds kept.
+        most_bytes: bytes of points kept.
+    """
+
+    def __init__(self, most: int, most_bytes: int = 2**62) -> None:
+        self._most = most
+        self._most_bytes = most_bytes
+        self.bytes = 0
+        """Bytes of points kept now."""
+        self._kept: dict[tuple[bytes, int], schemas.Points] = {}
+        self.newest_ns: int | None = None
+        """Stamp of the cloud that arrived last."""
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def __iter__(self) -> Iterator[schemas.Points]:
+        return iter(self._kept.values())
+
+    def bytes_beside(self, used: Container[int]) -> int:
+        """Return the bytes of points kept of all clouds but some, given by `id`; may be called by any thread."""
+        return sum(cloud.xyz.nbytes for cloud in tuple(self._kept.values()) if id(cloud) not in used)
+
+    def add(self, cloud: schemas.Points) -> None:
+        """Keep a cloud."""
+        key = cloud.epoch, cloud.stamp_ns
+        if key in self._kept:
+            self._drop(key)
+        self._kept[key] = cloud
+        self.bytes += cloud.xyz.nbytes
+        self.newest_ns = cloud.stamp_ns
+        while len(self._kept) > self._most or (self.bytes > self._most_bytes and len(self._kept) > 1):
+            self._drop(next(iter(self._kept)))
+
+    def get(self, epoch: bytes, stamp_ns: int, publishers: Callable[[bytes], bool]) -> schemas.Points | None:
+        """Return the cloud of a frame, None when it is not there; what another publisher of detections sent is not.
+
+        Args:
+            epoch: of the frame.
+            stamp_ns: of the frame.
+            publishers: whether detections came in an epoch.
+        """
+        own = self._kept.get((epoch, stamp_ns))
+        if own is not None:
+            return own
+        others = (cloud for (whose, stamp), cloud in self._kept.items() if stamp == stamp_ns and not publishers(whose))
+        return next(others, None)
+
+    def full_behind(self, stamp_ns: int) -> bool:
+        """Return whether it is full of clouds for frames later than a stamp: the next would push one of them off."""
+        full = len(self._kept) >= self._most or self.bytes >= self._most_bytes
+        return full and all(stamp > stamp_ns for _, stamp in self._kept)
+
+    def forget_before(self, stamp_ns: int, reach_ns: int) -> None:
+        """Drop the clouds before a stamp; those further back than `reach_ns` belong to frames after a jump."""
+        gone = [key for key in self._kept if 0 < stamp_ns - key[1] <= reach_ns]
+        for key in gone:
+            self._drop(key)
+
+    def _drop(self, key: tuple[bytes, int]) -> None:
+        self.bytes -= self._kept.pop(key).xyz.nbytes
+
+
+class StampCheck:
+    """Check that the stamps of a sensor advance as a clock in nanoseconds does; it decides about nothing but a report.
+
+    Frames of a detector are more than a millisecond apart. Stamps that advance by less are constant or have another
+    unit, at any speed of a replayed recording; the times of arrival tell which unit, where the ratio is certain.
+    """
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._first = 0, 0
+        self._constant = True
+
+    def add(self, stamp_ns: int, arrived_ns: int) -> str:
+        """Return the fault of the stamps up to a frame; empty without one, or when too few came.
+
+        Args:
+            stamp_ns: stamp of the frame.
+            arrived_ns: when it arrived, monotonic.
+        """
+        if not self._count:
+            self._first, self._constant = (stamp_ns, arrived_ns), True
+        self._count += 1
+        first_ns, first_arrived_ns = self._first
+        self._constant &= stamp_ns == first_ns
+        if self._count < CHECKED_FRAMES:
+            return ""
+        self._count = 0
+        if self._constant:
+            return f"{CHECKED_FRAMES} frames with the stamp {stamp_ns}: the clock does not advance"
+        advance_ns, took_ns = stamp_ns - first_ns, arrived_ns - first_arrived_ns
+        if not 0 < advance_ns < (CHECKED_FRAMES - 1) * SHORTEST_STEP_NS or took_ns < SHORTEST_ARRIVAL_NS:
+            return ""
+        for unit, factor in UNITS.items():
+            if 1 / CERTAIN < advance_ns * factor / took_ns < CERTAIN:
+                return (
+                    f"{CHECKED_FRAMES} frames in {took_ns / SECOND:.1f} s, {advance_ns} apart: stamps look like {unit}"
+                )
+        return ""
+
+
+class PoseCheck:
+    """Check that the poses of a sensor go on as it moves; it decides about nothing but a report.
+
+    A sensor moves with the velocity and turn rate of its last two poses, and may change them within `STEADY`.
+    """
+
+    def __init__(self) -> None:
+        self._world = self._astray = 0
+        self._last: tuple[int, optipmb.Relocation] | None = None
+        self._rate: optipmb.Relocation | None = None
+
+    def add(self, message: schemas.Detections, policy: Policy) -> str:
+        """Return the jump of the pose of a frame that was not announced; empty without one.
+
+        Poses that the sensor cannot have reached are refused elsewhere.
+        """
+        if message.pose is None:
+            return ""
+        x, y, height = message.pose.translation.tolist()
+        w, _, _, z = message.pose.quaternion.tolist()
+        here = optipmb.Relocation(x, y, height, 2.0 * math.atan2(z, w))
+        world = self._world if message.relocation is None else message.relocation.world
+        if self._last is None or world != self._world or self._astray >= policy.astray_frames:
+            self._world, self._astray, self._last, self._rate = world, 0, (message.stamp_ns, here), None
+            return ""
+        then_ns, there = self._last
+        dt = (message.stamp_ns - then_ns) / SECOND
+        if dt <= 0.0:
+            return ""
+        if policy.max_speed and math.dist(here[:3], there[:3]) > policy.pose_margin + policy.max_speed * dt:
+            self._astray += 1
+            return ""
+        self._astray, self._last = 0, (message.stamp_ns, here)
+        seen = _difference(here, there, 1.0 / dt)
+        rate = self._rate or seen
+        expected = optipmb.Relocation(*(one + dt * change for one, change in zip(there, rate, strict=True)))
+        error = _difference(here, expected)
+        distance, turn = math.hypot(*error[:3]), error.theta
+        metres, acceleration, angle, angular_acceleration = STEADY
+        if distance <= metres + acceleration * dt * dt and abs(turn) <= angle + angular_acceleration * dt * dt:
+            self._rate = seen
+            return ""
+        # The sensor keeps its motion, which has turned with the world.
+        motion = optipmb.Relocation(0.0, 0.0, 0.0, turn)
+        self._rate = optipmb.Relocation(*motion.place(rate[:3]), rate.theta)
+        shift = [f"{one - other:.3f}" for one, other in zip(here, motion.place(expected[:3]), strict=False)]
+        jump = f"{distance:.2f} m and {math.degrees(turn):.2f} degrees"
+        return f"a jump by {jump}, as of a motion by [{', '.join(shift)}] m and {turn:.5f} rad"
+
+
+def _difference(one: optipmb.Relocation, other: optipmb.Relocation, factor: float = 1.0) -> optipmb.Relocation:
+    x, y, z, theta = (factor * (a - b) for a, b in zip(one, other, strict=True))
+    return optipmb.Relocation(x, y, z, factor * math.remainder(theta / factor, 2.0 * math.pi))

@@ -1,0 +1,878 @@
+"""Session: the tracking of one stream, or of several sensors that feed one density.
+
+No I/O, no threads, no clock of its own.
+
+Conventions: `now_ns` is the local monotonic clock, given by the caller and used only for waiting, for point clouds and,
+during recovery, for frames that were missed; everything else follows from the messages. So the same messages give the
+same tracks, byte for byte, and frames of the window give the same state in any order.
+
+A frame that arrives is judged by the timeline (`on_detections`) and waits in the queue of its sensor (`pending`) until
+it is ready (`_advance`). Then it goes into the window (`window`), which takes it, and the frames behind it, through the
+tracker (`transition`). When a step raises, nothing has changed but that the sensor of the frame is quarantined: the
+frame and the pending frames of the sensor go, unprocessed, and its frames are refused until a reset or a restart of its
+publisher.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Any, Final, Literal, Self
+
+import numpy as np
+import optipmb_schemas as schemas
+
+import optipmb
+from optipmb.zones import ZoneState
+from optipmb_service.session import convert
+from optipmb_service.session.arrivals import Arrivals
+from optipmb_service.session.checkpoint import Checkpoint
+from optipmb_service.session.pending import PendingFrame, SensorQueue
+from optipmb_service.session.problems import problem_of
+from optipmb_service.session.state import FilterState, ProcessedFrame
+from optipmb_service.session.timeline import JUMP_FRAMES, FrameId, FusedTimeline, StreamTimeline, Verdict
+from optipmb_service.session.transition import Transition
+from optipmb_service.session.values import (
+    MAX_CLOUD_WAIT_NS,
+    MAX_ERROR,
+    MAX_SENSORS,
+    SECOND,
+    Begun,
+    Deliveries,
+    Incarnation,
+    Output,
+    Policy,
+    Quarantined,
+    RefusedError,
+    events_of,
+)
+from optipmb_service.session.window import ReorderWindow
+from optipmb_service.telemetry.stream_meter import Counters, total
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from optipmb_service.session.pending import Judged
+    from optipmb_service.session.state import Inputs
+    from optipmb_service.session.timeline import Decision, Timeline
+    from optipmb_service.session.transition import Outcome
+    from optipmb_service.session.values import Reached, Reason, Tracked
+
+    Condition = Literal["new", "running", "recovering", "quarantined", "closed"]
+
+FLUSH_NS: Final = SECOND
+"""Longest time for all pending frames at a reset, a change of parameters or the end: others wait for them."""
+
+SCORED: Final = 100
+"""Detections of a class after which its share below the score filter is reported."""
+
+SCORED_EVERY: Final = 8
+"""Frames of which one is looked at for that: in each it would take a tenth of the session's time."""
+
+
+class Session:
+    """The state of one stream, or of several that share a density.
+
+    Args:
+        stream: `site/node/sensor`, or the name of a fused session.
+        parameters: the profile to track with.
+        policy: waiting, restarting, going back.
+        fused: whether several sensors feed it, told apart by the streams of the messages.
+        instance: name of the service, for problems.
+        incarnation: ids that an earlier session of the stream used.
+        tracker: makes the tracker; tests put their own here.
+        clock: measures how long a step takes, ns.
+    """
+
+    def __init__(
+        self,
+        stream: str,
+        parameters: optipmb.Parameters,
+        policy: Policy | None = None,
+        *,
+        fused: bool = False,
+        instance: str = "session",
+        incarnation: Incarnation | None = None,
+        tracker: Callable[[optipmb.Parameters], optipmb.Tracker] = optipmb.Tracker,
+        clock: Callable[[], int] = time.perf_counter_ns,
+    ) -> None:
+        incarnation = incarnation or Incarnation()
+        self.stream = stream
+        self.run = incarnation.run
+        """Number that grows whenever a session of the stream begins or is restored, by whichever process.
+
+        A frame that was tracked before a crash may be tracked again after it, with others that were missing then, and
+        nobody knows any more under which revision it was published. The tracks of a later run replace earlier ones.
+        """
+        self._fused = fused
+        self._instance = instance
+        self._make = tracker
+        self._clock = clock
+        self._sensors: dict[str, SensorQueue] = {}
+        self._quarantine: dict[str, str] = {}
+        self._blind: set[str] = set()
+        """Sensors of which it was reported that they have no field of view."""
+        self._estimated = ""
+        """Incarnation in which the motion of a sensor was reported as estimated."""
+        self._deliveries = Deliveries()
+        self._has_ready = False
+        self._cloud_wait_ns: int | None = None
+        self._policy = policy or Policy()
+        self._limit_wait(self._policy.cloud_wait_ns)
+        limits, transition = self._policy.jump_limits, self._transition(parameters)
+        self._timeline: Timeline = FusedTimeline(limits) if fused else StreamTimeline(limits, {"": ()})
+        name = transition.name(None, incarnation.starts)
+        zones = ZoneState(numbers=incarnation.events) if incarnation.events else None
+        start = FilterState(transition.no_objects(incarnation.next_id), name, incarnation.starts, zones=zones)
+        self._window = ReorderWindow(start, transition)
+        self._restored = False
+        self.arrivals = Arrivals(self._policy)
+        self._now_ns = 0
+        """When frames became ready last (monotonic)."""
+        if not fused:
+            self._queue("")
+
+    # Messages
+
+    def on_detections(
+        self, message: schemas.Detections, now_ns: int, *, arrived_ns: int | None = None, ticket: Any = None
+    ) -> list[Output]:
+        """Take a frame; return the outputs of all frames that it made ready, itself or pending ones.
+
+        Args:
+            message: the frame.
+            now_ns: monotonic time.
+            arrived_ns: when the frame arrived, if before now: its wait for a cloud began then.
+            ticket: comes back with the tracks of the frame and the tracks that it corrects.
+        """
+        frame_id = self._frame_id(message)
+        since_ns = now_ns if arrived_ns is None else arrived_ns
+        queue = self._queue(frame_id.sensor)
+        if queue is None:
+            self.refuse()
+            return [self._too_many(frame_id)]
+        outputs: list[Output] = []
+        if error := self._quarantine.get(frame_id.sensor):
+            if self._timeline.knows(frame_id):
+                expected = "a reset or a restarted publisher: the session is quarantined"
+                return [self._refuse("quarantined", frame_id, "", expected, error)]
+            outputs += self._end_quarantine(frame_id.sensor)
+        if self._fused and not (self._restored or self.arrivals.waiting or self.counters.frames):
+            self.arrivals.begin(frame_id.stamp_ns, since_ns, now_ns)
+        judged = queue.judge(frame_id)
+        if queue.is_alive(frame_id, judged[1]):
+            outputs += self._reinstate(frame_id)
+            judged = queue.judge(frame_id)
+        if judged[1].verdict.admitted:
+            return [*outputs, *self._admit(queue, frame_id, judged, message, now_ns, since_ns, ticket)]
+        return [*outputs, *self._not_admitted(queue, frame_id, judged, message)]
+
+    def on_points(self, message: schemas.Points, now_ns: int, *, ticket: Any = None) -> list[Output]:
+        """Take a cloud; return the outputs of frames that waited for it and, by setting, corrected ones.
+
+        Args:
+            message: the cloud.
+            now_ns: monotonic time.
+            ticket: comes back with the tracks that the cloud corrects.
+        """
+        frame_id = self._frame_id(message)
+        try:
+            convert.cloud_of(message)
+        except optipmb.FrameError as error:
+            return [self._problem("invalid_value", frame_id, error.path, error.expected, error.received)]
+        queue = self._queue(frame_id.sensor)
+        if queue is None:
+            return [self._too_many(frame_id)]
+        queue.clouds.add(message)
+        amends = self._policy.late_clouds and frame_id.sensor not in self._quarantine
+        outputs = self._amend(message, frame_id, ticket) if amends else []
+        return [*outputs, *self._advance(now_ns)]
+
+    def on_tick(self, now_ns: int) -> list[Output]:
+        """Return the outputs of frames that need not wait any longer."""
+        return self._advance(now_ns)
+
+    @property
+    def deadline_ns(self) -> int | None:
+        """When `on_tick` is due (monotonic, ns), 0: at once; None while no frame waits."""
+        if self._has_ready:
+            return 0
+        due = [self._due_ns(one.held[0]) for one in self._sensors.values() if one.held]
+        return min((one for one in due if one is not None), default=None)
+
+    def refuse(self) -> None:
+        """Count a message of the stream that was not valid."""
+        self._deliveries.refused += 1
+
+    # Commands
+
+    def flush(self) -> list[Output]:
+        """Process the pending frames, without waiting any longer."""
+        return self._advance(None)
+
+    def reset(self, reason: Reason = "reset") -> list[Output]:
+        """Discard the density; frames seen before stay seen, track ids go on, a quarantine ends."""
+        outputs = self.flush()
+        self._quarantine.clear()
+        head, transition = self._window.head, self._window.transition
+        session = transition.name(head.last, head.starts + 1)
+        self._begin(head.begun_anew(transition.no_objects(head.density.next_id), session))
+        return [*outputs, Begun(self.session, reason)]
+
+    def configure(
+        self,
+        parameters: optipmb.Parameters | None,
+        cloud_wait_s: float | None,
+        horizons: Sequence[float] | None = None,
+        *,
+        restart: bool,
+    ) -> list[Output]:
+        """Change the settings of the session; another profile only before the first frame or with `restart`.
+
+        Args:
+            parameters: the profile; None: as before.
+            cloud_wait_s: the longest wait for a cloud; None: as before.
+            horizons: valid horizons of predicted paths; None: from the profile that is set, else as before.
+            restart: whether the density may be discarded.
+
+        Raises:
+            RefusedError: another profile, frames were processed, and no restart was asked for; or too long a wait.
+        """
+        if cloud_wait_s is not None and cloud_wait_s * SECOND > MAX_CLOUD_WAIT_NS:
+            longest = f"at most {MAX_CLOUD_WAIT_NS / SECOND:g} seconds"
+            raise RefusedError("cloud_wait_s", longest, f"{cloud_wait_s:g}")
+        before, frames = self.parameters, self.counters.frames
+        wanted = parameters or before
+        if horizons is not None:
+            wanted = wanted.model_copy(update={"horizons": tuple(horizons)})
+        changes = wanted.model_copy(update={"horizons": before.horizons}) != before
+        if changes and not restart and frames:
+            expected = f"{before.name!r}, or restart = true: {frames} frames have been tracked with it"
+            raise RefusedError("profile", expected, repr(wanted.name))
+        outputs = self.flush() if changes else []
+        if cloud_wait_s is not None:
+            self._cloud_wait_ns = round(cloud_wait_s * SECOND)
+            self._limit_wait(self._cloud_wait_ns)
+        if changes:
+            # Frames are given to the tracker by the classes of the old profile: they cannot be processed again.
+            self._begin(self._window.head, self._transition(wanted))
+        elif wanted != before:
+            self._window.transition = self._transition(wanted)
+        if restart:
+            return [*outputs, *self.reset("parameters")]
+        if changes:
+            head, transition = self._window.head, self._window.transition
+            density = transition.no_objects(head.density.next_id)
+            self._begin(replace(head, session=transition.name(None, head.starts), density=density))
+        return outputs
+
+    # Checkpoints and recovery
+
+    def snapshot(self) -> Checkpoint:
+        """Return the state between two frames, without pending ones, which come again from the publisher's cache.
+
+        It refers to values that never change: cheap, to be encoded later.
+        """
+        base, window = self._window.portable(self._policy.checkpoint_bytes)
+        newest = {name: one.clouds.newest_ns for name, one in self._sensors.items()}
+        return Checkpoint(
+            stream=self.stream,
+            parameters=self.parameters,
+            fused=self._fused,
+            cloud_wait_ns=self._cloud_wait_ns,
+            quarantine=dict(self._quarantine),
+            seen=self._timeline.seen,
+            base=base,
+            window=window,
+            head=self._window.head,
+            deliveries=replace(self._deliveries),
+            newest_cloud_ns={name: newest_ns for name, newest_ns in newest.items() if newest_ns is not None},
+            run=self.run,
+        )
+
+    @classmethod
+    def restore(
+        cls,
+        checkpoint: Checkpoint,
+        now_ns: int,
+        policy: Policy | None = None,
+        *,
+        fence: int = 1,
+        instance: str = "session",
+        tracker: Callable[[optipmb.Parameters], optipmb.Tracker] = optipmb.Tracker,
+        clock: Callable[[], int] = time.perf_counter_ns,
+    ) -> Self:
+        """Return the session that a checkpoint was taken of. It is `recovering` for a while.
+
+        Its tracks belong to another `run`, whose number is the sum of the checkpoint's and the fence: of two
+        sessions that go on from one checkpoint the later one has the higher fence, whichever wrote last.
+
+        Args:
+            checkpoint: its state; its profile goes on too.
+            now_ns: monotonic time; the waiting for missed frames begins now.
+            policy: waiting, restarting, going back.
+            fence: of the lease under which it goes on, 1 or higher.
+            instance: name of the service, for problems.
+            tracker: makes the tracker.
+            clock: measures how long a step takes, ns.
+        """
+        one = cls(
+            checkpoint.stream,
+            checkpoint.parameters,
+            policy,
+            fused=checkpoint.fused,
+            instance=instance,
+            tracker=tracker,
+            clock=clock,
+        )
+        one._cloud_wait_ns = checkpoint.cloud_wait_ns
+        if one._cloud_wait_ns is not None:
+            one._limit_wait(one._cloud_wait_ns)
+        one.run = total(checkpoint.run, fence)
+        one._restored = True
+        one._deliveries = replace(checkpoint.deliveries)
+        one._quarantine = dict(checkpoint.quarantine)
+        # Of the beginning of a session: other sensors may have been there that it does not know yet.
+        is_young = checkpoint.fused and checkpoint.base.last is None
+        stamps = (frame.frame_id.stamp_ns for frame in checkpoint.window if is_young)
+        one.arrivals.resume(now_ns, min(stamps, default=None))
+        one._timeline = type(one._timeline).resume(one._policy.jump_limits, checkpoint)
+        places = one._timeline.places()
+        frames = [replace(frame, place=places[frame.frame_id]) for frame in checkpoint.window]
+        frames.sort(key=lambda frame: frame.order)
+        one._window = ReorderWindow(checkpoint.base, one._window.transition, frames, checkpoint.head)
+        one._sensors.clear()
+        for name in checkpoint.head.sensors if checkpoint.fused else ("",):
+            if (queue := one._queue(name)) is not None:
+                queue.clouds.newest_ns = checkpoint.newest_cloud_ns.get(name)
+        for frame in checkpoint.window:
+            if (queue := one._sensors.get(frame.frame_id.sensor)) is not None:
+                queue.remember(frame.frame_id, frame.detections)
+        return one
+
+    @property
+    def sensors(self) -> set[str]:
+        """The sensors that it knows of, by stream; of one stream an empty name."""
+        return set(self._sensors)
+
+    def recovered(self, now_ns: int) -> list[Output]:
+        """End the recovery: all that the caches had is here. Return the outputs of frames that waited for it."""
+        self.arrivals.end()
+        return self._advance(now_ns)
+
+    def again(self) -> list[Tracked]:
+        """Return the tracks of the window once more, as of this run."""
+        tracked = [one.tracks for one in self._window.again() if one.tracks is not None]
+        for one in tracked:
+            one.run, one.final = self.run, self._window.base.reached
+        return tracked
+
+    def unprocessed(self) -> list[tuple[schemas.Detections | schemas.Points, Any]]:
+        """Return the messages that are in no snapshot: clouds without their frame, pending frames with their ticket."""
+        used = frozenset(id(frame.points) for frame in self._window.frames)
+        return [one for queue in self._sensors.values() for one in queue.unprocessed(used)]
+
+    # State
+
+    @property
+    def parameters(self) -> optipmb.Parameters:
+        return self._window.transition.parameters
+
+    @property
+    def session(self) -> str:
+        """Id of the present incarnation of the density."""
+        return self._window.head.session
+
+    @property
+    def final(self) -> Reached:
+        """Up to where no frame can be inserted any more."""
+        return self._window.base.reached
+
+    def zone_counts(self) -> schemas.Events | None:
+        """Return the counts of all zones after the newest frame; None: there is none, or no zone."""
+        head = self._window.head
+        if (last := head.last) is None or head.zones is None or not self._policy.zones:
+            return None
+        header: dict[str, Any] = {"stream": self.stream, "session": head.session, "labels": self.parameters.labels}
+        header |= {"epoch": last.epoch, "seq": last.seq, "stamp_ns": last.stamp_ns, "sensor": last.sensor or None}
+        header["revision"] = next((one.revision for one in self._window.frames if one.frame_id == last), 0)
+        return events_of(header, (), {one.name: head.zones.counts.get(one.name, {}) for one in self._policy.zones})
+
+    @property
+    def density(self) -> optipmb.Density:
+        """The density after the last frame."""
+        return self._window.head.density
+
+    @property
+    def counters(self) -> Counters:
+        """Counts of the messages so far: by delivery, and by the frames alone."""
+        counts, deliveries = self._window.head.counts, self._deliveries
+        return Counters(
+            frames=counts.frames,
+            duplicates=deliveries.duplicates,
+            late=deliveries.late,
+            inserted=deliveries.inserted,
+            corrected=deliveries.corrected,
+            refused=deliveries.refused + counts.astray + counts.effort + counts.unconfirmed,
+            gaps=counts.gaps,
+            new_epochs=counts.new_epochs,
+            clouds_used=counts.clouds_used,
+            clouds_missed=counts.clouds_missed,
+            repaired=counts.repaired,
+        )
+
+    @property
+    def held(self) -> int:
+        """Number of pending frames; may be called by any thread."""
+        return sum(len(one) for one in tuple(self._sensors.values()))
+
+    @property
+    def held_bytes(self) -> int:
+        """Bytes of the messages that are kept: pending frames, clouds, and the window; nearly, for any thread.
+
+        A cloud of the window is found by its stamp as well until its frame leaves the window: it counts once.
+        """
+        frames = self._window.frames
+        used = frozenset(id(frame.points) for frame in frames)
+        waiting = [one.held_bytes + one.clouds.bytes_beside(used) for one in tuple(self._sensors.values())]
+        return sum(frame.weight for frame in frames) + sum(waiting)
+
+    @property
+    def quarantine(self) -> str:
+        """The error for which frames are refused, of any sensor; empty while none are."""
+        return next(iter(self._quarantine.values()), "")
+
+    @property
+    def cloud_wait_s(self) -> float:
+        return self._policy.cloud_wait_ns / SECOND
+
+    @property
+    def incarnation(self) -> Incarnation:
+        """The ids that it used, for a later session of the stream."""
+        return self._window.head.incarnation(self.run)
+
+    def state(self, *, shed: int = 0, queue: int = 0, closed: bool = False) -> schemas.SessionState:
+        """Return the state as the message that answers a query.
+
+        Args:
+            shed: frames dropped before they came to the session.
+            queue: frames that wait for the session.
+            closed: whether it was closed.
+        """
+        head, counters = self._window.head, self.counters
+        density, last = head.density, head.last
+        condition: Condition = "running" if counters.frames else "new"
+        if closed:
+            condition = "closed"
+        elif self._quarantine and self._quarantine.keys() >= self._sensors.keys():
+            condition = "quarantined"
+        elif self.arrivals.recovering:
+            condition = "recovering"
+        return schemas.SessionState(
+            stream=self.stream,
+            session=head.session,
+            state=condition,
+            profile=self.parameters.name,
+            epoch=last.epoch if last else None,
+            seq=last.seq if last else None,
+            stamp_ns=last.stamp_ns if last else None,
+            shed=shed,
+            **{field.name: getattr(counters, field.name) for field in fields(Counters)},
+            tracks=head.tracks,
+            bernoullis=len(density.bernoulli),
+            poissons=len(density.poisson),
+            next_id=density.next_id,
+            queue=queue + self.held,
+        )
+
+    # Settings
+
+    def _transition(self, parameters: optipmb.Parameters) -> Transition:
+        self._scores: dict[str, tuple[NDArray[np.float64], NDArray[np.int64]]] = {}
+        """Score filter of each class; its detections, and those below it: by sensor where it has its own parameters."""
+        return Transition(self.stream, parameters, self._make, self._policy)
+
+    def _limit_wait(self, cloud_wait_ns: int) -> None:
+        if self._fused:  # a frame that waited for its cloud must still find its place
+            cloud_wait_ns = min(cloud_wait_ns, self._policy.rewind_ns // 2)
+        self._policy = replace(self._policy, cloud_wait_ns=cloud_wait_ns)
+        for one in self._sensors.values():
+            one.policy = self._policy
+
+    def _frame_id(self, message: schemas.Detections | schemas.Points) -> FrameId:
+        return FrameId(message.epoch, message.seq, message.stamp_ns, message.stream if self._fused else "")
+
+    # Sensors
+
+    def _queue(self, name: str) -> SensorQueue | None:
+        """Return the queue of a sensor, an empty one for a new sensor; None when there are too many."""
+        queue = self._sensors.get(name)
+        if queue is None and len(self._sensors) >= MAX_SENSORS:
+            self._forget_silent()
+        if queue is None and len(self._sensors) < MAX_SENSORS:
+            queue = self._sensors[name] = SensorQueue(self._policy, self._timeline)
+        return queue
+
+    def _forget_silent(self) -> None:
+        """Make room for a sensor: the one that fed the session longest ago goes, if that is not lately."""
+        for name in self._timeline.silent([name for name, one in self._sensors.items() if not one.held])[:1]:
+            del self._sensors[name]
+            self._quarantine.pop(name, None)
+            self._blind.discard(name)
+            self._scores.pop(name, None)
+
+    def _follow(self, gone: Sequence[FrameId] = ()) -> None:
+        """Give the timeline to the queues; `gone` are the frames that have left the window."""
+        for one in self._sensors.values():
+            one.follow(self._timeline, self._window.base, gone)
+
+    def _end_quarantine(self, sensor: str) -> list[Output]:
+        """End the quarantine of a sensor whose publisher was restarted; the density of others goes on."""
+        if not self._fused:
+            return self.reset("quarantine")
+        del self._quarantine[sensor]
+        return []
+
+    def _is_early(self, frame_id: FrameId) -> bool:
+        """Return whether the earliest pending frame of a sensor waits for others that sources may still send."""
+        if not self.arrivals.waiting:
+            return False
+        held = {name: one.held[0].frame_id.stamp_ns for name, one in self._sensors.items() if one.held}
+        last = self._window.head.sensor(frame_id.sensor).tracked
+        return self.arrivals.waits(frame_id, self._now_ns, self._timeline, held, last)
+
+    def _is_ahead(self, pending: PendingFrame) -> bool:
+        """Return whether a frame waits for others, to learn whether its clock or time itself has gone on so far.
+
+        Most sensors decide. A frame on the old clock refuses it (`_process`).
+        """
+        timeline = self._timeline
+        if not isinstance(timeline, FusedTimeline) or not timeline.is_ahead(pending.frame_id):
+            return False
+        queues = self._sensors.items()
+        ahead = {name for name, one in queues if one.held and timeline.is_ahead(one.held[0].frame_id)}
+        return 2 * len(ahead) <= len(timeline.live().keys() | ahead) and self._now_ns < self._follows_ns(pending)
+
+    def _follows_ns(self, pending: PendingFrame) -> int:
+        """Return until when the frames of other sensors follow it (monotonic)."""
+        return pending.since_ns + self._policy.rewind_ns
+
+    def _waits(self, pending: PendingFrame) -> bool:
+        return self._is_early(pending.frame_id) or self._is_ahead(pending)
+
+    def _due_ns(self, pending: PendingFrame) -> int | None:
+        """Return when a pending frame need not wait any longer (monotonic)."""
+        if self._is_early(pending.frame_id):
+            return self.arrivals.deadline_ns
+        return self._follows_ns(pending) if self._is_ahead(pending) else pending.deadline_ns
+
+    # Processing
+
+    def _admit(
+        self,
+        queue: SensorQueue,
+        frame_id: FrameId,
+        judged: Judged,
+        message: schemas.Detections,
+        now_ns: int,
+        since_ns: int,
+        ticket: Any,
+    ) -> list[Output]:
+        """Process a frame that has a place, or hold it; return the outputs of all frames that it made ready."""
+        outputs: list[Output] = []
+        parameters = self._window.transition.parameters_of(frame_id.sensor)
+        detections = schemas.encoded(message)
+        queue.remember(frame_id, detections)
+        try:
+            frame, ignored = convert.frame_of(parameters, message)
+        except optipmb.FrameError as error:
+            self._timeline = self._timeline.note(frame_id)
+            queue.timeline = judged[0].note(frame_id)
+            self._follow()
+            return [self._refuse("invalid_value", frame_id, error.path, error.expected, error.received)]
+        queue.timeline = judged[2]
+        if found := queue.stamps.add(frame_id.stamp_ns, since_ns):
+            expected = "stamps in nanoseconds that advance with time"
+            outputs.append(self._problem("clock", frame_id, "stamp_ns", expected, found))
+        if self._policy.jumps == "report" and (found := queue.poses.add(message, self._policy)):
+            expected = "a pose where the motion of the sensor leads, or a `relocation`"
+            outputs.append(self._problem("world_jump", frame_id, "pose", expected, found))
+        if self._policy.needs_view and message.field_of_view is None and frame_id.sensor not in self._blind:
+            self._blind.add(frame_id.sensor)
+            outputs.append(self._problem("no_view", frame_id, "field_of_view", "where the sensor sees", "nothing"))
+        if frame_id.seq % SCORED_EVERY == 0 and not parameters.self_calibration:
+            outputs += self._low_scores(frame_id, frame, parameters)  # none is filtered of the upper half of a class
+        deadline_ns, inputs = queue.cloud_deadline_ns(message, since_ns), (message, frame, ignored)
+        pending = PendingFrame(frame_id, detections, inputs, deadline_ns, ticket, judged, since_ns)
+        waits = queue.held or deadline_ns is not None or queue.clouds.newest_ns is not None
+        if len(self._sensors) == 1 and not waits and not self.arrivals.waiting:  # mostly
+            self._now_ns, self._has_ready = now_ns, False
+            return [*outputs, *self._process(pending)]
+        queue.add(pending)
+        return [*outputs, *self._advance(now_ns)]
+
+    def _not_admitted(
+        self, queue: SensorQueue, frame_id: FrameId, judged: Judged, message: schemas.Detections
+    ) -> list[Output]:
+        """Count and report a frame that has no place when it arrives."""
+        judged_by, decision, timeline = judged
+        queue.timeline = timeline
+        if self._timeline is judged_by is not timeline:
+            self._timeline = timeline
+            self._follow()
+        if queue.reuses_number(frame_id, schemas.encoded(message), decision):
+            expected = "a number that no other frame of the epoch has, or a new epoch"
+            received = f"{frame_id.seq} again, in another frame, {_seconds(decision.place.jump_ns)} from the newest"
+            return [self._refuse("duplicate_seq", frame_id, "seq", expected, received)]
+        return self._refused(frame_id, decision)
+
+    def _reinstate(self, frame_id: FrameId) -> list[Output]:
+        """Go on with the publisher of a frame, which another one has succeeded."""
+        outputs = self.flush()
+        if not self._fused:
+            self._begin(self._window.head)  # in the window publishers follow each other by their first frames
+        self._timeline = self._timeline.reinstated(frame_id)
+        self._follow()
+        return outputs
+
+    def _advance(self, now_ns: int | None) -> list[Output]:
+        """Process the frames that are ready, in order, `Policy.at_once` of them at most.
+
+        Args:
+            now_ns: monotonic time; None: all pending frames are ready. All are processed then, within `FLUSH_NS`;
+                those left are refused.
+        """
+        if now_ns is not None:
+            self._now_ns = now_ns
+            if (deadline_ns := self.arrivals.deadline_ns) is not None and now_ns >= deadline_ns:
+                self.arrivals.end()
+        outputs: list[Output] = []
+        self._has_ready, taken, policy = False, 0, self._policy
+        ends_ns = self._clock() + FLUSH_NS if now_ns is None else None
+        while pending := self._next_ready(now_ns):
+            outputs += self._process(pending)
+            taken += 1
+            if ends_ns is not None and self._clock() >= ends_ns:
+                return [*outputs, *self._refuse_pending()]
+            full = any(one.held_bytes > policy.held_bytes for one in self._sensors.values())
+            if ends_ns is None and taken >= policy.at_once and not full:
+                self._has_ready = self.held > 0
+                break
+        return outputs
+
+    def _next_ready(self, now_ns: int | None) -> PendingFrame | None:
+        """Take the earliest of the frames that are ready; None while none is."""
+        queues = [one for one in self._sensors.values() if one.held]
+        if len(queues) > 1:
+            queues.sort(key=lambda one: (one.held[0].frame_id.stamp_ns, one.held[0].frame_id.sensor))
+        for one in queues:
+            if pending := one.take(now_ns, self._waits):
+                return pending
+        return None
+
+    def _process(self, pending: PendingFrame) -> list[Output]:
+        """Put a frame in its place."""
+        began_ns, frame_id = self._clock(), pending.frame_id
+        judged_by, decision, timeline = pending.judged
+        if judged_by is not self._timeline:  # others were pending when it came
+            decision, timeline = self._timeline.judge(frame_id)
+            if not decision.verdict.admitted:
+                self._timeline = timeline
+                return self._refused(frame_id, decision)
+        frame = ProcessedFrame(frame_id, pending.detections, pending.points, pending.missed, 0, [], decision.place)
+        if decision.last:
+            outputs = self._step([frame], timeline, frame_id, pending.ticket, began_ns, pending.inputs)
+            return [*outputs, *self._refuse_ahead()] if self.held else outputs
+        return self._step(self._window.inserted(frame, timeline.places()), timeline, frame_id, pending.ticket, began_ns)
+
+    def _refuse_ahead(self) -> list[Output]:
+        """Refuse the first frame of each sensor that is ahead, as another one goes on; those after it follow it."""
+        outputs: list[Output] = []
+        for queue in self._sensors.values():
+            timeline = self._timeline
+            if queue.held and isinstance(timeline, FusedTimeline) and timeline.is_ahead(queue.held[0].frame_id):
+                frame_id = queue.pop().frame_id
+                decision, self._timeline = timeline.doubted(frame_id)
+                self._follow()
+                outputs += self._refused(frame_id, decision)
+        return outputs
+
+    def _amend(self, message: schemas.Points, frame_id: FrameId, ticket: Any) -> list[Output]:
+        """Put a cloud that came after its frame into the window."""
+        began_ns, frames = self._clock(), self._window.frames
+        placed = self._window.amended(message, frame_id, published=self._timeline.knows(frame_id))
+        if all(new is old for new, old in zip(placed, frames, strict=True)):
+            return []
+        return self._step(placed, self._timeline, frame_id, ticket, began_ns)
+
+    def _step(
+        self,
+        placed: list[ProcessedFrame],
+        timeline: Timeline,
+        frame_id: FrameId,
+        ticket: Any,
+        began_ns: int,
+        inputs: Inputs | None = None,
+    ) -> list[Output]:
+        """Process frames from the first that is not as it was; when a step raises, the sensor is quarantined.
+
+        Args:
+            placed: the frames of the window as they are to be; with `inputs` one that belongs behind all others.
+            timeline: that with these frames.
+            frame_id: the frame that is new.
+            ticket: its ticket.
+            began_ns: when this began.
+            inputs: the new frame, decoded; None: frames are inserted or changed.
+        """
+        window = self._window
+        before, final = window.head.session, window.base.reached
+        try:
+            outcomes = window.redo(placed) if inputs is None else window.append(placed[0], inputs)
+        except Exception as error:  # noqa: BLE001 - a fault in one session's step must not end the others
+            return self._fail(error, placed if inputs is None else [*window.frames, *placed], frame_id)
+        gone = window.trim(self._policy)
+        self._timeline = timeline.settle(window.base, gone) if gone else timeline
+        self._follow(gone)
+        self._deliveries.inserted += inputs is None
+        outputs = [] if self.session == before else self._restarted(outcomes)
+        if self.parameters.sensor_motion and self._estimated != self.session and self.density.sensor_motion is not None:
+            self._estimated = self.session
+            x, y, _ = self.density.sensor_motion.tolist()
+            received = f"none, and what stands moves by {math.hypot(x, y):.1f} m/s: the motion is estimated"
+            outputs.append(self._problem("no_pose", frame_id, "pose", "the pose of a sensor that moves", received))
+        step_ns = (self._clock() - began_ns) // max(1, len(outcomes))
+        for one in outcomes:
+            if (one.unknown or one.fault or one.tracks is None) and not one.frame.revision:
+                outputs += self._left_out(one)
+            if (tracks := one.tracks) is not None:
+                self._deliveries.corrected += one.frame.revision > 0
+                tracks.ticket, tracks.step_ns, tracks.run, tracks.final = ticket, step_ns, self.run, final
+                outputs.append(tracks)
+        return outputs
+
+    def _fail(self, error: Exception, placed: list[ProcessedFrame], frame_id: FrameId) -> list[Output]:
+        """Quarantine the sensor; the frame that failed and the pending ones go, unprocessed."""
+        reason = self._quarantine[frame_id.sensor] = f"{type(error).__name__}: {error}"[:MAX_ERROR]
+        came = len(placed) - len(self._window.frames)  # none with a late cloud, whose numbers are no frame's
+        self._deliveries.refused += came + self._sensors[frame_id.sensor].clear()
+        if came:
+            self._timeline = self._timeline.note(frame_id)
+        self._follow()
+        dump = self._window.transition.dump(self._window.base, placed, error)
+        problem = self._problem("internal", frame_id, "", "a step of the tracker without an error", reason)
+        return [problem, Quarantined(reason, dump)]
+
+    def _begin(self, state: FilterState, transition: Transition | None = None) -> None:
+        """Begin the window with a state when no frame is pending, with another transition when the profile changes."""
+        self._window = ReorderWindow(state, transition or self._window.transition)
+        self._timeline = self._timeline.settle(state, self._timeline.frame_ids)
+        self._follow()
+
+    # Problems
+
+    def _refused(self, frame_id: FrameId, decision: Decision) -> list[Output]:
+        """Count and report a frame that has no place; of a duplicate there is nothing to report."""
+        received = _seconds(decision.place.jump_ns)
+        if decision.verdict is Verdict.DUPLICATE:
+            self._deliveries.duplicates += 1
+            return []
+        if decision.verdict is Verdict.RETIRED:
+            silent = f"when the other has been silent for {self._policy.gap_limit_ns / SECOND:g} s"
+            expected = f"the publisher that began last; stop one of the two, this one is tracked again {silent}"
+            return [self._refuse("duplicate_epoch", frame_id, "epoch", expected, frame_id.epoch.hex())]
+        if decision.verdict is Verdict.JUMPED:
+            expected = "a stamp near those of the session's other sensors, or most of them on another clock"
+            return [self._refuse("time_jump", frame_id, "stamp_ns", expected, received)]
+        self._deliveries.late += 1
+        return [self._problem("late", frame_id, "stamp_ns", "a frame inside the window", received)]
+
+    def _restarted(self, outcomes: Sequence[Outcome]) -> list[Output]:
+        """Report the session id that frames started, the last one if there were several."""
+        for one in reversed(outcomes):
+            if (begun := one.begun) is not None:
+                if begun.reason == "first":
+                    return [begun]
+                received = f"{begun.reason}, {_seconds(begun.jump_ns)}"
+                return [begun, self._problem("restarted", one.frame.frame_id, "", "a stream that goes on", received)]
+        return []
+
+    def _low_scores(self, frame_id: FrameId, frame: optipmb.Frame, parameters: optipmb.Parameters) -> list[Output]:
+        """Count the detections below the score filter; report each class that loses most of them, once."""
+        sensor = "" if parameters is self.parameters else frame_id.sensor
+        if sensor not in self._scores:
+            limits = np.array([one.score_filter for one in parameters.classes.values()])
+            self._scores[sensor] = limits, np.zeros((2, len(limits)), np.int64)
+        filters, counts = self._scores[sensor]
+        labels, size = parameters.labels, len(filters)
+        counts[0] += np.bincount(frame.label, minlength=size)
+        low = frame.score < filters[frame.label]
+        if not low.any():
+            return []
+        counts[1] += np.bincount(frame.label[low], minlength=size)
+        given, removed = counts
+        problems: list[Output] = []
+        for index in np.flatnonzero((given >= SCORED) & (2 * removed > given)).tolist():
+            received = f"{removed[index]} of {given[index]} below {filters[index]:g}"
+            expected = f"most scores of {labels[index]} above the filter of the profile {parameters.name}"
+            problems.append(self._problem("score_filter", frame_id, f"{labels[index]}.score", expected, received))
+            filters[index] = 0.0  # reported
+        return problems
+
+    def _left_out(self, outcome: Outcome) -> list[Output]:
+        """Report objects of unknown classes, and a frame that was refused when its turn came."""
+        frame, parameters = outcome.frame, self.parameters
+        expected = f"one of {', '.join(parameters.classes)} (profile {parameters.name})"
+        problems: list[Output] = [
+            self._problem("unknown_class", frame.frame_id, "labels", expected, repr(label), count)
+            for label, count in (outcome.unknown or {}).items()
+        ]
+        if (fault := outcome.fault) is not None:
+            problems.append(self._problem("invalid_value", frame.frame_id, fault.path, fault.expected, fault.received))
+        if outcome.tracks is not None or fault is not None:
+            return problems
+        if frame.place.opens is Verdict.UNCONFIRMED:
+            expected = f"a stamp near the one before, or {JUMP_FRAMES} frames in a row that agree on the jump"
+            received = _seconds(frame.place.jump_ns)
+            return [self._problem("time_jump", frame.frame_id, "stamp_ns", expected, received)]
+        if (effort := outcome.effort) is not None:
+            return [self._problem("overload", frame.frame_id, effort.path, effort.expected, effort.received)]
+        pose = frame.message.pose
+        received = "nothing" if pose is None else ", ".join(f"{value:.1f}" for value in pose.translation)
+        expected = f"a position within reach of the last one at {self._policy.max_speed:g} m/s"
+        return [self._problem("astray", frame.frame_id, "pose.translation", expected, received)]
+
+    def _refuse_pending(self) -> list[Output]:
+        """Refuse all pending frames, with a problem for each sensor: there was no time to process them."""
+        problems: list[Output] = []
+        expected = f"at most {FLUSH_NS / SECOND:g} s for all frames that waited"
+        for one in self._sensors.values():
+            if one.held:
+                first, count = one.held[0].frame_id, one.clear()
+                self._deliveries.refused += count
+                problems.append(self._problem("overload", first, "", expected, "more", count))
+        self._follow()
+        return problems
+
+    def _too_many(self, frame_id: FrameId) -> schemas.Problem:
+        return self._problem("refused", frame_id, "stream", f"at most {MAX_SENSORS} sensors in a session", "another")
+
+    def _refuse(self, code: str, frame_id: FrameId, path: str, expected: str, received: str) -> schemas.Problem:
+        """Count a frame as refused; return the problem."""
+        self._deliveries.refused += 1
+        return self._problem(code, frame_id, path, expected, received)
+
+    def _problem(
+        self, code: str, frame_id: FrameId, path: str, expected: str, received: str, count: int = 1
+    ) -> schemas.Problem:
+        """Return a problem of a frame, on the stream of its sensor."""
+        texts = {"path": path, "expected": expected, "received": received}
+        frame = {"seq": frame_id.seq, "stamp_ns": frame_id.stamp_ns, "count": count}
+        stream, subject = frame_id.sensor or self.stream, f"Frame {frame_id.seq}: {path or 'tracker'}"
+        return problem_of(code, stream=stream, instance=self._instance, subject=subject, **texts, **frame)
+
+
+def _seconds(jump_ns: int) -> str:
+    return f"{jump_ns / SECOND:+.3f} s"

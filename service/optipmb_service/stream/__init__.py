@@ -1,1 +1,0 @@
-"""Streams: their backlogs, turns, opening and recovery, with their network inputs and their checkpoints."""

@@ -1,0 +1,1 @@
+"""Streams around their sessions: backlogs, turns, opening and recovery, network inputs, writing of checkpoints."""
