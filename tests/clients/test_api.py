@@ -32,6 +32,7 @@ from optipmb_schemas import (
     encode,
     encoding_of,
 )
+from proxy import Proxy
 from router import until
 from routers import free_endpoint, open_client
 from tracks_message import SESSION, tracks_message
@@ -416,6 +417,18 @@ def test_old_tracks_come_where_they_are_asked_for(endpoint: str, link: Connectio
             assert [one.tracks.seq for one in (late.receive(DEADLINE_S) for _ in range(3)) if one] == [5, 6, 7]
             assert subscriber.receive(1.5) is None  # nor do heartbeats bring any
             assert subscriber.missed == ()
+
+
+def test_the_first_tracks_after_a_subscriber_is_made_come(endpoint: str) -> None:
+    """Over a network that takes its time, too, though the publisher was there before."""
+    with Proxy(endpoint, delay_s=0.05) as far, Connection(endpoint) as service, Connection(far.endpoint) as link:
+        sender = service.cached_sender(Keys().tracks(STREAM), encoding_of(Tracks), cache=10)
+        sender.put(encode(tracks(0)))
+        with Subscriber(STREAM, connection=link) as subscriber:
+            for seq in (1, 2):
+                sender.put(encode(tracks(seq)))
+            found = [subscriber.receive(DEADLINE_S) for _ in range(2)]
+            assert [one.tracks.seq for one in found if one] == [1, 2]
 
 
 @pytest.mark.parametrize("pattern", ["garage/*", "garage/**", "a/b/c/d", "gar*/a/b", "$*/a/b", ""])

@@ -14,6 +14,8 @@ from optipmb_schemas import Tracks, encode
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
+from proxy import Proxy
+from service_process import ServiceProcess
 
 SUBSCRIBERS = 200
 FRAMES = 20
@@ -63,6 +65,15 @@ def test_without_history_only_new_frames_come(stub: Any, stream: str) -> None:
     call = subscribed(stub, pattern=stream)
     tracked(stub, stream, range(20, 30))
     assert taken(call, 1)[0].tracks.seq == 20
+
+
+def test_the_first_tracks_of_a_subscription_in_force_come(service: ServiceProcess, stub: Any, stream: str) -> None:
+    """Through a gateway that is far from the service, too."""
+    with Proxy(service.endpoint, delay_s=0.05) as far, GatewayProcess(far.endpoint) as gateway:
+        gateway.wait_ready()
+        call = subscribed(gateway.stub(), pattern=stream)
+        tracked(stub, stream, range(3))
+        assert [one.tracks.seq for one in taken(call, 3)] == [0, 1, 2]
 
 
 def test_filters(stub: Any, stream: str) -> None:

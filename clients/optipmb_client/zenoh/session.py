@@ -221,7 +221,8 @@ class Session:
         """Hand over all that is published under `key`, on a thread of its own.
 
         Losses are recovered from the publishers' caches. What those caches hold from before comes first: with
-        `history` at once, with None when a publisher is heard of, and not at all with False.
+        `history` at once, with None when a publisher is heard of. With False it does not come, and this returns when
+        the caches have said what is newest: what is published from then on comes.
         """
         after_loss: set[str] = set()
 
@@ -247,7 +248,14 @@ class Session:
         declared = self.listen(key, samples.put, recovers=True, history=EVERYTHING if history else None)
         if history is False:  # what is published from now on follows what the caches have now
             newest: list[Sample] = []
-            queries.ask(f"{key}/@adv/pub/**?_max=1", newest.append, lambda _: late_join.begin(newest))
+            begun = threading.Event()
+
+            def begin(_: bool) -> None:  # noqa: FBT001 - as `CacheQueries` has it called
+                late_join.begin(newest)
+                begun.set()
+
+            queries.ask(f"{key}/@adv/pub/**?_max=1", newest.append, begin)
+            begun.wait(ANSWER_S)
         return self._read(key, declared, samples, late_join.take, ended)
 
     def read_newest(self, key: str, receive: Callable[[Sample], None], *, most: int = 1) -> Reading:

@@ -61,8 +61,8 @@ async def subscribe(call: Call) -> None:
         await subscriptions.enter_async_context(network.subscribed(tracks, listener))
         if asked.problems:
             await subscriptions.enter_async_context(network.subscribed(problems, listener))
-        await call.begin()
         history = [] if asked.predict else await network.recent(tracks)
+        await call.begin()
         for one in history if asked.history else ():
             if passes(one):
                 await call.write(Item.of_tracks(one, selection).response)
@@ -88,8 +88,8 @@ async def subscribe_events(call: Call) -> None:
 
     listener = Listener(take)
     async with network.subscribed(key, listener):
-        await call.begin()
         history = await network.recent_events(key)
+        await call.begin()
         for one in history if asked.history else ():
             for response in chosen.responses(one):
                 await call.write(response)
