@@ -263,3 +263,24 @@ def test_the_end_of_a_gateway_finishes_what_is_under_way(service: ServiceProcess
             assert raised.value.code() == grpc.StatusCode.UNAVAILABLE
         release.set()
         assert (received, status) == (list(range(20)), 0)
+
+
+def test_tracks_that_a_caller_does_not_take_end_its_call_alone(gateway: GatewayProcess, stream: str) -> None:
+    """A caller with a limit below one frame hears so; the next call and other callers get the frames after it."""
+    limited = gateway.stub([("grpc.max_receive_message_length", 4000)])
+    calls = [one.Subscribe(pb.SubscribeRequest(pattern=stream)) for one in (limited, gateway.stub())]
+    for call in calls:
+        call.initial_metadata()
+    crowd = {name: np.repeat(getattr(frame(0), name)[:1], 20, axis=0) for name in ("label", "size", "yaw", "score")}
+    crowd["center"] = np.arange(20)[:, None] * [20.0, 0.0, 0.0] + [0.0, 50.0, 0.8]
+    frames = [frame(seq, stream, **(crowd if 3 <= seq < 6 else {})) for seq in range(12)]
+    tracked = [one.tracks for one in gateway.stub().Track(map(detections, frames))]
+    large = next(one.seq for one in tracked if one.ByteSize() > 4000)
+    with pytest.raises(grpc.RpcError) as raised:
+        list(calls[0])
+    assert raised.value.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+    assert [next(calls[1]).tracks.seq for _ in tracked] == [one.seq for one in tracked]
+    again = limited.Subscribe(pb.SubscribeRequest(pattern=stream))
+    again.initial_metadata()
+    list(gateway.stub().Track(detections(frame(seq, stream)) for seq in range(40, 60)))
+    assert next(one.tracks.seq for one in again) > large

@@ -5,6 +5,7 @@ Python, maintained, Apache-2.0, and it needs no ROS. It has most of ROS 2's type
 """
 
 import functools
+import struct
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -189,8 +190,15 @@ class Types:
         return np.zeros(length, item[1][0]) if given is None else given
 
     def write(self, message: Any) -> bytes:
-        """Return the CDR bytes of a message, little endian."""
-        return bytes(self._store.serialize_cdr(message, message.__msgtype__, little_endian=True))
+        """Return the CDR bytes of a message, little endian.
+
+        Raises:
+            MessageError: A value is beyond its field, such as a time after January 2038.
+        """
+        try:
+            return bytes(self._store.serialize_cdr(message, message.__msgtype__, little_endian=True))
+        except (SerdeError, ValueError, struct.error) as error:
+            raise MessageError("invalid_value", "", f"values of {message.__msgtype__}", cut(str(error))) from error
 
     def definition(self, name: str) -> str:
         """Return the definition of a type and of the types inside, as bags hold it."""

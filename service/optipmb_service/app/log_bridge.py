@@ -100,7 +100,7 @@ class LogBridge(Reporter):
             instance=self._instance,
             expected="a log that takes the message",
             received=why,
-            message=f"Log: a message is not in the log: {why}.",
+            message=f"Not in the log: {why}.",
         )
         self.reporter.report(problem, time.monotonic_ns())
 

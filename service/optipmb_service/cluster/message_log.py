@@ -435,7 +435,7 @@ class LogWriter:
     Args:
         log: where messages go; closed by the caller, after this.
         keep: retention by topic.
-        lost: called, on any thread, with the stream of a message that is not in the log, and why.
+        lost: called, on any thread, with the stream of a message that is not in the log, and its topic and why.
         held_bytes: bytes that are held at most.
     """
 
@@ -504,7 +504,7 @@ class LogWriter:
 
     def _lose(self, message: LogMessage, why: str) -> None:
         self.dropped += 1
-        self._lost(message.stream, why)
+        self._lost(message.stream, f"{message.topic}: {why}")
 
     # On the loop of the log
 

@@ -52,7 +52,7 @@ def test_without_servers_the_oldest_messages_go() -> None:
 
 
 def test_a_message_that_the_servers_do_not_take_keeps_none_waiting(log: MessageLog) -> None:
-    """One that is too large with its headers is reported; the others are written."""
+    """One that is too large with its headers is reported with stream, topic and size; the others are written."""
     lost: list[tuple[str, str]] = []
     most = log.connection.client().max_payload
     writer = LogWriter(log, KEEP, lambda *one: lost.append(one))
@@ -61,7 +61,10 @@ def test_a_message_that_the_servers_do_not_take_keeps_none_waiting(log: MessageL
     until(writer.idle, "all are written, or lost")
     writer.close()
     assert (writer.written, writer.dropped, writer.failure) == (3, 1, "")
-    assert str(most) in lost[0][1]
+    ((stream, why),) = lost
+    assert (stream, why.split()[0]) == ("a/b/c", "detections:")
+    assert int(why.split()[1]) > most
+    assert why.endswith(f"{most} at once")
 
 
 def test_a_failure_holds_until_something_is_written(log: MessageLog, monkeypatch: pytest.MonkeyPatch) -> None:

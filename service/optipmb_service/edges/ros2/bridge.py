@@ -167,7 +167,11 @@ class Bridge:
                     queue.popleft()
 
     def take_tracks(self, message: schemas.Tracks) -> None:
-        """Publish the tracks of a stream to ROS, but for frames before the newest one."""
+        """Publish the tracks of a stream to ROS, but for frames before the newest one.
+
+        Raises:
+            MessageError: ROS has no place for a value of theirs.
+        """
         stream = self._streams[message.stream]
         if time.monotonic() < stream.restart_s or message.session == stream.ended:
             return
@@ -175,7 +179,6 @@ class Bridge:
             stream.session, stream.shown_ns = message.session, -1  # its clock may have stepped back
         if message.stamp_ns < stream.shown_ns or message.epoch != stream.epoch:
             return  # a repetition after a restart, or a late correction: ROS expects stamps that ascend
-        stream.shown_ns = message.stamp_ns
         arrived = stream.arrived.get(message.stamp_ns)
         if arrived is not None:
             stream.latency_ms = 1e3 * (time.monotonic() - arrived)
@@ -185,6 +188,7 @@ class Bridge:
         made = tracks.messages(self._node.types, message, message.stamp_ns, stream.world, stream.name)
         for end, one in made:
             self._node.publish(stream.topics.tracks_topic + end, one)
+        stream.shown_ns = message.stamp_ns
 
     def take_problem(self, problem: schemas.Problem) -> None:
         """Note a problem that the service reports of a stream."""

@@ -86,6 +86,7 @@ class Ros2Node:
 
         Raises:
             TransportError: the session is closed.
+            MessageError: ROS has no place for a value of it.
         """
         hashed, unhashed = self._senders[topic]
         payload, number = self.types.write(message), self._numbers.get(topic, 0) + 1
