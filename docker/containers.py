@@ -53,6 +53,28 @@ cat memory.max memory/memory.limit_in_bytes 2>/dev/null | sed 's/^/memory=/'
 cat cpu.max cpu/cpu.cfs_quota_us cpu/cpu.cfs_period_us 2>/dev/null | xargs | awk '{ print "cpus=" $1 / $2 }'
 awk '$2 == "/" { print "root=" substr($4, 1, 2) } $2 == "/tmp" { print "tmp=" $4 }' /proc/mounts
 """
+CONSUMERS: Final = """\
+import json, os, subprocess, time, urllib.request
+import grpc
+from optipmb_schemas.protobuf import tracking_pb2 as pb, tracking_pb2_grpc as rpc
+over_http, ends = [], time.monotonic() + 60
+while not over_http and time.monotonic() < ends:
+    with urllib.request.urlopen("http://edge:8080/api/v1/tracks?stream=*/*/*", timeout=10) as answer:
+        over_http = [one["stream"] for one in json.load(answer)]
+listed = rpc.TrackingServiceStub(grpc.insecure_channel("edge:50051")).ListStreams(pb.ListStreamsRequest(), timeout=10)
+ready = []
+for arguments, settings in (
+    ("mqtt --broker mqtt://router:1883 --connect tcp/router:7447", {}),
+    ("ros2 --connect tcp/router:7447", {"OPTIPMB_ROS2": '{"streams": {"a/b/c": {"detections": "/boxes"}}}'}),
+    ("run", {"OPTIPMB_TRACES": "true", "OPTIPMB_STORE": "none"}),
+):
+    command = ["timeout", "60", "optipmb-service", *arguments.split()]
+    with subprocess.Popen(command, env=os.environ | settings, stdout=subprocess.PIPE, text=True) as process:
+        ready += [arguments.split()[0]] if process.stdout.readline().startswith("ready ") else []
+        process.terminate()
+print(json.dumps([over_http, [one.session.stream for one in listed.streams], ready]))
+"""
+"""What a consumer does: read JSON and gRPC of the gateway, and start the bridges and a service with traces."""
 
 
 class Check:
@@ -169,6 +191,15 @@ class Check:
         with urllib.request.urlopen("http://127.0.0.1:8080/readyz", timeout=10) as answer:
             state = json.load(answer)["state"]
         self.show("network", "services have names; ports open on 127.0.0.1 only", f"service-a says {state} on the host")
+
+    def consumers(self) -> None:
+        """Read tracks over HTTP and gRPC, and start what serves other consumers, from the same image."""
+        client = self.stack.container(CLIENT)
+        over_http, over_grpc, ready = json.loads(self.engine.run("exec", client, "python", "-c", CONSUMERS))
+        if not over_http or not over_grpc or ready != ["mqtt", "ros2", "run"]:
+            raise CheckError(f"JSON has {over_http}, gRPC {over_grpc}, ready are {ready}")
+        what = "JSON and gRPC give the replay's stream; the bridges to MQTT and ROS 2 and a service with traces start"
+        self.show("consumers", what)
 
     def takeover(self) -> None:
         """Replay a scene, kill the service that tracks it, and compare the result with tracking in one process."""
@@ -313,7 +344,15 @@ def main(arguments: list[str]) -> int:
     try:
         check.stack.remove()
         check.images()
-        for step in (check.start, check.confinement, check.network, check.takeover, check.metrics, check.stop):
+        for step in (
+            check.start,
+            check.confinement,
+            check.network,
+            check.consumers,
+            check.takeover,
+            check.metrics,
+            check.stop,
+        ):
             step()
     except (CheckError, EngineError, OSError, KeyboardInterrupt) as error:
         failed = str(error) or "interrupted"

@@ -33,7 +33,7 @@ CONTENTS: Final = {
         rb"|AKIA[0-9A-Z]{16}|xox[bap]-[0-9]{8,}-[\w-]{10,})\b"
     ),
     "a name and a password in an address": re.compile(
-        rb"https?://[\w.%-]{1,64}:(?!pass|pw\b|secret)[\w.%-]{8,64}@[\w-]+\.\w"
+        rb"https?://[\w.%-]{1,64}:(?!pass|pw\b|secret|REDACTED@)[\w.%-]{8,64}@[\w-]+\.\w"
     ),
 }
 SETTING: Final = re.compile(r"(?i)(password|passwd|secret|token|api_?key|credential)")

