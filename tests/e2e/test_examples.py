@@ -1,88 +1,136 @@
 """The examples run as they stand, and the README shows them as they are."""
 
-import itertools
 import re
 import subprocess
 import sys
 import threading
-from pathlib import Path
-from typing import IO
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
 
 import pytest
-from optipmb_client import Publisher
 from optipmb_client.zenoh import DEFAULT_ENDPOINT
 from real_data import REPOSITORY
 from service_process import ServiceProcess
-from without_numpy import command
+from without_numpy import command as without_numpy
 
 EXAMPLES = REPOSITORY / "examples"
 README = REPOSITORY / "README.md"
 
 
-def example(name: str, service: ServiceProcess, folder: Path, *, numpy: bool) -> list[str]:
-    """Give the command that runs an example against a service that does not listen at the default endpoint.
+def block(page: str, language: str) -> str:
+    """Return the first block of a page in a language."""
+    found = re.search(rf"^```{language}\n(.*?)^```", (REPOSITORY / "docs" / page).read_text(), re.DOTALL | re.MULTILINE)
+    assert found
+    return found[1]
 
-    Without numpy it publishes another stream, for the service keeps the tracks of a stream for those who come late.
+
+def connected(text: str, endpoint: str) -> str:
+    """Return a program that talks to this endpoint, and prints a line when it listens to something."""
+    text = text.replace(f', connect="{DEFAULT_ENDPOINT}"', "")
+    text, count = re.subn(r"((?:Publisher|Subscriber)\([^()]+)\)", rf'\1, connect="{endpoint}")', text)
+    assert count
+    return re.sub(
+        r"^(with .*Subscriber.* as \w+:.*)$", r'\1\n    print("listens", flush=True)', text, flags=re.MULTILINE
+    )
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceProcess]:
+    """A service with the settings of the pages on zones and on a fixed rate."""
+    file = tmp_path_factory.mktemp("settings") / "service.toml"
+    file.write_text(block("zones.md", "toml") + block("fixed-rate.md", "toml"))
+    with ServiceProcess("--settings", str(file)) as process:
+        process.wait_ready()
+        yield process
+
+
+@pytest.fixture(scope="module")
+def fused(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceProcess]:
+    """A service with the settings of the page on several sensors."""
+    file = tmp_path_factory.mktemp("settings") / "fusion.toml"
+    file.write_text(block("fusion.md", "toml"))
+    with ServiceProcess("--settings", str(file)) as process:
+        process.wait_ready()
+        yield process
+
+
+class Program(AbstractContextManager["Program"]):
+    """A program that runs until it ends or the test has read enough of it.
+
+    Args:
+        text: of the program.
+        numpy: whether it finds numpy.
     """
-    text = (EXAMPLES / name).read_text()
-    assert text.count(DEFAULT_ENDPOINT) == 1, "the example names the endpoint, once"
-    path = folder / name
-    text = text.replace(DEFAULT_ENDPOINT, service.endpoint)
-    if numpy:
-        path.write_text(text)
-        return [sys.executable, str(path)]
-    path.write_text(text.replace("robot-1", "robot-2"))
-    return [*command("import runpy; runpy.run_path(sys.argv[2])"), str(path)]
+
+    def __init__(self, text: str, *, numpy: bool = True) -> None:
+        command = [sys.executable, "-c", text] if numpy else without_numpy(text)
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        self.lines: list[str] = []
+        self._came = threading.Condition()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.wait(60)
+        self._reader.join(60)
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+    def until(self, pattern: str) -> list[str]:
+        """Return the lines up to one that begins like this."""
+        with self._came:
+            assert self._came.wait_for(lambda: any(re.match(pattern, one) for one in self.lines), 60), self.lines
+            return list(self.lines)
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            with self._came:
+                self.lines.append(line.rstrip("\n"))
+                self._came.notify_all()
 
 
 @pytest.mark.parametrize("numpy", [True, False])
-def test_publisher_and_subscriber(service: ServiceProcess, tmp_path: Path, *, numpy: bool) -> None:
-    """The subscriber prints the car that the publisher publishes, under one identity, moving along x at 10 m/s.
+def test_the_examples_work_twice(service: ServiceProcess, *, numpy: bool) -> None:
+    """Each reader of the examples and the pages says what it promises of the car that the publisher publishes.
 
-    Both need no numpy.
+    That is so again with the state that is left, without numpy for the examples.
     """
-    stream = f"garage/robot-{1 if numpy else 2}/lidar"
-    lines: list[str] = []
-    listening, seen = threading.Event(), threading.Event()
-
-    def read(output: IO[str]) -> None:
-        for line in output:
-            lines.append(line)
-            listening.set()
-            if line.startswith(stream):
-                seen.set()
-
+    texts = [(EXAMPLES / f"{name}.py").read_text() for name in ("subscriber", "publisher")]
+    assert all(text.count(DEFAULT_ENDPOINT) == 1 for text in texts), "an example names the endpoint, once"
+    subscriber, publisher = (connected(text, service.endpoint) for text in texts)
     with (
-        Publisher("garage/test/probe", service.endpoint, frame="world") as probe,
-        subprocess.Popen(
-            example("subscriber.py", service, tmp_path, numpy=numpy), stdout=subprocess.PIPE, text=True
-        ) as subscriber,
+        Program(subscriber.replace("timeout=5", "timeout=100"), numpy=numpy) as tracks,
+        Program(connected(block("zones.md", "python"), service.endpoint)) as events,
+        Program(connected(block("fixed-rate.md", "python"), service.endpoint)) as outputs,
     ):
-        assert subscriber.stdout is not None
-        reader = threading.Thread(target=read, args=(subscriber.stdout,), daemon=True)
-        reader.start()
-        numbers = itertools.count()
-        box = {"label": ["car"], "center": [[0, 0, 1]], "size": [[4, 2, 1.5]], "yaw": [0], "score": [0.9]}
-
-        def drive_until(event: threading.Event) -> None:
-            """Publish a car of another stream, so that the subscriber goes on listening."""
-            for _ in range(600):
-                probe.publish(stamp_ns=next(numbers) * 100_000_000, **box)
-                if event.wait(0.1):
-                    return
-
-        drive_until(listening)
-        with subprocess.Popen(example("publisher.py", service, tmp_path, numpy=numpy)) as publisher:
-            drive_until(seen)
-            assert publisher.wait(200) == 0
-        reader.join(60.0)
-        assert subscriber.wait(120) == 0
-    rows = [line.split() for line in lines if line.startswith(f"{stream} ")]
+        for one in (tracks, events, outputs):
+            one.until("listens")
+        with Program(publisher, numpy=numpy) as car:
+            assert car.process.wait(200) == 0
+        rows = [line.split() for line in tracks.until(r".* at 49\.")[1:]]
+        said = [line.split() for line in events.until(f"yard left .* {1 if numpy else 2}$")[1:]]
+        predicted = outputs.until("frame 45")[1:]
     assert len(rows) >= 45
-    assert {(row[2], row[3]) for row in rows} == {(rows[0][2], "car")}
+    assert {tuple(row[:4]) for row in rows} == {("garage/robot-1/lidar", "track", rows[0][2], "car")}
     x = [float(row[5]) for row in rows]
     assert x == sorted(x)
-    assert 44.0 < x[-1] < 54.0
+    time = 1 if numpy else 2  # a reader of events first gets those that are kept
+    promised = (REPOSITORY / "docs/zones.md").read_text().partition("It prints:\n\n```\n")[2].partition("```")[0]
+    assert [one[:-2] for one in said] == time * [line.split()[:-2] for line in promised.splitlines()]
+    assert [one[-1] for one in said[-4:]] == 4 * [str(time)]
+    assert all(re.fullmatch(r"frame \d+, -?\d+ ms later: x = \[.*\]", line) for line in predicted)
+
+
+@pytest.mark.parametrize("time", [1, 2])
+def test_two_sensors_work_twice(fused: ServiceProcess, time: int) -> None:
+    """The radar goes on with the track and the box of the lidar, and does so again with the state that is left."""
+    del time
+    with Program(connected(block("fusion.md", "python"), fused.endpoint)) as program:
+        lines = program.until(r"radar: track \d+ at 58\.")
+    assert len({line.split()[2] for line in lines[-20:]}) == 1
+    assert all(line.endswith("4.5 m long, heading 0.0") for line in lines[-20:])
 
 
 def test_the_examples_are_short() -> None:
