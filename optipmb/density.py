@@ -21,7 +21,7 @@ import numpy as np
 
 from optipmb.compiled import kernel
 from optipmb.errors import DensityError
-from optipmb.rows import Column, Rows, arrays_of, record, shown
+from optipmb.rows import Column, Rows, arrays_of, record, shown, views_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -144,29 +144,8 @@ OBJECT: Final = Bernoullis.width
 COMPONENT: Final = Poissons.width
 BernoulliArrays: Final = arrays_of(Bernoullis, "BernoulliArrays", __name__)
 PoissonArrays: Final = arrays_of(Poissons, "PoissonArrays", __name__)
-
-
-@kernel
-def objects_in(words: Array) -> Bernoullis:
-    """Return the columns of the array of `Bernoullis`, which are views of it; flags are the integers 0 and 1."""
-    n = words.shape[0] // OBJECT
-    whole = words.view(np.int64)
-    columns: Bernoullis = BernoulliArrays(
-        words[: 6 * n].reshape(n, STATE),
-        words[6 * n : 42 * n].reshape(n, STATE, STATE),
-        words[42 * n : 43 * n],  # existence
-        whole[43 * n : 44 * n],  # label
-        words[44 * n : 48 * n].reshape(n, 4),
-        whole[48 * n : 49 * n],  # id
-        whole[49 * n : 50 * n],  # born_ns
-        whole[50 * n : 51 * n],  # seen_ns
-        words[51 * n : 52 * n],  # score
-        words[52 * n : 53 * n],  # evidence
-        words[53 * n : 54 * n],  # heading_odds
-        whole[54 * n : 55 * n],  # extracted
-        whole[55 * n : 56 * n],  # confirmed
-    )
-    return columns
+objects_in: Final = views_of(Bernoullis, BernoulliArrays, "objects_in", __file__)
+components_in: Final = views_of(Poissons, PoissonArrays, "components_in", __file__)
 
 
 @kernel
@@ -178,22 +157,6 @@ def misses_counted_from(objects: Bernoullis, missed_from_ns: Index) -> Index:
         missed_from_ns: `Density.missed_from_ns`.
     """
     return missed_from_ns if missed_from_ns.shape[0] > 0 else objects.seen_ns
-
-
-@kernel
-def components_in(words: Array) -> Poissons:
-    """Return the columns of the array of `Poissons`, which are views of it."""
-    n = words.shape[0] // COMPONENT
-    whole = words.view(np.int64)
-    columns: Poissons = PoissonArrays(
-        words[: 6 * n].reshape(n, STATE),
-        words[6 * n : 42 * n].reshape(n, STATE, STATE),
-        words[42 * n : 43 * n],  # weight
-        whole[43 * n : 44 * n],  # label
-        words[44 * n : 48 * n].reshape(n, 4),
-        whole[48 * n : 49 * n],  # born_ns
-    )
-    return columns
 
 
 BINS: Final = 26

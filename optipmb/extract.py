@@ -28,7 +28,7 @@ from optipmb.frame import PLAIN
 from optipmb.lightweight import doubt, sign_probability
 from optipmb.predict import heading_unknown
 from optipmb.preprocess import Measurements
-from optipmb.rows import Column, Rows, arrays_of
+from optipmb.rows import Column, Rows, arrays_of, views_of
 from optipmb.table import known_length
 from optipmb.unknown_heading import show_heading
 
@@ -40,6 +40,19 @@ if TYPE_CHECKING:
     from optipmb.table import Classes
 
     Flags = NDArray[np.bool_]
+
+
+MAX_PLACE: Final = 1e9
+"""Largest coordinate of a track, m: ten times what a detection may have."""
+
+MAX_VALUE: Final = 1e5
+"""Largest size, heading, speed, turn rate and acceleration, in the units of `Tracks`."""
+
+MAX_COVARIANCE: Final = 1e30
+"""Largest entry of a covariance, in the units of `Tracks`."""
+
+MAX_AGE: Final = 1e12
+"""Longest age, s."""
 
 
 class Tracks(Rows):
@@ -73,50 +86,25 @@ class Tracks(Rows):
 
     id = Column(np.int64)
     label = Column(np.int64)
-    center = Column(np.float64, 3)
-    size = Column(np.float64, 3)
-    yaw = Column(np.float64)
-    heading_confidence = Column(np.float64)
-    velocity = Column(np.float64, 2)
-    yaw_rate = Column(np.float64)
-    acceleration = Column(np.float64)
-    existence = Column(np.float64)
-    score = Column(np.float64)
-    covariance = Column(np.float64, STATE, STATE)
-    age = Column(np.float64)
-    time_since_detection = Column(np.float64)
+    center = Column(np.float64, 3, low=-MAX_PLACE, high=MAX_PLACE)
+    size = Column(np.float64, 3, low=5e-324, high=MAX_VALUE)
+    yaw = Column(np.float64, low=-MAX_VALUE, high=MAX_VALUE)
+    heading_confidence = Column(np.float64, low=0.0, high=1.0)
+    velocity = Column(np.float64, 2, low=-MAX_VALUE, high=MAX_VALUE)
+    yaw_rate = Column(np.float64, low=-MAX_VALUE, high=MAX_VALUE)
+    acceleration = Column(np.float64, low=-MAX_VALUE, high=MAX_VALUE)
+    existence = Column(np.float64, low=0.0, high=1.0)
+    score = Column(np.float64, low=0.0, high=1.0)
+    covariance = Column(np.float64, STATE, STATE, low=-MAX_COVARIANCE, high=MAX_COVARIANCE)
+    age = Column(np.float64, low=0.0, high=MAX_AGE)
+    time_since_detection = Column(np.float64, low=0.0, high=MAX_AGE)
     detection = Column(np.int64)
     confirmed = Column(np.bool_)
 
 
 TRACK: Final = Tracks.width
 TrackArrays: Final = arrays_of(Tracks, "TrackArrays", __name__)
-
-
-@kernel
-def tracks_in(words: Array) -> Tracks:
-    """Return the columns of the array of `Tracks`, which are views of it; flags are the integers 0 and 1."""
-    n = words.shape[0] // TRACK
-    whole = words.view(np.int64)
-    columns: Tracks = TrackArrays(
-        whole[:n],  # id
-        whole[n : 2 * n],  # label
-        words[2 * n : 5 * n].reshape(n, 3),  # center
-        words[5 * n : 8 * n].reshape(n, 3),  # size
-        words[8 * n : 9 * n],  # yaw
-        words[9 * n : 10 * n],  # heading_confidence
-        words[10 * n : 12 * n].reshape(n, 2),  # velocity
-        words[12 * n : 13 * n],  # yaw_rate
-        words[13 * n : 14 * n],  # acceleration
-        words[14 * n : 15 * n],  # existence
-        words[15 * n : 16 * n],  # score
-        words[16 * n : 52 * n].reshape(n, STATE, STATE),
-        words[52 * n : 53 * n],  # age
-        words[53 * n : 54 * n],  # time_since_detection
-        whole[54 * n : 55 * n],  # detection
-        whole[55 * n : 56 * n],  # confirmed
-    )
-    return columns
+tracks_in: Final = views_of(Tracks, TrackArrays, "tracks_in", __file__)
 
 
 @kernel
@@ -212,34 +200,6 @@ def confirm(rows: Index, label: Index, existence: Array, classes: Classes, confi
         confirmed[rows[k]] = now[k]
 
 
-MAX_PLACE: Final = 1e9
-"""Largest coordinate of a track, m: ten times what a detection may have."""
-
-MAX_VALUE: Final = 1e5
-"""Largest size, heading, speed, turn rate and acceleration, in the units of `Tracks`."""
-
-MAX_COVARIANCE: Final = 1e30
-"""Largest entry of a covariance, in the units of `Tracks`."""
-
-MAX_AGE: Final = 1e12
-"""Longest age, s."""
-
-_BOUNDS: Final[tuple[tuple[str, float, float], ...]] = (
-    ("center", -MAX_PLACE, MAX_PLACE),
-    ("size", 5e-324, MAX_VALUE),
-    ("yaw", -MAX_VALUE, MAX_VALUE),
-    ("heading_confidence", 0.0, 1.0),
-    ("velocity", -MAX_VALUE, MAX_VALUE),
-    ("yaw_rate", -MAX_VALUE, MAX_VALUE),
-    ("acceleration", -MAX_VALUE, MAX_VALUE),
-    ("existence", 0.0, 1.0),
-    ("score", 0.0, 1.0),
-    ("covariance", -MAX_COVARIANCE, MAX_COVARIANCE),
-    ("age", 0.0, MAX_AGE),
-    ("time_since_detection", 0.0, MAX_AGE),
-)
-
-
 def sound(tracks: Tracks) -> bool:
     """Tell whether all numbers of the tracks are finite and within bounds, and the ids ascend.
 
@@ -251,23 +211,18 @@ def sound(tracks: Tracks) -> bool:
 
 def unsound(tracks: Tracks) -> tuple[str, str, str]:
     """Return the first fault of tracks that are not `sound`: path, expected, received."""
-    for name, low, high in _BOUNDS:
-        values = getattr(tracks, name)
-        for place in np.argwhere(~((low <= values) & (values <= high)))[:1]:
+    for name, values in tracks.columns():
+        low, high = Tracks.described[name].low, Tracks.described[name].high
+        for place in np.argwhere(~((low <= values) & (values <= high)) & (low <= high))[:1]:
             least = f"from {low:g}" if low <= 0.0 else "above 0"
             return f"tracks.{name}[{place[0]}]", f"a number {least} to {high:g}", f"{values[tuple(place)]:g}"
     row = int((np.diff(tracks.id, prepend=-1) <= 0).argmax())
     return f"tracks.id[{row}]", "ids that ascend, from 0", str(tracks.id[row])
 
 
-def _bounds() -> Array:
-    bounds = np.full((TRACK, 2), np.nan)
-    for name, low, high in _BOUNDS:
-        bounds[Tracks.described[name].begin : Tracks.described[name].end] = low, high
-    return bounds
-
-
-_BOUNDS_OF_WORDS: Final = _bounds()
+_BOUNDS_OF_WORDS: Final = np.array(
+    [(one.low, one.high) for one in Tracks.described.values() for _ in range(one.begin, one.end)]
+)
 """(`TRACK`, 2) bounds of each word of a row, NaN where it is an integer."""
 
 

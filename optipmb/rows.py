@@ -13,19 +13,21 @@ from __future__ import annotations
 import sys
 from collections import namedtuple
 from dataclasses import dataclass, field
-from math import prod
+from math import nan, prod
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, Self, TypeAlias, TypeVar, dataclass_transform, overload
 
 import numpy as np
 
+from optipmb.compiled import kernel
 from optipmb.errors import DensityError, OptipmbError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from numpy.typing import NDArray
 
 _N = TypeVar("_N", bound=np.generic)
+_R = TypeVar("_R", bound="Rows")
 
 _LOWEST: Final = 0 if sys.byteorder == "little" else 7
 """Byte of an integer that holds a flag."""
@@ -39,12 +41,14 @@ class Column(Generic[_N]):
     Args:
         number: float64, int64 or bool.
         shape: of a row.
+        low, high: range of the numbers, both ends included; NaN: any number.
     """
 
-    def __init__(self, number: type[_N], *shape: int) -> None:
+    def __init__(self, number: type[_N], *shape: int, low: float = nan, high: float = nan) -> None:
         self.number = np.dtype(number)
         self.kind = self.number.kind
         self.shape = shape
+        self.low, self.high = low, high
         self.begin = self.end = 0
 
     def __set_name__(self, record: type[Rows], name: str) -> None:
@@ -151,6 +155,26 @@ class Rows:
 def arrays_of(record: type[Rows], name: str, module: str) -> Any:
     """Return the named tuple in which kernels have the columns of a record, a constant of a module by that name."""
     return namedtuple(name, [*record.described], module=module)  # noqa: PYI024 - a class would list the columns of the record again
+
+
+def views_of(record: type[_R], arrays: Any, name: str, file: str) -> Callable[[Array], _R]:
+    """Return the kernel that takes `words` of a record and returns its columns, which are views; flags are 0 and 1.
+
+    Args:
+        record: the record.
+        arrays: the named tuple of its columns, by `arrays_of`.
+        name: of the kernel, a constant of the same module.
+        file: of the module: numba keeps the machine code beside it.
+    """
+    views = []
+    for one in record.described.values():
+        shape = f".reshape(n, {', '.join(map(str, one.shape))})" if one.shape else ""
+        views.append(f"{'words' if one.kind == 'f' else 'whole'}[{one.begin} * n : {one.end} * n]{shape}")
+    lines = f"n = words.shape[0] // {record.width}", "whole = words.view(integer)", f"return arrays({', '.join(views)})"
+    names = {"__name__": arrays.__module__, "arrays": arrays, "integer": np.int64}
+    exec(compile(f"def {name}(words):\n    " + "\n    ".join(lines), file, "exec"), names)  # noqa: S102 - as `namedtuple` does
+    views_in: Callable[[Array], _R] = kernel(names[name])
+    return views_in
 
 
 def shown(column: object) -> str:

@@ -69,6 +69,7 @@ EXCEPTIONS = {
     # dates, forms that users ask for, and a page for notebooks
     "online": {"datetime", "html", "io", "matplotlib", "pandas", "pyarrow", "supervision"},
 }
+EXECUTES = {"rows": {"exec"}}  # the views of the columns of a record, which come from their declaration
 TOUCHES_FILES = {"compiled", "parameters", "prepared", "warm"}
 
 
@@ -140,13 +141,8 @@ def test_the_tracker_is_pure_computation(source: Path) -> None:
     if source.stem not in TOUCHES_FILES:
         assert not first(source) & {"pathlib", "importlib", "tomllib"}
         calls = [node.func for node in ast.walk(tree(source)) if isinstance(node, ast.Call)]
-        assert not {call.id for call in calls if isinstance(call, ast.Name)} & {
-            "open",
-            "print",
-            "input",
-            "exec",
-            "eval",
-        }
+        names = {call.id for call in calls if isinstance(call, ast.Name)}
+        assert names & {"open", "print", "input", "exec", "eval"} <= EXECUTES.get(source.stem, set())
     assert not [node for node in ast.walk(tree(source)) if isinstance(node, ast.Global | ast.Nonlocal)]
     for node in tree(source).body:
         if isinstance(node, ast.Assign | ast.AnnAssign) and source.stem != "__init__":

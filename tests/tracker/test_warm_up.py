@@ -98,10 +98,11 @@ def test_all_kernels_are_counted() -> None:
     defined = set()
     for path in folder.glob("*.py"):
         for node in ast.parse(path.read_text(encoding="utf-8")).body:
-            if not isinstance(node, ast.FunctionDef):
-                continue
-            if {"kernel", "long_kernel"} & {ast.unparse(one) for one in node.decorator_list}:
-                defined.add(f"optipmb.{path.stem}.{node.name}")
+            if isinstance(node, ast.FunctionDef):
+                if {"kernel", "long_kernel"} & {ast.unparse(one) for one in node.decorator_list}:
+                    defined.add(f"optipmb.{path.stem}.{node.name}")
+            elif isinstance(node, ast.AnnAssign) and ast.unparse(node.value or node).startswith("views_of("):
+                defined.add(f"optipmb.{path.stem}.{ast.unparse(node.target)}")
     assert set(kernels()) == defined
 
 
