@@ -37,8 +37,12 @@ Columns: TypeAlias = dict[str, NDArray[Any]]
 SUFFIXES: Final = (".csv", ".tsv", ".parquet", ".jsonl", ".ndjson", ".feather", ".arrow")
 """Formats that are read and written."""
 NO_VALUE: Final = (
-    *("", "nan", "NaN", "NAN", "NA", "N/A", "n/a", "#N/A", "<NA>"),
-    *("null", "NULL", "Null", "None", "NONE", "nil", "\\N", "?", "-", "--"),
+    *("", "NaN", "\\N", "?", "-", "--", ".", "*", "1.#QNAN", "1.#IND", "-1.#IND"),
+    *(
+        write(word)
+        for word in ("nan", "na", "n/a", "n.a.", "#n/a", "<na>", "null", "none", "nil", "#value!", "#null!", "#div/0!")
+        for write in (str.lower, str.upper, str.title)
+    ),
 )
 """Texts that stand for no value."""
 _READ_ONLY: Final = (".json", ".txt")
@@ -258,7 +262,8 @@ def _benchmark(line: str) -> str | None:
         return "labels or results of KITTI's tracking benchmark: --dataset kitti reads a folder of it"
     if len(fields) == 15 and all(numeric):  # noqa: PLR2004  fields of a detection
         return "detections for KITTI's tracking benchmark: --dataset kitti reads a folder of it"
-    if all(one.isdigit() for one in fields[:1]) and fields[7:] == ["-1"] * 3 and all(numeric):
+    counted = all(one.isdigit() for one in fields[:2]) or fields[7:] == ["-1"] * 3
+    if len(fields) in {9, 10} and counted and fields[0].isdigit() and all(numeric):
         return "image boxes as of MOTChallenge: boxes in pixels lie nowhere in the world, 3D boxes are needed"
     return None
 
@@ -489,27 +494,31 @@ def read_frames(folder: Path) -> list[_Record]:
         DatasetError: A file is wrong; says where.
     """
     files = frame_files(folder)
-    number = frame_numbers(files)
-    name = "timestamp" if min(number) >= _STAMPS else "frame"
+    name, number = frame_numbers(files)
     read = _kitti_frame if files[0].suffix == ".txt" else read_json
     return split_boxes([{name: n} | one for n, file in sorted(zip(number, files, strict=True)) for one in read(file)])
 
 
-def frame_numbers(files: Sequence[Path]) -> list[int]:
-    """Return the number of each file: the one that differs among their names, or the smallest of those in one order.
+def frame_numbers(files: Sequence[Path]) -> tuple[str, list[float]]:
+    """Return `frame`, or `timestamp`, and that number of each file: the one that differs among their names.
+
+    Of several in one order it is the one with the smallest values.
 
     Raises:
         DatasetError: Several numbers differ in orders of their own, none does, or other parts of the names do.
     """
-    parts = [re.split(r"(\d+)", file.stem) for file in files]
-    columns = np.array([[int(one) for one in part[1::2]] for part in parts if part[::2] == parts[0][::2]], dtype=object)
-    alike = columns.T.tolist() if len(columns) == len(files) else []
+    parts = [re.split(r"(\d{9,10}\.\d+|\d+)", file.stem) for file in files]
+    columns = [
+        [float(one) if "." in one else int(one) for one in part[1::2]] for part in parts if part[::2] == parts[0][::2]
+    ]
+    alike = list(zip(*columns, strict=True)) if len(columns) == len(files) else []
     varying = [one for one in alike if len(set(one)) > 1 or len(files) == 1]
     orders = {tuple(sorted(range(len(files)), key=one.__getitem__)) for one in varying if len(set(one)) == len(files)}
     if len(orders) != 1 or any(len(set(one)) < len(files) for one in varying):
         expected = "a file for each frame, whose names differ in its number alone"
         raise DatasetError(files[0].parent, expected, f"{files[0].name} … {files[-1].name}")
-    return min(varying, key=max)
+    number = min(varying, key=max)
+    return "timestamp" if min(number) >= _STAMPS else "frame", list(number)
 
 
 def _kitti_frame(path: Path) -> list[_Record]:

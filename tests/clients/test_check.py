@@ -110,12 +110,12 @@ def test_stamps_that_lost_their_digits_are_refused(tmp_path: Path, capsys: pytes
     """Frames whose boxes share their places are no frames, unless the user states the unit of their stamps."""
     data = write(tmp_path / "d.csv", street(), t=np.full(2 * FRAMES, 1.6e18))
     line = refused(capsys, data)
-    assert "have stamps lost digits" in line
+    assert "stamps have lost digits" in line
     assert "--option time=UNIT" in line
     _, notes = tracked(capsys, data, "--option", "time=ns")
     assert "100% of the boxes at the place of another one" in notes
     seconds = write(tmp_path / "s.csv", street(), t=1_600_000_000.0 + INDEX // 10)
-    assert "have stamps lost digits" in refused(capsys, seconds)
+    assert "stamps have lost digits" in refused(capsys, seconds)
 
 
 def test_a_unit_in_the_name_that_contradicts_the_rate_is_refused(

@@ -273,7 +273,7 @@ def test_centres_without_sizes_have_the_figures_of_distances(bench: Bench, bare:
     pair = (centres, cars()) if bare == "truth" else (cars(), centres)
     done = bench.evaluate(*pair, "--verbose")
     assert counts(done) == RIGHT
-    assert f"{bare}.csv: no columns for the size or the heading: only centres can be compared" in done.stderr
+    assert f"{bare}.csv: no column for the size or the heading: only centres can be compared" in done.stderr
     done = bench.evaluate(*pair, "--iou", "0.5")
     assert done.returncode == 2
     assert "--iou: expected truth and tracks with sizes" in done.stderr

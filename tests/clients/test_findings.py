@@ -11,6 +11,9 @@ from optipmb_tools.datasets import DatasetError
 from optipmb_tools.datasets.evidence import Evidence
 from optipmb_tools.datasets.table import TableDataset
 from optipmb_tools.datasets.table.findings import Finding
+from optipmb_tools.results.output import TrackCounts
+from optipmb_tools.run.profiles import profile_for
+from optipmb_tools.run.tracking import track_whole
 from optipmb_tools.table_files import write_table
 from own_tables import boxes
 
@@ -108,14 +111,17 @@ def test_an_orientation_is_read_whole_or_refused(tmp_path: Path) -> None:
         "z w": [np.sin(yaw / 2), np.cos(yaw / 2)],
         "x y z": [zero, zero, yaw],
         "0 1 2": [zero, zero, yaw],
-        "0 1 2 3 4 5 6 7 8": [cos, -sin, zero, sin, cos, zero, zero, zero, zero + 1],
+        "matrix.0.0 matrix.0.1 matrix.0.2 matrix.1.0 matrix.1.1 matrix.1.2 matrix.2.0 matrix.2.1 matrix.2.2": [
+            *(cos, -sin, zero, sin, cos, zero, zero, zero, zero + 1)
+        ],
+        "vector.0 vector.1 vector.2": [zero, zero, yaw],
     }
     for names, values in groups.items():
         group = {f"rotation.{name}": one for name, one in zip(names.split(), values, strict=True)}
         write_table(tmp_path / "d.parquet", {**{name: one for name, one in columns.items() if name != "yaw"}, **group})
         turn = np.abs(np.exp(1j * yaw_of(tmp_path / "d.parquet")) - np.exp(1j * yaw))
         assert turn.max() < 1e-6, names
-    tilted = {f"rotation.{name}": yaw for name in "xyz"}
+    tilted = {f"eulerAngles.{name}": yaw for name in "xyz"}
     write_table(tmp_path / "d.parquet", {**{name: one for name, one in columns.items() if name != "yaw"}, **tilted})
     with pytest.raises(DatasetError, match=r"expected a column yaw \(--option column.yaw=NAME\)"):
         yaw_of(tmp_path / "d.parquet")
@@ -273,6 +279,18 @@ def test_boxes_may_lack_their_headings(tmp_path: Path) -> None:
         assert sum("unknown" in one.text for one in findings) == 1
 
 
+@pytest.mark.parametrize("name", ["17000000{:02d}.{:d}00000", "17000000{:02d}{:d}00000000"])
+def test_names_of_files_that_are_stamps_give_the_rate(tmp_path: Path, name: str) -> None:
+    """Seconds with a fraction, and nanoseconds, in the names of the tables of frames are stamps."""
+    columns = street(2.0)
+    rows = {key: one for key, one in columns.items() if key != "t"}
+    for frame, stamp in enumerate(np.unique(columns["t"]).tolist()):
+        file = tmp_path / f"{name.format(frame // 2, frame % 2 * 5)}.csv"
+        write_table(file, {key: one[columns["t"] == stamp] for key, one in rows.items()})
+    stamps = TableDataset(tmp_path).sequences(["all"])[0].stamps
+    assert np.diff(stamps) == pytest.approx(0.5e9, rel=1e-3)
+
+
 def test_a_class_with_the_number_of_an_object_is_a_class(tmp_path: Path) -> None:
     """`car:3` is of class `car`; classes that differ in a number alone stay as they are."""
     columns = street(4.0)
@@ -294,8 +312,22 @@ def test_boxes_of_an_image_are_refused(tmp_path: Path) -> None:
             TableDataset(tmp_path / "d.csv")
 
 
+def test_a_heading_that_may_be_in_unread_columns_is_doubted(tmp_path: Path) -> None:
+    """An angle about an axis is not taken for a yaw; without a heading, columns that may have it are named."""
+    columns = street(4.0)
+    yaw = columns.pop("yaw")
+    axis = {f"rotation.axis.{place}": np.full(len(yaw), float(place == 2)) for place in range(3)}
+    for others in ({**axis, "rotation.angle": yaw}, {"yaw_sin": np.sin(yaw), "yaw_cos": np.cos(yaw)}):
+        (found,) = troubles(tmp_path / "d.parquet", {**columns, **others})
+        assert all(name in found for name in others)
+    assert troubles(tmp_path / "d.parquet", columns) == []
+
+
 def test_objects_that_report_one_by_one_are_looks_at_each(tmp_path: Path) -> None:
-    """Frames of one box whose objects come back in turn look around their box; `group` bounds a frame in time."""
+    """Frames of one box whose objects come back in turn look around their box; `group` bounds a frame in time.
+
+    The gate of the profile made for them holds the way from one report to the next.
+    """
     rng = np.random.default_rng(1)
     t = np.sort(
         np.concatenate([rng.uniform(0.0, 2.0) + np.arange(40) * 2.0 + rng.normal(0.0, 0.1, 40) for _ in range(5)])
@@ -314,16 +346,35 @@ def test_objects_that_report_one_by_one_are_looks_at_each(tmp_path: Path) -> Non
     frame = next(dataset.sequences(["all"])[0].frames())
     assert frame.field_of_view is not None
     assert frame.pose.translation[:2] == pytest.approx([columns["x"][0], columns["y"][0]])
+    tracks = track_whole(profile_for("auto", dataset.sequences(["all"])), dataset.sequences(["all"])[0]).tracks
+    assert TrackCounts.of(tracks.values()).tracks == 5
     stamps = looked(tmp_path / "d.csv", columns, group="2.3")[0].sequences(["all"])[0].stamps
     assert 25 < len(stamps) < 45
 
 
 def test_rows_that_repeat_another_one_count_once(tmp_path: Path) -> None:
-    """A table in which each row stands twice has the boxes of the plain one."""
+    """A table in which each row stands twice has the boxes of the plain one; a copy of a recording has all of them."""
     columns = {name: np.repeat(one, 2) for name, one in street(4.0).items()}
-    dataset, findings = looked(tmp_path / "d.csv", columns)
+    dataset, findings = looked(tmp_path / "a" / "d.csv", columns)
     assert sum(len(frame) for frame in dataset.sequences(["all"])[0].frames()) == len(columns["t"]) // 2
     assert any("rows that another one repeats are left out" in one.text for one in findings)
+    for name in ("a.csv", "b.csv"):
+        looked(tmp_path / "b" / name, street(4.0))
+    for one in TableDataset(tmp_path / "b").sequences(["all"]):
+        assert sum(len(frame) for frame in one.frames()) == len(columns["t"]) // 2
+
+
+def test_boxes_of_two_detectors_are_refused_with_the_column_of_the_detector(tmp_path: Path) -> None:
+    """Two boxes at each place are refused where frames may be merged; a column that tells them apart is named."""
+    columns = {name: np.repeat(one, 2) for name, one in street(4.0).items()}
+    columns["x"] = columns["x"] + np.resize([0.0, 0.05], len(columns["x"]))
+    (found,) = troubles(tmp_path / "d.csv", columns)
+    assert "two detectors see each object --option time=UNIT" in found
+    cameras = {**columns, "camera": np.resize(["left", "right"], len(columns["x"]))}
+    assert any("--option column.sensor=camera" in one for one in troubles(tmp_path / "d.csv", cameras))
+    assert troubles(tmp_path / "d.csv", cameras, **{"column.sensor": "camera"}) == []
+    even = {**columns, "t": columns["t"] * 0.3}  # frames that were merged are not 30 ms apart
+    assert [one for one in looked(tmp_path / "d.csv", even)[1] if one.wrong] == []
 
 
 def test_stronger_evidence_needs_numbers_and_a_difference() -> None:

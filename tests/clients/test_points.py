@@ -43,7 +43,7 @@ def test_a_table_of_points_is_tracked(tmp_path: Path, capsys: pytest.CaptureFixt
     write_table(tmp_path / "points.csv", boxes(**UNKNOWN))
     done = run_here(capsys, "track", tmp_path / "points.csv", "--out", tmp_path / "t.csv", "--verbose")
     assert done.returncode == 0, done.stderr
-    assert "no columns for the size or the heading: they are unknown" in done.stderr + done.stdout
+    assert "no column for the size or the heading: unknown" in done.stderr + done.stdout
     tracks = read_table(tmp_path / "t.csv")
     last = np.flatnonzero(tracks["t"] == tracks["t"].max())
     assert len(last) == len(set(tracks["id"].tolist())) == 3

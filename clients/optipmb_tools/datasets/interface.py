@@ -82,6 +82,15 @@ DETECTION_COLUMNS = ("label", "center", "size", "yaw", "score", "velocity", "pos
 
 
 @dataclass(frozen=True)
+class Reports:
+    """Reports of objects one by one, as of vessels: a frame is a look at the place of its box."""
+
+    distance: float  # m around a box in which its object reported before
+    period: float  # s between the reports of an object
+    speed: float  # m/s, of the fastest ones
+
+
+@dataclass(frozen=True)
 class Regions:
     """Parts of the image in which nothing is annotated (KITTI's DontCare)."""
 
@@ -147,6 +156,7 @@ class DataSequence(ABC):
     key_columns: Mapping[str, str] = {}
     time_column: str = ""  # empty: the columns are `sequence` and `stamp_ns` instead
     numbers: NDArray[Any] | None = None  # (F,) numbers of the frames as the table has them
+    reports: Reports | None = None  # where objects report one by one
 
     if TYPE_CHECKING:
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from optipmb_tools.datasets.evidence import Evidence
+from optipmb_tools.datasets.interface import Reports
 from optipmb_tools.geometry import Bools, Floats, Ints, stack_poses, to_world, wrap_angle
 
 if TYPE_CHECKING:
@@ -40,9 +41,10 @@ COMMON_STEP: Final = 4.0
 COMMON_S: Final = 1.5  # median step in metres from which a motion tells rigid ones from traffic; longest time for it
 LIKE: Final = 0.25  # least score of the boxes at one place, by their largest, from which none is a weaker guess
 MOST_ALONE: Final = 0.9  # share of frames with one box, and of boxes that come back, of objects that report one by one
-LONGEST_ALONE_S: Final = 30.0
-LONGEST_RETURN: Final = 60.0
-LEAST_LOOK: Final = 10.0  # longest time and way in metres to the next report; least range of a look at one object
+SPEEDS: Final = (40.0, 350.0)  # m/s that such objects reach: on the ground and on water, in the air
+LONGEST_ALONE_S: Final = 30.0  # to the next report of an object,
+LONGEST_WAY_S: Final = 1.5  # in which it goes no further than at its highest speed for so long
+LEAST_LOOK: Final = 10.0  # least range in metres of a look at one object
 LARGEST_OVERLAP: Final = 2.5  # distance in metres from which the centres of two boxes of a class are two places
 
 
@@ -203,13 +205,13 @@ def _chains(following: Ints, xy: Floats, least: Floats) -> tuple[Ints, Ints]:
     return np.concatenate([one for one, _ in ended]), np.concatenate([one for _, one in ended])
 
 
-def overlapping(frame: Ints, xy: Floats, size: Floats, kind: Ints, score: Floats) -> Bools:
-    """Return the boxes (B,) that share their place with another one of their frame and class, of like score.
+def overlapping(frame: Ints, xy: Floats, size: Floats, kind: Ints, score: Floats) -> Ints:
+    """Return how many boxes of its frame and class are at the place of each box (B,), itself among them.
 
-    A detector without suppression gives many boxes of an object, of scores from high to low: these are none.
+    A detector without suppression gives many boxes of an object, of scores from high to low: these count as one.
     Of frames with more than `MOST_BOXES` boxes a part is looked at, and no more than `MOST_FRAMES` frames.
     """
-    found = np.zeros(len(frame), dtype=np.bool_)
+    found = np.ones(len(frame), dtype=np.int64)
     order = np.argsort(frame, kind="stable")
     starts = np.flatnonzero(np.r_[True, np.diff(frame[order]) != 0])
     near = np.minimum(0.7 * size[:, :2].max(axis=1, initial=0.0), LARGEST_OVERLAP)
@@ -219,34 +221,33 @@ def overlapping(frame: Ints, xy: Floats, size: Floats, kind: Ints, score: Floats
         close = (away < near[some][:, None]) & (kind[some][:, None] == kind[some][None])
         least = np.where(close, score[some][None], np.inf).min(axis=1)
         most = np.where(close, score[some][None], 0.0).max(axis=1)
-        found[some] = (close.sum(axis=1) > 1) & (least > LIKE * most)
+        found[some] = np.where(least > LIKE * most, close.sum(axis=1), 1)
     return found
 
 
-def reported_alone(key: Ints, seconds: Floats, xy: Floats, kind: Ints) -> float | None:
-    """Return how far in metres the boxes (B,) of an object are apart where objects report one by one; None otherwise.
+def find_reports(key: Ints, seconds: Floats, xy: Floats, kind: Ints) -> Reports | None:
+    """Return how the objects of boxes (B,) report where they do so one by one; None otherwise.
 
     Then nearly every frame has one box, the next box is elsewhere, and a later one is where motion would take it.
     """
-    order = np.lexsort((seconds, key))
-    order = order[:MOST_FRAMES]
-    if len(order) < LEAST_FRAMES // 2:
-        return None
+    order = np.lexsort((seconds, key))[:MOST_FRAMES]
     time, place, mine = seconds[order], xy[order], key[order]
     again = np.diff(mine) == 0
-    if np.mean((np.diff(time) > 0.0)[again]) < MOST_ALONE:
+    if len(order) < LEAST_FRAMES // 2 or not again.any() or np.mean((np.diff(time) > 0.0)[again]) < MOST_ALONE:
         return None
     away = np.linalg.norm(place[:, None] - place[None], axis=2)
     passed = time[None] - time[:, None]
-    same = (mine[:, None] == mine[None]) & (kind[order][:, None] == kind[order][None]) & (passed > 0.0)
-    reach = REACH[0] + REACH[1] * passed
-    back = same & (away <= np.minimum(reach, LONGEST_RETURN)) & (passed <= LONGEST_ALONE_S)
-    following = np.where(back.any(axis=1), np.argmax(back, axis=1), -1)
-    found = np.flatnonzero(following >= 0)
-    jumps = (
-        np.linalg.norm(np.diff(place, axis=0), axis=1)[again]
-        > reach[np.arange(len(order) - 1), np.arange(1, len(order))][again]
-    )
-    if np.mean(jumps) < MOST or len(found) < MOST_ALONE * len(order) or not len(jumps):
-        return None
-    return float(max(2.0 * np.quantile(away[found, following[found]], 0.95), LEAST_LOOK))
+    same = (mine[:, None] == mine[None]) & (kind[order][:, None] == kind[order][None])
+    same &= (passed > 0.0) & (passed <= LONGEST_ALONE_S)
+    before, after = np.flatnonzero(again), np.flatnonzero(again) + 1
+    for speed in SPEEDS:
+        reach = REACH[0] + speed * passed
+        back = same & (away <= np.minimum(reach, LONGEST_WAY_S * speed))
+        found = np.flatnonzero(back.any(axis=1))
+        jumps = np.mean(away[before, after] > reach[before, after])
+        if jumps >= MOST and len(found) >= MOST_ALONE * len(order):
+            following = np.argmax(back[found], axis=1)
+            way, duration = away[found, following], passed[found, following]
+            fastest = float(np.quantile(way / duration, 0.95))
+            return Reports(max(2.0 * float(np.quantile(way, 0.95)), LEAST_LOOK), float(np.median(duration)), fastest)
+    return None

@@ -37,6 +37,8 @@ __all__ = [
 
 AUTO: Final = "auto"  # name of the profile that is made for the data: rate and classes as they come
 USUAL_PERIOD: Final = 0.1
+SLOWEST: Final = 4.0  # s, the longest period that such a profile is for
+REPORTED_CLUTTER: Final = 0.1  # false boxes per frame where objects report themselves
 FAR: Final = 1.6  # ratio of rates from which a profile does not fit
 LOOKED_AT: Final = 20  # sequences that tell rate and scores
 LOOKED_INTO: Final = 300  # frames of each of them
@@ -120,7 +122,8 @@ def doubts(parameters: Parameters, sequences: Sequence[DataSequence]) -> Iterato
     if renamed := [f"{name} as {known[place]}" for name, place in found.items() if place >= 0 and name != known[place]]:
         yield f"profile {parameters.name} tracks {', '.join(renamed)}"
     period, nominal = _period(sequences, GLANCE), parameters.nominal_period
-    if period is not None and not 1.0 / FAR <= period / nominal <= FAR:
+    reported = any(one.reports is not None for one in sequences)  # each in a frame of its own
+    if period is not None and not reported and not 1.0 / FAR <= period / nominal <= FAR:
         yield (
             f"frames come at {1.0 / period:.3g} Hz, profile {parameters.name} is for {1.0 / nominal:.3g} Hz: "
             "--profile auto, or a profile tuned at this rate, may track better"
@@ -145,8 +148,17 @@ def _period(sequences: Sequence[DataSequence], frames: int) -> float | None:
 
 
 def _made_for(sequences: Sequence[DataSequence]) -> Parameters:
-    labels = _labels(sequences)
+    labels, reports = _labels(sequences), [one.reports for one in sequences if one.reports is not None]
+    period = median(one.period for one in reports) if reports else _period(sequences, LOOKED_INTO) or USUAL_PERIOD
     try:
-        return generic_parameters(labels or ("object",), _period(sequences, LOOKED_INTO) or USUAL_PERIOD)
+        parameters = generic_parameters(labels or ("object",), min(period, SLOWEST))
     except OptipmbError as error:
         raise UsageError(f"--profile {AUTO}: {error}") from error
+    for name, own in parameters.classes.items() if reports else ():
+        # The gate grows with the time since the last frame, and not since the last report of the object.
+        gate = max(own.gate, *(one.distance for one in reports))
+        speed = max(own.birth.unknown_speed, 0.5 * max(one.speed for one in reports))
+        birth = own.birth.model_copy(update={"unknown_speed": speed})
+        own_reports = {"gate": gate, "birth": birth, "clutter_rate": REPORTED_CLUTTER}
+        parameters.classes[name] = own.model_copy(update=own_reports)
+    return parameters

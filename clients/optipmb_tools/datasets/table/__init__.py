@@ -231,7 +231,7 @@ class TableSequence(DataSequence):
         self._boxes = boxes
         self._truth = truth
         self._origin = origin
-        self.alone = boxes.alone is not None
+        self.reports = boxes.reports
         rows = np.flatnonzero(boxes.frame_key == key)
         self._stamps, first, frame = np.unique(boxes.frame_stamp[rows], return_index=True, return_inverse=True)
         self.times: NDArray[Any] = boxes.frame_time[rows[first]]
@@ -279,10 +279,10 @@ class TableSequence(DataSequence):
             known = (name for name in DETECTION_COLUMNS if name != "label" and getattr(boxes, name) is not None)
             columns = {name: getattr(boxes, name)[rows] for name in known}
             pose, view = self.poses[index], None
-            if boxes.alone is not None and len(rows) == 1:
-                pose = Pose(columns["center"][0], IDENTITY.quaternion)
-                columns["center"] = np.where(np.isnan(columns["center"]), np.nan, 0.0)
-                view = _view(boxes.alone)
+            if boxes.reports is not None and len(rows) == 1:
+                pose = Pose(np.nan_to_num(columns["center"][0]), IDENTITY.quaternion)
+                columns["center"] = columns["center"] - pose.translation
+                view = _view(boxes.reports.distance)
             yield DetectionFrame(index, stamp_ns, pose, self.labels, label, field_of_view=view, **columns)
 
     def truth(self) -> Truth | None:
@@ -421,7 +421,7 @@ def _note_gaps(reading: Reading, sequence: TableSequence) -> None:
     steps = np.diff(sequence.stamps)
     period = float(np.median(steps)) if len(steps) else 0.0
     missing = int(np.sum(np.round(steps[steps > GAP * period] / period) - 1)) if period else 0
-    if missing and not sequence.alone:
+    if missing and sequence.reports is None:
         text = f"{sequence.name}: {missing} frames at {1e9 / period:.3g} Hz have no row"
         how = "if nothing was detected in them, a row with their stamp and nothing else says so"
         reading.doubt("time", f"{text}; {how}")

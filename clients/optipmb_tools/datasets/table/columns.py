@@ -99,9 +99,11 @@ _UNITS: Final[Mapping[str, str]] = {
 }  # fmt: skip
 _WORDS: Final = {"stamp", "class", "id", "recording", "sensor"}  # meanings whose values may be words
 _PART: Final = re.compile(
-    rf"({'|'.join((*_BOX_TURN.split(), 'r', 'euler', 'rpy', 'ypr', 'matrix'))})_?(q?[wxyz]|\d(?:_?\d)?)"
+    rf"((?:{'|'.join((*_BOX_TURN.split(), 'r', 'euler', 'rpy', 'ypr', 'matrix', 'rotvec', 'rvec'))})"
+    r"(?:_(?:matrix|mat|angles?|vector|vec))?)_?(q?[wxyz]|\d(?:_?\d)?)"
 )
 """Base of a column that may be one of several numbers of an orientation."""
+_TURNED: Final = re.compile("(^|_)(rot|r?vec|orient|head|yaw|quat|euler|angle|axis|cog$|course)")
 _OTHER: Final = re.compile("ego|pose|sensor|camera|lidar|vehicle|header")  # what is not of a box
 _LENGTHS: Final = {"m", "meter", "meters", "metre", "metres", "mps"}
 
@@ -130,8 +132,11 @@ def find_columns(names: Iterable[str], chosen: Mapping[str, str], texts: Collect
             for one in known
             if one.base in aliases and one.name not in used and (role in _WORDS or one.name not in texts)
         ]
-        if role == "yaw" and turn_of(known) is not None:
-            fitting = [one for one in fitting if not _PART.fullmatch(one.base)]
+        if role == "yaw":
+            turn = turn_of(known)
+            fitting = [
+                one for one in fitting if not (turn and _PART.fullmatch(one.base)) and not _is_shared(one, known)
+            ]
         if role == "nanosec":
             bases = {
                 one.base for one in known if "stamp" in taken and one.name == taken["stamp"].name and one.unit == "s"
@@ -143,6 +148,18 @@ def find_columns(names: Iterable[str], chosen: Mapping[str, str], texts: Collect
             taken[role] = best
             used.add(best.name)
     return taken
+
+
+def _is_shared(column: Column, known: Collection[Column]) -> bool:
+    """Tell whether a column is one of several of an orientation, as `rotation.angle` beside `rotation.axis`."""
+    group = column.name.rpartition(".")[0]
+    others = [one for one in known if one.name.startswith(f"{group}.") and one.name != column.name]
+    return bool(group and others) and _plain(group.rpartition(".")[2]) in _BOX_TURN.split()
+
+
+def turned(names: Iterable[str]) -> list[str]:
+    """Return the names that may be of a heading."""
+    return [name for name in names if _TURNED.search(_plain(name))]
 
 
 def _names_of(role: str) -> tuple[str, ...]:

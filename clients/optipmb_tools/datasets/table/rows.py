@@ -10,15 +10,17 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from optipmb_tools.datasets.interface import georeference_of
-from optipmb_tools.datasets.motion import Moves, find_moves, overlapping, reported_alone
+from optipmb_tools.datasets.interface import Reports, georeference_of
+from optipmb_tools.datasets.motion import Moves, find_moves, find_reports, overlapping
 from optipmb_tools.datasets.table.columns import NOTHING, Column, find_columns, normalised, turn_of
+from optipmb_tools.datasets.table.columns import turned as turned_names
 from optipmb_tools.datasets.table.findings import Reading, is_number
 from optipmb_tools.datasets.table.times import (
     COUNTED_HZ,
     CROWDED,
     SECONDS,
     Stamps,
+    may_be_merged,
     median_step,
     nanoseconds,
     read_frames,
@@ -28,6 +30,7 @@ from optipmb_tools.datasets.table.times import (
 from optipmb_tools.datasets.table.values import (
     FULL_TURN,
     LARGEST_SIZE,
+    NOISE,
     is_moving,
     no_angle,
     read_angle,
@@ -47,6 +50,7 @@ NO_CLASS: Final = "object"  # class of all boxes of a table without classes
 NO_ID: Final = -1  # id of a box that has none
 _UNIT: Final = 1e-3
 _MOST_SHOWN: Final = 6
+_MOST_SENSORS: Final = 16
 _LONGEST: Final = 30.0  # boxes that are longer, in metres, are suspicious
 _LOOKED_AT: Final = 200  # texts of a column that tell whether it has numbers
 _TILTED: Final = 1 / 12  # of a turn: largest angle about x and y of a box that stands upright
@@ -55,7 +59,8 @@ LEAST_VARIANCE: Final = 1e-8
 LARGEST_VARIANCE: Final = 1e8  # variances of a position along any axis, m^2, as `Detections` have them
 _POSE: Final = ("pose_x", "pose_y", "pose_z")
 _TURNS: Final = ("w", "x", "y", "z")
-_NUMBERED: Final = re.compile(r"(.*[^\W\d_])[\W_]+(\d+)")  # a class and the number of an object of it
+_NUMBERED: Final = re.compile(r"(.*[^\W\d_])[\W_]*\d+|\d+[\W_]*([^\W\d_].*)")  # a class, a number of an object
+_LAST_OF_FOUR: Final = re.compile(r"(.*[._])?b?box(_?2d)?\.3")
 _PIXELS: Final = re.compile(
     r"(.*_)?(px|pixels?|image|img|u|v|bb|xmin|ymin|xmax|ymax|x1|y1|x2|y2|bbox_(left|top|width|height))(_.*)?"
 )
@@ -71,7 +76,7 @@ class Boxes:
     """(R, 7) translation and quaternion, world from sensor; None where boxes are in the world frame."""
     frame_time: NDArray[Any]  # (R,) time as the table has it
     frame_number: NDArray[Any] | None  # (R,) number of the frame as the table has it; None where it has none
-    alone: float | None  # range in metres around the box of a frame in which others were seen; None: everywhere
+    reports: Reports | None  # where objects report one by one
     row: Ints  # (B,) row of each box, counted from 0
     center: Floats  # (B, 3)
     size: Floats  # (B, 3); NaN in a table that has neither l nor w
@@ -154,9 +159,9 @@ def _is_frame_each(reading: Reading, tables: dict[Path, Columns]) -> bool:
             return True
     if any(one.keys() & {"stamp", "frame"} for one in found.values()) or not reading.path.is_dir():
         return False
-    numbers = frame_numbers(list(tables))
+    name, numbers = frame_numbers(list(tables))
     for (path, columns), number in zip(tables.items(), numbers, strict=True):
-        tables[path] = {**columns, "frame": np.full(len(next(iter(columns.values()), ())), number)}
+        tables[path] = {**columns, name: np.full(len(next(iter(columns.values()), ())), number)}
     return True
 
 
@@ -191,6 +196,7 @@ class _Table:
         self._time = reading.strict()  # without stamps nothing can be found
         self._columns = columns
         self._rows = len(next(iter(columns.values())))
+        self._objects: NDArray[np.str_] | None = None  # (R,) names of objects in the column of the class
         marks = [text.strip() for text in reading.options.get("missing", "").split(",") if text.strip()]
         if wrong := [text for text in marks if not is_number(text)]:
             raise DatasetError("--option missing", "numbers, with commas between them", repr(wrong[0]))
@@ -233,20 +239,20 @@ class _Table:
         file = np.searchsorted([first for _, first in reading.files], np.arange(self._rows), side="right")
         series = np.unique(key, return_inverse=True)[1] * (len(reading.files) + 1) + file * (not self._frames)
         stamps = self._stamps(series)
-        center = self._centers()
         centres = not {"l", "w"} & found.keys()
         self._refuse_pixels(centres=centres)
+        center = self._centers()
         ends = (("l", 1.0 if centres else None), ("w", 1.0 if centres else None), ("h", 1.5))
-        size = np.column_stack([self._numbers(role, without) for role, without in ends])
+        factor = reading.positive("size_factor", "a factor of sizes") or 1.0
+        size = factor * np.column_stack([self._numbers(role, without) for role, without in ends])
         yaw, yaw_unit = self._yaw(scored=scored)
         turned = yaw_unit != "none"
-        score = self._numbers("score", 1.0)
-        names, id_ = self._names(stamps.ns), self._ids()
-        self._note_missing(scored=scored, points=scored and centres, boxes=turned and not centres)
+        score, names, id_ = self._numbers("score", 1.0), self._names(stamps.ns), self._ids()
+        self._note_missing(scored=scored, centres=centres, turned=turned)
         empty = np.isnan(center[:, :2]).all(axis=1) & (centres | np.isnan(size[:, :2]).all(axis=1))
         kept = np.asarray(~(empty | stamps.skipped))
         if scored:
-            self._leave_out(kept, self._doubled(stamps.ns, center), "that another one repeats")
+            self._leave_out(kept, self._doubled(stamps.ns, series, center), "that another one repeats")
         kept = self._valid(kept, center, size, yaw, yaw_unit, score, names)
         if "score" in found and scored:
             score[kept] = read_scores(reading, score[kept], np.flatnonzero(kept))
@@ -272,9 +278,9 @@ class _Table:
         motion = _Motion(row, pose, find_moves(series[row], stamp[row] / 1e9, world, kind))
         yaw = self._heading(motion, size, yaw, yaw_unit if turned else "none", strict=scored)
         looks = scored and pose is None and "sensor" not in found
-        alone = reported_alone(series[row], stamp[row] / 1e9, world, kind) if looks else None
-        if alone is not None:
-            text = f"objects report one by one: a frame is a look at {alone:.3g} m around its box"
+        reports = find_reports(series[row], stamp[row] / 1e9, world, kind) if looks else None
+        if reports is not None:
+            text = f"objects report one by one: a frame is a look at {reports.distance:.3g} m around its box"
             reading.doubt("time", text, "--option group=SECONDS joins them")
         self._note_columns(size)
         no_height = scored and centres and self._height not in found  # not even that is taken for granted
@@ -284,7 +290,7 @@ class _Table:
             frame_pose=pose,
             frame_time=stamps.time,
             frame_number=self._frame_numbers(),
-            alone=alone,
+            reports=reports,
             row=row,
             center=np.insert(center[:, :2], 2, np.nan, axis=1) if no_height else center,
             size=np.full_like(size, np.nan) if centres else size,
@@ -300,10 +306,11 @@ class _Table:
             keys=keys,
         )
 
-    def _doubled(self, stamp: Ints, center: Floats) -> Bools:
-        """Return the rows that are equal to another one in all columns."""
-        order = np.lexsort((center[:, 1], center[:, 0], stamp))
-        same = (np.diff(stamp[order]) == 0) & (np.diff(center[order, :2], axis=0) == 0.0).all(axis=1)
+    def _doubled(self, stamp: Ints, series: Ints, center: Floats) -> Bools:
+        """Return the rows that are equal to another one of their recording in all columns."""
+        order = np.lexsort((center[:, 1], center[:, 0], stamp, series))
+        same = (np.diff(stamp[order]) == 0) & (np.diff(series[order]) == 0)
+        same &= (np.diff(center[order, :2], axis=0) == 0.0).all(axis=1)
         first, second = order[:-1][same], order[1:][same]
         equal = np.ones(len(first), dtype=np.bool_)
         for one in self._columns.values():
@@ -317,8 +324,10 @@ class _Table:
         """Refuse boxes of an image."""
         found = self._found
         named = [name for name in self._columns if _PIXELS.fullmatch(normalised(name).base)]
+        lists = [one for one in self._columns if _LAST_OF_FOUR.fullmatch(one) and f"{one[:-1]}4" not in self._columns]
+        named += lists
         flat = {"w", "h"} <= found.keys() and "l" not in found
-        if "z" in found or not (flat or (centres and named)) or "lat" in found:
+        if not lists and ("z" in found or not (flat or (centres and named)) or "lat" in found):
             return
         received = f"{', '.join(named or [found['w'].name, found['h'].name])} and no length: boxes in pixels?"
         expected = (
@@ -342,13 +351,17 @@ class _Table:
             more = f" and {len(unused) - _MOST_SHOWN} more" if len(unused) > _MOST_SHOWN else ""
             self._reading.note("columns", f"columns not used: {', '.join(unused[:_MOST_SHOWN])}{more}")
 
-    def _note_missing(self, *, scored: bool, points: bool, boxes: bool) -> None:
+    def _note_missing(self, *, scored: bool, centres: bool, turned: bool) -> None:
         """Note assumptions about missing columns."""
-        if not boxes:
-            meaning = "they are unknown" if scored else "only centres can be compared"
-            self._reading.note("sizes", f"no columns for the size or the heading: {meaning}")
+        missing = ["the size"] * centres + ["the heading"] * (not turned)
+        if missing:
+            meaning = "unknown" if scored else "only centres can be compared"
+            self._reading.note("sizes", f"no column for {' or '.join(missing)}: {meaning}")
+        if not turned and (others := turned_names(self._columns)):
+            text = f"the heading is unknown, though {', '.join(others[:_MOST_SHOWN])} may have it"
+            self._reading.doubt("yaw", text, "--option column.yaw=NAME, or none")
         for role, text in ((self._height, "z = 0"), ("h", "a height of 1.5 m"), ("score", "a score of 1")):
-            if role not in self._found and (scored if role == "score" else not points):
+            if role not in self._found and (scored if role == "score" else not (scored and centres)):
                 self._reading.note(role, f"no column for {role}: {text} for every box")
 
     @property
@@ -448,32 +461,43 @@ class _Table:
         """Return the stamps of frames; refuse frames most of whose boxes stand at the places of others."""
         reading = self._reading
 
-        def overlaps(stamp: Ints) -> Bools:
-            place = np.unique(stamp[row], return_inverse=True)[1]
-            frame = np.unique(series[row] * len(stamp) + place, return_inverse=True)[1].astype(np.int64)
+        def at_places(stamp: Ints, part: NDArray[Any]) -> Ints:
+            keys = np.column_stack([np.unique(one[row], return_inverse=True)[1] for one in (series, stamp, part)])
+            frame = np.unique(keys, axis=0, return_inverse=True)[1].astype(np.int64)
             return overlapping(frame, center[:, :2], size, kind, score[row])
 
-        def crowd(stamp: Ints) -> float:
-            return float(np.mean(overlaps(stamp))) if len(row) else 0.0
+        def crowd(stamp: Ints, part: NDArray[Any] = series) -> float:
+            return float(np.mean(at_places(stamp, part) > 1)) if len(row) else 0.0
 
         column = self._found.get("frame")
         numbers = None if column is None or column.name == stamps.column else self._frame_numbers()
         name = "" if column is None else column.name
         stamps = read_frames(reading, stamps, series, numbers, crowd, name)
         share = crowd(stamps.ns) if scored else 0.0
-        if share > CROWDED:
-            most = int(np.unique(stamps.ns[row], return_counts=True)[1].max())
-            received = f"{share:.0%} of the boxes at the place of another one, up to {most} boxes a stamp"
-            text = "have stamps lost digits, or were frames merged?"
-            if "time" in reading.options:
-                reading.doubt("time", f"{received}: {text}")
-            else:
-                option = "--option time=UNIT, if the stamps are right"
-                reading.refuse("time", f"boxes apart from each other under one stamp; {text}", received, option)
-        elif share > _TWICE:
-            text = f"{share:.0%} of the boxes stand at the place of another one of their frame and class"
-            reading.doubt("rows", f"{text}: objects are reported twice, by two detectors or before suppression?")
+        if share <= _TWICE:
+            return stamps
+        used = {one.name for one in self._found.values()}
+        parts = (name for name in self._columns if name not in used and self._is_name_of_few(name))
+        divider = next((name for name in parts if crowd(stamps.ns, self._columns[name]) < NOISE), None)
+        counts = at_places(stamps.ns, series)
+        received, option = f"{share:.0%} of the boxes at the place of another one of their stamp and class", ""
+        if divider is not None:
+            received, option = f"{received}, which differs in column {divider}", f"--option column.sensor={divider}"
+        elif share > CROWDED and may_be_merged(stamps.ns, series, float(np.median(counts[counts > 1]))):
+            received += ": stamps have lost digits, frames were merged, or two detectors see each object"
+            option = "--option time=UNIT, if the stamps are right"
+        else:
+            received += ": objects are reported twice, by two detectors or before suppression"
+        if option and share > CROWDED and "time" not in reading.options:
+            reading.refuse("time", "boxes apart from each other under one stamp", received, option)
+        else:
+            reading.doubt("rows", received, option)
         return stamps
+
+    def _is_name_of_few(self, column: str) -> bool:
+        """Tell whether a column may have the names of a few sensors."""
+        values = self._columns[column]
+        return values.dtype.kind in "iU" and 1 < len(np.unique(values)) <= _MOST_SENSORS
 
     def _keys(self) -> tuple[NDArray[np.str_], tuple[str, ...], dict[str, tuple[str, ...]]]:
         names = tuple(self._found[role].name for role in ("recording", "sensor") if role in self._found)
@@ -580,7 +604,7 @@ class _Table:
     def _without_numbers(self, names: NDArray[np.str_], stamp: Ints) -> NDArray[np.str_]:
         """Return the classes of names that are a class and the number of an object, as `car:12`; else the names."""
         split = {name: _NUMBERED.fullmatch(name) for name in np.unique(names).tolist() if name}
-        classes = {name: match[1] for name, match in split.items() if match}
+        classes = {name: match[1] or match[2] for name, match in split.items() if match}
         if len(classes) < len(split) or len(set(classes.values())) == len(classes):
             return names
         found = np.array([classes.get(name, name) for name in names.tolist()])
@@ -594,13 +618,14 @@ class _Table:
         self._reading.note(
             "class", f"column {column} has classes and numbers of objects: {names[0]} is of class {found[0]}"
         )
+        self._objects = names
         return found
 
     def _ids(self) -> Ints | None:
         column = self._found.get("id")
-        if column is None:
+        values = self._objects if column is None else self._columns[column.name]
+        if values is None:
             return None
-        values = self._columns[column.name]
         if values.dtype.kind == "i":
             return values.astype(np.int64)
         texts = np.char.strip(values.astype(np.str_))
@@ -695,7 +720,11 @@ class _Table:
         for what, values, fine in (
             ("finite x, y and z", center, (np.abs(center) <= LARGEST).all(axis=1)),
             ("positive length, width and height", size, (np.isfinite(size) & (size > 0.0)).all(axis=1)),
-            (f"sizes up to {LARGEST_SIZE:g} m", size, (size <= LARGEST_SIZE).all(axis=1)),
+            (
+                f"sizes up to {LARGEST_SIZE:g} m, or --option size_factor=0.01 or 0.001,",
+                size,
+                (size <= LARGEST_SIZE).all(axis=1),
+            ),
             ("finite yaw", yaw, ~np.isinf(yaw)),
             ("a yaw within a turn", yaw, ~no_angle(self._reading, yaw, unit)),
             ("finite score", score, np.isfinite(score)),

@@ -17,6 +17,8 @@ PERIODS: Final = (0.005, 10.0)  # shortest and longest time between frames that 
 COUNTED_HZ: Final = 10.0  # default rate of frames that are counted and not stamped
 APART: Final = 3.0  # ratio of the shortest step between frames to the longest step inside of one
 CROWDED: Final = 0.5  # share of boxes that share their place with another one from which their stamps cannot be right
+ROUNDED: Final = 1e-3  # relative difference of a step from a power of ten
+FASTEST: Final = 30.0  # frames a second of a detector
 NEAR: Final = 5.0  # steps of a counter from its end to its beginning, where it wraps
 LONGEST_GAP: Final = 60.0  # s; a longer one than this and than all other steps together is a fault of a stamp
 UNITS_APART: Final = 100.0  # ratio of steps, many of either length, from which stamps have two units
@@ -48,6 +50,16 @@ def median_step(numbers: np.ndarray, key: Ints) -> float:
     steps = _steps(numbers, key)
     longest = _longest_inside(steps)
     return float(np.median(steps[steps > longest])) if len(steps) else 0.0
+
+
+def may_be_merged(stamp: Ints, key: Ints, boxes: float) -> bool:
+    """Tell whether stamps (R,) may be those of several frames each, of which `boxes` are at one place.
+
+    Then they are a power of ten apart, or further than frames are, and no detector is faster than the merged frames.
+    """
+    step = median_step(stamp, key) / 1e9
+    rounded = not step or step > PERIODS[1] or abs(np.log10(step) - round(np.log10(step))) < ROUNDED
+    return bool(rounded and (not step or boxes <= FASTEST * step))
 
 
 def frame_starts(stamp: Ints, key: Ints) -> Ints | None:

@@ -244,10 +244,9 @@ def read_sizes(reading: Reading, sizes: Floats, names: np.ndarray, *, stated: bo
         claims.append(Claim(order, evidence, shown, option, "doubt" if stated else "taken"))
     order = reading.decide("sizes", claims, asked=asked)
     found = sizes[:, [order.index(letter) for letter in "lwh"]]
-    factor = reading.positive("size_factor", "a factor of sizes")
-    if factor is None:
+    if "size_factor" not in reading.options:
         _check_sizes(reading, found, names, kinds)
-    return found * (factor or 1.0)
+    return found
 
 
 def _check_sizes(reading: Reading, sizes: Floats, names: np.ndarray, kinds: Mapping[str, str | None]) -> None:
