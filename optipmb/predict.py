@@ -69,10 +69,10 @@ SMALL_TURN = 0.1
 square."""
 
 START = 5.0
-"""Where the acceleration decays, it raises a speed by at most so many times itself (`travel`)."""
+"""Bound of an acceleration that raises the speed, in ``|v| / tau`` (`travel`)."""
 
 BRAKING = 3.0
-"""Braking is limited to so many times ``|v| / tau`` (`travel`)."""
+"""Bound of an acceleration that lowers the speed, in ``|v| / tau`` (`travel`)."""
 
 ACCELERATIONS = 3.0
 """Standard deviations of the acceleration of objects of unknown heading, which no state follows."""
@@ -140,8 +140,9 @@ def travel(
     ``v(t) = v + a tau (1 - e^(-t/tau))``; the way is the integral of ``v(t) [cos(omega t), sin(omega t)]``, with
     ``int e^(-t/tau) e^(i omega t) dt = (1 - e^(-dt/tau) e^(i omega dt)) / (1/tau - i omega)``.
 
-    Braking counts up to ``BRAKING |v| / tau``, and to a standstill at the end of dt. So that the motion is continuous
-    in v, an acceleration counts up to ``START |v| / tau``: from a standstill objects start under the process noise.
+    An acceleration against v is bounded by ``BRAKING |v| / tau``, and so that the object stands at the end of dt at
+    most; one along v is bounded by ``START |v| / tau``. Both bounds are zero at a standstill, where the way would
+    otherwise jump with the sign of v: objects that stand start by the process noise.
 
     Args:
         v: speed, m/s.
