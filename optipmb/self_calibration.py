@@ -438,3 +438,13 @@ def followed(
     words, stamps = (prior.bernoulli.words, objects.words), (moment.stamp_ns, moment.before_ns)
     scatter = learn_scatter(own.scatter, *words, (update.row, hit), measurements.position, stamps, table.classes)
     return SelfCalibration(*found, scatter)
+
+
+def learned_noise(density: Density) -> tuple[str, ...]:
+    """Return the learned noise of the detections of each class in words, of classes with `PRIOR_PAIRS` pairs."""
+    own, lines = density.self_calibration, []
+    for name, row in zip(density.labels, () if own is None else own.scatter.tolist(), strict=own is not None):
+        if row[PAIRS] >= PRIOR_PAIRS:
+            scatter = math.sqrt(0.5 * (row[ALONG] + row[ACROSS]) / row[PAIRS])
+            lines.append(f"{name}: {scatter:.2f} m scatter, {LASTING_RATIO * scatter:.2f} m lasting")
+    return tuple(lines)

@@ -360,7 +360,7 @@ class OutputSettings(BaseModel):
     rate_hz: float = Field(default=20.0, gt=0, le=50)
     """messages a second"""
     delay_s: float = Field(default=0.0, ge=0, le=10)
-    """tracks are predicted to the present minus this"""
+    """tracks are those of the present minus this; existence and `confirmed` also use the frames since then"""
     longest_s: float = Field(default=0.5, gt=0, le=30)
     """no output while the newest frame is older"""
     clock: Literal["system", "arrival"] = "system"

@@ -11,6 +11,9 @@ from optipmb_tools.datasets import Dataset, Preloaded, open_dataset, selected_fr
 from optipmb_tools.run.profiles import read_profile
 from optipmb_tools.run.tracking import Tracking, track, track_whole
 
+from optipmb import Tracks
+from optipmb.hindsight import with_hindsight
+
 
 @pytest.fixture(scope="module")
 def dataset() -> Dataset:
@@ -43,6 +46,22 @@ def test_predicted_paths_are_written_with_all_columns(dataset: Dataset, tmp_path
     np.testing.assert_allclose(columns["path_position"][:, 0], ahead, atol=0.2)
     assert (np.trace(columns["path_covariance"][:, 1], axis1=1, axis2=2)
             > np.trace(columns["path_covariance"][:, 0], axis1=1, axis2=2)).all()  # fmt: skip
+
+
+def test_hindsight_is_of_the_seconds_after_a_frame(dataset: Dataset) -> None:
+    """Existence and `confirmed` of every frame are by the frames of the next half second; nothing else changes."""
+    (sequence,), parameters = dataset.sequences(["0000"]), read_profile("scene")
+    plain, found = (track_whole(parameters, sequence, hindsight_s=seconds).tracks for seconds in (0.0, 0.5))
+    told = {}
+    for index, one in plain.items():
+        columns = {name: np.array(getattr(one, name)) for name in Tracks.described}
+        told[index] = Tracks(**columns | {"confirmed": columns["confirmed"].astype(np.bool_)})
+    for index, one in found.items():
+        later = [told[k] for k in range(index + 1, 20) if plain[k].stamp_ns - one.stamp_ns <= 500_000_000]
+        wanted = with_hindsight(told[index], later, parameters)
+        changed = {"existence": wanted.existence, "confirmed": wanted.confirmed.astype(np.int64)}
+        assert one == plain[index].model_copy(update=changed)
+    assert any(one != plain[index] for index, one in found.items())
 
 
 def test_what_is_reported_is_what_was_written(dataset: Dataset, tmp_path: Path) -> None:

@@ -161,8 +161,9 @@ def test_a_submission_has_confirmed_tracks_of_high_mean_score_in_the_image(
 ) -> None:
     """Tracks that were confirmed and whose mean score reaches the threshold, with all rows that have an image box."""
     write_cars(tmp_path)
-    run_here(capsys, "track", tmp_path, "--out", tmp_path / "all")
-    done = run_here(capsys, "track", tmp_path, "--out", tmp_path / "cut", "--submission", *options)
+    data = (tmp_path, "--hindsight", 0)
+    run_here(capsys, "track", *data, "--out", tmp_path / "all")
+    done = run_here(capsys, "track", *data, "--out", tmp_path / "cut", "--submission", *options)
     assert done.returncode == 0, done.stderr
     least = float(options[0]) if options else SUBMISSION_SCORES["Car"]
     assert f"confirmed tracks from these mean scores on, in the image: Car {least:g}" in done.stderr
@@ -177,7 +178,7 @@ def test_a_submission_has_confirmed_tracks_of_high_mean_score_in_the_image(
     wanted = {one for one in confirmed if np.mean([row[4] for row in shown[one]]) >= least}
     assert len(wanted) == (3 if options == ["0.3"] else 2)
     assert cut == {one: shown[one] for one in every if one in wanted}
-    again = run_here(capsys, "track", tmp_path, "--out", tmp_path / "again", "--submission", *options)
+    again = run_here(capsys, "track", *data, "--out", tmp_path / "again", "--submission", *options)
     assert again.returncode == 0
     assert (tmp_path / "again/0000.txt").read_bytes() == (tmp_path / "cut/0000.txt").read_bytes()
 

@@ -110,7 +110,7 @@ def test_a_bag_of_tracks_says_what_is_known_of_them(
 ) -> None:
     """Another library reads ids, probabilities, poses, twists and covariances in ROS's order from the written bag."""
     table = tracks_of("rosbag", bag, tmp_path / "table")
-    done = run_here(capsys, "track", bag, "--profile", "scene", "--out", tmp_path / "tracks.mcap")
+    done = run_here(capsys, "track", bag, "--profile", "scene", "--hindsight", 0, "--out", tmp_path / "tracks.mcap")
     assert done.returncode == 0, done.stderr
     found = decoded(tmp_path / "tracks.mcap")
     assert set(found) == {f"/detector/boxes/tracks{end}" for end in ("", "/detections", "/markers", "/predicted")}

@@ -35,7 +35,9 @@ class Both:
         self._capsys = capsys
 
     def track(self, *data: object) -> Any:
-        return result_of(run_here(self._capsys, "track", *data, "--out", self.out / "track", "--json"))
+        return result_of(
+            run_here(self._capsys, "track", *data, "--out", self.out / "track", "--hindsight", 0, "--json")
+        )
 
     def replay(self, *data: object) -> Any:
         """Replay a tracked data set; the files are the same, and not empty."""
@@ -91,9 +93,9 @@ def test_chosen_classes_and_another_profile(both: Both) -> None:
 
 
 def test_a_table_without_a_profile(service: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A table is replayed with the profile generic where none is named: the bytes of `track --profile generic`."""
+    """A table is replayed with the profile generic where none is named: the bytes of `track`."""
     table, tracked, replayed = SAMPLE, tmp_path / "tracked.csv", tmp_path / "replayed.csv"
-    run_here(capsys, "track", table, "--profile", "generic", "--out", tracked)
+    run_here(capsys, "track", table, "--profile", "generic", "--hindsight", 0, "--out", tracked)
     done = run_here(capsys, "replay", table, "--connect", service.endpoint, "--out", replayed)
     assert "profile generic, which is auto at 10 Hz" in done.stderr
     assert tracked.read_bytes() == replayed.read_bytes()

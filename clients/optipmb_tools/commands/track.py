@@ -49,6 +49,12 @@ class TrackOptions:
         bool,
         typer.Option("--smooth", help="Estimate every state from all frames of its track, later ones too: for labels."),
     ] = False
+    hindsight: Annotated[
+        float,
+        typer.Option(
+            min=0.0, max=10.0, help="Seconds after a frame by which its tracks are confirmed; 0: as the service does."
+        ),
+    ] = 1.0
     fuse: Annotated[
         bool,
         typer.Option("--fuse", help="The sensors of a recording feed one density, by turns: by the column sensor."),
@@ -105,7 +111,8 @@ def track(
 
     From a bag of ROS 2, --out FILE.mcap makes a bag with the tracks as TrackedObjects, Detection3DArray and markers.
 
-    A profile may also be a TOML file here. Replaying the same data through a service gives the same files.
+    A profile may also be a TOML file here. Existence and confirmed also use the second after each frame; with
+    --hindsight 0, replaying the same data through a service gives the same files.
     With --smooth, positions, headings and velocities also use later frames, which no service can.
 
     With --dump, the frames that a service saved are tracked again instead. Status 1 and one line say which
@@ -142,7 +149,12 @@ def track(
                 chosen,
                 how.out,
                 tracking.Tracking(
-                    *(parameters, how.classes or ()), full=how.full, smooth=how.smooth, sensors=sensors, view=how.view
+                    *(parameters, how.classes or ()),
+                    full=how.full,
+                    smooth=how.smooth,
+                    hindsight_s=how.hindsight,
+                    sensors=sensors,
+                    view=how.view,
                 ),
                 executor=executor,
                 on_frame=progress.advance,
@@ -171,6 +183,8 @@ def _say_result(result: "TrackedSequence") -> None:
     rate = result.frames / max(result.seconds, 1e-9)
     step = f", step p50 {result.step.p50_ms:.2f} ms p99 {result.step.p99_ms:.2f} ms" if result.step else ""
     say(f"{result.name}: {result.frames} frames, {result.tracks} tracks, {rate:.0f} frames/s{step}")
+    if result.learned:
+        say(f"{result.name}: learned {'; '.join(result.learned)}")
 
 
 def _complain(results: "list[TrackedSequence]", profile: str) -> None:

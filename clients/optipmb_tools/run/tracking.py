@@ -35,7 +35,9 @@ from optipmb import (
     predict_tracks,
     warm_up,
 )
+from optipmb.hindsight import with_hindsight
 from optipmb.parameters import ALIKE
+from optipmb.self_calibration import learned_noise
 from optipmb_tools.datasets import DataSequence, Dataset, DatasetArguments, DetectionFrame, selected_frames
 from optipmb_tools.files import remove_unfinished
 from optipmb_tools.results.output import Latency, Results, TrackCounts, horizons_for, latency
@@ -58,6 +60,7 @@ class Tracked:
     detections: int
     left_out: dict[str, int]  # detections of each class that the profile lacks, or that are below its score filter
     estimated: int  # frames in which the motion of the sensor was estimated
+    learned: tuple[str, ...]  # noise of the detections of each class, in words
     steps_ns: tuple[int, ...]
     seconds: float
 
@@ -108,11 +111,13 @@ def track_whole(
     *,
     sensors: Sensors = ALIKE,
     smooth: bool = False,
+    hindsight_s: float = 0.0,
     on_frame: Callable[[], None] = lambda: None,
 ) -> Tracked:
     """Track one sequence, with `smooth` so that states are given all frames of their track.
 
-    Frames that name their sensor are used as `sensors` say.
+    Frames that name their sensor are used as `sensors` say. Existence and `confirmed` are also by the frames of the
+    next `hindsight_s` seconds.
 
     Raises:
         UsageError: A frame holds values that the tracker refuses.
@@ -121,6 +126,7 @@ def track_whole(
     _warm()
     begun = time.monotonic()
     found: dict[int, Tracks] = {}
+    extracted: dict[int, optipmb.Tracks] = {}
     steps: list[int] = []
     clouds = detections = estimated = 0
     left_out: Counter[str] = Counter()
@@ -143,6 +149,7 @@ def track_whole(
         steps.append(time.perf_counter_ns() - started)
         density = result.density
         found[frame.index] = _message(parameters, sequence, frame, result)
+        extracted[frame.index] = result.tracks
         if smoother is not None:
             smoother.add(frame.index, density, result.tracks)
         clouds += frame.cloud is not None
@@ -162,7 +169,22 @@ def track_whole(
         for index, one in smoother.tracks():
             paths = predict_tracks(one, parameters.horizons, parameters) if parameters.horizons else None
             found[index] = found[index].model_copy(update=fields_of(one, paths))
-    return Tracked(found, clouds, detections, dict(left_out), estimated, tuple(steps), time.monotonic() - begun)
+    _use_hindsight(found, extracted, hindsight_s, parameters)
+    counts = clouds, detections, dict(left_out), estimated
+    return Tracked(found, *counts, learned_noise(density), tuple(steps), time.monotonic() - begun)
+
+
+def _use_hindsight(
+    frames: dict[int, Tracks], extracted: Mapping[int, optipmb.Tracks], seconds: float, parameters: Parameters
+) -> None:
+    """Write existence and `confirmed` in hindsight of some seconds to the messages of all frames; 0: leave them."""
+    order = sorted(frames) if seconds else []
+    stamps = np.array([frames[index].stamp_ns for index in order], np.int64)
+    ends = np.searchsorted(stamps, stamps + round(seconds * 1e9), "right").tolist()
+    for place, (index, end) in enumerate(zip(order, ends, strict=True)):
+        one = with_hindsight(extracted[index], (extracted[k] for k in order[place + 1 : end]), parameters)
+        changed = {"existence": one.existence, "confirmed": one.confirmed.astype(np.int64)}
+        frames[index] = frames[index].model_copy(update=changed)
 
 
 def fields_of(tracks: optipmb.Tracks, paths: PredictedPaths | None, **others: Any) -> dict[str, Any]:
@@ -209,6 +231,7 @@ class TrackedSequence:
     tracks: int  # that are shown in some frame
     rows: int  # a track in a frame
     unconfirmed_rows: int
+    learned: tuple[str, ...]  # noise of the detections of each class, in words
     seconds: float
     step: Latency | None  # durations of the tracker's steps
 
@@ -222,6 +245,7 @@ class Tracking:
     modules: Modules | None = None
     full: bool = False  # also write all columns of the tracks
     smooth: bool = False  # estimate states from all frames of their track (`optipmb_tools.run.smoothing`)
+    hindsight_s: float = 0.0  # time after a frame that tells which of its tracks exist (`optipmb.hindsight`)
     sensors: Sensors = ALIKE  # how frames that name their sensor are used
     view: Path | None = None  # page of the tracks, of one sequence
 
@@ -262,6 +286,7 @@ def _track_one(job: _Job, name: str) -> tuple[TrackedSequence, Path | Columns]:
     dataset, how = job.dataset, job.how
     sequence = job.sequences[name] if name in job.sequences else dataset.sequences([name])[0]
     options: dict[str, Any] = {"sensors": how.sensors, "smooth": how.smooth, "on_frame": job.on_frame}
+    options["hindsight_s"] = how.hindsight_s
     found = track_whole(how.parameters, sequence, how.classes, how.modules, **options)
     written = Results(dataset, job.out, full=how.full).write(sequence, found.tracks)
     if how.view is not None:
@@ -284,6 +309,7 @@ def _track_one(job: _Job, name: str) -> tuple[TrackedSequence, Path | Columns]:
         found.estimated,
         (sum(beyond), len(beyond)),
         *TrackCounts.of(found.tracks.values()),
+        found.learned,
         found.seconds,
         latency(found.steps_ns),
     ), written
