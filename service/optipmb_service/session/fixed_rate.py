@@ -1,12 +1,14 @@
-"""Output at a fixed rate: the newest tracks of a session, predicted to now. It has no clock of its own."""
+"""Output at a fixed rate: tracks of a session, predicted to now or as they were some time ago. It has no own clock."""
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from optipmb_schemas import PATHS
 
+from optipmb.hindsight import with_hindsight
 from optipmb.paths import tracks_ahead
 from optipmb.table import ClassTable
 from optipmb_service.session.values import SECOND, Begun, Tracked
@@ -21,6 +23,14 @@ if TYPE_CHECKING:
 CLOCK_NS: Final = 5 * SECOND
 """Time for which stamps are away from the clock before that is a problem."""
 
+MOST_FRAMES: Final = 200
+"""Frames held for a delay; beyond them the delay is shorter."""
+
+
+def _stamp_of(tracked: Tracked) -> int:
+    stamp_ns: int = tracked.header["stamp_ns"]
+    return stamp_ns
+
 
 class FixedRate:
     """Tracks of one session, due at a fixed rate while frames come.
@@ -33,7 +43,8 @@ class FixedRate:
         self._period_ns = round(SECOND / settings.rate_hz)
         self._delay_ns, self._longest_ns = round(settings.delay_s * SECOND), round(settings.longest_s * SECOND)
         self._by_arrival = settings.clock == "arrival"
-        self._newest: Tracked | None = None
+        self._frames: list[Tracked] = []
+        """By stamp: the newest frames, up to the one before the delay."""
         self._arrived_ns = 0
         """Monotonic arrival of the newest stamp."""
         self._away_ns: int | None = None
@@ -45,19 +56,24 @@ class FixedRate:
 
     def take(self, outputs: Sequence[Output], now_ns: int) -> str:
         """Take outputs of the session; return how far its stamps are from the clock, once they have been for long."""
-        before = newest = self._newest
+        frames = self._frames
+        before = frames[-1] if frames else None
         for one in outputs:
             if isinstance(one, Begun):
-                newest = None
-            elif isinstance(one, Tracked):
-                newest = one  # frames come in the order of their stamps, corrected ones up to the newest
-        self._newest = newest
-        if newest is None or newest is before:
+                frames.clear()
+            elif isinstance(one, Tracked):  # corrected ones come up to the newest
+                place = bisect_left(frames, _stamp_of(one), key=_stamp_of)
+                same = place < len(frames) and _stamp_of(frames[place]) == _stamp_of(one)
+                frames[place : place + same] = [one]
+        if not frames or frames[-1] is before:
             return ""
+        newest, stamp_ns = frames[-1], _stamp_of(frames[-1])
+        passed = bisect_left(frames, stamp_ns - self._delay_ns, key=_stamp_of) - 1
+        del frames[: max(passed, len(frames) - MOST_FRAMES, 0)]
         if self.due_ns is None:
             self.due_ns = now_ns
-        stamp_ns, ticket = newest.header["stamp_ns"], newest.ticket
-        if before is not None and before.header["stamp_ns"] == stamp_ns:
+        ticket = newest.ticket
+        if before is not None and _stamp_of(before) == stamp_ns:
             return ""  # corrected, with the ticket of a late frame
         self._arrived_ns = ticket.now_ns
         behind_ns = ticket.wall_ns - stamp_ns
@@ -80,21 +96,31 @@ class FixedRate:
         """
         if self.due_ns is None or now_ns < self.due_ns:
             return None
-        newest = self._newest
-        stamp_ns = 0 if newest is None else newest.header["stamp_ns"]
+        frames = self._frames
+        stamp_ns = _stamp_of(frames[-1]) if frames else 0
         silent_ns = now_ns - self._arrived_ns
         age_ns = silent_ns if self._by_arrival else wall_ns - stamp_ns
-        if newest is None or self._wrong or max(age_ns, silent_ns) > self._longest_ns:
+        if not frames or self._wrong or max(age_ns, silent_ns) > self._longest_ns:
             self.due_ns = None
             return None
         self.due_ns += ((now_ns - self.due_ns) // self._period_ns + 1) * self._period_ns
         if parameters is not self._parameters:
             self._parameters, self._table = parameters, ClassTable.of(parameters)
-        ahead_ns = max(0, age_ns - self._delay_ns)
-        tracks = newest.estimates
+        wanted_ns = stamp_ns + max(0, age_ns) - self._delay_ns
+        if len(frames) == MOST_FRAMES:
+            wanted_ns = max(wanted_ns, _stamp_of(frames[0]))
+        elif wanted_ns < _stamp_of(frames[0]):
+            return None  # of a time before the first frame
+        place = min(bisect_left(frames, wanted_ns, key=_stamp_of), len(frames) - 1)
+        shown, later = frames[place], frames[place + 1 :]
+        tracks, shown_ns = shown.estimates, _stamp_of(shown)
+        if later:
+            tracks = with_hindsight(tracks, (one.estimates for one in later), parameters)
+        elif wanted_ns > shown_ns:
+            tracks = tracks_ahead(tracks, (wanted_ns - shown_ns) * 1e-9, self._table)
         return replace(
-            newest,
-            estimates=tracks_ahead(tracks, ahead_ns * 1e-9, self._table) if ahead_ns else tracks,
-            header=newest.header | {"predicted_to_ns": stamp_ns + ahead_ns},
-            others={name: value for name, value in newest.others.items() if name not in PATHS},
+            shown,
+            estimates=tracks,
+            header=shown.header | {"predicted_to_ns": max(wanted_ns, shown_ns)},
+            others={name: value for name, value in shown.others.items() if name not in PATHS},
         )

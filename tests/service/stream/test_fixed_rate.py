@@ -18,6 +18,7 @@ from registries import Around, packet_of, streams_of
 from router import SECOND, Sensor
 
 import optipmb
+from optipmb.hindsight import with_hindsight
 
 MS = 1_000_000
 SENSOR = Sensor()
@@ -158,6 +159,44 @@ def test_tracks_are_predicted_to_the_present_less_the_delay(process: Callable[..
     same = {"predicted_to_ns": None, "delivery": None}
     assert as_is.model_copy(update=same) == one.tracks[3].model_copy(update=same)
     assert max(as_is.detection) >= 0
+
+
+def test_with_a_delay_frames_since_tell_which_tracks_exist(process: Callable[..., Process]) -> None:
+    """Frames of half a second ago as they were, with existence and `confirmed` by the frames that have come since."""
+    one = process(RATE | {"delay_s": 0.5})
+    for seq in range(12):
+        one.frame(SENSOR.detections(seq, score=np.full(3, 0.3 if seq % 3 else 0.9)))
+    assert one.now[0][0] >= SECOND // 2, "of a time before the first frame nothing is sent"
+    changed = 0
+    for at_ns, payload in one.now:
+        message, wall_ns = decode(payload, Tracks), at_ns + one.wall_ns
+        own = columns(one.tracks[message.seq])
+        assert 400 * MS <= wall_ns - message.stamp_ns <= 500 * MS
+        since = [each for each in one.tracks[message.seq + 1 :] if each.stamp_ns + LATENCY_NS <= wall_ns]
+        later = (optipmb.Tracks(**columns(each)) for each in since)
+        wanted = dict(with_hindsight(optipmb.Tracks(**own), later, PROFILE).columns())
+        assert all(column.tobytes() == wanted[name].tobytes() for name, column in columns(message).items())
+        changed += wanted["existence"].tobytes() != own["existence"].tobytes()
+    assert changed > 1
+
+
+def test_after_a_kill_an_output_with_a_delay_goes_on_with_the_same_bytes(process: Callable[..., Process]) -> None:
+    """From the checkpoint on, as soon as the delay has passed; before that nothing is sent, and nothing else."""
+    outputs = RATE | {"delay_s": 0.3}
+    messages = [SENSOR.detections(seq, score=np.full(3, 0.3 if seq % 3 else 0.9)) for seq in range(20)]
+    whole = process(outputs)
+    for message in messages:
+        if message.seq == 8:
+            whole.streams.keep_now()
+        whole.frame(message)
+    other = process(outputs)
+    other.kept = dict(whole.kept)
+    for message in messages[8:]:
+        other.frame(message)
+    bare = {"delivery": None}
+    found = [one.model_copy(update=bare) for one in other.predicted()]
+    assert len(found) > 10
+    assert found == [one.model_copy(update=bare) for one in whole.predicted()][-len(found) :]
 
 
 def test_stamps_ahead_of_the_clock_are_sent_as_they_are(process: Callable[..., Process]) -> None:
