@@ -190,6 +190,11 @@ class SessionSummary(Message):
         default=None,
         description="Profile that the settings name, where the session runs with another one, or with other values.",
     )
+    learned: tuple[Text, ...] = Field(
+        default=(),
+        max_length=256,
+        description="Noise of the detections of each class that the session has learned, in words.",
+    )
 
 
 class MemberSummary(Message):

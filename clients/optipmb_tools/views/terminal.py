@@ -48,6 +48,8 @@ def status_tables(services: Sequence[ServiceStatus]) -> Group:
         head = f"{service.instance}  {service.state}, version {service.version}, up {duration(service.uptime_s)}, "
         shown.append(Text(head + f"{service.frames} frames, {service.refused} refused", style="bold"))
         shown.append(_streams(service.sessions) if service.sessions else Text("no streams"))
+        for each in service.sessions:
+            shown += [Text(f"{each.stream}: learned {'; '.join(each.learned)}")] if each.learned else []
         for one in service.problems[-LISTED_PROBLEMS:]:
             text = f"problem: {one.stream or 'no stream'}: {in_words(one)}{_times(one)}"
             shown.append(Text(text, style="yellow"))

@@ -24,6 +24,7 @@ import numpy as np
 import optipmb_schemas as schemas
 
 import optipmb
+from optipmb.self_calibration import learned_noise
 from optipmb.zones import ZoneState
 from optipmb_service.session import convert
 from optipmb_service.session.arrivals import Arrivals
@@ -487,6 +488,11 @@ class Session:
             next_id=density.next_id,
             queue=queue + self.held,
         )
+
+    @property
+    def learned(self) -> tuple[str, ...]:
+        """Noise of the detections of each class, as far as it is learned; for any thread."""
+        return learned_noise(self._window.head.density)
 
     # Settings
 

@@ -744,8 +744,8 @@ class Stream:
             return None
         degraded = any(now_ns < until for until in tuple(self._resting.values()))
         summary = self.sensors.summary(self._counts.state(session), now_ns, degraded=degraded)
-        configured = self._configured(session)
-        return summary if configured is None else summary.model_copy(update={"configured": configured})
+        more = {"configured": self._configured(session), "learned": session.learned}
+        return summary.model_copy(update=more)
 
 
 def message_of(packet: Packet, stream: str, limits: schemas.Limits) -> schemas.Detections | schemas.Points:

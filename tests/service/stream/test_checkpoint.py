@@ -129,6 +129,23 @@ def test_scores_are_calibrated_once_also_over_a_restore() -> None:
         assert all(np.array_equal(getattr(a, column), getattr(b, column)) for a, b in pairs), column
 
 
+def test_what_is_learned_outlives_kills_and_moves() -> None:
+    """A session that is restored after every third frame while it learns the noise ends as one that never was."""
+    one, other = (Session(SENSOR.stream, optipmb.load_profile("generic")) for _ in range(2))
+    learned = set()
+    for seq in range(30):
+        message = SENSOR.detections(seq, objects=6)
+        one.on_detections(message, 0)
+        other.on_detections(message, 0)
+        if seq % 3 == 2:
+            other = Session.restore(decode_checkpoint(encode_checkpoint(other.snapshot())), 0)
+            other.recovered(0)
+        assert one.learned == other.learned
+        learned.add(one.learned)
+    assert state_bytes(one.snapshot()) == state_bytes(other.snapshot())
+    assert len(learned) > 1, "it learned on the way"
+
+
 def test_rewind_goes_back_over_a_restore() -> None:
     """A frame that was late before the crash and comes after it is put in its place."""
     one, other = (Session(SENSOR.stream, NUSCENES) for _ in range(2))
