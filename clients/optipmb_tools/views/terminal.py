@@ -51,7 +51,7 @@ def status_tables(services: Sequence[ServiceStatus]) -> Group:
         for each in service.sessions:
             shown += [Text(f"{each.stream}: learned {'; '.join(each.learned)}")] if each.learned else []
         for one in service.problems[-LISTED_PROBLEMS:]:
-            text = f"problem: {one.stream or 'no stream'}: {in_words(one)}{_times(one)}"
+            text = f"problem: {one.stream or 'no stream'}: {one.message}{_times(one)}"
             shown.append(Text(text, style="yellow"))
     members = members_of(services)
     return Group(*shown, _members(members)) if len(members) > 1 else Group(*shown)
@@ -109,21 +109,6 @@ def duration(seconds: float) -> str:
         if seconds >= 2 * size:
             return f"{seconds / size:.0f} {unit}"
     return f"{seconds:.1f} s"
-
-
-def in_words(problem: Problem) -> str:
-    """Return what happened, for people who do not know the messages."""
-    reason, _, jump = problem.received.rpartition(", ")
-    try:
-        seconds = float(jump.removesuffix(" s"))
-    except ValueError:
-        return problem.message
-    if problem.code == "restarted":
-        gap = f"{seconds:.3g} s gap" if seconds >= 0.0 else f"stamps {-seconds:.3g} s earlier"
-        return f"publisher restarted, {gap}" if reason == "publisher" else f"session restarted ({reason}), {gap}"
-    if problem.code == "late":
-        return f"a frame came too late: {-seconds:.3g} s before the newest one"
-    return problem.message
 
 
 def _times(problem: Problem) -> str:
@@ -270,7 +255,7 @@ class StatusView:
 
     def _problem(self, at_s: float, problem: Problem) -> Text:
         age = self._now_s - at_s
-        text = f"{_short(problem.stream or 'no stream', NAME)}: {in_words(problem)}{_times(problem)}"
+        text = f"{_short(problem.stream or 'no stream', NAME)}: {problem.message}{_times(problem)}"
         style = POOR if age < RECENT_S else QUIET
         line = f"{duration(age):>8} ago  {text}"
         return Text(line, style=style, no_wrap=True, overflow="ellipsis")

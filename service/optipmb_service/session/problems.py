@@ -117,6 +117,19 @@ CODES: Final = {
 }
 """Every code of a problem: what it means, and what to do."""
 
+SENTENCES: Final = {
+    "late": "{subject}: it came too late, {apart} the newest one.",
+    "time_jump": "{subject}: its stamp is {apart} the newest one; expected {expected}.",
+    "jump": "{subject}: tracks begin anew, because stamps jumped; it is {apart} the newest one.",
+    "clock": "{subject}: stamps went back, it is {apart} the newest one; objects that are found again keep their ids.",
+    "publisher": "{subject}: tracks begin anew with a new publisher; it is {apart} the newest one.",
+    "pose": "{subject}: tracks begin anew, because its pose is out of reach of the last one.",
+    "world": "{subject}: tracks begin anew, because its world frame is another one.",
+    "effort": "{subject}: tracks begin anew, because they took too much computing time.",
+}
+"""Message of a frame's problem by its code, of `restarted` by the reason; `apart`: from the newest frame in time."""
+
+DAY_S: Final = 86_400
 MAX_TEXT: Final = 500
 """Characters of a text in a problem."""
 
@@ -130,7 +143,8 @@ def problem_of(code: str, *, subject: str = "", **fields: Any) -> schemas.Proble
         fields: further fields of the message.
     """
     fields = {"path": "", "expected": "", "received": ""} | fields
-    fields.setdefault("message", f"{subject}: expected {fields['expected']}, received {fields['received']}.")
+    place = f"{subject}: {fields['path']}" if fields["path"] else subject
+    fields.setdefault("message", f"{place}: expected {fields['expected']}, received {fields['received']}.")
     texts = {name: _fit(fields[name]) for name in ("path", "expected", "received", "message")}
     return schemas.Problem(code=code, **fields | texts)
 
@@ -138,3 +152,12 @@ def problem_of(code: str, *, subject: str = "", **fields: Any) -> schemas.Proble
 def _fit(text: str) -> str:
     text = "".join(character if character.isprintable() else "?" for character in text[: MAX_TEXT + 1])
     return text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 3] + "..."
+
+
+def sentence(kind: str, subject: str, jump_ns: int, expected: str = "") -> str:
+    """Return the message of a problem of `SENTENCES`, of a frame that is so far from the newest one."""
+    seconds = abs(jump_ns) / 1e9
+    long = f"{seconds / DAY_S:.0f} days" if seconds >= 2 * DAY_S else f"{seconds:.2f} s"
+    return SENTENCES[kind].format(
+        subject=subject, apart=f"{long} {'before' if jump_ns < 0 else 'after'}", expected=expected
+    )

@@ -30,7 +30,7 @@ from optipmb_service.session import convert
 from optipmb_service.session.arrivals import Arrivals
 from optipmb_service.session.checkpoint import Checkpoint
 from optipmb_service.session.pending import PendingFrame, SensorQueue
-from optipmb_service.session.problems import problem_of
+from optipmb_service.session.problems import problem_of, sentence
 from optipmb_service.session.state import FilterState, ProcessedFrame
 from optipmb_service.session.timeline import JUMP_FRAMES, FrameId, FusedTimeline, StreamTimeline, Verdict
 from optipmb_service.session.transition import Transition
@@ -781,7 +781,7 @@ class Session:
 
     def _refused(self, frame_id: FrameId, decision: Decision) -> list[Output]:
         """Count and report a frame that has no place; of a duplicate there is nothing to report."""
-        received = _seconds(decision.place.jump_ns)
+        jump_ns = decision.place.jump_ns
         if decision.verdict is Verdict.DUPLICATE:
             self._deliveries.duplicates += 1
             return []
@@ -791,9 +791,10 @@ class Session:
             return [self._refuse("duplicate_epoch", frame_id, "epoch", expected, frame_id.epoch.hex())]
         if decision.verdict is Verdict.JUMPED:
             expected = "a stamp near those of the session's other sensors, or most of them on another clock"
-            return [self._refuse("time_jump", frame_id, "stamp_ns", expected, received)]
+            self._deliveries.refused += 1
+            return [self._jumped("time_jump", frame_id, expected, jump_ns)]
         self._deliveries.late += 1
-        return [self._problem("late", frame_id, "stamp_ns", "a frame inside the window", received)]
+        return [self._jumped("late", frame_id, "a frame inside the window", jump_ns)]
 
     def _restarted(self, outcomes: Sequence[Outcome]) -> list[Output]:
         """Report the session id that frames started, the last one if there were several."""
@@ -801,8 +802,8 @@ class Session:
             if (begun := one.begun) is not None:
                 if begun.reason == "first":
                     return [begun]
-                received = f"{begun.reason}, {_seconds(begun.jump_ns)}"
-                return [begun, self._problem("restarted", one.frame.frame_id, "", "a stream that goes on", received)]
+                frame_id, expected = one.frame.frame_id, "frames that continue the stream"
+                return [begun, self._jumped("restarted", frame_id, expected, begun.jump_ns, begun.reason)]
         return []
 
     def _low_scores(self, frame_id: FrameId, frame: optipmb.Frame, parameters: optipmb.Parameters) -> list[Output]:
@@ -841,8 +842,7 @@ class Session:
             return problems
         if frame.place.opens is Verdict.UNCONFIRMED:
             expected = f"a stamp near the one before, or {JUMP_FRAMES} frames in a row that agree on the jump"
-            received = _seconds(frame.place.jump_ns)
-            return [self._problem("time_jump", frame.frame_id, "stamp_ns", expected, received)]
+            return [self._jumped("time_jump", frame.frame_id, expected, frame.place.jump_ns)]
         if (effort := outcome.effort) is not None:
             return [self._problem("overload", frame.frame_id, effort.path, effort.expected, effort.received)]
         pose = frame.message.pose
@@ -870,13 +870,20 @@ class Session:
         self._deliveries.refused += 1
         return self._problem(code, frame_id, path, expected, received)
 
+    def _jumped(self, code: str, frame_id: FrameId, expected: str, jump_ns: int, reason: str = "") -> schemas.Problem:
+        """Return a problem of a frame that is so far from the newest one, for a restart with its reason."""
+        seconds = _seconds(jump_ns)
+        message = sentence(reason or code, f"Frame {frame_id.seq}", jump_ns, expected)
+        path, received = ("", f"{reason}, {seconds}") if reason else ("stamp_ns", seconds)
+        return self._problem(code, frame_id, path, expected, received, message=message)
+
     def _problem(
-        self, code: str, frame_id: FrameId, path: str, expected: str, received: str, count: int = 1
+        self, code: str, frame_id: FrameId, path: str, expected: str, received: str, count: int = 1, **message: str
     ) -> schemas.Problem:
         """Return a problem of a frame, on the stream of its sensor."""
-        texts = {"path": path, "expected": expected, "received": received}
+        texts = {"path": path, "expected": expected, "received": received} | message
         frame = {"seq": frame_id.seq, "stamp_ns": frame_id.stamp_ns, "count": count}
-        stream, subject = frame_id.sensor or self.stream, f"Frame {frame_id.seq}: {path or 'tracker'}"
+        stream, subject = frame_id.sensor or self.stream, f"Frame {frame_id.seq}"
         return problem_of(code, stream=stream, instance=self._instance, subject=subject, **texts, **frame)
 
 

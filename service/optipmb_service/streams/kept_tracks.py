@@ -221,5 +221,5 @@ class TrackQuery:
     def _problem(
         self, code: str, stream: str, path: str, expected: str, received: str, stamp_ns: int | None = None
     ) -> schemas.Problem:
-        texts = {"path": path, "expected": expected, "received": received, "subject": f"Query: {path or 'tracks'}"}
+        texts = {"path": path, "expected": expected, "received": received, "subject": "Query"}
         return problem_of(code, stream=stream, instance=self._instance, stamp_ns=stamp_ns, **texts)

@@ -95,8 +95,7 @@ def guarded(request: Query, answer: Callable[[], Future[None] | None], *, instan
 def problem_with(error: schemas.MessageError, *, instance: str, stream: str = "", code: str = "") -> schemas.Problem:
     """Return the answer to a query that is refused, by default with the code of its error."""
     texts = {"path": error.path, "expected": error.expected, "received": error.received}
-    subject = f"Query: {error.path or 'payload'}"
-    return problem_of(code or error.code, stream=stream, instance=instance, subject=subject, **texts)
+    return problem_of(code or error.code, stream=stream, instance=instance, subject="Query", **texts)
 
 
 class StreamQueries:

@@ -425,7 +425,7 @@ class Stream:
             stream: the stream it is reported on; by default the session's.
         """
         texts = {"path": path, "expected": expected, "received": received}
-        about = {"stream": stream or self.name, "subject": f"{what or 'Stream'}: {path or 'message'}"}
+        about = {"stream": stream or self.name, "subject": what or "Stream"}
         problem = problem_of(code, instance=self._streams.instance, count=count, **about, **texts)
         self._streams.reporter.report(problem, time.monotonic_ns())
 

@@ -589,9 +589,7 @@ class Streams:
 
     def _report(self, code: str, stream: str, expected: str, received: str, count: int = 1, path: str = "key") -> None:
         texts = {"path": path, "expected": expected, "received": received}
-        problem = problem_of(
-            code, stream=stream, instance=self.instance, subject=path.capitalize(), count=count, **texts
-        )
+        problem = problem_of(code, stream=stream, instance=self.instance, subject="Stream", count=count, **texts)
         self.reporter.report(problem, time.monotonic_ns())
 
     # The table

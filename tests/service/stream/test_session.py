@@ -1,5 +1,6 @@
 """A session as a function of its messages: order, clouds, restarts, failures, commands."""
 
+import re
 from dataclasses import replace
 from itertools import count
 from typing import Any
@@ -112,6 +113,7 @@ def test_late_frames_are_refused_with_a_problem() -> None:
     density = one.density
     found = problems(feed(one, [2]))
     assert [(p.code, p.seq, p.path) for p in found] == [("late", 2, "stamp_ns")]
+    assert re.fullmatch(r"Frame 2: it came too late, \d\.\d+ s before the newest one\.", found[0].message)
     assert one.density is density
     assert one.counters.late == 1
 
@@ -453,11 +455,18 @@ def test_a_stamp_ahead_ends_no_track() -> None:
     assert (one.counters.refused, one.counters.new_epochs) == (2, 0)
 
 
-@pytest.mark.parametrize("shift_s", [-3600.0, 3600.0])
-def test_a_jump_that_frames_agree_on_is_reported(shift_s: float) -> None:
-    """Three frames in a row an hour ahead or back begin a new session, which is a problem of its own kind."""
+@pytest.mark.parametrize(("shift_s", "apart"), [(-3600.0, r"3599\.\d0 s before"), (864_000.0, "10 days after")])
+def test_a_jump_that_frames_agree_on_is_reported(shift_s: float, apart: str) -> None:
+    """Three frames in a row far ahead or back begin a new session, a problem of its own kind, told in a sentence."""
     one = session()
     feed(one, range(5))
     outputs = feed(one, range(5, 9), replace(SENSOR, start_s=SENSOR.start_s + shift_s))
-    assert [problem.code for problem in problems(outputs)] == ["time_jump", "time_jump", "restarted"]
+    said = problems(outputs)
+    assert [problem.code for problem in said] == ["time_jump", "time_jump", "restarted"]
+    assert re.match(
+        f"Frame 5: its stamp is {apart} the newest one; expected a stamp near the one before", said[0].message
+    )
+    assert re.match(
+        f"Frame 7: tracks begin anew, because stamps jumped; it is {apart} the newest one", said[-1].message
+    )
     assert (begun(outputs), len(tracks(outputs))) == (["jump"], 2)
