@@ -25,7 +25,7 @@ README = (ROOT / "README.md").read_text()
 MESSAGES = (ROOT / "docs" / "messages.md").read_text()
 CARS = ((0.0, 0.0, 8.0), (40.0, 4.0, -6.0))  # x, y, speed along x
 LIMIT_S = 1800
-NODE_MB = 60
+NODE_MB = 140
 KEPT = "(?i)(https?|no)_proxy$|ssl_|lang$"
 PYTHONS_OWN = "pip|setuptools|pkg_resources|_distutils|distutils"
 # Of downloads, so that a second run need not repeat them.
@@ -191,13 +191,11 @@ def python(base: Path, wheel: Path, _node: Path) -> None:
 
 
 def node(base: Path, wheel: Path, node_wheel: Path) -> None:
-    """A service; a publisher and a subscriber without tracker and numpy; publishers with numpy and with Zenoh alone."""
+    """A service; a publisher and a subscriber without the tracker; a publisher with Zenoh alone."""
     place = Environment(base, "service", f"{wheel}[service]")
     nodes = Environment(base, "node", node_wheel)
     checked(nodes.megabytes < NODE_MB, f"expected a node of less than {NODE_MB} MB")
-    arrays = Environment(base, "arrays", f"{node_wheel}[arrays]")
-    for one in (nodes, arrays):
-        said(f"  {one.name}: import optipmb_client: {one.import_ms('optipmb_client'):.0f} ms of processor time")
+    said(f"  import optipmb_client: {nodes.import_ms('optipmb_client'):.0f} ms of processor time")
     plain = Environment(base, "zenoh", "eclipse-zenoh")
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -205,7 +203,6 @@ def node(base: Path, wheel: Path, node_wheel: Path) -> None:
     programs = (
         (nodes, "publisher.py", blocks(README, "python", "Publisher(")),
         (nodes, "subscriber.py", blocks(README, "python", "Subscriber(")),
-        (arrays, "publisher.py", blocks(README, "python", "Publisher(")),
         (plain, "plain.py", blocks(MESSAGES, "python", "import zenoh")),
     )
     for where, name, text in programs:

@@ -17,6 +17,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
+import numpy as np
 from optipmb_schemas import PREFIX, Detections, FieldOfView, Keys, MessageError, Points, Pose, Relocation
 from optipmb_schemas.arrays import ArrayLike, numeric
 
@@ -180,16 +181,14 @@ class Publisher:
                 relocation=world,
                 labels=names,
                 label=index,
-                center=_array("center", center, 3),
-                size=None if size is None else _array("size", size, 3),
-                yaw=None if yaw is None else _array("yaw", yaw),
-                velocity=None if velocity is None else _array("velocity", velocity, 2),
-                score=_array("score", score),
+                center=_array(center, 3),
+                size=None if size is None else _array(size, 3),
+                yaw=None if yaw is None else _array(yaw),
+                velocity=None if velocity is None else _array(velocity, 2),
+                score=_array(score),
                 has_points=has_points,
                 field_of_view=field_of_view,
-                position_covariance=None
-                if position_covariance is None
-                else _array("position_covariance", position_covariance, 3, 3),
+                position_covariance=None if position_covariance is None else _array(position_covariance, 3, 3),
             )
             payload = self._detections.pack(message)
             attachment = attachment_of(current_traceparent())
@@ -230,7 +229,7 @@ class Publisher:
                 stamp_ns=_stamp(stamp_ns),
                 frame=self.frame,
                 pose=_pose(pose),
-                xyz=numeric.finite(_array("xyz", points, 3)),
+                xyz=numeric.finite(_array(points, 3)),
             )
         )
 
@@ -238,7 +237,7 @@ class Publisher:
 def _labelled(label: Any, labels: Sequence[str] | None) -> tuple[tuple[str, ...], Any]:
     """Return class names and indices (M,) into them, from either form that `publish` takes."""
     if labels is not None:
-        return tuple(labels), _array("label", label)
+        return tuple(labels), _array(label)
     if isinstance(label, str) or not isinstance(label, Iterable):
         raise MessageError("invalid_value", "label", "a list of class names", repr(label)[:80])
     names = list(label)
@@ -249,16 +248,9 @@ def _labelled(label: Any, labels: Sequence[str] | None) -> tuple[tuple[str, ...]
     return tuple(index), array.array("q", [index[name] for name in names])
 
 
-def _array(name: str, values: Any, *columns: int) -> Any:
-    """Return lists as they are (errors then name the element), all else as arrays; a table without rows as a list.
-
-    Raises:
-        MessageError: They are a buffer of something else than numbers; names the field.
-    """
-    try:
-        rows = values if isinstance(values, list | tuple) else numeric.asarray(values)
-    except MessageError as error:
-        raise error.under(name) from None
+def _array(values: Any, *columns: int) -> Any:
+    """Return lists as they are (errors then name the element), all else as arrays; a table without rows as a list."""
+    rows = values if isinstance(values, list | tuple) else np.asarray(values)
     return [] if columns and getattr(rows, "shape", None) == (0,) else rows
 
 
@@ -277,16 +269,14 @@ def _pose(pose: PoseLike | None) -> Pose | None:
         translation, quaternion = pose
     except (TypeError, ValueError):
         raise MessageError("invalid_value", "pose", "a pair: translation, quaternion", type(pose).__name__) from None
-    return Pose(translation=_array("pose.translation", translation), quaternion=_array("pose.quaternion", quaternion))
+    return Pose(translation=_array(translation), quaternion=_array(quaternion))
 
 
 def _relocation(motion: PoseLike, world: int) -> Relocation:
     """Return the motion into a world of this number."""
     try:
         translation, quaternion = (motion.translation, motion.quaternion) if isinstance(motion, Pose) else motion
-        return Relocation(
-            world=world, translation=_array("translation", translation), quaternion=_array("quaternion", quaternion)
-        )
+        return Relocation(world=world, translation=_array(translation), quaternion=_array(quaternion))
     except MessageError as error:
         raise error.under("relocation") from None
     except (TypeError, ValueError):

@@ -1,9 +1,8 @@
 """Columnar arrays as pydantic fields: one value per column, checked with whole-array operations.
 
 `Annotated[Reals, Array("f8", ("M", 3), low, high)]` is an array of M rows of 3 numbers. A field may be
-given an array of another number type, or nested lists. It always holds an array of the number type of the description,
-row by row and read-only: of numpy (`numeric`), or, where numpy is not installed, `Numbers` (`plain`). An array
-or buffer that is all this already is held as a view, without a copy.
+given an array of another number type, a buffer, or nested lists. It always holds a numpy array of the number type of
+the description, row by row and read-only (`numeric`). An array or buffer that is all this already is held as a view.
 
 A letter is a symbolic dimension: equal letters are equal numbers within one message (`Message` compares them).
 """
@@ -20,16 +19,11 @@ from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
+from optipmb_schemas import numeric
 from optipmb_schemas.errors import MessageError, cut, invalid, shape_text
 
 if sys.byteorder != "little":
     raise ImportError("the messages need a little-endian machine")
-try:
-    from optipmb_schemas import numeric
-except ModuleNotFoundError as error:
-    if error.name != "numpy":
-        raise
-    from optipmb_schemas import plain as numeric  # type: ignore[no-redef]  # the same names for programs without numpy
 
 if TYPE_CHECKING:
     import numpy as np
@@ -43,7 +37,6 @@ else:  # pydantic looks at the `Array` in their metadata alone
     ArrayLike = Reals = Singles = Integers = Numeric = Any
 
 __all__ = [
-    "ARRAY",
     "MAX_COLUMNS",
     "Array",
     "ArrayLike",
@@ -55,9 +48,6 @@ __all__ = [
     "numeric",
     "unit_quaternion",
 ]
-
-ARRAY: Final = numeric.ARRAY
-"""The type of what fields of numbers hold."""
 
 MAX_COLUMNS: Final = 64
 """Most columns of an array whose further columns are dropped."""

@@ -29,11 +29,12 @@ from typing import Annotated, Any, Final, Literal, NamedTuple, TypeVar, get_type
 
 import msgpack
 import msgspec
+import numpy as np
 from msgspec import UNSET, UnsetType
 from pydantic import AfterValidator, TypeAdapter
 from typing_extensions import TypedDict
 
-from optipmb_schemas.arrays import ARRAY, Array, Numeric, numeric
+from optipmb_schemas.arrays import Array, Numeric, numeric
 from optipmb_schemas.control import (
     DrainRequest,
     MoveRequest,
@@ -48,11 +49,6 @@ from optipmb_schemas.errors import MessageError, invalid, show
 from optipmb_schemas.limits import DEFAULT, Limits
 from optipmb_schemas.messages import Density, Detections, Events, FieldOfView, Points, Pose, Relocation, Tracks
 from optipmb_schemas.model import Message
-
-try:
-    import numpy as np
-except ModuleNotFoundError:  # the models read every form then
-    np = None  # type: ignore[assignment]  # numpy is an extra
 
 T = TypeVar("T", bound=Message)
 
@@ -435,7 +431,7 @@ def _parts(kind: type[Message], values: dict[str, Any]) -> list[Any]:
     parts: list[Any] = [_head(len(fields))]
     offset, plain = len(parts[0]), {}
     for name, value in fields:
-        if type(value) is not ARRAY:
+        if type(value) is not np.ndarray:
             plain[name] = value if type(value) in _PLAIN else _plain(value, blocks=True)
             continue
         if plain:
@@ -446,7 +442,7 @@ def _parts(kind: type[Message], values: dict[str, Any]) -> list[Any]:
         if not head:
             head = _large_head(name, kind.arrays[name].dtype, value.shape, offset)
             length += len(head)
-        parts += head, numeric.memory_of(value)
+        parts += head, value.data
         offset += length
     if plain:
         parts.append(_without_head(plain))
@@ -467,7 +463,7 @@ def encode_columns(
     """
     parts: list[Any] = [_head(len(header) + len(names) + len(others)), _without_head(header)]
     heads, places = _column_heads(kind, names, columns.size, (len(parts[0]) + len(parts[1])) % ALIGNMENT)
-    parts += chain.from_iterable(zip(heads, map(numeric.memory_of(columns).cast("B").__getitem__, places), strict=True))
+    parts += chain.from_iterable(zip(heads, map(columns.data.cast("B").__getitem__, places), strict=True))
     parts.append(_without_head(others))
     return b"".join(parts)
 
@@ -500,7 +496,7 @@ def _plain(value: Any, *, blocks: bool) -> Any:
         for name, field in value.present():
             if type(field) in _PLAIN and blocks:
                 fields[name] = field
-            elif isinstance(field, ARRAY):
+            elif isinstance(field, np.ndarray):
                 array = value.arrays[name]
                 fields[name] = _block(field, array.dtype) if blocks else array.to_lists(field)
             else:
@@ -854,7 +850,7 @@ def read_columns(payload: bytes, kind: type[T], limits: Limits) -> T | None:
     of floats. Where it would copy a large payload, `_is_encoding` compares the payload without them.
     """
     builder: Any = _BUILDERS.get(kind)
-    if np is None or builder is None or not limits.allows_columns:
+    if builder is None or not limits.allows_columns:
         return None
     try:
         fields = DECODERS[kind](payload)

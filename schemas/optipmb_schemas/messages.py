@@ -13,7 +13,7 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, Field
 
-from optipmb_schemas.arrays import Array, Integers, Numeric, Reals, Singles, first_descent, numeric, unit_quaternion
+from optipmb_schemas.arrays import Array, Integers, Numeric, Reals, Singles, first_descent, unit_quaternion
 from optipmb_schemas.errors import MessageError, invalid, shape_text
 from optipmb_schemas.model import (
     Count,
@@ -488,18 +488,15 @@ def _check_labels(label: Integers, labels: tuple[str, ...]) -> None:
 
 
 def _check_covariances(covariance: Reals) -> None:
-    for at, good in enumerate(numeric.of_each_matrix(_is_covariance, covariance)):
+    for at, good in enumerate(_are_covariances(covariance).tolist()):
         if not good and not all(map(math.isnan, chain.from_iterable(rows := covariance[at].tolist()))):
             expected = "a symmetric covariance with variances from 1e-8 to 1e8 along every axis, or NaN alone"
             raise invalid(f"position_covariance[{at}]", expected, rows)
 
 
-def _is_covariance(matrix: Any) -> Any:
-    """Return whether a matrix (3, 3) is symmetric with its eigenvalues within the limits, element by element.
-
-    The elements may be arrays, of several matrices; then the result is one too. NaN gives False.
-    """
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = matrix
+def _are_covariances(matrices: Reals) -> Any:
+    """Return which matrices (M, 3, 3) are symmetric with their eigenvalues within the limits; NaN is in none."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = matrices.transpose(1, 2, 0)
     good = True
     for one, other in ((xy, yx), (xz, zx), (yz, zy)):
         gap = abs(one - other) / SYMMETRY

@@ -10,6 +10,7 @@ from functools import lru_cache
 from types import UnionType
 from typing import Annotated, Any, ClassVar, Final, Self, Union, get_args, get_origin
 
+import numpy as np
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -22,7 +23,7 @@ from pydantic import (
     model_validator,
 )
 
-from optipmb_schemas.arrays import ARRAY, Array, Reals, first_descent
+from optipmb_schemas.arrays import Array, Reals, first_descent
 from optipmb_schemas.errors import MessageError, cut, invalid, path_of, shape_text, show
 
 CHUNK: Final = r"[A-Za-z0-9_.-]+"
@@ -254,12 +255,12 @@ class Message(BaseModel):
 
     def __repr_args__(self) -> list[tuple[str | None, Any]]:
         """Show arrays by type and shape."""
-        return [(n, show(v) if isinstance(v, ARRAY) else v) for n, v in self.present()]
+        return [(n, show(v) if isinstance(v, np.ndarray) else v) for n, v in self.present()]
 
 
 def _same(one: Any, other: Any) -> bool:
-    if isinstance(one, ARRAY):
-        return isinstance(other, ARRAY) and one.shape == other.shape and one.tobytes() == other.tobytes()
+    if isinstance(one, np.ndarray):
+        return isinstance(other, np.ndarray) and one.shape == other.shape and one.tobytes() == other.tobytes()
     return bool(one == other)
 
 

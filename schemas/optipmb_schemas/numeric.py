@@ -1,4 +1,4 @@
-"""Fields of numbers as numpy arrays. `plain` has the same names for programs without numpy; `arrays` chooses.
+"""Fields of numbers as numpy arrays.
 
 A field always holds a numpy array of the number type of its description, in native byte order,
 C-contiguous, aligned and read-only, so compiled code that is specialised on array types sees one type. An array that is
@@ -6,7 +6,6 @@ all this already is held as a view, without a copy.
 """
 
 import array
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -15,19 +14,11 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from optipmb_schemas.arrays import Array
 
-ARRAY: Final = np.ndarray
-"""What fields of numbers hold."""
-
 WHOLE: Final = (int, np.integer)
 REAL: Final = (int, float, np.integer, np.floating)
 """Types of the numbers in lists."""
 
 _DTYPES: Final = {name: np.dtype("<" + name) for name in ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")}
-
-
-def asarray(value: Any) -> Any:
-    """Return a value that is no list as an array, as far as it is one."""
-    return np.asarray(value)
 
 
 def given(value: object) -> NDArray[Any] | None:
@@ -45,11 +36,6 @@ def of_leaves(leaves: list[Any], dtype: str, shape: tuple[int, ...]) -> NDArray[
 def of_bytes(data: bytes | memoryview, dtype: str, shape: list[int]) -> NDArray[Any]:
     """Return little-endian numbers as an array: a view."""
     return np.frombuffer(data, _DTYPES[dtype]).reshape(shape) if data else np.empty(shape, _DTYPES[dtype])
-
-
-def memory_of(array: NDArray[Any]) -> Any:
-    """Return the numbers of an array in memory, row by row."""
-    return array.data
 
 
 def read_only(array: NDArray[Any]) -> NDArray[Any]:
@@ -114,9 +100,3 @@ def finite(points: Any) -> Any:
     xyz = np.ascontiguousarray(points[:, :3])
     good = np.isfinite(xyz)
     return xyz if good.all() else xyz[good[:, 0] & good[:, 1:].all(axis=1)]
-
-
-def of_each_matrix(function: Callable[[Any], Any], matrices: NDArray[Any]) -> list[bool]:
-    """Return what a function of the elements of a matrix gives for each of (M, rows, columns)."""
-    result: list[bool] = function(matrices.transpose(1, 2, 0)).tolist()
-    return result

@@ -1,8 +1,6 @@
 """Publisher and Subscriber through a real router; plain Zenoh sessions play the other side."""
 
-import functools
 import re
-import subprocess
 import threading
 import time
 from collections.abc import Iterator
@@ -36,7 +34,6 @@ from proxy import Proxy
 from router import until
 from routers import free_endpoint, open_client
 from tracks_message import SESSION, tracks_message
-from without_numpy import command, publish_everything
 
 DEADLINE_S = 60.0
 STREAM = "garage/robot-1/lidar"
@@ -84,20 +81,6 @@ class Service:
 def service(endpoint: str) -> Iterator[Service]:
     with open_client(endpoint) as session:
         yield Service(session)
-
-
-def test_without_numpy_the_same_is_published(link: Connection, endpoint: str) -> None:
-    """A process without numpy publishes poses, fields of view, covariances and clouds as one with numpy does."""
-    boxes, clouds = listen(link, "detections"), listen(link, "points")
-    publish_everything(functools.partial(Publisher, connect=endpoint))
-    code = "import functools\nfrom optipmb_client import Publisher\nfrom without_numpy import publish_everything\n"
-    code += "publish_everything(functools.partial(Publisher, connect=sys.argv[2]))"
-    subprocess.run([*command(code), endpoint], check=True, timeout=DEADLINE_S)
-    for inbox, kind, count in ((boxes, Detections, 2), (clouds, Points, 1)):
-        arrivals = [inbox.get(DEADLINE_S) for _ in range(2 * count)]
-        messages = [arrival.read(kind).model_copy(update={"epoch": bytes(16)}) for arrival in arrivals if arrival]
-        assert messages[:count] == messages[count:]
-        assert len(messages) == 2 * count
 
 
 def test_messages_carry_the_context_of_the_active_span(link: Connection) -> None:

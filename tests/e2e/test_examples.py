@@ -11,7 +11,6 @@ import pytest
 from optipmb_client.zenoh import DEFAULT_ENDPOINT
 from real_data import REPOSITORY
 from service_process import ServiceProcess
-from without_numpy import command as without_numpy
 
 EXAMPLES = REPOSITORY / "examples"
 README = REPOSITORY / "README.md"
@@ -55,16 +54,10 @@ def fused(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceProcess]:
 
 
 class Program(AbstractContextManager["Program"]):
-    """A program that runs until it ends or the test has read enough of it.
+    """A program that runs until it ends or the test has read enough of it."""
 
-    Args:
-        text: of the program.
-        numpy: whether it finds numpy.
-    """
-
-    def __init__(self, text: str, *, numpy: bool = True) -> None:
-        command = [sys.executable, "-c", text] if numpy else without_numpy(text)
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    def __init__(self, text: str) -> None:
+        self.process = subprocess.Popen([sys.executable, "-c", text], stdout=subprocess.PIPE, text=True)
         self.lines: list[str] = []
         self._came = threading.Condition()
         self._reader = threading.Thread(target=self._read, daemon=True)
@@ -91,32 +84,32 @@ class Program(AbstractContextManager["Program"]):
                 self._came.notify_all()
 
 
-@pytest.mark.parametrize("numpy", [True, False])
-def test_the_examples_work_twice(service: ServiceProcess, *, numpy: bool) -> None:
+@pytest.mark.parametrize("time", [1, 2])
+def test_the_examples_work_twice(service: ServiceProcess, time: int) -> None:
     """Each reader of the examples and the pages says what it promises of the car that the publisher publishes.
 
-    That is so again with the state that is left, without numpy for the examples.
+    That is so again with the state that is left.
     """
     texts = [(EXAMPLES / f"{name}.py").read_text() for name in ("subscriber", "publisher")]
     assert all(text.count(DEFAULT_ENDPOINT) == 1 for text in texts), "an example names the endpoint, once"
     subscriber, publisher = (connected(text, service.endpoint) for text in texts)
     with (
-        Program(subscriber.replace("timeout=5", "timeout=100"), numpy=numpy) as tracks,
+        Program(subscriber.replace("timeout=5", "timeout=100")) as tracks,
         Program(connected(block("zones.md", "python"), service.endpoint)) as events,
         Program(connected(block("fixed-rate.md", "python"), service.endpoint)) as outputs,
     ):
         for one in (tracks, events, outputs):
             one.until("listens")
-        with Program(publisher, numpy=numpy) as car:
+        with Program(publisher) as car:
             assert car.process.wait(200) == 0
         rows = [line.split() for line in tracks.until(r".* at 49\.")[1:]]
-        said = [line.split() for line in events.until(f"yard left .* {1 if numpy else 2}$")[1:]]
+        said = [line.split() for line in events.until(f"yard left .* {time}$")[1:]]
         predicted = outputs.until("frame 45")[1:]
     assert len(rows) >= 45
     assert {tuple(row[:4]) for row in rows} == {("garage/robot-1/lidar", "track", rows[0][2], "car")}
     x = [float(row[5]) for row in rows]
     assert x == sorted(x)
-    time = 1 if numpy else 2  # a reader of events first gets those that are kept
+    # A reader of events first gets those that are kept.
     promised = (REPOSITORY / "docs/zones.md").read_text().partition("It prints:\n\n```\n")[2].partition("```")[0]
     assert [one[:-2] for one in said] == time * [line.split()[:-2] for line in promised.splitlines()]
     assert [one[-1] for one in said[-4:]] == 4 * [str(time)]

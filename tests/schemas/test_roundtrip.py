@@ -1,5 +1,6 @@
 """Messages survive the wire unchanged, to the bit."""
 
+import array
 import json
 import pickle
 from pathlib import Path
@@ -351,6 +352,14 @@ def test_numbers_of_numpy_are_encoded_as_those_of_python(examples: dict[str, Mes
     delivery = tracks.delivery.model_copy(update={"queue_ms": np.float64(1.5)})  # type: ignore[attr-defined]
     same = tracks.delivery.model_copy(update={"queue_ms": 1.5})  # type: ignore[attr-defined]
     assert encode(tracks, delivery=delivery) == encode(tracks, delivery=same)
+
+
+def test_buffers_of_other_libraries_are_columns(detections: Detections) -> None:
+    """Columns given as buffers, of several dimensions and another number type too, make the same message."""
+    rows = len(detections.label)
+    center = memoryview(detections.center.tobytes()).cast("d", (rows, 3))
+    columns = {"center": center, "label": array.array("i", detections.label.tolist())}
+    assert Detections(**dict(detections.present()) | columns) == detections
 
 
 def test_messages_cross_processes_and_pydantic(examples: dict[str, Message]) -> None:

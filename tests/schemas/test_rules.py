@@ -21,7 +21,6 @@ from optipmb_schemas import (
     encode,
     encode_json,
     messages,
-    numeric,
 )
 
 
@@ -76,7 +75,8 @@ def test_long_ellipsoids_are_covariances(spread: tuple[float, ...]) -> None:
 
     def accepted(*values: float) -> list[bool]:
         matrices = turns * np.array(values) @ turns.transpose(0, 2, 1)
-        return numeric.of_each_matrix(messages._is_covariance, matrices)
+        found: list[bool] = messages._are_covariances(matrices).tolist()
+        return found
 
     assert all(accepted(*spread))
     assert not any(accepted(spread[0], spread[1], -1e-3 * spread[1] - 1e-14 * spread[0]))
