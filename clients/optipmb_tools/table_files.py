@@ -82,6 +82,11 @@ def is_table(path: Path) -> bool:
     return _kind(path) in SUFFIXES
 
 
+def is_text(path: Path) -> bool:
+    """Tell by its name whether a table is written as text."""
+    return _kind(path) in {*_TEXT, ".jsonl", ".ndjson"}
+
+
 def tables_in(path: Path) -> list[Path]:
     """Return the tables that a file or folder is; a folder with a file for each frame is one table by itself."""
     if not path.is_dir():

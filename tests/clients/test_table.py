@@ -335,3 +335,22 @@ def test_a_dataset_is_guessed_from_its_file(tmp_path: Path, capsys: pytest.Captu
     done = run_here(capsys, "track", tmp_path / "a.xyz")
     assert done.returncode == 2
     assert "expected a table (.csv, .parquet, .jsonl, .json, .feather)" in done.stderr
+
+
+def test_text_has_the_digits_of_its_units(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """CSV and JSON Lines hold the same short numbers, Parquet and `--digits full` every bit."""
+    data = table(tmp_path / "d.csv", boxes())
+    found: dict[str, Any] = {}
+    for name in ("a.csv", "a.jsonl", "a.parquet", "full.csv"):
+        more = ("--digits", "full") if name == "full.csv" else ()
+        assert run_here(capsys, "track", data, "--out", tmp_path / name, *more).returncode == 0
+        found[name] = read_table(tmp_path / name)
+    for name, doubles in found["a.parquet"].items():
+        if doubles.dtype.kind == "f":
+            unit = 1e-3 if name in {"vx", "vy", "acceleration"} else 1e-4
+            np.testing.assert_array_equal(found["full.csv"][name], doubles)
+            np.testing.assert_array_equal(found["a.csv"][name], found["a.jsonl"][name])
+            np.testing.assert_allclose(found["a.csv"][name], doubles, rtol=0.0, atol=0.5001 * unit)
+    fields = (tmp_path / "a.csv").read_text().replace("\n", ",").split(",")
+    assert max(len(field.partition(".")[2]) for field in fields) == 4
+    assert "--digits: expected unit or full" in run_here(capsys, "track", data, "--digits", "x").stderr

@@ -95,8 +95,9 @@ def test_chosen_classes_and_another_profile(both: Both) -> None:
 def test_a_table_without_a_profile(service: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A table is replayed with the profile generic where none is named: the bytes of `track`."""
     table, tracked, replayed = SAMPLE, tmp_path / "tracked.csv", tmp_path / "replayed.csv"
-    run_here(capsys, "track", table, "--profile", "generic", "--hindsight", 0, "--out", tracked)
-    done = run_here(capsys, "replay", table, "--connect", service.endpoint, "--out", replayed)
+    full = ("--digits", "full")
+    run_here(capsys, "track", table, "--profile", "generic", "--hindsight", 0, "--out", tracked, *full)
+    done = run_here(capsys, "replay", table, "--connect", service.endpoint, "--out", replayed, *full)
     assert "profile generic, which is auto at 10 Hz" in done.stderr
     assert tracked.read_bytes() == replayed.read_bytes()
     rows = list(csv.DictReader(tracked.read_text().splitlines()))

@@ -49,6 +49,12 @@ Out = Annotated[
 Full = Annotated[
     bool, typer.Option("--full", help="Also write all that is known of the tracks, with covariances, as .npz files.")
 ]
+Digits = Annotated[
+    str,
+    typer.Option(
+        "--digits", metavar="unit|full", help="Of numbers in tables as text: 1e-4 m, rad and so on, or every bit."
+    ),
+]
 Profile = Annotated[
     str | None,
     typer.Option(

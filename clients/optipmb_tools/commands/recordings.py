@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from optipmb_client.errors import UsageError
 
-from optipmb_tools.commands.options import AsJson, Full, print_json, report, say, warn
+from optipmb_tools.commands.options import AsJson, Digits, Full, print_json, report, say, warn
 from optipmb_tools.commands.service_options import PaceOptions, ServiceOptions
 from optipmb_tools.extras import needed
 from optipmb_tools.views.progress import FrameProgress, StatusLine
@@ -100,6 +100,7 @@ class PlayOptions:
     )
     out: Annotated[Path | None, typer.Option("--out", help="Folder for result files of the tracks.")] = None
     full: Full = False
+    digits: Digits = "unit"
 
 
 def play(
@@ -134,7 +135,7 @@ def play(
         playing = Playing(chosen_pace, site, how.profile, service.prefix, progress.advance)
         results = play_streams(connection, recording, plans, playing)
     if how.out is not None:
-        _write(file, how.out, results, {name: list(one.frames) for name, one in plans.items()}, full=how.full)
+        _write(file, how.out, results, {name: list(one.frames) for name, one in plans.items()}, how)
     shown = {"command": "play", "cut": recording.cut, "out": how.out, "streams": [_summary(one) for one in results]}
     report(shown, *map(_line, results), as_json=as_json)
     wrong = False
@@ -153,13 +154,13 @@ def play(
 
 
 def _write(
-    file: Path, out: Path, results: "list[PlayedStream]", frames: dict[str, list[tuple[bytes, int]]], *, full: bool
+    file: Path, out: Path, results: "list[PlayedStream]", frames: dict[str, list[tuple[bytes, int]]], how: PlayOptions
 ) -> None:
     from optipmb_tools.datasets import open_dataset  # noqa: PLC0415  only with --out
     from optipmb_tools.results.output import Results  # noqa: PLC0415  as above
 
-    dataset = open_dataset("mcap", file)
-    files = Results(dataset, out, full=full)
+    dataset = open_dataset("mcap", file, digits=how.digits)
+    files = Results(dataset, out, full=how.full)
     sequences = dataset.sequences([result.name for result in results])
     for result, sequence in zip(results, sequences, strict=True):
         known = enumerate(frames[result.name])

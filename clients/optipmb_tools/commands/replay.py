@@ -10,7 +10,7 @@ import typer
 from optipmb_client.errors import UsageError
 from optipmb_client.links import linked
 
-from optipmb_tools.commands.options import AsJson, Classes, DataOptions, Full, Out, Profile, report, warn
+from optipmb_tools.commands.options import AsJson, Classes, DataOptions, Digits, Full, Out, Profile, report, warn
 from optipmb_tools.commands.service_options import PaceOptions, ServiceOptions
 from optipmb_tools.results.output import latency
 from optipmb_tools.run.replay import ReplayedSequence, Replaying
@@ -26,6 +26,7 @@ class ReplayOptions:
     profile: Profile = None
     classes: Classes = None
     full: Full = False
+    digits: Digits = "unit"
 
 
 def replay(
@@ -42,7 +43,7 @@ def replay(
     The profile is one that the service knows. Ends with status 1 when tracks of some frames did not come back.
     """
     chosen_pace = pace.pace()
-    opened = data.open()
+    opened = data.open(digits=how.digits)
     name = how.profile or opened.dataset.profile
     if how.profile == "auto":
         raise UsageError("--profile: one that the service knows, such as generic; auto is made for offline tracking")

@@ -23,10 +23,10 @@ from optipmb_schemas import SessionParameters, encode_json
 from rich.console import Console
 from rich.live import Live
 
-from optipmb_tools.commands.options import AsJson, Origin, print_json, print_table, report
+from optipmb_tools.commands.options import AsJson, Digits, Origin, print_json, print_table, report
 from optipmb_tools.commands.service_options import ServiceOptions
-from optipmb_tools.datasets.interface import georeference_of
-from optipmb_tools.table_files import SUFFIXES, write_table
+from optipmb_tools.datasets.interface import digits_of, georeference_of
+from optipmb_tools.table_files import SUFFIXES
 from optipmb_tools.views.terminal import StatusView, status_tables
 
 SECOND = 1_000_000_000
@@ -93,6 +93,7 @@ def tracks(
     when: TimeOptions,
     out: Annotated[Path | None, typer.Option(help="Write a table: .csv, .parquet, .jsonl or .feather.")] = None,
     origin: Origin = None,
+    digits: Digits = "unit",
     service: ServiceOptions,
     as_json: AsJson = False,
 ) -> None:
@@ -102,7 +103,7 @@ def tracks(
         raise UsageError("--last: not together with --from and --to")
     if out is not None and out.suffix.lower() not in SUFFIXES:
         raise UsageError(f"--out: a table such as tracks.csv or tracks.parquet, not {out}")
-    georeference = None if origin is None else georeference_of(origin)
+    georeference, digits = None if origin is None else georeference_of(origin), digits_of(digits)
     with service.connection(2.0) as connection:
         if last is not None:
             state = session_state(connection, stream, prefix=service.prefix)
@@ -111,9 +112,9 @@ def tracks(
             from_ns = max(0, state.stamp_ns - round(last * SECOND))
         found = list(kept_tracks(connection, stream, from_ns, when.to_ns, prefix=service.prefix))
     if out is not None:
-        from optipmb_tools.results.output import track_columns  # noqa: PLC0415  only with --out
+        from optipmb_tools.results.output import track_columns, write_tracks  # noqa: PLC0415  only with --out
 
-        write_table(out, track_columns(stream, dict(enumerate(found)), georeference=georeference))
+        write_tracks(out, track_columns(stream, dict(enumerate(found)), georeference=georeference), digits)
     stamps = [found[0].stamp_ns, found[-1].stamp_ns] if found else []
     text = f"{stream}: no tracks are kept of this time"
     if found:

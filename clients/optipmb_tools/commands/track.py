@@ -14,6 +14,7 @@ from optipmb_tools.commands.options import (
     Classes,
     Data,
     DataOptions,
+    Digits,
     Full,
     JobOptions,
     Origin,
@@ -44,6 +45,7 @@ class TrackOptions:
     profile: Profile = None
     classes: Classes = None
     full: Full = False
+    digits: Digits = "unit"
     origin: Origin = None
     smooth: Annotated[
         bool,
@@ -124,6 +126,7 @@ def track(
     from optipmb_tools.run import profiles, tracking  # noqa: PLC0415  loads the tracker and its compiler
 
     more: dict[str, float | str] = {name: 1 for name in ("keep_input", "fuse") if getattr(how, name)}
+    more["digits"] = how.digits
     if how.origin is not None:
         more["origin"] = how.origin
     if how.submission is not None:

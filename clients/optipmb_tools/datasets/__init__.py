@@ -12,6 +12,7 @@ from optipmb_tools.datasets.interface import (
     Preloaded,
     Regions,
     Truth,
+    digits_of,
     georeference_of,
     selected_frames,
 )
@@ -55,7 +56,8 @@ def open_dataset(
         options: Of the data set. kitti: `clouds`, `poses`, `split`, `submission`; nuscenes: `clouds`, `z_bottom`,
             `submission`; scene: the fields of `SceneOptions`; mcap: none; rosbag: `points`, `odometry`, `fixed_frame`,
             `keep_input`, `invalid` and `class.NAME`; table: `optipmb_tools.datasets.table.OPTIONS`. For table and mcap
-            also `fuse`: the sensors of a recording share a density. For all `origin`: as of `Georeference.parse`.
+            also `fuse`: the sensors of a recording share a density. For all `origin`: as of `Georeference.parse`; and
+            `digits`: `unit` or `full`, of numbers in tables of tracks as text.
 
     Raises:
         DatasetError: The name, the root, the detector or an option is not known.
@@ -73,19 +75,21 @@ def open_dataset(
     fuse = name != "scene" and str(options.pop("fuse", "0")) not in {"0", "0.0", "False"}
     if fuse and name not in {"table", "mcap"}:
         raise DatasetError("--fuse", "a table with a column `sensor`, or a recording (.mcap)", name)
+    digits = digits_of(options.pop("digits", "unit"))
     georeference = None
     if "origin" in options:
         georeference = georeference_of(options["origin"])
     if name != "table":  # whose latitudes and longitudes need it
         options.pop("origin", None)
     with reading(place or name):
-        opened = _OPEN[name](place or Path(), detections, options)
+        opened = [_OPEN[name](place or Path(), detections, options)]
     if fuse:
         from optipmb_tools.datasets.fused import FusedDataset  # noqa: PLC0415  of one format
 
-        opened = FusedDataset(opened)
-    opened.arguments, opened.georeference = arguments, georeference
-    return opened
+        opened.append(FusedDataset(opened[0]))
+    for one in opened:
+        one.arguments, one.georeference, one.digits = arguments, georeference, digits
+    return opened[-1]
 
 
 # Each function imports the modules of its format: a command reads one, and some need packages of extras.

@@ -227,6 +227,7 @@ class Dataset(ABC):
     name: str  # as given to `open_dataset`
     arguments = DatasetArguments("")  # by which another process opens it; set by `open_dataset`
     georeference: "Georeference | None" = None  # place of its world frame; set by `open_dataset`
+    digits = "unit"  # of numbers in tables of its tracks as text; set by `open_dataset`
 
     if TYPE_CHECKING:
 
@@ -295,6 +296,17 @@ def georeference_of(origin: float | str) -> "Georeference":
         return Georeference.parse(str(origin))
     except ParameterError as error:
         raise DatasetError(f"--{error.path}", error.expected, error.received) from error
+
+
+def digits_of(text: float | str) -> str:
+    """Return the digits of numbers in text that `--digits` names.
+
+    Raises:
+        DatasetError: It names none.
+    """
+    if text not in {"unit", "full"}:
+        raise DatasetError("--digits", "unit or full", repr(text))
+    return str(text)
 
 
 def selected_frames(sequence: DataSequence, classes: Sequence[str]) -> Iterator[DetectionFrame]:

@@ -8,7 +8,7 @@ the table (from 0; for other data sets the place in the frame) of the detection 
 it is missed. A velocity has no value until it is known: from the second detection on, where the detector gives none.
 With a georeference lat, lon, alt and heading follow (degrees, m above the ellipsoid, degrees from true north). On
 request the upper triangle of the covariance of (x, y, v, phi, omega, a) follows, `cov_x_x` to `cov_a_a`. Metres,
-seconds, radians. The same tracks always give the same bytes.
+seconds, radians; in text with the decimals of `DECIMALS`. The same tracks always give the same bytes.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,7 +21,7 @@ from optipmb_schemas import Tracks
 from optipmb_schemas.json_form import shown
 
 from optipmb_tools.results import full_path, stacked, write_full
-from optipmb_tools.table_files import Columns, is_table, write_table
+from optipmb_tools.table_files import Columns, is_table, is_text, write_table
 
 if TYPE_CHECKING:
     from optipmb_tools.datasets.interface import DataSequence, Dataset, Georeference
@@ -29,6 +29,15 @@ if TYPE_CHECKING:
 _STATE: Final = ("x", "y", "v", "phi", "omega", "a")
 COVARIANCE: Final = {f"cov_{_STATE[i]}_{_STATE[j]}": (i, j) for i in range(6) for j in range(i, 6)}
 """Column -> place in the covariance (6, 6)."""
+DECIMALS: Final = {
+    **dict.fromkeys((*"xyzlwh", "yaw", "yaw_rate", "score", "existence", "age", "time_since_detection"), 4),
+    **dict.fromkeys(("vx", "vy", "acceleration"), 3),
+    **dict.fromkeys(("lat", "lon"), 9),
+    **dict.fromkeys(("alt", "heading"), 4),
+    **dict.fromkeys(COVARIANCE, 8),
+}
+"""Decimals of columns in text: 0.1 mm, 1e-4 rad, 1 mm/s, probabilities to 1e-4."""
+FULL: Final = "full"  # digits of text that give every bit of a number
 
 
 def track_columns(
@@ -83,6 +92,16 @@ def track_columns(
         covariance = stacked(parts, "covariance")
         columns |= {name: covariance[:, i, j] for name, (i, j) in COVARIANCE.items()}
     return columns
+
+
+def write_tracks(path: Path, columns: Columns, digits: str) -> None:
+    """Write columns of tracks as a table; numbers in text have the decimals of `DECIMALS`, with `FULL` all digits."""
+    if digits != FULL and is_text(path):
+        columns = {
+            name: np.round(values, DECIMALS[name]) + 0.0 if name in DECIMALS and values.dtype.kind == "f" else values
+            for name, values in columns.items()
+        }
+    write_table(path, columns)
 
 
 class TrackCounts(NamedTuple):
@@ -171,6 +190,7 @@ class Results:
         """
         parts = [written for _, written in sorted(self._taken.items()) if not isinstance(written, Path)]
         if parts:
-            write_table(self._out, {name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+            columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+            write_tracks(self._out, columns, self._dataset.digits)
         elif all(one.name in self._taken for one in sequences):
             self._dataset.join(self._out, sequences)

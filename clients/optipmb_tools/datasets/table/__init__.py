@@ -31,8 +31,8 @@ from optipmb_tools.datasets.table.findings import Finding, Reading
 from optipmb_tools.datasets.table.rows import NO_ID, Boxes, read_tables
 from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Bools, Floats, Ints, Pose, stack_poses, to_world
-from optipmb_tools.results.output import track_columns
-from optipmb_tools.table_files import SUFFIXES, Columns, line_of, read_table, tables_in, write_table
+from optipmb_tools.results.output import track_columns, write_tracks
+from optipmb_tools.table_files import SUFFIXES, Columns, line_of, read_table, tables_in
 
 # Options, besides `column.MEANING=NAME` and `class.NAME=NAME`; `tracks` are tables that are yet to be read by them
 OPTIONS: Final = (
@@ -374,7 +374,8 @@ class TableDataset(Dataset):
         """Write `out/NAME.csv`, or the format of the detections."""
         suffix = self.path.suffix if self.path.is_file() and self.path.suffix.lower() in SUFFIXES else ".csv"
         path = out / f"{sequence.name}{suffix}"
-        write_table(path, track_columns(sequence.name, tracks, sequence, georeference=self.georeference))
+        columns = track_columns(sequence.name, tracks, sequence, georeference=self.georeference)
+        write_tracks(path, columns, self.digits)
         return path
 
 
