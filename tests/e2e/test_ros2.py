@@ -256,8 +256,12 @@ def test_what_is_wrong_on_the_other_side_is_reported(robot: Robot, scene: DataSe
         process.wait_log("ros2_mismatch")
         assert client.received[TRACKS] == []
 
-        # The clock has started, the transforms come: the same bridge tracks.
-        play(client, [[one for one in frame if one.topic != "/points"] for frame in frames[:2]])
+        # The clock has started, the transforms and clouds come: the same bridge tracks.
+        static = next(one.message for one in frames[0] if one.topic == "/tf_static")
+        with open_client(robot.endpoint) as session:
+            publisher = publish_static(session, robot.domain, static)
+            play(client, frames[:2])
+            del publisher  # as above
         assert ids(client.received[TRACKS][-1])
 
 

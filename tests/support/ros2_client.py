@@ -56,14 +56,15 @@ class Ros2Client:
         self.received: dict[str, list[Any]] = {}
 
     def publish(self, topic: str, kind: str, fields: Mapping[str, Any], **options: Any) -> None:
-        if topic not in self._publishers:
+        to = f"{topic} {options.get('type_hash')}"
+        if to not in self._publishers:
             about = {"msg_definition": own_types().definition(kind), "type_hash": hash_by_sdk(kind)}
-            self._publishers[topic] = sdk.ROS2Publisher(topic, kind, **(self._where | about | options))
+            self._publishers[to] = sdk.ROS2Publisher(topic, kind, **(self._where | about | options))
             ends = time.monotonic() + DEADLINE_S
-            while not self._publishers[topic].pub.matching_status.matching:  # earlier messages are lost
+            while not self._publishers[to].pub.matching_status.matching:  # earlier messages are lost
                 assert time.monotonic() < ends, f"nobody subscribes to {topic}"
                 time.sleep(0.01)
-        publisher = self._publishers[topic]
+        publisher = self._publishers[to]
         message = _built(publisher.session_mgr.store, kind, fields)
         publisher.publish(**{name: getattr(message, name) for name in message.__dataclass_fields__})
 

@@ -37,26 +37,31 @@ def undisturbed(frames: list[Detections]) -> tuple[dict[tuple[bytes, int], bytes
     return merged.plain(), digest_of(one.snapshot())
 
 
+def published(node: Node, key: str, wanted: dict[tuple[bytes, int], bytes]) -> Merged:
+    """Wait until the tracks on a key, with their corrections, are those of frames in order; return them."""
+    found = Merged()
+
+    def complete(items: list[tuple[str, bytes, str]]) -> bool:
+        found.newest.clear()
+        for at, payload, _ in items:
+            if at == key:
+                found.add(decode(payload, Tracks), 0)
+        return found.plain() == wanted
+
+    node.tracks_seen.wait(complete, "the tracks of the frames in order")
+    return found
+
+
 def test_a_car_keeps_its_id_through_the_service(start: Callable[..., Any]) -> None:
     """Two sensors publish, each on its key; the tracks on the common key equal the frames in order."""
     _, endpoint = start(fuse=["site/node/*"])
-    frames, merged = drive(), Merged()
+    frames = drive()
     wanted, _ = undisturbed(frames)
     with Node(endpoint) as node:
         node.send(*frames, OTHER.detections(0))
         node.tracks(OTHER.stream, 1)
         until(lambda: node.ask(KEYS.query(FUSED, "state"), SessionState).frames == len(frames), "all are tracked")
-
-        def complete(items: list[tuple[str, bytes, str]]) -> bool:
-            for key, payload, _ in items:
-                if key == KEYS.tracks(FUSED):
-                    message = decode(payload, Tracks)
-                    where = message.epoch + (message.sensor or "").encode(), message.seq
-                    if where not in merged.newest or message.revision > merged.newest[where][1].revision:
-                        merged.newest[where] = 0, message
-            return len(merged.newest) == len(frames) and merged.plain() == wanted
-
-        node.tracks_seen.wait(complete, "the tracks of the frames in order")
+        merged = published(node, KEYS.tracks(FUSED), wanted)
         assert {key for key, _, _ in node.tracks_seen.items} == {KEYS.tracks(FUSED), KEYS.tracks(OTHER.stream)}
         owners = node.alive(KEYS.all_owners())
     found = [message for _, message in merged.newest.values()]
@@ -209,7 +214,7 @@ def test_streams_of_several_nodes_feed_one_session() -> None:
 def test_nodes_of_a_site_share_tracks(start: Callable[..., Any]) -> None:
     """The tracks equal one session with all their frames; detections below the node `fused` are refused."""
     fused = {"crossing": {"streams": ["site/*/front", "site/*/rear"]}}
-    service, endpoint = start(fused=fused, sensors={"site/*/rear": {"trust_size": False}}, recovery_wait_s=30)
+    service, endpoint = start(fused=fused, sensors={"site/*/rear": {"trust_size": False}}, recovery_wait_s=1)
     there = replace(REAR, stream="site/other/rear")
     frames = [sensor.detections(seq) for seq in range(20) for sensor in (FRONT, there)]
     sensors = optipmb.Sensors.read({"site/*/rear": {"trust_size": False}})
@@ -221,12 +226,7 @@ def test_nodes_of_a_site_share_tracks(start: Callable[..., Any]) -> None:
         node.send(*frames, OTHER.detections(0))
         until(lambda: node.ask(KEYS.query(CROSSING, "state"), SessionState).frames == len(frames), "all are tracked")
         assert node.ask(KEYS.query(CROSSING, "state"), SessionState).session == one.session
-        found = Merged()
-        with node.tracks_seen.changed:
-            for key, payload, _ in node.tracks_seen.items:
-                if key == KEYS.tracks(CROSSING):
-                    found.add(decode(payload, Tracks), 0)
-        assert found.plain() == merged.plain()
+        published(node, KEYS.tracks(CROSSING), merged.plain())
         assert node.refused(KEYS.query(FRONT.stream, "state")).expected.startswith(CROSSING)
         node.send_raw(KEYS.detections("site/fused/lidar"), b"")
         blind = {FRONT.stream, there.stream}
