@@ -141,7 +141,7 @@ def test_tokens_of_ones_own(network: Network, tmp_path: Path) -> None:
     environment = {"PYTHONPATH": paths, "OPTIPMB_GRPC_TOKENS": "own_tokens:caller"}
     with (
         ServiceProcess("router") as router,
-        GatewayProcess(router.endpoint, environment=environment, fresh=True) as gateway,
+        GatewayProcess(router.endpoint, environment=environment) as gateway,
     ):
         gateway.wait_ready()
         one = gateway.stub()

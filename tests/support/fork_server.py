@@ -62,14 +62,18 @@ def serve(asking: socket.socket) -> str:
 
 
 def become(request: dict[str, Any], files: list[int]) -> str:
-    """Take over files, environment, folder and words of the request; returns its module."""
+    """Take over files, environment, folder and words of the request, as a new interpreter does; returns its module."""
     for number, one in enumerate(files):
         os.dup2(one, number)
         os.close(one)
     os.environ.clear()
     os.environ.update(request["environment"])
     os.chdir(request["folder"])
-    sys.path[0] = request["folder"]
+    paths = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    sys.path[:1] = [request["folder"], *filter(None, paths)]
+    sys.modules.pop("sitecustomize", None)
+    with suppress(ModuleNotFoundError):
+        import_module("sitecustomize")
     module, *sys.argv[1:] = request["words"]
     return str(module)
 

@@ -52,10 +52,9 @@ def processes(folder: Path, router: str, hang: str = "") -> dict[str, ServicePro
         "log": ("log", "--connect", router, "--cluster", f"nats://{nowhere}"),
         "ros2": ("ros2", "--connect", router, "--settings", str(topics)),
     }
+    listening = {"alone", "workers", "router"}
     return {
-        name: ServiceProcess(
-            *options, listen=name in {"alone", "workers", "router"}, environment=environment(hang), fresh=bool(hang)
-        )
+        name: ServiceProcess(*options, listen=name in listening, environment=environment(hang))
         for name, options in commands.items()
     }
 
@@ -97,20 +96,10 @@ def test_what_hangs_nowhere_ends_with_status_0(tmp_path: Path) -> None:
     assert not [name for name, text in logs.items() if "hangs" in text or "Traceback" in text]
 
 
-def test_the_lock_of_the_interpreter_keeps_no_process() -> None:
-    """A close that hangs with the interpreter's lock held, so that no Python runs, is ended too, with tracebacks."""
-    with ServiceProcess("router", environment=environment("lock"), fresh=True) as router:
-        router.wait_ready()
-        status, seconds = router.end()
-    assert status == 1
-    assert seconds < BOUND_S + BUSY_S
-    assert "in hang_with_the_lock" in router.errors
-
-
 def test_a_step_that_hangs_before_the_last_checkpoint_does_not_prevent_it(tmp_path: Path) -> None:
     """A member whose end hangs in its first step keeps the newest state all the same: the next one continues it."""
     settings = {"STORE": tmp_path, "CHECKPOINT_S": 3600}
-    with ServiceProcess(environment=environment("leave", **settings), fresh=True) as service:
+    with ServiceProcess(environment=environment("leave", **settings)) as service:
         service.wait_ready()
         with Node(service.endpoint) as node:
             node.send(*(SENSOR.detections(seq) for seq in range(5)))
@@ -127,19 +116,25 @@ def test_a_step_that_hangs_before_the_last_checkpoint_does_not_prevent_it(tmp_pa
         assert service.end(signal.SIGTERM)[0] == 0
 
 
-def test_a_control_loop_that_hangs_is_ended_by_the_first_signal() -> None:
-    """Where the loop turns no more, SIGTERM begins the bound all the same."""
-    with ServiceProcess(environment=environment("loop"), fresh=True) as service:
+def test_what_lets_no_python_run_is_ended_by_the_first_signal() -> None:
+    """A loop that turns no more, and a close with the interpreter's lock held, are ended too, with tracebacks."""
+    with (
+        ServiceProcess("router", environment=environment("lock")) as router,
+        ServiceProcess(environment=environment("loop")) as service,
+        ThreadPoolExecutor() as threads,
+    ):
+        router.wait_ready()
         service.wait_log("the loop hangs")
-        status, seconds = service.end()
-    assert status == 1
-    assert seconds < BOUND_S + BUSY_S
+        for status, seconds in threads.map(ServiceProcess.end, (router, service)):
+            assert status == 1
+            assert seconds < BOUND_S + BUSY_S
+    assert "in hang_with_the_lock" in router.errors
     assert "sitecustomize.hang" in service.errors
 
 
 def test_the_time_of_a_frozen_process_does_not_count() -> None:
     """A process that is stopped during its end has the rest of its time when it continues."""
-    with ServiceProcess("router", environment=environment("close"), fresh=True) as router:
+    with ServiceProcess("router", environment=environment("close")) as router:
         router.wait_ready()
         began = time.monotonic()
         router.process.send_signal(signal.SIGTERM)
