@@ -186,7 +186,9 @@ def main(seed: int, count: int, cap_s: float) -> None:
     """Make the faults, and print what becomes of each and how many survive."""
     results = []
     with tempfile.TemporaryDirectory(prefix="mutants-") as name:
-        folder = Path(name)
+        folder = Path(name) / ROOT.name
+        for beside in {data.parent for data in ROOT.parent.glob("*/data")} - {ROOT}:  # with recorded data
+            (Path(name) / beside.name).symlink_to(beside)
         for part in COPIED:
             shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))
         for file in filter(Path.is_file, ROOT.iterdir()):
