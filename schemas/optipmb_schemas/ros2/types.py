@@ -147,13 +147,7 @@ class Types:
     """
 
     def __init__(self, carried: Mapping[str, MessageDefinition] | None = None) -> None:
-        self._store = get_typestore(Stores.ROS2_JAZZY)
-        ours: dict[str, Any] = {}
-        for package, text in _DEFINITIONS:
-            for lines in text.strip().split("\n\n"):
-                kind, _, fields = lines.partition("\n")
-                ours |= get_types_from_msg(fields, f"{package}/{kind}")
-        self._store.register(ours)
+        self._store = _own_store()
         self._carried: dict[str, Any] = {}
         for name, definition in (carried or {}).items():
             if definition.format != MessageDefinitionFormat.NONE:
@@ -209,6 +203,19 @@ class Types:
         """Return the hash of a type, `RIHS01_` and 64 hexadecimal digits (REP 2011)."""
         text: str = self._store.hash_rihs01(name)
         return text
+
+
+@functools.cache
+def _own_store() -> Any:
+    """Return the store of rosbags with the definitions made here; to make it takes longer than to read a small bag."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    ours: dict[str, Any] = {}
+    for package, text in _DEFINITIONS:
+        for lines in text.strip().split("\n\n"):
+            kind, _, fields = lines.partition("\n")
+            ours |= get_types_from_msg(fields, f"{package}/{kind}")
+    store.register(ours)
+    return store
 
 
 @functools.cache
