@@ -84,10 +84,10 @@ types: $(VENV)/.installed
 kernels: $(VENV)/.installed
 	$(BIN)/optipmb warm-up
 
-# Twice as many as two processors: what starts processes and waits for them leaves half of the time free. Files run in
-# the order of their folders, for those with few tests and long ones would otherwise come last, with nothing beside them.
+# More than two processors: what starts processes and waits for them leaves half of the time free. The order of files
+# is that of tests/conftest.py: those with few and long tests would otherwise come last, with nothing beside them.
 # A process that ends is not replaced: the next one would run the same test again, and wait as long.
-JOBS ?= 4
+JOBS ?= 5
 # What a test calls with types that the warm-up lacks is compiled in its own process, not by others for it.
 # Rewritten assertions are written to disk by one process before all workers would do the same.
 tests: kernels

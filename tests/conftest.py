@@ -26,6 +26,9 @@ OTHERS = {
 }
 """Files whose tests `make test` leaves to `make alone` and `make accuracy`, by their marker."""
 
+WAITING = ("docker", "e2e", "grpc", "service")
+"""Folders whose tests mostly start processes and wait for them."""
+
 # The same thirty examples in every run, unless a test says otherwise; `--hypothesis-profile default` looks at more.
 hypothesis.settings.register_profile("same", derandomize=True, deadline=None, database=None, max_examples=30)
 hypothesis.settings.load_profile("same")
@@ -44,10 +47,22 @@ def pytest_collection() -> Generator[None, object, object]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    _interleave(items)
     marker_of = {HERE / name: marker for marker, names in OTHERS.items() for name in names}
     for item in items:
         if item.path in marker_of:
             item.add_marker(marker_of[item.path])
+
+
+def _interleave(items: list[pytest.Item]) -> None:
+    """Order files so that those which start processes and wait run beside those which compute, from first to last."""
+    waiting, computing = {}, {}
+    for item in items:
+        folder = item.path.relative_to(HERE).parts[0]
+        (waiting if folder in WAITING else computing).setdefault(item.path, None)
+    place = {path: number / len(waiting) for number, path in enumerate(waiting)}
+    place |= {path: number / len(computing) for number, path in enumerate(reversed(computing))}
+    items.sort(key=lambda item: place[item.path])
 
 
 def pytest_unconfigure() -> None:

@@ -240,7 +240,7 @@ def test_an_error_that_no_code_foresaw_is_one_line(
 def test_ctrl_c_on_a_terminal_says_what_is_written(tmp_path: Path) -> None:
     """Status 130, one line with the recordings that are written, and no half-written file."""
     begin = "import fcntl, os, sys, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); os.execv(sys.argv[1], sys.argv[1:])"
-    words = ["track", "--dataset", "scene", "--option", "frames=200", "--option", "clouds=0", "--jobs", "1"]
+    words = ["track", "--dataset", "scene", "--option", "frames=100", "--option", "clouds=0", "--jobs", "1"]
     words += ["--sequences", *(f"{k:04}" for k in range(20)), "--out", str(tmp_path)]
     ours, theirs = pty.openpty()
     process = subprocess.Popen(
@@ -250,7 +250,7 @@ def test_ctrl_c_on_a_terminal_says_what_is_written(tmp_path: Path) -> None:
     os.close(theirs)
     shown = b""
     with os.fdopen(ours, "r+b", buffering=0) as terminal:
-        while b"0000: 200 frames" not in shown:
+        while b"0000: 100 frames" not in shown:
             shown += terminal.read(4096)
         terminal.write(b"\x03")
         with contextlib.suppress(OSError):  # a terminal without programs

@@ -18,7 +18,7 @@ def test_demo_runs_without_a_display(tmp_path: Path) -> None:
     environment = {name: value for name, value in os.environ.items() if name not in {"DISPLAY", "WAYLAND_DISPLAY"}}
     out = tmp_path / "not" / "there" / "yet"
     done = subprocess.run(
-        [sys.executable, "-m", "optipmb_tools", "demo", "--out", str(out), "--json"],
+        [sys.executable, "-m", "optipmb_tools", "demo", "--out", str(out), "--frames", "60", "--json"],
         capture_output=True,
         text=True,
         timeout=280,
@@ -27,12 +27,12 @@ def test_demo_runs_without_a_display(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
-    assert (result["frames"], result["returned"], result["missing"], result["clouds_missed"]) == (200, 200, 0, 0)
+    assert (result["frames"], result["returned"], result["missing"], result["clouds_missed"]) == (60, 60, 0, 0)
     assert 0.0 < result["latency"]["p50_ms"] <= result["latency"]["p99_ms"]
     assert result["MOTA"] > 0.9
     assert result["IDS"] == 0
-    assert result["objects"] > 20
-    assert {int(line.split()[0]) for line in (out / "0000.txt").read_text().splitlines()} > set(range(5, 195))
+    assert result["objects"] > 10
+    assert {int(line.split()[0]) for line in (out / "0000.txt").read_text().splitlines()} > set(range(5, 55))
     head = (out / "tracks.png").read_bytes()[:24]
     assert head[:8] == b"\x89PNG\r\n\x1a\n"
     width, height = struct.unpack(">II", head[16:24])

@@ -122,7 +122,7 @@ class World:
 ACTIONS = st.sampled_from(["send"] * 3 + ["turn"] * 4 + ["answer"] * 3 + ["keep", "recall", "move"])
 
 
-@settings(deadline=None, max_examples=100)
+@settings(deadline=None, max_examples=60)
 @given(st.lists(ACTIONS, max_size=60), st.booleans())
 def test_each_frame_is_tracked_once(actions: list[str], cached: bool) -> None:  # noqa: FBT001 - drawn
     """However reads and writes of the store, turns, frames and moves follow each other.
