@@ -119,9 +119,12 @@ def test_the_examples_work_twice(service: ServiceProcess, time: int) -> None:
 @pytest.mark.parametrize("time", [1, 2])
 def test_two_sensors_work_twice(fused: ServiceProcess, time: int) -> None:
     """The radar goes on with the track and the box of the lidar, and does so again with the state that is left."""
-    del time
     with Program(connected(block("fusion.md", "python"), fused.endpoint)) as program:
         lines = program.until(r"radar: track \d+ at 58\.")
+    if time == 1:
+        promised = (REPOSITORY / "docs/fusion.md").read_text().partition("for each frame and track:\n\n```\n")[2]
+        assert lines[1:3] == promised.splitlines()[:2]
+        assert lines[-1] == promised.splitlines()[3]
     assert len({line.split()[2] for line in lines[-20:]}) == 1
     assert all(line.endswith("4.5 m long, heading 0.0") for line in lines[-20:])
 

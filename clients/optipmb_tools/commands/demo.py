@@ -137,10 +137,10 @@ def _show_live(frames: int, *, browser: bool) -> None:
         with Connection(service.endpoint) as connection:
             for number in itertools.count(1):
                 status.update(f"sending {frames / 10:.0f} s of a generated street, time {number}; Ctrl-C ends it")
-                _drive(connection, seen)
+                drive(connection, seen)
 
 
-def _drive(connection: "Connection", frames: "Sequence[DetectionFrame]") -> None:
+def drive(connection: "Connection", frames: "Sequence[DetectionFrame]") -> None:
     """Publish frames once, each at its time, in a session of their own."""
     from optipmb_client.publisher import Publisher  # noqa: PLC0415  packages of this command alone
     from optipmb_client.sessions import close_session, set_parameters  # noqa: PLC0415  as above

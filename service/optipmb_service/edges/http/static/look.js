@@ -67,21 +67,12 @@ function list(status) {
   at("problems-title").hidden = !status.problems || status.problems.length === 0;
   at("problems").replaceChildren(...(status.problems || []).slice(-5).reverse().map((problem) => {
     const often = problem.count > 1 ? ` (${problem.count} times)` : "";
-    const item = made("li", ` ${problem.stream} ${inWords(problem)}${often}`);
+    const item = made("li", ` ${problem.stream} ${problem.message}${often}`);
     if (problem.reported_ns) item.prepend(made("time", ago(Date.now() / 1e3 - problem.reported_ns / 1e9)), " ");
     item.prepend(made("code", problem.code), " ");
     return item;
   }));
   if (!chosen && status.sessions.length > 0) choose(status.sessions[0].stream);
-}
-
-function inWords(problem) { // as `optipmb status` has it
-  const [, reason, jump] = /(?:(.*), )?([+-][\d.]+) s$/.exec(problem.received || "") || [];
-  const seconds = Math.abs(jump).toPrecision(3);
-  if (problem.code === "late" && jump) return `a frame came too late: ${seconds} s before the newest one`;
-  if (problem.code !== "restarted" || !jump) return problem.message;
-  const gap = jump >= 0 ? `${seconds} s gap` : `stamps ${seconds} s earlier`;
-  return reason === "publisher" ? `publisher restarted, ${gap}` : `session restarted (${reason}), ${gap}`;
 }
 
 function heard(seconds) {
@@ -238,6 +229,7 @@ function draw() {
   pen.setTransform(ratio, 0, 0, ratio, 0, 0);
   pen.clearRect(0, 0, wide, high);
   grid(wide, high, true);
+  names = [];
   if (frame !== null) {
     for (const zone of frame.zones || []) area(zone);
     for (const [x, y] of frame.detections) cross(x, y);
@@ -246,7 +238,6 @@ function draw() {
       pen.globalAlpha = shown.has(id) ? sure(shown.get(id)) : 0.25; // a track that has ended fades
       line(trail, colour(id), 1.5);
     }
-    names = [];
     for (const track of frame.tracks) box(track);
     pen.globalAlpha = 1;
     if (frame.sensor !== null) sensor(...frame.sensor);
@@ -302,6 +293,8 @@ function area({ name, polygon, line: path }) {
   pen.textAlign = "left";
   pen.fillStyle = ink.zone;
   pen.fillText(name, px + 4, py - 5);
+  const wide = pen.measureText(name).width;
+  names.push([px + 4 + wide / 2, py - 5, wide]);
 }
 
 function box(track) {
@@ -325,7 +318,7 @@ function box(track) {
   const name = bold || view.scale > NAMED ? `${track[ID]} ${frame.labels[track[LABEL]]}` : track[ID];
   let above = py - 4;
   const wide = pen.measureText(name).width, taken = ([x, y, w]) => Math.abs(x - px) < (w + wide) / 2 && Math.abs(y - above) < 12;
-  while (names.some(taken) && above > py - 60) above -= 13; // above the names that are there
+  while (names.some(taken) && above > py - 20) above -= 13; // above the names that are there, near its box
   if (bold || !names.some(taken)) {
     names.push([px, above, wide]);
     pen.strokeText(name, px, above);
