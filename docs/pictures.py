@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse
+from matplotlib.patches import Ellipse, Rectangle
 
 import optipmb
 from optipmb.zones import Zone, ZoneState, observe
@@ -212,6 +212,48 @@ def draw_fusion(figure: Figure) -> None:
     axes.legend(frameon=False, fontsize=8, loc="lower left", ncols=4)
 
 
+GATE: Final = {
+    "image": [1920, 1080],
+    "pinhole": {
+        "intrinsics": [1050.0, 1050.0, 960.0, 540.0],
+        "position": [0.0, 0.0, 6.0],
+        "quaternion": [0.5, -0.5, 0.5, -0.5],
+    },
+}
+
+
+def draw_camera(figure: Figure) -> None:
+    """Draw the boxes of a street in the image of a camera, and their places on the ground with ellipses."""
+    camera = optipmb.GroundCamera.parse(GATE)
+    image, ground = figure.subplots(1, 2)
+    unit = np.array(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [0.0, 1.0])).reshape(3, 8).T
+    places = [(22, 6, "car"), (30, -4, "car"), (45, 4, "car"), (70, -6, "car"), (26, -9, "person"), (38, 10, "person")]
+    boxes = []
+    for x, y, name in places:
+        size = (4.5, 1.9, 1.6) if name == "car" else (0.7, 0.7, 1.75)
+        pixels = camera.project(unit * size + np.array([x, y, 0.0]))
+        boxes.append(np.concatenate([pixels.min(axis=0), pixels.max(axis=0)]))
+    found = camera.detections(boxes, [name for *_, name in places])
+    for row, (center, spread) in enumerate(zip(found["center"], found["position_covariance"], strict=True)):
+        colour = CAR if places[row][2] == "car" else GHOST
+        x1, y1, x2, y2 = boxes[row]
+        image.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, fc="none", ec=colour))
+        values, axes = np.linalg.eigh(spread[:2, :2])
+        width, height = 2.0 * np.sqrt(5.99 * values)
+        angle = float(np.degrees(np.arctan2(axes[1, 0], axes[0, 0])))
+        ground.add_patch(Ellipse(center[:2], width, height, angle=angle, fc=f"{colour}33", ec=colour))
+        ground.plot(*places[row][:2], "+", color=colour)
+    view = camera.field_of_view
+    if view is not None:
+        turn = np.linspace(*view.azimuth, 50)
+        arcs = [np.array([np.cos(turn), np.sin(turn)]) * reach for reach in view.range]
+        ground.plot(*np.hstack([arcs[0], arcs[1][:, ::-1], arcs[0][:, :1]]), color=TRUTH)
+    image.axhline(camera.project([[1e6, 0.0, 0.0]])[0, 1], color=TRUTH, lw=0.8)
+    image.set(xlim=(0, 1920), ylim=(1080, 0), aspect="equal", xlabel="u (px)", ylabel="v (px)", title="boxes, horizon")
+    limits = {"xlim": (0, 85), "ylim": (-40, 40)}
+    ground.set(**limits, aspect="equal", xlabel="x (m)", ylabel="y (m)", title="places, 95 % ellipses, field of view")
+
+
 def main(folder: Path) -> None:
     """Write the pictures into a folder."""
     figure = Figure(figsize=(7.5, 6.4), layout="constrained")
@@ -223,6 +265,10 @@ def main(folder: Path) -> None:
     FigureCanvasAgg(figure)
     draw_zones(figure)
     figure.savefig(folder / "zones.png", dpi=110, metadata={"Software": None})
+    figure = Figure(figsize=(10, 3.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    draw_camera(figure)
+    figure.savefig(folder / "cameras.png", dpi=100, metadata={"Software": None})
     for name, size in (("track", (6.0, 4.2)), ("ellipse", (6.0, 4.2)), ("existence", (6.0, 3.0))):
         figure = Figure(figsize=size, layout="constrained")
         FigureCanvasAgg(figure)

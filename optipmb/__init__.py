@@ -16,7 +16,7 @@ Or as a pure function, from a density and a frame to the next density and tracks
         result = tracker.step(density, frame)
         density, tracks = result.density, result.tracks
 
-Pure computation: no files but the profiles, no network, no state outside the density.
+Pure computation: no files but profiles and calibrations, no network, no state outside the density.
 """
 
 from optipmb.class_names import class_indices, common_name
@@ -29,6 +29,7 @@ from optipmb.frame import Frame, PointCloud, Pose, make_frame
 from optipmb.generic import generic_parameters
 from optipmb.geometry import bev_iou
 from optipmb.georeference import Geographic, Georeference
+from optipmb.ground_camera import GroundCamera
 from optipmb.online import OnlineTracker, OnlineTracks
 from optipmb.parameters import (
     Calibration,
@@ -63,6 +64,7 @@ __all__ = [
     "FrameError",
     "Geographic",
     "Georeference",
+    "GroundCamera",
     "HeadingSign",
     "Modules",
     "OnlineTracker",

@@ -10,7 +10,7 @@ It is a thin object over the pure `Tracker.step`, for those who want no densitie
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from html import escape
 from io import StringIO
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from optipmb.extract import Tracks
     from optipmb.field_of_view import FieldOfView
     from optipmb.frame import PointCloud, Pose
+    from optipmb.ground_camera import GroundCamera
     from optipmb.parameters import Parameters
     from optipmb.paths import PredictedPaths
     from optipmb.rows import Array, Index
@@ -45,6 +46,8 @@ if TYPE_CHECKING:
 
 FLAT: Final = (("center", ("x", "y", "z")), ("size", ("l", "w", "h")), ("velocity", ("vx", "vy")))
 """Arrays of a frame, and the columns that may stand for them."""
+PIXELS: Final = (("box", ("x1", "y1", "x2", "y2")), ("foot", ("u", "v")))
+"""The same of boxes in the image of a camera, px."""
 ALIASES: Final = MappingProxyType({
     "length": "l", "width": "w", "height": "h", "heading": "yaw", "confidence": "score",
     "class": "label", "name": "label", "category": "label", "type": "label",
@@ -55,6 +58,7 @@ WITHOUT: Final = MappingProxyType({"z": 0.0, "h": 1.5, "score": 1.0})
 BOXES: Final = ("center", "score", "label")
 OTHERS: Final = ("size", "yaw", "velocity", "position_covariance")
 KNOWN: Final = (*BOXES, *OTHERS, *(part for _, parts in FLAT for part in parts), *ALIASES)
+KNOWN_PIXELS: Final = ("score", "label", *(part for name, parts in PIXELS for part in (name, *parts)), *ALIASES)
 SHOWN_ROWS: Final = 10
 """Tracks that the representation of `OnlineTracks` lists."""
 CLASS_COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#8C6D1F")
@@ -74,7 +78,7 @@ class OnlineTracks:
         name: (N,) class names as the detections gave them, else as the profile does.
         velocity: (N, 2) over ground, m/s; NaN while it is unknown: before the second detection, where the detector
             gives none.
-        left_out: detections of classes that the profile lacks.
+        left_out: detections of classes that the profile lacks, and boxes that the camera does not place.
         paths: where the tracks will be at the `horizons` of the profile; None where it has none.
         class_probability: (N, C) probability of each class of the profile; None where it has no groups of classes.
         sensor_motion: (3,) velocity, m/s, and turn rate, rad/s, with which what stands passes the sensor, where the
@@ -337,6 +341,7 @@ class OnlineTracker:
         pose: Pose | None = None,
         cloud: PointCloud | None = None,
         field_of_view: FieldOfView | None = None,
+        camera: GroundCamera | None = None,
         **arrays: ArrayLike,
     ) -> OnlineTracks:
         """Take the detections of the next frame and return the tracks.
@@ -351,9 +356,12 @@ class OnlineTracker:
                 1.5 m. Without `score` it is 1. None: nothing was detected.
             t: time of the frame: seconds, or a date (of pandas too; UTC where it has no zone); or
             stamp_ns: nanoseconds.
-            pose: world from sensor, or None when the boxes are in the world frame.
+            pose: world from sensor, or None when the boxes are in the world frame; with a camera on a vehicle, of it.
             cloud: the scan of the same stamp.
-            field_of_view: where the sensor detects objects; outside it they are neither detected nor missed.
+            field_of_view: where the sensor detects objects; outside it they are neither detected nor missed. With a
+                camera, that of its image.
+            camera: of pixel boxes: `box` (M, 4) or `x1`, `y1`, `x2`, `y2`, or the points `foot` (M, 2) or `u`, `v` on
+                which objects stand, with classes and scores.
             arrays: the same columns as arguments.
 
         Raises:
@@ -366,7 +374,13 @@ class OnlineTracker:
             stamp_ns = _stamp(t)
             if stamp_ns < max(self.density.stamp_ns, 0):
                 raise FrameError("t", f"a time from {max(self.density.stamp_ns, 0) / 1e9:g} s on", str(t))
-        columns = _columns(boxes, arrays)
+        row, outside = None, 0
+        if camera is None:
+            columns = _columns(boxes, arrays)
+        else:
+            columns = self._on_ground(camera, pose, _pixels(boxes, arrays))
+            row, outside = columns.pop("row"), sum(columns.pop("left_out").values())
+            field_of_view = field_of_view or camera.view_from(pose)
         names, label, left_out = self._classes(columns.pop("label"))
         frame, missing = make_frame(
             self.parameters,
@@ -378,6 +392,8 @@ class OnlineTracker:
             field_of_view=field_of_view,
             **columns,
         )
+        if row is not None:
+            frame = replace(frame, source=row[frame.source])
         result = self._tracker.step(self.density, frame)
         self.density = result.density
         tracks = result.tracks
@@ -387,7 +403,7 @@ class OnlineTracker:
             stamp_ns=frame.stamp_ns,
             tracks=tracks,
             name=self._names[tracks.label].astype(np.str_),
-            left_out=max(left_out, missing),
+            left_out=max(left_out, missing) + outside,
             **known,
             paths=result.paths,
             class_probability=result.class_probability,
@@ -396,6 +412,15 @@ class OnlineTracker:
         )
         self._latest = online.summary
         return online
+
+    def _on_ground(self, camera: GroundCamera, pose: Pose | None, columns: dict[str, Any]) -> dict[str, Any]:
+        """Return the detections of pixel boxes, in the frame of the camera's position."""
+        if camera.mount == "fixed" and pose is not None:
+            raise FrameError("pose", "none, for the camera is fixed in the world (mount)", "a pose")
+        names, label, _ = self._classes(columns.pop("label"))
+        if not ((label >= 0) & (label < len(names))).all():
+            raise FrameError("label", f"integers in [0, {len(names)})", str(label.tolist())[:80])
+        return camera.detections(label=np.asarray(names, np.object_)[label], pose=pose, **columns)
 
     def _classes(self, values: ArrayLike) -> tuple[tuple[str, ...], NDArray[np.int64], int]:
         """Return the names of the classes of a frame, which of them each detection is of, and how many are unknown."""
@@ -440,17 +465,9 @@ def _stamp(t: Any) -> int:
 
 def _columns(boxes: Any, arrays: Mapping[str, ArrayLike]) -> dict[str, Any]:
     """Return the columns as `make_frame` takes them."""
-    given = {**_named(boxes), **arrays}
+    given = _renamed(boxes, arrays, KNOWN, FLAT)
     if not given:
         return {"center": [], "score": [], "label": []}
-    if unknown := [name for name in given if name not in KNOWN]:
-        raise FrameError(unknown[0], f"columns among {', '.join(KNOWN)}", f"the columns {', '.join(given)}")
-    whole = {part: name for name, parts in FLAT for part in parts}
-    renamed = [ALIASES.get(name, name) for name in given]
-    meanings = [whole[name] if whole.get(name) in given else name for name in renamed]
-    if twice := [name for name, meaning in zip(given, meanings, strict=True) if meanings.count(meaning) > 1]:
-        raise FrameError(twice[-1], "one column for each meaning", f"the columns {', '.join(twice)}")
-    given = dict(zip(renamed, given.values(), strict=True))
     columns: dict[str, Any] = {}
     for name, parts in FLAT:
         if name in given:
@@ -467,6 +484,33 @@ def _columns(boxes: Any, arrays: Mapping[str, ArrayLike]) -> dict[str, Any]:
     if isinstance(columns["label"], list):
         columns["label"] = [getattr(one, "value", one) for one in columns["label"]]  # of an enumeration
     return columns
+
+
+def _renamed(
+    boxes: Any, arrays: Mapping[str, ArrayLike], known: Sequence[str], flat: Sequence[tuple[str, tuple[str, ...]]]
+) -> dict[str, Any]:
+    """Return the columns of boxes and arguments by their first names, each meaning once."""
+    given = {**_named(boxes), **arrays}
+    if unknown := [name for name in given if name not in known]:
+        pixels = " (pixel boxes need camera=)" if unknown[0] in KNOWN_PIXELS else ""
+        raise FrameError(unknown[0], f"columns among {', '.join(known)}{pixels}", f"the columns {', '.join(given)}")
+    whole = {part: name for name, parts in flat for part in parts}
+    renamed = [ALIASES.get(name, name) for name in given]
+    meanings = [whole[name] if whole.get(name) in given else name for name in renamed]
+    if twice := [name for name, meaning in zip(given, meanings, strict=True) if meanings.count(meaning) > 1]:
+        raise FrameError(twice[-1], "one column for each meaning", f"the columns {', '.join(twice)}")
+    return dict(zip(renamed, given.values(), strict=True))
+
+
+def _pixels(boxes: Any, arrays: Mapping[str, ArrayLike]) -> dict[str, Any]:
+    """Return the columns as `GroundCamera.detections` takes them."""
+    given = _renamed(boxes, arrays, KNOWN_PIXELS, PIXELS)
+    if not given:
+        return {"box": np.empty((0, 4)), "label": []}
+    for name, parts in PIXELS:
+        if any(part in given for part in parts):
+            given[name] = _stacked(given, parts)
+    return {name: _nested(values) for name, values in given.items() if name in {"box", "foot", "score", "label"}}
 
 
 def _nested(values: Any) -> Any:

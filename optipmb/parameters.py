@@ -19,7 +19,7 @@ from importlib import resources
 from itertools import pairwise
 from operator import not_
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -71,11 +71,16 @@ ClassName = Annotated[str, Field(min_length=1, max_length=64), AfterValidator(_p
 """As messages take it."""
 
 
-class _Table(BaseModel):
+class ParameterTable(BaseModel):
+    """A table of TOML, whose fields are all known and finite."""
+
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-class ProcessNoise(_Table):
+_T = TypeVar("_T", bound=ParameterTable)
+
+
+class ProcessNoise(ParameterTable):
     """Process noise Q_k of the CTRA model, as standard deviations that grow with the square root of time.
 
     ``Q_k = diag(q_x, q_x, q_v, q_phi, q_omega, q_a)^2 * dt``, so that two steps of dt/2 add as much as one of dt.
@@ -89,7 +94,7 @@ class ProcessNoise(_Table):
     acceleration: Positive = Field(description="of a, m/s^2")
 
 
-class MeasurementNoise(_Table):
+class MeasurementNoise(ParameterTable):
     """Measurement noise R_k of the detector, as standard deviations of z_M = [x, y, v_x, v_y, phi]."""
 
     position: Positive = Field(description="standard deviation of x and of y, m; its square fills R_xy")
@@ -97,7 +102,7 @@ class MeasurementNoise(_Table):
     heading: Positive = Field(description="of phi, rad")
 
 
-class ReportedNoise(_Table):
+class ReportedNoise(ParameterTable):
     """Noise of the detector for the boxes that tracks report (`optipmb.calibration`).
 
     An entry that is not below its counterpart in `measurement_noise` reports the state as it is.
@@ -107,7 +112,7 @@ class ReportedNoise(_Table):
     heading: Positive = Field(description="of phi, rad")
 
 
-class BirthSpread(_Table):
+class BirthSpread(ParameterTable):
     """Birth covariance P^0 of a newborn object, as standard deviations."""
 
     position: Positive = Field(description="of x and of y, m")
@@ -118,7 +123,7 @@ class BirthSpread(_Table):
     acceleration: Positive = Field(description="of a, m/s^2")
 
 
-class HeadingSign(_Table):
+class HeadingSign(ParameterTable):
     """How it is found out which way an object faces, as log odds (`optipmb.lightweight`)."""
 
     memory: OpenProbability = Field(
@@ -131,7 +136,7 @@ class HeadingSign(_Table):
     speed: NonNegative = Field(default=1.0, description="v_0: speed from which an object counts as driving, m/s")
 
 
-class Calibration(_Table):
+class Calibration(ParameterTable):
     """How the tracks of a class turned out on training data, by their evidence (`optipmb.calibration`).
 
     From evidence to across, the fields are columns of one table, a row for each knot; between the knots the curves are
@@ -173,7 +178,7 @@ class Calibration(_Table):
 Knots = Annotated[tuple[OpenProbability, ...], Field(min_length=2, max_length=MAX_KNOTS)]
 
 
-class ScoreCalibration(_Table):
+class ScoreCalibration(ParameterTable):
     """Curve from the scores of a detector to the scale of the thresholds (`optipmb.frame`).
 
     The fields are columns of one table, a row for each knot; the curve is straight from knot to knot, from (0, 0) to
@@ -194,7 +199,7 @@ class ScoreCalibration(_Table):
         return self
 
 
-class ClassParameters(_Table):
+class ClassParameters(ParameterTable):
     """Everything the tracker knows of one object class; the paper's symbol stands first in each description."""
 
     score_filter: Probability = Field(description="eta_sf: detections with a lower score are removed")
@@ -311,7 +316,7 @@ class ClassParameters(_Table):
         return self
 
 
-class Parameters(_Table):
+class Parameters(ParameterTable):
     """A profile: the classes to track, in the order of their indices, and the nominal period of the stream."""
 
     name: Annotated[str, Field(min_length=1, max_length=64, description="name of the profile, repeated in results")]
@@ -401,12 +406,24 @@ def parse_parameters(document: dict[str, Any]) -> Parameters:
     Raises:
         ParameterError: for the first value that is not allowed.
     """
+    return checked(Parameters, document, "profile")
+
+
+def checked(table: type[_T], document: Mapping[str, Any], name: str) -> _T:
+    """Return a table of nested dictionaries; `name` is the path of the whole.
+
+    Raises:
+        ParameterError: for the first value that is not allowed.
+    """
     try:
-        return Parameters.model_validate(document)
+        return table.model_validate(document)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        path = ".".join(str(part) for part in first["loc"]) or "profile"
-        raise ParameterError(path, *_explained(first)) from error
+        path = ".".join(str(part) for part in first["loc"])
+        inner = first.get("ctx", {}).get("error")
+        if isinstance(inner, ParameterError):  # of one field, found beside others
+            raise ParameterError(".".join(filter(None, (path, inner.path))), inner.expected, inner.received) from None
+        raise ParameterError(path or name, *_explained(first)) from error
 
 
 MEASUREMENT: Final = (
@@ -540,7 +557,7 @@ def _explained(problem: ErrorDetails) -> tuple[str, str]:
     if problem["type"] == "missing":
         return "a value", "none"
     if problem["type"] == "extra_forbidden":
-        known = sorted({name for model in _Table.__subclasses__() for name in model.model_fields})
+        known = sorted({name for model in ParameterTable.__subclasses__() for name in model.model_fields})
         near = get_close_matches(str(problem["loc"][-1]), known, 3, 0.5)
         return "a known field" + (f", such as {' or '.join(near)}" if near else ""), repr(problem["loc"][-1])
     text = problem["msg"].removeprefix("Input should be ").removeprefix("Value error, ")

@@ -308,7 +308,7 @@ def test_boxes_of_an_image_are_refused(tmp_path: Path) -> None:
     image = {"image_width": plain["w"] * 30.0, "image_height": plain["h"] * 30.0}
     for columns in (plain, {**rest, **image}):
         write_table(tmp_path / "d.csv", columns)
-        with pytest.raises(DatasetError, match=r"points\.md.*boxes in pixels\?"):
+        with pytest.raises(DatasetError, match=r"cameras\.md.*boxes in pixels\?"):
             TableDataset(tmp_path / "d.csv")
 
 

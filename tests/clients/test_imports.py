@@ -70,7 +70,7 @@ EXCEPTIONS = {
     "online": {"datetime", "html", "io", "matplotlib", "pandas", "pyarrow", "supervision"},
 }
 EXECUTES = {"rows": {"exec"}}  # the views of the columns of a record, which come from their declaration
-TOUCHES_FILES = {"compiled", "parameters", "prepared", "warm"}
+TOUCHES_FILES = {"camera_files", "compiled", "parameters", "prepared", "warm"}
 
 
 @cache

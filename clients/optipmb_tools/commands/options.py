@@ -137,6 +137,7 @@ class DatasetOptions:
     ] = None
     verbose: Annotated[bool, typer.Option("--verbose", help="Say all that is assumed about the data.")] = False
     truth: Path | None = field(default=None, init=False)
+    camera: Path | None = field(default=None, init=False)
 
     def named(self) -> tuple[str, Path | None]:
         """Return the name of the data set and its root.
@@ -165,6 +166,10 @@ class DatasetOptions:
             if dataset != "table":
                 raise UsageError(f"--truth: for tables; {dataset} has annotations of its own")
             found["truth"] = str(self.truth)
+        if self.camera is not None:
+            if dataset != "table":
+                raise UsageError(f"--camera: for tables of pixel boxes, not for {dataset}")
+            found["camera"] = str(self.camera)
         return found
 
     def open(self, **more: float | str) -> Data:
@@ -192,6 +197,14 @@ class DataOptions(DatasetOptions):
             metavar="[DATA]",
             help="Your data: a table (CSV, Parquet, JSON Lines, Feather) or a folder of them, a bag of ROS 2, a "
             "recording (.mcap), or a folder of KITTI or nuScenes. In the place of --dataset and --root.",
+            show_default=False,
+        ),
+    ] = None
+    camera: Annotated[
+        Path | None,
+        typer.Option(
+            "--camera",
+            help="Calibration (TOML) that places the pixel boxes of a table on the ground.",
             show_default=False,
         ),
     ] = None

@@ -26,6 +26,7 @@ from optipmb_tools.datasets.interface import (
     Truth,
     chosen,
 )
+from optipmb_tools.datasets.table import pixels
 from optipmb_tools.datasets.table.columns import ALIASES
 from optipmb_tools.datasets.table.findings import Finding, Reading
 from optipmb_tools.datasets.table.rows import NO_ID, Boxes, read_tables
@@ -39,6 +40,7 @@ OPTIONS: Final = (
     *("time", "rate", "group", "yaw", "heading", "quaternion", "sizes", "axes", "velocity", "score", "invalid"),
     *("missing", "size_factor"),
     *("poses", "truth", "tracks", "decimal", "encoding", "date", "origin"),
+    *pixels.OPTIONS,
 )
 GAP: Final = 1.5
 SPARSE: Final = 1.5
@@ -283,6 +285,8 @@ class TableSequence(DataSequence):
                 pose = Pose(np.nan_to_num(columns["center"][0]), IDENTITY.quaternion)
                 columns["center"] = columns["center"] - pose.translation
                 view = _view(boxes.reports.distance)
+            if boxes.camera is not None:
+                pose, columns, view = pixels.seen_from(boxes.camera, pose, columns)
             yield DetectionFrame(index, stamp_ns, pose, self.labels, label, field_of_view=view, **columns)
 
     def truth(self) -> Truth | None:
@@ -336,7 +340,8 @@ class TableDataset(Dataset):
         self._sequences: dict[str, TableSequence] = {}
         notes: list[str] = []
         self.path = path
-        shared, tracks = TableOptions(options), options.pop("tracks", None)
+        tracks = options.pop("tracks", None)
+        shared = TableOptions({name: value for name, value in options.items() if name not in pixels.OPTIONS})
         others = read_objects(Path(truth), _tables(Path(truth)), shared) if truth is not None else []
         notes += [note for one in others for note in one.notes]
         reading = Reading(path, options, lenient, named=shared.named, findings=[] if findings is None else findings)

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from optipmb_tools.datasets.motion import Moves, find_moves, find_reports, overl
 from optipmb_tools.datasets.table.columns import NOTHING, Column, find_columns, normalised, turn_of
 from optipmb_tools.datasets.table.columns import turned as turned_names
 from optipmb_tools.datasets.table.findings import Reading, is_number
+from optipmb_tools.datasets.table.pixels import METRES, Placed, place
 from optipmb_tools.datasets.table.times import (
     COUNTED_HZ,
     CROWDED,
@@ -45,6 +46,9 @@ from optipmb_tools.datasets.table.values import (
 from optipmb_tools.files import LARGEST, DatasetError
 from optipmb_tools.geometry import Bools, Floats, Ints
 from optipmb_tools.table_files import NO_VALUE, Columns, frame_numbers, read_table
+
+if TYPE_CHECKING:
+    from optipmb import GroundCamera
 
 NO_CLASS: Final = "object"  # class of all boxes of a table without classes
 NO_ID: Final = -1  # id of a box that has none
@@ -91,6 +95,7 @@ class Boxes:
     key_columns: tuple[str, ...]
     sensor_column: str  # one of `key_columns`, with the sensor; empty: none
     keys: Mapping[str, tuple[str, ...]]  # key -> values of the columns that it stands for
+    camera: "GroundCamera | None" = None  # that placed the boxes
 
     def rows(self, first: int, last: int) -> "Boxes":
         """Return the table of the rows from `first` up to `last`, which are counted from 0 again."""
@@ -185,6 +190,8 @@ def _columns_of(reading: Reading, columns: Columns) -> dict[str, Column]:
     chosen = {key.removeprefix("column."): name for key, name in reading.options.items() if key.startswith("column.")}
     for role, name in chosen.items():
         reading.name(f"column.{role}", [*columns, NOTHING], "a column", name)
+    if "camera" in reading.options:
+        chosen |= dict.fromkeys(METRES, NOTHING)
     taken = {role: name for role, name in chosen.items() if name in columns or name == NOTHING}
     return find_columns(columns, taken, [name for name, one in columns.items() if _has_no_number(one)])
 
@@ -204,6 +211,7 @@ class _Table:
         self._found = _columns_of(reading, columns)
         turn = None if "yaw" in self._found else turn_of(map(normalised, columns))
         self._turn_of, self._turn_columns = turn or ("", [])
+        self._placed: Placed | None = None
 
     def _numbers(self, role: str, otherwise: float | None = None) -> Floats:
         """Return a column of numbers, NaN where there is none."""
@@ -241,7 +249,7 @@ class _Table:
         stamps = self._stamps(series)
         centres = not {"l", "w"} & found.keys()
         self._refuse_pixels(centres=centres)
-        center = self._centers()
+        center = self._centers(series, stamps)
         ends = (("l", 1.0 if centres else None), ("w", 1.0 if centres else None), ("h", 1.5))
         factor = reading.positive("size_factor", "a factor of sizes") or 1.0
         size = factor * np.column_stack([self._numbers(role, without) for role, without in ends])
@@ -273,11 +281,11 @@ class _Table:
         stamps = self._framed(stamps, series, row, center, size, kind, score, scored=scored)
         stamp = stamps.ns
         refuse_gap(reading, stamp, series)
-        pose = self._poses(stamp)
+        pose = self._checked_poses(stamp)
         world = _world(center, row, pose)[:, :2]
         motion = _Motion(row, pose, find_moves(series[row], stamp[row] / 1e9, world, kind))
         yaw = self._heading(motion, size, yaw, yaw_unit if turned else "none", strict=scored)
-        looks = scored and pose is None and "sensor" not in found
+        looks = scored and pose is None and "sensor" not in found and self._placed is None
         reports = find_reports(series[row], stamp[row] / 1e9, world, kind) if looks else None
         if reports is not None:
             text = f"objects report one by one: a frame is a look at {reports.distance:.3g} m around its box"
@@ -304,6 +312,7 @@ class _Table:
             key_columns=key_columns,
             sensor_column=found["sensor"].name if "sensor" in found else "",
             keys=keys,
+            camera=self._placed.camera if self._placed else None,
         )
 
     def _doubled(self, stamp: Ints, series: Ints, center: Floats) -> Bools:
@@ -320,6 +329,22 @@ class _Table:
         again[second[equal]] = True
         return again
 
+    def _place(self, series: Ints, stamps: Stamps) -> Placed | None:
+        """Return the pixel boxes of a camera on the ground; None without a camera."""
+        if "camera" not in self._reading.options:
+            return None
+        frame = np.unique(np.column_stack([series, stamps.ns]), axis=0, return_inverse=True)[1].reshape(-1)
+        return place(self._reading, list(self._columns), self._read_numbers, frame, self._names(stamps.ns))
+
+    def _checked_poses(self, stamp: Ints) -> Floats | None:
+        """Return the poses of the table, which a camera on a vehicle needs, and a fixed one cannot have."""
+        pose = self._poses(stamp)
+        if self._placed is not None and (pose is None) == (self._placed.camera.mount == "vehicle"):
+            wanted, found = ("poses", "none") if pose is None else ("none", "poses")
+            expected = f"{wanted} of the vehicle, as mount = {self._placed.camera.mount} (pose columns or poses=FILE)"
+            raise DatasetError(self._reading.path, expected, found)
+        return pose
+
     def _refuse_pixels(self, *, centres: bool) -> None:
         """Refuse boxes of an image."""
         found = self._found
@@ -327,12 +352,14 @@ class _Table:
         lists = [one for one in self._columns if _LAST_OF_FOUR.fullmatch(one) and f"{one[:-1]}4" not in self._columns]
         named += lists
         flat = {"w", "h"} <= found.keys() and "l" not in found
+        if "camera" in self._reading.options:
+            return
         if not lists and ("z" in found or not (flat or (centres and named)) or "lat" in found):
             return
         received = f"{', '.join(named or [found['w'].name, found['h'].name])} and no length: boxes in pixels?"
         expected = (
-            "boxes in metres, with z up; of a camera the places on the ground, which need neither size nor heading "
-            "(docs/points.md)"
+            "boxes in metres, with z up, or --camera FILE, the calibration that places pixel boxes on the ground "
+            "(docs/cameras.md)"
         )
         self._reading.refuse("sizes", expected, received, "--option column.l=NAME")
 
@@ -344,6 +371,7 @@ class _Table:
             pairs = (role if role == one.name else f"{role} from {one.name}" for role, one in self._found.items())
             self._reading.note("columns", f"columns found: {', '.join(pairs)}")
         used = {one.name for one in self._found.values()} | set(self._turn_columns)
+        used |= set(self._placed.columns if self._placed else ())
         unused = [name for name in self._columns if name not in used]
         stems = {name.rpartition(".")[0] for name in used} - {""}
         unused.sort(key=lambda name: name.rpartition(".")[0] not in stems)  # the rest of a group that is used in part
@@ -368,8 +396,14 @@ class _Table:
     def _height(self) -> str:
         return "alt" if "alt" in self._found else "z"
 
-    def _centers(self) -> Floats:
-        """Return centres (R, 3): x, y, z, or latitude and longitude where an origin is given and x is not."""
+    def _centers(self, series: Ints, stamps: Stamps) -> Floats:
+        """Return centres (R, 3): x, y, z, or latitude and longitude where an origin is given and x is not.
+
+        Those of a camera come from its pixel boxes.
+        """
+        self._placed = self._place(series, stamps)
+        if self._placed is not None:
+            return np.insert(self._placed.center[:, :2], 2, 0.0, axis=1)
         origin, found = self._reading.options.get("origin"), self._found
         if "x" in found or "lat" not in found or origin is None:
             return np.column_stack([self._numbers("x"), self._numbers("y"), self._numbers("z", 0.0)])
@@ -557,7 +591,7 @@ class _Table:
             unknown = int(np.isnan(found).sum())
             if unknown:
                 reading.note("yaw", f"{unknown} of {len(found)} boxes have no heading: it is unknown")
-        if unposed:
+        if unposed and self._placed is None:
             reading.note("pose", "no columns for the pose of the sensor: boxes are assumed to be in the world frame")
             if unit != "none" and is_moving(found, long):
                 text = f"the sensor seems to move, boxes share a motion in {moves.common.share:.0%} of the frames"
@@ -676,6 +710,8 @@ class _Table:
         Rows with others are taken out of `kept`, if the user leaves such rows out.
         The height has no column: its variance is the mean of the others, and nothing depends on it.
         """
+        if self._placed is not None:
+            return self._placed.covariance
         if not {"cov_xx", "cov_yy"} & self._found.keys():
             return None
         if self._reading.options.get("axes") == "camera":
