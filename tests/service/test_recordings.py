@@ -37,6 +37,12 @@ BETWEEN_NS: Final = SECOND // 50
 RECORDED: Final = optipmb.load_profile(PROFILE)
 OTHER: Final = RECORDED.model_copy(update={"name": "other", "nominal_period": 0.2, "detection_time": 0.2})
 PROFILES: Final = Profiles("recorded", (), {one.name: one for one in (RECORDED, OTHER)})
+OF_SESSIONS: Final = (
+    "frames", "duplicates", "late", "inserted", "corrected", "refused", "gaps", "new_epochs", "clouds_used",
+    "clouds_missed", "repaired",
+)  # fmt: skip
+OF_STREAMS: Final = ("received", "shed", "clouds_refused", "clouds_shed")
+"""Counts of messages that are recorded."""
 TRACKERS: Final = {"chained": chained, "filter": optipmb.Tracker}
 KEYS: Final = schemas.Keys()
 
@@ -50,6 +56,11 @@ class Failing:
             raise ZeroDivisionError("seven")
         result: optipmb.StepResult = self._tracker.step(density, frame)
         return result
+
+
+def told(counts: object, *names: str) -> bytes:
+    """Return counts as text."""
+    return f"{type(counts).__name__}({', '.join(f'{name}={getattr(counts, name)}' for name in names)})".encode()
 
 
 class SessionSeam:
@@ -71,7 +82,7 @@ class SessionSeam:
             self._step(step)
         self._take(self._session.flush())
         self._out.message(self._session.state())
-        self._out.add("counters", repr(self._session.counters).encode())
+        self._out.add("counters", told(self._session.counters, *OF_SESSIONS))
 
     def _step(self, step: Step) -> None:
         if isinstance(step, tuple):
@@ -222,7 +233,7 @@ class CoreSeam:
         self._streams.finish()
         self._process.run()
         self._ask("state", None)
-        self._out.add("totals", repr(self._streams.totals()).encode())
+        self._out.add("totals", told(self._streams.totals(), *OF_SESSIONS, *OF_STREAMS))
 
     def _begin(self) -> None:
         self._process = Process(self._out, self._kept)

@@ -27,22 +27,20 @@ from pydantic import BaseModel, Field, ValidationError
 import optipmb
 from optipmb.zones import MOST, Seen, ZoneState
 from optipmb_service.session import convert
-from optipmb_service.session.state import UNPLACED, FilterState, FrameCounts, ProcessedFrame, SensorState
+from optipmb_service.session.counts import MAX_COUNT, Count, Deliveries, FrameCounts
+from optipmb_service.session.state import UNPLACED, FilterState, ProcessedFrame, SensorState
 from optipmb_service.session.timeline import EPOCHS, WINDOW, FrameId, SeenNumbers
 from optipmb_service.session.values import (
     MAX_CLOUD_WAIT_NS,
     MAX_ERROR,
     MAX_SENSORS,
     Binary,
-    Count,
-    Deliveries,
     Epoch,
     Incarnation,
     SensorName,
     Whole,
 )
 from optipmb_service.session.worlds import Worlds  # noqa: TC001 - pydantic reads the annotation
-from optipmb_service.telemetry.stream_meter import MAX_COUNT
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import fields, replace
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
 import numpy as np
@@ -29,6 +29,7 @@ from optipmb.zones import ZoneState
 from optipmb_service.session import convert
 from optipmb_service.session.arrivals import Arrivals
 from optipmb_service.session.checkpoint import Checkpoint
+from optipmb_service.session.counts import Counters, Deliveries, total
 from optipmb_service.session.pending import PendingFrame, SensorQueue
 from optipmb_service.session.problems import problem_of, sentence
 from optipmb_service.session.state import FilterState, ProcessedFrame
@@ -40,7 +41,6 @@ from optipmb_service.session.values import (
     MAX_SENSORS,
     SECOND,
     Begun,
-    Deliveries,
     Incarnation,
     Output,
     Policy,
@@ -49,7 +49,6 @@ from optipmb_service.session.values import (
     events_of,
 )
 from optipmb_service.session.window import ReorderWindow
-from optipmb_service.telemetry.stream_meter import Counters, total
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -161,7 +160,7 @@ class Session:
                 expected = "a reset or a restarted publisher: the session is quarantined"
                 return [self._refuse("quarantined", frame_id, "", expected, error)]
             outputs += self._end_quarantine(frame_id.sensor)
-        if self._fused and not (self._restored or self.arrivals.waiting or self.counters.frames):
+        if self._fused and not (self._restored or self.arrivals.waiting or self._window.head.counts.frames):
             self.arrivals.begin(frame_id.stamp_ns, since_ns, now_ns)
         judged = queue.judge(frame_id)
         if queue.is_alive(frame_id, judged[1]):
@@ -409,21 +408,8 @@ class Session:
 
     @property
     def counters(self) -> Counters:
-        """Counts of the messages so far: by delivery, and by the frames alone."""
-        counts, deliveries = self._window.head.counts, self._deliveries
-        return Counters(
-            frames=counts.frames,
-            duplicates=deliveries.duplicates,
-            late=deliveries.late,
-            inserted=deliveries.inserted,
-            corrected=deliveries.corrected,
-            refused=deliveries.refused + counts.astray + counts.effort + counts.unconfirmed,
-            gaps=counts.gaps,
-            new_epochs=counts.new_epochs,
-            clouds_used=counts.clouds_used,
-            clouds_missed=counts.clouds_missed,
-            repaired=counts.repaired,
-        )
+        """Counts of the messages so far."""
+        return Counters.of(self._window.head.counts, self._deliveries)
 
     @property
     def held(self) -> int:
@@ -481,7 +467,7 @@ class Session:
             seq=last.seq if last else None,
             stamp_ns=last.stamp_ns if last else None,
             shed=shed,
-            **{field.name: getattr(counters, field.name) for field in fields(Counters)},
+            **{name: count for name, count in asdict(counters).items() if name in schemas.SessionState.names},
             tracks=head.tracks,
             bernoullis=len(density.bernoulli),
             poissons=len(density.poisson),

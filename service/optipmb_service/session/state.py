@@ -13,8 +13,9 @@ import optipmb_schemas as schemas
 from pydantic import Field
 
 from optipmb.rows import record
+from optipmb_service.session.counts import Count, FrameCounts
 from optipmb_service.session.timeline import Cursor, FrameId, Order, Placement, Verdict
-from optipmb_service.session.values import MAX_LABELS, Count, Epoch, Incarnation, Reached, Whole
+from optipmb_service.session.values import MAX_LABELS, Epoch, Incarnation, Reached, Whole
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -26,33 +27,6 @@ if TYPE_CHECKING:
 ClassName = Annotated[str, Field(strict=True, max_length=64)]
 _Metres = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Position = tuple[_Metres, _Metres, _Metres]
-
-
-@record
-class FrameCounts:
-    """Counts of the frames that were processed.
-
-    Attributes:
-        frames: tracked.
-        gaps: missing between those tracked.
-        new_epochs: how often the publisher restarted or its stamps jumped.
-        clouds_used: tracked with their cloud.
-        clouds_missed: that waited for a cloud in vain.
-        astray: refused because the sensor cannot have been there.
-        effort: refused because they need too much computing.
-        unconfirmed: refused because their stamps jumped and no others agreed.
-        repaired: covariances that had lost rank in rounding and were repaired.
-    """
-
-    frames: Count = 0
-    gaps: Count = 0
-    new_epochs: Count = 0
-    clouds_used: Count = 0
-    clouds_missed: Count = 0
-    astray: Count = 0
-    effort: Count = 0
-    unconfirmed: Count = 0
-    repaired: Count = 0
 
 
 @record

@@ -28,9 +28,9 @@ from enum import StrEnum, unique
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from optipmb.rows import record
+from optipmb_service.session.counts import Count  # noqa: TC001 - pydantic reads the annotation
 from optipmb_service.session.values import (
     MAX_SENSORS,
-    Count,
     Epoch,
     JumpLimits,
     SensorName,

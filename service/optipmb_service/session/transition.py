@@ -30,11 +30,11 @@ import optipmb
 from optipmb.rows import record
 from optipmb.zones import Shapes, ZoneState, adapted, end, observe
 from optipmb_service.session import convert
-from optipmb_service.session.state import FilterState, FrameCounts, PoseHistory, SensorState
+from optipmb_service.session.counts import FrameCounts, total
+from optipmb_service.session.state import FilterState, PoseHistory, SensorState
 from optipmb_service.session.timeline import JUMP_FRAMES, FrameId, Verdict
 from optipmb_service.session.values import MAX_LABELS, MAX_SENSORS, SECOND, Begun
 from optipmb_service.session.worlds import in_one_world, relocated
-from optipmb_service.telemetry.stream_meter import total
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""Settings, outputs and counts of sessions as plain values; times in nanoseconds."""
+"""Settings and outputs of sessions as plain values; times in nanoseconds."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from pydantic import AfterValidator, Field
 import optipmb
 from optipmb.parameters import ALIKE
 from optipmb.zones import COUNTS, Event, Zone
-from optipmb_service.telemetry.stream_meter import MAX_COUNT
 
 SECOND: Final = 1_000_000_000
 
@@ -22,7 +21,6 @@ COLUMNS: Final = tuple(optipmb.Tracks.described)
 
 # What checkpoints hold, as pydantic reads it.
 Whole = Annotated[int, Field(strict=True, ge=0, lt=2**63)]
-Count = Annotated[int, Field(strict=True, ge=0, le=MAX_COUNT)]
 Binary = Annotated[bytes, Field(strict=True)]
 Epoch = Annotated[bytes, Field(strict=True, min_length=16, max_length=16)]
 
@@ -269,25 +267,6 @@ class Quarantined:
 
 
 Output = Tracked | schemas.Problem | Begun | Quarantined
-
-
-@dataclass(slots=True)
-class Deliveries:
-    """Counts of frames that were not tracked, and of corrections: they depend on how messages were delivered.
-
-    Attributes:
-        duplicates: frames that came again.
-        late: frames that came too late.
-        refused: messages that were not valid, or not wanted.
-        inserted: late frames and clouds that were put in their place.
-        corrected: tracks that were published again because of these.
-    """
-
-    duplicates: Count = 0
-    late: Count = 0
-    refused: Count = 0
-    inserted: Count = 0
-    corrected: Count = 0
 
 
 class RefusedError(ValueError):

@@ -20,6 +20,7 @@ import structlog
 import optipmb
 from optipmb.zones import MOST
 from optipmb_service.cluster.leases import Change, partition_of
+from optipmb_service.session.counts import MessageCounters
 from optipmb_service.session.fixed_rate import FixedRate
 from optipmb_service.session.problems import problem_of
 from optipmb_service.session.values import SECOND, Policy
@@ -27,7 +28,6 @@ from optipmb_service.streams.admission import Admission
 from optipmb_service.streams.backlog import MEGABYTE, Backlog, Bounds, ByteBudget
 from optipmb_service.streams.profiles import FUSED, Fusion
 from optipmb_service.streams.stream import Stream
-from optipmb_service.telemetry.stream_meter import MessageCounters
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterable, Iterator

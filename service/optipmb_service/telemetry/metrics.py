@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
     import optipmb
     from optipmb_service.telemetry.problem_reporter import ProblemReporter
-    from optipmb_service.telemetry.stream_meter import MessageCounters
 
 log = structlog.get_logger("optipmb_service")
 
@@ -261,7 +260,7 @@ class StreamFigures:
 
     Attributes:
         reporter: of problems.
-        totals: what happened to the messages of all streams since the start.
+        totals: `MessageCounters` of all streams since the start.
         sessions: a line for each session.
         listed: sessions with series of their own.
         densities: of the sessions.
@@ -271,7 +270,7 @@ class StreamFigures:
     """
 
     reporter: ProblemReporter
-    totals: MessageCounters
+    totals: Any
     sessions: Sequence[schemas.SessionSummary]
     listed: Sequence[schemas.SessionSummary]
     densities: Sequence[optipmb.Density]

@@ -1,10 +1,9 @@
-"""Figures of a stream that an operator reads: rate, latency, age, counts. The clock is handed in, in monotonic ns."""
+"""Figures of a stream that an operator reads: rate, latency, age. The clock is handed in, in monotonic ns."""
 
 from __future__ import annotations
 
 from bisect import bisect_left
 from collections import deque
-from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Final
 
@@ -15,9 +14,6 @@ ARRIVALS: Final = 1024
 RATE_NS: Final = 5_000_000_000  # the rate is averaged over this time, or over the last two frames
 SILENT_PERIODS: Final = 3  # after so many periods without a frame the rate falls, and the stream is silent
 LAST: Final = 5  # frames whose largest distance is the period by which silence is judged
-
-MAX_COUNT: Final = 2**61
-"""Where counters end, so that neither one more nor the sum of two leaves the 64 bits of a message."""
 
 
 class StreamMeter:
@@ -95,51 +91,3 @@ class StreamMeter:
             queue=state.queue,
             age_s=self.age_s(now_ns),
         )
-
-
-def total(*counts: int) -> int:
-    """Return the sum of counts; beyond the highest it stays there.
-
-    A publisher chooses its sequence numbers, and all numbers between two of them count as missing.
-    """
-    return min(sum(counts), MAX_COUNT)
-
-
-@dataclass(slots=True)
-class Counters:
-    """Counts of the messages of a session so far; see `Deliveries` and `state.FrameCounts`."""
-
-    frames: int = 0
-    duplicates: int = 0
-    late: int = 0
-    inserted: int = 0
-    corrected: int = 0
-    refused: int = 0
-    gaps: int = 0
-    new_epochs: int = 0
-    clouds_used: int = 0
-    clouds_missed: int = 0
-    repaired: int = 0
-
-
-@dataclass(slots=True)
-class MessageCounters(Counters):
-    """The same with what never came to a session, of a stream or of all.
-
-    Every frame received ends in one of frames, duplicates, late, refused and shed, or waits: received is their sum.
-    """
-
-    received: int = 0
-    shed: int = 0
-    clouds_refused: int = 0
-    clouds_shed: int = 0
-
-    def __add__(self, other: MessageCounters) -> MessageCounters:
-        return MessageCounters(
-            **{one.name: total(getattr(self, one.name), getattr(other, one.name)) for one in fields(MessageCounters)}
-        )
-
-    def since(self, earlier: Counters, now: Counters) -> MessageCounters:
-        """Return the sum with the growth of a session's counters between two times."""
-        come = {one.name: getattr(now, one.name) - getattr(earlier, one.name) for one in fields(Counters)}
-        return self + MessageCounters(**come)

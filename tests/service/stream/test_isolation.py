@@ -26,6 +26,7 @@ from optipmb_service.app.storage import STORE_FILE
 from optipmb_service.cluster.leases import PARTITIONS
 from optipmb_service.cluster.member import Member
 from optipmb_service.cluster.sqlite import SqliteStore
+from optipmb_service.session.counts import MAX_COUNT
 from optipmb_service.session.session import Session
 from optipmb_service.settings import LimitSettings
 from optipmb_service.streams import persistence, queries
@@ -33,7 +34,6 @@ from optipmb_service.streams.backlog import Backlog
 from optipmb_service.streams.persistence import CheckpointWriter
 from optipmb_service.telemetry.health import ProcessHealth
 from optipmb_service.telemetry.metrics import Metrics
-from optipmb_service.telemetry.stream_meter import MAX_COUNT
 from optipmb_service.zenoh.inputs import Packet
 from router import Node, Sensor, until
 from sessions import Gated

@@ -6,9 +6,9 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from optipmb_service.session.counts import MessageCounters
 from optipmb_service.session.values import MAX_SENSORS
 from optipmb_service.streams import backlog, stream
-from optipmb_service.telemetry.stream_meter import MessageCounters
 from optipmb_service.zenoh.inputs import Packet
 from registries import Around, packet_of, streams_of
 from router import Sensor
