@@ -12,7 +12,7 @@ KITTI = --dataset kitti --root $(DATA)/kitti --detections pointrcnn
 NUSCENES = --dataset nuscenes --root $(DATA)/nuscenes --detections centerpoint
 
 FUZZ_TARGETS := fuzz-messages fuzz-checkpoints fuzz-protobuf
-.PHONY: help kernels dist docs release demo test accuracy alone bounds ray bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests check mutants lowest paths pythons repeat schemas wheel clean tune ablate
+.PHONY: help kernels dist docs pictures release demo test accuracy alone bounds ray bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests check mutants lowest paths pythons repeat schemas wheel clean tune ablate
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
 	@echo "make install a virtual environment with everything, and compiled kernels"
@@ -37,6 +37,7 @@ help:
 	@echo "make containers  build the image, run the compose file's stack in containers, and show that it works"
 	@echo "make tune    tune profiles from DATA=... (out/tune-*/tuned.toml), beginning at those of the paper"
 	@echo "make ablate  print the figures of docs/ablation.md and docs/ablation/*.csv from DATA=..."
+	@echo "make pictures draw the pictures of the pages again, into docs/images"
 	@echo "make docs    build the documentation site into out/site and check its links"
 	@echo "make release test, build and check a release, and print what would publish it"
 	@echo "make clean   remove the virtual environment and everything generated"
@@ -174,6 +175,10 @@ $(DOCS)/.installed: pyproject.toml
 docs: $(DOCS)/.installed
 	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --strict
 	@echo "the site is in out/site"
+
+# Not live.png, live-phone.png, and the figures of performance.
+pictures: kernels
+	$(BIN)/python docs/pictures.py docs/images
 
 # Everything that a release needs, up to publishing.
 release: $(VENV)/.installed

@@ -1,8 +1,9 @@
-"""Pictures of concepts, fusion and zones: `python docs/pictures.py docs/images`; needs the extra `plot`."""
+"""Pictures of the pages: `make pictures`; needs the extra `demo`."""
 
 from __future__ import annotations
 
 import sys
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -10,6 +11,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, Rectangle
+from optipmb_tools.cli import run
 
 import optipmb
 from optipmb.zones import Zone, ZoneState, observe
@@ -254,8 +256,22 @@ def draw_camera(figure: Figure) -> None:
     ground.set(**limits, aspect="equal", xlabel="x (m)", ylabel="y (m)", title="places, 95 % ellipses, field of view")
 
 
+def draw_runs(folder: Path) -> None:
+    """Draw the demonstration and the crossing by the commands of the pages."""
+    examples = Path(__file__).parent.parent / "examples"
+    crossing = [f"{examples}/crossing.csv"]
+    truth = ["--truth", f"{examples}/crossing_truth.csv"]
+    scene = ["--dataset", "scene", "--option", "seed=4"]
+    with tempfile.TemporaryDirectory() as place:
+        for data, known, name in ((scene, [], "demo.gif"), (crossing, truth, "getting-started.png")):
+            tracks = f"{place}/{name}.csv"
+            run(["track", *data, "--out", tracks])
+            run(["plot", *data, *known, "--tracks", tracks, "--out", f"{folder / name}"])
+
+
 def main(folder: Path) -> None:
     """Write the pictures into a folder."""
+    draw_runs(folder)
     figure = Figure(figsize=(7.5, 6.4), layout="constrained")
     FigureCanvasAgg(figure)
     draw_fusion(figure)

@@ -52,7 +52,7 @@ def demo(
     if live:
         _show_live(frames, browser=browser)
         return
-    needed("optipmb demo", "demo", "uvicorn", "starlette", "structlog", "prometheus_client", "scipy")
+    needed("optipmb demo", "demo", "uvicorn", "starlette", "structlog", "prometheus_client", "scipy", "pyarrow")
     from optipmb_client.zenoh import Connection  # noqa: PLC0415  as above
 
     from optipmb_tools.datasets import Preloaded, open_dataset  # noqa: PLC0415  packages of this command alone
@@ -61,7 +61,7 @@ def demo(
     from optipmb_tools.run.service_process import ServiceProcess  # noqa: PLC0415  as above
     from optipmb_tools.views.pictures import draw_results  # noqa: PLC0415  as above
 
-    pace = speed_of(speed)
+    pace, table = speed_of(speed), out / "tracks.csv"
     with FrameProgress("replaying", frames) as progress:
         dataset = open_dataset("scene", frames=frames, seed=SEED)
         progress.note(f"generating {frames / 10:.0f} s of traffic")
@@ -76,14 +76,14 @@ def demo(
             progress.note(f"replaying through {service.endpoint}, {rate}")
             how = Replaying(dataset.profile, Pace(speed=pace, window=1, patience_s=PATIENCE_S))
             with Connection(service.endpoint) as connection:
-                (replayed,) = replay(connection, dataset, [sequence], out, how, progress.advance)
+                (replayed,) = replay(connection, dataset, [sequence], table, how, progress.advance)
         progress.note("comparing the tracks with the truth, drawing them")
-        results = evaluate_files([sequence], out, sequence.labels, default_rules(dataset.name))
-        figures = combine(result.sweep.results[result.sweep.best] for result in results)
+        results = evaluate_files([sequence], table, sequence.labels, default_rules(dataset.name))
+        figures = combine(result.shown for result in results)
         pictures = [out / "tracks.png", out / "tracks.gif"]
         try:
             for one in pictures:
-                draw_results(one, sequence, [out], [results], numbered=True)
+                draw_results(one, sequence, [table], [results])
         except ClientError as error:  # pictures are worth having, not worth failing for
             progress.note(str(error))
             pictures = []
@@ -107,8 +107,8 @@ def demo(
         f"tracks    {figures.objects} objects, {figures.switches} id switches, MOTA "
         f"{100 * figures.mota:.1f} %, precision {100 * figures.precision:.1f} %, recall {100 * figures.recall:.1f} %"
     )
-    lines.append(f"files     {replayed.file}: the tracks, a line for each box, in the format of KITTI's results")
-    lines += [f"          {one}: the tracks that are worth showing, numbered from 1" for one in pictures]
+    lines.append(f"files     {replayed.file}: all tracks, a row for each in each frame")
+    lines += [f"          {one}: the confirmed tracks" for one in pictures]
     report(shown, *lines, as_json=as_json)
     complain([replayed])
 

@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,6 +136,13 @@ class Assumption(str):
     __slots__ = ()
 
 
+class Area(NamedTuple):
+    """A part of the ground, for pictures."""
+
+    kind: str  # pavement, road, block, building, crosswalk or line
+    outline: Floats  # (N, 2) in the world frame
+
+
 class DataSequence(ABC):
     """One recording, or one sensor of it.
 
@@ -156,6 +163,7 @@ class DataSequence(ABC):
     key_columns: Mapping[str, str] = {}
     time_column: str = ""  # empty: the columns are `sequence` and `stamp_ns` instead
     numbers: NDArray[Any] | None = None  # (F,) numbers of the frames as the table has them
+    areas: Sequence[Area] = ()  # later ones lie above earlier ones
     reports: Reports | None = None  # where objects report one by one
 
     if TYPE_CHECKING:
@@ -332,6 +340,7 @@ class Preloaded(DataSequence):
         self.labels: tuple[str, ...] = sequence.labels
         self.has_clouds: bool = sequence.has_clouds
         self.poses: Sequence[Pose] = sequence.poses
+        self.areas = sequence.areas
         self._frames = list(sequence.frames())
         self._truth = sequence.truth()
 

@@ -7,7 +7,6 @@ the installation and is imported when the first picture is drawn.
 
 import contextlib
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,7 +17,7 @@ from optipmb_schemas.installation import install_command
 from optipmb_tools.datasets import DataSequence, DetectionFrame, Truth
 from optipmb_tools.geometry import Floats, Ints, box_corners, rotation_of, stack_poses, to_world
 from optipmb_tools.results import ResultTable
-from optipmb_tools.views.colours import colour_of
+from optipmb_tools.views.colours import COLOURS, colour_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -41,11 +40,21 @@ INSIDE = (0.03, 0.97)  # quantiles of the places of tracks between which the vie
 MARGIN_M = 4.0
 NARROWEST_M = 30.0
 SCALE_M = 10.0
-WIDTH_PX = 560
-LEGEND = 0.5  # its height, inches
-COLOURS = 16
-WHITE = 250
-_SHADE, _DETECTION = "#C4C4C4", "#5A5A5A"
+WIDTH_PX = 800
+LEGEND = 2.0  # its width, inches, on the right
+HEIGHTS = (0.45, 0.72)  # least and largest height of the view, as a share of its width
+_SHADE, _DETECTION = "#8E8E8E", _INK
+
+# Of the ground
+_GROUND = {
+    "pavement": "#EDEAE4",
+    "road": "#CDD1D6",
+    "block": "#F7F6F2",
+    "building": "#B7A692",
+    "crosswalk": "#FFFFFF",
+    "line": "#FFFFFF",
+}
+_DASHES = (0, (7, 5))
 
 
 class Panel(NamedTuple):
@@ -100,6 +109,7 @@ def draw_tracks(path: Path, sequence: DataSequence, panels: Sequence[Panel], tru
         axes.set_title(f"{title}: {len(np.unique(panel.tracks.id))} tracks in {len(sequence)} frames")
         axes.grid(visible=True, color="#EEEEEE", linewidth=0.6)
         axes.set_axisbelow(True)
+        _draw_ground(axes, sequence)
         if truth is not None:
             _draw_truth(axes, truth)
         if sensor.any():
@@ -120,6 +130,14 @@ def _extent(places: Sequence[Floats]) -> tuple[Floats, Floats]:
     # A long street is to be wider than a line: the short side is at least a quarter of the long one.
     lack = np.maximum(0.25 * float(max(high - low)) - (high - low), 0.0)
     return low - 0.5 * lack, high + 0.5 * lack
+
+
+def _draw_ground(axes: "Axes", sequence: DataSequence) -> None:
+    for kind, outline in sequence.areas:
+        if kind == "line":
+            axes.plot(*outline.T, color=_GROUND[kind], linewidth=1.0, linestyle=_DASHES, zorder=1.5)
+        else:
+            axes.fill(*outline.T, color=_GROUND[kind], linewidth=0.0, zorder=1.5)
 
 
 def _draw_truth(axes: "Axes", truth: Truth) -> None:
@@ -229,18 +247,22 @@ def animate_tracks(path: Path, sequence: DataSequence, tracks: ResultTable, trut
         raise ClientError(f"sequence {sequence.name}: expected frames to draw, received none")
     view = _View(sequence, tracks, None if truth is None else truth.take(~truth.ignored), given)
     pictures = [Image.fromarray(view.drawn(frame)) for frame in given]
-    # One palette for all frames: still parts have the same bytes in each, and are stored once.
-    sample = Image.new("RGB", (pictures[0].width, 3 * pictures[0].height))
-    for place, chosen in enumerate((pictures[0], pictures[len(pictures) // 2], pictures[-1])):
-        sample.paste(chosen, (0, place * chosen.height))
-    found = sample.quantize(COLOURS, dither=Image.Dither.NONE).getpalette() or []
-    shades = np.array(found, dtype=np.int64).reshape(-1, 3)
-    shades[shades.min(axis=1) >= WHITE] = 255  # the ground; an entry near white would replace it
     palette = Image.new("P", (1, 1))
-    palette.putpalette(shades.ravel().tolist())
+    palette.putpalette(_palette())
     first, *others = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures)
     path.parent.mkdir(parents=True, exist_ok=True)
     first.save(path, save_all=True, append_images=others, duration=_durations_ms(given), loop=0, optimize=True)
+
+
+def _palette() -> list[int]:
+    """Return one palette for all frames, whose still parts are then stored once: tracks, ground, and their mixtures."""
+    from matplotlib.colors import to_rgb  # noqa: PLC0415  an extra
+
+    ground, tracks = (np.array([to_rgb(one) for one in colours]) for colours in ({*_GROUND.values()}, COLOURS))
+    road = np.array(to_rgb(_GROUND["road"]))
+    greys = np.linspace(float(np.array(to_rgb(_INK))[0]), 1.0, 12)[:, None] * np.ones(3)
+    mixed = [share * tracks + (1.0 - share) * road for share in (1.0, 0.75, 0.5, 0.25)]
+    return [round(255.0 * value) for value in np.vstack([greys, np.sort(ground, axis=0), *mixed]).ravel().tolist()]
 
 
 def _durations_ms(given: list[DetectionFrame]) -> list[int]:
@@ -258,7 +280,7 @@ class _View:
         from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  an extra
         from matplotlib.figure import Figure  # noqa: PLC0415  an extra
 
-        self._tracks, self._truth = tracks, truth
+        self._sequence, self._tracks, self._truth = sequence, tracks, truth
         self._begin_ns = given[0].stamp_ns
         period_s = (given[-1].stamp_ns - self._begin_ns) * 1e-9 / max(1, given[-1].index - given[0].index)
         self._trail = round(TRAIL_S / period_s) if period_s > 0.0 else 1
@@ -270,12 +292,15 @@ class _View:
         self._follows = bool((high - low).max() > WIDEST_M)
         if self._follows:
             low, high = np.array([-REACH_M, -0.6 * REACH_M]), np.array([REACH_M, 0.6 * REACH_M])
-        wide, tall = high - low
-        figure = Figure(figsize=(WIDTH_PX / 100, WIDTH_PX / 100 * tall / wide + LEGEND), dpi=100)
+        wide, tall = (high - low).tolist()
+        share = min(max(tall / wide, HEIGHTS[0]), HEIGHTS[1])
+        more = np.maximum((tall / share - wide, share * wide - tall), 0.0)
+        self._low, self._high = low - 0.5 * more, high + 0.5 * more
+        across = WIDTH_PX / 100 - LEGEND
+        figure = Figure(figsize=(WIDTH_PX / 100, share * across), dpi=100)
         self._canvas: Any = FigureCanvasAgg(figure)  # two of its methods have no annotations
-        share = LEGEND / figure.get_figheight()
-        self._axes: Axes = figure.add_axes((0.0, share, 1.0, 1.0 - share))
-        self._low, self._high = low, high
+        self._axes: Axes = figure.add_axes((0.0, 0.0, across / (across + LEGEND), 1.0))
+        self._time = figure.text(1.0 - LEGEND / (across + LEGEND) + 0.025, 0.95, "", fontsize=16, va="top", color=_INK)
         self._legend(figure)
 
     def drawn(self, frame: DetectionFrame) -> "np.ndarray[tuple[int, ...], np.dtype[np.uint8]]":
@@ -286,14 +311,15 @@ class _View:
         origin = sensor if self._follows else np.zeros(2)
         axes.set_xlim(self._low[0] + origin[0], self._high[0] + origin[0])
         axes.set_ylim(self._low[1] + origin[1], self._high[1] + origin[1])
+        _draw_ground(axes, self._sequence)
         self._draw_truth(frame.index)
         center, _ = to_world(rotation_of(frame.pose.quaternion), frame.pose.translation, frame.center, frame.yaw)
-        axes.plot(*center[:, :2].T, "+", color=_DETECTION, markersize=4, markeredgewidth=0.8, zorder=6)
+        axes.plot(*center[:, :2].T, "+", color=_DETECTION, markersize=5, markeredgewidth=1.0, zorder=6)
         self._draw_tracks(frame)
         if self._sensor.any():
             axes.plot(*sensor, "^", color=_INK, markersize=7, zorder=7)
         seconds = (frame.stamp_ns - self._begin_ns) * 1e-9
-        axes.text(0.012, 0.975, f"{seconds:.1f} s", transform=axes.transAxes, fontsize=12, va="top", color=_INK)
+        self._time.set_text(f"{seconds:.1f} s")
         left, bottom = self._low + origin + 0.03 * (self._high - self._low)
         axes.plot([left, left + SCALE_M], [bottom, bottom], color=_INK, linewidth=1.5)
         axes.text(left, bottom, f"{SCALE_M:.0f} m", fontsize=9, va="bottom", color=_INK)
@@ -310,6 +336,7 @@ class _View:
 
     def _draw_tracks(self, frame: DetectionFrame) -> None:
         from matplotlib.collections import LineCollection, PolyCollection  # noqa: PLC0415  an extra
+        from matplotlib.patheffects import Normal, Stroke  # noqa: PLC0415  an extra
 
         tracks = self._tracks
         rows = np.flatnonzero(tracks.frame == frame.index)
@@ -319,23 +346,21 @@ class _View:
         since = frame.index - self._trail
         recent = np.flatnonzero((tracks.frame > since) & (tracks.frame <= frame.index))
         trails = [tracks.center[recent[tracks.id[recent] == identity], :2] for identity in tracks.id[rows]]
-        self._axes.add_collection(LineCollection(trails, colors=colours, linewidths=1.6, zorder=4))
-        faces = [f"{colour}66" for colour in colours]
+        self._axes.add_collection(LineCollection(trails, colors=colours, linewidths=2.2, zorder=4))
         self._axes.add_collection(
-            PolyCollection(outlines, facecolors=faces, edgecolors=colours, linewidths=1.2, zorder=5)
+            PolyCollection(outlines, facecolors=colours, edgecolors=_INK, linewidths=0.6, zorder=5)
         )
-        self._axes.add_collection(LineCollection(fronts, colors=colours, linewidths=1.2, zorder=5))
-        for kind in np.unique(tracks.label[rows]).tolist():
-            places = tracks.center[rows[tracks.label[rows] == kind], :2]
-            self._axes.plot(*places.T, _MARKERS[kind % len(_MARKERS)], color=_INK, markersize=2.5, zorder=6)
-        for place, identity, colour in zip(tracks.center[rows], tracks.id[rows].tolist(), colours, strict=True):
+        self._axes.add_collection(LineCollection(fronts, colors="#FFFFFF", linewidths=1.2, zorder=5))
+        for place, identity in zip(tracks.center[rows], tracks.id[rows].tolist(), strict=True):
             self._axes.annotate(
                 str(identity),
                 (float(place[0]), float(place[1])),
                 xytext=(6, 5),
                 textcoords="offset points",
-                color=colour,
-                fontsize=8,
+                color=_INK,
+                fontsize=10,
+                fontweight="bold",
+                path_effects=[Stroke(linewidth=2.5, foreground="#FFFFFF"), Normal()],
                 annotation_clip=True,
                 zorder=8,
             )
@@ -343,19 +368,18 @@ class _View:
     def _legend(self, figure: "Figure") -> None:
         from matplotlib.lines import Line2D  # noqa: PLC0415  an extra
 
-        colour, path = colour_of(0), f"track: box, id, path of {TRAIL_S:.0f} s"
+        colour, path = colour_of(0), f"track, path of {TRAIL_S:.0f} s"
         handles = [
             Line2D([], [], label="detection", marker="+", linestyle="", color=_DETECTION, markersize=6),
-            Line2D([], [], label="truth", marker="s", linestyle="", color=_SHADE, markersize=8),
-            Line2D([], [], label=path, marker="s", color=colour, markerfacecolor=f"{colour}66"),
+            Line2D([], [], label="truth", marker="s", linestyle="", color=_SHADE, markersize=9),
+            Line2D([], [], label=path, marker="s", color=colour, linewidth=2.2, markersize=9),
+            Line2D([], [], label="id of the track", marker="$7$", linestyle="", color=_INK, markersize=8),
             Line2D([], [], label="sensor", marker="^", linestyle="", color=_INK, markersize=7),
         ]
-        drawn = (True, self._truth is not None, True, bool(self._sensor.any()))
+        drawn = (True, self._truth is not None, True, True, bool(self._sensor.any()))
         handles = [handle for handle, one in zip(handles, drawn, strict=True) if one]
-        for kind in np.unique(self._tracks.label).tolist():
-            name, marker = self._tracks.labels[kind], _MARKERS[kind % len(_MARKERS)]
-            handles.append(Line2D([], [], label=name, marker=marker, linestyle="", color=_INK, markersize=4))
-        figure.legend(handles=handles, loc="lower center", ncols=-(-len(handles) // 2), frameon=False, fontsize=8)
+        place = 1.0 - LEGEND * 100 / WIDTH_PX, 0.82
+        figure.legend(handles=handles, loc="upper left", bbox_to_anchor=place, frameon=False, fontsize=10)
 
 
 def _outlines(boxes: "Truth | ResultTable", rows: Ints) -> list[Floats]:
@@ -370,7 +394,6 @@ def draw_results(
     results: "Sequence[Sequence[ClassResult]]",
     score: float | None = None,
     *,
-    numbered: bool = False,
     every: bool = False,
 ) -> None:
     """Draw the result files of a sequence from above.
@@ -382,7 +405,6 @@ def draw_results(
         results: Figures of the classes of each tracker; their misses and identity changes are marked.
         score: Least mean score of the tracks that are shown; default: confirmed tracks; where the files do not tell,
             those from the best threshold of each class by `results` on.
-        numbered: Number the tracks that are shown from 1; default: their ids.
         every: Whether to draw all tracks.
 
     Raises:
@@ -404,13 +426,6 @@ def draw_results(
             table, best = table.shown, [result.shown for result in own]
         else:
             table = _from_score(table, own, score)
-        if numbered:
-            known, which = np.unique(table.id, return_inverse=True)
-            number = {identity: place + 1 for place, identity in enumerate(known.tolist())}
-            table = replace(table, id=which + 1)
-            for k, one in enumerate(best):
-                changes = [change._replace(old=number[change.old], new=number[change.new]) for change in one.changes]
-                best[k] = replace(one, changes=tuple(changes))
         panels.append(Panel(table, best, name if len(names) > 1 else ""))
     if picture.suffix == ".gif":
         animate_tracks(picture, sequence, panels[0].tracks, sequence.truth())

@@ -17,7 +17,7 @@ from optipmb_tools.camera import synthetic_camera
 from optipmb_tools.datasets.interface import Cloud, DataSequence, Dataset, DetectionFrame, Truth
 from optipmb_tools.datasets.scene.detector import CLASSES, Found, Seen, detect
 from optipmb_tools.datasets.scene.lidar import Scan, scan
-from optipmb_tools.datasets.scene.traffic import World, build_world, fixed_boxes
+from optipmb_tools.datasets.scene.traffic import World, build_world, fixed_boxes, street
 from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Bools, Floats, Ints, Pose, planar_pose, rotation_of, to_sensor, wrap_angle
 from optipmb_tools.results.kitti import write_kitti_results
@@ -70,6 +70,7 @@ class SceneSequence(DataSequence):
 
     def __init__(self, name: str, options: SceneOptions) -> None:
         self.name = name
+        self.areas = street()
         self._options = options
         self._scanned: dict[int, tuple[Ints, Floats]] = {}
 

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from optipmb_tools.datasets.interface import Area
 from optipmb_tools.datasets.scene.detector import CLASSES, SIZES
 from optipmb_tools.geometry import Floats, Ints
 
@@ -26,6 +27,10 @@ HALF_LENGTH, HALF_WIDTH, CORNER = 32.0, 25.0, 15.0
 """Of the middle of the street round the block, and the radius of its corners."""
 LANE, CYCLE_LANE, PARKING, KERB, PAVEMENT = 1.75, 4.4, 6.6, 8.2, 10.6
 """Distances of the strips from the middle of the street."""
+_LINES = (-5.3, -3.5, 0.0, 3.5, 5.3)  # between lanes, cycle lanes and parked cars
+_WALLS = 12.6  # distance of the end of the pavement
+_STRIPES = 3.0  # length of those of a crosswalk
+_BLOCK = np.array([[1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]])
 _WALKING_LANES = (0.5, 1.5)  # distances of pedestrians from the middle of their way, on its right
 _WAY = 20.0  # length of the pavement on either side of a crosswalk
 _LINE = 4.2  # distance of the vehicles' stop lines from the middle of the crosswalk
@@ -92,14 +97,7 @@ class Circuit:
     def __init__(self, kind: int, corners: Floats, radius: float, stops: Floats, crosswalks: tuple[int, int]) -> None:
         self.kind = kind
         self.crosswalks = crosswalks
-        turn = np.linspace(0.0, 0.5 * np.pi, 33)[:, None]
-        parts = []
-        for before, corner, after in zip(
-            np.roll(corners, 1, axis=0), corners, np.roll(corners, -1, axis=0), strict=True
-        ):
-            into, out = ((way / np.hypot(*way)) * radius for way in (corner - before, after - corner))
-            parts.append(corner - into * (1.0 - np.sin(turn)) + out * (1.0 - np.cos(turn)))
-        closed = np.vstack([*parts, parts[0][:1]])
+        closed = _rounded(corners, radius)
         arc = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1)))
         self.length = float(arc[-1])
         self.spacing = self.length / round(self.length / 0.25)
@@ -121,15 +119,24 @@ class Circuit:
         return np.asarray(np.sqrt(square[: len(self.points)]), dtype=np.float64)
 
 
+def _rounded(corners: Floats, radius: float) -> Floats:
+    """Return the points of a closed way with rounded corners."""
+    turn = np.linspace(0.0, 0.5 * np.pi, 33)[:, None]
+    parts = []
+    for before, corner, after in zip(np.roll(corners, 1, axis=0), corners, np.roll(corners, -1, axis=0), strict=True):
+        into, out = ((way / np.hypot(*way)) * radius for way in (corner - before, after - corner))
+        parts.append(corner - into * (1.0 - np.sin(turn)) + out * (1.0 - np.cos(turn)))
+    return np.vstack([*parts, parts[0][:1]])
+
+
 def _circuits() -> dict[int, list[Circuit]]:
     """Return the circuits of each kind of road user."""
     found: dict[int, list[Circuit]] = {_CAR: [], _CYCLIST: [], _PEDESTRIAN: []}
-    block = np.array([[1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]])
     for kind, offset in ((_CAR, LANE), (_CYCLIST, CYCLE_LANE)):
         for side in (1.0, -1.0):  # outside counter-clockwise, inside clockwise
             half = np.array([HALF_LENGTH, HALF_WIDTH]) + side * offset
             stops = np.array([[side * y * _LINE, y * half[1]] for _, y in _SIGN])
-            found[kind].append(Circuit(kind, (block * half)[:: int(side)], CORNER + side * offset, stops, (0, 1)))
+            found[kind].append(Circuit(kind, (_BLOCK * half)[:: int(side)], CORNER + side * offset, stops, (0, 1)))
     for crosswalk, (turn, _) in enumerate(_SIGN):
         for d in _WALKING_LANES:
             end = _WAY + d
@@ -356,6 +363,21 @@ def fixed_boxes() -> tuple[Floats, Floats]:
             boxes += [(turn * x, turn * y, 2.5, 0.3, 0.3, 5.0) for x, y in poles]
     table = np.array(boxes)
     return table[:, :3], table[:, 3:]
+
+
+def street() -> list[Area]:
+    """Return the street with its markings, the pavements, and the building in the block."""
+    half = np.array([HALF_LENGTH, HALF_WIDTH])
+    strips = [("pavement", _WALLS), ("road", KERB), ("pavement", -KERB), ("block", -_WALLS)]
+    strips += [("line", offset) for offset in _LINES]
+    areas = [Area(kind, _rounded(_BLOCK * (half + offset), CORNER + offset)) for kind, offset in strips]
+    center, size = (one[0, :2] for one in fixed_boxes())
+    areas.append(Area("building", center + 0.5 * size * _BLOCK))
+    stripe = 0.5 * np.array([_STRIPES, 0.5]) * _BLOCK
+    across = np.arange(0.5 - KERB, KERB, 1.0)
+    return areas + [
+        Area("crosswalk", stripe + np.array([0.0, y])) for _, sign in _SIGN for y in sign * HALF_WIDTH + across
+    ]
 
 
 def _ease(rng: np.random.Generator, objects: int, times: Floats) -> Floats:
