@@ -2,13 +2,17 @@
 
 A test file is near when it imports a module that changed; when no test does, tests that import a module that imports
 one, and so on. Of many that are equally near, the namesakes run: a package that imports all its parts brings them all
-near. Tests that changed run too. Files are compared with where the branch left COMMIT; files that are not
-committed count. (Tools that watch which lines a test runs cannot see into compiled kernels.)
+near. Beside them run those that share the most and rarest words with a module: a session's rules are tested by what
+they are about, through the session. Tests that changed run too. Files are compared with where the branch left COMMIT;
+files that are not committed count. (Tools that watch which lines a test runs cannot see into compiled kernels.)
 """
 
 from __future__ import annotations
 
 import ast
+import collections
+import math
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -26,6 +30,9 @@ SLOW = ("e2e", "docker")
 """Tests of whole systems run only when they changed themselves."""
 MANY = 8
 """Beyond so many files a check would take more than a minute."""
+AKIN = 3
+"""Test files chosen for each module by their words."""
+WORD = re.compile(r"[A-Za-z_]\w{3,}")
 
 
 def main(since: str) -> int:
@@ -46,7 +53,7 @@ def nearest(changed: set[Path]) -> set[Path]:
     imports = {path: _imports(path) for path in _modules() | tests}
     quick = {path for path in tests if path.relative_to(ROOT / "tests").parts[0] not in SLOW}
     whole = {ROOT / test for folder, test in WHOLE.items() if any((ROOT / folder) in path.parents for path in changed)}
-    return _nearest(changed, imports, quick) | whole
+    return _nearest(changed, imports, quick) | _akin(changed - tests, quick) | whole
 
 
 def _tests() -> set[Path]:
@@ -100,6 +107,18 @@ def _nearest(changed: set[Path], imports: dict[Path, set[Path]], tests: set[Path
             break
         reached |= importers
     return set()
+
+
+def _akin(changed: set[Path], tests: set[Path]) -> set[Path]:
+    """Return for each module the tests that share the most words with it: rare ones count more, long tests less."""
+    words = {path: set(WORD.findall(path.read_text(encoding="utf-8"))) for path in changed | tests}
+    number = collections.Counter(word for path in tests for word in words[path])
+
+    def likeness(test: Path, module: Path) -> float:
+        shared = words[test] & words[module]
+        return sum(math.log(len(tests) / number[word]) for word in sorted(shared)) / math.sqrt(len(words[test]))
+
+    return {test for module in changed for test in sorted(tests, key=lambda one: (-likeness(one, module), one))[:AKIN]}
 
 
 def _namesakes(tests: set[Path], changed: set[Path]) -> set[Path]:
