@@ -77,6 +77,30 @@ def test_the_same_seed_gives_the_same_bytes_in_another_process() -> None:
     assert digest(here) != digest(other)
 
 
+def weighed(column: np.ndarray) -> float:
+    """Return one number that changes with any value of a column and with its place."""
+    return float(column.ravel() @ np.cos(np.arange(column.size)))
+
+
+def test_a_seed_gives_the_scene_that_it_gave_before() -> None:
+    """Figures that were measured on scenes hold in the next release: objects, their traffic, detections and clouds."""
+    sequence = scene(7, 20, velocity=1)
+    frames, truth = list(sequence.frames()), sequence.truth()
+    clouds = [frame.cloud.xyz for frame in frames if frame.cloud is not None]
+    detected = ("center", "size", "yaw", "velocity", "score")
+    found = {name: np.concatenate([getattr(frame, name) for frame in frames]) for name in detected}
+    found |= {"cloud": np.concatenate(clouds).astype(np.float64)}
+    found |= {f"true {name}": getattr(truth, name) for name in ("id", "center", "yaw", "velocity", "points", "covered")}
+    assert {name: weighed(column) for name, column in found.items()} == pytest.approx(
+        {
+            "center": 988.789204, "size": 17.7176306, "yaw": -3.13737891, "velocity": 35.0721884,
+            "score": -0.332010159, "cloud": -726.378632, "true id": -28.0849198, "true center": -59.9147632,
+            "true yaw": -46.3768611, "true velocity": -33.281936, "true points": 4220.28845, "true covered": 3.45176526,
+        },
+        rel=1e-6,
+    )  # fmt: skip
+
+
 def test_clouds_and_velocities_are_options() -> None:
     """Without velocities all else is equal; with them, they are near the true ones."""
     plain, rich = scene(2, 5), scene(2, 5, clouds=0, velocity=1)

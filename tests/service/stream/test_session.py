@@ -293,6 +293,17 @@ def test_unknown_classes_are_left_out_and_told_once() -> None:
     assert len(problems(one.reset() and feed(one, [3], labels=labels, label=np.array([0, 1, 2])))) == 2
 
 
+def test_of_endless_unknown_classes_so_many_are_told_as_are_remembered() -> None:
+    """256, however they come; all of their objects are counted as ignored."""
+    one = session()
+    outputs: list[Output] = []
+    for seq in range(3):
+        labels = tuple(f"thing-{seq}-{k}" for k in range(100))
+        outputs += feed(one, [seq], labels=labels, label=np.arange(100), objects=100)
+    assert [message.ignored for message in tracks(outputs)] == [100] * 3
+    assert len({p.received for p in problems(outputs) if p.code == "unknown_class"}) == len(problems(outputs)) == 256
+
+
 def test_a_score_filter_that_removes_most_of_a_class_is_reported_once() -> None:
     """The class whose scores lie below the filter of the profile is reported with its share, and no other class."""
     one, scores = session(), np.array([0.001, 0.9, 0.001])
