@@ -380,7 +380,7 @@ class Lives:
 
 
 def lives(owner: Ints, frame: Ints, matched: Bools) -> Lives:
-    """Return how well objects were followed, from the owner (R,), frame (R,) and state (R,) of their boxes."""
+    """Return how well objects were followed: object, frame and whether it is matched of each box, (R,)."""
     order = np.lexsort((frame, owner))
     _, owner = np.unique(owner[order], return_inverse=True)
     matched = matched[order]

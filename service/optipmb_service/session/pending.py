@@ -1,8 +1,8 @@
 """Frames and clouds of one sensor awaiting processing.
 
 A frame is held for its point cloud and, while the session recovers, for frames before it that may still come. The queue
-has a timeline of the past with the frames held: a frame is judged by it when it arrives, and by the session's when its
-turn comes.
+has a timeline of the processed frames with the pending ones: a frame is judged by it when it arrives, and by the
+timeline of the session when its turn comes.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ class SensorQueue:
 
     @property
     def timeline(self) -> Timeline:
-        """The timeline of the past with the frames held."""
+        """The timeline of the processed frames, with the pending ones added."""
         if self._behind:
             # Other sensors' frames were processed since: judge the held ones again, on the new timeline.
             self._behind = False

@@ -453,7 +453,7 @@ class Streams:
             stream.keep()
 
     def resume(self) -> None:
-        """Schedule all streams: they paused, and need not any longer."""
+        """Schedule all streams after a pause."""
         for stream in self.tracking():
             stream.backlog.wake()
 

@@ -52,7 +52,7 @@ class MetricFamily:
     """A row of the list.
 
     Attributes:
-        kind: as Prometheus has it.
+        kind: type of the metric in Prometheus.
         meaning: its help text.
         read: takes the source of the table; returns the value, or the values by labels, or None.
         labels: their names.
