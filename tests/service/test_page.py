@@ -4,12 +4,18 @@ import ast
 import re
 import socket
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
+import optipmb_schemas as schemas
 import optipmb_service
 import pytest
 from optipmb_schemas import Code
-from optipmb_service.app import cli
+from optipmb_service.app import cli, mqtt
+from optipmb_service.cluster import message_log
+from optipmb_service.edges import readers
+from optipmb_service.edges.grpc import calls, inputs, outputs
+from optipmb_service.edges.grpc.server import OPTIONS
+from optipmb_service.edges.http import server
 from optipmb_service.session.problems import CODES
 from optipmb_service.settings import LimitSettings, Ros2Settings, Ros2Stream, Settings, SiteSettings, load
 from optipmb_service.telemetry.logs import EVENTS
@@ -19,10 +25,15 @@ DOCS = Path(__file__).parents[2] / "docs"
 OPERATION = DOCS / "operation.md"
 REFERENCE = DOCS / "reference.md"
 SOURCES = sorted(Path(optipmb_service.__file__).parent.rglob("*.py"))
+options: dict[str, int] = dict(OPTIONS)
 LEVELS = {"debug", "info", "warning", "error", "exception"}
 
 
-def calls(names: set[str]) -> list[ast.Call]:
+def default(setting: str) -> Any:
+    return Settings.model_fields[setting].default
+
+
+def calls_of(names: set[str]) -> list[ast.Call]:
     found = []
     for source in SOURCES:
         for part in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
@@ -63,7 +74,7 @@ def test_every_setting_is_described() -> None:
 def test_every_log_event_is_described() -> None:
     """The code logs the events of the table."""
     logged = set()
-    for call in calls(LEVELS):
+    for call in calls_of(LEVELS):
         receiver = call.func.value if isinstance(call.func, ast.Attribute) else None
         if (isinstance(receiver, ast.Name) and receiver.id == "log") or isinstance(receiver, ast.Call):
             logged |= texts(call.args[0])
@@ -73,7 +84,7 @@ def test_every_log_event_is_described() -> None:
 def test_every_problem_is_described() -> None:
     """The code and the schemas report the codes of the table."""
     reported = set(get_args(Code))
-    for call in calls({"problem_of", "_problem", "_jumped", "_refuse", "_report", "report"}):
+    for call in calls_of({"problem_of", "_problem", "_jumped", "_refuse", "_report", "report"}):
         code = call.args[0] if call.args else None
         reported |= texts(code) if isinstance(code, ast.Constant) else set()
         reported |= {text for keyword in call.keywords if keyword.arg == "code" for text in texts(keyword.value)}
@@ -123,3 +134,44 @@ def test_the_outputs_of_the_example_are_valid(tmp_path: Path) -> None:
     output = load(file).settings.output_of("garage/robot-1/lidar")
     assert output is not None
     assert output.rate_hz == 20
+
+
+FIGURES = {
+    "grpc.md": {
+        f"size of a message | {schemas.DEFAULT.max_bytes // 2**20} MB |",
+        f"points of a cloud | {schemas.DEFAULT.max_detections:,}, {schemas.DEFAULT.max_points:,} |",
+        f"`Publish` | {inputs.MAX_CACHE:,}, {inputs.MAX_CACHE_CLOUDS} |",
+        f"(default {outputs.QUEUE}, at most {outputs.MAX_QUEUE}), {readers.BYTES // 2**20} MB in total",
+        f"no message within {calls.FIRST_S:.0f} s of opening a call",
+        f"no service answered within {outputs.QUERY_S:.0f} s",
+        f"`grpc_calls` ({default('grpc_calls'):,}), `grpc_connections` ({default('grpc_connections'):,})",
+        f"metadata of a call | {options['grpc.max_metadata_size'] // 2**10} KiB |",
+        f"at least {options['grpc.http2.min_ping_interval_without_data_ms'] // 1000} s |",
+        f"closed after {options['grpc.max_connection_idle_ms'] // 60_000} minutes |",
+    },
+    "json.md": {
+        f"{readers.BOUNDS.seconds / 60:.0f} minutes longer: {readers.BOUNDS.events:,} of each stream, ",
+        f"of each stream, {readers.BOUNDS.size // 2**20} MiB in all",
+        f"you took nothing for {server.SEND_S:.0f} s",
+        f"for `stale_s` ({default('stale_s'):g} s)",
+        f"{mqtt.EVENTS:,}\nevents of each stream ({mqtt.EVENT_BYTES // 2**20} MiB in all)",
+        f"for {mqtt.FORGET_S / 60:.0f} minutes what is as large",
+        f"tries again after {mqtt.TAKEN_OVER_S:.0f} s",
+    },
+    "messages.md": {
+        f"`max_json_bytes` {LimitSettings().max_json_bytes:,} and `max_values` {LimitSettings().max_values:,}",
+    },
+    "deployment.md": {
+        f"a bridge holds {message_log.HELD_BYTES // 2**20} MB",
+        f"`standby_mb` ({default('standby_mb')}) of",
+    },
+    "watching.md": {f"`http_clients` ({default('http_clients')}) readers"},
+}
+"""Figures in the text of pages, as the code has them."""
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_figures_of_the_pages_are_those_of_the_code(name: str) -> None:
+    """A limit that changes is changed on the page as well."""
+    text = (DOCS / name).read_text(encoding="utf-8")
+    assert not [figure for figure in sorted(FIGURES[name]) if figure not in text]

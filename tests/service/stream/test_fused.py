@@ -185,6 +185,21 @@ def test_a_pause_of_all_sensors_loses_nothing() -> None:
         assert begun(outputs) == ["first"]
 
 
+@pytest.mark.parametrize(("wait_s", "refused"), [(0.5, REAR.stream), (1.5, FRONT.stream)])
+def test_a_sensor_ahead_of_one_that_pauses_waits_as_long_as_a_frame_may_be_late(wait_s: float, refused: str) -> None:
+    """It is refused if the other one comes back on the old clock meanwhile; else that one is late."""
+    one, outputs = fused(), list[Any]()
+    given_to(one, [sensor.detections(seq) for seq in range(10) for sensor in (FRONT, REAR)])
+    paused = round(10 * wait_s)
+    for k in range(30):
+        outputs += one.on_detections(delayed(REAR, 2.0).detections(10 + k), k * SECOND // 10)
+        outputs += one.on_tick(k * SECOND // 10)
+        if k >= paused:
+            outputs += one.on_detections(FRONT.detections(10 + k - paused), k * SECOND // 10)
+    assert {p.stream for p in problems(outputs)} == {refused}
+    assert {m.sensor for m in tracks(outputs)} == {FRONT.stream, REAR.stream} - {refused}
+
+
 @pytest.mark.parametrize("drifts", [True, False])
 def test_a_clock_that_drifts_ahead_is_left_behind(*, drifts: bool) -> None:
     """Most sensors get their session back within the gap limit, whether one drifts away or began ahead."""
