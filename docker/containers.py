@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import signal
 import sys
 import tempfile
@@ -36,6 +37,8 @@ DATA: Final = "--dataset scene --sequences 0001 --option frames=300"
 KILL_AT: Final = 30
 """Frames after which the service that tracks is killed; the rest is time for a slow machine to do so."""
 READY_S: Final = 60.0
+CHANGED_MB: Final = 20
+"""Difference between the size of the image and that on its page."""
 WAIT_S: Final = 90.0
 INTERVALS: Final = {"$__rate_interval": "20s"}
 """Grafana's own variables: four scrape intervals."""
@@ -122,6 +125,12 @@ class Check:
             raise CheckError("in the image:\n" + "\n".join(found.wrong))
         size = f"{found.bytes / 1e6:.0f} MB, {found.added / 1e6:.0f} MB of them above the base image"
         self.show("size", "of all layers, not compressed", size)
+        page = (HERE.parent / "docs/deployment.md").read_text(encoding="utf-8")
+        said = [int(one) for one in re.findall(r"(\d+) MB above a base", page)]
+        if not said or any(abs(one - found.added / 1e6) > CHANGED_MB for one in said):
+            raise CheckError(
+                f"docs/deployment.md says {said} MB above the base image, it is {found.added / 1e6:.0f} MB"
+            )
         what = "only root can write, but in the volume; no program runs as its owner or its group; in our layers no "
         self.show("scan", what + "settings of pip, keys, tokens, passwords or private hosts", f"{found.files} files")
         for name, service in list(self.stack.services.items()):

@@ -20,7 +20,7 @@ from optipmb_client.merging import FinalEvents, Merging, Novelty
 __all__ = ["EventSubscriber", "Missed", "Received", "Statistics", "Subscriber"]
 
 REMEMBERED = 65_536  # frames whose repetition is recognised
-RECOVERED_NS = 500_000_000  # delay of tracks that do not come at their time
+RECOVERED_NS = 500_000_000  # delay from which tracks count as recovered
 MISSED = 1024  # ranges of lost frames that are kept
 
 _Message = TypeVar("_Message", bound=Message)
@@ -278,7 +278,7 @@ class Subscriber(_Subscription):
         if tracks.delivery is None:
             return False
         published_ns = tracks.delivery.published_ns
-        took_ns = arrived_ns - published_ns  # of two clocks: only differences mean something
+        took_ns = arrived_ns - published_ns  # two clocks: only differences are meaningful
         if published_ns < self._began_ns:
             return True
         fastest_ns = self._fastest_ns[tracks.stream] = min(took_ns, self._fastest_ns.get(tracks.stream, took_ns))

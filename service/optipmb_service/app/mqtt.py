@@ -1,13 +1,11 @@
 """The bridge to an MQTT broker as a process of its own: publishes tracks, events, counts and problems as JSON.
 
-Topics are the keys of the network. It keeps nothing, and reads from the broker only which
-counts it has kept. While the broker is away, events
-and the newest counts wait; tracks and problems do not, because they would be out of date.
+Topics are the keys of the network. The bridge stores nothing, and reads only the retained counts from the broker. While
+the broker is away, events and the newest counts wait. Tracks and problems are dropped, because they would be outdated.
 
-A message that the broker cannot take is left out, and named, so that it does not block the others: one above the size
-that the broker says (MQTT 5), one that it refuses, and one that ends the connection twice while no other is under way.
-To know which one that is, a message that is larger than those that its topic has had on a connection is confirmed
-(QoS 1), also where its topic is not.
+A message that the broker cannot take is reported and dropped, so that it does not block others: a message above the
+broker's Maximum Packet Size (MQTT 5), a refused one, and one that ends the connection twice while it is sent alone. To
+find the last kind, each message that is larger than all before on its topic and connection is sent with QoS 1.
 """
 
 from __future__ import annotations
@@ -77,10 +75,10 @@ STRIKES: Final = 2  # connections that a message may end while it is alone under
 TOO_LARGE: Final = "Packet too large"
 ENDED: Final = "ended the connection"
 FORGET_S: Final = 600.0
-"""Time after which what was left out because it ended connections is tried again."""
+"""Time after which a size that ended connections is tried again."""
 
 HEAD_BYTES: Final = 64
-"""At most so many bytes of a published packet are neither topic nor payload."""
+"""Most bytes of a published packet beside topic and payload."""
 
 
 class LinkError(Exception):
@@ -96,7 +94,7 @@ class LinkError(Exception):
 
 
 class Link:
-    """One connection to the broker. To be made and used on one loop; the callbacks come on a thread of paho's.
+    """One connection to the broker. Create and use it on one loop; callbacks run on a thread of paho.
 
     Args:
         client: not connected yet.
@@ -107,12 +105,12 @@ class Link:
         self._loop = loop = asyncio.get_running_loop()
         self._under_way: dict[int, asyncio.Future[str]] = {}
         self.opened: asyncio.Future[int] = loop.create_future()
-        """Size of the largest packet that the broker takes; 0: it says none."""
+        """Maximum Packet Size of the broker; 0: none."""
         self.ended: asyncio.Future[LinkError] = loop.create_future()
         client.on_connect = lambda _c, _d, _f, reason, properties: self._call(self._connected, reason, properties)
         client.on_disconnect = lambda _c, _d, _f, reason, _p: self._call(self._disconnected, reason)
         self.retained: asyncio.Queue[str] = asyncio.Queue()
-        """Topics of subscriptions that the broker has kept a message of."""
+        """Subscribed topics with a retained message."""
         client.on_message = lambda _c, _d, one: self._call(self._heard, one.topic, one.retain)
         client.on_publish = lambda _c, _d, number, reason, _p: self._call(self._published, number, reason)
 
@@ -150,7 +148,7 @@ class Link:
             del self._under_way[sent.mid]
 
     def subscribe(self, pattern: str) -> None:
-        """Have the broker name the topics of a pattern that it has kept messages of."""
+        """Ask the broker for the topics of a pattern that have a retained message."""
         self._client.subscribe(pattern, 1)
 
     async def close(self) -> None:
@@ -191,7 +189,7 @@ class Link:
 
 @dataclass
 class Unsent:
-    """A message that the broker has not taken yet, and the connections that it ended."""
+    """A message without confirmation, and the number of connections that it ended."""
 
     text: Text
     payload: bytes
@@ -203,7 +201,7 @@ TAKEN_OVER_S: Final = 30.0
 
 
 class Bridge(Reporter):
-    """From the network to the broker. To be made and run on one loop.
+    """From the network to the broker. Create and run it on one loop.
 
     Args:
         settings: of the process.
@@ -315,7 +313,7 @@ class Bridge(Reporter):
         publishing.result()
 
     async def _clear(self, link: Link) -> None:
-        """Clear kept counts of streams whose zones are gone: the services know the stream, and have no counts of it."""
+        """Clear retained counts of streams whose zones are gone: services know the stream, and have no counts of it."""
         for pattern in self._wish.streams if RETAINED in self._wish.topics else ():
             link.subscribe(f"{self._keys.prefix}/{pattern.replace('*', '+')}/{RETAINED}")
         while True:

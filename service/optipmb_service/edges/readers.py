@@ -1,4 +1,4 @@
-"""Readers of an edge: subscriptions that they share, and what waits for each of them.
+"""Readers of an edge: their shared subscriptions, and a queue for each of them.
 
 A message is received and decoded once for all its readers, and written as JSON once for all that want the same of it,
 when the first of them takes it: what a slow reader cannot take is never made. Unused subscriptions are kept for the
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from optipmb_schemas.json_form import Place
 
 BYTES: Final = 32 * 2**20
-"""Bytes that wait at most for one reader, beyond one message of each stream."""
+"""Most bytes in the queue of a reader, beyond one message of each stream."""
 
 KEPT: Final = 64
 """Subscriptions that are kept without readers."""
@@ -44,7 +44,7 @@ BURST: Final = 200
 """Subscriptions of readers that are opened at once."""
 
 PERIOD_S: Final = 7.5
-"""Time after which a further one is, in the long run: 11,520 a day, each with a number that Zenoh never gives back."""
+"""Mean time between two new subscriptions: 11,520 a day, each with a number that Zenoh never gives back."""
 
 WAITING: Final = 256
 """Messages between Zenoh and the thread of a subscription without recovery."""
@@ -53,7 +53,7 @@ IDLE_LOGS: Final = 16
 """Subscriptions to events that are kept without readers."""
 
 BEGINNING: Final = "0"
-"""Id of a reader of events that has none yet, and wants all that are kept."""
+"""Id with which a new reader of events gets all kept events."""
 
 DIGITS: Final = 20
 PROBLEMS: Final = 16
@@ -62,10 +62,10 @@ QUERY_S: Final = 2.0
 """Longest wait for the services."""
 
 TOLERANCE: Final = 0.999
-"""Part of a period that counts as a whole one: stamps of real sensors jitter."""
+"""Shortest accepted part of a period: stamps of real sensors jitter."""
 
 PREDICTED_TOLERANCE: Final = 0.95
-"""The same of predicted states: the time of an output jitters by milliseconds."""
+"""The same for predicted states: the time of an output jitters by milliseconds."""
 
 REMEMBERED: Final = 64
 
@@ -84,9 +84,9 @@ log = structlog.get_logger("optipmb_service")
 
 
 class Outbox(Generic[T]):
-    """Bounded queue of what waits for one reader; the newest win. To be made and read on the reader's loop.
+    """Bounded queue of one reader; the oldest items are dropped. Create and read it on the reader's loop.
 
-    Streams take turns, so that one of them cannot hide the others.
+    Streams take turns, so a fast one does not displace the others.
 
     Args:
         per_stream: items of one stream that may wait.
@@ -129,7 +129,7 @@ class Outbox(Generic[T]):
         self._wake()
 
     def close(self) -> None:
-        """Say that nothing follows."""
+        """Mark the queue as complete."""
         self._closed = True
         self._wake()
 
@@ -179,7 +179,7 @@ class Outbox(Generic[T]):
 class Pace:
     """Leaves out frames that come sooner than a period after the one before, in sensor time, in each stream.
 
-    What corrects a frame that was let through is let through too.
+    Corrections of accepted frames pass, too.
 
     Args:
         max_rate_hz: highest rate; 0: all frames.
@@ -279,7 +279,7 @@ class Text(NamedTuple):
 
 
 class Bounds(NamedTuple):
-    """What an event log keeps at most: events of one stream, for how long, and bytes in all."""
+    """Bounds of an event log: events of one stream, their age, and bytes of all."""
 
     events: int = 1000
     seconds: float = 600.0
@@ -301,7 +301,7 @@ class Event(NamedTuple):
 class EventLog:
     """The newest events of one subscription, numbered as they come, from which readers take. For any threads.
 
-    A reader that comes again goes on after the last event that it has, and learns how many it cannot get any more.
+    A returning reader continues after its last event, and learns how many events were dropped since.
 
     Args:
         final: whether it holds events when they do not change any more, each once, or as they are published.
@@ -351,14 +351,14 @@ class EventLog:
             return min(int(number), self._last)
 
     def after(self, number: int) -> tuple[list[Event], int]:
-        """Return the events after a number, and how many there were that are kept no longer."""
+        """Return the events after a number, and the count of those that have been dropped."""
         with self._lock:
             self._expire()
             found = list(takewhile(lambda one: one.number > number, reversed(self._kept.values())))
             return found[::-1], self._last - number - len(found)
 
     def id_of(self, number: int) -> str:
-        """Return the id by which a reader goes on after an event."""
+        """Return the id with which a reader continues after an event."""
         return f"{self._name}-{number}"
 
     def _expire(self) -> None:
@@ -378,18 +378,18 @@ class EventLog:
 
 @dataclass(frozen=True)
 class Wish:
-    """What a reader wants: patterns of streams, topics, which tracks, and how often."""
+    """Request of a reader: patterns of streams, topics, selection of tracks, rate."""
 
     streams: tuple[str, ...]
     topics: frozenset[str]
     selection: Selection = EVERYTHING
     max_rate_hz: float = 0.0
     final: bool = True
-    """Whether it gets events when they do not change any more, each once, or as they are published."""
+    """Whether events come once, when they are final, or as they are published."""
     predict: bool = False
     """Whether it gets tracks at a fixed rate, predicted to now."""
     after: str = ""
-    """Id of the last event that it has; those since are sent, too."""
+    """Id of the last event of the reader; later ones are sent, too."""
 
     def keys(self, keys: schemas.Keys) -> list[str]:
         """Return the keys to subscribe to.
@@ -452,7 +452,7 @@ class Reader:
 
     @property
     def lost_events(self) -> int:
-        """Events that it was too slow for."""
+        """Events that were dropped because the reader was too slow."""
         return self._missed + sum(log.after(number)[1] for log, number in tuple(self._numbers.items()))
 
     async def take(self, seconds: float | None = None) -> tuple[bytes, str]:
@@ -621,7 +621,7 @@ class Feeds:
 async def listed(session: Session, keys: schemas.Keys, pattern: str) -> list[tuple[str, schemas.SessionSummary]]:
     """Return the sessions of a pattern by stream, each with its service.
 
-    Workers, who answer too, are no services: their parent speaks for them.
+    Answers of workers are left out: their parent answers for them.
 
     Raises:
         TransportError: the network cannot be used.
