@@ -12,6 +12,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, Rectangle
 from optipmb_tools.cli import run
+from optipmb_tools.datasets import open_dataset
+from optipmb_tools.run import profiles
+from optipmb_tools.run.rejoining import Gaps, Rejoin, motion_of, motion_scores, tracklets
+from optipmb_tools.run.tracking import track_whole
 
 import optipmb
 from optipmb.zones import Zone, ZoneState, observe
@@ -269,6 +273,70 @@ def draw_runs(folder: Path) -> None:
             run(["plot", *data, *known, "--tracks", tracks, "--out", f"{folder / name}"])
 
 
+def behind_a_building(path: Path) -> None:
+    """Write a table of the detections of a car that a building hides, and of people who appear meanwhile."""
+    rng, rows = np.random.default_rng(5), ["t,x,y,l,w,yaw,score,class"]
+    for k in range(130):
+        boxes = [(2.0 + 6.0 * n, 11.0, 0.0) for n in range(7) if k >= max(0, 12 * (n - 1))]
+        if k >= 5 and not HIDDEN[0] < CAR_SPEED * k / RATE < HIDDEN[1]:  # noqa: PLR2004 - its first frame
+            boxes.append((CAR_SPEED * k / RATE, 5.0, 1.0))
+        for x, y, is_car in boxes:
+            name = "4.5,1.9,0.0,0.9,car" if is_car else "0.7,0.6,1.6,0.9,pedestrian"
+            rows.append(f"{k / RATE},{x + rng.normal(0.0, 0.08)},{y + rng.normal(0.0, 0.08)},{name}")
+    path.write_text("\n".join(rows) + "\n")
+
+
+CAR_SPEED = 4.5
+HIDDEN = (18.5, 40.7)
+"""x between which the building of the picture hides the car."""
+
+
+def draw_gap(axes: Axes) -> None:
+    """Draw the tracks of a car before and behind a building, and where it could have been."""
+    with tempfile.TemporaryDirectory() as folder:
+        table = Path(folder) / "boxes.csv"
+        behind_a_building(table)
+        (sequence,) = open_dataset("table", table).sequences(["all"])
+        parameters = profiles.profile_for("auto", [sequence])
+        tracks = track_whole(parameters, sequence).tracks
+    found, objects = tracklets(tracks, parameters.labels), Rejoin().objects(tracks, parameters)
+    object_of = dict(zip(objects.id.tolist(), objects.object.tolist(), strict=True))
+    earlier, later = np.flatnonzero([parameters.labels[one] == "car" for one in found.label.tolist()]).tolist()
+    ends = found.take(np.array([earlier]))
+    seconds = (found.first_ns[[later]] - ends.last_ns) * 1e-9
+    x, y = np.meshgrid(np.arange(0.0, 62.0, 0.25), np.arange(-18.0, 16.0, 0.25))
+    grid = np.column_stack((x.ravel(), y.ravel())) - ends.end
+    one = Gaps(grid, ends.end_velocity, ends.end_variance, *np.full((2, 1), np.nan), seconds, 35.0 * seconds)
+    many = Gaps(
+        grid,
+        *(np.broadcast_to(column, (len(grid), *np.shape(column)[1:])) for column in one[1:3]),
+        np.full_like(grid, np.nan),
+        *(np.repeat(column, len(grid)) for column in one[4:]),
+    )
+    density = np.exp(motion_scores(many, motion_of("car"))).reshape(x.shape)
+    axes.contourf(
+        x,
+        y,
+        density,
+        levels=density.max() * np.array((0.02, 0.1, 0.3, 1.0)),
+        colors=[(CAR, 0.12), (CAR, 0.22), (CAR, 0.35)],
+    )
+    axes.add_patch(Rectangle((22.0, -2.0), 14.0, 4.0, color=TRUTH, label="building"))
+    axes.annotate("where it may be when\nit is seen again", (44.0, 10.0), (44.0, 10.8), fontsize=9)
+    axes.plot(28.0, -14.0, "^", color="#222222", label="sensor")
+    for edge in HIDDEN:
+        axes.plot((28.0, edge), (-14.0, 5.0), ":", color=TRUTH)
+    for identity, label in zip(found.id.tolist(), found.label.tolist(), strict=True):
+        path = [one.center[one.id == identity, :2][0] for one in tracks.values() if identity in one.id]
+        is_car = parameters.labels[label] == "car"
+        axes.plot(*np.array(path).T, color=CAR if is_car else "#009E73", linewidth=2)
+        text = f"id {identity}, object {object_of[identity]}" if is_car else f"{identity}"
+        axes.annotate(
+            text, path[len(path) // 2], (0, -14 if is_car else 6), textcoords="offset points", ha="center", fontsize=9
+        )
+    axes.plot(*np.column_stack((ends.end[0], found.begin[later])), color=CAR, linewidth=0.8)
+
+
 def main(folder: Path) -> None:
     """Write the pictures into a folder."""
     draw_runs(folder)
@@ -276,6 +344,13 @@ def main(folder: Path) -> None:
     FigureCanvasAgg(figure)
     draw_fusion(figure)
     figure.savefig(folder / "fusion.png", dpi=100, metadata={"Software": None})
+    figure = Figure(figsize=(7.0, 4.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    draw_gap(axes)
+    axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", xlim=(-1, 61), ylim=(-17, 15))
+    axes.legend(frameon=False, fontsize=9, loc="lower left")
+    figure.savefig(folder / "gaps.png", dpi=110, metadata={"Software": None})
     tracks, found = scene()
     figure = Figure(figsize=(6.0, 4.6), layout="constrained")
     FigureCanvasAgg(figure)

@@ -22,7 +22,11 @@ guard.begin()
 
 OTHERS = {
     "alone": ("e2e/test_cluster.py", "e2e/test_load.py", "e2e/test_soak.py"),
-    "accuracy": ("clients/test_accuracy_kitti.py", "clients/test_accuracy_nuscenes.py"),
+    "accuracy": (
+        "clients/test_accuracy_gaps.py",
+        "clients/test_accuracy_kitti.py",
+        "clients/test_accuracy_nuscenes.py",
+    ),
 }
 """Files whose tests `make test` leaves to `make alone` and `make accuracy`, by their marker."""
 

@@ -187,6 +187,7 @@ def run(arguments: Sequence[str]) -> int:
 def _run(arguments: list[str]) -> int:
     words = filled(spread(arguments, MANY), "--ray", RAY_ADDRESS, "local")
     words = filled(words, "--submission", re.compile(r"\d*\.?\d+"), "default")
+    words = filled(words, "--rejoin", re.compile(r"-?\d*\.?\d+"), "60")
     if words[:1] == ["help"]:
         words = [*words[1:], "--help"]
     return int(app(words or ["--help"], prog_name="optipmb", standalone_mode=False) or 0)

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from optipmb_tools.evaluation import ClassResult, Rules
     from optipmb_tools.evaluation.evaluate import ClassFigures
+    from optipmb_tools.evaluation.tracks import By
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +81,14 @@ def evaluate(
     ] = None,
     how: MatchingOptions,
     jobs: EvaluationJobs,
+    by: Annotated[
+        str,
+        typer.Option(
+            "--by",
+            metavar="id|object",
+            help="Column of a table of tracks that names them: with object, tracks that track --rejoin joined are one.",
+        ),
+    ] = "id",
     every: All = False,
     as_json: AsJson = False,
 ) -> None:
@@ -97,11 +106,14 @@ def evaluate(
 
     more = {"tracks": " ".join(map(str, tracks))} if data.named()[0] == "table" else {}
     opened = data.open(**more)
+    column = _column(by, opened.name)
     spelt = {label.lower(): label for label in opened.labels}
     names = tuple(one if one in opened.labels else spelt.get(one.lower(), one) for one in classes or opened.labels)
     note = cache(warn)  # prints each assumption once
     with jobs.executor(opened.frames, max(1, len(names))) as executor:
-        reports = {str(one): _evaluated(opened, one, names, how, executor, note, every=every) for one in tracks}
+        reports = {
+            str(one): _evaluated(opened, one, names, how, executor, note, every=every, by=column) for one in tracks
+        }
     for tables in (one.tables for one in opened.sequences if hasattr(one, "tables")):
         tables.check()
     report = {"command": "evaluate", "dataset": opened.name, "sequences": opened.names}
@@ -114,6 +126,16 @@ def evaluate(
         shown = comparison_tables({place: one.figures for place, one in reports.items()}) if others else first.tables
         for table in shown:
             print_table(table)
+
+
+def _column(by: str, dataset: str) -> "By":
+    if by == "object":
+        if dataset == "nuscenes":
+            raise UsageError("--by object: the result files of nuScenes have no such column")
+        return "object"
+    if by != "id":
+        raise UsageError(f"--by: expected id or object, received {by}")
+    return "id"
 
 
 @dataclass(frozen=True)
@@ -134,6 +156,7 @@ def _evaluated(
     note: Callable[[str], None],
     *,
     every: bool,
+    by: "By",
 ) -> _Evaluated:
     from optipmb_tools.commands.tables import clear_table, figure_tables, nuscenes_table  # noqa: PLC0415  as above
     from optipmb_tools.evaluation import evaluate_files  # noqa: PLC0415  as above
@@ -158,13 +181,13 @@ def _evaluated(
         parts = {name: {"nuscenes": one.to_json()} for name, one in scores.classes.items() if name in names}
         best = {name: scores.classes[name].best.threshold for name in parts}
     else:
-        results = evaluate_files(opened.sequences, tracks, names, how.rules(opened.name), note)
+        results = evaluate_files(opened.sequences, tracks, names, how.rules(opened.name), note, by=by)
         parts = {one.name: _figures(one) for one in results}
         best = {} if opened.name == "kitti" else {one.name: one.sweep.thresholds[one.sweep.best] for one in results}
         if opened.name != "kitti" or how.distance is not None:  # AB3DMOT's protocol gives them at its own threshold
             head = [clear_table(results, metres=how.iou is None, every=every)]
     here = opened.sequences if executor.here else None
-    executor.start(figures_of, Evaluation(asked, tuple(opened.names), tracks, settings, names, here))
+    executor.start(figures_of, Evaluation(asked, tuple(opened.names), tracks, settings, names, here, by))
     tasks = [(name, best.get(name)) for name in names]
     found = bulk.values(executor, tasks, lambda task: f"{task[0]} of {tracks}", warn)
     figures = [one for each in found for one in each]

@@ -26,11 +26,13 @@ from optipmb_tools.commands.options import (
     say,
     warn,
 )
+from optipmb_tools.extras import needed
 from optipmb_tools.files import remove_unfinished
 from optipmb_tools.table_files import is_table
 from optipmb_tools.views.progress import FrameProgress
 
 if TYPE_CHECKING:
+    from optipmb_tools.run.rejoining import Rejoin
     from optipmb_tools.run.tracking import TrackedSequence
 
 
@@ -67,6 +69,18 @@ class TrackOptions:
             "--sensors", help="With --fuse: settings of a service (TOML), whose [sensors] say how sensors differ."
         ),
     ] = None
+    rejoin: Annotated[
+        float | None,
+        typer.Option(
+            metavar="[GAP_S]",
+            help="Join the tracks of an object that is seen again after at most so many seconds (60): the columns "
+            "object and object_probability of a table.",
+            show_default=False,
+        ),
+    ] = None
+    min_probability: Annotated[
+        float | None, typer.Option(help="With --rejoin: least probability of a join; default 0.98.", show_default=False)
+    ] = None
     keep_input: Annotated[
         bool, typer.Option("--keep-input", help="Of a bag, with --out FILE.mcap: also copy what is in it.")
     ] = False
@@ -79,9 +93,27 @@ class TrackOptions:
         typer.Option(metavar="[SCORE]", help="Write a submission; of KITTI confirmed tracks from this mean score on."),
     ] = None
 
+    def rejoining(self) -> "Rejoin | None":
+        """Return which tracks are joined.
+
+        Raises:
+            UsageError: A value is out of its bounds.
+            ClientError: scipy is not installed.
+        """
+        if self.rejoin is None:
+            return None
+        needed("optipmb track --rejoin", "evaluation", "scipy")
+        from optipmb_tools.run.rejoining import Rejoin  # noqa: PLC0415  loads the solvers of scipy
+
+        return Rejoin(self.rejoin, *() if self.min_probability is None else (self.min_probability,))
+
     def check_out(self, data: Data) -> None:
         """Refuse a file where the results are several; a bag of tracks holds one topic of a bag."""
         out = self.out
+        if self.rejoin is not None and (not is_table(out) or out.is_dir()):
+            raise UsageError(f"--rejoin: expected a table as --out, such as tracks.csv, received {out}")
+        if self.rejoin is None and self.min_probability is not None:
+            raise UsageError(f"--min-probability {self.min_probability:g}: expected --rejoin")
         if self.sensors is not None and not self.fuse:
             raise UsageError(f"--sensors {self.sensors}: expected --fuse, for one sensor has --profile alone")
         if self.view is not None and (self.view.suffix != ".html" or len(data.sequences) > 1):
@@ -115,6 +147,7 @@ def track(
 
     A profile may also be a TOML file here. Existence and confirmed also use the second after each frame; with
     --hindsight 0, replaying the same data through a service gives the same files.
+    With --rejoin, a table also says which tracks are of the same object; ids stay (docs/gaps.md).
     With --smooth, positions, headings and velocities also use later frames, which no service can.
 
     With --dump, the frames that a service saved are tracked again instead. Status 1 and one line say which
@@ -133,6 +166,7 @@ def track(
         more["submission"] = number_or_text(how.submission)
     opened = data.open(**more)
     how.check_out(opened)
+    rejoin = how.rejoining()
     chosen = opened.sequences
     name = how.profile or opened.dataset.profile
     parameters = profiles.profile_for(name, chosen)
@@ -157,6 +191,7 @@ def track(
                     smooth=how.smooth,
                     hindsight_s=how.hindsight,
                     sensors=sensors,
+                    rejoin=rejoin,
                     view=how.view,
                 ),
                 executor=executor,

@@ -22,7 +22,7 @@ from optipmb_tools.evaluation.errors import ErrorResult, evaluate_errors
 from optipmb_tools.evaluation.figures import defined
 from optipmb_tools.evaluation.gospa import CUTOFF, ORDER, GospaResult, evaluate_gospa
 from optipmb_tools.evaluation.hota import HotaResult, evaluate_hota
-from optipmb_tools.evaluation.tracks import read_compared, read_full_tracks, result_file
+from optipmb_tools.evaluation.tracks import By, read_compared, read_full_tracks, result_file
 from optipmb_tools.results import FullTable, ResultTable
 from optipmb_tools.results.nuscenes import read_nuscenes_results, result_table, scene_file
 
@@ -51,6 +51,8 @@ def evaluate_files(
     names: Sequence[str],
     rules: Rules,
     warn: Callable[[str], None] | None = None,
+    *,
+    by: By = "id",
 ) -> list[ClassResult]:
     """Return the CLEAR MOT figures of each class from the tracks of each sequence.
 
@@ -60,13 +62,14 @@ def evaluate_files(
         names: classes; a class that occurs neither in the truth nor in the results is left out.
         rules: how to compare.
         warn: is called with each assumption.
+        by: column that tells which rows are of one track.
 
     Raises:
         DatasetError: a sequence has no truth, or its result file is missing or wrong.
     """
     cases: dict[str, list[Case]] = {name: [] for name in names}
     confirmed: dict[str, list[Case]] = {name: [] for name in names}
-    pairs = read_compared(sequences, results, names, warn)
+    pairs = read_compared(sequences, results, names, warn, by=by)
     for sequence, (truth, table) in zip(sequences, pairs, strict=True):
         local = truth.to_sensor(sequence.poses)
         for name in names:
@@ -141,7 +144,7 @@ class ClassFigures:
 
 
 def load_recordings(
-    dataset: str, sequences: Sequence[DataSequence], results: Path, names: Sequence[str] = ()
+    dataset: str, sequences: Sequence[DataSequence], results: Path, names: Sequence[str] = (), by: By = "id"
 ) -> list[Recording]:
     """Return the sequences with their truth and their tracks, which each data set has in a layout of its own.
 
@@ -150,7 +153,7 @@ def load_recordings(
     """
     if dataset == "nuscenes":
         return _nuscenes_recordings(sequences, results)
-    pairs = zip(sequences, read_compared(sequences, results, names), strict=True)
+    pairs = zip(sequences, read_compared(sequences, results, names, by=by), strict=True)
     return [
         Recording(one, truth, tracks.to_world(one.poses), read_full_tracks(result_file(results, one.name)))
         for one, (truth, tracks) in pairs
@@ -268,12 +271,13 @@ class Evaluation:
     settings: Settings
     classes: tuple[str, ...] = ()  # names that classes of truth and tracks are mapped to
     here: Sequence[DataSequence] | None = None  # the sequences, where this process has opened them
+    by: By = "id"
 
     @cached_property
     def recordings(self) -> Sequence[Recording]:
         """Truth and tracks; a process reads them once."""
         sequences = self.here or self.data.open().sequences(self.names)
-        return load_recordings(self.data.name, sequences, self.tracks, self.classes)
+        return load_recordings(self.data.name, sequences, self.tracks, self.classes, self.by)
 
 
 def figures_of(shared: Evaluation, task: tuple[str, float | None]) -> list[ClassFigures]:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -20,12 +21,20 @@ _OTHERS = ("Van", "Truck", "Person_sitting", "Person", "Tram")
 """Classes of KITTI that are no synonyms of evaluated ones."""
 
 
+By = Literal["id", "object"]
+"""Column that tells which rows are of one track."""
+
 _BETTER = 0.5  # share of the distance from which another frame fits much better
 _ENOUGH = 20  # boxes from which distances are compared
 
 
 def read_compared(
-    sequences: Sequence[DataSequence], results: Path, names: Sequence[str], warn: Callable[[str], None] | None = None
+    sequences: Sequence[DataSequence],
+    results: Path,
+    names: Sequence[str],
+    warn: Callable[[str], None] | None = None,
+    *,
+    by: By = "id",
 ) -> list[tuple[Truth, ResultTable]]:
     """Return truth and tracks (as `read_tracks`) of each sequence, with one name for classes that mean the same.
 
@@ -34,6 +43,7 @@ def read_compared(
         results: as for `read_tracks`.
         names: classes to be evaluated, by whose names others are called.
         warn: is called with each assumption.
+        by: as for `read_tracks`.
 
     Raises:
         DatasetError: a sequence has no truth, or as for `read_tracks`.
@@ -43,7 +53,7 @@ def read_compared(
         truth = sequence.truth()
         if truth is None:
             raise DatasetError(f"sequence {sequence.name}", "annotations to compare with", "none")
-        pairs.append((truth, read_tracks(results, sequence)))
+        pairs.append((truth, read_tracks(results, sequence, by)))
     detected = _alike((label for one in sequences for label in one.labels), names)
     known = (*names, *detected.values())
     true = tuple(label for truth, _ in pairs for label in truth.labels)
@@ -109,27 +119,35 @@ def _alike(labels: Iterable[str], known: Sequence[str]) -> dict[str, str]:
     return {label: label if name in same and label.lower() != name.lower() else name for label, name in found.items()}
 
 
-def read_tracks(results: Path, sequence: DataSequence) -> ResultTable:
+def read_tracks(results: Path, sequence: DataSequence, by: By = "id") -> ResultTable:
     """Return the tracks of a sequence in the sensor frame of each frame, where KITTI's result files have them.
 
     Args:
         results: a table of tracks of one or more sequences, or a folder with `NAME.txt` (KITTI) or a table `NAME.*`;
             for nuScenes also a result file of its benchmark, or its folder.
         sequence: the tracked sequence.
+        by: `object`: ids are the column `object` of `optipmb track --rejoin`, or the track's id where it has none.
 
     Raises:
-        DatasetError: there is no such file, or it is wrong, or has frames that the sequence lacks.
+        DatasetError: there is no such file, or it is wrong, or has frames that the sequence lacks, or no objects.
     """
     if isinstance(sequence, NuScenesSequence) and (results.suffix == ".json" or (results / NUSCENES_FILE).is_file()):
         scene = result_table(read_nuscenes_results(results), sequence.name, sequence.samples)
+        _refuse_objects(results, by)
         return scene.to_sensor(sequence.poses)
     path = result_file(results, sequence.name)
     if is_table(path):
-        return _with_image(path, _from_table(path, sequence).to_sensor(sequence.poses), sequence)
+        return _with_image(path, _from_table(path, sequence, by).to_sensor(sequence.poses), sequence)
+    _refuse_objects(path, by)
     table = read_kitti_results(path)
     if len(table) and table.frame[-1] >= len(sequence):
         raise DatasetError(path, f"frames from 0 to {len(sequence) - 1}", f"frame {table.frame[-1]}")
     return _with_image(path, table, sequence)
+
+
+def _refuse_objects(path: Path, by: By) -> None:
+    if by == "object":
+        raise DatasetError(path, "a table with the column object (optipmb track --rejoin --out tracks.csv)", "none")
 
 
 def read_full_tracks(result: Path) -> FullTable | None:
@@ -146,7 +164,7 @@ def result_file(results: Path, name: str) -> Path:
     return next((path for path in tables if path.is_file()), results / f"{name}.txt")
 
 
-def _from_table(path: Path, sequence: DataSequence) -> ResultTable:
+def _from_table(path: Path, sequence: DataSequence, by: By) -> ResultTable:
     """Return the tracks of a table in the world frame."""
     tables: TableOptions = getattr(sequence, "tables", TableOptions())
     (table,) = read_objects(path, [path], tables)
@@ -159,11 +177,18 @@ def _from_table(path: Path, sequence: DataSequence) -> ResultTable:
         line = table.line(int(rows[np.flatnonzero(frame < 0)[0]]))
         raise DatasetError(path, f"stamps of the frames of {sequence.name}", "another stamp", line=line)
     labels = tuple(dict.fromkeys(boxes.name[rows].tolist()))
+    identity = boxes.id[rows] if boxes.id is not None else rows
+    if by == "object":
+        if table.object is None:
+            _refuse_objects(path, by)
+        else:
+            joined = table.object[boxes.row[rows]]
+            identity = np.where(joined < 0, identity, joined)
     center, yaw, _ = table.in_world(rows)
     return ResultTable(
         labels=labels,
         frame=frame,
-        id=boxes.id[rows] if boxes.id is not None else rows,
+        id=identity,
         label=np.array([labels.index(name) for name in boxes.name[rows].tolist()], dtype=np.int64),
         center=center,
         size=boxes.size[rows],

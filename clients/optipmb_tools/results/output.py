@@ -6,6 +6,7 @@ frame (its number in the table of detections, or else counted from 0), id, class
 yaw_rate, acceleration, score, existence, confirmed (1 or 0), age, time_since_detection and detection_row: the row of
 the table (from 0; for other data sets the place in the frame) of the detection that the track was given, no value while
 it is missed. A velocity has no value until it is known: from the second detection on, where the detector gives none.
+Where tracks are joined over gaps, object (id of the first track of the object, -1: none) and object_probability follow.
 With a georeference lat, lon, alt and heading follow (degrees, m above the ellipsoid, degrees from true north). On
 request the upper triangle of the covariance of (x, y, v, phi, omega, a) follows, `cov_x_x` to `cov_a_a`. Metres,
 seconds, radians; in text with the decimals of `DECIMALS`. The same tracks always give the same bytes.
@@ -20,6 +21,7 @@ import numpy as np
 from optipmb_schemas import Tracks
 from optipmb_schemas.json_form import shown
 
+from optipmb_tools.geometry import Floats, Ints
 from optipmb_tools.results import full_path, stacked, write_full
 from optipmb_tools.table_files import Columns, is_table, is_text, write_table
 
@@ -34,6 +36,7 @@ DECIMALS: Final = {
     **dict.fromkeys(("vx", "vy", "acceleration"), 3),
     **dict.fromkeys(("lat", "lon"), 9),
     **dict.fromkeys(("alt", "heading"), 4),
+    "object_probability": 4,
     **dict.fromkeys(COVARIANCE, 8),
 }
 """Decimals of columns in text: 0.1 mm, 1e-4 rad, 1 mm/s, probabilities to 1e-4."""
@@ -47,6 +50,7 @@ def track_columns(
     *,
     full: bool = False,
     georeference: "Georeference | None" = None,
+    objects: "Objects | None" = None,
 ) -> Columns:
     """Return tracks (world frame) by frame index as columns, with `full` also the covariance.
 
@@ -56,10 +60,12 @@ def track_columns(
         sequence: The tracked sequence; knows the columns and rows of its table of detections, if it came from one.
         full: Whether to add the covariance.
         georeference: Place of the world frame; adds latitude, longitude, height and true heading.
+        objects: Which object each track is of; adds `object` and `object_probability`.
     """
     order = sorted(tracks)
     parts = [tracks[index] for index in order]
     frame = np.repeat(np.array(order, dtype=np.int64), [len(one.id) for one in parts])
+    stamps = np.repeat(np.array([one.stamp_ns for one in parts], dtype=np.int64), [len(one.id) for one in parts])
     names = [name for one in parts for name in np.asarray(one.labels, np.str_)[one.label]]
     numbers = None if sequence is None else sequence.numbers
     columns: Columns = {} if sequence is None else {one: each[frame] for one, each in sequence.frame_columns.items()}
@@ -67,7 +73,6 @@ def track_columns(
         keys = {column: np.full(len(frame), value) for column, value in sequence.key_columns.items()}
         columns = keys | columns | {sequence.time_column: sequence.times[frame]}
     else:
-        stamps = np.repeat(np.array([one.stamp_ns for one in parts], dtype=np.int64), [len(one.id) for one in parts])
         columns = {"sequence": np.full(len(frame), name)} | columns | {"stamp_ns": stamps}
     columns |= {"frame": frame if numbers is None else numbers[frame]}
     columns |= {"id": stacked(parts, "id"), "class": np.array(names, dtype=np.str_)}
@@ -86,6 +91,8 @@ def track_columns(
         place = part.detection.tolist()
         detection += [np.nan if one < 0 else one if rows is None else rows[one] for one in place]
     columns["detection_row"] = np.array(detection, dtype=np.float64)
+    if objects is not None:
+        columns |= objects.columns(columns["id"], stamps)
     if georeference is not None:
         columns |= georeference.to_geographic(stacked(parts, "center"), columns["yaw"])._asdict()
     if full:
@@ -102,6 +109,25 @@ def write_tracks(path: Path, columns: Columns, digits: str) -> None:
             for name, values in columns.items()
         }
     write_table(path, columns)
+
+
+@dataclass(frozen=True)
+class Objects:
+    """The objects of the confirmed tracks of a recording."""
+
+    id: Ints  # (N,) of the tracks, ascending
+    object: Ints  # (N,) id of the first track of the object
+    probability: Floats  # (N,) that all joins up to this track are right
+    until_ns: Ints  # (N,) stamp from which a later track is the object
+
+    def columns(self, identity: Ints, stamp_ns: Ints) -> Columns:
+        """Return the columns of rows of tracks: `object` is -1 in rows that are of no object, or not any more."""
+        place = np.minimum(np.searchsorted(self.id, identity), max(len(self.id) - 1, 0))
+        known = np.isin(identity, self.id)
+        known[known] = stamp_ns[known] < self.until_ns[place[known]]
+        number, probability = np.full(len(identity), -1, dtype=np.int64), np.full(len(identity), np.nan)
+        number[known], probability[known] = self.object[place[known]], self.probability[place[known]]
+        return {"object": number, "object_probability": probability}
 
 
 class TrackCounts(NamedTuple):
@@ -164,11 +190,16 @@ class Results:
         self._table = is_table(out) and not out.is_dir()
         self._taken: dict[str, Path | Columns] = {}
 
-    def write(self, sequence: "DataSequence", tracks: Mapping[int, Tracks]) -> Path | Columns:
-        """Write the tracks of a sequence by frame index; return the file, or its rows of the table of all."""
+    def write(
+        self, sequence: "DataSequence", tracks: Mapping[int, Tracks], objects: Objects | None = None
+    ) -> Path | Columns:
+        """Write the tracks of a sequence by frame index; return the file, or its rows of the table of all.
+
+        Only a table has columns for `objects`.
+        """
         if self._table:
-            georeference = self._dataset.georeference
-            return track_columns(sequence.name, tracks, sequence, full=self._full, georeference=georeference)
+            place = self._dataset.georeference
+            return track_columns(sequence.name, tracks, sequence, full=self._full, georeference=place, objects=objects)
         path = self._dataset.write(self._out, sequence, tracks)
         if self._full:
             write_full(full_path(path), tracks)

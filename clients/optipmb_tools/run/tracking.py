@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,9 @@ from optipmb_tools.files import remove_unfinished
 from optipmb_tools.results.output import Latency, Results, TrackCounts, horizons_for, latency
 from optipmb_tools.run.bulk import Executor, Failed, Here, in_order, run
 from optipmb_tools.table_files import Columns
+
+if TYPE_CHECKING:
+    from optipmb_tools.run.rejoining import Rejoin
 
 SHOWN = 20  # recordings that failed, named in the error
 
@@ -247,6 +250,7 @@ class Tracking:
     smooth: bool = False  # estimate states from all frames of their track (`optipmb_tools.run.smoothing`)
     hindsight_s: float = 0.0  # time after a frame that tells which of its tracks exist (`optipmb.hindsight`)
     sensors: Sensors = ALIKE  # how frames that name their sensor are used
+    rejoin: "Rejoin | None" = None  # join tracks over gaps (`optipmb_tools.run.rejoining`)
     view: Path | None = None  # page of the tracks, of one sequence
 
 
@@ -288,7 +292,11 @@ def _track_one(job: _Job, name: str) -> tuple[TrackedSequence, Path | Columns]:
     options: dict[str, Any] = {"sensors": how.sensors, "smooth": how.smooth, "on_frame": job.on_frame}
     options["hindsight_s"] = how.hindsight_s
     found = track_whole(how.parameters, sequence, how.classes, how.modules, **options)
-    written = Results(dataset, job.out, full=how.full).write(sequence, found.tracks)
+    if how.rejoin is not None and found.estimated:
+        expected = "expected boxes in a world frame, or poses of the sensor"
+        raise UsageError(f"--rejoin: sequence {name}: {expected}; here the motion of the sensor is estimated")
+    objects = None if how.rejoin is None else how.rejoin.objects(found.tracks, how.parameters)
+    written = Results(dataset, job.out, full=how.full).write(sequence, found.tracks, objects)
     if how.view is not None:
         from optipmb_tools.views.page import write_page  # noqa: PLC0415  only where it is asked for
 

@@ -45,6 +45,7 @@ class SceneOptions:
     cyclists: int = 5
     clouds: bool = True  # frames carry their point cloud
     velocity: bool = False  # detections carry a velocity
+    lasting: bool = False  # objects keep their ids when they were hidden long, and more buildings hide them
 
     def __post_init__(self) -> None:
         for name, low, high in _BOUNDS:
@@ -104,7 +105,7 @@ class SceneSequence(DataSequence):
     def _scan(self, frame: int) -> Scan:
         """Return the scan of a frame; its first boxes are the objects, the others only hide them."""
         world = self._world
-        place, extent = fixed_boxes()
+        place, extent = fixed_boxes(lasting=self._options.lasting)
         center, yaw = self._local(
             frame,
             np.vstack([world.center[frame], place]),
@@ -136,7 +137,7 @@ class SceneSequence(DataSequence):
             points=view.points[rows],
             ease=world.ease[frame, rows],
         )
-        place, _ = fixed_boxes()
+        place, _ = fixed_boxes(lasting=self._options.lasting)
         sites, _ = self._local(frame, place, np.zeros(len(place)))
         return view, detect(seen, sites[:, :2], RADIUS, HEIGHT, self._chance(2, frame))
 
@@ -159,7 +160,10 @@ class SceneSequence(DataSequence):
             )
 
     def truth(self) -> Truth:
-        """Return the objects in range, from when they are first seen; one that was away or hidden long is a new one."""
+        """Return the objects in range, from when they are first seen.
+
+        One that was away or hidden long is a new one, or the same with the option `lasting`.
+        """
         world = self._world
         inside = np.zeros(world.yaw.shape, dtype=np.bool_)
         for frame in range(len(self)):
@@ -167,7 +171,8 @@ class SceneSequence(DataSequence):
             if frame not in self._scanned:
                 self._scan(frame)
         returns = np.stack([self._scanned[i][0] for i in range(len(self))])
-        identity = visits(inside & (returns > 0), round(HIDDEN_S * self._options.rate))
+        absence = len(self) if self._options.lasting else round(HIDDEN_S * self._options.rate)
+        identity = visits(inside & (returns > 0), absence)
         when, which = np.nonzero(inside & (identity >= 0))
         points = returns[when, which]
         covered = np.stack([self._scanned[i][1] for i in range(len(self))])[when, which]

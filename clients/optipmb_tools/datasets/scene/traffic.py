@@ -353,9 +353,17 @@ def _ride(length: float, speed: float, time: Floats, acceleration: float = 0.9) 
     return np.where(t < 0.5 * whole, near, length - near), np.minimum(speed, acceleration * left), whole
 
 
-def fixed_boxes() -> tuple[Floats, Floats]:
-    """Return centres (B, 3) and sizes (B, 3) of the building and the poles, along the axes."""
+def fixed_boxes(*, lasting: bool = False) -> tuple[Floats, Floats]:
+    """Return centres (B, 3) and sizes (B, 3) of the building and the poles, along the axes.
+
+    With `lasting` there are another building in the block, which hides cars, and walls before the pavements, which hide
+    pedestrians.
+    """
     boxes = [(-10.0, 0.0, 4.0, 18.0, 12.0, 8.0)]
+    if lasting:
+        walls = [(along, HALF_WIDTH + side * KERB) for along in (-15.5, -8.5, 8.5, 15.5) for side in (1.0, -1.0)]
+        boxes += [(3.0, 0.0, 4.0, 6.0, 16.0, 8.0)]
+        boxes += [(turn * x, turn * y, 1.5, 6.0, 0.4, 3.0) for turn, _ in _SIGN for x, y in walls]
     for turn, _ in _SIGN:
         for side in (KERB, -KERB):
             poles = [(along, HALF_WIDTH + side) for along in (-19.0, -12.0, 12.0, 19.0)]

@@ -75,6 +75,7 @@ class ObjectTable:
     options: Mapping[str, str]
     notes: tuple[str, ...] = ()
     confirmed: Bools | None = None  # (R,) of every row; None without such a column
+    object: Ints | None = None  # (R,) id of the first track of the object, -1: none; None without such a column
 
     def at(self, key: str, stamps: Ints, numbers: NDArray[Any] | None) -> tuple[Ints, Ints, Bools, list[str]]:
         """Return the boxes of a recording at the frames of a sequence.
@@ -151,11 +152,20 @@ def read_objects(path: Path, files: Sequence[Path], tables: TableOptions) -> lis
     reading = Reading(path, options, named=tables.named)
     found = read_tables(files, reading, scored=False, loaded=columns)
     notes = () if written else tuple(reading.notes)
-    return [ObjectTable(file, boxes, options, notes, _confirmed(columns[file])) for file, boxes in found]
+    return [
+        ObjectTable(
+            file, boxes, options, notes, _confirmed(columns[file]), _objects(columns[file]) if written else None
+        )
+        for file, boxes in found
+    ]
 
 
 def _confirmed(columns: Columns) -> Bools | None:
     return np.isin(columns["confirmed"].astype(str), ("1", "1.0", "True", "true")) if "confirmed" in columns else None
+
+
+def _objects(columns: Columns) -> Ints | None:
+    return columns["object"].astype(np.int64) if "object" in columns else None
 
 
 def _is_written(file: Path) -> bool:

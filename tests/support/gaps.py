@@ -1,0 +1,345 @@
+"""Generated scenes whose objects are hidden for seconds: detections with the object of each, tracks, and true gaps.
+
+A street behind buildings, a car park, a sensor that turns to and fro, and a square with kiosks; 10 Hz. Objects also
+end and begin behind what hides them, stop, and leave their slot to another one.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from optipmb_schemas import Tracks
+from optipmb_tools.run.rejoining import Rejoin, joins, tracklets
+from optipmb_tools.run.tracking import fields_of
+
+import optipmb
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+RATE: Final = 10
+CLASSES: Final = ("car", "pedestrian", "bicycle")
+SIZES: Final = np.array([[4.4, 1.85, 1.55], [0.7, 0.65, 1.74], [1.8, 0.65, 1.74]])
+SPREAD: Final = np.array([[0.09, 0.05, 0.06], [0.1, 0.1, 0.05], [0.05, 0.05, 0.05]])
+PLACE: Final = np.array([0.12, 0.06, 0.08])
+"""White error of detected places, m; errors that last are twice as large for cars."""
+FALSE: Final = 0.3
+"""False detections in a frame."""
+FALSE_OBJECT: Final = -1
+
+
+@dataclass
+class Scene:
+    """Paths of objects, and what hides them."""
+
+    seconds: float
+    rng: np.random.Generator
+    boxes: list[tuple[float, float, float, float]] = field(default_factory=list)  # x, y from and to, of buildings
+    label: list[int] = field(default_factory=list)
+    first: list[int] = field(default_factory=list)  # frame
+    path: list[Floats] = field(default_factory=list)  # (F, 2)
+    yaw: list[Floats] = field(default_factory=list)
+    dark: list[NDArray[np.bool_]] = field(default_factory=list)  # frames without detections
+    heading: Callable[[int], float] | None = None  # of a sensor of 120 degrees
+    region: tuple[float, float, float, float] = (-40.0, -5.0, 40.0, 30.0)
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return round(self.seconds * RATE)
+
+    def add(self, label: int, first: int, path: Floats, yaw: Floats | float, dark: Any = None) -> None:
+        """Add an object with places (F, 2) from a frame on; frames before the start or after the end are cut."""
+        begin, end = max(0, -first), min(len(path), self.frames - first)
+        if end - begin < 2:
+            return
+        self.label.append(label)
+        self.first.append(max(first, 0))
+        self.path.append(path[begin:end])
+        self.yaw.append(np.broadcast_to(yaw, len(path))[begin:end])
+        self.dark.append(np.zeros(end - begin, np.bool_) if dark is None else np.asarray(dark)[begin:end])
+
+    def hidden(self, place: Floats) -> NDArray[np.bool_]:
+        """Return whether the line from the sensor, at the origin, to places (N, 2) crosses a building."""
+        found = np.zeros(len(place), dtype=np.bool_)
+        way = np.where(np.abs(place) < 1e-9, 1e-9, place)
+        for x0, y0, x1, y1 in self.boxes:
+            a, b = np.array((x0, y0)) / way, np.array((x1, y1)) / way
+            enter, leave = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
+            found |= np.maximum(enter, 0.0) < np.minimum(leave, 1.0)
+        return found
+
+
+def _walk(rng: np.random.Generator, count: int, speed: float, spread: float, memory: float) -> Floats:
+    """Return speeds (F,) that vary around a mean."""
+    keep = np.exp(-1.0 / (RATE * memory))
+    noise, found = rng.standard_normal(count) * spread * np.sqrt(1.0 - keep**2), np.empty(count)
+    found[0] = spread * rng.standard_normal()
+    for k in range(1, count):
+        found[k] = keep * found[k - 1] + noise[k]
+    return np.maximum(speed + found, 0.1 * speed)
+
+
+def _along(rng: np.random.Generator, lane: tuple[Floats, Floats], speed: float, spread: float) -> tuple[Floats, Floats]:
+    """Return places (F, 2) and headings of an object that goes from one end of a lane to the other."""
+    start, end = lane
+    length = float(np.linalg.norm(end - start))
+    way = np.concatenate(([0.0], np.cumsum(_walk(rng, round(3 * RATE * length / speed), speed, spread, 4.0)) / RATE))
+    way = way[way < length]
+    ahead = (end - start) / length
+    aside = 0.15 * np.cumsum(rng.standard_normal(len(way))) / np.sqrt(RATE * 10.0)
+    place = start + way[:, None] * ahead + aside[:, None] * (-ahead[1], ahead[0])
+    return place, np.full(len(way), np.arctan2(ahead[1], ahead[0]))
+
+
+def _traffic(scene: Scene, lanes: list[tuple[int, Floats, Floats, float, float]], every: float, lost: float) -> None:
+    """Let objects arrive on lanes; the share `lost` ends somewhere on the way, and as many begin there."""
+    rng = scene.rng
+    for label, start, end, speed, spread in lanes:
+        clock = -40.0
+        while clock < scene.seconds:
+            place, yaw = _along(rng, (start, end), speed * rng.uniform(0.8, 1.2), spread)
+            kind = rng.random()
+            cut = int(rng.uniform(0.3, 0.7) * len(place))
+            first = round(clock * RATE)
+            if kind < lost:
+                place, yaw = place[:cut], yaw[:cut]
+            elif kind < 2 * lost:
+                place, yaw, first = place[cut:], yaw[cut:], first + cut
+            elif kind < 2.5 * lost and len(place) > cut:  # stops for a while
+                stop = np.full(round(rng.uniform(3.0, 8.0) * RATE), cut)
+                order = np.concatenate((np.arange(cut), stop, np.arange(cut, len(place))))
+                place, yaw = place[order], yaw[order]
+            scene.add(label, first, place, yaw)
+            clock += max(rng.exponential(every), 12.0 / speed)
+
+
+def street(seconds: float, rng: np.random.Generator) -> Scene:
+    """Return a street behind three buildings, with a parked row on its far side."""
+    scene = Scene(seconds, rng, boxes=[(-20.0, 4.5, -13.0, 5.5), (-4.0, 4.5, 2.0, 5.5), (11.0, 4.5, 19.0, 5.5)])
+    lanes = [(0, np.array((-45.0, y)), np.array((45.0, y)), 9.0, 1.0) for y in (9.0, 12.5)]
+    lanes += [(0, np.array((45.0, y)), np.array((-45.0, y)), 9.0, 1.0) for y in (16.0, 19.5)]
+    lanes += [(2, np.array((45.0, 22.0)), np.array((-45.0, 22.0)), 4.5, 0.5)]
+    _traffic(scene, lanes, 6.0, 0.1)
+    walks = [(1, np.array((-35.0, y)), np.array((35.0, y)), 1.4, 0.15) for y in (7.0, 26.0)]
+    walks += [(1, np.array((35.0, y)), np.array((-35.0, y)), 1.4, 0.15) for y in (7.8, 26.8)]
+    _traffic(scene, walks, 12.0, 0.1)
+    for x in np.arange(-30.0, 31.0, 6.0):
+        _park(scene, np.array((x, 24.0)) + 0.2 * rng.standard_normal(2), np.pi, mean=(60.0, 2.0))
+    return scene
+
+
+def _park(scene: Scene, place: Floats, yaw: float, mean: tuple[float, float], leaves: float = 0.0) -> None:
+    """Add a parked car that is detected and not detected by turns, of mean durations, and may leave its slot."""
+    rng, first = scene.rng, 0
+    while first < scene.frames:
+        stays = round(min(rng.exponential(leaves), 1e4) * RATE) if leaves else scene.frames
+        stays = min(stays, scene.frames - first)
+        dark = np.concatenate([
+            np.full(max(1, round(rng.exponential(mean[k % 2]) * RATE)), bool(k % 2))
+            for k in range(2 * scene.frames // round(sum(mean) * 2) + 40)
+        ])  # fmt: skip
+        dark = np.resize(dark, stays + 60)
+        drive = np.cumsum(np.minimum(0.15 * np.arange(60) / RATE * 10.0, 4.0)) / RATE
+        path = np.concatenate((np.tile(place, (stays, 1)), place + drive[:, None] * (np.cos(yaw), np.sin(yaw))))
+        dark[stays:] &= rng.random() < 0.3  # most are seen to drive off
+        scene.add(0, first, path, yaw, dark)
+        first += stays + 60 + round(rng.exponential(6.0) * RATE)
+
+
+def car_park(seconds: float, rng: np.random.Generator) -> Scene:
+    """Return two double rows of parked cars whose detections drop out; some slots change their owner."""
+    scene = Scene(seconds, rng)
+    for row, y in enumerate((6.0, 18.0, 24.0)):
+        for x in np.arange(-27.0, 28.0, 3.0):
+            if rng.random() < 0.7:
+                yaw = np.pi / 2 * (1 if row else -1)
+                leaves = 80.0 if rng.random() < 0.3 else 0.0
+                _park(scene, np.array((x, y)) + 0.15 * rng.standard_normal(2), yaw, (14.0, 2.5), leaves)
+    lanes = [(0, np.array((-40.0, 11.0)), np.array((40.0, 11.0)), 4.0, 0.6)]
+    lanes += [(1, np.array((-30.0, 13.0)), np.array((30.0, 13.0)), 1.3, 0.15)]
+    _traffic(scene, lanes, 15.0, 0.15)
+    return scene
+
+
+def turning_sensor(seconds: float, rng: np.random.Generator) -> Scene:
+    """Return a crossing as a sensor of 120 degrees sees it that turns to and fro by 70 degrees."""
+    scene = Scene(seconds, rng, region=(-40.0, -40.0, 40.0, 40.0))
+    scene.heading = lambda frame: 1.2 * np.sin(2.0 * np.pi * frame / (RATE * 16.0))
+    lanes = [(0, np.array((x, -45.0 * way)), np.array((x, 45.0 * way)), 7.0, 1.0) for x, way in ((12.0, 1), (16.0, -1))]
+    lanes += [(2, np.array((20.0, 45.0)), np.array((20.0, -45.0)), 4.5, 0.5)]
+    _traffic(scene, lanes, 7.0, 0.1)
+    walks = [(1, np.array((x, -30.0 * way)), np.array((x, 30.0 * way)), 1.4, 0.15) for x, way in ((8.0, 1), (23.0, -1))]
+    _traffic(scene, walks, 10.0, 0.1)
+    for y in np.arange(-28.0, 29.0, 7.0):
+        _park(scene, np.array((26.0, y)) + 0.2 * rng.standard_normal(2), np.pi / 2, mean=(60.0, 1.0))
+    return scene
+
+
+def _border(rng: np.random.Generator) -> Floats:
+    """Return a point on the border of the square."""
+    x, y = rng.uniform((-20.0, 4.0), (20.0, 26.0))
+    aside, end = rng.random() < 0.35, rng.random() < 0.5
+    return np.array((20.0 - 40.0 * end, y) if aside else (x, 4.0 + 22.0 * end))
+
+
+def square(seconds: float, rng: np.random.Generator) -> Scene:
+    """Return 55 people who cross a square with six kiosks from side to side, and some of them rest at its border."""
+    kiosks = [(x - 1.2, y - 0.8, x + 1.2, y + 0.8) for x in (-12.0, 0.0, 12.0) for y in (9.0, 17.0)]
+    scene = Scene(seconds, rng, boxes=kiosks, region=(-22.0, 3.0, 22.0, 27.0))
+    for _ in range(55):
+        place, points = rng.uniform((-20.0, 4.0), (20.0, 26.0)), []
+        speed, turned = rng.uniform(1.0, 1.6), rng.uniform(-np.pi, np.pi)
+        target = _border(rng)
+        rests, yaws, side = 0, [], rng.choice((-1.0, 1.0))
+        for _ in range(scene.frames):
+            if rests:
+                rests -= 1
+            else:
+                wanted = np.arctan2(*(target - place)[::-1])
+                turned += np.clip(np.angle(np.exp(1j * (wanted - turned))), -0.15, 0.15) + 0.03 * rng.standard_normal()
+                ahead = place + speed / RATE * np.array((np.cos(turned), np.sin(turned)))
+                if any(x0 - 0.4 < ahead[0] < x1 + 0.4 and y0 - 0.4 < ahead[1] < y1 + 0.4 for x0, y0, x1, y1 in kiosks):
+                    turned += 0.4 * side
+                    side = side if rng.random() < 0.95 else -side
+                else:
+                    place = ahead
+                if np.linalg.norm(target - place) < 0.7:
+                    target = _border(rng)
+                    rests = round(rng.uniform(2.0, 8.0) * RATE) if rng.random() < 0.3 else 0
+            points.append(place)
+            yaws.append(turned)
+        scene.add(1, 0, np.array(points), np.array(yaws))
+    return scene
+
+
+SCENES: Final = {"street": street, "car park": car_park, "turning sensor": turning_sensor, "square": square}
+
+
+@dataclass(frozen=True)
+class Recording:
+    """The detections and the truth of a scene."""
+
+    frames: list[dict[str, Any]]  # arguments of `make_frame`
+    source: list[Ints]  # object of each detection, or `FALSE_OBJECT`
+    truth: list[tuple[Ints, Floats]]  # objects that can be seen in each frame, and their places (N, 2)
+    labels: dict[int, int]  # of the objects
+
+
+def record(name: str, seed: int, seconds: float = 120.0) -> Recording:
+    """Return what a detector sees of a scene."""
+    rng = np.random.Generator(np.random.PCG64([seed, list(SCENES).index(name)]))
+    scene = SCENES[name](seconds, rng)
+    label = np.array(scene.label)
+    size = SIZES[label] * np.exp(SPREAD[label] * rng.standard_normal((len(label), 3)))
+    bias, lasting = 0.05 * rng.standard_normal((len(label), 3)), np.zeros((len(label), 2))
+    frames, sources, truths = [], [], []
+    first, last = np.array(scene.first), np.array(scene.first) + [len(one) for one in scene.path]
+    for k in range(scene.frames):
+        here = np.flatnonzero((first <= k) & (k < last))
+        place = np.array([scene.path[n][k - first[n]] for n in here]).reshape(-1, 2)
+        yaw = np.array([scene.yaw[n][k - first[n]] for n in here])
+        seen = ~scene.hidden(place) & ~np.array([scene.dark[n][k - first[n]] for n in here], dtype=np.bool_)
+        if scene.heading is not None:
+            aside = np.angle(np.exp(1j * (np.arctan2(place[:, 1], place[:, 0]) - scene.heading(k))))
+            seen &= np.abs(aside) < np.pi / 3.0
+        lasting = 0.95 * lasting + np.sqrt(1.0 - 0.95**2) * PLACE[label][:, None] * rng.standard_normal(lasting.shape)
+        truths.append((here[seen], place[seen]))
+        found = np.flatnonzero(seen & (rng.random(len(here)) < 0.92))
+        own, count = here[found], int(rng.poisson(FALSE))
+        noise = PLACE[label[own]][:, None] * rng.standard_normal((len(own), 2)) + lasting[own]
+        x0, y0, x1, y1 = scene.region
+        kinds = np.concatenate((label[own], rng.integers(0, 3, count)))
+        boxes = size[own] * np.exp(bias[own] + 0.03 * rng.standard_normal((len(own), 3)))
+        boxes = np.concatenate((boxes, SIZES[kinds[len(own) :]]))
+        center = np.concatenate((place[found] + noise, rng.uniform((x0, y0), (x1, y1), (count, 2))))
+        turned = yaw[found] + np.where(label[own] == 1, 0.25, 0.05) * rng.standard_normal(len(own))
+        turned = np.concatenate((turned, rng.uniform(-np.pi, np.pi, count)))
+        score = np.concatenate((rng.beta(8.0, 2.0, len(own)), rng.beta(2.0, 6.0, count)))
+        sources.append(np.concatenate((own, np.full(count, FALSE_OBJECT))))
+        frames.append({
+            "stamp_ns": k * 10**9 // RATE,
+            "labels": CLASSES,
+            "center": np.column_stack((center, 0.5 * boxes[:, 2])),
+            "size": boxes,
+            "yaw": np.angle(np.exp(1j * turned)),
+            "score": np.clip(score, 0.05, 0.99),
+            "label": kinds.astype(np.int64),
+        })  # fmt: skip
+    return Recording(frames, sources, truths, dict(enumerate(label.tolist())))
+
+
+def tracked(frames: list[dict[str, Any]], parameters: optipmb.Parameters) -> dict[int, Tracks]:
+    """Return the tracks of each frame as messages."""
+    tracker = optipmb.Tracker(parameters)
+    density, found = tracker.initial(), {}
+    for k, given in enumerate(frames):
+        result = tracker.step(density, optipmb.make_frame(parameters, **given)[0])
+        density = result.density
+        header = {"stream": "a/b/c", "epoch": bytes(16), "seq": k, "stamp_ns": given["stamp_ns"], "session": "0" * 32}
+        header |= {"profile": parameters.name, "cloud_used": False, "labels": parameters.labels}
+        found[k] = Tracks.trusted(header | fields_of(result.tracks, None, measured=result.measured))
+    return found
+
+
+def owners(tracks: dict[int, Tracks], source: list[Ints]) -> dict[int, tuple[int, int]]:
+    """Return the objects on which each track began and ended, by its first and last detections."""
+    rows: dict[int, list[int]] = {}
+    for k, one in tracks.items():
+        for identity, detection in zip(one.id.tolist(), one.detection.tolist(), strict=True):
+            if detection >= 0:
+                rows.setdefault(identity, []).append(int(source[k][detection]))
+    return {identity: (own[0], own[-1]) for identity, own in rows.items()}
+
+
+@dataclass(frozen=True)
+class Judged:
+    """True gaps of at most `gap_s`, and joins, of some recordings; results add up."""
+
+    gap: Floats = field(default_factory=lambda: np.empty((0, 2)))  # (G, 2) length, s, and the probability of its join
+    join: Floats = field(default_factory=lambda: np.empty((0, 2)))
+    """(J, 2) probability, and 1 of a right, 0 of a wrong one, NaN of tracks on nothing that is labelled."""
+
+    def __add__(self, other: "Judged") -> "Judged":
+        return Judged(np.concatenate((self.gap, other.gap)), np.concatenate((self.join, other.join)))
+
+    def counts(self, least: float) -> tuple[int, int, int]:
+        """Return the numbers of right, wrong and unlabelled joins from a probability on."""
+        right = self.join[self.join[:, 0] >= least, 1]
+        return int((right == 1.0).sum()), int((right == 0.0).sum()), int(np.isnan(right).sum())
+
+    def share(self, low: float, high: float, least: float) -> tuple[float, int]:
+        """Return the share of the gaps of these lengths that is joined, and their number."""
+        rows = (self.gap[:, 0] >= low) & (self.gap[:, 0] < high)
+        return float(np.mean(self.gap[rows, 1] >= least)) if rows.any() else np.nan, int(rows.sum())
+
+
+def judge(
+    tracks: dict[int, Tracks],
+    owner: dict[int, tuple[int, int]],
+    parameters: optipmb.Parameters,
+    *,
+    whole: bool = True,
+) -> Judged:
+    """Return the true gaps of a recording and its joins, with any probability.
+
+    A join is right if the earlier track ended on the object on which the later one began. Without `whole` annotations,
+    an object may lack one.
+    """
+    how = Rejoin()
+    found = tracklets(tracks, parameters.labels)
+    before, after, probability = joins(found, parameters, how.gap_s)
+    by = dict(zip(zip(before.tolist(), after.tolist(), strict=True), probability.tolist(), strict=True))
+    begun, ended = (np.array([owner[one][end] for one in found.id.tolist()], dtype=np.int64) for end in (0, 1))
+    gaps = []
+    for j in np.flatnonzero(begun != FALSE_OBJECT).tolist():
+        gap = (found.first_ns[j] - found.last_ns) * 1e-9
+        same = np.flatnonzero((ended == begun[j]) & (gap > 0.0) & (gap <= how.gap_s))
+        if len(same):
+            i = int(same[gap[same].argmin()])
+            gaps.append((gap[i], by.get((i, j), 0.0)))
+    right = (ended[before] == begun[after]).astype(np.float64)
+    nothing = ended[before] == FALSE_OBJECT, begun[after] == FALSE_OBJECT
+    right[nothing[0] & nothing[1] if whole else nothing[0] | nothing[1]] = np.nan
+    return Judged(np.array(gaps).reshape(-1, 2), np.column_stack((probability, right)))
