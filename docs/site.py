@@ -23,6 +23,11 @@ FIRST: Final = ("OnlineTracker", "OnlineTracks", "generic_parameters", "predict_
 """What most programs need of the library; the rest follows by name."""
 
 
+def on_config(config: MkDocsConfig) -> None:
+    """Write the version at the foot of each page."""
+    config.copyright = f"OptiPMB {optipmb.__version__}"
+
+
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the generated pages."""
     pages = {page: _page(ROOT / source) for source, page in PAGES.items()}

@@ -1,7 +1,7 @@
 """Asking the service: parameters, reset, state and kept tracks of a stream's session, and the services themselves."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TypeVar
 
 from optipmb_schemas import (
@@ -151,16 +151,32 @@ def _order(connection: Connection, key: str, request: Message, instance: str) ->
         raise ServiceUnavailable(f"no service {instance} answers")
 
 
-def find_services(connection: Connection, *, prefix: str = PREFIX, patience_s: float = 1.0) -> list[ServiceStatus]:
-    """Return the status of every service that is alive, by instance; waits up to `patience_s` for a first one."""
+def find_services(
+    connection: Connection,
+    *,
+    prefix: str = PREFIX,
+    patience_s: float = 1.0,
+    on_silent: Callable[[str], None] = lambda _: None,
+) -> list[ServiceStatus]:
+    """Return the status of every service that is alive, by instance.
+
+    Args:
+        connection: Where to ask.
+        prefix: First part of all keys.
+        patience_s: Time to wait for a first service, and for the answers of all.
+        on_silent: Is called with the instance of each service that is alive and has not answered.
+    """
     keys = Keys(prefix)
     deadline = time.monotonic() + patience_s
-    while not (alive := connection.alive(keys.all_alive())):
-        if time.monotonic() >= deadline:
-            return []
+    while True:
+        instances = [key.rsplit("/", 2)[1] for key in connection.alive(keys.all_alive())]
+        found = [_ask(connection, keys.status(instance), ServiceStatus) for instance in instances]
+        if (found and None not in found) or time.monotonic() >= deadline:
+            break
         time.sleep(RETRY_S)
-    instances = [key.rsplit("/", 2)[1] for key in alive]
-    found = [_ask(connection, keys.status(instance), ServiceStatus) for instance in instances]
+    for instance, status in zip(instances, found, strict=True):
+        if status is None:
+            on_silent(instance)
     return [status for status in found if status is not None]
 
 

@@ -1,5 +1,6 @@
 """What runs: services found by their liveliness, shown as a table or as JSON."""
 
+import contextlib
 import json
 import time
 
@@ -7,10 +8,11 @@ import pytest
 from fake_service import FakeService
 from optipmb_client import Connection
 from optipmb_client.sessions import find_services
-from optipmb_schemas import MemberSummary, Problem, ServiceStatus
+from optipmb_schemas import Keys, MemberSummary, Problem, ServiceStatus
 from optipmb_tools.cli import run
 from optipmb_tools.views.terminal import members_of, status_tables
 from rich.console import Console
+from routers import open_client
 
 
 def test_a_service_is_shown_with_its_streams_and_problems(
@@ -66,6 +68,21 @@ def test_every_service_is_found(endpoint: str) -> None:
         while len(found := find_services(connection)) > 1 and time.monotonic() < deadline:
             pass
         assert [status.instance for status in found] == ["one"]
+
+
+def test_a_service_that_does_not_answer_is_named(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """It has a liveliness token and answers no question, as one that is overloaded."""
+    with contextlib.closing(open_client(endpoint)) as session, FakeService(endpoint):
+        token = session.liveliness().declare_token(Keys().alive("slow"))
+        deadline = time.monotonic() + 60.0
+        with Connection(endpoint) as connection:
+            while len(connection.alive(Keys().all_alive())) < 2 and time.monotonic() < deadline:
+                pass
+        assert run(["status", "--connect", endpoint, "--timeout", "0.1"]) == 0
+        token.undeclare()
+    shown = capsys.readouterr()
+    assert "slow is alive and does not answer" in shown.err
+    assert shown.out.startswith("fake")
 
 
 def test_nobody_is_an_empty_list_after_the_patience(endpoint: str) -> None:

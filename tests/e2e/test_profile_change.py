@@ -40,7 +40,7 @@ def test_a_profile_that_differs_from_the_settings_is_shown_and_changed(
             node.tracks(SENSOR.stream, 1)
         service.wait_log("profile_differs")
         until(lambda: profiles() == [("kitti", "nuscenes")], "both are shown")
-        assert "kitti (settings: nuscenes)" in run_here(capsys, "status", "--connect", service.endpoint).stdout
+        assert "kitti, not nuscenes" in run_here(capsys, "status", "--connect", service.endpoint).stdout
         change = ("set", SENSOR.stream, "--profile", "nuscenes", "--connect", service.endpoint)
         refused = run_here(capsys, *change)
         assert (refused.returncode, refused.stderr.count("\n")) == (1, 1)

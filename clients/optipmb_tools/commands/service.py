@@ -23,7 +23,7 @@ from optipmb_schemas import SessionParameters, encode_json
 from rich.console import Console
 from rich.live import Live
 
-from optipmb_tools.commands.options import AsJson, Digits, Origin, print_json, print_table, report
+from optipmb_tools.commands.options import AsJson, Digits, Origin, print_json, print_table, report, warn
 from optipmb_tools.commands.service_options import ServiceOptions
 from optipmb_tools.datasets.interface import digits_of, georeference_of
 from optipmb_tools.table_files import SUFFIXES
@@ -48,9 +48,14 @@ def status(
         if watch:
             _watch(connection, service.prefix, interval)
             return
-        services = find_services(connection, prefix=service.prefix, patience_s=timeout)
+        services = find_services(
+            connection,
+            prefix=service.prefix,
+            patience_s=timeout,
+            on_silent=lambda name: warn(f"{name} is alive and does not answer: it starts, or is overloaded"),
+        )
     if not services:
-        raise ServiceUnavailable(f"no tracking service is alive at {connection.where} (prefix {service.prefix})")
+        raise ServiceUnavailable(f"no tracking service answers at {connection.where} (prefix {service.prefix})")
     if as_json:
         print_json({"command": "status", "services": [json.loads(encode_json(one)) for one in services]})
         return

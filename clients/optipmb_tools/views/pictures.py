@@ -42,7 +42,7 @@ NARROWEST_M = 30.0
 SCALE_M = 10.0
 WIDTH_PX = 800
 LEGEND = 2.0  # its width, inches, on the right
-HEIGHTS = (0.45, 0.72)  # least and largest height of the view, as a share of its width
+HEIGHTS = (0.45, 0.6)  # least and largest height of the view, as a share of its width
 _SHADE, _DETECTION = "#8E8E8E", _INK
 
 # Of the ground

@@ -100,7 +100,7 @@ def _streams(sessions: Sequence[SessionSummary]) -> Table:
 
 def profile_of(session: SessionSummary) -> str:
     """Return the profile of a session, and the one of the settings if it differs."""
-    return session.profile if session.configured is None else f"{session.profile} (settings: {session.configured})"
+    return session.profile if session.configured is None else f"{session.profile}, not {session.configured}"
 
 
 def duration(seconds: float) -> str:
