@@ -467,3 +467,16 @@ def test_detections_are_read_as_other_systems_write_them(change: Callable[[str],
     path.write_bytes(change(path.read_text()).encode())
     (frame, *_) = only_sequence(tmp_path).frames()
     assert len(frame) == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "profile"),
+    [("pointrcnn", "kitti"), ("SECOND_iou", "kitti-second-iou"), ("VirConv-S", "kitti-virconv"), ("mine", "auto")],
+)
+def test_the_profile_is_that_of_the_detector_that_is_named(tmp_path: Path, name: str, profile: str) -> None:
+    """The name of its folder counts; of unknown detectors it is auto, and a note says so."""
+    write_root(tmp_path)
+    (tmp_path / "detections/rcnn").rename(tmp_path / "detections" / name)
+    dataset = KittiDataset(tmp_path)
+    assert dataset.profile == profile
+    assert any("profile auto" in note for note in dataset.notes) == (profile == "auto")

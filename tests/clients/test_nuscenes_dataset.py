@@ -503,3 +503,26 @@ def test_a_cut_sweep_is_named(tmp_path: Path) -> None:
     path.write_bytes(b"123")
     with pytest.raises(DatasetError, match="20 bytes per point"):
         read_sweep(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "meta", "profile"),
+    [
+        ("CenterPoint_val", {}, "nuscenes"),
+        ("results", {"detector": "Center-Point, 10 sweeps"}, "nuscenes"),
+        ("cbgs", {}, "nuscenes-megvii"),
+        ("results", {"model": ["MEGVII"]}, "nuscenes-megvii"),
+        ("results", {}, "auto"),
+    ],
+)
+def test_the_profile_is_that_of_the_detector_that_is_named(
+    tmp_path: Path, name: str, meta: dict[str, Any], profile: str
+) -> None:
+    """The name of the file and `meta` count; of unknown detectors it is auto, and a note says so."""
+    write_root(tmp_path, [one_scene()])
+    path = write_detections(tmp_path, name, [one_scene()])
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps(content | {"meta": content["meta"] | meta}))
+    dataset = NuScenesDataset(tmp_path)
+    assert dataset.profile == profile
+    assert any("profile auto" in note for note in dataset.notes) == (profile == "auto")

@@ -265,6 +265,12 @@ class Dataset(ABC):
         """Write the file of a benchmark that holds all sequences, from their files."""
 
 
+def profile_named(text: str, known: Mapping[str, str]) -> str:
+    """Return the profile of the first detector whose name is part of a text, in any case; `auto` of none."""
+    plain = "".join(letter for letter in text.lower() if letter.isalnum())
+    return next((profile for detector, profile in known.items() if detector in plain), "auto")
+
+
 def chosen(names: Iterable[str], known: Mapping[str, _T], what: str, spelt: Callable[[str], str] = str) -> list[_T]:
     """Return the values of some names, or of `all`, each once.
 

@@ -16,12 +16,22 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from optipmb_schemas import Tracks
 
 from optipmb_tools.camera import SENSOR_FROM_CAMERA, Camera, sensor_from_kitti
-from optipmb_tools.datasets.interface import Cloud, DataSequence, Dataset, DetectionFrame, Points, Regions, Truth
+from optipmb_tools.datasets.interface import (
+    Cloud,
+    DataSequence,
+    Dataset,
+    DetectionFrame,
+    Points,
+    Regions,
+    Truth,
+    profile_named,
+)
 from optipmb_tools.files import DatasetError, numbers, read_points, read_rows
 from optipmb_tools.geometry import Floats, Ints, Pose, pose_of, stack_poses, to_world
 from optipmb_tools.results.kitti import SUBMISSION_SCORES, write_kitti_results
@@ -201,11 +211,18 @@ class KittiSequence(DataSequence):
         )
 
 
+PROFILES: Final = {
+    **dict.fromkeys(("pointrcnn", "pvrcnn", "casa"), "kitti"),
+    "second": "kitti-second-iou",
+    "virconv": "kitti-virconv",
+}
+"""Tuned profiles by the detector's name."""
+
+
 class KittiDataset(Dataset):
     """A KITTI tracking root, together with the results of a detector for tracking."""
 
     name = "kitti"
-    profile = "kitti"
 
     def __init__(
         self,
@@ -242,6 +259,13 @@ class KittiDataset(Dataset):
         if lacking := sorted(detected - set(self.present())):
             text = f"{len(lacking)} of {len(detected)} sequences with detections are left out, without a calib/SSSS.txt"
             self.notes.append(f"{base}: {text}: {' '.join(lacking)}")
+        if self.detector is not None and self.profile == "auto":
+            self.notes.append(f"{self.detector}: not the name of a known detector: profile auto fits it")
+
+    @cached_property
+    def profile(self) -> str:
+        """The profile that was tuned with the detector of this name, else `auto`."""
+        return "auto" if self.detector is None else profile_named(self.detector.name, PROFILES)
 
     @cached_property
     def probability(self) -> bool:

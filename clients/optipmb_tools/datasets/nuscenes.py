@@ -24,12 +24,21 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from optipmb_schemas import Tracks
 
-from optipmb_tools.datasets.interface import IDENTITY, Cloud, DataSequence, Dataset, DetectionFrame, Points, Truth
+from optipmb_tools.datasets.interface import (
+    IDENTITY,
+    Cloud,
+    DataSequence,
+    Dataset,
+    DetectionFrame,
+    Points,
+    Truth,
+    profile_named,
+)
 from optipmb_tools.files import DatasetError, read_points, read_text
 from optipmb_tools.geometry import Bools, Floats, Ints, Pose, pose_of, rotation_of
 from optipmb_tools.results.nuscenes import (
@@ -462,11 +471,14 @@ def read_sweep(path: Path) -> Points:
     return read_points(path, "a LiDAR scan", 5)
 
 
+PROFILES: Final = {"centerpoint": "nuscenes", "megvii": "nuscenes-megvii", "cbgs": "nuscenes-megvii"}
+"""Tuned profiles by the detector's name."""
+
+
 class NuScenesDataset(Dataset):
     """A nuScenes root together with one detector's results; each file is read on first use, and once."""
 
     name = "nuscenes"
-    profile = "nuscenes-megvii"
 
     def __init__(
         self,
@@ -499,6 +511,14 @@ class NuScenesDataset(Dataset):
         return self.submission
 
     @cached_property
+    def profile(self) -> str:
+        """The profile that was tuned with the detector which the file or its `meta` names, else `auto`."""
+        if self.submission is None:
+            return "auto"
+        texts = (str(value) for value in self.submission.meta.values() if not isinstance(value, bool))
+        return profile_named(" ".join([self.submission.path.stem, *texts]), PROFILES)
+
+    @cached_property
     def z_bottom(self) -> bool:
         """Whether the height of a detection means the bottom of its box."""
         if self._z_bottom is not None:
@@ -513,6 +533,8 @@ class NuScenesDataset(Dataset):
     def notes(self) -> tuple[str, ...]:
         """Assumptions about the detections, and the content of a submission."""
         found = list(self.submission.notes) if self.submission is not None else []
+        if self.submission is not None and self.profile == "auto":
+            found.insert(0, f"{self.submission.path}: neither name nor meta of a known detector: profile auto fits it")
         if self.submission is not None and (others := len(self.submission.rows) - len(self._known)):
             folder, count = self.tables.folder.name, len(self.submission.rows)
             found.append(f"{self.submission.path}: {others} of {count} samples are not in {folder}: left out")
