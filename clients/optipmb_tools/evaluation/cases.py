@@ -17,9 +17,8 @@ from scipy.optimize import linear_sum_assignment
 from optipmb_tools.datasets import DatasetError, Truth
 from optipmb_tools.evaluation.overlap import iou_2d, iou_3d
 from optipmb_tools.geometry import Bools, Floats, Ints
-from optipmb_tools.results import ResultTable
+from optipmb_tools.results import ResultTable, ranks
 
-_DECIMALS = 12
 _EPSILON = float(np.finfo(np.float64).eps)
 _HALF = 0.5
 
@@ -134,10 +133,7 @@ class Case:
 
     def mean_scores(self) -> Floats:
         """Return for each track row (K,) the mean score of its whole track."""
-        _, which = np.unique(self.track_id, return_inverse=True)
-        count = np.bincount(which)
-        # Rounding in the sum must not tell tracks of equal scores apart.
-        return np.round(np.bincount(which, self.track_score) / np.maximum(count, 1), _DECIMALS)[which]
+        return ranks(self.track_id, self.track_score)
 
 
 def prepare(truth: Truth, tracks: ResultTable, name: str, rules: Rules, sequence: str = "") -> Case:

@@ -77,6 +77,21 @@ class ResultTable(BoxTable):
         return self if self.confirmed is None else self.take(self.confirmed)
 
 
+_DECIMALS: Final = 12
+"""Of ranks: rounding in the sum must not tell tracks of equal scores apart."""
+
+
+def ranks(identity: Ints, score: Floats) -> Floats:
+    """Return the rank of the track of each row (R,), by which AMOTA, sAMOTA and thresholds sort tracks.
+
+    The mean score of the frames that detect the track, times the share of its frames that do: as predicted rows have
+    score zero, the mean of all rows.
+    """
+    _, which = np.unique(identity, return_inverse=True)
+    count = np.maximum(np.bincount(which), 1)
+    return np.asarray(np.round(np.bincount(which, score) / count, _DECIMALS)[which])
+
+
 def column_shape(name: str) -> tuple[int, ...]:
     """Return the shape of one row of a column of tracks."""
     return tuple(length for length in Tracks.arrays[name].shape if isinstance(length, int))

@@ -16,7 +16,7 @@ from optipmb_schemas.installation import install_command
 
 from optipmb_tools.datasets import DataSequence, DetectionFrame, Truth
 from optipmb_tools.geometry import Floats, Ints, box_corners, rotation_of, stack_poses, to_world
-from optipmb_tools.results import ResultTable
+from optipmb_tools.results import ResultTable, ranks
 from optipmb_tools.views.colours import COLOURS, colour_of
 
 if TYPE_CHECKING:
@@ -439,6 +439,4 @@ def _from_score(table: ResultTable, results: "Sequence[ClassResult]", score: flo
         return table
     best = {result.name: result.sweep.thresholds[result.sweep.best] for result in results}
     least = np.array([score if score is not None else best.get(label, 0.0) for label in table.labels])
-    _, which = np.unique(table.id, return_inverse=True)
-    mean = np.round(np.bincount(which, table.score) / np.bincount(which), 12)  # as thresholds are
-    return table.take(np.asarray(mean[which] >= least[table.label], dtype=np.bool_))
+    return table.take(np.asarray(ranks(table.id, table.score) >= least[table.label], dtype=np.bool_))
