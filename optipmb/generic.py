@@ -93,8 +93,8 @@ def _of_class(kind: str, period: float) -> dict[str, Any]:
         "birth_overlap": 0.1,
         "motion": "cv" if agile else "ctra",
         "acceleration_time": None if agile else 1.0 if two_wheeled else 3.0,
-        "confirm_from": 0.5,
-        "confirm_until": 0.3,
+        "confirm_from": 0.55,
+        "confirm_until": 0.4,
         "calibration": {
             "memory": round(0.8 ** (10.0 * period), 4),  # 0.8 over a tenth of a second
             "missed": 1.0,
