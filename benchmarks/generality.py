@@ -6,6 +6,7 @@ and every fifth frame of KITTI. Columns in addition to `optipmb evaluate`:
 
 - IDF1, IDS all: of the tracks above the best threshold, and identity switches of all tracks.
 - scenes: AMOTA of nuScenes, the mean over scenes that have objects.
+- confirmed tracks, existence, NEES and inside: as `optipmb track` writes them, with `--hindsight` seconds.
 - sure: HOTA of the confirmed tracks alone, without a threshold on scores.
 - gain: confirmed tracks with an object within two metres, less those without, as a share of the objects.
 - confirmed: share of all tracks that are confirmed.
@@ -15,7 +16,8 @@ and every fifth frame of KITTI. Columns in addition to `optipmb evaluate`:
 - existence: largest difference of the predicted and the observed share of objects, of tenths with `TENTH` of the boxes.
 - speed: root mean square error of the velocity of moving objects in KITTI, m/s, against labels half a second apart.
 
-With `--summary` it prints the figures by which a change of the default is judged, a line each. With `--cache` a cell is
+With `--summary` it prints the figures by which a change of the default is judged, a line each, with `--table` those of
+each detector with `auto` and with its tuned profile, at the full rate. With `--cache` a cell is
 computed once for each state of the tracker.
 """
 
@@ -49,6 +51,7 @@ from optipmb_tools.tuning.clips import Clip, load, of_class
 from optipmb_tools.tuning.scoring import plain_figures, rules_of, scorer_of
 
 import optipmb
+from optipmb.hindsight import with_hindsight
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -146,6 +149,7 @@ class Cell:
     posed: bool = True
     distort: str = ""
     fast: bool = False
+    hindsight: float = 1.0
 
     def figures(self) -> Figures:
         """Return the figures of each class."""
@@ -159,7 +163,7 @@ class Cell:
         for one in taken:
             parameters = profiles.profile_for(self.profile, [one])
             clip = load(one, parameters, rules)
-            tracked.append((clip, *track(clip, parameters, posed=self.posed)))
+            tracked.append((clip, *track(clip, parameters, posed=self.posed, hindsight=self.hindsight)))
         found = {}
         for name in names:
             if name not in tracked[0][0].labels:
@@ -208,14 +212,18 @@ def sequences_of(root: Path, detector: str, *, fast: bool) -> tuple[DataSequence
     return tuple(one for one in opened.sequences(["all"]) if not fast or one.name in FEW_SEQUENCES)
 
 
-def track(clip: Clip, parameters: Parameters, *, posed: bool) -> tuple[FullTable, Bools]:
-    """Return the tracks of all classes in the world frame, and which are confirmed."""
+def track(clip: Clip, parameters: Parameters, *, posed: bool, hindsight: float) -> tuple[FullTable, Bools]:
+    """Return the tracks of all classes in the world frame, and which are confirmed, with some seconds of hindsight."""
     tracker = optipmb.Tracker(parameters)
     found: dict[int, Tracks] = {}
     density = tracker.initial()
     for index, frame in enumerate(clip.frames):
         result = tracker.step(density, frame)
         density, found[index] = result.density, result.tracks
+    if hindsight:
+        ends = np.searchsorted(clip.stamps, clip.stamps + round(hindsight * 1e9), "right").tolist()
+        later = [[found[k] for k in range(index + 1, end)] for index, end in enumerate(ends)]
+        found = {index: with_hindsight(one, later[index], parameters) for index, one in found.items()}
     table = full_table(parameters.labels, found)
     confirmed, when = stacked(list(found.values()), "confirmed").astype(np.bool_), table.frame
     rotation, translation = clip.rotation[when], clip.translation[when]
@@ -398,11 +406,22 @@ def _ranges(given: Summary, figure: str, form: str, scale: float = 1.0) -> str:
     return ", ".join(parts)
 
 
+def _each(given: Summary, figure: str, low: float, high: float) -> str:
+    """Return how many cells of cars and pedestrians have a figure from `low` to `high`, and those that do not."""
+    count, others = 0, []
+    for cell in ALL:
+        for label, found in given.of(*cell).items():
+            value = found[figure]
+            if value is not None and label.lower() in {"car", "pedestrian"}:
+                count += 1
+                others += [] if low <= value <= high else [f"{cell[0]} 1/{cell[1]} {label} {value:.3g}"]
+    return f"{count - len(others)} of {count} from {low:g} to {high:g}; not {', '.join(others) or 'none'}"
+
+
 def _gains(given: Summary) -> str:
     values = []
-    for detector in ("pointrcnn", "second_iou"):
-        for label in ROAD_USERS:
-            values += given.across("gain", label, [(detector, 1), (detector, 5)])
+    for label in ROAD_USERS:
+        values += given.across("gain", label, [("pointrcnn", 1), ("second_iou", 1), ("second_iou", 5)])
     values += given.across("gain", "Car", [("casa", 1)])
     for label in ("car", "pedestrian"):
         values += given.across("gain", label, NUSCENES)
@@ -431,11 +450,27 @@ SUMMARY: dict[str, Callable[[Summary], str]] = {
     "HOTA, %": lambda given: _ranges(given, "HOTA", ".1f", 100.0),
     "inside the 95 % ellipse, %": lambda given: _ranges(given, "inside", ".0f", 100.0),
     "NEES": lambda given: _ranges(given, "NEES", ".1f"),
+    "inside from .90 to .97, NEES from 1.5 to 3, existence to .15, cells": lambda given: " | ".join(
+        _each(given, *one) for one in (("inside", 0.9, 0.97), ("NEES", 1.5, 3.0), ("existence", 0.0, 0.15))
+    ),
     "position error of tracks beside boxes": lambda _: f"{smoothing():.2f}",
     "velocity error of moving cars, m/s, by KITTI detector": _speeds,
     "existence, largest difference": lambda given: _ranges(given, "existence", ".2f"),
     "confirmed, (TP - FP) / true": _gains,
 }
+
+
+def table(given: Summary) -> Iterator[str]:
+    """Yield the rows of the table in `docs/tuning.md`: figures with `auto`, and with the profile of the detector."""
+    yield "| detector | class | figure | `auto` | tuned | profile |"
+    yield "| --- | --- | --- | ---: | ---: | --- |"
+    for detector, (folder, names) in DETECTORS.items():
+        figure = "sAMOTA" if folder == "kitti" else "AMOTA"
+        opened = open_dataset("kitti" if folder == "kitti" else "nuscenes", given.root / folder, detector, clouds=False)
+        for name in (one for one in names if one.lower() in {"car", "pedestrian"}):
+            auto, tuned = (given.of(detector, 1, profile)[name][figure] or 0.0 for profile in ("auto", opened.profile))
+            values = _joined((auto, tuned), scale=100.0).replace(" / ", " | ")
+            yield f"| {detector} | {name} | {figure} | {values} | `{opened.profile}` |"
 
 
 def _state(profile: str) -> str:
@@ -471,22 +506,27 @@ def main() -> None:
     parser.add_argument("--strides", default="1,2,5", help="of frames, with commas")
     parser.add_argument("--unposed", action="store_true", help="withhold the poses of the sensor")
     parser.add_argument("--distort", default="", choices=["", "scaled", "cubed"], help="scores x 0.4, or cubed")
+    parser.add_argument("--hindsight", type=float, default=1.0, help="seconds; 0: as the service confirms tracks")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--fast", action="store_true", help="a few sequences only")
     parser.add_argument("--summary", action="store_true", help="print the figures by which the default is judged")
+    parser.add_argument("--table", action="store_true", help="print the table of docs/tuning.md")
     parser.add_argument("--cache", type=Path, help="folder of figures of cells")
     given = parser.parse_args()
     measured = functools.partial(figures, cache=given.cache)
-    if given.summary:
+    if given.summary or given.table:
 
         def of(detector: str, stride: int, profile: str = "auto", *, posed: bool = True) -> Figures:
-            return measured(Cell(given.root, detector, stride, profile, posed, given.distort, given.fast))
+            return measured(
+                Cell(given.root, detector, stride, profile, posed, given.distort, given.fast, given.hindsight)
+            )
 
-        for name, value in Summary(of, given.root, given.fast).lines():
-            print(f"{name}: {value}", flush=True)  # noqa: T201
+        summary = Summary(of, given.root, given.fast)
+        for line in table(summary) if given.table else (": ".join(one) for one in summary.lines()):
+            print(line, flush=True)  # noqa: T201
         return
     cells = [
-        Cell(given.root, detector, stride, name, not given.unposed, given.distort, given.fast)
+        Cell(given.root, detector, stride, name, not given.unposed, given.distort, given.fast, given.hindsight)
         for detector, stride in product(given.detectors.split(","), map(int, given.strides.split(",")))
         if stride in STRIDES[folder := DETECTORS[detector][0]]
         for profile in given.profiles.split(",")
