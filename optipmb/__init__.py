@@ -22,6 +22,7 @@ Pure computation: no files but profiles and calibrations, no network, no state o
 from optipmb.class_names import class_indices, common_name
 from optipmb.density import Bernoullis, Density, Poissons, bytes_of, columns_in, columns_of, density_of
 from optipmb.detection_probability import points_in_boxes
+from optipmb.detectors import from_detector
 from optipmb.errors import DensityError, EffortError, FrameError, OptipmbError, ParameterError
 from optipmb.extract import Tracks, sound
 from optipmb.field_of_view import FieldOfView
@@ -90,6 +91,7 @@ __all__ = [
     "columns_of",
     "common_name",
     "density_of",
+    "from_detector",
     "generic_parameters",
     "load_profile",
     "make_frame",

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from optipmb.class_names import class_indices
+from optipmb.detectors import forms_of, from_detector
 from optipmb.errors import FrameError
 from optipmb.frame import make_frame
 from optipmb.tracker import Tracker
@@ -347,13 +348,14 @@ class OnlineTracker:
         """Take the detections of the next frame and return the tracks.
 
         Args:
-            boxes: columns by name: a dictionary, a list of one for each box, a structured array, or a data frame of
-                pandas, polars or pyarrow. `center` (M, 3) or `x`, `y`, `z`; `size` (M, 3) or `l`, `w`, `h` or `length`,
-                `width`, `height`; `yaw` or `heading` (M,) rad; `score` or `confidence` (M,) in (0, 1]; `class`,
-                `label`, `name`, `category` or `type` (M,): class names, or their places in the profile; `velocity`
-                (M, 2) or `vx`, `vy`, m/s, NaN where unknown; `position_covariance` (M, 3, 3), m^2, likewise. Sizes,
-                headings and `z` may be NaN or absent, unknown; but with a size a missing column `z` is 0 and `h`
-                1.5 m. Without `score` it is 1. None: nothing was detected.
+            boxes: a result of a detection framework (`from_detector`), or columns by name: a dictionary, a list of one
+                for each box, a structured array, or a data frame of pandas, polars or pyarrow. `center` (M, 3) or `x`,
+                `y`, `z`; `size` (M, 3) or `l`, `w`, `h` or `length`, `width`, `height`; `yaw` or `heading` (M,) rad;
+                `score` or `confidence` (M,) in (0, 1]; `class`, `label`, `name`, `category` or `type` (M,): class
+                names, or their places in the profile; `velocity` (M, 2) or `vx`, `vy`, m/s, NaN where unknown;
+                `position_covariance` (M, 3, 3), m^2, likewise. Sizes, headings and `z` may be NaN or absent, unknown;
+                but with a size a missing column `z` is 0 and `h` 1.5 m. Without `score` it is 1. None: nothing was
+                detected.
             t: time of the frame: seconds, or a date (of pandas too; UTC where it has no zone); or
             stamp_ns: nanoseconds.
             pose: world from sensor, or None when the boxes are in the world frame; with a camera on a vehicle, of it.
@@ -374,6 +376,10 @@ class OnlineTracker:
             stamp_ns = _stamp(t)
             if stamp_ns < max(self.density.stamp_ns, 0):
                 raise FrameError("t", f"a time from {max(self.density.stamp_ns, 0) / 1e9:g} s on", str(t))
+        if forms_of(boxes):
+            arrays = {**from_detector(boxes, camera=camera), **arrays}
+            boxes = None
+            arrays.pop("camera", None)
         row, outside = None, 0
         if camera is None:
             columns = _columns(boxes, arrays)
