@@ -128,10 +128,8 @@ def read_table(path: Path, options: Mapping[str, str] | None = None) -> Columns:
     """
     pa = _pyarrow()
     kind, options = _kind(path), options or {}
-    if not path.is_dir() and kind not in (*SUFFIXES, *_READ_ONLY):
+    if not path.is_dir() and kind not in (*SUFFIXES, *_READ_ONLY, *_PICKLES):
         found = f"a file named *{kind}" if kind else "no suffix"
-        if kind in _PICKLES:
-            found = "a pickle, which may run any program: docs/own-data.md, Recipes, converts it in five lines"
         raise DatasetError(path, f"a table ({', '.join((*SUFFIXES, *_READ_ONLY))})", found)
     columns: Columns = {}
     try:
@@ -161,6 +159,10 @@ def _read(pa: Any, path: Path, kind: str, options: Mapping[str, str]) -> Any:
         return _read_text(pa, path, kind, options)
     if kind == ".json":
         return _rows(pa, split_boxes(read_json(path)))
+    if kind in _PICKLES:
+        from optipmb_tools.pickles import read_pickle  # noqa: PLC0415  of one format
+
+        return _rows(pa, split_boxes(read_pickle(path)))
     if kind in {".jsonl", ".ndjson"}:
         table = _read_lines(pa, path, options)
     elif kind == ".parquet":

@@ -127,7 +127,7 @@ def test_the_day_is_found_where_a_number_exceeds_twelve(tmp_path: Path) -> None:
         ("d.parquet", "version https://git-lfs.github.com/spec/v1\noid sha256:0\n", {}, "git lfs pull"),
         ("d.csv", "<!DOCTYPE html>\n<html>\n", {}, "a page of HTML"),
         ("d.csv", "PK\3\4and more", {}, "a ZIP archive or a spreadsheet"),
-        ("d.pkl", "anything", {}, "docs/own-data.md, Recipes"),
+        ("d.pkl", "anything", {}, "a result.pkl of OpenPCDet"),
         ("d.npy", "anything", {}, "a table (.csv, .tsv, .parquet, .jsonl, .ndjson, .feather, .arrow, .json, .txt)"),
         ("d.xlsx", "anything", {}, "a table (.csv, .tsv, .parquet, .jsonl, .ndjson, .feather, .arrow, .json, .txt)"),
         ("d.json", '{"meta": {}, "results": {"a": []}}', {}, "--dataset nuscenes --root ROOT --detections"),
