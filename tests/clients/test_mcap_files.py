@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from optipmb_client.zenoh import Connection
 from optipmb_schemas import (
     Detections,
+    FieldOfView,
     Keys,
     Message,
     Points,
@@ -405,6 +407,26 @@ def test_a_recording_is_a_dataset(tmp_path: Path) -> None:
     assert frames[0].labels == ("Car",)
     assert np.array_equal(frames[1].center, detections(1).center)
     assert len(sequence.poses) == len(sequence) == 2
+
+
+def test_boxes_of_the_world_are_carried_to_a_sensor_with_a_field_of_view(tmp_path: Path) -> None:
+    """All columns are what they would be in the frame of a sensor that is turned to the left by a right angle."""
+    pose = Pose(translation=[10.0, 0.0, 0.0], quaternion=[np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
+    seen = FieldOfView(azimuth=[-1.0, 1.0], elevation=[-1.0, 1.0], range=[0.0, 50.0])
+    common: dict[str, Any] = {"stream": STREAM, "epoch": EPOCH, "labels": ["Car"], "pose": pose, "field_of_view": seen}
+    common |= {"label": [0], "size": [[4.0, 2.0, 1.5]], "score": [0.9]}
+    world: dict[str, Any] = {"center": [[10.0, 5.0, 1.0]], "yaw": [np.pi / 2], "velocity": [[0.0, 3.0]]}
+    sensor: dict[str, Any] = {"center": [[5.0, 0.0, 1.0]], "yaw": [0.0], "velocity": [[3.0, 0.0]]}
+    variances = {"world": [1.0, 2.0, 3.0], "sensor": [2.0, 1.0, 3.0]}
+    with RecordingWriter(tmp_path / "two.mcap") as writer:
+        for seq, (frame, columns) in enumerate({"world": world, "sensor": sensor}.items()):
+            covariance = np.diag(variances[frame])[None]
+            at: dict[str, Any] = {"seq": seq, "stamp_ns": seq, "frame": frame, "position_covariance": covariance}
+            put(writer, Detections(**common, **columns, **at), seq)
+    one, other = open_dataset("mcap", tmp_path / "two.mcap").sequences(["all"])[0].frames()
+    for name in ("center", "yaw", "velocity", "position_covariance"):
+        np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-12, err_msg=name)
+    assert one.pose == other.pose
 
 
 def test_a_dataset_needs_frames_in_order(tmp_path: Path) -> None:
