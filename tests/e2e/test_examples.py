@@ -74,7 +74,8 @@ class Program(AbstractContextManager["Program"]):
         """Return the lines up to one that begins like this."""
         with self._came:
             assert self._came.wait_for(lambda: any(re.match(pattern, one) for one in self.lines), 60), self.lines
-            return list(self.lines)
+            last = next(place for place, one in enumerate(self.lines) if re.match(pattern, one))
+            return self.lines[: last + 1]
 
     def _read(self) -> None:
         assert self.process.stdout is not None
