@@ -14,7 +14,8 @@ from optipmb_schemas import MessageError, Tracks
 from optipmb_schemas.ros2.arrays import CLOUD, DETECTIONS, boxes_of, points_of
 from optipmb_schemas.ros2.tracks import HORIZONS, TOPICS, messages
 from optipmb_schemas.ros2.transforms import TransformError, Transforms
-from optipmb_schemas.ros2.types import own_types
+from optipmb_schemas.ros2.types import Types, own_types
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
 REFERENCE = json.loads(Path(__file__).with_name("ros2_reference.json").read_text())
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
@@ -425,3 +426,13 @@ def test_damaged_bytes_raise_nothing_else() -> None:
         except MessageError:
             refused += 1
     assert refused > len(whole) // 2
+
+
+def test_definitions_of_the_data_take_the_place_of_ours() -> None:
+    """Data of a type whose fields have changed since are read as they were written."""
+    name = "geometry_msgs/msg/Point"
+    turned = MessageDefinition(MessageDefinitionFormat.MSG, "float64 z\nfloat64 y\nfloat64 x\n")
+    data = own_types().write(own_types().new(name, x=1.0, y=2.0, z=3.0))
+    there, ours = Types({name: turned}).read(name, data), Types({}).read(name, data)
+    assert (there.x, there.y, there.z) == (3.0, 2.0, 1.0)
+    assert (ours.x, ours.y, ours.z) == (1.0, 2.0, 3.0)
