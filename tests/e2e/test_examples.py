@@ -103,9 +103,9 @@ def test_the_examples_work_twice(service: ServiceProcess, time: int) -> None:
             one.until("listens")
         with Program(publisher) as car:
             assert car.process.wait(200) == 0
-        rows = [line.split() for line in tracks.until(r".* at 49\.")[1:]]
+        rows = [line.split() for line in tracks.until(r".* at (4[89]|5\d)\.")[1:]]
         said = [line.split() for line in events.until(f"yard left .* {time}$")[1:]]
-        predicted = outputs.until("frame 45")[1:]
+        predicted = outputs.until(r"frame 4\d")[1:]
     assert len(rows) >= 45
     assert {tuple(row[:4]) for row in rows} == {("garage/robot-1/lidar", "track", rows[0][2], "car")}
     x = [float(row[5]) for row in rows]
