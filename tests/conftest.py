@@ -21,7 +21,7 @@ forked.ALLOWED = True
 guard.begin()
 
 OTHERS = {
-    "alone": ("e2e/test_cluster.py", "e2e/test_load.py", "e2e/test_soak.py"),
+    "alone": ("clients/test_long_tables.py", "e2e/test_cluster.py", "e2e/test_load.py", "e2e/test_soak.py"),
     "accuracy": (
         "clients/test_accuracy_gaps.py",
         "clients/test_accuracy_kitti.py",

@@ -6,10 +6,12 @@ with a file for each frame, are read as records, one for each box; such a folder
 or has `.txt` files in the format of KITTI's object benchmark.
 """
 
+import codecs
 import io
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
@@ -53,6 +55,7 @@ _SEPARATORS: Final = ",;\t"
 _MOST_PARTS: Final = 16
 _EXACT: Final = 2**53  # integers up to it are exact as 64-bit numbers with a point
 _INT64: Final = 2**63
+_BLOCK: Final = 1 << 20  # characters of a text that are read at once
 _LONGEST_LINE: Final = 1 << 25  # bytes of a line of JSON that pyarrow reads; longer ones are read one by one
 _OWN: Final = {".parquet": (b"par1",), ".feather": (b"arrow1", b"feather"), ".arrow": (b"arrow1", b"feather")}
 _OWN_COMPRESSED: Final = (b"\x1f\x8b", b"\x28\xb5\x2f\xfd")
@@ -112,6 +115,7 @@ def _pyarrow() -> Any:
     needed("tables", "table", "pyarrow", need="need")
     import pyarrow as pa  # noqa: PLC0415  packages of an extra
 
+    pa.set_memory_pool(pa.system_memory_pool())  # the only one that gives memory back
     return pa
 
 
@@ -141,8 +145,10 @@ def read_table(path: Path, options: Mapping[str, str] | None = None) -> Columns:
                 refuse_foreign(path, f"a table ({kind})", file.read(64), *own)
         with damage(path, f"a table ({kind})"):
             table = _read(pa, path, kind, options)
-            for name, column in zip(table.column_names, table.columns, strict=True):
-                for part, values in _parts(pa, str(name), column.combine_chunks()):
+            for name in table.column_names:
+                column, table = table.column(0).combine_chunks(), table.remove_column(0)
+                pa.default_memory_pool().release_unused()
+                for part, values in _parts(pa, str(name), column):
                     if part in columns:
                         raise DatasetError(path, "every column once", f"{part!r} twice")
                     columns[part] = _dates(pa, path, part, values, options) if values.dtype.kind == "U" else values
@@ -220,6 +226,45 @@ def _text(path: Path, options: Mapping[str, str]) -> str:
     return re.sub(r"\Asep=.(?=\n)", "", decode_text(path, data, expected, options.get("encoding")))
 
 
+def _blocks(path: Path, options: Mapping[str, str]) -> Iterator[str]:
+    """Yield `_text` in blocks of whole lines, so that the text of a long table is never in memory as a whole."""
+    encoding = options.get("encoding", "utf-8-sig")
+    try:
+        with _pyarrow().input_stream(path) as stream:
+            if stream.read(2) in {codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE} and "encoding" not in options:
+                encoding = "utf-16"
+        with _pyarrow().input_stream(path) as stream:
+            lines = io.TextIOWrapper(io.BufferedReader(stream), encoding, newline=None)
+            while block := "".join(lines.readlines(_BLOCK)):
+                if "\0" in block and encoding == "utf-8-sig":
+                    _text(path, options)
+                yield block
+    except (ValueError, LookupError):
+        _text(path, options)  # raises with the line
+        raise
+
+
+class _Blocks(io.RawIOBase):
+    """File of the bytes of some texts."""
+
+    def __init__(self, texts: Iterator[str]) -> None:
+        self._texts = texts
+        self._rest = memoryview(b"")
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        while not self._rest:
+            text = next(self._texts, None)
+            if text is None:
+                return 0
+            self._rest = memoryview(text.encode())
+        count = min(len(buffer), len(self._rest))
+        buffer[:count], self._rest = self._rest[:count], self._rest[count:]
+        return count
+
+
 def line_of(path: Path, row: int, options: Mapping[str, str] | None = None) -> int:
     """Return the line, from 1, of a row of a text table, or the row, from 1, of another table."""
     if path.is_dir() or _kind(path) not in _TEXT:
@@ -233,15 +278,21 @@ def _has_names(fields: list[str]) -> bool:
     return 2 * sum(map(_is_number, fields)) < len(fields)
 
 
-def _normal_text(path: Path, original: str, kind: str) -> tuple[bytes, str]:
-    """Return a text table without comments and with as many names as columns, and its separator."""
-    text = re.sub(r"(?m)^#.*\n?", "", original) if "#" in original else original
+def _normal_text(path: Path, blocks: Iterator[str], kind: str) -> tuple[Iterator[str], str]:
+    """Return the blocks of a text table without comments and with as many names as columns, and its separator."""
+    original = text = ""
+    for block in blocks:
+        original += block
+        text = _without_comments(original).lstrip("\n")
+        if text:
+            break
+    text = re.sub(r"\Asep=.\n", "", text)
     head, _, rest = text.lstrip("\n").partition("\n")
     comments = [line.lstrip("# ") for line in original.split("\n", _MOST_PARTS) if line.startswith("#")]
     separator = "\t" if kind == ".tsv" else max(_SEPARATORS, key=head.count)
     if separator not in head and len(head.split()) > 1:
         separator = " "
-        head, rest = (re.sub(r"(?m)^ +| +$", "", re.sub(r"[ \t]+", " ", part)) for part in (head, rest))
+        head, rest = map(_with_single_blanks, (head, rest))
         comments = [" ".join(line.split()) for line in comments]
     if known := _benchmark(head):
         raise DatasetError(path, "a table", known)
@@ -256,7 +307,18 @@ def _normal_text(path: Path, original: str, kind: str) -> tuple[bytes, str]:
         head += separator
     elif more == -1 and head.endswith(separator):
         head = head.removesuffix(separator)
-    return f"{head}\n{rest}".encode(), separator
+    more_blocks = map(_without_comments, blocks)
+    if separator == " ":
+        more_blocks = map(_with_single_blanks, more_blocks)
+    return chain([f"{head}\n{rest}"], more_blocks), separator
+
+
+def _without_comments(text: str) -> str:
+    return re.sub(r"(?m)^#.*\n?", "", text) if "#" in text else text
+
+
+def _with_single_blanks(text: str) -> str:
+    return re.sub(r"(?m)^ +| +$", "", re.sub(r"[ \t]+", " ", text))
 
 
 def _benchmark(line: str) -> str | None:
@@ -278,16 +340,16 @@ def _benchmark(line: str) -> str | None:
 def _read_text(pa: Any, path: Path, kind: str, options: Mapping[str, str]) -> Any:
     from pyarrow import csv  # noqa: PLC0415  packages of an extra
 
-    data, separator = _normal_text(path, _text(path, options), kind)
-
     def parsed(decimal: str, *texts: str, threads: bool = True) -> Any:
+        blocks, separator = _normal_text(path, _blocks(path, options), kind)
         null = list(NO_VALUE)
         types = dict.fromkeys(texts, pa.string())
         convert = csv.ConvertOptions(
             null_values=null, strings_can_be_null=True, decimal_point=decimal, column_types=types
         )
         parse, read = csv.ParseOptions(delimiter=separator), csv.ReadOptions(use_threads=threads)
-        return csv.read_csv(io.BytesIO(data), parse_options=parse, convert_options=convert, read_options=read)
+        data = io.BufferedReader(_Blocks(blocks), _BLOCK)
+        return csv.read_csv(data, parse_options=parse, convert_options=convert, read_options=read)
 
     decimal = options.get("decimal")
     if decimal not in {None, ",", "."}:
@@ -324,11 +386,11 @@ def _has_commas(pa: Any, path: Path, table: Any) -> bool:
 
 def _dates(pa: Any, path: Path, name: str, texts: NDArray[Any], options: Mapping[str, str]) -> NDArray[Any]:
     """Return a column of dates with a time of day as such, and other texts as they are."""
-    first = next((text for text in texts.tolist() if text), "").strip()
+    first = next((text for text in unique_texts(texts)[0].tolist() if text), "").strip()
     date = _DATE.fullmatch(first)
     if date is None:
         return texts
-    unique, place = np.unique(texts, return_inverse=True)
+    unique, place = unique_texts(texts)
     found = [text.strip() for text in unique.tolist()]
     order = _order_of_days(path, name, found, options)
     days = [_DAY_OR_MONTH.sub(order, text.removesuffix("UTC").strip()).replace("/", "-") for text in found]
@@ -406,7 +468,24 @@ def _parts(pa: Any, name: str, column: Any) -> Iterator[tuple[str, NDArray[Any]]
     elif types.is_binary(kind) or types.is_large_binary(kind):
         yield from _parts(pa, name, column.cast(pa.string()))
     else:
-        yield name, np.array(["" if value is None else str(value) for value in column.to_pylist()], dtype=np.str_)
+        yield name, _texts(pa, column)
+
+
+def _texts(pa: Any, column: Any) -> NDArray[np.str_]:
+    """Return values as texts, none as an empty one."""
+    if not pa.types.is_string(column.type):
+        return np.array(["" if value is None else str(value) for value in column.to_pylist()], dtype=np.str_)
+    column.validate(full=True)  # offsets of a damaged file are read without a check otherwise
+    coded = column.dictionary_encode()
+    texts = np.array([*coded.dictionary.to_pylist(), ""], dtype=np.str_)
+    return np.asarray(texts[coded.indices.fill_null(len(texts) - 1).to_numpy(zero_copy_only=False)])
+
+
+def unique_texts(texts: NDArray[np.str_]) -> tuple[NDArray[np.str_], NDArray[np.int64]]:
+    """Return the different ones of some texts (R,), in the order of their first rows, and the place (R,) of each."""
+    pa = _pyarrow()
+    coded = pa.array(texts, type=pa.large_string()).dictionary_encode()
+    return np.array(coded.dictionary.to_pylist(), dtype=texts.dtype), coded.indices.to_numpy().astype(np.int64)
 
 
 def _integers(pa: Any, column: Any) -> NDArray[Any]:
@@ -418,7 +497,7 @@ def _integers(pa: Any, column: Any) -> NDArray[Any]:
         return np.asarray(column.cast(pa.int64()).to_numpy(zero_copy_only=False), dtype=np.int64)
     if -_EXACT <= low <= high <= _EXACT:
         return np.asarray(column.cast(pa.float64()).to_numpy(zero_copy_only=False))
-    return np.array(["" if value is None else str(value) for value in column.to_pylist()], dtype=np.str_)
+    return _texts(pa, column)
 
 
 def to_arrow(columns: Mapping[str, NDArray[Any]]) -> "pa.Table":
@@ -468,7 +547,7 @@ def write_table(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
         feather.write_feather(table, content)
     else:
         raise DatasetError(path, f"a table ({', '.join(SUFFIXES)})", f"a file named *{kind}")
-    write_whole(path, content.getvalue())
+    write_whole(path, content.getbuffer())
 
 
 def frame_files(folder: Path) -> list[Path]:

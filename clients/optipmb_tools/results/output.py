@@ -221,7 +221,7 @@ class Results:
         """
         parts = [written for _, written in sorted(self._taken.items()) if not isinstance(written, Path)]
         if parts:
-            columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+            columns = {name: np.concatenate([part.pop(name) for part in parts]) for name in list(parts[0])}
             write_tracks(self._out, columns, self._dataset.digits)
         elif all(one.name in self._taken for one in sequences):
             self._dataset.join(self._out, sequences)

@@ -33,7 +33,7 @@ from optipmb_tools.datasets.table.rows import NO_ID, Boxes, read_tables
 from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Bools, Floats, Ints, Pose, stack_poses, to_world
 from optipmb_tools.results.output import track_columns, write_tracks
-from optipmb_tools.table_files import SUFFIXES, Columns, line_of, read_table, tables_in
+from optipmb_tools.table_files import SUFFIXES, Columns, line_of, read_table, tables_in, unique_texts
 
 # Options, besides `column.MEANING=NAME` and `class.NAME=NAME`; `tracks` are tables that are yet to be read by them
 OPTIONS: Final = (
@@ -208,12 +208,12 @@ def truth_at(name: str, stamps: Ints, numbers: NDArray[Any] | None, table: Objec
         meaning = "only these are compared" if sparse else "the others count as frames without objects"
         notes.append(f"{path}: truth has {count} of {len(stamps)} frames of {name}: {meaning}")
     center, yaw, velocity = table.in_world(rows)
-    labels = tuple(dict.fromkeys(boxes.name[rows].tolist()))
+    names, label = unique_texts(boxes.name[rows])
     return Truth.of(
-        labels,
+        tuple(names.tolist()),
         frame,
         id=np.zeros(len(rows), dtype=np.int64) if boxes.id is None else boxes.id[rows],
-        label=np.array([labels.index(one) for one in boxes.name[rows].tolist()], dtype=np.int64),
+        label=label,
         center=center,
         size=boxes.size[rows],
         yaw=yaw,
@@ -255,9 +255,8 @@ class TableSequence(DataSequence):
         self._order = mine[np.argsort(frame_of_row[boxes.row[mine]], kind="stable")]
         bounds = np.arange(len(self._stamps) + 1)
         self._start = np.searchsorted(frame_of_row[boxes.row[self._order]], bounds)
-        names = boxes.name[self._order]
-        self.labels: tuple[str, ...] = tuple(dict.fromkeys(names.tolist()))
-        self._label = np.array([self.labels.index(name) for name in names.tolist()], dtype=np.int64)
+        names, self._label = unique_texts(boxes.name[self._order])
+        self.labels: tuple[str, ...] = tuple(names.tolist())
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -363,7 +362,7 @@ class TableDataset(Dataset):
             own = [ObjectTable(file, boxes, options)] if boxes.id is not None else []
             if not len(boxes.frame_stamp):
                 reading.doubt("rows", f"{file.name}: no rows, a recording without frames")
-            for key in dict.fromkeys(boxes.frame_key.tolist()) or boxes.keys:
+            for key in unique_texts(boxes.frame_key)[0].tolist() or boxes.keys:
                 name = _plain(".".join(part for part in (_stem(file), key) if part))
                 if len(files) == 1 and key:
                     name = _plain(key)

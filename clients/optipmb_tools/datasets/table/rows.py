@@ -1,7 +1,6 @@
 """Tables of boxes, one row per box: read, checked, in nanoseconds, metres and radians with z up."""
 
 import re
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -45,7 +44,7 @@ from optipmb_tools.datasets.table.values import (
 )
 from optipmb_tools.files import LARGEST, DatasetError
 from optipmb_tools.geometry import Bools, Floats, Ints
-from optipmb_tools.table_files import NO_VALUE, Columns, frame_numbers, read_table
+from optipmb_tools.table_files import NO_VALUE, Columns, frame_numbers, read_table, unique_texts
 
 if TYPE_CHECKING:
     from optipmb import GroundCamera
@@ -99,6 +98,8 @@ class Boxes:
 
     def rows(self, first: int, last: int) -> "Boxes":
         """Return the table of the rows from `first` up to `last`, which are counted from 0 again."""
+        if (first, last) == (0, len(self.frame_stamp)):
+            return self
         mine = (self.row >= first) & (self.row < last)
         arrays = {name: one for name, one in vars(self).items() if isinstance(one, np.ndarray)}
         parts: dict[str, Any] = {
@@ -245,7 +246,7 @@ class _Table:
         reading, found = self._reading, self._found
         key, key_columns, keys = self._keys()
         file = np.searchsorted([first for _, first in reading.files], np.arange(self._rows), side="right")
-        series = np.unique(key, return_inverse=True)[1] * (len(reading.files) + 1) + file * (not self._frames)
+        series = unique_texts(key)[1] * (len(reading.files) + 1) + file * (not self._frames)
         stamps = self._stamps(series)
         centres = not {"l", "w"} & found.keys()
         self._refuse_pixels(centres=centres)
@@ -261,15 +262,16 @@ class _Table:
         kept = np.asarray(~(empty | stamps.skipped))
         if scored:
             self._leave_out(kept, self._doubled(stamps.ns, series, center), "that another one repeats")
+        self._release("x", "y", "z", "l", "w", "h", "yaw", "score", "class")
         kept = self._valid(kept, center, size, yaw, yaw_unit, score, names)
         if "score" in found and scored:
             score[kept] = read_scores(reading, score[kept], np.flatnonzero(kept))
             self._leave_out(kept, np.isnan(score), "with a score that is none")
             self._leave_out(kept, score == 0.0, "with a score of 0")
         covariance = self._covariances(kept) if scored else None
-        row = np.flatnonzero(kept)
-        center, size, yaw, names = center[row], size[row], yaw[row], names[row]
-        kind = np.unique(names, return_inverse=True)[1].astype(np.int64)
+        if len(row := np.flatnonzero(kept)) < self._rows:
+            center, size, yaw, names = center[row], size[row], yaw[row], names[row]
+        kind = unique_texts(names)[1]
         stated = centres or found["l"].base == "l" or found["l"].base.endswith(("_l", "length"))
         if not centres:
             size = read_sizes(reading, size, names, stated=stated)
@@ -279,8 +281,7 @@ class _Table:
             yaw_unit = "rad"
         read_digits(reading, center)
         stamps = self._framed(stamps, series, row, center, size, kind, score, scored=scored)
-        stamp = stamps.ns
-        refuse_gap(reading, stamp, series)
+        refuse_gap(reading, stamp := stamps.ns, series)
         pose = self._checked_poses(stamp)
         world = _world(center, row, pose)[:, :2]
         motion = _Motion(row, pose, find_moves(series[row], stamp[row] / 1e9, world, kind))
@@ -315,11 +316,15 @@ class _Table:
             camera=self._placed.camera if self._placed else None,
         )
 
+    def _release(self, *roles: str) -> None:
+        """Free columns that were read, whose arrays would double the memory of a long table."""
+        self._columns.update({self._found[role].name: np.empty(0) for role in roles if role in self._found})
+
     def _doubled(self, stamp: Ints, series: Ints, center: Floats) -> Bools:
         """Return the rows that are equal to another one of their recording in all columns."""
         order = np.lexsort((center[:, 1], center[:, 0], stamp, series))
         same = (np.diff(stamp[order]) == 0) & (np.diff(series[order]) == 0)
-        same &= (np.diff(center[order, :2], axis=0) == 0.0).all(axis=1)
+        same &= (np.diff(center[order, 0]) == 0.0) & (np.diff(center[order, 1]) == 0.0)
         first, second = order[:-1][same], order[1:][same]
         equal = np.ones(len(first), dtype=np.bool_)
         for one in self._columns.values():
@@ -496,8 +501,10 @@ class _Table:
         reading = self._reading
 
         def at_places(stamp: Ints, part: NDArray[Any]) -> Ints:
-            keys = np.column_stack([np.unique(one[row], return_inverse=True)[1] for one in (series, stamp, part)])
-            frame = np.unique(keys, axis=0, return_inverse=True)[1].astype(np.int64)
+            frame = series[row]
+            for one in (stamp, part):
+                place = np.unique(one[row], return_inverse=True)[1]
+                frame = np.unique(frame * len(stamp) + place, return_inverse=True)[1].astype(np.int64)
             return overlapping(frame, center[:, :2], size, kind, score[row])
 
         def crowd(stamp: Ints, part: NDArray[Any] = series) -> float:
@@ -537,9 +544,16 @@ class _Table:
         names = tuple(self._found[role].name for role in ("recording", "sensor") if role in self._found)
         if not names or not self._rows:
             return np.full(self._rows, ""), names, {"": ("",) * len(names)}
-        parts = [self._columns[name].astype(np.str_).tolist() for name in names]
-        joined = [".".join(row) for row in zip(*parts, strict=True)]
-        return np.array(joined, dtype=np.str_), names, dict(zip(joined, zip(*parts, strict=True), strict=True))
+        parts = [self._columns[name].astype(np.str_, copy=False) for name in names]
+        place = np.zeros(self._rows, dtype=np.int64)
+        for part in parts:
+            values, own = unique_texts(part)
+            place = place * len(values) + own
+        _, first, place = np.unique(place, return_index=True, return_inverse=True)
+        rows = list(zip(*(part[first].tolist() for part in parts), strict=True))
+        joined = [".".join(row) for row in rows]
+        keys = {joined[one]: rows[one] for one in np.argsort(first).tolist()}  # in the order of the table
+        return np.array(joined, dtype=np.str_)[place], names, keys
 
     def _yaw(self, *, scored: bool) -> tuple[Floats, str | None]:
         """Return headings as the table has them, and the unit that is stated for them; `none` where there are none."""
@@ -614,14 +628,15 @@ class _Table:
     def _names(self, stamp: Ints) -> NDArray[np.str_]:
         column = self._found.get("class")
         if column is None:
-            names = np.full(self._rows, NO_CLASS)
+            names, place = np.array([NO_CLASS]), np.zeros(self._rows, dtype=np.int64)
             self._reading.note("class", f"no column for class: every box is of class {NO_CLASS}")
         else:
             values = self._columns[column.name]
             if values.dtype.kind == "f":  # numbers with an empty cell
                 values = np.where(np.isnan(values), "", np.char.mod("%g", values))
-            names = np.char.strip(values.astype(np.str_))
-            names = self._without_numbers(np.where(np.isin(names, NO_VALUE), "", names), stamp)
+            names, place = unique_texts(values.astype(np.str_, copy=False))
+            names = np.char.strip(names)
+            names = self._without_numbers(np.where(np.isin(names, NO_VALUE), "", names), place, stamp)
         renamed = {
             key.removeprefix("class."): name for key, name in self._reading.options.items() if key.startswith("class.")
         }
@@ -633,18 +648,26 @@ class _Table:
             elif name not in have:
                 self._reading.note("class", f"no box is of class {name}")
         new = {one: renamed[folded[one.lower()]] if one.lower() in folded else one for one in have}
-        return np.array([new[name] for name in names.tolist()], dtype=np.str_)
+        return np.array([new[name] for name in names.tolist()], dtype=np.str_)[place]
 
-    def _without_numbers(self, names: NDArray[np.str_], stamp: Ints) -> NDArray[np.str_]:
-        """Return the classes of names that are a class and the number of an object, as `car:12`; else the names."""
-        split = {name: _NUMBERED.fullmatch(name) for name in np.unique(names).tolist() if name}
+    def _without_numbers(self, names: NDArray[np.str_], place: Ints, stamp: Ints) -> NDArray[np.str_]:
+        """Return the classes of names that are a class and the number of an object, as `car:12`; else the names.
+
+        Args:
+            names: The different ones.
+            place: (R,) of each row's name.
+            stamp: (R,) of the rows.
+        """
+        split = {name: _NUMBERED.fullmatch(name) for name in names.tolist() if name}
         classes = {name: match[1] or match[2] for name, match in split.items() if match}
         if len(classes) < len(split) or len(set(classes.values())) == len(classes):
             return names
         found = np.array([classes.get(name, name) for name in names.tolist()])
 
         def most(values: NDArray[np.str_]) -> int:
-            return max(Counter(zip(stamp.tolist(), values.tolist(), strict=True)).values())
+            kind = np.unique(values, return_inverse=True)[1][place]
+            frame = np.unique(stamp, return_inverse=True)[1]
+            return int(np.unique(frame * len(values) + kind, return_counts=True)[1].max())
 
         if most(names) > 1 or most(found) == 1:  # a class may have several boxes in a frame, an object has one
             return names
@@ -652,7 +675,7 @@ class _Table:
         self._reading.note(
             "class", f"column {column} has classes and numbers of objects: {names[0]} is of class {found[0]}"
         )
-        self._objects = names
+        self._objects = names[place]
         return found
 
     def _ids(self) -> Ints | None:

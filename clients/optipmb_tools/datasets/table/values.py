@@ -15,6 +15,7 @@ from optipmb_tools.datasets.interface import class_like
 from optipmb_tools.datasets.motion import LEAST_ALONG, MOST, SAME_DIRECTION, Moves
 from optipmb_tools.datasets.table.findings import HALF, Claim, Reading
 from optipmb_tools.geometry import Bools, Floats, Ints, wrap_angle
+from optipmb_tools.table_files import unique_texts
 
 UPRIGHT: Final = 0.3  # largest x and y of the quaternion of a box that stands upright
 FULL_TURN: Final = 6.4
@@ -31,6 +32,7 @@ REFUSED_MOVES: Final = 80  # moves of several objects from which headings are re
 FORWARD: Final = 0.8  # share of forward moves from which traffic shares a motion, not the sensor
 SINGLE: Final = 0.1
 FAR: Final = 1e5  # coordinates in metres beyond which single precision loses centimetres
+MOST_SIZES: Final = 100_000  # boxes whose sizes are looked at
 LARGEST_SIZE: Final = 500.0  # m: longer than any ship
 LONGER: Final = 1.3  # ratio of the longest side of a vehicle to the next one
 SLOW: Final = 0.5  # differences of velocities up to it say nothing, m/s
@@ -225,9 +227,10 @@ def read_sizes(reading: Reading, sizes: Floats, names: np.ndarray, *, stated: bo
     The order is that in which vehicles are longer than wide and high; height, width, length where the longest is last.
     """
     asked = reading.chosen("sizes", ("lwh", "wlh", "hwl"))
-    kinds = {name: class_like(name, tuple(USUAL)) or class_like(name, LONG) for name in np.unique(names).tolist()}
+    kinds = {name: class_like(name, tuple(USUAL)) or class_like(name, LONG) for name in unique_texts(names)[0].tolist()}
     long = [name for name, kind in kinds.items() if kind in LONG]
-    vehicles = sizes[np.isin(names, long)]
+    some = slice(None, None, 1 + len(sizes) // MOST_SIZES)
+    vehicles = sizes[some][np.isin(names[some], long)]
     with np.errstate(invalid="ignore"):
         longest = np.where(vehicles.max(axis=1, initial=0.0) > LONGER * np.median(vehicles, axis=1), 1.0, 0.0)
         side = np.argmax(np.nan_to_num(vehicles), axis=1)
@@ -245,7 +248,7 @@ def read_sizes(reading: Reading, sizes: Floats, names: np.ndarray, *, stated: bo
     order = reading.decide("sizes", claims, asked=asked)
     found = sizes[:, [order.index(letter) for letter in "lwh"]]
     if "size_factor" not in reading.options:
-        _check_sizes(reading, found, names, kinds)
+        _check_sizes(reading, found[some], names[some], kinds)
     return found
 
 
@@ -253,7 +256,7 @@ def _check_sizes(reading: Reading, sizes: Floats, names: np.ndarray, kinds: Mapp
     """Doubt sizes that would be usual ones of their classes if they were multiplied by a factor."""
     usual = {name: USUAL[kind] for name, kind in kinds.items() if kind is not None and kind in USUAL}
     rows = np.isin(names, list(usual)) & np.isfinite(sizes).all(axis=1)
-    found, place = np.unique(names[rows], return_inverse=True)
+    found, place = unique_texts(names[rows])
     bounds = np.array([usual[name] for name in found.tolist()]).reshape(-1, 3, 2)[place]
     claims = []
     for factor, unit in FACTORS.items():
