@@ -80,7 +80,8 @@ def test_a_table_gives_the_tracks_of_the_tracker(
     """`optipmb track --camera` and `OnlineTracker.update(camera=)` give the same tracks, an empty frame included."""
     table = write(tmp_path / "boxes.csv", camera, "x1,y1,x2,y2")
     out, gate = tmp_path / "t.csv", tmp_path / "gate.toml"
-    done = run_here(capsys, "track", table, "--camera", gate, "--profile", "generic", "--out", out, "--verbose")
+    options = ["--profile", "generic", "--digits", "full", "--verbose"]
+    done = run_here(capsys, "track", table, "--camera", gate, "--out", out, *options)
     assert done.returncode == 0, done.stderr
     assert "29 of 58 boxes have no place on the ground: 29 horizon" in done.stderr
     tracks, tracker = read_table(out), optipmb.OnlineTracker("generic")

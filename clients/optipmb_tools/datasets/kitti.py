@@ -260,7 +260,7 @@ class KittiDataset(Dataset):
             text = f"{len(lacking)} of {len(detected)} sequences with detections are left out, without a calib/SSSS.txt"
             self.notes.append(f"{base}: {text}: {' '.join(lacking)}")
         if self.detector is not None and self.profile == "auto":
-            self.notes.append(f"{self.detector}: not the name of a known detector: profile auto fits it")
+            self.notes.append(f"{self.detector}: not the name of a known detector: its profile is auto")
 
     @cached_property
     def profile(self) -> str:

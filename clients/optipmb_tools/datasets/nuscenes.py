@@ -534,7 +534,7 @@ class NuScenesDataset(Dataset):
         """Assumptions about the detections, and the content of a submission."""
         found = list(self.submission.notes) if self.submission is not None else []
         if self.submission is not None and self.profile == "auto":
-            found.insert(0, f"{self.submission.path}: neither name nor meta of a known detector: profile auto fits it")
+            found.insert(0, f"{self.submission.path}: neither name nor meta of a known detector: its profile is auto")
         if self.submission is not None and (others := len(self.submission.rows) - len(self._known)):
             folder, count = self.tables.folder.name, len(self.submission.rows)
             found.append(f"{self.submission.path}: {others} of {count} samples are not in {folder}: left out")
