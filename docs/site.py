@@ -1,7 +1,8 @@
-"""Pages of the site that are generated: the quick start from the README, the references from the code."""
+"""Pages of the site that are generated: the quick start from the README, references and lists from the code."""
 
 from __future__ import annotations
 
+import ast
 import re
 import types
 from pathlib import Path
@@ -31,7 +32,7 @@ def on_config(config: MkDocsConfig) -> None:
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the generated pages."""
     pages = {page: _page(ROOT / source) for source, page in PAGES.items()}
-    pages |= {"profiles.md": _profiles(), "api.md": _api()}
+    pages |= {"profiles.md": _profiles(), "api.md": _api(), "attack-tests.md": _attacks()}
     for page, text in pages.items():
         files.append(File.generated(config, page, content=text))
     return files
@@ -43,6 +44,18 @@ def _page(path: Path) -> str:
     for source, page in PAGES.items():
         text = text.replace(f"]({source})", f"]({page})")
     return text
+
+
+def _attacks() -> str:
+    """Return the list of the tests of attacks, each with its claim."""
+    file = "tests/e2e/test_security.py"
+    lines = ["# Tests of attacks", "", f"`pytest {file}::NAME` runs one.", "", "| name | claim |", "| --- | --- |"]
+    lines += [
+        f"| `{part.name}` | {ast.get_docstring(part)} |"
+        for part in ast.parse((ROOT / file).read_text(encoding="utf-8")).body
+        if isinstance(part, ast.FunctionDef) and part.name.startswith("test_")
+    ]
+    return "\n".join(lines)
 
 
 def _profiles() -> str:

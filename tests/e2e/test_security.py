@@ -20,7 +20,7 @@ from optipmb_client import Publisher, Subscriber
 from optipmb_schemas import Density, Keys, ServiceStatus, SessionState, decode
 from optipmb_service.cluster.message_log import MessageLog
 from optipmb_service.cluster.store import StoreError
-from protected import MAKE, REFUSAL_MS, Network, Party, make
+from protected import REFUSAL_MS, Network, Party, make
 from router import until
 from routers import free_endpoint
 from service_process import ServiceProcess
@@ -376,11 +376,3 @@ def test_names_that_could_mean_more_are_refused(tmp_path: Path, options: tuple[s
     done = make(tmp_path, *options)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert re.match(r"make\.py: (expected (site/\S+|a name) of letters|--reads: expected a node)", done.stderr)
-
-
-def test_the_page_lists_every_probe() -> None:
-    """The table of probes in `docs/security.md` names exactly the tests of this file."""
-    page = (MAKE.parents[2] / "docs" / "security.md").read_text(encoding="utf-8")
-    told = set(re.findall(r"^\| `(test_\w+)`", page, re.MULTILINE))
-    written = set(re.findall(r"^def (test_\w+)", Path(__file__).read_text(encoding="utf-8"), re.MULTILINE))
-    assert told == written - {"test_the_page_lists_every_probe"}
