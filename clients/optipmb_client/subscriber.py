@@ -30,10 +30,10 @@ _Message = TypeVar("_Message", bound=Message)
 class Received:
     """Tracks, and the monotonic time (`time.monotonic_ns`) at which they arrived on this machine.
 
-    `corrects` says whether they replace earlier tracks of the same frame. `recovered` says that they do not come at
-    their time: half a second later than others of the stream did, as those that were lost on the way, or with `history`
-    from before the subscription, by the clocks of both machines. `traceparent` is the W3C trace context in
-    which the service published them; empty where it records no traces, and over gRPC.
+    `corrects` says whether they replace earlier tracks of the same frame. `recovered` says that they come late:
+    half a second later than others of the stream did, after a loss on the way, or with `history` from before the
+    subscription, by the clocks of both machines. `traceparent` is the W3C trace context in which the service published
+    them; empty where it records no traces, and over gRPC.
     """
 
     tracks: Tracks
@@ -188,10 +188,9 @@ class Subscriber(_Subscription):
     inserts it and publishes the tracks of the frames behind it again, with a higher `revision`: the latest one
     of a frame holds. `corrections=False` leaves these out, for programs that act on new frames alone.
 
-    Tracks come from now on; those that are lost on the way are recovered while the stream goes on. With `history` a
-    subscriber that comes late first gets what the service keeps of each stream, some seconds, also of streams that have
-    ended. A program that is too slow loses the oldest waiting messages, never anybody else's; `statistics` counts
-    them, and `missed` names the frames.
+    Tracks come from now on; lost messages are recovered while the stream goes on. With `history` a late subscriber
+    first gets the messages that the service keeps: some seconds of each stream, also of ended ones. A program that is
+    too slow loses the oldest of its own waiting messages; `statistics` counts them, and `missed` names the frames.
 
     Args:
         pattern: Name of a stream, `site/node/sensor`, or a pattern with `*` in the place of names: `garage/*/*`.
@@ -201,7 +200,7 @@ class Subscriber(_Subscription):
         on_problem: Called with each `Problem` that the service reports for these streams (refused messages and the
             like), by the thread that iterates.
         corrections: Whether messages that replace earlier ones are given out too.
-        history: Give out first what was published before.
+        history: Give out the kept earlier messages first.
         predict: Receive tracks predicted to now, at a fixed rate, of the streams in the setting `outputs`: each
             message replaces the one before, and none is kept for late subscribers.
         queue: Number of messages that may wait.

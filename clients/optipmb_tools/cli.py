@@ -1,6 +1,6 @@
 """The command `optipmb`. An error is one line on standard error and a status: 2 for wrong input, 1 for the rest.
 
-An error that no code foresaw is such a line too, which says what was being read; `--debug` shows its traceback.
+An unexpected error is one line too, with the input that was being read; `--debug` shows its traceback.
 """
 
 import inspect

@@ -68,7 +68,7 @@ def reading(path: Path | str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def damage(path: Path | str, what: str) -> Iterator[None]:
-    """Report whatever a library raises over the bytes of a file as damage: their kinds are not documented."""
+    """Report any exception of a library on the bytes of a file as damage: their types are not documented."""
     try:
         yield
     except (DatasetError, MessageError):
@@ -80,7 +80,7 @@ def damage(path: Path | str, what: str) -> Iterator[None]:
 
 
 def unexpected(error: BaseException) -> str:
-    """Return the line that reports an error that no code foresaw, and what was being read."""
+    """Return the line that reports an unexpected error and the input that was being read."""
     notes = "; ".join(dict.fromkeys(getattr(error, "__notes__", ())))
     text = f"{type(error).__name__}: {error}" + (f" ({notes})" if notes else "")
     return f"unexpected {text}: please report this line, with the file if you can; --debug shows the traceback"
@@ -92,7 +92,7 @@ def decode_text(path: Path, data: bytes, what: str, encoding: str | None = None)
     Args:
         path: The file, for errors.
         data: Its bytes.
-        what: Names what is expected where the bytes are none.
+        what: Expected content, for errors.
         encoding: Of the user; None: UTF-8, or UTF-16 where the first bytes are its mark.
 
     Raises:

@@ -120,7 +120,7 @@ def read_pickle(path: Path) -> list[dict[str, Any]]:
     """Return a record with the lists of boxes for each frame.
 
     Raises:
-        DatasetError: The file is another pickle, or none; says what it holds.
+        DatasetError: The file is another pickle, or none; names its content.
     """
     if path.stat().st_size > LARGEST:
         raise DatasetError(path, f"at most {LARGEST >> 30} GB", f"{path.stat().st_size} bytes")

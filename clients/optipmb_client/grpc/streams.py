@@ -266,7 +266,7 @@ class GrpcSubscription(ResumedCall):
         self._call.initial_metadata()  # it is in force
         if self._call.is_active():
             self._settled.set()
-            self._request.history = True  # of the next call, for what is lost in between
+            self._request.history = True  # the next call recovers the losses in between
 
     def _ended(self) -> None:
         if not self._over.is_set():

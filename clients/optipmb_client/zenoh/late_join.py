@@ -188,7 +188,7 @@ class LateJoin(Generic[_S]):
         self._closed = False
 
     def begin(self, newest: Iterable[_S]) -> None:
-        """Hand over waiting and new messages, without those that were published before this call.
+        """Hand over waiting and new messages, except messages published before this call.
 
         Args:
             newest: the newest sample of each publisher that was there.

@@ -222,7 +222,7 @@ class Session:
 
         Losses are recovered from the publishers' caches. What those caches hold from before comes first: with
         `history` at once, with None when a publisher is heard of. With False it does not come, and this returns when
-        the caches have said what is newest: what is published from then on comes.
+        the caches have named their newest samples: later samples come.
         """
         after_loss: set[str] = set()
 
@@ -246,7 +246,7 @@ class Session:
 
         samples: Channel[Sample] = Channel(SUBSCRIBED)
         declared = self.listen(key, samples.put, recovers=True, history=EVERYTHING if history else None)
-        if history is False:  # what is published from now on follows what the caches have now
+        if history is False:  # samples after the newest ones of the caches are new
             newest: list[Sample] = []
             begun = threading.Event()
 
@@ -468,9 +468,9 @@ class Session:
     def _follow_links(self) -> tuple[object, object]:
         """Have withdrawals wait while Zenoh sets up a link to a router; return references to the listeners.
 
-        Zenoh collects what is declared, and sends it to the new router, without a lock in between: a withdrawal would
-        overtake its declaration, which the router would then keep until the link ends. On the thread that does this,
-        Zenoh tells of the transport before, and of its link after.
+        Zenoh collects the declarations and sends them to the new router without a lock in between. A withdrawal would
+        overtake its declaration, which the router would then keep until the link ends. The same thread reports the
+        transport before this, and its link after it.
         """
 
         def follow_transport(event: Any) -> None:
@@ -529,7 +529,7 @@ class Session:
 
 
 def _call(withdrawals: list[Callable[[], object]]) -> None:
-    while withdrawals:  # each is let go at once: that is how a publisher is withdrawn
+    while withdrawals:  # releasing the reference withdraws a publisher, so none is kept
         with contextlib.suppress(zenoh.ZError):  # the session is closed
             withdrawals.pop(0)()
 

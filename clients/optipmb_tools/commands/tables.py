@@ -42,7 +42,7 @@ def clear_table(results: "Sequence[ClassResult]", *, metres: bool, every: bool) 
 
 
 def _named_sets(confirmed: T | None, everything: T, best: T | None, least: float, *, every: bool) -> dict[str, T]:
-    """Return the sets of tracks that have a row: those that are shown, those from a score on, and the rest if asked."""
+    """Return the sets of tracks that have a row: confirmed tracks, tracks from a score on, and all if asked."""
     sets = {"confirmed": confirmed, f"≥ {least:.3f}": best, "all": everything if every or confirmed is None else None}
     first = ("all",) if confirmed is None else ()
     return {name: found for name in (*first, *sets) if (found := sets[name]) is not None}

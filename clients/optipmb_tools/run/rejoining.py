@@ -5,7 +5,7 @@ log ratio of "j continues i" and "j is a new object" is
 
     s_ij = log [P f(T) p(y, w | i, T) p(size_j | size_i)] - log [lambda(y) p(w | new) p(size_j | class)]
 
-P is the probability that an object returns, and f(T) = 1 / (T log(1 + gap / T_0)) prefers no length of a gap.
+P is the probability that an object returns, and f(T) = 1 / (T log(1 + gap / T_0)) is log-uniform in T.
 p(y, w | i, T) is a mixture along and across the heading of i: the object stays, keeps its velocity up to white noise of
 its acceleration, wanders (its velocity is an Ornstein-Uhlenbeck process), or is anywhere in reach. lambda is the rate
 of new objects, half uniform over the area of the class, half around other beginnings. Each beginning counts with the
@@ -13,7 +13,7 @@ probability that it was new, which `TURNS` turns estimate.
 
 The joins are the matching of ends and beginnings with the largest sum of positive s_ij. A join has the probability
 1 / (1 + exp(-m)) with the margin m: the largest sum less the largest one without that pair. Two equal candidates have
-one half.
+one half each.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -76,13 +76,13 @@ SIZE_NOISE: Final = 0.06
 """Standard deviation of the logarithm of a track's mean size."""
 SIZE_BOUNDS: Final = (-6.0, 2.5)
 AROUND_S: Final = 60.0
-"""Beginnings so long before and after count for the rate of new objects."""
+"""Beginnings up to this long before and after count for the rate of new objects."""
 KERNEL_M: Final = 3.0
 TURNS: Final = 4
 AT_ONCE: Final = 256
 """Beginnings that are compared together; bounds the memory."""
 QUANTUM: Final = 2.0**-20
-"""Scores are multiples: sums are exact, and equal candidates have equal sums."""
+"""Scores are multiples of it, so sums are exact and equal candidates have equal sums."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Rejoin:
             raise UsageError(f"--min-probability: expected a number in [0.5, 1), received {self.min_probability:g}")
 
     def objects(self, tracks: Mapping[int, Tracks], parameters: Parameters) -> Objects:
-        """Return the object of each track of a recording, given the tracks by frame in a world frame that stands."""
+        """Return the object of each track of a recording, given the tracks by frame in a fixed world frame."""
         found = tracklets(tracks, parameters.labels)
         before, after, probability = joins(found, parameters, self.gap_s)
         sure = probability >= self.min_probability
@@ -220,7 +220,7 @@ def joins(found: Tracklets, parameters: Parameters, gap_s: float) -> tuple[Ints,
 
 
 def _pairs(found: Tracklets, later: Ints, kind: Ints, motion: Floats, gap_s: float) -> tuple[Ints, Ints, Floats]:
-    """Return the rows of tracks before and after a gap, one of `later`, and their s but for sizes and the rate."""
+    """Return the rows of tracks before and after a gap, these among `later`, and their s without sizes and rate."""
     order = np.argsort(found.last_ns, kind="stable")
     first = found.first_ns[later]
     low, high = (np.searchsorted(found.last_ns[order], one) for one in (first - round(gap_s * 1e9), first))
@@ -374,7 +374,7 @@ def matching(before: Ints, after: Ints, score: Floats) -> tuple[Ints, Floats, In
     _, i = np.unique(before[pairs], return_inverse=True)
     nodes, j = np.unique(after[pairs], return_inverse=True)
     count, value = int(i.max()) + 1, score[pairs]
-    # A column of its own leaves a row without a partner. Each row has one column, so that one more for all is the same.
+    # A row that takes its own column has no partner. Each row takes one column, so one more for all changes nothing.
     own = np.arange(count)
     columns = (np.concatenate((i, own)), np.concatenate((j, len(nodes) + own)))
     table = coo_array((np.concatenate((value + 1.0, np.ones(count))), columns)).tocsr()

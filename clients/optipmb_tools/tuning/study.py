@@ -1,4 +1,4 @@
-"""Tuning of one class: an Optuna study on some sequences, measured on those that are held out.
+"""Tuning of one class: an Optuna study on some sequences, measured on held-out ones.
 
 By default only the values that the paper's table of parameters lacks are searched: Q, R, P^0, the area and the two
 limits of forgetting. Bounds lie around the values that the study begins from: the profile's and the estimated

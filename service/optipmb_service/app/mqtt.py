@@ -342,7 +342,7 @@ class Bridge(Reporter):
             self._reader.receive(one)
 
     async def _publish(self, link: Link) -> None:
-        """Publish waiting messages, a few at once; those that an ended connection left, one by one."""
+        """Publish waiting messages, a few at once; messages that an ended connection left, one by one."""
         while True:
             while self._unsent:
                 await self._send(link, self._unsent[0], alone=True)

@@ -31,7 +31,7 @@ NOT_THE_NEWEST: Final = 10071
 UNDECIDED: Final = 10164  # several servers have not agreed yet on a write that was asked for before
 NOTHING_THERE: Final = 10037
 AGAIN_S: Final = 0.05
-MOST_NUMBERS: Final = 4096  # streams of which it is remembered what was written
+MOST_NUMBERS: Final = 4096  # streams whose written numbers are remembered
 
 EXPECTED: Final = "Nats-Expected-Last-Subject-Sequence"
 

@@ -1,1 +1,1 @@
-"""Ways to tracks other than Zenoh, and what they share: rights of callers, queues of readers, shared subscriptions."""
+"""Interfaces other than Zenoh, with their common parts: rights of callers, queues of readers, shared subscriptions."""

@@ -320,7 +320,7 @@ class EventLog:
         self._entered = False
 
     def add(self, one: Publication) -> None:
-        """Add the events of a message, or those that it makes final."""
+        """Add the events of a message, or the events that it makes final."""
         message: schemas.Events = one.message
         with self._lock:
             for each in self._held[message.stream].take(message) if self._is_final else [message]:
@@ -351,7 +351,7 @@ class EventLog:
             return min(int(number), self._last)
 
     def after(self, number: int) -> tuple[list[Event], int]:
-        """Return the events after a number, and the count of those that have been dropped."""
+        """Return the events after a number, and the count of dropped ones."""
         with self._lock:
             self._expire()
             found = list(takewhile(lambda one: one.number > number, reversed(self._kept.values())))
@@ -500,7 +500,7 @@ class Reader:
         if one.topic in {"tracks", "now"}:
             with self._lock:
                 self._newest.pop(stream, None)
-                self._newest[stream] = one  # behind those that came before
+                self._newest[stream] = one  # the newest is last
             if self._pace.passes(stream, message.predicted_to_ns or message.stamp_ns):
                 put(f"tracks {stream}", self._tracks(one), size)
         elif one.topic == "problems":

@@ -85,7 +85,7 @@ class Counters(FrameCounts, Deliveries):
 
 @dataclass
 class MessageCounters(Counters):
-    """Counts of the messages of a stream, or of all: also those that never came to a session.
+    """Counts of the messages of a stream, or of all, with messages that reached no session.
 
     Every frame received ends in one of frames, duplicates, late, refused and shed, or waits: received is their sum.
     """

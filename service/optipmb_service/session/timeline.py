@@ -513,7 +513,7 @@ class FusedTimeline(Timeline):
         return self._jump_ns(frame_id) > self.limits.back_ns and not self._is_doubted(frame_id.sensor)
 
     def doubted(self, frame_id: FrameId) -> tuple[Decision, Timeline]:
-        """Refuse a frame that is ahead, and those of its sensor that follow it, until most sensors agree."""
+        """Refuse a frame that is ahead, and later frames of its sensor, until most sensors agree."""
         decision, _ = self._refuse(frame_id, Verdict.JUMPED)
         return decision, replace(self, jumped=self._jumped(frame_id))
 
@@ -533,7 +533,7 @@ class FusedTimeline(Timeline):
             return self._admit(frame_id)
         newest = number < 0 or (number == len(epochs) - 1 and frame_id.seq > epochs[number].highest)
         if refusal is Verdict.LATE and newest:
-            return self._other_clock(frame_id, refusal)  # its clock has stepped back, or that of another one ahead
+            return self._other_clock(frame_id, refusal)  # its clock has stepped back, or another sensor's ahead
         return self._refuse(frame_id, refusal)
 
     def _no_place(self, frame_id: FrameId, number: int) -> Verdict | None:

@@ -29,7 +29,7 @@ LANE, CYCLE_LANE, PARKING, KERB, PAVEMENT = 1.75, 4.4, 6.6, 8.2, 10.6
 """Distances of the strips from the middle of the street."""
 _LINES = (-5.3, -3.5, 0.0, 3.5, 5.3)  # between lanes, cycle lanes and parked cars
 _WALLS = 12.6  # distance of the end of the pavement
-_STRIPES = 3.0  # length of those of a crosswalk
+_STRIPES = 3.0  # length of the stripes of a crosswalk
 _BLOCK = np.array([[1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]])
 _WALKING_LANES = (0.5, 1.5)  # distances of pedestrians from the middle of their way, on its right
 _WAY = 20.0  # length of the pavement on either side of a crosswalk

@@ -104,7 +104,7 @@ _PART: Final = re.compile(
 )
 """Base of a column that may be one of several numbers of an orientation."""
 _TURNED: Final = re.compile("(^|_)(rot|r?vec|orient|head|yaw|quat|euler|angle|axis|cog$|course)")
-_OTHER: Final = re.compile("ego|pose|sensor|camera|lidar|vehicle|header")  # what is not of a box
+_OTHER: Final = re.compile("ego|pose|sensor|camera|lidar|vehicle|header")  # groups that describe no box
 _LENGTHS: Final = {"m", "meter", "meters", "metre", "metres", "mps"}
 
 
@@ -114,7 +114,7 @@ def find_columns(names: Iterable[str], chosen: Mapping[str, str], texts: Collect
     Args:
         names: Of all columns.
         chosen: Meanings whose column the user has named.
-        texts: Columns without any number, which are no quantities whatever their name.
+        texts: Columns without any number, which hold no quantities under any name.
     """
     known = [normalised(name) for name in names]
     taken: dict[str, Column] = {}
@@ -151,7 +151,7 @@ def find_columns(names: Iterable[str], chosen: Mapping[str, str], texts: Collect
 
 
 def _is_shared(column: Column, known: Collection[Column]) -> bool:
-    """Tell whether a column is one of several of an orientation, as `rotation.angle` beside `rotation.axis`."""
+    """Tell whether a column is one of several of an orientation, as `rotation.angle` with `rotation.axis`."""
     group = column.name.rpartition(".")[0]
     others = [one for one in known if one.name.startswith(f"{group}.") and one.name != column.name]
     return bool(group and others) and _plain(group.rpartition(".")[2]) in _BOX_TURN.split()

@@ -1,4 +1,4 @@
-"""Findings about a table: what is assumed, doubted or wrong, on which evidence, and the option that corrects it.
+"""Findings about a table: assumptions, doubts and errors, with the evidence and the option that corrects each.
 
 An option of the user holds, then what the name of a column says, then the first way to read the values, unless another
 way has the stronger evidence (`Evidence.beats`). `Reading.decide` alone compares evidence.
@@ -23,7 +23,7 @@ HALF: Final = 0.5  # share of its rival's evidence up to which a reading is refu
 class Finding:
     """An assumption about a recording, or an error in it."""
 
-    topic: str  # `time`, `yaw`, `scores` …: what it changes
+    topic: str  # subject: `time`, `yaw`, `scores` …
     text: str  # one line
     option: str = ""  # that changes it
     wrong: bool = False  # whether `optipmb track` refuses the recording for it
@@ -111,8 +111,8 @@ class Reading:
         Args:
             topic: Of the findings.
             claims: The first one holds unless another one has the stronger evidence.
-            things: What is counted, and how it agrees: "moves are along it"; empty: it is not shown.
-            clash: What is doubted where the claim that holds is at odds with the evidence.
+            things: Noun and verb behind a share, as in "moves are along it"; empty: shares are not shown.
+            clash: Text of the doubt where the evidence contradicts the claim that holds.
             expected: For the error.
             asked: Value that the user has chosen.
             least: Share of the evidence below which the claim is doubted, also without a rival.

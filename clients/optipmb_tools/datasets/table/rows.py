@@ -404,7 +404,7 @@ class _Table:
     def _centers(self, series: Ints, stamps: Stamps) -> Floats:
         """Return centres (R, 3): x, y, z, or latitude and longitude where an origin is given and x is not.
 
-        Those of a camera come from its pixel boxes.
+        With a camera they come from its pixel boxes.
         """
         self._placed = self._place(series, stamps)
         if self._placed is not None:
@@ -444,7 +444,7 @@ class _Table:
             expected = f"stamps in column {column.name}: numbers, or dates as YYYY-MM-DD HH:MM:SS.ffffff"
             self._time.first("time", bad, expected, values)
             texts = [text.strip() for text in values.tolist()]
-            integers = all(text.lstrip("+-").isdigit() for text in texts)  # such as nanoseconds beside an empty cell
+            integers = all(text.lstrip("+-").isdigit() for text in texts)  # as nanoseconds with an empty cell
             values = np.array(
                 [int(text) for text in texts] if integers else texts, dtype=np.int64 if integers else np.float64
             )

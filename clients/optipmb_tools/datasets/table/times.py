@@ -1,4 +1,4 @@
-"""Stamps of a table: their unit, what they count from, and which of them belong to one frame."""
+"""Stamps of a table: unit, origin, and grouping into frames."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -53,7 +53,7 @@ def median_step(numbers: np.ndarray, key: Ints) -> float:
 
 
 def may_be_merged(stamp: Ints, key: Ints, boxes: float) -> bool:
-    """Tell whether stamps (R,) may be those of several frames each, of which `boxes` are at one place.
+    """Tell whether each of the stamps (R,) may hold several frames, given the number of `boxes` at one place.
 
     Then they are a power of ten apart, or further than frames are, and no detector is faster than the merged frames.
     """
