@@ -241,14 +241,14 @@ def test_a_name_of_a_frame_of_reference_is_no_number_of_a_frame(tmp_path: Path) 
         assert len(dataset.sequences(["all"])[0]) == 40
 
 
-@pytest.mark.parametrize("factor", [2.0, 0.01, 0.3048])
-def test_sizes_by_a_factor_are_doubted_with_the_option(tmp_path: Path, factor: float) -> None:
-    """Halves of sizes, centimetres and feet are named; by the option sizes are those of cars."""
+@pytest.mark.parametrize("factor", [2.0, 0.01, 0.001, 0.3048])
+def test_sizes_by_a_factor_are_named_with_the_option(tmp_path: Path, factor: float) -> None:
+    """Halves of sizes, centimetres, millimetres and feet are named; by the option sizes are those of cars."""
     columns = street(4.0)
     for name in "lwh":
         columns[name] = columns[name] / factor
     (found,) = troubles(tmp_path / "d.csv", columns)
-    assert f"--option size_factor={factor:g}" in found
+    assert f"{factor:g}" in found.partition("--option size_factor=")[2].split()
     dataset, findings = looked(tmp_path / "d.csv", columns, size_factor=str(factor))
     assert not any(one.doubt for one in findings)
     assert next(dataset.sequences(["all"])[0].frames()).size[0] == pytest.approx([4.5, 1.9, 1.6])
@@ -269,14 +269,33 @@ def test_marks_for_no_value_are_refused_or_left_out(tmp_path: Path, column: str,
         assert np.isnan(yaw).sum() == 1
 
 
+@pytest.mark.parametrize("mark", ["NULL", "none", "na", "N.A.", "\\N", "#VALUE!", "1.#QNAN"])
+def test_texts_for_no_value_are_empty_cells(tmp_path: Path, mark: str) -> None:
+    """Where a text stands for no value, a heading is unknown, and the row of a size is refused or left out."""
+    columns = street(4.0)
+    for name in ("yaw", "l"):
+        cells = columns[name].astype(np.str_)
+        cells[10] = mark
+        path, changed = tmp_path / f"{name}.csv", {**columns, name: cells}
+        if name == "l":
+            (found,) = troubles(path, changed)
+            assert "l.csv:12: expected positive length, width and height" in found
+        assert troubles(path, changed, invalid="skip") == []
+        (sequence,) = looked(path, changed, invalid="skip")[0].sequences(["all"])
+        yaw = np.concatenate([frame.yaw for frame in sequence.frames()])
+        assert (np.isnan(yaw).sum(), len(yaw)) == ((1, 320) if name == "yaw" else (0, 319))
+
+
 def test_boxes_may_lack_their_headings(tmp_path: Path) -> None:
     """Headings are unknown where the column or a cell is missing, and one line says so."""
-    for yaw in (None, np.where(np.arange(len(street(4.0)["t"])) % 3 == 0, np.nan, street(4.0)["yaw"])):
+    none = np.full(len(street(4.0)["t"]), np.nan)
+    for yaw in (None, none, np.where(np.arange(len(none)) % 3 == 0, np.nan, street(4.0)["yaw"])):
         columns = {**street(4.0), "yaw": yaw}
         dataset, findings = looked(tmp_path / "d.csv", {name: one for name, one in columns.items() if one is not None})
         given = np.concatenate([frame.yaw for frame in dataset.sequences(["all"])[0].frames()])
         assert np.isnan(given).sum() == (len(given) if yaw is None else np.isnan(yaw).sum())
         assert sum("unknown" in one.text for one in findings) == 1
+        assert any("yaw is in radians" in one.text for one in findings) == (yaw is not None and yaw is not none)
 
 
 @pytest.mark.parametrize("name", ["17000000{:02d}.{:d}00000", "17000000{:02d}{:d}00000000"])
@@ -291,24 +310,43 @@ def test_names_of_files_that_are_stamps_give_the_rate(tmp_path: Path, name: str)
     assert np.diff(stamps) == pytest.approx(0.5e9, rel=1e-3)
 
 
-def test_a_class_with_the_number_of_an_object_is_a_class(tmp_path: Path) -> None:
-    """`car:3` is of class `car`; classes that differ in a number alone stay as they are."""
+@pytest.mark.parametrize("form", ["car:{}", "{}:car", "car{}"])
+def test_a_class_with_the_number_of_an_object_is_class_and_id(tmp_path: Path, form: str) -> None:
+    """`car:3` is the object 3 of class `car`; classes that differ in a number alone stay as they are."""
     columns = street(4.0)
     number = np.arange(len(columns["t"])) % CARS
-    columns["class"] = np.char.add("car:", number.astype(np.str_))
+    columns["class"] = np.array([form.format(one) for one in number.tolist()])
     assert looked(tmp_path / "a.csv", columns)[0].sequences(["all"])[0].labels == ("car",)
+    truth = TableDataset(tmp_path / "a.csv").sequences(["all"])[0].truth()
+    assert truth is not None
+    assert len(np.unique(truth.id)) == CARS
     columns["class"] = np.char.add("class_", (number % 2).astype(np.str_))
     assert set(looked(tmp_path / "b.csv", columns)[0].sequences(["all"])[0].labels) == {"class_0", "class_1"}
 
 
+def test_a_rate_is_that_of_numbers_and_not_of_times(tmp_path: Path) -> None:
+    """Whole numbers in a column of stamps count frames if a rate says so; of fractions, the rate is named as unused."""
+    columns = street(4.0)
+    (found,) = troubles(tmp_path / "d.csv", columns, rate="50")
+    assert "rate is not used: column t has times" in found
+    for stamps, rate in ((columns["t"], "50"), (np.round(columns["t"] / PERIOD), "10")):
+        dataset, findings = looked(tmp_path / "d.csv", {**columns, "t": stamps}, rate=rate)
+        assert np.diff(dataset.sequences(["all"])[0].stamps) == pytest.approx(PERIOD * 1e9)
+    assert any("column t counts frames, 10 a second" in one.text for one in findings)
+
+
 def test_boxes_of_an_image_are_refused(tmp_path: Path) -> None:
-    """Width and height without a length are an image's, whether or not there is a heading."""
+    """Width and height without a length, corners and lists of four numbers are an image's, with or without heading."""
     plain = boxes(z=None, l=None)
     rest = {name: one for name, one in plain.items() if name not in {"w", "h"}}
     image = {"image_width": plain["w"] * 30.0, "image_height": plain["h"] * 30.0}
-    for columns in (plain, {**rest, **image}):
+    bare = {name: one for name, one in rest.items() if name not in {"x", "y", "yaw"}}
+    ends = (plain["x"], plain["y"], plain["x"] + 30.0, plain["y"] + 30.0)
+    corners = dict(zip(("x1", "y1", "x2", "y2"), ends, strict=True))
+    listed = {f"bbox.{place}": one for place, one in enumerate(ends)}
+    for columns in (plain, {**rest, **image}, {**bare, **corners}, {**bare, **listed}):
         write_table(tmp_path / "d.csv", columns)
-        with pytest.raises(DatasetError, match=r"cameras\.md.*boxes in pixels\?"):
+        with pytest.raises(DatasetError, match=r"--camera FILE.*cameras\.md.*boxes in pixels\?"):
             TableDataset(tmp_path / "d.csv")
 
 

@@ -449,7 +449,10 @@ class _Table:
                 [int(text) for text in texts] if integers else texts, dtype=np.int64 if integers else np.float64
             )
         if rate is not None:
-            return Stamps(nanoseconds(reading, values, 1e9 / rate), values, column.name, skipped)
+            if np.all(values == np.round(values)):
+                reading.note("time", f"column {column.name} counts frames, {rate:g} a second")
+                return Stamps(nanoseconds(reading, values, 1e9 / rate), values, column.name, skipped)
+            reading.doubt("time", f"rate is not used: column {column.name} has times, not numbers of frames")
         if "nanosec" in found:
             whole = np.asarray(values == np.floor(values))
             self._time.first("time", ~whole, f"whole seconds in column {column.name}", values)
@@ -600,11 +603,12 @@ class _Table:
         unposed = motion.pose is None
         found = yaw
         if unit != "none":
-            moving = unposed and is_moving(yaw, long)
-            found = read_heading(reading, yaw, unit, long, motion.carry, strict=strict, moving=moving)
-            unknown = int(np.isnan(found).sum())
+            unknown = int(np.isnan(yaw).sum())
+            if unknown < len(yaw):
+                moving = unposed and is_moving(yaw, long)
+                found = read_heading(reading, yaw, unit, long, motion.carry, strict=strict, moving=moving)
             if unknown:
-                reading.note("yaw", f"{unknown} of {len(found)} boxes have no heading: it is unknown")
+                reading.note("yaw", f"{unknown} of {len(yaw)} boxes have no heading: it is unknown")
         if unposed and self._placed is None:
             reading.note("pose", "no columns for the pose of the sensor: boxes are assumed to be in the world frame")
             if unit != "none" and is_moving(found, long):
@@ -780,9 +784,9 @@ class _Table:
             ("finite x, y and z", center, (np.abs(center) <= LARGEST).all(axis=1)),
             ("positive length, width and height", size, (np.isfinite(size) & (size > 0.0)).all(axis=1)),
             (
-                f"sizes up to {LARGEST_SIZE:g} m, or --option size_factor=0.01 or 0.001,",
+                f"sizes up to {LARGEST_SIZE:g} m, or --option size_factor=0.01 or 0.001",
                 size,
-                (size <= LARGEST_SIZE).all(axis=1),
+                ~(size > LARGEST_SIZE).any(axis=1),
             ),
             ("finite yaw", yaw, ~np.isinf(yaw)),
             ("a yaw within a turn", yaw, ~no_angle(self._reading, yaw, unit)),
