@@ -153,6 +153,17 @@ def test_an_option_applies_to_the_tables_that_have_what_it_names(bench: Bench) -
     assert (done.returncode, "class of the table: car" in done.stderr) == (2, True)
 
 
+def test_a_column_of_ids_may_be_named_in_each_table(bench: Bench) -> None:
+    """`column.id` reaches the truth and the tracks of `evaluate`, and the table of `check`."""
+    other = cars(id=None, number=cars()["id"])
+    done = bench.evaluate(other, cars())
+    assert (done.returncode, "truth.csv: expected a column of ids" in done.stderr) == (2, True)
+    assert counts(bench.evaluate(other, cars(), options=["column.id=number"])) == RIGHT
+    assert counts(bench.evaluate(cars(), other, options=["column.id=number"])) == RIGHT
+    done = bench.run("check", bench.table("truth.csv", other), "--json", options=["column.id=number"])
+    assert "id from number" in next(one["text"] for one in result_of(done)["findings"] if one["topic"] == "columns")
+
+
 def test_the_truth_of_a_folder_is_matched_by_the_names_of_files(bench: Bench) -> None:
     """Each recording has the truth of the file of its name; a recording without one is named."""
     for name, shift in (("one", 0.0), ("two", 500.0)):

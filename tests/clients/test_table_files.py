@@ -124,6 +124,7 @@ def test_the_day_is_found_where_a_number_exceeds_twelve(tmp_path: Path) -> None:
             "--dataset kitti reads a folder of it",
         ),
         ("d.txt", "1,1,794.2,247.5,71.2,174.8,-1,-1,-1,-1\n", {}, "image boxes as of MOTChallenge"),
+        ("d.txt", "1,1,794.2,247.5,71.2,174.8,1,1,0.86\n", {}, "image boxes as of MOTChallenge"),
         ("d.parquet", "version https://git-lfs.github.com/spec/v1\noid sha256:0\n", {}, "git lfs pull"),
         ("d.csv", "<!DOCTYPE html>\n<html>\n", {}, "a page of HTML"),
         ("d.csv", "PK\3\4and more", {}, "a ZIP archive or a spreadsheet"),
