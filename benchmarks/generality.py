@@ -16,9 +16,9 @@ and every fifth frame of KITTI. Columns in addition to `optipmb evaluate`:
 - existence: largest difference of the predicted and the observed share of objects, of tenths with `TENTH` of the boxes.
 - speed: root mean square error of the velocity of moving objects in KITTI, m/s, against labels half a second apart.
 
-With `--summary` it prints the figures by which a change of the default is judged, a line each, with `--table` those of
-each detector with `auto` and with its tuned profile, at the full rate. With `--cache` a cell is
-computed once for each state of the tracker.
+With `--summary` it prints the figures by which a change of the default is judged, a line each. With `--table` it prints
+figures of each detector at the full rate, with `auto` and with its tuned profile. With `--cache` a cell is computed
+once for each state of the tracker.
 """
 
 from __future__ import annotations
@@ -255,7 +255,7 @@ def identity_f1(cases: Sequence[Case], threshold: float) -> float:
         if len(both):
             chosen = best_pairs(both[:, 0], both[:, 1], times.astype(np.float64))
             agreed += int(times[chosen].sum())
-        judged = ~case.excused  # and those that an object has, which would be excused without it
+        judged = ~case.excused  # a track of an object counts although it would be excused without the object
         judged[case.track_row[counts]] = True
         total += int((~case.ignored).sum() + judged.sum())
     return 2.0 * agreed / max(total, 1)
@@ -298,7 +298,7 @@ SMOOTHED = (0.1, 0.2, 0.3, 0.5)
 
 
 def smoothing() -> float:
-    """Return the error of tracks beside that of their boxes, for objects at constant velocity at 10 Hz."""
+    """Return the ratio of the errors of tracks and their boxes, for objects at constant velocity at 10 Hz."""
     ratios, rng = [], np.random.Generator(np.random.PCG64(1))
     for noise in SMOOTHED:
         tracker = optipmb.OnlineTracker("generic")
@@ -407,7 +407,7 @@ def _ranges(given: Summary, figure: str, form: str, scale: float = 1.0) -> str:
 
 
 def _each(given: Summary, figure: str, low: float, high: float) -> str:
-    """Return how many cells of cars and pedestrians have a figure from `low` to `high`, and those that do not."""
+    """Return how many cells of cars and pedestrians have a figure from `low` to `high`, and name the others."""
     count, others = 0, []
     for cell in ALL:
         for label, found in given.of(*cell).items():
@@ -474,7 +474,7 @@ def table(given: Summary) -> Iterator[str]:
 
 
 def _state(profile: str) -> str:
-    """Return a digest of everything that figures depend on beside the data."""
+    """Return a digest of the tracker, the profiles and this file."""
     folder = Path(optipmb.__file__).parent
     files = [*folder.glob("*.py"), *folder.glob("profiles/*.toml"), Path(__file__)]
     content = b"".join(one.read_bytes() for one in sorted(files))
@@ -482,7 +482,7 @@ def _state(profile: str) -> str:
 
 
 def figures(cell: Cell, cache: Path | None = None) -> Figures:
-    """Return the figures of the classes of a cell, those of a cache where it has them."""
+    """Return the figures of the classes of a cell, from the cache if it has them."""
     key = "-".join(str(one) for one in astuple(cell)[1:])
     path = None if cache is None else cache / _state(cell.profile) / f"{key}.json"
     if path is not None and path.is_file():

@@ -59,7 +59,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _interleave(items: list[pytest.Item]) -> None:
-    """Order files so that those which start processes and wait run beside those which compute, from first to last."""
+    """Alternate files that start processes and wait with files that compute, from first to last."""
     waiting, computing = {}, {}
     for item in items:
         folder = item.path.relative_to(HERE).parts[0]

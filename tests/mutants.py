@@ -81,7 +81,7 @@ def mutated(node: ast.AST) -> ast.expr | None:
 
 
 def expressions(tree: ast.AST) -> Iterator[ast.expr]:
-    """Yield the expressions within functions, without annotations, decorators, texts and what is raised or logged."""
+    """Yield the expressions within functions, without annotations, decorators, texts, exceptions and logs."""
     for node in ast.iter_child_nodes(tree):
         inside = isinstance(tree, ast.FunctionDef | ast.AsyncFunctionDef)
         if isinstance(node, ast.JoinedStr | ast.Raise | ast.arguments | ast.Assert) or (

@@ -2,8 +2,8 @@
 
 A test file is near when it imports a module that changed; when no test does, tests that import a module that imports
 one, and so on. Of many that are equally near, the namesakes run: a package that imports all its parts brings them all
-near. Beside them run those that share the most and rarest words with a module: a session's rules are tested by what
-they are about, through the session. Tests that changed run too. Files are compared with where the branch left COMMIT;
+near. Tests that share the most and rarest words with a module run too: the rules of a session are tested through the
+session. So do tests that changed. Files are compared with where the branch left COMMIT;
 files that are not committed count. (Tools that watch which lines a test runs cannot see into compiled kernels.)
 """
 
@@ -48,7 +48,7 @@ def main(since: str) -> int:
 
 
 def nearest(changed: set[Path]) -> set[Path]:
-    """Return the files of tests nearest to modules, but for those of whole systems."""
+    """Return the files of tests nearest to modules, without tests of whole systems."""
     tests = _tests()
     imports = {path: _imports(path) for path in _modules() | tests}
     quick = {path for path in tests if path.relative_to(ROOT / "tests").parts[0] not in SLOW}

@@ -1,4 +1,4 @@
-"""Damaged files: each reader gives what is left, or one clear error, and no library's error or warning."""
+"""Damaged files: each reader gives the readable part, or one clear error, and no library's error or warning."""
 
 import json
 import random
@@ -132,7 +132,7 @@ def results(name: str) -> Callable[[Path], tuple[Path, Callable[[], None]]]:
 
 
 def _done(_: Any) -> None:
-    """Drop what was read."""
+    """Drop a result."""
 
 
 READERS = {
@@ -154,7 +154,7 @@ READERS = {
 
 @pytest.mark.parametrize("reader", READERS)
 def test_a_damaged_file_is_read_or_refused(reader: str, tmp_path: Path) -> None:
-    """Each of 200 damages gives what is left or one error that names the place; warnings are errors here."""
+    """Each of 200 damages gives the readable part, or one error that names the place; warnings are errors here."""
     path, read = READERS[reader](tmp_path)
     data = path.read_bytes()
     read()

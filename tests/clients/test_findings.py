@@ -1,4 +1,4 @@
-"""Tables of strangers: what is right is read, and what is wrong is refused or named with the remedy."""
+"""Tables of unknown sources: correct columns are read, wrong ones are refused or named with the remedy."""
 
 import json
 from pathlib import Path
@@ -102,7 +102,7 @@ def yaw_of(path: Path) -> np.ndarray:
 
 
 def test_an_orientation_is_read_whole_or_refused(tmp_path: Path) -> None:
-    """Quaternions, three angles and matrices give the heading whatever the group is called; half of one is refused."""
+    """Quaternions, three angles and matrices give the heading under any name of their group; half of one is refused."""
     columns = street(4.0)
     yaw, zero = columns["yaw"], np.zeros(len(columns["t"]))
     cos, sin = np.cos(yaw), np.sin(yaw)
@@ -132,7 +132,7 @@ def test_an_orientation_is_read_whole_or_refused(tmp_path: Path) -> None:
 )
 @pytest.mark.parametrize("column", ["t", "yaw_rate"])
 def test_a_folder_with_a_table_for_each_frame_is_one_recording(tmp_path: Path, name: str, column: str) -> None:
-    """The stamps give the order of the frames, or the number that differs among the names, wherever it stands."""
+    """The stamps give the order of the frames, or the number that differs among the names, at any place in them."""
     columns = street(2.0)
     for number, stamp in enumerate(np.unique(columns["t"]).tolist()):
         rows = {key: one[columns["t"] == stamp] for key, one in columns.items()}
@@ -243,7 +243,7 @@ def test_a_name_of_a_frame_of_reference_is_no_number_of_a_frame(tmp_path: Path) 
 
 @pytest.mark.parametrize("factor", [2.0, 0.01, 0.001, 0.3048])
 def test_sizes_by_a_factor_are_named_with_the_option(tmp_path: Path, factor: float) -> None:
-    """Halves of sizes, centimetres, millimetres and feet are named; by the option sizes are those of cars."""
+    """Halves of sizes, centimetres, millimetres and feet are named; with the option they are sizes of cars."""
     columns = street(4.0)
     for name in "lwh":
         columns[name] = columns[name] / factor

@@ -1,4 +1,4 @@
-"""Rules of the repository: which way imports run, what is pure computation, and what the documentation names."""
+"""Rules of the repository: directions of imports, pure computation, and names in the documentation."""
 
 import ast
 import re
@@ -115,7 +115,7 @@ def test_libraries_of_an_edge_stay_there() -> None:
 
 
 def test_folders_of_the_service_import_what_the_page_says() -> None:
-    """The table of docs/architecture.md has each folder and module, and what it may import of the others."""
+    """The table of docs/architecture.md has each folder and module, and its allowed imports of the others."""
     page = (DOCS / "architecture.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `(\w+)(?:/|\.py)` \|.*\| ([^|]*) \|$", page, re.MULTILINE)
     allowed = {folder: set(re.findall(r"`(\w+)`", imports)) for folder, imports in rows}

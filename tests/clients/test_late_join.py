@@ -94,7 +94,7 @@ def test_a_gap_is_asked_for_once() -> None:
 
 
 def test_what_was_published_before_is_left_out() -> None:
-    """What comes waits until the newest samples of the caches are known; a publisher that is not among them is new."""
+    """Samples wait until the newest ones of the caches are known; a publisher that is not among them is new."""
     one, other = Joined(), Entity(eid=8)
     one.join = LateJoin(
         lambda sample: one.received.append(sample.source_info and sample.source_info.source_sn),

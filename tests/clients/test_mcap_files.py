@@ -410,7 +410,7 @@ def test_a_recording_is_a_dataset(tmp_path: Path) -> None:
 
 
 def test_boxes_of_the_world_are_carried_to_a_sensor_with_a_field_of_view(tmp_path: Path) -> None:
-    """All columns are what they would be in the frame of a sensor that is turned to the left by a right angle."""
+    """All columns are in the frame of a sensor that is turned to the left by a right angle."""
     pose = Pose(translation=[10.0, 0.0, 0.0], quaternion=[np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
     seen = FieldOfView(azimuth=[-1.0, 1.0], elevation=[-1.0, 1.0], range=[0.0, 50.0])
     common: dict[str, Any] = {"stream": STREAM, "epoch": EPOCH, "labels": ["Car"], "pose": pose, "field_of_view": seen}

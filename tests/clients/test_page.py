@@ -10,7 +10,7 @@ from tracks_message import tracks_message
 
 
 def test_a_page_is_one_small_file_with_the_confirmed_tracks(tmp_path: Path) -> None:
-    """A thousand frames of twenty tracks take less than 2 MB, refer to nothing else, and lack what is not confirmed."""
+    """A thousand frames of twenty tracks take less than 2 MB, refer to nothing else, and lack unconfirmed tracks."""
     ids = np.arange(1, 21)
     rng = np.random.default_rng(1)
     places = np.cumsum(rng.normal(0.0, 1.0, (1000, 20, 3)), axis=0)

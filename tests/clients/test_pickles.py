@@ -1,4 +1,4 @@
-"""`result.pkl` of OpenPCDet is read without running anything, and every other pickle is refused by what it holds."""
+"""`result.pkl` of OpenPCDet is read without running anything, and other pickles are refused by their content."""
 
 import contextlib
 import io
@@ -33,7 +33,7 @@ def frames() -> list[dict[str, Any]]:
 
 @pytest.mark.parametrize("protocol", range(6))
 def test_results_are_read_in_every_protocol(tmp_path: Path, protocol: int) -> None:
-    """The columns are those of the same frames as lines of JSON, with the numbers of the frames, the empty one too."""
+    """The columns equal the same frames as lines of JSON, with the numbers of the frames, also of an empty one."""
     lines = []
     for frame in frames():
         lists = {name: frame[name].tolist() for name in ("name", "score", "boxes_lidar")}

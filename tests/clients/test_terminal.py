@@ -97,7 +97,7 @@ def test_a_narrow_terminal_shows_fewer_columns(width: int) -> None:
 
 
 def test_long_names_fit_80_columns() -> None:
-    """Of a long name the end is seen, in the view and in the tables, beside the message of a problem."""
+    """The view and the tables show the end of a long name, with the message of a problem."""
     name = "plant-north-hall-3/forklift-0012/lidar-front-left"
     problem = Problem(
         stream=name, instance="one", code="restarted", received="publisher, +24.064 s", message="the publisher is new"

@@ -15,7 +15,7 @@ SET_UP = ("pip install ", "python3 -m venv ")
 
 
 def run(page: str, heading: str, capsys: pytest.CaptureFixture[str]) -> str:
-    """Run the blocks of a section of a page twice, without installations; return what they print the second time."""
+    """Run the blocks of a section of a page twice, without installations; return the second output."""
     (section,) = re.findall(
         rf"^## {re.escape(heading)}\n(.*?)(?=^## |\Z)", (ROOT / page).read_text(), re.DOTALL | re.MULTILINE
     )

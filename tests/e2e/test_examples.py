@@ -87,10 +87,7 @@ class Program(AbstractContextManager["Program"]):
 
 @pytest.mark.parametrize("time", [1, 2])
 def test_the_examples_work_twice(service: ServiceProcess, time: int) -> None:
-    """Each reader of the examples and the pages says what it promises of the car that the publisher publishes.
-
-    That is so again with the state that is left.
-    """
+    """Readers of the examples and the pages print the promised lines of the published car, also with kept state."""
     texts = [(EXAMPLES / f"{name}.py").read_text() for name in ("subscriber", "publisher")]
     assert all(text.count(DEFAULT_ENDPOINT) == 1 for text in texts), "an example names the endpoint, once"
     subscriber, publisher = (connected(text, service.endpoint) for text in texts)
@@ -110,7 +107,7 @@ def test_the_examples_work_twice(service: ServiceProcess, time: int) -> None:
     assert {tuple(row[:4]) for row in rows} == {("garage/robot-1/lidar", "track", rows[0][2], "car")}
     x = [float(row[5]) for row in rows]
     assert x == sorted(x)
-    # A reader of events first gets those that are kept.
+    # A reader of events first gets the kept ones.
     promised = (REPOSITORY / "docs/zones.md").read_text().partition("It prints:\n\n```\n")[2].partition("```")[0]
     assert [one[:-2] for one in said] == time * [line.split()[:-2] for line in promised.splitlines()]
     assert [one[-1] for one in said[-4:]] == 4 * [str(time)]

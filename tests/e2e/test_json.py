@@ -60,7 +60,7 @@ def read(address: str, count: int, lines: queue.SimpleQueue[bytes]) -> None:
 def frames(service: ServiceProcess, address: str) -> tuple[list[bytes], list[bytes]]:
     """Publish each frame when all readers have the one before, and compare; return the texts of tracks and of events.
 
-    Readers get the newest frame alone of those that wait for them.
+    Readers get only the newest waiting frame.
     """
     base, query = f"http://{address}/api/v1", f"stream={SENSOR.stream}&topics=tracks,events&events=now"
     socket = create_connection(f"ws://{address}/api/v1/ws?{query}", timeout=60, suppress_origin=True)

@@ -40,7 +40,7 @@ class LiDARInstance3DBoxes:
 
 
 class DepthInstance3DBoxes(LiDARInstance3DBoxes):
-    """As those of a LiDAR, with x right and y ahead."""
+    """Boxes as of a LiDAR, with x right and y ahead."""
 
 
 class CameraInstance3DBoxes(LiDARInstance3DBoxes):

@@ -45,7 +45,7 @@ def server() -> socket.socket:
 
     def end() -> None:
         asking.close()
-        process.kill()  # it may still load; what was forked belongs to others
+        process.kill()  # it may still load; forked processes belong to others
         process.wait(60)
 
     atexit.register(end)

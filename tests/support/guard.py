@@ -1,7 +1,7 @@
 """The end of all that a test process has started, when it has ended: also by SIGKILL, when it can end nothing itself.
 
-`python guard.py MARK` runs beside it, and holds the other end of a pipe. Processes that were started carry the mark in
-their environment, and so do those that these have started.
+`python guard.py MARK` runs as its companion and holds the other end of a pipe. Started processes and their
+descendants carry the mark in their environment.
 """
 
 from __future__ import annotations

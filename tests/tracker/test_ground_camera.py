@@ -122,7 +122,7 @@ def test_ranges_and_covariances_of_a_level_camera() -> None:
 
 
 def test_the_height_of_a_box_gives_a_range_without_ground() -> None:
-    """With `range = "height"` the range is that of a box as high as its class, and both are weighted if asked."""
+    """With `range = "height"` the range fits a box as high as its class; `both` weights the two."""
     high: dict[str, Any] = {"class": {"car": {"size": [4.5, 1.9, 1.6], "height_sd": 0.1}}}
     names = ("ground", "height", "both")
     cameras = {one: optipmb.GroundCamera.parse(pinhole(error={"range": one, "tilt": 0.01}, **high)) for one in names}
@@ -311,7 +311,7 @@ WRONG: Final[list[tuple[dict[str, Any], str]]] = [
 
 @pytest.mark.parametrize(("change", "path"), WRONG, ids=[f"{number}-{path}" for number, (_, path) in enumerate(WRONG)])
 def test_a_calibration_that_is_none_is_refused(change: dict[str, Any], path: str) -> None:
-    """What is not finite, not of norm one, below the ground, looks away, or is singular is refused by its path."""
+    """Values that are not finite, not of norm one, below the ground, away from it or singular are refused by path."""
     document = pinhole()
     for name, value in change.items():
         table, _, field = name.rpartition(".")

@@ -115,7 +115,7 @@ def test_the_representation_lists_tracks() -> None:
 
 
 def test_a_notebook_shows_confirmed_tracks() -> None:
-    """The tracker says profile, time and tracks; tracks are a drawing and a table, without those that are not shown."""
+    """The tracker says profile, time and tracks; confirmed tracks are a drawing and a table."""
     tracker = optipmb.OnlineTracker()
     assert repr(tracker) == "OnlineTracker: profile generic, no frame yet"
     weak = {name: [*values, *values] for name, values in flat(0).items()} | {"x": [0.0, 30.0], "score": [0.9, 0.2]}

@@ -147,7 +147,7 @@ async def test_files_that_cannot_be_read_end_the_start(session: Session, tmp_pat
 
 
 async def published(session: Session, broker: Broker, bridge: Any, seq: int) -> set[str]:
-    """Publish a frame of many objects, one of few, and an event; return the topics of what came."""
+    """Publish a frame of many objects, one of few, and an event; return the topics of the received messages."""
     await until(lambda: bridge.connected)
     broker.messages.clear()
     many = tracks(seq, count=400).model_copy(update={"confirmed": np.ones(400, np.int64)})
@@ -163,8 +163,8 @@ async def test_a_message_that_the_broker_cannot_take_blocks_no_other(
 ) -> None:
     """It is left out and named with its stream, topic and size.
 
-    At once where the broker says its limit; else after it has ended two connections alone, and then so is what is as
-    large.
+    At once where the broker says its limit; else after it alone has ended two connections. Then messages as large are
+    left out too.
     """
     broker = Broker((version,), most=20_000, says_most=says)
     async with broker, bridging(session, broker, tracks_hz=0) as bridge:

@@ -39,7 +39,7 @@ def test_more_than_can_be_handled_keeps_nothing_waiting_that_is_due(monkeypatch:
 
 
 def test_tracks_that_ros_cannot_hold_keep_no_others_waiting() -> None:
-    """Tracks after January 2038 are logged with their key, and those of the next frames are published."""
+    """Tracks after January 2038 are logged with their key, and tracks of the next frames are published."""
     given: dict[str, Any] = {}
     published: list[Any] = []
 

@@ -199,7 +199,7 @@ def test_a_bad_parameter_is_refused_with_its_path(address: str, query: str, path
 
 
 def test_no_parameter_is_ignored(address: str) -> None:
-    """Every path refuses those that it does not know, also those of other paths."""
+    """Every path refuses unknown parameters, also parameters of other paths."""
     paths = (
         "api/v1/streams?class=car",
         "api/v1/asyncapi.json?class=car",
@@ -534,7 +534,7 @@ def test_a_reader_that_takes_nothing_loses_its_place(
 
 
 def test_too_many_patterns_are_refused_with_the_reason(session: Session, watched: Watched) -> None:
-    """503 before anything of the stream is sent; those who read what is subscribed to go on."""
+    """503 before anything of the stream is sent; readers of subscribed patterns go on."""
     with served(watched, http_clients=4) as address:
         for number in range(BURST):
             with asked(address, f"/api/v1/stream?stream=garage/rig/s{number}") as response:

@@ -134,7 +134,7 @@ def test_what_waits_for_a_takeover_is_bounded(arrivals: list[tuple[int, bool, fl
 @pytest.mark.parametrize("recovered", [False, True])
 @pytest.mark.parametrize("room", [3, 6])
 def test_clouds_of_a_takeover_go_first(room: int, *, recovered: bool) -> None:
-    """When there is no room a session gives up its clouds, then its oldest frames, wherever they came from."""
+    """When there is no room a session gives up its clouds, then its oldest frames, of any source."""
     backlog = live(held=ByteBudget(room * PACKET_BYTES))
     backlog.open()
     packets = [packet(number, size=0, frame=frame) for number in range(5) for frame in (True, False)]

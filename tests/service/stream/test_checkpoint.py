@@ -266,7 +266,7 @@ def test_another_version_is_refused_by_number(version: int) -> None:
 
 
 def test_the_format_is_named_before_the_digest_is_compared() -> None:
-    """Bytes of another layout are those of another format, and not torn ones."""
+    """Bytes of another layout are reported as another format, not as torn."""
     data = MAGIC + (1).to_bytes(2, "big") + bytes(500)
     with pytest.raises(CheckpointError, match=r"format 1: expected .*; torn or changed") as refused:
         decode_checkpoint(data)

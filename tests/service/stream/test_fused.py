@@ -156,7 +156,7 @@ STEPS = [-20.0, -4.95, -1.2, 0.5, 1.05, 1.2, 2.5, 4.95, 5.05, 20.0]
 @pytest.mark.parametrize("step_s", STEPS)
 @pytest.mark.parametrize("sensors", [2, 3, 5])
 def test_the_clock_of_a_session_follows_most_sensors(sensors: int, step_s: float) -> None:
-    """Whatever one clock steps by, the others lose no frame, and the one is refused and named unless it fits in."""
+    """At any step of one clock the others lose no frame, and the one is refused and named unless it fits in."""
     streams = [Sensor(f"site/node/s{k}", bytes([k]) * 16, start_s=10_000.0 + 0.03 * k) for k in range(sensors)]
     odd = streams[int(10 * step_s) % sensors]
     one, outputs = fused(), list[Any]()

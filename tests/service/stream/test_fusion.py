@@ -38,7 +38,7 @@ def undisturbed(frames: list[Detections]) -> tuple[dict[tuple[bytes, int], bytes
 
 
 def published(node: Node, key: str, wanted: dict[tuple[bytes, int], bytes]) -> Merged:
-    """Wait until the tracks on a key, with their corrections, are those of frames in order; return them."""
+    """Wait until the tracks on a key, with their corrections, equal tracks of frames in order; return them."""
     found = Merged()
 
     def complete(items: list[tuple[str, bytes, str]]) -> bool:

@@ -177,7 +177,7 @@ def test_a_misspelt_variable_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None
     ("value", "says"), [("x", "a valid number.*received 'x'"), (-1, "greater than 0; received -1")]
 )
 def test_a_wrong_setting_is_named_with_what_was_received(value: object, says: str) -> None:
-    """The error has the setting, where it is from, what was expected and what was received."""
+    """The error has the setting, its source, the expected and the received value."""
     with pytest.raises(SettingsInvalidError, match=rf"setting gap_limit_s \(from the option\): .*{says}"):
         load(None, {"gap_limit_s": value})
 

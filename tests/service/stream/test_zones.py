@@ -110,7 +110,7 @@ def test_a_zone_that_was_changed_begins_anew_and_the_others_go_on() -> None:
 
 
 def test_numbers_go_on_when_all_zones_come_back() -> None:
-    """Neither sessions without zones in between, nor another session, nor a checkpoint that went, begin them anew."""
+    """Sessions without zones in between, another session and a lost checkpoint do not restart them."""
     before, session = in_order()
     for policy, frames in ((Policy(), range(40, 50)), (POLICY, range(50, 60))):
         session = Session.restore(decode_checkpoint(encode_checkpoint(session.snapshot())), 0, policy)

@@ -57,7 +57,7 @@ def test_withdrawing_never_stops_the_process(session: zenoh.Session) -> None:
 def test_nothing_withdrawn_while_a_link_is_set_up_stays_at_the_router() -> None:
     """A token that is closed while Zenoh declares all of them to a new router is not there afterwards; the others are.
 
-    Closed at once, most of those that Zenoh has collected and not sent would stay.
+    Without the wait most of the collected and unsent tokens would stay.
     """
     began, ended = threading.Event(), threading.Event()
 
