@@ -23,7 +23,7 @@ _MODELS: Final = MappingProxyType(
 
 
 def read_calibration(file: FilePath) -> dict[str, Any]:
-    """Return the calibration of a TOML file, with the intrinsics of the file that it names beside it.
+    """Return the calibration of a TOML file, whose `intrinsics` may name a file in its folder.
 
     Raises:
         ParameterError: a file cannot be read.

@@ -112,7 +112,7 @@ def _bent(flat: Array, terms: tuple[float, ...]) -> tuple[Array, Array, Array, A
 
 
 def _straightened(bent: Array, terms: tuple[float, ...]) -> Array:
-    """Return the points (..., 2) whose distortion is `bent`; NaN where the lens folds."""
+    """Return the points (..., 2) whose distortion is `bent`; NaN where the distortion has no inverse."""
     flat = bent.copy()
     with np.errstate(all="ignore"):
         for _ in range(STEPS):

@@ -12,8 +12,9 @@ With w, h: width and height of the box, L, W: length and width of the class, the
     (r s_H / H)^2 along the ray    H: height of the camera, s_H: `error.height`
     max(0.1, 0.07 L)^2 across it
 
-A flat ray has a second range, of the height H_c of the class, which needs no ground: H_c / (tan(top) - tan(bottom)) of
-the elevations, with the relative variance sd_c^2 + 2 (p^2 + (q h)^2) / h^2. The two are weighted by inverse variances.
+A flat ray has a second range that is independent of the ground. With the height H_c of the class and the elevations of
+the edges it is H_c / (tan(top) - tan(bottom)), with the relative variance sd_c^2 + 2 (p^2 + (q h)^2) / h^2. The two are
+weighted by inverse variances.
 
 The centre lies (L cos a + W sin a) / 2 behind the foot, with a from the width that is seen, L sin a + W cos a. Of a box
 that the border of the image cuts, and of a foot without a box, a is unknown: it is (L + W) / 4.
@@ -47,13 +48,13 @@ if TYPE_CHECKING:
 HORIZON: Final = math.tan(0.003)
 """Slope below the ground plane from which a ray meets it."""
 FLAT: Final = math.tan(0.35)
-"""Slope up to which the height of a box says how far away it is."""
+"""Slope of a ray up to which the height of a box gives a range."""
 BORDER_PX: Final = 3.0
 """Distance from the border of the image up to which it cuts a box."""
 HIDING_PX: Final = 2.0
-"""By how much the lower edge of a box is below the foot that it hides."""
+"""Least distance of the lower edge of a box below a foot that it hides."""
 _HALVES: Final = np.array([[0.0, 0.0], [0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
-_TURNS: Final = np.linspace(-math.pi, math.pi, 1441)  # rad, where its sides are
+_TURNS: Final = np.linspace(-math.pi, math.pi, 1441)  # rad, where the sides of the field of view are sought
 _RANGES: Final = np.geomspace(0.1, 2000.0, 1000)  # m, where the ends of the field of view are sought
 
 Pair = tuple[float, float]
@@ -83,7 +84,7 @@ class Pinhole(Lens):
 
     Attributes:
         position: of the camera's centre, m, in the world or in the frame of the vehicle.
-        quaternion: w x y z, from the axes of the camera (x right, y down, z forward) to those of that frame.
+        quaternion: w x y z, from the axes of the camera (x right, y down, z forward) to that frame.
         ground: its plane a, b, c, d: a x + b y + c z + d = 0; a file may have its height, m.
     """
 
@@ -208,7 +209,7 @@ class CameraErrors(ParameterTable):
         tilt: rad, of the camera against the ground.
         height: m, of the camera above the ground.
         largest: m, along the ray; detections with a larger one are left out.
-        range: where the distance comes from.
+        range: source of the distance.
     """
 
     pixel: tuple[Positive, Annotated[float, Field(ge=0.0, le=1.0)]] = (1.0, 0.04)
@@ -236,14 +237,14 @@ class _Boxes(NamedTuple):
 
 
 class GroundCamera(ParameterTable):
-    """A camera whose pixels are places on the ground: the file of a calibration.
+    """Calibration of a camera: places on the ground from pixels.
 
     Attributes:
         image: width and height of the image that the boxes are in, px.
-        mount: whether the camera is fixed in the world, or on a vehicle, in the frame that the poses place.
+        mount: whether the camera is fixed in the world, or on a vehicle whose poses are known.
         pinhole, homography: one of them.
         error: standard deviations.
-        classes: `class` in the file; those without a size have the usual one of their name.
+        classes: `class` in the file; the default size is the usual one of the name.
     """
 
     image: tuple[Annotated[int, Field(ge=8, le=100_000)], Annotated[int, Field(ge=8, le=100_000)]]
@@ -255,7 +256,7 @@ class GroundCamera(ParameterTable):
 
     @classmethod
     def read(cls, path: FilePath) -> Self:
-        """Return the camera of a TOML file, whose `intrinsics` may name a file of ROS or OpenCV beside it.
+        """Return the camera of a TOML file, whose `intrinsics` may name a file of ROS or OpenCV in its folder.
 
         Raises:
             ParameterError: the file cannot be read, or a value is not allowed; names the file and the value.
@@ -316,7 +317,7 @@ class GroundCamera(ParameterTable):
             foot: (M, 2) u v, where objects stand.
             label: (M,) class names.
             score: (M,); None: 1.
-            pose: of the vehicle, which a camera on one needs.
+            pose: of the vehicle; required if the camera is on one.
 
         Returns:
             `center` (K, 3) with z NaN, `position_covariance` (K, 3, 3), `label`, `score`; `row` (K,) of each in the
@@ -441,7 +442,7 @@ class GroundCamera(ParameterTable):
 
     @property
     def range(self) -> str:
-        """Where the distance comes from: `ground`, `height` or `both`."""
+        """Source of the distance: `ground`, `height` or `both`."""
         if self.homography is not None:
             return "ground"
         return self.error.range or ("ground" if self.mount == "fixed" else "both")
@@ -455,9 +456,9 @@ class GroundCamera(ParameterTable):
 
     @cached_property
     def field_of_view(self) -> FieldOfView | None:
-        """Part of the ground whose objects the image shows whole, and as exact as `error.largest`.
+        """Part of the ground where the image shows whole objects, with errors up to `error.largest`.
 
-        Its pose is in the frame of the camera's position. None of a homography without a position.
+        Its pose is in the frame of the camera's position. None for a homography without a position.
         """
         geometry, (width, height), base = self._geometry, self.image, self._geometry.base
         if base is None:

@@ -1,4 +1,4 @@
-"""Existence of tracks in hindsight: by the frames after theirs, too (not in the paper).
+"""Existence of tracks in hindsight: from their frame and later ones (not in the paper).
 
 The existence probability of a track rises and falls with the scores of its detections. Objects are detected again, and
 clutter ends, so the frames after a frame tell more about its tracks. The existence of a track of frame k becomes
@@ -30,7 +30,7 @@ def with_hindsight(tracks: Tracks, later: Iterable[Tracks], parameters: Paramete
 
     Args:
         tracks: of the frame.
-        later: of the frames after it, as far as hindsight goes; of the same session.
+        later: of the frames within the time after it, in the same session.
         parameters: the profile.
     """
     total, count = _log_odds(tracks.existence), np.ones(len(tracks))

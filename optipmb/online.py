@@ -361,7 +361,7 @@ class OnlineTracker:
             pose: world from sensor, or None when the boxes are in the world frame; with a camera on a vehicle, of it.
             cloud: the scan of the same stamp.
             field_of_view: where the sensor detects objects; outside it they are neither detected nor missed. With a
-                camera, that of its image.
+                camera the default is the field of view of its image.
             camera: of pixel boxes: `box` (M, 4) or `x1`, `y1`, `x2`, `y2`, or the points `foot` (M, 2) or `u`, `v` on
                 which objects stand, with classes and scores.
             arrays: the same columns as arguments.

@@ -421,7 +421,7 @@ def checked(table: type[_T], document: Mapping[str, Any], name: str) -> _T:
         first = error.errors(include_url=False)[0]
         path = ".".join(str(part) for part in first["loc"])
         inner = first.get("ctx", {}).get("error")
-        if isinstance(inner, ParameterError):  # of one field, found beside others
+        if isinstance(inner, ParameterError):  # raised by a validator of the model
             raise ParameterError(".".join(filter(None, (path, inner.path))), inner.expected, inner.received) from None
         raise ParameterError(path or name, *_explained(first)) from error
 

@@ -164,7 +164,7 @@ def views_of(record: type[_R], arrays: Any, name: str, file: str) -> Callable[[A
         record: the record.
         arrays: the named tuple of its columns, by `arrays_of`.
         name: of the kernel, a constant of the same module.
-        file: of the module: numba keeps the machine code beside it.
+        file: of the module: numba keeps the machine code in its folder.
     """
     views = []
     for one in record.described.values():

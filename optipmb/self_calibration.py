@@ -302,7 +302,7 @@ def learn(
 
 @kernel
 def learned(own: Array, axis: int, prior: float) -> float:
-    """Return the variance of a class along an axis by its row of the scatter (3,), with that of the profile, m^2."""
+    """Return the variance of a class along an axis, m^2, from its row of the scatter (3,) and the prior variance."""
     variance: float = (PRIOR_PAIRS * prior + own[axis]) / (PRIOR_PAIRS + own[PAIRS])
     return min(max(variance, LEAST_NOISE * LEAST_NOISE), MOST_NOISE * MOST_NOISE)
 
