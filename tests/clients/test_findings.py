@@ -248,7 +248,7 @@ def test_sizes_by_a_factor_are_named_with_the_option(tmp_path: Path, factor: flo
     for name in "lwh":
         columns[name] = columns[name] / factor
     (found,) = troubles(tmp_path / "d.csv", columns)
-    assert f"{factor:g}" in found.partition("--option size_factor=")[2].split()
+    assert f"{factor:g}" in found.partition("--option size_factor=")[2].replace(",", " ").split()
     dataset, findings = looked(tmp_path / "d.csv", columns, size_factor=str(factor))
     assert not any(one.doubt for one in findings)
     assert next(dataset.sequences(["all"])[0].frames()).size[0] == pytest.approx([4.5, 1.9, 1.6])
@@ -435,3 +435,21 @@ def test_check_ends_with_the_status_of_its_findings(tmp_path: Path, capsys: pyte
     assert done.stdout.count("WRONG") == 1
     assert "all right" not in done.stdout
     assert json.loads(run_here(capsys, "check", wrong, "--json").stdout)["findings"][-1]["wrong"] is True
+
+
+def test_check_refuses_data_without_boxes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A table whose rows are all left out is not all right, with the number of its recordings."""
+    write_table(tmp_path / "d.csv", {**street(4.0), "l": np.zeros(320)})
+    done = run_here(capsys, "check", tmp_path / "d.csv", "--option", "invalid=skip")
+    assert done.returncode == 1
+    assert "WRONG expected boxes, received none in 1 recordings" in done.stdout
+    assert "all right" not in done.stdout
+
+
+def test_check_says_once_how_rows_are_left_out(tmp_path: Path) -> None:
+    """The option that leaves out a wrong row stands in its own column, once for each finding."""
+    columns = street(4.0)
+    columns["l"][10] = np.nan
+    (found,) = (one for one in looked(tmp_path / "d.csv", columns)[1] if one.wrong)
+    assert found.option.startswith("--option invalid=skip leaves such rows out")
+    assert "--option" not in found.text

@@ -54,12 +54,14 @@ def check(data: DataOptions, *, as_json: AsJson = False) -> None:
         findings = [asdict(Finding("yaw", text))]
     recordings = [_recording(one) for one in chosen]
     classes = _classes(chosen)
-    wrong = any(one["wrong"] for one in findings)
+    if not classes and not any(one["wrong"] for one in findings):
+        received = f"received none in {len(chosen)} recordings"
+        findings.append(asdict(Finding("data", f"expected boxes, {received}", wrong=True)))
     if as_json:
         print_json({"command": "check", "findings": findings, "recordings": recordings, "classes": classes})
     else:
         _print(findings, recordings, classes)
-    if wrong:
+    if any(one["wrong"] for one in findings):
         raise typer.Exit(1)
 
 

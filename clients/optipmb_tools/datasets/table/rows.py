@@ -780,6 +780,7 @@ class _Table:
         """Return the rows with a box that can be used; refuse one that cannot, unless the user leaves them out."""
         good = kept.copy()
         marks = "" if "missing" in self._reading.options else ", missing=NUMBER names a mark for no value"
+        option = f"--option invalid=skip leaves such rows out{marks}"
         for what, values, fine in (
             ("finite x, y and z", center, (np.abs(center) <= LARGEST).all(axis=1)),
             ("positive length, width and height", size, (np.isfinite(size) & (size > 0.0)).all(axis=1)),
@@ -795,8 +796,7 @@ class _Table:
         ):
             bad = kept & ~fine
             if not self._reading.skips:
-                expected = f"{what} (--option invalid=skip leaves such rows out{marks})"
-                self._reading.first("rows", bad, expected, values)
+                self._reading.first("rows", bad, what, values, option)
             good &= fine
         self._leave_out(kept, ~good, "with values that are missing, not finite or out of range")
         return good
