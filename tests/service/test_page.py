@@ -9,16 +9,19 @@ from typing import Any, get_args
 import optipmb_schemas as schemas
 import optipmb_service
 import pytest
+from optipmb_client import publisher
 from optipmb_schemas import Code
 from optipmb_service.app import cli, mqtt
-from optipmb_service.cluster import message_log
+from optipmb_service.cluster import message_log, sqlite
 from optipmb_service.edges import readers
 from optipmb_service.edges.grpc import calls, inputs, outputs
 from optipmb_service.edges.grpc.server import OPTIONS
 from optipmb_service.edges.http import server
 from optipmb_service.session.problems import CODES
 from optipmb_service.settings import LimitSettings, Ros2Settings, Ros2Stream, Settings, SiteSettings, load
+from optipmb_service.streams import persistence
 from optipmb_service.telemetry.logs import EVENTS
+from optipmb_service.zenoh import transport
 from reference import docstrings, main, page
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -164,6 +167,16 @@ FIGURES = {
     "deployment.md": {
         f"a bridge holds {message_log.HELD_BYTES // 2**20} MB",
         f"`standby_mb` ({default('standby_mb')}) of",
+    },
+    "state.md": {
+        f"`idle_s` ({default('idle_s'):g}) without messages, ",
+        f"`keep_days` ({default('keep_days'):g}); last ids of {sqlite.NUMBERS:,} streams",
+        f"table `aside` | the newest {sqlite.ASIDE} |",
+        f"`store/{persistence.DUMPS}` | the newest {persistence.MAX_DUMPS} |",
+        f"`log_s` ({default('log_s'):g}), `log_tracks_s` ({default('log_tracks_s'):g}) |",
+        f"in memory: {publisher.CACHE} detections",
+        f"in memory: {transport.TRACKS_CACHE} messages of each stream",
+        f"{readers.BOUNDS.seconds / 60:.0f} minutes after the last reader",
     },
     "watching.md": {f"`http_clients` ({default('http_clients')}) readers"},
 }
