@@ -154,6 +154,8 @@ class Link:
     async def close(self) -> None:
         self._client.disconnect()
         await asyncio.to_thread(self._client.loop_stop)
+        # A client closes its sockets when nothing refers to it any more.
+        self._client.on_connect = self._client.on_disconnect = self._client.on_message = self._client.on_publish = None
 
     async def _answer(self, answer: asyncio.Future[T], seconds: float) -> T:
         await asyncio.wait((answer, self.ended), timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
