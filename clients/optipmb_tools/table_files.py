@@ -56,6 +56,7 @@ _MOST_PARTS: Final = 16
 _EXACT: Final = 2**53  # integers up to it are exact as 64-bit numbers with a point
 _INT64: Final = 2**63
 _BLOCK: Final = 1 << 20  # characters of a text that are read at once
+_PART: Final = 1 << 20  # texts that are compared at once: an array of pyarrow holds 2 GB of them
 _LONGEST_LINE: Final = 1 << 25  # bytes of a line of JSON that pyarrow reads; longer ones are read one by one
 _OWN: Final = {".parquet": (b"par1",), ".feather": (b"arrow1", b"feather"), ".arrow": (b"arrow1", b"feather")}
 _OWN_COMPRESSED: Final = (b"\x1f\x8b", b"\x28\xb5\x2f\xfd")
@@ -484,8 +485,12 @@ def _texts(pa: Any, column: Any) -> NDArray[np.str_]:
 def unique_texts(texts: NDArray[np.str_]) -> tuple[NDArray[np.str_], NDArray[np.int64]]:
     """Return the different ones of some texts (R,), in the order of their first rows, and the place (R,) of each."""
     pa = _pyarrow()
-    coded = pa.array(texts, type=pa.large_string()).dictionary_encode()
-    return np.array(coded.dictionary.to_pylist(), dtype=texts.dtype), coded.indices.to_numpy().astype(np.int64)
+    if not len(texts):
+        return texts, np.zeros(0, dtype=np.int64)
+    parts = np.array_split(texts, 1 + len(texts) // _PART)
+    coded = pa.chunked_array([pa.array(part) for part in parts], pa.string()).dictionary_encode().unify_dictionaries()
+    places = np.concatenate([one.indices.to_numpy() for one in coded.chunks])
+    return np.array(coded.chunk(0).dictionary.to_pylist(), dtype=texts.dtype), places.astype(np.int64)
 
 
 def _integers(pa: Any, column: Any) -> NDArray[Any]:
