@@ -479,4 +479,4 @@ def test_the_profile_is_that_of_the_detector_that_is_named(tmp_path: Path, name:
     (tmp_path / "detections/rcnn").rename(tmp_path / "detections" / name)
     dataset = KittiDataset(tmp_path)
     assert dataset.profile == profile
-    assert any("profile auto" in note for note in dataset.notes) == (profile == "auto")
+    assert any("profile is auto" in note for note in dataset.notes) == (profile == "auto")

@@ -525,4 +525,4 @@ def test_the_profile_is_that_of_the_detector_that_is_named(
     path.write_text(json.dumps(content | {"meta": content["meta"] | meta}))
     dataset = NuScenesDataset(tmp_path)
     assert dataset.profile == profile
-    assert any("profile auto" in note for note in dataset.notes) == (profile == "auto")
+    assert any("profile is auto" in note for note in dataset.notes) == (profile == "auto")
