@@ -523,7 +523,7 @@ def main() -> None:
 
         summary = Summary(of, given.root, given.fast)
         for line in table(summary) if given.table else (": ".join(one) for one in summary.lines()):
-            print(line, flush=True)  # noqa: T201
+            print(line, flush=True)
         return
     cells = [
         Cell(given.root, detector, stride, name, not given.unposed, given.distort, given.fast, given.hindsight)

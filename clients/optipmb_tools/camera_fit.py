@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 
 LARGEST_RMS: Final = 20.0
 """Root mean square of the residuals, px, from which a calibration is refused."""
-_IN_PLANE, _IN_SPACE = 4, 6  # least points
+IN_PLANE: Final = 4
+"""Least points on the ground; no residual is left of so many."""
+_IN_SPACE: Final = 6
+_FLAT: Final = 1e-6  # m, difference of heights up to which points are of one
 _ON_LINE: Final = 1e-3  # height of the flattest triangle of three points, as a part of its longest side
 
 
@@ -55,11 +58,11 @@ def fit(path: Path, pixels: Floats, points: Floats, image: tuple[int, int], lens
     """
     from optipmb import GroundCamera, ParameterError  # noqa: PLC0415  loads the tracker
 
-    flat = bool(np.ptp(points[:, 2]) < 1e-6)  # noqa: PLR2004  a rounding
-    least = _IN_PLANE if flat or lens is None else _IN_SPACE
+    flat = bool(np.ptp(points[:, 2]) < _FLAT)
+    least = IN_PLANE if flat or lens is None else _IN_SPACE
     if len(points) < least:
         raise DatasetError(path, f"at least {least} points", str(len(points)))
-    if len(points) == _IN_PLANE and (_on_line(points[:, :2]) or _on_line(pixels)):
+    if len(points) == IN_PLANE and (_on_line(points[:, :2]) or _on_line(pixels)):
         raise DatasetError(path, "four points of which no three are on one line", "three on a line")
     document: dict[str, Any] = {"image": list(image), "error": {"largest": 1e4}}
     if lens is None:
@@ -72,7 +75,7 @@ def fit(path: Path, pixels: Floats, points: Floats, image: tuple[int, int], lens
         document["homography"] = {"matrix": matrix.tolist(), "reference": pixels.mean(axis=0).tolist()}
         seen = bool((side > 0.0).all() or (side < 0.0).all())
     else:
-        rotation, position, seen = _pose(pixels, points, lens)
+        rotation, position, seen = _pose(pixels, points, lens, flat=flat)
         place = {"position": position.tolist(), "quaternion": quaternion_of(rotation).tolist()}
         document["pinhole"] = {**lens, **place, "ground": float(points[0, 2]) if flat else 0.0}
     if not seen:
@@ -96,7 +99,7 @@ def odd_point(path: Path, found: Fit, lens: Mapping[str, Any] | None) -> tuple[i
         except DatasetError:
             continue
         off = float(np.linalg.norm(rest.camera.project(found.points[point]) - found.pixels[point]))
-        if len(rest.points) > _IN_PLANE and (best is None or rest.rms < best[0]):
+        if len(rest.points) > IN_PLANE and (best is None or rest.rms < best[0]):
             best = (rest.rms, point, off)
     return None if best is None or best[0] > 0.5 * found.rms else best[1:]
 
@@ -167,7 +170,7 @@ def _homography(pixels: Floats, ground: Floats) -> Floats:
     return np.asarray(matrix / np.abs(matrix).max())
 
 
-def _pose(pixels: Floats, points: Floats, lens: Mapping[str, Any]) -> tuple[Floats, Floats, bool]:
+def _pose(pixels: Floats, points: Floats, lens: Mapping[str, Any], *, flat: bool) -> tuple[Floats, Floats, bool]:
     """Return world from camera (3, 3), the camera's place (3,), and whether all points are in front of it."""
     from scipy.optimize import least_squares  # noqa: PLC0415  an extra
     from scipy.spatial.transform import Rotation  # noqa: PLC0415  as above
@@ -176,7 +179,6 @@ def _pose(pixels: Floats, points: Floats, lens: Mapping[str, Any]) -> tuple[Floa
 
     own = Lens.model_validate(lens)
     rays = own.rays(pixels)
-    flat = bool(np.ptp(points[:, 2]) < 1e-6)  # noqa: PLR2004  a rounding
     used = points[:, :2] if flat else points
     matrix = _linear(used, rays[:, :2] / rays[:, 2:])
     matrix /= np.linalg.norm(matrix[:, :2], axis=0).mean()

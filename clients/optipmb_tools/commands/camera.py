@@ -143,14 +143,15 @@ def _points(file: Path, origin: str | None) -> "tuple[Floats, Floats]":
 
 
 def _print_fit(found: "Fit", odd: tuple[int, float] | None) -> None:
-    from optipmb_tools.camera_fit import error_at, horizon_row  # noqa: PLC0415  packages of an extra
+    from optipmb_tools.camera_fit import IN_PLANE, error_at, horizon_row  # noqa: PLC0415  packages of an extra
 
     table = plain_table((), ("point", "u", "v", "off by px", "m"))
     for row, (pixel, off, away) in enumerate(zip(found.pixels, found.residual_px, found.residual_m, strict=True), 1):
         place = "-" if np.isnan(away) else f"{away:.2f}"
         table.add_row(str(row), f"{pixel[0]:.0f}", f"{pixel[1]:.0f}", f"{off:.1f}", place)
     print_table(table)
-    say("no residual can be given for 4 points" if len(found.points) == 4 else f"RMS {found.rms:.2f} px")  # noqa: PLR2004
+    exact = len(found.points) == IN_PLANE
+    say(f"no residual can be given for {IN_PLANE} points" if exact else f"RMS {found.rms:.2f} px")
     if odd is not None:
         warn(f"point {odd[0] + 1} is {odd[1]:.0f} px off the others: a wrong place, or swapped u and v?")
     say(f"horizon at row {horizon_row(found.camera):.0f}")

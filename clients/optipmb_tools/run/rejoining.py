@@ -95,7 +95,7 @@ class Rejoin:
     def __post_init__(self) -> None:
         if not 0.0 < self.gap_s <= 600.0:  # noqa: PLR2004  the bounds are named in the message
             raise UsageError(f"--rejoin: expected a gap in (0, 600] s, received {self.gap_s:g}")
-        if not 0.5 <= self.min_probability < 1.0:  # noqa: PLR2004
+        if not 0.5 <= self.min_probability < 1.0:  # noqa: PLR2004  as above
             raise UsageError(f"--min-probability: expected a number in [0.5, 1), received {self.min_probability:g}")
 
     def objects(self, tracks: Mapping[int, Tracks], parameters: Parameters) -> Objects:

@@ -175,11 +175,14 @@ class Call:
         self.gateway.metrics.responses[self._method] += 1
 
     async def drain(self, outbox: Outbox[bytes]) -> None:
-        """Write the responses of an outbox until it is closed."""
+        """Write the responses of an outbox until it is closed, and count those that it has left out."""
         self._outbox = outbox
-        while (taken := await outbox.take()) is not None:
-            response, skipped = taken
-            await self.write(response + _SKIPPED + varint(skipped) if skipped else response)
+        try:
+            while (taken := await outbox.take()) is not None:
+                response, skipped = taken
+                await self.write(response + _SKIPPED + varint(skipped) if skipped else response)
+        finally:
+            self.left_out += outbox.left_out
 
     @contextlib.asynccontextmanager
     async def writing(self, outbox: Outbox[bytes]) -> AsyncIterator[None]:
@@ -199,7 +202,6 @@ class Call:
             task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await task
-            self.left_out += outbox.left_out
 
     def check_ending(self) -> None:
         """End a call that the gateway has ended and not the caller.

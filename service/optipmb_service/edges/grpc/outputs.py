@@ -67,10 +67,7 @@ async def subscribe(call: Call) -> None:
             if passes(one):
                 await call.write(Item.of_tracks(one, selection).response)
         listener.begin(history)
-        try:
-            await call.drain(outbox)
-        finally:
-            call.left_out += outbox.left_out
+        await call.drain(outbox)
     call.check_ending()
 
 
@@ -94,10 +91,7 @@ async def subscribe_events(call: Call) -> None:
             for response in chosen.responses(one):
                 await call.write(response)
         listener.begin(history)
-        try:
-            await call.drain(outbox)
-        finally:
-            call.left_out += outbox.left_out
+        await call.drain(outbox)
     call.check_ending()
 
 
