@@ -471,7 +471,12 @@ def test_detections_are_read_as_other_systems_write_them(change: Callable[[str],
 
 @pytest.mark.parametrize(
     ("name", "profile"),
-    [("pointrcnn", "kitti"), ("SECOND_iou", "kitti-second-iou"), ("VirConv-S", "kitti-virconv"), ("mine", "auto")],
+    [
+        ("pointrcnn", "kitti"),
+        ("SECOND_iou", "kitti-second-iou"),
+        ("VirConv-S", "kitti-virconv"),
+        ("second_try", "auto"),
+    ],
 )
 def test_the_profile_is_that_of_the_detector_that_is_named(tmp_path: Path, name: str, profile: str) -> None:
     """The name of its folder counts; of unknown detectors it is auto, and a note says so."""

@@ -213,7 +213,7 @@ class KittiSequence(DataSequence):
 
 PROFILES: Final = {
     **dict.fromkeys(("pointrcnn", "pvrcnn", "casa"), "kitti"),
-    "second": "kitti-second-iou",
+    "secondiou": "kitti-second-iou",
     "virconv": "kitti-virconv",
 }
 """Tuned profiles by the detector's name."""
