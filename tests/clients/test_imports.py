@@ -50,6 +50,7 @@ AT_HOME = {
     "grpc_health": SERVICE / "edges/grpc",
     "grpc_reflection": SERVICE / "edges/grpc",
     "grpc_status": SERVICE / "edges/grpc",
+    "paho": SERVICE / "edges/mqtt.py",
     "opentelemetry.sdk": SERVICE / "streams/traces.py",
 }
 """Where the service imports a library; of all packages, only the client's `zenoh/` imports Zenoh."""

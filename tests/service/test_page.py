@@ -11,9 +11,9 @@ import optipmb_service
 import pytest
 from optipmb_client import publisher
 from optipmb_schemas import Code
-from optipmb_service.app import cli, mqtt
+from optipmb_service.app import cli
 from optipmb_service.cluster import message_log, sqlite
-from optipmb_service.edges import readers
+from optipmb_service.edges import mqtt, readers
 from optipmb_service.edges.grpc import calls, inputs, outputs
 from optipmb_service.edges.grpc.server import OPTIONS
 from optipmb_service.edges.http import server

@@ -25,7 +25,8 @@ from typer.main import get_command
 
 from optipmb_service import __version__
 from optipmb_service.app import health_command
-from optipmb_service.app.lifecycle import leave_or_restart, run_gateway, run_router
+from optipmb_service.app.lifecycle import leave_or_restart
+from optipmb_service.app.processes import run_gateway, run_log, run_mqtt, run_ros2, run_router
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.settings import (
     DEFAULT_GRPC,
@@ -235,7 +236,8 @@ def ros2_command(**given: Unpack[RouterOptions]) -> None:
     settings = _client(given)
     if not settings.ros2.streams:
         _wrong("setting ros2.streams: expected a table of streams and their topics in --settings, received none")
-    leave_or_restart(asyncio.run(_needed("optipmb_service.app.ros2", "ros2").run(settings)))
+    _needed("optipmb_service.edges.ros2.node", "ros2")
+    leave_or_restart(asyncio.run(run_ros2(settings)))
 
 
 @app.command("mqtt")
@@ -249,7 +251,8 @@ def mqtt_command(
 ) -> None:
     """Publish tracks and events as JSON to an MQTT broker, a client of routers. SIGINT and SIGTERM end it."""
     settings = _client({**given, "mqtt": broker and {"broker": broker}})
-    leave_or_restart(asyncio.run(_needed("optipmb_service.app.mqtt", "mqtt").run(settings)))
+    _needed("optipmb_service.edges.mqtt", "mqtt")
+    leave_or_restart(asyncio.run(run_mqtt(settings)))
 
 
 @app.command("log")
@@ -257,7 +260,8 @@ def mqtt_command(
 def log_command(**given: Unpack[LogOptions]) -> None:
     """Put detections and tracks into the log of a cluster, a client of routers. SIGINT and SIGTERM end it."""
     settings = _client(given, cluster=[f"nats://{DEFAULT_NATS}"])
-    leave_or_restart(asyncio.run(_needed("optipmb_service.app.log_bridge", "cluster").run(settings)))
+    _needed("optipmb_service.app.log_bridge", "cluster")
+    leave_or_restart(asyncio.run(run_log(settings)))
 
 
 @app.command("nats")

@@ -37,7 +37,7 @@ from optipmb_service import __version__
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.telemetry import logs
 from optipmb_service.telemetry.certificates import Certificates
-from optipmb_service.telemetry.health import BEAT_S, ProcessHealth, Reporter
+from optipmb_service.telemetry.health import BEAT_S, ProcessHealth
 from optipmb_service.telemetry.metrics import GATEWAY_METRICS, NETWORK_METRICS, TLS_METRICS, Metrics
 from optipmb_service.zenoh.client import LISTENING, Client, certificates_of
 
@@ -47,7 +47,6 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from optipmb_client.zenoh.session import KeyNumbers
-    from optipmb_schemas.json_form import Place
 
     from optipmb_service.settings import Settings
 
@@ -312,15 +311,6 @@ def _certificate_files(settings: Settings) -> dict[str, Path]:
     return files
 
 
-def places_of(settings: Settings) -> dict[str, Place]:
-    """Return the places of sites whose world frames have one."""
-    if not settings.sites:
-        return {}
-    from optipmb import Georeference  # noqa: PLC0415 - the tracker, which a router does not load
-
-    return {name: Georeference(site.origin, site.x_heading).to_geographic for name, site in settings.sites.items()}
-
-
 @contextlib.contextmanager
 def _monitoring(settings: Settings, health: ProcessHealth) -> Iterator[None]:
     """Answer over HTTP, where that is asked for.
@@ -334,6 +324,7 @@ def _monitoring(settings: Settings, health: ProcessHealth) -> Iterator[None]:
     from optipmb_schemas.asyncapi import document  # noqa: PLC0415 - as above
 
     from optipmb_service.edges.http import Server, application  # noqa: PLC0415 - a third of a second that only this needs
+    from optipmb_service.edges.readers import places_of  # noqa: PLC0415 - as above
 
     endpoint = (*settings.connect, *settings.endpoints)[0]
     interface = functools.partial(document, settings.prefix, endpoint, settings.http)
@@ -434,34 +425,3 @@ async def run_client(settings: Settings, serve: Callable[[StopRequest, ProcessHe
         return True
 
     return await run(settings, connected)
-
-
-async def run_router(settings: Settings) -> int:
-    """Route until SIGINT or SIGTERM; returns the exit status, as `run` does."""
-
-    async def serve(asked: StopRequest, health: ProcessHealth) -> bool:
-        router = Client(settings)
-        health.report(Reporter(router))
-        say_ready("router", settings.instance, settings.endpoints)
-        log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
-        await asked.wait()
-        health.ends()
-        await asyncio.to_thread(router.close)
-        return True
-
-    return await run(settings, serve)
-
-
-async def run_gateway(settings: Settings) -> int:
-    """Serve gRPC until SIGINT or SIGTERM; returns the exit status, as `run` does."""
-
-    async def serve(asked: StopRequest, health: ProcessHealth, client: Client) -> None:
-        with grpc_edge(settings, client, health.metrics) as address:
-            health.report(Reporter(client))
-            settle()
-            say_ready("grpc", address, settings.connect)
-            log.info("ready", instance=settings.instance, grpc=address, connect=settings.connect)
-            await asked.wait()
-            health.ends()
-
-    return await run_client(settings, serve)

@@ -1,4 +1,4 @@
-"""The bridge into the log as a process of its own: puts published detections and tracks into NATS.
+"""The bridge into the message log: puts published detections and tracks into NATS.
 
 It keeps nothing, so any number of it may run: the servers drop what another one has put there. It is no part
 of a member, because it receives the messages of all members, and a killed member must not take messages with it that
@@ -7,35 +7,25 @@ its successor needs.
 
 from __future__ import annotations
 
-import asyncio
 import time
 from typing import TYPE_CHECKING, Final
 
 import optipmb_schemas as schemas
-import structlog
 
-from optipmb_service.app import lifecycle
-from optipmb_service.app.lifecycle import say_ready, settle
 from optipmb_service.app.storage import nats_access
 from optipmb_service.cluster.message_log import LogMessage, LogWriter, MessageLog, Retention
 from optipmb_service.session.problems import problem_of
 from optipmb_service.streams.kept_tracks import order_of
 from optipmb_service.telemetry.health import Reporter
-from optipmb_service.telemetry.metrics import LOG_METRICS, PROBLEM_METRICS
 from optipmb_service.telemetry.problem_reporter import ProblemReporter
 
 if TYPE_CHECKING:
     from optipmb_client.incoming import Arrival
 
-    from optipmb_service.app.lifecycle import StopRequest
     from optipmb_service.cluster.message_log import Topic
     from optipmb_service.settings import Settings
-    from optipmb_service.telemetry.health import ProcessHealth
     from optipmb_service.zenoh.client import Client
 
-log = structlog.get_logger("optipmb_service")
-
-HOUSEKEEPING_S: Final = 0.5
 CLOSE_S: Final = 1.0
 DRAIN_POLL_S: Final = 0.01
 MEGABYTE: Final = 2**20
@@ -103,22 +93,3 @@ class LogBridge(Reporter):
             message=f"Not in the log: {why}.",
         )
         self.reporter.report(problem, time.monotonic_ns())
-
-
-async def run(settings: Settings) -> int:
-    """Write until SIGINT or SIGTERM; returns the exit status, as `lifecycle.run` does."""
-
-    async def serve(asked: StopRequest, health: ProcessHealth, client: Client) -> None:
-        bridge = LogBridge(settings, client)
-        health.metrics.add(LOG_METRICS | PROBLEM_METRICS, lambda: bridge)
-        health.report(bridge)
-        settle()
-        say_ready("log", settings.instance, settings.connect)
-        log.info("ready", instance=settings.instance, connect=settings.connect)
-        while not asked.is_set():
-            await asked.wait(HOUSEKEEPING_S)
-            bridge.reporter.flush(time.monotonic_ns())
-        health.ends()
-        await asyncio.to_thread(bridge.close)
-
-    return await lifecycle.run_client(settings, serve)

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from optipmb_client.zenoh.session import Session
     from optipmb_schemas.json_form import Place
 
+    from optipmb_service.settings import Settings
+
 BYTES: Final = 32 * 2**20
 """Most bytes in the queue of a reader, beyond one message of each stream."""
 
@@ -646,3 +648,12 @@ def _matches(stream: str, pattern: str) -> bool:
 def _deliver(receivers: tuple[Callable[[Publication], None], ...], one: Publication) -> None:
     for receive in receivers:
         receive(one)
+
+
+def places_of(settings: Settings) -> dict[str, Place]:
+    """Return the places of sites whose world frames have one."""
+    if not settings.sites:
+        return {}
+    from optipmb import Georeference  # noqa: PLC0415 - the tracker, which a router does not load
+
+    return {name: Georeference(site.origin, site.x_heading).to_geographic for name, site in settings.sites.items()}

@@ -17,7 +17,7 @@ from watched import PROBLEM, STREAM, Session, events, plain, settled, tracks
 
 paho = pytest.importorskip("paho.mqtt.client")
 CallbackAPIVersion = pytest.importorskip("paho.mqtt.enums").CallbackAPIVersion
-mqtt = pytest.importorskip("optipmb_service.app.mqtt")
+mqtt = pytest.importorskip("optipmb_service.edges.mqtt")
 
 TOPIC = f"optipmb/v1/{STREAM}"
 ALIVE = "optipmb/v1/mqtt/one/alive"

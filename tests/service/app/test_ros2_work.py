@@ -9,8 +9,8 @@ import pytest
 from optipmb_client.incoming import Arrival
 from optipmb_schemas.ros2.tracks import TRACKED
 from optipmb_schemas.ros2.types import own_types
-from optipmb_service.app.ros2 import _Work
 from optipmb_service.edges.ros2.graph import Endpoint, Node
+from optipmb_service.edges.ros2.work import Work
 from optipmb_service.settings import load
 from structlog.testing import capture_logs
 from tracks_message import tracks_message
@@ -21,7 +21,7 @@ HANGS_S = 30.0
 def test_more_than_can_be_handled_keeps_nothing_waiting_that_is_due(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where each message is followed by the next, diagnostics are sent and the work returns in its time."""
     node: Any = SimpleNamespace(endpoint=lambda *about: about, client=None)
-    work = _Work(load(None, {"store": "none"}).settings, node)
+    work = Work(load(None, {"store": "none"}).settings, node)
     diagnosed: list[float] = []
     monkeypatch.setattr(work, "_diagnose", lambda: diagnosed.append(time.monotonic()))
     gives_up = time.monotonic() + HANGS_S
@@ -57,7 +57,7 @@ def test_tracks_that_ros_cannot_hold_keep_no_others_waiting() -> None:
     node.endpoint = lambda kind, topic, type_, qos: Endpoint(Node(0, "", "", "", 0), 0, kind, topic, type_, "", qos)
     stream = "garage/robot-1/lidar"
     settings = load(None, {"store": "none", "ros2": {"streams": {stream: {"detections": "/boxes"}}}}).settings
-    work = _Work(settings, node)
+    work = Work(settings, node)
     work.open()
     work._bridge._streams[stream].epoch = bytes(16)
     with capture_logs() as logs:

@@ -1,4 +1,4 @@
-"""The bridge to an MQTT broker as a process of its own: publishes tracks, events, counts and problems as JSON.
+"""The bridge to an MQTT broker: publishes tracks, events, counts and problems as JSON.
 
 Topics are the keys of the network. The bridge stores nothing, and reads only the retained counts from the broker. While
 the broker is away, events and the newest counts wait. Tracks and problems are dropped, because they would be outdated.
@@ -29,19 +29,14 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode, MQTTProtocolVersi
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
-from optipmb_service.app import lifecycle
-from optipmb_service.app.lifecycle import places_of, say_ready, settle
-from optipmb_service.edges.readers import Bounds, Feeds, Reader, Text, Wish
+from optipmb_service.edges.readers import Bounds, Feeds, Reader, Text, Wish, places_of
 from optipmb_service.telemetry.health import Reporter
-from optipmb_service.telemetry.metrics import MQTT_METRICS
 
 if TYPE_CHECKING:
     import ssl
 
-    from optipmb_service.app.lifecycle import StopRequest
     from optipmb_service.edges.readers import Publication
     from optipmb_service.settings import Settings
-    from optipmb_service.telemetry.health import ProcessHealth
     from optipmb_service.zenoh.client import Client
 
 T = TypeVar("T")
@@ -404,25 +399,3 @@ class Bridge(Reporter):
 
 def _unsent(taken: tuple[Text, int]) -> Unsent:
     return Unsent(taken[0], taken[0].make())
-
-
-async def run(settings: Settings) -> int:
-    """Publish until SIGINT or SIGTERM; returns the exit status, as `lifecycle.run` does."""
-
-    async def serve(asked: StopRequest, health: ProcessHealth, client: Client) -> None:
-        bridge = Bridge(settings, client)
-        health.metrics.add(MQTT_METRICS, lambda: bridge)
-        health.report(bridge)
-        running = asyncio.create_task(bridge.run())
-        settle()
-        say_ready("mqtt", settings.mqtt.broker, settings.connect)
-        log.info("ready", instance=settings.instance, broker=settings.mqtt.broker, connect=settings.connect)
-        stop = asyncio.create_task(asked.wait())
-        await asyncio.wait((stop, running), return_when=asyncio.FIRST_COMPLETED)
-        health.ends()
-        stop.cancel()
-        running.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await running
-
-    return await lifecycle.run_client(settings, serve)

@@ -1,11 +1,10 @@
-"""The ROS 2 bridge as a process: threads that receive put into one queue, and one thread does the work.
+"""Work of the ROS 2 bridge: threads that receive put into one queue, and one thread does the work.
 
 The queue is bounded; when it is full the oldest message goes and is counted.
 """
 
 from __future__ import annotations
 
-import asyncio
 import collections
 import threading
 import time
@@ -17,21 +16,17 @@ import structlog
 from optipmb_schemas.ros2.arrays import CLOUD
 from optipmb_schemas.ros2.tracks import TOPICS
 
-from optipmb_service.app import lifecycle
-from optipmb_service.app.lifecycle import say_ready, unless
 from optipmb_service.edges.ros2 import graph
 from optipmb_service.edges.ros2.bridge import DIAGNOSTICS, Bridge
-from optipmb_service.edges.ros2.node import Ros2Node
-from optipmb_service.telemetry.health import BEAT_S, STUCK_S, Reporter
+from optipmb_service.telemetry.health import STUCK_S, Reporter
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from optipmb_client.incoming import Arrival
 
-    from optipmb_service.app.lifecycle import StopRequest
+    from optipmb_service.edges.ros2.node import Ros2Node
     from optipmb_service.settings import Settings
-    from optipmb_service.telemetry.health import ProcessHealth
 
     Receive = Callable[[Any], None]
 
@@ -51,7 +46,7 @@ ODOMETRY: Final = "nav_msgs/msg/Odometry"
 log = structlog.get_logger("optipmb_service")
 
 
-class _Work(Reporter):
+class Work(Reporter):
     """The queue of the working thread, and what connects the node and the bridge."""
 
     def __init__(self, settings: Settings, node: Ros2Node) -> None:
@@ -180,29 +175,3 @@ class _Work(Reporter):
             log.warning("problem", code="shed", message="the bridge is too slow for what comes in", count=shed)
         if self._settings.ros2.diagnostics:
             self._bridge.diagnose(self._matching.problems())
-
-
-async def run(settings: Settings) -> int:
-    """Bridge until SIGINT or SIGTERM; returns the exit status, as `lifecycle.run` does."""
-
-    async def serve(asked: StopRequest, health: ProcessHealth) -> bool | None:
-        log.info("connecting", endpoints=settings.connect)
-        node = await unless(asked, lambda: Ros2Node(settings))
-        if node is None:
-            return None
-        work = _Work(settings, node)
-        try:
-            work.open()
-            health.report(work)
-            streams = ",".join(settings.ros2.streams)
-            say_ready("ros2", streams, settings.connect)
-            log.info("ready", instance=settings.instance, streams=streams, connect=settings.connect)
-            while not asked.is_set():
-                await asyncio.to_thread(work.work, BEAT_S)
-            health.ends()
-        finally:
-            asked.bound.begin()
-            await asyncio.to_thread(node.close)
-        return True
-
-    return await lifecycle.run(settings, serve)
