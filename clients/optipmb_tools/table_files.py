@@ -633,6 +633,10 @@ def read_json(path: Path) -> list[_Record]:
         content = json.loads(read_text(path, "JSON"))
     except json.JSONDecodeError as error:
         raise DatasetError(path, "JSON", error.msg, line=error.lineno) from error
+    if isinstance(content, dict) and "openlabel" in content:
+        from optipmb_tools.openlabel import openlabel_records  # noqa: PLC0415  of one format
+
+        return openlabel_records(path, content["openlabel"])
     if isinstance(content, dict) and isinstance(content.get("results"), dict):
         how = f"--dataset nuscenes --root ROOT --detections {path}"
         raise DatasetError(path, "a table", f"results of nuScenes, which are read by {how}")

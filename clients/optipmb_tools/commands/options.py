@@ -18,6 +18,7 @@ from rich.table import Table
 
 from optipmb_tools.datasets import DATASETS, DataSequence, Dataset, dataset_at, open_dataset
 from optipmb_tools.datasets.interface import Assumption
+from optipmb_tools.results.exports import FEATURES, OPENLABEL, is_openlabel
 from optipmb_tools.run.bulk import Executor, executor_for
 from optipmb_tools.table_files import SUFFIXES
 
@@ -35,15 +36,18 @@ Classes = Annotated[
 def _out(out: Path) -> Path:
     """Refuse a file in a format that is not written."""
     suffix = out.suffix.lower()
-    if not out.is_dir() and suffix not in (*SUFFIXES, ".mcap") and re.fullmatch(r"\.[a-z]{2,}[a-z0-9]*", suffix):
-        raise UsageError(f"--out {out}: expected a folder, or a table ({', '.join(SUFFIXES)})")
+    known = suffix in (*SUFFIXES, *FEATURES, ".mcap") or is_openlabel(out)
+    if not out.is_dir() and not known and re.fullmatch(r"\.[a-z]{2,}[a-z0-9]*", suffix):
+        raise UsageError(f"--out {out}: expected a folder, or a table ({', '.join((*SUFFIXES, *FEATURES, OPENLABEL))})")
     return out
 
 
 Out = Annotated[
     Path,
     typer.Option(
-        "--out", callback=_out, help="Folder for the results, or one table: .csv, .parquet, .jsonl, .feather."
+        "--out",
+        callback=_out,
+        help="Folder for the results, or a file: .csv, .parquet, .jsonl, .feather, .geojson, .mfjson, .openlabel.json.",
     ),
 ]
 Full = Annotated[

@@ -157,9 +157,11 @@ def _write(
     file: Path, out: Path, results: "list[PlayedStream]", frames: dict[str, list[tuple[bytes, int]]], how: PlayOptions
 ) -> None:
     from optipmb_tools.datasets import open_dataset  # noqa: PLC0415  only with --out
+    from optipmb_tools.results.exports import check_export  # noqa: PLC0415  as above
     from optipmb_tools.results.output import Results  # noqa: PLC0415  as above
 
     dataset = open_dataset("mcap", file, digits=how.digits)
+    check_export(out, dataset, len(results))
     files = Results(dataset, out, full=how.full)
     sequences = dataset.sequences([result.name for result in results])
     for result, sequence in zip(results, sequences, strict=True):

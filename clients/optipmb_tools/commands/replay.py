@@ -12,6 +12,7 @@ from optipmb_client.links import linked
 
 from optipmb_tools.commands.options import AsJson, Classes, DataOptions, Digits, Full, Out, Profile, report, warn
 from optipmb_tools.commands.service_options import PaceOptions, ServiceOptions
+from optipmb_tools.results.exports import check_export
 from optipmb_tools.results.output import latency
 from optipmb_tools.run.replay import ReplayedSequence, Replaying
 from optipmb_tools.run.replay import replay as replay_sequences
@@ -44,6 +45,7 @@ def replay(
     """
     chosen_pace = pace.pace()
     opened = data.open(digits=how.digits)
+    check_export(how.out, opened.dataset, len(opened.sequences))
     name = how.profile or opened.dataset.profile
     if how.profile == "auto":
         raise UsageError("--profile: one that the service knows, such as generic; auto is made for offline tracking")

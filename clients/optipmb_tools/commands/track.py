@@ -28,6 +28,7 @@ from optipmb_tools.commands.options import (
 )
 from optipmb_tools.extras import needed
 from optipmb_tools.files import remove_unfinished
+from optipmb_tools.results.exports import check_export, is_features, is_openlabel
 from optipmb_tools.table_files import is_table
 from optipmb_tools.views.progress import FrameProgress
 
@@ -110,6 +111,9 @@ class TrackOptions:
     def check_out(self, data: Data) -> None:
         """Refuse a file where the results are several; a bag of tracks holds one topic of a bag."""
         out = self.out
+        check_export(out, data.dataset, len(data.sequences))
+        if self.full and is_features(out):
+            raise UsageError(f"--full: expected a folder, a table or OpenLABEL as --out, received {out}")
         if self.rejoin is not None and (not is_table(out) or out.is_dir()):
             raise UsageError(f"--rejoin: expected a table as --out, such as tracks.csv, received {out}")
         if self.rejoin is None and self.min_probability is not None:
@@ -119,7 +123,7 @@ class TrackOptions:
         if self.view is not None and (self.view.suffix != ".html" or len(data.sequences) > 1):
             count = len(data.sequences)
             raise UsageError(f"--view {self.view}: expected a file .html of one recording, received {count} recordings")
-        if self.submission is not None and (self.full or is_table(out)):
+        if self.submission is not None and (self.full or is_table(out) or is_features(out) or is_openlabel(out)):
             raise UsageError("--submission: expected a folder as --out, and no --full: the files are for the benchmark")
         if out.suffix != ".mcap":
             return
@@ -205,7 +209,7 @@ def track(
         failed = error
     except KeyboardInterrupt:
         remove_unfinished(how.out, opened.names)
-        done = 0 if is_table(how.out) else len(results)
+        done = 0 if is_table(how.out) or is_features(how.out) else len(results)
         raise typer.Abort(f"{done} of {len(chosen)} recordings are in {how.out}") from None
     reasons = {} if failed is None else {name: one.reason for name, one in failed.failures.items()}
     shown = {"command": "track", "dataset": opened.name, "profile": name, "out": how.out, "sequences": results}

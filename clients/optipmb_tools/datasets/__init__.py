@@ -15,6 +15,7 @@ from optipmb_tools.datasets.interface import (
     digits_of,
     georeference_of,
     selected_frames,
+    time_origin_of,
 )
 from optipmb_tools.extras import needed
 from optipmb_tools.files import DatasetError, reading
@@ -56,8 +57,9 @@ def open_dataset(
         options: Of the data set. kitti: `clouds`, `poses`, `split`, `submission`; nuscenes: `clouds`, `z_bottom`,
             `submission`; scene: the fields of `SceneOptions`; mcap: none; rosbag: `points`, `odometry`, `fixed_frame`,
             `keep_input`, `invalid` and `class.NAME`; table: `optipmb_tools.datasets.table.OPTIONS`. For table and mcap
-            also `fuse`: the sensors of a recording share a density. For all `origin`: as of `Georeference.parse`; and
-            `digits`: `unit` or `full`, of numbers in tables of tracks as text.
+            also `fuse`: the sensors of a recording share a density. For all `origin`: as of `Georeference.parse`;
+            `digits`: `unit` or `full`, of numbers in tables of tracks as text; and `time_origin`: the time in UTC of
+            the stamp 0, for GeoJSON, MF-JSON and OpenLABEL.
 
     Raises:
         DatasetError: The name, the root, the detector or an option is not known.
@@ -76,6 +78,7 @@ def open_dataset(
     if fuse and name not in {"table", "mcap"}:
         raise DatasetError("--fuse", "a table with a column `sensor`, or a recording (.mcap)", name)
     digits = digits_of(options.pop("digits", "unit"))
+    time_origin_ns = time_origin_of(options.pop("time_origin")) if "time_origin" in options else 0
     georeference = None
     if "origin" in options:
         georeference = georeference_of(options["origin"])
@@ -89,6 +92,7 @@ def open_dataset(
         opened.append(FusedDataset(opened[0]))
     for one in opened:
         one.arguments, one.georeference, one.digits = arguments, georeference, digits
+        one.time_origin_ns = time_origin_ns
     return opened[-1]
 
 

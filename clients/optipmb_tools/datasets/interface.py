@@ -7,6 +7,7 @@ frame. Centres are geometric centres, sizes are length, width, height, stamps ar
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -235,6 +236,7 @@ class Dataset(ABC):
     name: str  # as given to `open_dataset`
     arguments = DatasetArguments("")  # by which another process opens it; set by `open_dataset`
     georeference: "Georeference | None" = None  # place of its world frame; set by `open_dataset`
+    time_origin_ns = 0  # time in UTC of the stamp 0, in files that hold times in UTC; set by `open_dataset`
     digits = "unit"  # of numbers in tables of its tracks as text; set by `open_dataset`
 
     if TYPE_CHECKING:
@@ -310,6 +312,22 @@ def georeference_of(origin: float | str) -> "Georeference":
         return Georeference.parse(str(origin))
     except ParameterError as error:
         raise DatasetError(f"--{error.path}", error.expected, error.received) from error
+
+
+def time_origin_of(text: float | str) -> int:
+    """Return the time in UTC, nanoseconds since 1970, that `--option time_origin` names.
+
+    Raises:
+        DatasetError: It names none, or has no zone.
+    """
+    try:
+        time = datetime.fromisoformat(str(text))
+        zone = time.utcoffset()
+    except ValueError:
+        zone = None
+    if zone is None:
+        raise DatasetError("--option time_origin", "a time as 2026-01-31T08:00:00Z, with its zone", repr(text))
+    return round(time.timestamp() * 1e6) * 1000
 
 
 def digits_of(text: float | str) -> str:

@@ -23,6 +23,7 @@ from optipmb_schemas.json_form import shown
 
 from optipmb_tools.geometry import Floats, Ints
 from optipmb_tools.results import full_path, stacked, write_full
+from optipmb_tools.results.exports import is_features, is_openlabel, write_features
 from optipmb_tools.table_files import Columns, is_table, is_text, write_table
 
 if TYPE_CHECKING:
@@ -178,7 +179,7 @@ class Results:
 
     Args:
         dataset: The tracked data set; it knows the format of its result files.
-        out: The folder, or a file with the suffix of a table.
+        out: The folder, or a file with the suffix of a table or of another form (`optipmb_tools.results.exports`).
         full: Whether all columns of the tracks are written: into a file for each result file, or into further
             columns of the table. Otherwise such files of an earlier run are removed.
     """
@@ -187,7 +188,8 @@ class Results:
         self._dataset = dataset
         self._out = out
         self._full = full
-        self._table = is_table(out) and not out.is_dir()
+        self._features = is_features(out)
+        self._table = self._features or (is_table(out) and not out.is_dir())
         self._taken: dict[str, Path | Columns] = {}
 
     def write(
@@ -197,8 +199,17 @@ class Results:
 
         Only a table has columns for `objects`.
         """
+        place = self._dataset.georeference
+        if self._features:
+            columns = track_columns(sequence.name, tracks, georeference=place)
+            columns["stamp_ns"] += self._dataset.time_origin_ns
+            return columns
+        if is_openlabel(self._out):
+            from optipmb_tools.results.openlabel import write_openlabel  # noqa: PLC0415  of one format
+
+            write_openlabel(self._out, sequence, tracks, self._dataset.time_origin_ns, full=self._full)
+            return self._out
         if self._table:
-            place = self._dataset.georeference
             return track_columns(sequence.name, tracks, sequence, full=self._full, georeference=place, objects=objects)
         path = self._dataset.write(self._out, sequence, tracks)
         if self._full:
@@ -214,14 +225,18 @@ class Results:
             self._taken[sequence.name] = written
         return here
 
-    def close(self, sequences: "Sequence[DataSequence]") -> None:
+    def close(self, sequences: "Sequence[DataSequence]") -> list[str]:
         """Write the table in the order of the names, or the file of a benchmark that holds all sequences.
 
         Sequences that were not taken are missing in the table; a file of a benchmark is written of all or not at all.
+        Return notes on what is not in the file.
         """
         parts = [written for _, written in sorted(self._taken.items()) if not isinstance(written, Path)]
         if parts:
             columns = {name: np.concatenate([part.pop(name) for part in parts]) for name in list(parts[0])}
+            if self._features:
+                return write_features(self._out, columns)
             write_tracks(self._out, columns, self._dataset.digits)
-        elif all(one.name in self._taken for one in sequences):
+        elif not is_openlabel(self._out) and all(one.name in self._taken for one in sequences):
             self._dataset.join(self._out, sequences)
+        return []

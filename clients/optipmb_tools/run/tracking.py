@@ -383,7 +383,8 @@ def track(
             yield one
     if len(failures) == len(names) > 0:
         raise failures[names[0]].error()
-    results.close(sequences)
+    for text in results.close(sequences):
+        note(text)
     if not executor.here:
         remove_unfinished(out, names)
     if failures:

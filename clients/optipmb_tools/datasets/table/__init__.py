@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from optipmb_schemas import FieldOfView, Tracks
 
+from optipmb_tools import openlabel
 from optipmb_tools.datasets.interface import (
     DETECTION_COLUMNS,
     IDENTITY,
@@ -149,7 +150,7 @@ def read_objects(path: Path, files: Sequence[Path], tables: TableOptions) -> lis
         results = {f"class.{value}" for name, value in options.items() if name.startswith("class.")}
         kept = {*_PLACES, *(name for name in options.keys() - results if name.startswith("class."))}
         options = _UNITS | {name: value for name, value in options.items() if name in kept}
-    reading = Reading(path, options, named=tables.named)
+    reading = Reading(path, openlabel.options_of(files) | dict(options), named=tables.named)
     found = read_tables(files, reading, scored=False, loaded=columns)
     notes = () if written else tuple(reading.notes)
     return [
@@ -353,7 +354,8 @@ class TableDataset(Dataset):
         shared = TableOptions({name: value for name, value in options.items() if name not in pixels.OPTIONS})
         others = read_objects(Path(truth), _tables(Path(truth)), shared) if truth is not None else []
         notes += [note for one in others for note in one.notes]
-        reading = Reading(path, options, lenient, named=shared.named, findings=[] if findings is None else findings)
+        read_by = openlabel.options_of(files) | options
+        reading = Reading(path, read_by, lenient, named=shared.named, findings=[] if findings is None else findings)
         tables = read_tables(files, reading, scored=True)
         origin = min(int(boxes.frame_stamp.min(initial=0)) for _, boxes in tables)
         if not any(len(boxes.frame_stamp) for _, boxes in tables):
