@@ -103,6 +103,8 @@ NEW = [(frame, 100 * frame + one, x, y) for frame, one, x, y in TWO]
 @pytest.mark.parametrize(
     ("truth", "tracks", "expected"),
     [
+        # Two metres apart is no match any more.
+        (ONE, [*ONE[:9], (9, 1, 2.0, 0.0)], {"tp": 9, "fp": 1, "fn": 1}),
         # A switch counts once and is no true positive.
         (ONE, CHANGED, {"tp": 9, "ids": 1, "fn": 0, "fp": 0, "recall": 1.0, "mota": 0.9, "motar": 1.0}),
         # It counts after a gap, however long.

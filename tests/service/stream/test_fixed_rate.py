@@ -312,6 +312,7 @@ def test_only_the_owner_sends(process: Callable[..., Process]) -> None:
     monkey.fence = lambda _: None
     one.streams.command(SENSOR.stream, Stream.on_lost, urgent=True)
     one.run()
+    assert [problem.code for problem in one.problems] == ["superseded"]
     one.until(3 * SECOND)
     assert len(one.now) == 22
 

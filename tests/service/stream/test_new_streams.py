@@ -14,7 +14,7 @@ from optipmb_service.cluster.leases import PARTITIONS, Change, partition_of
 from optipmb_service.session.values import SECOND
 from optipmb_service.streams import directory, streams
 from optipmb_service.streams.backlog import UNASKED_NS
-from optipmb_service.streams.intake import NEW_STREAMS, Intake
+from optipmb_service.streams.intake import DISCOVERY, NEW_STREAMS, Intake
 from optipmb_service.streams.profiles import Fusion
 from optipmb_service.zenoh.inputs import ALL, Packet
 from registries import Around, packet_of, streams_of
@@ -81,6 +81,19 @@ class Following(Network):
         """Announcing is not looked at."""
 
 
+class Discovering(Following):
+    """Gives out the function that is called with each detections message of any stream."""
+
+    noticed: Callable[[str, bool], bool]
+    announced: set[str]
+
+    def receive(self, *callbacks: Callable[..., Any]) -> None:
+        self.noticed, self.announced = callbacks[1], set()
+
+    def discover(self, streams: set[str]) -> None:
+        self.announced = streams
+
+
 class Holding:
     strained = False
 
@@ -107,6 +120,8 @@ def member_of(network: Network, held: set[int]) -> tuple[Intake, Any]:
         cache_answered=None,
         of=lambda _: None,
         held=lambda _: set(),
+        tracked=lambda _: False,
+        parsed=lambda key: (KEYS.stream_of(key),) * 2,
         expect=lambda _: None,
         hold=lambda _: None,
         forget_caches=lambda _: None,
@@ -359,6 +374,26 @@ def test_what_is_put_off_is_within_the_quota(monkeypatch: pytest.MonkeyPatch) ->
     kept.crowded(False)
     kept.streams.sweep(0)
     assert kept.tracked() == [1]
+
+
+def test_messages_without_a_token_are_kept_for_who_tracks_their_stream() -> None:
+    """The first message of an unknown stream is kept for its member; once the stream is known, its member asks."""
+    network = Discovering()
+    intake, streams = member_of(network, {DISCOVERY})
+    kept: list[str] = []
+    streams.expect = kept.append
+    foreign = next(stream for stream in STREAMS if partition_of(stream) != DISCOVERY)
+
+    def known() -> bool:
+        """Another message comes: whether the stream of the first one has been announced."""
+        assert network.noticed(KEYS.detections(foreign), False)
+        return foreign in network.announced
+
+    run(network, intake, known)
+    before = len(kept)
+    assert set(kept) == {foreign}
+    assert network.noticed(KEYS.detections(foreign), False)
+    assert len(kept) == before
 
 
 @pytest.mark.parametrize("asked", [True, False])
