@@ -276,7 +276,7 @@ def line_of(path: Path, row: int, options: Mapping[str, str] | None = None) -> i
 
 
 def _has_names(fields: list[str]) -> bool:
-    return 2 * sum(map(_is_number, fields)) < len(fields)
+    return 2 * sum(is_number(one.strip().strip('"')) for one in fields) < len(fields)
 
 
 def _normal_text(path: Path, blocks: Iterator[str], kind: str) -> tuple[Iterator[str], str]:
@@ -325,7 +325,7 @@ def _with_single_blanks(text: str) -> str:
 def _benchmark(line: str) -> str | None:
     """Return what a first line without names of columns is in the format of a benchmark."""
     fields = re.split(r"[,;\s]+", line.strip(" \t,;"))
-    numeric = [_is_number(one) for one in fields]
+    numeric = [is_number(one) for one in fields]
     if is_kitti_object(line):
         return "boxes of a frame as in KITTI's object benchmark: name their folder"
     if len(fields) in {17, 18} and numeric[:3] == [True, True, False] and all(numeric[3:]):
@@ -334,7 +334,8 @@ def _benchmark(line: str) -> str | None:
         return "detections for KITTI's tracking benchmark: --dataset kitti reads a folder of it"
     counted = all(one.isdigit() for one in fields[:2]) or fields[7:] == ["-1"] * 3
     if len(fields) in {9, 10} and counted and fields[0].isdigit() and all(numeric):
-        return "image boxes as of MOTChallenge: boxes in pixels lie nowhere in the world, 3D boxes are needed"
+        way = "a first line frame,id,x,y,w,h,score,class and --camera place them on the ground"
+        return f"image boxes as of MOTChallenge, which have no place in the world; {way}"
     return None
 
 
@@ -430,12 +431,13 @@ def _rows(pa: Any, records: list[dict[str, Any]]) -> Any:
     return pa.table(columns)
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str) -> bool:
+    """Tell whether a text is a number, which for Python also 1_000 is."""
     try:
-        float(text.strip().strip('"'))
+        float(text)
     except ValueError:
         return False
-    return True
+    return "_" not in text
 
 
 def _is_list(pa: Any, kind: Any) -> bool:
@@ -606,7 +608,7 @@ def frame_numbers(files: Sequence[Path]) -> tuple[str, list[float]]:
     varying = [one for one in alike if len(set(one)) > 1 or len(files) == 1]
     orders = {tuple(sorted(range(len(files)), key=one.__getitem__)) for one in varying if len(set(one)) == len(files)}
     if len(orders) != 1 or any(len(set(one)) < len(files) for one in varying):
-        expected = "a file for each frame, whose names differ in its number alone"
+        expected = "names of frames that differ in one number, that of the frame"
         raise DatasetError(files[0].parent, expected, f"{files[0].name} … {files[-1].name}")
     number = min(varying, key=max)
     return "timestamp" if min(number) >= _STAMPS else "frame", list(number)

@@ -178,8 +178,33 @@ def test_names_of_frames_in_two_orders_are_refused(tmp_path: Path) -> None:
         (tmp_path / folder).mkdir()
         for name in names:
             write_table(tmp_path / folder / f"{name}.csv", columns)
-        with pytest.raises(DatasetError, match="whose names differ in its number alone"):
+        with pytest.raises(DatasetError, match="names of frames that differ in one number"):
             TableDataset(tmp_path / folder)
+
+
+def test_names_in_a_column_number_the_frames(tmp_path: Path) -> None:
+    """The number in the name of each row's frame counts frames; names of two numbers are refused."""
+    columns = street()
+    number = np.unique(columns.pop("t"), return_inverse=True)[1]
+    names = np.char.add("scan_", number.astype(str))
+    for column, option in (("frame", {}), ("file", {"column.frame": "file"})):
+        dataset, _ = looked(tmp_path / "d.csv", {column: names, **columns}, rate="5", **option)
+        assert dataset.sequences(["all"])[0].stamps.tolist() == [200_000_000 * one for one in range(number.max() + 1)]
+    names = np.char.add((number % 2).astype(str), np.char.add("_", number.astype(str)))
+    with pytest.raises(DatasetError, match="names of frames that differ in one number"):
+        looked(tmp_path / "d.csv", {"frame": names, **columns})
+
+
+def test_a_rate_counts_no_times(tmp_path: Path) -> None:
+    """`rate` is for numbers of frames: seconds with nanoseconds, or since 1970, stay times, with a finding."""
+    columns = street()
+    number = np.unique(columns.pop("t"), return_inverse=True)[1]
+    parts = {"sec": 1_700_000_000 + number // 10, "nanosec": number % 10 * 100_000_000}
+    for times in (parts, {"stamp": parts["sec"] * 1_000_000_000 + parts["nanosec"]}):
+        found = troubles(tmp_path / "d.csv", {**times, **columns}, rate="10")
+        assert found == [f"rate is not used: column {next(iter(times))} has times, not numbers of frames "]
+        dataset, _ = looked(tmp_path / "d.csv", {**times, **columns}, rate="10")
+        assert len(dataset.sequences(["all"])[0].stamps) == number.max() + 1
 
 
 def test_recordings_of_one_frame_are_refused(tmp_path: Path) -> None:

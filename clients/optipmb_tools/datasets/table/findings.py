@@ -14,7 +14,7 @@ import numpy as np
 from optipmb_tools.datasets.evidence import Evidence
 from optipmb_tools.datasets.interface import Assumption
 from optipmb_tools.files import DatasetError
-from optipmb_tools.table_files import line_of
+from optipmb_tools.table_files import is_number, line_of
 
 HALF: Final = 0.5  # share of its rival's evidence up to which a reading is refused
 
@@ -181,12 +181,3 @@ class Reading:
             value = values[row]
             shown = repr(value.item()) if isinstance(value, np.str_) else str(value)
             self.refuse(topic, expected, shown, option, row)
-
-
-def is_number(text: str) -> bool:
-    """Tell whether a text is a number, or empty."""
-    try:
-        float(text or "nan")
-    except ValueError:
-        return False
-    return True

@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 
 from optipmb_tools.datasets.interface import Reports, georeference_of
 from optipmb_tools.datasets.motion import Moves, find_moves, find_reports, overlapping
-from optipmb_tools.datasets.table.columns import NOTHING, Column, find_columns, normalised, turn_of
+from optipmb_tools.datasets.table.columns import ALIASES, NOTHING, Column, find_columns, normalised, turn_of
 from optipmb_tools.datasets.table.columns import turned as turned_names
-from optipmb_tools.datasets.table.findings import Reading, is_number
+from optipmb_tools.datasets.table.findings import Reading
 from optipmb_tools.datasets.table.pixels import METRES, Placed, place
 from optipmb_tools.datasets.table.times import (
     COUNTED_HZ,
     CROWDED,
+    DATED,
     SECONDS,
     Stamps,
     may_be_merged,
@@ -44,7 +45,7 @@ from optipmb_tools.datasets.table.values import (
 )
 from optipmb_tools.files import LARGEST, DatasetError
 from optipmb_tools.geometry import Bools, Floats, Ints
-from optipmb_tools.table_files import NO_VALUE, Columns, frame_numbers, read_table, unique_texts
+from optipmb_tools.table_files import NO_VALUE, Columns, frame_numbers, is_number, read_table, unique_texts
 
 if TYPE_CHECKING:
     from optipmb import GroundCamera
@@ -202,7 +203,7 @@ class _Table:
         self._reading = reading
         self._frames = frames  # whether each of the files is a frame
         self._time = reading.strict()  # without stamps nothing can be found
-        self._columns = columns
+        self._columns = columns = _with_frame_numbers(reading, columns)
         self._rows = len(next(iter(columns.values())))
         self._objects: NDArray[np.str_] | None = None  # (R,) names of objects in the column of the class
         marks = [text.strip() for text in reading.options.get("missing", "").split(",") if text.strip()]
@@ -230,11 +231,11 @@ class _Table:
         values = self._columns[name]
         if values.dtype.kind not in "iuf":
             texts = ["" if text.strip() in NO_VALUE else text for text in values.tolist()]
-            bad = np.array([not is_number(text) for text in texts], dtype=np.bool_)
+            bad = np.array([text != "" and not is_number(text) for text in texts], dtype=np.bool_)
             expected = f"a number in column {name} (--option invalid=skip leaves such rows out)"
             if not self._reading.skips:
                 self._reading.first(role, bad, expected, values)
-            values = np.array([float(text or "nan") if is_number(text) else np.nan for text in texts])
+            values = np.array([float(text) if is_number(text) else np.nan for text in texts])
             values[bad] = np.inf
         numbers = values.astype(np.float64)
         return np.where(np.isin(numbers, self._marks), np.nan, numbers) if self._marks else numbers
@@ -449,7 +450,8 @@ class _Table:
                 [int(text) for text in texts] if integers else texts, dtype=np.int64 if integers else np.float64
             )
         if rate is not None:
-            if np.all(values == np.round(values)):
+            counted = "nanosec" not in found and bool(np.all((values == np.round(values)) & (values < DATED[0])))
+            if counted:
                 reading.note("time", f"column {column.name} counts frames, {rate:g} a second")
                 return Stamps(nanoseconds(reading, values, 1e9 / rate), values, column.name, skipped)
             reading.doubt("time", f"rate is not used: column {column.name} has times, not numbers of frames")
@@ -870,6 +872,28 @@ def _poses_at(reading: Reading, path: Path, stamp: Ints) -> Floats:
     angle = np.maximum(angle, _LEAST_TURN)  # spherical interpolation of Shoemake (1985), linear for small angles
     turn = (np.sin((1.0 - part) * angle) * first + np.sin(part * angle) * last) / np.sin(angle)
     return np.column_stack([pose[before, :3] * (1.0 - part) + pose[after, :3] * part, turn])
+
+
+def _with_frame_numbers(reading: Reading, columns: Columns) -> Columns:
+    """Return columns with the numbers of frames, or stamps, that their names hold: `frame_12.bin`.
+
+    Raises:
+        DatasetError: The names differ in several numbers.
+    """
+    found = _columns_of(reading, columns)
+    if "stamp" in found:
+        return columns
+    named = (
+        [found["frame"].name]
+        if "frame" in found
+        else [one for one in columns if normalised(one).base in ALIASES["frame"]]
+    )
+    for name in (one for one in named if _has_no_number(columns[one])):
+        texts, place = np.unique(columns[name], return_inverse=True)
+        if len(texts) > 1 and all(map(re.compile(r"\d").search, texts.tolist())):
+            kind, numbers = frame_numbers([reading.path / text for text in texts.tolist()])
+            return columns | {name if kind == "frame" else kind: np.array(numbers)[place]}
+    return columns
 
 
 def _has_no_number(values: NDArray[Any]) -> bool:
