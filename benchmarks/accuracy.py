@@ -20,6 +20,7 @@ from greedy import greedy_tracks
 from kalman import HABITS, kalman_tracks
 from optipmb_tools.datasets import open_dataset
 from optipmb_tools.evaluation.errors import evaluate_errors
+from optipmb_tools.evaluation.figures import cell
 from optipmb_tools.tuning.clips import Clip, load, of_class, track_clip
 from optipmb_tools.tuning.scoring import plain_figures, rules_of, scorer_of
 from optipmb_tools.tuning.values import only
@@ -92,14 +93,8 @@ def main() -> None:
                 found = plain_figures(scorer.figures([scorer.measure(clip, run(clip)) for clip in clips]))
                 known = way in optipmb.profiles()
                 sides = backward(sequences, clips, way, name, scorer.near) if known else ("-", "-")
-                out.writerow((detections, name, way, *(_shown(found[key]) for key in SHOWN), *sides))
+                out.writerow((detections, name, way, *(cell(key, found[key]) for key in SHOWN), *sides))
                 sys.stdout.flush()
-
-
-def _shown(value: float | None) -> str:
-    if value is None:
-        return "-"
-    return str(int(value)) if value == int(value) else f"{value:.4f}"
 
 
 if __name__ == "__main__":

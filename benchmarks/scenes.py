@@ -70,7 +70,7 @@ def shown(values: Sequence[float], pairs: int) -> tuple[str, ...]:
     means = []
     for chosen in (values[:1], values[1:2], values[:2], values):
         known = [value for value in chosen if not math.isnan(value)]
-        means.append(f"{sum(known) / len(known):.4f}" if known else "-")
+        means.append(f"{100 * sum(known) / len(known):.2f}" if known else "-")
     return (*means, str(pairs))
 
 

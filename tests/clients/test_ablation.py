@@ -37,7 +37,7 @@ def test_the_ablation_has_the_sixteen_rows_of_the_paper(
     ("section", "file", "name"), [("## nuScenes", "nuscenes.csv", "car"), ("## KITTI", "kitti.csv", "Car")]
 )
 def test_the_tables_of_the_page_are_those_of_the_files(section: str, file: str, name: str) -> None:
-    """Rows of docs/ablation.md are those with ADP of its files; without ADP FP differs by 13, others by 0.0008."""
+    """Rows of docs/ablation.md are those with ADP of its files; without ADP FP differs by 13, others by 0.08."""
     page = (DOCS / "ablation.md").read_text(encoding="utf-8")
     lines = [line for line in page[page.index(section) :].split("\n## ")[0].splitlines() if line.startswith("| ")]
     shown = [[cell.strip() for cell in line[1:-1].split("|")] for line in lines]
@@ -50,4 +50,4 @@ def test_the_tables_of_the_page_are_those_of_the_files(section: str, file: str, 
     for one, without in zip(kept["x"], kept[""], strict=True):
         assert one[:3] == without[:3]
         differ = {name: abs(float(a) - float(b)) for name, a, b in zip(head[3:], one[3:], without[3:], strict=True)}
-        assert all(value <= (13.0 if name == "FP" else 0.00081) for name, value in differ.items())
+        assert all(value <= (13.0 if name == "FP" else 0.081) for name, value in differ.items())

@@ -94,6 +94,19 @@ def test_the_tracks_that_are_shown_are_the_confirmed_ones(bench: Bench) -> None:
         assert [line.split()[at] for at, line in zip((1, 0, 0), lines[: len(rows)], strict=False)] == rows
 
 
+def test_trackers_are_compared_by_mota_and_identity_switches(bench: Bench) -> None:
+    """A row for each tracker begins with MOTA in percent and identity switches of the tracks that it shows."""
+    late = np.where(cars()["t"] < 2.0, cars()["id"], cars()["id"] + 2)
+    bench.evaluate(cars(), cars())
+    tables = [bench.table("changes.csv", cars(id=late)), bench.folder / "truth.csv"]
+    asked = ("--truth", bench.folder / "truth.csv", *(word for one in tables for word in ("--tracks", one)))
+    lines = bench.run("evaluate", bench.folder / "d.csv", *asked).stdout.splitlines()
+    head = next(place for place, line in enumerate(lines) if line.startswith("tracks"))
+    assert lines[head].split()[1:4] == ["MOTA", "IDS", "HOTA"]
+    rows = [line.split()[1:3] for line in lines[head + 1 : head + 3]]
+    assert rows == [["98.00", "2"], ["100.00", "0"]]
+
+
 def test_the_unit_of_time_reaches_truth_and_own_tracks(bench: Bench) -> None:
     """Microseconds from 0 with `time=us` are tracked and evaluated alike."""
     data = bench.table("d.csv", cars(scale=1e6, id=None, score=np.full(FRAMES * CARS, 0.9)))

@@ -61,7 +61,7 @@ def ablate(
     speed = [f"{row.frames_per_second:.0f}" for row in rows]
     for title, figures in _by_class(rows):
         each = zip(marks, figures, speed, strict=True)
-        cells = [[*left, *cells_of(one, ABLATION_COLUMNS), fps] for left, one, fps in each]
+        cells = [[*left, *cells_of(one, ABLATION_COLUMNS, opened.name), fps] for left, one, fps in each]
         columns = [*(one.upper() for one in MODULES), *ABLATION_COLUMNS, "FPS"]
         _print_rows(title, columns, cells, marked=len(MODULES) if markdown else None)
 
@@ -103,7 +103,9 @@ def sweep(
         swept.append({"parameter": path, "profile": own, "values": tried, "figures": figures})
         for label, each in [] if as_json else _by_class(found):
             now = f" (profile: {own[label]})" if label in own else ""
-            cells = [[str(value), *cells_of(one, SWEEP_COLUMNS)] for value, one in zip(tried, each, strict=True)]
+            cells = [
+                [str(value), *cells_of(one, SWEEP_COLUMNS, opened.name)] for value, one in zip(tried, each, strict=True)
+            ]
             _print_rows(f"{label}, {path}{now}", [path, *SWEEP_COLUMNS], cells)
     result = _head("sweep", opened, name) | {"sweeps": swept}
     if out is not None:
@@ -143,10 +145,11 @@ def _by_class(rows: "Many[Row]") -> "list[tuple[str, list[Figures]]]":
     return tables if len(tables) == 1 else [*tables, ("all classes", [row.overall for row in rows])]
 
 
-def cells_of(figures: "Figures", names: "Many[str]") -> list[str]:
-    from optipmb_tools.evaluation.figures import number  # noqa: PLC0415  as above
+def cells_of(figures: "Figures", names: "Many[str]", dataset: str) -> list[str]:
+    """Return figures as tables print them; KITTI matches boxes by overlap, other data by metres."""
+    from optipmb_tools.evaluation.figures import cell  # noqa: PLC0415  as above
 
-    return [number(figures[name]) for name in names]
+    return [cell(name, figures[name], metres=dataset != "kitti") for name in names]
 
 
 def _print_rows(title: str, columns: "Many[str]", cells: "Many[Many[str]]", *, marked: int | None = None) -> None:

@@ -123,7 +123,9 @@ def evaluate(
     elif as_json:
         print_json({**report, "tracks": tracks[0], **first.parts})
     else:
-        shown = comparison_tables({place: one.figures for place, one in reports.items()}) if others else first.tables
+        distinct = len({one.name for one in tracks}) == len(reports)
+        compared = {Path(one).name if distinct else one: (each.clear, each.figures) for one, each in reports.items()}
+        shown = comparison_tables(compared) if others else first.tables
         for table in shown:
             print_table(table)
 
@@ -145,6 +147,17 @@ class _Evaluated:
     parts: dict[str, Any]
     figures: "Sequence[ClassFigures]"
     tables: "Sequence[RenderableType]"
+
+    @property
+    def clear(self) -> dict[str, dict[str, float | None]]:
+        """MOTA and identity switches by class, of confirmed tracks where the files tell, else at the best threshold."""
+        found = {}
+        for one in self.figures:
+            parts = self.parts["classes"][one.name]
+            official = parts.get("nuscenes")
+            known = official or parts["confirmed"] or (one.ab3dmot[0].summary() if one.ab3dmot else parts["best"])
+            found[one.name] = {title: known[title.lower() if official else title] for title in ("MOTA", "IDS")}
+        return found
 
 
 def _evaluated(

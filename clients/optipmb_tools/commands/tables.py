@@ -4,7 +4,7 @@ Shares are printed in percent, distances in metres; a dash stands for a figure t
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from rich.console import Group, RenderableType
 from rich.table import Table
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from optipmb_tools.evaluation.nuscenes import NuScenesScores
 
 T = TypeVar("T")
+Compared: TypeAlias = "tuple[Mapping[str, Mapping[str, float | None]], Sequence[ClassFigures]]"
+"""MOTA and identity switches by class, and the other figures."""
 
 _CLEAR = ("MOTA", "MOTP", "precision", "recall", "GT", "FP", "FN", "IDS", "FRAG")
 _PROTOCOL = ("sAMOTA", "AMOTA", "AMOTP", "score", "MOTA", "MOTP", "recall", "precision", "IDS", "FRAG", "FP", "FN")
@@ -26,6 +28,8 @@ _NUSCENES = ("amota", "amotp", "recall", "mota", "motp", "gt", "tp", "fp", "fn",
 _HOTA = ("HOTA", "DetA", "AssA")
 _DIRECTIONS = ("along", "across", "height", "heading", "length", "width", "tall")
 _GOSPA = ("GOSPA", "localisation", "missed", "false", "OSPA")
+_COMPARED = ("MOTA", "IDS")
+_DISTANCES = ("GOSPA", "OSPA", "localisation", "missed", "false")
 SETS = "tracks"  # which of them a row is about
 
 
@@ -86,18 +90,19 @@ def figure_tables(
         )
 
 
-def comparison_tables(trackers: "Mapping[str, Sequence[ClassFigures]]") -> Iterator[RenderableType]:
-    """Yield a table for each class with the figures of the tracks that several trackers show."""
-    for name in dict.fromkeys(one.name for figures in trackers.values() for one in figures):
-        table = _empty(("tracks", *_HOTA, "LocA", *_GOSPA))
-        for place, figures in trackers.items():
-            for one in (one.shown for one in figures if one.name == name):
+def comparison_tables(trackers: "Mapping[str, Compared]") -> Iterator[RenderableType]:
+    """Yield a table for each class with the figures of several trackers, of the tracks that a picture shows."""
+    for name in dict.fromkeys(one.name for _, figures in trackers.values() for one in figures):
+        table = _empty(("tracks", *_COMPARED, *_HOTA, "LocA", *_DISTANCES))
+        for place, (clear, figures) in trackers.items():
+            for one in (one.confirmed or one.best or one.everything for one in figures if one.name == name):
                 table.add_row(
                     place,
+                    *_cells(clear[name], _COMPARED),
                     *_cells(one.hota.summary(), (*_HOTA, "LocA")),
-                    *_cells(one.gospa.summary(), _GOSPA),
+                    *_cells(one.gospa.summary(), _DISTANCES),
                 )
-        yield _titled(f"{name}: HOTA of centres in percent; GOSPA and OSPA in metres", table)
+        yield _titled(f"{name}: MOTA and HOTA of centres in percent; GOSPA and OSPA in metres", table)
 
 
 def _protocol(figures: "Sequence[ClassFigures]") -> Table:

@@ -112,7 +112,7 @@ def tune(data: LabelledOptions, *, how: TuneOptions, jobs: TuneJobs, as_json: As
         print_json({"command": "tune", "profile": out / "tuned.toml", "classes": results})
         return
     for result in tuned.values():
-        print_table(_report(result))
+        print_table(_report(result, opened.name))
     say(f"profile in {out / 'tuned.toml'}")
 
 
@@ -154,7 +154,7 @@ def _share(value: float) -> str:
     return f"{100.0 * value:.1f} %"
 
 
-def _report(tuned: "Tuned") -> Group:
+def _report(tuned: "Tuned", dataset: str) -> Group:
     figures = _table(tuned.name, *SHOWN)
     for title, one in (
         ("before", tuned.before),
@@ -163,7 +163,7 @@ def _report(tuned: "Tuned") -> Group:
         (f"held out ({' '.join(tuned.held_out)}), after", tuned.held_out_after),
     ):
         if one is not None:
-            figures.add_row(title, *cells_of(one.figures, SHOWN))
+            figures.add_row(title, *cells_of(one.figures, SHOWN, dataset))
     changes = _table("changed", "from", "to")
     for change in tuned.changes:
         changes.add_row(change.path, str(change.start), str(change.value))
@@ -189,7 +189,7 @@ def _calibration(tuned: "Tuned") -> str:
 
 
 def _objective(tuned: "Tuned") -> str:
-    text = f"{tuned.plan.metric}: before {tuned.before.value:.4f}, after {tuned.after.value:.4f}"
+    text = f"{tuned.plan.metric} in percent: before {100 * tuned.before.value:.2f}, after {100 * tuned.after.value:.2f}"
     if tuned.held_out_before is None or tuned.held_out_after is None:
         return f"{text}; no sequences were held out, so how much of it holds elsewhere is not known"
-    return f"{text}; held out {tuned.held_out_before.value:.4f} and {tuned.held_out_after.value:.4f}"
+    return f"{text}; held out {100 * tuned.held_out_before.value:.2f} and {100 * tuned.held_out_after.value:.2f}"

@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
-__all__ = ["FIGURES", "Figure", "cell", "defined", "number", "overall", "ratio"]
+__all__ = ["FIGURES", "Figure", "cell", "defined", "overall", "ratio"]
 
 Kind = Literal["share", "count", "metres", "match", "plain"]
 """Unit of a figure; `match` is the mean similarity of matched boxes: an overlap, or a distance in metres."""
@@ -78,17 +78,10 @@ def overall(classes: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def cell(name: str, value: float | None, *, metres: bool = False) -> str:
-    """Return a figure as `optipmb evaluate` prints it: shares in percent; `metres`: matches are distances."""
+    """Return a figure as tables print it: shares in percent; `metres`: matches are distances."""
     kind = FIGURES[name].kind
     if value is None or math.isnan(value):
         return "-"
     if kind == "count":
         return f"{value:.0f}"
     return f"{100.0 * value:.2f}" if kind == "share" or (kind == "match" and not metres) else f"{value:.3f}"
-
-
-def number(value: float) -> str:
-    """Return a figure as `optipmb tune`, `sweep` and `ablate` print it."""
-    if not math.isfinite(value):
-        return "-"
-    return str(int(value)) if value == int(value) else f"{value:.4f}"

@@ -101,7 +101,7 @@ class TrialDisplay(_Bar):
         self._done += 1
         now = time.monotonic()
         rate = self._done / max(now - self._begun, 1e-9)
-        text = f"best {best:.4f}, {60.0 * rate:.1f} trials a minute"
+        text = f"best {100 * best:.2f} %, {60.0 * rate:.1f} trials a minute"
         if self._bar is not None:
             self._bar.update(self._task, advance=1, rate=text)
         elif now - self._shown >= PLAIN_PERIOD_S or self._done == self._total:
