@@ -78,6 +78,7 @@ TASKS: Final = (
         "browser, web page, JSON, WebSocket, readers",
         "`http`, `http_hosts`, `http_origins`, `http_clients`; see [JSON](json.md)",
     ),
+    ("curl, POST, sensors without a client", "`http_senders`, `inputs`; see [JSON](json.md#send-detections)"),
     ("gRPC clients", "`grpc`, `grpc_calls`, `grpc_connections`; see [gRPC](grpc.md)"),
     ("MQTT broker", "`mqtt`; see [MQTT](json.md#mqtt)"),
     ("zones, lines, counting, alarms", "`zones`; see [Zones](zones.md)"),

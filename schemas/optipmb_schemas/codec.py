@@ -119,7 +119,7 @@ def decode(payload: bytes, expected: type[T], *, encoding: str = "", limits: Lim
     if form == "msgpack" and (message := read_columns(payload, expected, limits)) is not None:
         return message
     what = f"one map with the fields of {expected.__name__}"
-    fields = _map_of(_parse_json(payload, limits), what) if form == "json" else read_map(payload, limits, what)
+    fields = read_json_map(payload, limits, what) if form == "json" else read_map(payload, limits, what)
     return build(fields, expected, limits)
 
 
@@ -165,11 +165,13 @@ def read_map(payload: bytes, limits: Limits, what: str = "one map") -> dict[str,
         raise MessageError("malformed", "", "msgpack, its keys texts, its texts in UTF-8", show(str(error))) from None
 
 
-def _parse_json(payload: bytes, limits: Limits) -> Any:
+def read_json_map(payload: bytes, limits: Limits, what: str = "one map") -> dict[str, Any]:
+    """Return the map that JSON holds; as `read_map`."""
     _check_json(payload, limits)
     try:
         text = payload.decode()
-        return json.loads(text, object_pairs_hook=_unique, parse_constant=_refuse_constant, parse_int=_integer)
+        parsed = json.loads(text, object_pairs_hook=_unique, parse_constant=_refuse_constant, parse_int=_integer)
+        return _map_of(parsed, what)
     except MessageError:
         raise
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""JSON of the edges: one object per track, event and problem, for browsers, city platforms and Node-RED.
+"""JSON of the edges: one object per detection, track, event and problem, for browsers, sensors and Node-RED.
 
 A text is one frame of a WebSocket, one server-sent event, or the payload of one MQTT message. Numbers equal the
 messages, rounded; stamps are texts, because 2^63 does not fit a number of JavaScript.
@@ -142,7 +142,60 @@ class EdgeMissed(Struct, frozen=True, tag_field="type", tag="missed"):
     events: Annotated[int | None, Meta(description="So many events; null: not known, compare `n`.")]
 
 
-KINDS: Final = (EdgeTracks, EdgeEvent, EdgeZones, EdgeMissed)
+Corners = Annotated[tuple[float, float, float, float], Meta(description="Left, top, right, bottom in pixels.")]
+Foot = Annotated[tuple[float, float], Meta(description="Column and row in pixels where it stands.")]
+Row = tuple[float, float, float]
+
+
+class EdgeObject(Struct, frozen=True, rename={"name": "class"}):
+    """One detection: its class and one of `position`, `lat` with `lon`, `box` and `foot`. Other fields are ignored."""
+
+    name: Class
+    score: Annotated[float, Meta(description="Confidence of the detector, 0 to 1. Absent: 1.")] | None = None
+    confidence: Annotated[float, Meta(description="Another name of `score`.")] | None = None
+    position: (
+        Annotated[list[Known], Meta(min_length=2, max_length=3, description="Centre: x, y, and z if known; m.")] | None
+    ) = None
+    lat: Annotated[float, Meta(ge=-90, le=90, description="Latitude in degrees; the site needs a place.")] | None = None
+    lon: Annotated[float, Meta(ge=-180, le=180, description="Longitude in degrees.")] | None = None
+    alt: Annotated[float, Meta(ge=-1e5, le=1e5, description="Height above the ellipsoid in m.")] | None = None
+    heading: (
+        Annotated[float, Meta(ge=-1e5, le=1e5, description="Degrees clockwise from true north: `yaw` of the site.")]
+        | None
+    ) = None
+    box: Corners | None = None
+    foot: Foot | None = None
+    size: Size | None = None
+    yaw: Annotated[float, Meta(description="Heading in radians, counter-clockwise from x of `frame`.")] | None = None
+    velocity: Annotated[tuple[float, float], Meta(description="Over ground, m/s along x and y of `frame`.")] | None = (
+        None
+    )
+    position_covariance: Annotated[tuple[Row, Row, Row], Meta(description="Of the errors of x, y, z; m^2.")] | None = (
+        None
+    )
+
+
+class EdgeDetections(Struct, frozen=True, forbid_unknown_fields=True):
+    """The detections of one frame, from a sensor that speaks JSON. A frame without objects is sent, too."""
+
+    objects: Annotated[list[EdgeObject], Meta(description="The detected objects; may be empty.")]
+    stream: Annotated[str, Meta(description="`site/node/sensor`. Absent: the address says it.")] | None = None
+    time: Annotated[str, Meta(description="Sensor time: ISO 8601 with `Z` or an offset. Absent: arrival.")] | None = (
+        None
+    )
+    stamp_ns: Annotated[int | str, Meta(description="The same in nanoseconds, also as text.")] | None = None
+    frame: Annotated[Literal["world", "sensor"], Meta(description="Frame of all coordinates.")] = "world"
+    pose: Annotated[dict[str, Any], Meta(description="As in Detections.")] | None = None
+    field_of_view: Annotated[dict[str, Any], Meta(description="As in Detections.")] | None = None
+    relocation: Annotated[dict[str, Any], Meta(description="As in Detections.")] | None = None
+    epoch: Annotated[str, Meta(description="As in Detections, with `seq`. Absent: the edge numbers.")] | None = None
+    seq: Annotated[int | str, Meta(description="As in Detections, also as text.")] | None = None
+    key: Annotated[str, Meta(min_length=1, max_length=128, description="Frames of one key are one frame.")] | None = (
+        None
+    )
+
+
+KINDS: Final = (EdgeDetections, EdgeTracks, EdgeEvent, EdgeZones, EdgeMissed)
 
 
 class Selection(Struct, frozen=True):

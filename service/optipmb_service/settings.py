@@ -367,15 +367,29 @@ class OutputSettings(BaseModel):
     """what the present is: the system's time (UTC), or the newest stamp plus the time since it arrived"""
 
 
+class InputSettings(BaseModel):
+    """How frames are read that come as JSON over HTTP."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    clock: Literal["sender", "arrival", "offset"] = "sender"
+    """stamps of frames: the sender's; those of their arrival; or the sender's moved to the clock of this machine, which
+    keeps their intervals and puts several sensors on one clock"""
+    classes: dict[str, str] = Field(default_factory=dict)
+    """names of classes by those of the sender, as `{ Human = "pedestrian" }`; others stay"""
+
+
 def _default_instance() -> str:
     """Return a name that two services do not share."""
     host = re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname()[:HOST_CHARACTERS]) or "host"
     return f"{host}-{os.getpid()}-{RUN}"
 
 
-def _is_loopback(host: str) -> bool:
+def is_loopback(address: str) -> bool:
+    """Return whether `host:port` is reached from this machine alone."""
+    host = address.rpartition(":")[0].strip("[]")
     try:
-        return ipaddress.ip_address(host).is_loopback
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
 
@@ -518,9 +532,11 @@ class Settings(BaseSettings):
     """origins of other pages that may read over HTTP, as `https://map.example`; `*`: any"""
     http_tokens: str = ""
     """JSON file of names by the SHA-256 of their tokens, or `module:function`, as `grpc_tokens`; default: all may
-    read"""
+    read, and on a loopback address send"""
     http_clients: int = Field(default=32, ge=1, le=128)
     """readers of streams over HTTP at once, viewers of the page among them; further ones are refused"""
+    http_senders: int = Field(default=64, ge=1, le=256)
+    """requests and WebSockets that send detections over HTTP at once; further ones are refused"""
     http_streams: int = Field(default=100, ge=0, le=10_000)
     """streams with series of their own in the metrics, by name"""
     grpc: Address = ""
@@ -549,6 +565,8 @@ class Settings(BaseSettings):
     cluster"""
     outputs: dict[Pattern, OutputSettings] = Field(default_factory=dict)
     """tracks predicted to now, at a fixed rate, by stream pattern (as `garage/*/fused`); the first match applies"""
+    inputs: dict[Pattern, InputSettings] = Field(default_factory=dict)
+    """frames that come as JSON, by stream pattern (as `garage/*/cam*`); the first match applies"""
     ros2: Ros2Settings = Ros2Settings()
     """topics of ROS 2, for `optipmb-service ros2`"""
     mqtt: MqttSettings = MqttSettings()
@@ -599,8 +617,7 @@ class Settings(BaseSettings):
         addresses = [(one, one.partition("/")[2].partition("?")[0].partition("#")[0]) for one in endpoints]
         if self.grpc_tls is None and not self.grpc_tokens and self.grpc:
             addresses.append((f"grpc {self.grpc}", self.grpc))
-        hosts = [(said, address.rpartition(":")[0].strip("[]")) for said, address in addresses]
-        return tuple(said for said, host in hosts if host and host != "localhost" and not _is_loopback(host))
+        return tuple(said for said, address in addresses if address.rpartition(":")[0] and not is_loopback(address))
 
     @property
     def folder(self) -> Path | None:

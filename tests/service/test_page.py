@@ -13,10 +13,11 @@ from optipmb_client import publisher
 from optipmb_schemas import Code
 from optipmb_service.app import cli
 from optipmb_service.cluster import message_log, sqlite
-from optipmb_service.edges import mqtt, readers
+from optipmb_service.edges import inputs as edge_inputs
+from optipmb_service.edges import json_frames, mqtt, readers
 from optipmb_service.edges.grpc import calls, inputs, outputs
 from optipmb_service.edges.grpc.server import OPTIONS
-from optipmb_service.edges.http import server
+from optipmb_service.edges.http import detections, server
 from optipmb_service.session.problems import CODES
 from optipmb_service.settings import LimitSettings, Ros2Settings, Ros2Stream, Settings, SiteSettings, load
 from optipmb_service.streams import persistence
@@ -160,6 +161,14 @@ FIGURES = {
         f"{mqtt.EVENTS:,}\nevents of each stream ({mqtt.EVENT_BYTES // 2**20} MiB in all)",
         f"for {mqtt.FORGET_S / 60:.0f} minutes what is as large",
         f"tries again after {mqtt.TAKEN_OVER_S:.0f} s",
+        f"`http_senders` ({default('http_senders')})",
+        f"array of 1 to {json_frames.MOST_FRAMES} frames",
+        f"up to {detections.WAIT_S:.0f} s; one frame",
+        f"the body took longer than {detections.BODY_S:.0f} s",
+        f"| {edge_inputs.WINDOW} frames of the stream are without tracks",
+        f"the newest {edge_inputs.CACHE} frames",
+        f"The newest {edge_inputs.FRAMES:,} frames",
+        f"in the last {edge_inputs.OFFSETS} frames",
     },
     "messages.md": {
         f"`max_json_bytes` {LimitSettings().max_json_bytes:,} and `max_values` {LimitSettings().max_values:,}",

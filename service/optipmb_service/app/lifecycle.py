@@ -311,6 +311,15 @@ def _certificate_files(settings: Settings) -> dict[str, Path]:
     return files
 
 
+def sessions_of(settings: Settings) -> Callable[[str], str]:
+    """Return what names the session that a stream feeds."""
+    if not (settings.fuse or settings.fused):
+        return str
+    from optipmb_service.streams.profiles import Fusion  # noqa: PLC0415 - the tracker, which a router does not load
+
+    return Fusion.of(settings).session_of
+
+
 @contextlib.contextmanager
 def _monitoring(settings: Settings, health: ProcessHealth) -> Iterator[None]:
     """Answer over HTTP, where that is asked for.
@@ -328,7 +337,8 @@ def _monitoring(settings: Settings, health: ProcessHealth) -> Iterator[None]:
 
     endpoint = (*settings.connect, *settings.endpoints)[0]
     interface = functools.partial(document, settings.prefix, endpoint, settings.http)
-    server = Server(application(health, settings, places_of(settings), interface), settings.http)
+    answers = application(health, settings, places_of(settings), interface, sessions_of(settings))
+    server = Server(answers, settings.http)
     log.info("http", address=server.address)
     try:
         yield

@@ -220,6 +220,13 @@ GATEWAY_METRICS: Final = {
 }
 """Metrics of a process that serves gRPC, whether or not it tracks."""
 
+INPUT_METRICS: Final = {
+    "inputs_frames_total": _counter("Frames handed to the network for senders of JSON.", lambda i: i.frames, "edge"),
+    "inputs_duplicates_total": _counter("Frames of them that came again.", lambda i: i.duplicates, "edge"),
+    "inputs_refused_total": _counter("Frames of them that were refused.", lambda i: i.refused, "edge", "code"),
+}
+"""Metrics of a process that takes frames of senders of JSON."""
+
 LOG_METRICS: Final = {
     "log_written_total": _counter("Messages put into the log.", lambda b: b.writer.written),
     "log_repeated_total": _counter("Messages that another bridge had put there.", lambda b: b.writer.repeated),
@@ -250,7 +257,7 @@ MQTT_METRICS: Final = {
 }
 """Metrics of the bridge to MQTT."""
 
-METRICS: Final = SERVICE_METRICS | GATEWAY_METRICS | LOG_METRICS | MQTT_METRICS | TLS_METRICS
+METRICS: Final = SERVICE_METRICS | GATEWAY_METRICS | INPUT_METRICS | LOG_METRICS | MQTT_METRICS | TLS_METRICS
 """Every metric. The figures of the process itself start with `process_`."""
 
 

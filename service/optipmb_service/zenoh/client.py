@@ -192,6 +192,14 @@ class SharedSubscriptions(Generic[L, M]):
         self._idle.close()
 
 
+class TooManyStreamsError(TransportError):
+    """Too many new streams were asked for; `wait_s` seconds later there is room for one."""
+
+    def __init__(self, wait_s: float) -> None:
+        super().__init__(f"too many new streams were asked for; the next one can be in {wait_s:.0f} s")
+        self.wait_s = wait_s
+
+
 class Turns:
     """Bound on how often strangers have keys declared: a burst, then one in each period. May be used by any threads."""
 
@@ -205,15 +213,14 @@ class Turns:
         """Take a turn.
 
         Raises:
-            TransportError: there is none now.
+            TooManyStreamsError: there is none now.
         """
         with self._lock:
             now = time.monotonic()
             self._left = min(float(self._burst), self._left + (now - self._at) / self._period_s)
             self._at = now
             if self._left < 1:
-                wait_s = (1 - self._left) * self._period_s
-                raise TransportError(f"too many new streams were asked for; the next one can be in {wait_s:.0f} s")
+                raise TooManyStreamsError((1 - self._left) * self._period_s)
             self._left -= 1
 
 

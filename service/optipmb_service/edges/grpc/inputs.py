@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import collections
 import contextlib
-import time
 from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_schemas as schemas
@@ -14,6 +13,7 @@ from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
 from optipmb_service.edges.grpc.network import Item, Listener
+from optipmb_service.edges.inputs import CACHE, INLINE_BYTES, WINDOW, InFlight
 from optipmb_service.edges.readers import Outbox
 
 if TYPE_CHECKING:
@@ -24,20 +24,8 @@ if TYPE_CHECKING:
     from optipmb_service.edges.grpc.calls import Call
     from optipmb_service.zenoh.client import Outgoing
 
-CACHE: Final = 400
-"""Detections that are kept for recovery unless the publisher says otherwise: 10 s of a sensor at 20 Hz."""
-
 MAX_CACHE: Final = 4096
 MAX_CACHE_CLOUDS: Final = 64
-
-INLINE_BYTES: Final = 64 * 2**10
-"""Larger messages are handed to the network on a thread: each is cut into fragments and may wait for the link."""
-
-WINDOW: Final = 64
-"""Frames of a `Track` call without tracks; beyond it the gateway reads no further, and the caller feels it."""
-
-STALL_S: Final = 1.0
-"""Frames that are without tracks when nothing has come for so long were refused, or are not tracked."""
 
 RESPONSES: Final = 256
 """Responses that may wait for a caller: more than the window, so that none are left out but for others' frames."""
@@ -251,7 +239,7 @@ class _Answers:
         self._gateway = call.gateway
         self._outbox = outbox
         self._reported: collections.deque[tuple[str, str]] = collections.deque(maxlen=RESPONSES)
-        self.in_flight = _InFlight()
+        self.in_flight = InFlight()
         self.listener = Listener(self._answer)
 
     def report(self, problem: schemas.Problem) -> None:
@@ -266,39 +254,6 @@ class _Answers:
             self.in_flight.remove(item.tracks.epoch, item.tracks.seq)
         if item.problem not in self._reported:
             self._outbox.put(item.stream, item.response, len(item.response))
-
-
-class _InFlight:
-    """Frames of a call that are without tracks; their number bounds the caller's speed. To be used on the loop."""
-
-    def __init__(self) -> None:
-        self._frames: collections.OrderedDict[tuple[bytes, int], None] = collections.OrderedDict()
-        self._progress = time.monotonic()
-        self._changed = asyncio.Event()
-
-    def add(self, epoch: bytes, seq: int) -> None:
-        """Add a frame that goes out."""
-        if not self._frames:
-            self._progress = time.monotonic()
-        self._frames[epoch, seq] = None
-
-    def remove(self, epoch: bytes, seq: int) -> None:
-        """Remove a frame that has tracks; those sent before it that have none will have none, or have them late."""
-        if (epoch, seq) in self._frames:
-            while next(iter(self._frames)) != (epoch, seq):
-                self._frames.popitem(last=False)
-            del self._frames[epoch, seq]
-            self._progress = time.monotonic()
-            self._changed.set()
-
-    async def below(self, most: int) -> None:
-        """Wait until less than so many frames are without tracks; when that stalls, forget them."""
-        while len(self._frames) >= most:
-            self._changed.clear()
-            try:
-                await asyncio.wait_for(self._changed.wait(), self._progress + STALL_S - time.monotonic())
-            except TimeoutError:
-                self._frames.clear()
 
 
 class _Acknowledgements:

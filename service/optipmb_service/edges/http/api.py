@@ -1,4 +1,4 @@
-"""JSON over HTTP: the newest tracks and counts by GET, all of them as server-sent events and over a WebSocket.
+"""JSON over HTTP for readers: the newest tracks by GET, all of them as server-sent events and over a WebSocket.
 
 Readers share subscriptions and are counted here, apart from other requests. One that is too slow gets the newest frame
 of each stream. Events are kept for a while, for slow readers and for those who come again.
@@ -48,6 +48,13 @@ STREAMING: Final = {"cache-control": "no-store, no-transform", "x-accel-bufferin
 HEADERS: Final = {"cache-control": "no-store", "x-content-type-options": "nosniff", "referrer-policy": "no-referrer"}
 
 
+ANSWERS: Final = {
+    HTTPStatus.UNAUTHORIZED: {"www-authenticate": "Bearer"},
+    HTTPStatus.SERVICE_UNAVAILABLE: {"retry-after": "1"},
+}
+"""Headers of answers by their status."""
+
+
 class NoTokenError(Exception):
     """The token is missing or not valid."""
 
@@ -56,12 +63,21 @@ class NoRoomError(Exception):
     """There are as many readers as there may be."""
 
 
+class RequestError(Exception):
+    """A request that cannot be read, with the status of its answer."""
+
+    def __init__(self, status: HTTPStatus, reason: str) -> None:
+        super().__init__(reason)
+        self.status = status
+
+
 STATUS: Final[dict[type[Exception], HTTPStatus]] = {
     schemas.MessageError: HTTPStatus.BAD_REQUEST,
     NoTokenError: HTTPStatus.UNAUTHORIZED,
     NotAllowedError: HTTPStatus.FORBIDDEN,
     NoRoomError: HTTPStatus.SERVICE_UNAVAILABLE,
     TransportError: HTTPStatus.SERVICE_UNAVAILABLE,
+    RequestError: HTTPStatus.BAD_REQUEST,  # or its own
 }
 
 
@@ -69,7 +85,9 @@ async def refuse(connection: HTTPConnection, error: Exception) -> Response | Non
     """Answer what cannot be answered otherwise: with the status of the error, its text and its path."""
     status = next(status for kind, status in STATUS.items() if isinstance(error, kind))
     body = {"error": str(error), "path": getattr(error, "path", "")}
-    headers = HEADERS | ({"www-authenticate": "Bearer"} if status == HTTPStatus.UNAUTHORIZED else {})
+    headers = HEADERS | ANSWERS.get(status, {})
+    if isinstance(error, RequestError):  # the rest of its body is not read
+        status, headers = error.status, HEADERS | {"connection": "close"}
     response = JSONResponse(body, status, headers)
     if not isinstance(connection, WebSocket):
         return response

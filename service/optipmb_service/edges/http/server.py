@@ -28,6 +28,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.wsproto_impl import WSProtocol
 
 from optipmb_service.edges.http.api import STATUS, Api, Readers, parameters_of, refuse
+from optipmb_service.edges.http.detections import Senders
 from optipmb_service.edges.http.page import page
 from optipmb_service.telemetry.metrics import CONTENT_TYPE
 
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
 
 GRACE_S: Final = 1  # how long an answer under way may take at the end
 CONNECTIONS: Final = 256  # open connections; a further one closes an idle one
-REQUESTS: Final = 64  # requests answered at once, without probes and readers
+REQUESTS: Final = 64  # requests answered at once, without probes, readers and senders
 HEAD_S: Final = 5.0  # longest time from the begin of a connection until its first request is complete
 KEEP_ALIVE_S: Final = 5
 HEAD_BYTES: Final = 16 * 1024
@@ -66,6 +67,7 @@ def application(
     settings: Settings,
     places: Mapping[str, Place] | None = None,
     interface: Callable[[], str] = document,
+    sessions: Callable[[str], str] = str,
 ) -> ASGIApp:
     """Return the application: health, readiness, metrics, the JSON interface, and the page.
 
@@ -74,6 +76,7 @@ def application(
         settings: of the process.
         places: of the world frames of sites that have one.
         interface: returns the AsyncAPI document.
+        sessions: returns the session that a stream feeds; by default its own.
 
     Raises:
         ClientError: the tokens cannot be used.
@@ -102,16 +105,20 @@ def application(
     routes: list[BaseRoute] = [Route("/healthz", alive), Route("/readyz", ready), Route("/metrics", metrics)]
     places = places or {}
     readers = Readers(health, settings, places)
+    senders = Senders(health, readers, settings, places, sessions)
     routes += [
         Route("/api/v1/asyncapi.json", asyncapi),
         *Api(readers).routes(),
+        *senders.routes(),
         *page(health, readers, settings, places),
     ]
     refusals: dict[Any, Any] = dict.fromkeys(STATUS, refuse)
     answers: ASGIApp = Starlette(routes=routes, exception_handlers=refusals)
     if settings.http_origins:
-        answers = CORSMiddleware(answers, allow_origins=settings.http_origins, allow_headers=["authorization"])
-    return _Guarded(answers, settings, readers)
+        allowed = ["authorization", "content-type", "idempotency-key"]
+        origins = settings.http_origins
+        answers = CORSMiddleware(answers, allow_origins=origins, allow_methods=["GET", "POST"], allow_headers=allowed)
+    return _Guarded(answers, settings, readers, senders)
 
 
 def _answer(body: dict[str, object], *, well: bool) -> Response:
@@ -119,15 +126,16 @@ def _answer(body: dict[str, object], *, well: bool) -> Response:
 
 
 class _Guarded:
-    """An application that answers known host names, and a bounded number of requests, without probes and readers.
+    """An application that answers known host names, and a bounded number of requests beside probes, readers, senders.
 
-    A WebSocket is opened for programs, for pages of this service, and for pages of `http_origins`: a browser opens one
-    for the page of a stranger without asking.
+    A WebSocket is opened, and a POST answered, for programs, for pages of this service, and for pages of
+    `http_origins`: a browser asks for both for the page of a stranger.
     """
 
-    def __init__(self, application: ASGIApp, settings: Settings, readers: Readers) -> None:
+    def __init__(self, application: ASGIApp, settings: Settings, readers: Readers, senders: Senders) -> None:
         self._application = application
         self._readers = readers
+        self._senders = senders
         self._names = {name.lower().rstrip(".") for name in settings.http_hosts}
         self._origins = settings.http_origins
         self._requests = 0
@@ -140,11 +148,11 @@ class _Guarded:
             await answer(scope, receive, send)
             return
         headers = Headers(scope=scope)
-        if self._requests - self._readers.count >= REQUESTS:
+        if self._requests - self._readers.count - self._senders.count >= REQUESTS:
             answer = PlainTextResponse(f"{REQUESTS} requests are being answered; ask again", UNAVAILABLE)
         elif (path not in MONITORING or is_socket) and not self._knows(headers.get("host", "")):
             answer = PlainTextResponse("unknown host; see the setting http_hosts", MISDIRECTED)
-        elif is_socket and not self._welcomes(headers):
+        elif (is_socket or scope["method"] == "POST") and not self._welcomes(headers):
             answer = PlainTextResponse("page of another origin; see the setting http_origins", FORBIDDEN)
         self._requests += 1
         try:

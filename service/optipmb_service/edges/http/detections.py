@@ -1,0 +1,297 @@
+"""Detections by POST: frames in JSON from programs that have no client of ours."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Any, Final, cast
+
+import msgspec
+import optipmb_schemas as schemas
+from optipmb_client.errors import ConnectionFailed as TransportError
+from optipmb_schemas.json_form import EXACT
+from starlette.requests import ClientDisconnect
+from starlette.responses import Response
+from starlette.routing import Route
+
+from optipmb_service.edges.access import NotAllowedError
+from optipmb_service.edges.http.api import HEADERS, NoRoomError, RequestError, parameters_of, wish_of
+from optipmb_service.edges.inputs import Inputs, RefusedError
+from optipmb_service.edges.json_frames import FrameReader
+from optipmb_service.edges.readers import Publication
+from optipmb_service.settings import is_loopback
+from optipmb_service.telemetry.metrics import INPUT_METRICS
+from optipmb_service.zenoh.client import TooManyStreamsError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from optipmb_schemas.json_form import Place, Selection
+    from starlette.requests import Request
+
+    from optipmb_service.edges.access import Caller
+    from optipmb_service.edges.http.api import Readers
+    from optipmb_service.settings import Settings
+    from optipmb_service.telemetry.health import ProcessHealth
+    from optipmb_service.zenoh.client import Client
+
+BODY_S: Final = 10.0
+"""Longest time until a body has come."""
+
+WAIT_S: Final = 5.0
+"""Longest wait for tracks."""
+
+JSON: Final = "application/json"
+SELECTION: Final = ("classes", "confirmed", "min_existence", "fields")
+LENGTH_DIGITS: Final = 12
+
+STATUS: Final = {
+    "busy": HTTPStatus.TOO_MANY_REQUESTS,
+    "duplicate_epoch": HTTPStatus.CONFLICT,
+    "not_allowed": HTTPStatus.FORBIDDEN,
+    "too_many_streams": HTTPStatus.TOO_MANY_REQUESTS,
+    "unlinked": HTTPStatus.SERVICE_UNAVAILABLE,
+}
+"""Statuses of refused frames by their codes; of others 400."""
+
+
+class _Stream(msgspec.Struct):
+    """The stream that a frame names."""
+
+    stream: str = ""
+
+
+class Senders:
+    """Programs that send now: a bounded number, counted apart from other requests.
+
+    Args:
+        health: of the process.
+        readers: whose tokens hold for senders, too.
+        settings: of the process.
+        places: of the world frames of sites.
+        sessions: returns the session that a stream feeds.
+    """
+
+    def __init__(
+        self,
+        health: ProcessHealth,
+        readers: Readers,
+        settings: Settings,
+        places: Mapping[str, Place],
+        sessions: Callable[[str], str],
+    ) -> None:
+        self.count = 0
+        self._health = health
+        self._readers = readers
+        self._settings = settings
+        self._places = places
+        self._sessions = sessions
+        self._frames = FrameReader(settings)
+        self._is_open = bool(settings.http_tokens) or not settings.http or is_loopback(settings.http)
+        self._inputs: Inputs | None = None
+
+    def routes(self) -> list[Route]:
+        return [Route("/api/v1/detections", self.post, methods=["POST"])]
+
+    async def post(self, request: Request) -> Response:
+        """Hand the frames of a request to the network."""
+        caller = await self._caller(request)
+        parameters = parameters_of(request, ("stream", "wait", *(SELECTION if "wait" in request.query_params else ())))
+        stream, wait_s = parameters.get("stream", ""), _wait(parameters)
+        wish = wish_of({name: parameters[name] for name in SELECTION if name in parameters} | {"stream": "*/*/*"})
+        inputs = self._opened()
+        if self.count >= self._settings.http_senders:
+            raise NoRoomError(f"{self._settings.http_senders} requests that send are here already")
+        self.count += 1
+        try:
+            _check_type(request)
+            frames, is_array = self._frames.split(await self._body(request))
+            if is_array and wait_s:
+                raise schemas.MessageError(
+                    "invalid_value", "wait", "one frame, not in an array", f"{len(frames)} frames"
+                )
+            sender = _Sender(inputs, self._frames, caller, stream, request.headers.get("traceparent", ""))
+            repeats = request.headers.get("idempotency-key", "")
+            answers = []
+            for at, payload in enumerate(frames):
+                path = f"frames[{at}]" if is_array else ""
+                answer, retry_s = await sender.send(payload, path, repeats and f"{at} {repeats}", wait_s)
+                answers.append(({"index": at} | answer, retry_s))
+            return self._answer(answers, wish.selection if wait_s else None)
+        finally:
+            self.count -= 1
+
+    async def _caller(self, request: Request) -> Caller:
+        """Return who sends.
+
+        Raises:
+            NoTokenError: the token is missing or not valid.
+            NotAllowedError: nobody may, without tokens.
+        """
+        if not self._is_open:
+            raise NotAllowedError("set http_tokens: without them detections are taken on a loopback address alone")
+        return await self._readers.caller(request)
+
+    def _opened(self) -> Inputs:
+        """Return the inputs on the session of the process.
+
+        Raises:
+            TransportError: there is no session yet.
+        """
+        session = self._health.session()
+        if session is None:
+            raise TransportError(f"the service is {self._health.state()}")
+        client = cast("Client", session)  # as in every process with edges
+        if self._inputs is None or self._inputs.client is not client:
+            self._inputs = inputs = Inputs(self._settings, client, "http", self._sessions)
+            self._health.metrics.add(INPUT_METRICS, lambda: inputs)
+        return self._inputs
+
+    async def _body(self, request: Request) -> bytes:
+        """Return the body of a request.
+
+        Raises:
+            RequestError: it is too large, or does not come in time.
+        """
+        most = self._settings.limits.max_json_bytes
+        too_large = RequestError(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"a body of at most {most} bytes is expected")
+        length, body = request.headers.get("content-length", ""), bytearray()
+        is_over = length.isdecimal() and (len(length) > LENGTH_DIGITS or int(length) > most)
+        if is_over and "expect" in request.headers:  # it asks before it sends
+            raise too_large
+        try:
+            async with asyncio.timeout(BODY_S):
+                async for chunk in request.stream():  # to its end: a sender that still sends would not read the answer
+                    is_over = is_over or len(body) + len(chunk) > most
+                    if not is_over:
+                        body += chunk
+        except TimeoutError:
+            if not is_over:
+                late = f"the body did not come within {BODY_S:g} s"
+                raise RequestError(HTTPStatus.REQUEST_TIMEOUT, late) from None
+        except ClientDisconnect:
+            raise RequestError(HTTPStatus.BAD_REQUEST, "the sender has gone") from None
+        if is_over:
+            raise too_large
+        return bytes(body)
+
+    def _answer(self, answers: list[tuple[dict[str, Any], float]], selection: Selection | None) -> Response:
+        """Return the answer about frames, each with when it may come again if it was refused."""
+        frames = [one for one, _ in answers]
+        refused = [one["error"]["code"] for one in frames if "error" in one]
+        body: dict[str, Any] = {"accepted": len(frames) - len(refused), "refused": len(refused), "frames": frames}
+        statuses = {STATUS.get(code, HTTPStatus.BAD_REQUEST) for code in refused}
+        headers = dict(HEADERS)
+        if not refused:
+            status = HTTPStatus.ACCEPTED if selection is None else HTTPStatus.OK
+        elif body["accepted"]:
+            status = HTTPStatus.MULTI_STATUS
+        else:
+            status = statuses.pop() if len(statuses) == 1 else HTTPStatus.BAD_REQUEST
+            if status in {HTTPStatus.TOO_MANY_REQUESTS, HTTPStatus.SERVICE_UNAVAILABLE}:
+                headers["retry-after"] = str(math.ceil(max(1.0, *(retry_s for _, retry_s in answers))))
+        if selection is not None and not refused:
+            tracks = frames[0].pop("tracks")
+            body["tracks"] = None
+            if tracks is not None:
+                found = Publication(tracks.key, tracks.payload, tracks.encoding, self._places)
+                body["tracks"] = msgspec.Raw(found.tracks(selection, self._settings.stale_s))
+        return Response(msgspec.json.encode(body), status, headers, JSON)
+
+
+class _Sender:
+    """A request or socket that sends frames.
+
+    Args:
+        inputs: takes them.
+        frames: reads them.
+        caller: who sends.
+        stream: that the address names; empty: none.
+        traceparent: W3C trace context, unchecked.
+    """
+
+    def __init__(self, inputs: Inputs, frames: FrameReader, caller: Caller, stream: str, traceparent: str) -> None:
+        self._inputs = inputs
+        self._frames = frames
+        self._caller = caller
+        self._stream = stream
+        self._traceparent = traceparent
+
+    async def send(self, payload: bytes, path: str, repeats: str, wait_s: float) -> tuple[dict[str, Any], float]:
+        """Send a frame; return the answer about it, and when it may come again if it was refused."""
+        retry_s = 0.0
+        try:
+            frame = self._frames.read(payload, self._stream)
+            name = frame.message.stream
+            self._caller.may_publish(name)
+            found = await self._inputs.send(frame, self._frames.rules(name), repeats, self._traceparent, wait_s)
+            sent, duplicate, tracks = found
+            answer = {
+                "stream": name,
+                "epoch": sent.epoch.hex(),
+                "seq": sent.seq if sent.seq < EXACT else str(sent.seq),
+                "stamp_ns": str(sent.stamp_ns),
+                "duplicate": duplicate,
+            }
+            return answer | ({"tracks": tracks} if wait_s else {}), retry_s
+        except schemas.MessageError as error:
+            self._inputs.report(self._reported(payload), error)
+            refused = error.under(path) if path else error
+            about = {"code": refused.code, "path": refused.path, "expected": refused.expected}
+            return {"error": about | {"received": refused.received, "message": str(refused)}}, retry_s
+        except RefusedError as error:
+            retry_s, code, expected, received = error.retry_s, error.code, error.expected, error.received
+            message = str(error)
+        except NotAllowedError as error:
+            code, expected, received, message = "not_allowed", "a stream of the token", "another one", str(error)
+        except TransportError as error:
+            code, expected, received = "unlinked", "a network", "none"
+            if isinstance(error, TooManyStreamsError):
+                code, expected, received, retry_s = "too_many_streams", "fewer new streams", "more", error.wait_s
+            message = str(error)
+        self._inputs.refused["http", code] += 1
+        about = {"code": code, "path": path, "expected": expected, "received": received, "message": message}
+        return {"error": about}, retry_s
+
+    def _reported(self, payload: bytes) -> str:
+        """Return the stream on which a frame that is not valid is reported; empty: on none."""
+        name = self._stream
+        try:
+            name = name or msgspec.json.decode(payload, type=_Stream).stream
+            self._inputs.client.keys.problems(name)
+            self._caller.may_publish(name)
+        except (ValueError, msgspec.DecodeError, RecursionError, NotAllowedError):
+            return ""
+        return name
+
+
+def _check_type(request: Request) -> None:
+    """Refuse a body that a page of a stranger could send without asking, and one that is compressed.
+
+    Raises:
+        RequestError: it is such.
+    """
+    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if kind != JSON or "content-encoding" in request.headers:
+        expected = f"content-type {JSON} without content-encoding is expected"
+        raise RequestError(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, expected)
+
+
+def _wait(parameters: Mapping[str, str]) -> float:
+    """Return how long a request waits for tracks, s; 0 without it.
+
+    Raises:
+        MessageError: it is no such time.
+    """
+    if (text := parameters.get("wait")) is None:
+        return 0.0
+    try:
+        wait_s = float(text)
+    except ValueError:
+        wait_s = math.nan
+    if not 0 < wait_s <= WAIT_S:
+        raise schemas.MessageError(
+            "invalid_value", "wait", f"seconds, above 0 and at most {WAIT_S:g}", ascii(text)[:80]
+        )
+    return wait_s

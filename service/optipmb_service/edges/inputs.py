@@ -1,0 +1,479 @@
+"""Frames of senders that have no publisher of their own: numbers, repetitions, and the way to the network.
+
+The service tracks a frame once by its epoch and number. A sender that gives none gets those of the edge, one epoch for
+each stream and process. What it sends again is known by its key or stamp. After a restart of the edge, the services'
+caches say which stamps were tracked: a new epoch that repeats one would restart the session.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import contextlib
+import secrets
+import time
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import msgspec
+import optipmb_schemas as schemas
+from optipmb_client.errors import ConnectionFailed as TransportError
+from optipmb_client.incoming import Answer
+from optipmb_client.trace_context import attachment_of
+
+from optipmb_service.telemetry.problem_reporter import ProblemReporter
+from optipmb_service.zenoh.client import IdlePool
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable, Hashable
+
+    from optipmb_client.zenoh.handles import Declared
+    from optipmb_client.zenoh.session import Sample
+
+    from optipmb_service.edges.json_frames import JsonFrame
+    from optipmb_service.settings import InputSettings, Settings
+    from optipmb_service.zenoh.client import Client, Outgoing
+
+CACHE: Final = 400
+"""Detections that a publisher keeps for recovery: 20 s of a sensor at 20 Hz."""
+
+INLINE_BYTES: Final = 64 * 2**10
+"""Larger messages are handed to the network on a thread: each is cut into fragments and may wait for the link."""
+
+WINDOW: Final = 64
+"""Frames of a stream that may be without tracks."""
+
+STALL_S: Final = 1.0
+"""Frames that are without tracks when nothing has come for so long were refused, or are not tracked."""
+
+STREAMS: Final = 10_000
+"""Streams whose epochs are kept; then the least recently used one goes."""
+
+FRAMES: Final = 1024
+"""Frames of a stream that are known when they come again."""
+
+ALL_FRAMES: Final = 2**20
+"""The same of all streams."""
+
+IDLE_PUBLISHERS: Final = 1000
+HISTORY_S: Final = 2.0
+"""Longest wait for the caches of the services."""
+
+FLUSH_S: Final = 1.0
+"""Period of summaries of problems."""
+
+STEP_NS: Final = 1000
+"""Least distance of two stamps of arrival."""
+
+OFFSETS: Final = 100
+"""Frames by which the offset of a sender's clock is known."""
+
+NEW_CLOCK: Final = 3
+"""Frames after which another offset is that of a new clock."""
+
+SECOND: Final = 1_000_000_000
+
+
+class RefusedError(Exception):
+    """A frame that is valid, and was not sent.
+
+    Attributes:
+        code: for programs: `late`, `duplicate_epoch`, `busy`.
+        expected, received: why.
+        retry_s: when it may come again; 0: never.
+    """
+
+    def __init__(self, code: str, expected: str, received: str, retry_s: float = 0.0) -> None:
+        super().__init__(f"expected {expected}, received {received} [{code}]")
+        self.code = code
+        self.expected = expected
+        self.received = received
+        self.retry_s = retry_s
+
+
+class Sent(NamedTuple):
+    """Numbers and stamp with which a frame was sent."""
+
+    epoch: bytes
+    seq: int
+    stamp_ns: int
+
+
+class _Head(msgspec.Struct):
+    """What an edge reads of tracks."""
+
+    stream: str
+    epoch: bytes
+    seq: int
+    stamp_ns: int
+    sensor: str | None = None
+
+
+class _Problem(msgspec.Struct):
+    """What an edge reads of problems."""
+
+    code: str
+    received: str = ""
+
+
+_head: Final = msgspec.msgpack.Decoder(_Head)
+_problem: Final = msgspec.msgpack.Decoder(_Problem)
+
+
+class InFlight:
+    """Frames of a sender that are without tracks; their number bounds its speed. To be used on the loop."""
+
+    def __init__(self) -> None:
+        self._frames: collections.OrderedDict[tuple[bytes, int], None] = collections.OrderedDict()
+        self._progress = time.monotonic()
+        self._changed = asyncio.Event()
+
+    def add(self, epoch: bytes, seq: int) -> None:
+        """Add a frame that goes out."""
+        if not self._frames:
+            self._progress = time.monotonic()
+        self._frames[epoch, seq] = None
+
+    def remove(self, epoch: bytes, seq: int) -> None:
+        """Remove a frame that has tracks; those sent before it that have none will have none, or have them late."""
+        if (epoch, seq) in self._frames:
+            while next(iter(self._frames)) != (epoch, seq):
+                self._frames.popitem(last=False)
+            del self._frames[epoch, seq]
+            self._progress = time.monotonic()
+            self._changed.set()
+
+    def full(self) -> bool:
+        """Return whether `WINDOW` frames are without tracks; when that stalls, forget them."""
+        if len(self._frames) >= WINDOW and time.monotonic() - self._progress >= STALL_S:
+            self._frames.clear()
+        return len(self._frames) >= WINDOW
+
+    async def below(self, most: int) -> None:
+        """Wait until less than so many frames are without tracks; when that stalls, forget them."""
+        while len(self._frames) >= most:
+            self._changed.clear()
+            try:
+                await asyncio.wait_for(self._changed.wait(), self._progress + STALL_S - time.monotonic())
+            except TimeoutError:
+                self._frames.clear()
+
+
+class _Clock:
+    """Stamps of frames that do not keep the sender's. Created for each stream."""
+
+    def __init__(self) -> None:
+        self._offsets: collections.deque[int] = collections.deque(maxlen=OFFSETS)
+        self._others: list[int] = []
+        self._sender_ns = self._last_ns = 0
+
+    def arrival(self) -> int:
+        """Return the time of arrival, after the one before."""
+        self._last_ns = max(time.time_ns(), self._last_ns + STEP_NS)
+        return self._last_ns
+
+    def moved(self, sender_ns: int) -> int:
+        """Return a sender's stamp on the clock of this machine, by the least offset of the last frames."""
+        offset = time.time_ns() - sender_ns
+        if self._offsets and abs(offset - min(self._offsets)) > SECOND:
+            self._others.append(offset)
+            if len(self._others) >= NEW_CLOCK:
+                self._offsets = collections.deque(self._others, OFFSETS)
+        else:
+            self._offsets.append(offset)
+        if offset in self._offsets:
+            self._others.clear()
+        stamp_ns = max(0, sender_ns + min(self._offsets))
+        if sender_ns > self._sender_ns:
+            stamp_ns = max(stamp_ns, self._last_ns + STEP_NS)
+        self._sender_ns, self._last_ns = sender_ns, stamp_ns
+        return stamp_ns
+
+
+@dataclass
+class _Stream:
+    """A stream of the edge: its numbers, the newest frames, and who waits for tracks. To be used on the loop."""
+
+    epoch: bytes = field(default_factory=lambda: secrets.token_bytes(16))
+    seq: int = 0
+    sent: collections.OrderedDict[Hashable, Sent] = field(default_factory=collections.OrderedDict)
+    tracked: dict[int, Sent] | None = None
+    """Frames in the caches of tracks when the stream was opened, by stamp; None: they were not asked yet."""
+    replaced_until: float = 0.0
+    """Monotonic time until which another publisher has the stream."""
+    clock: _Clock = field(default_factory=_Clock)
+    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
+    in_flight: InFlight = field(default_factory=InFlight)
+    waiting: dict[tuple[bytes, int], list[asyncio.Future[Answer]]] = field(default_factory=dict)
+    users: int = 0
+    link: _Link | None = None
+
+
+class _Link:
+    """Publisher and subscriptions of a stream."""
+
+    def __init__(self, outgoing: Outgoing, subscriptions: tuple[Declared, ...]) -> None:
+        self.outgoing = outgoing
+        self._subscriptions = subscriptions
+
+    def close(self) -> None:
+        for one in self._subscriptions:
+            one.close()
+        self.outgoing.close()
+
+
+class Inputs:
+    """Streams of senders without publishers. Create and use it on one loop.
+
+    Attributes:
+        frames, duplicates: frames that were sent, and that came again, by edge.
+        refused: frames that were not valid or not sent, by edge and code.
+
+    Args:
+        settings: of the process.
+        client: on the network.
+        edge: its name in the metrics.
+        sessions: returns the session that a stream feeds.
+    """
+
+    def __init__(self, settings: Settings, client: Client, edge: str, sessions: Callable[[str], str]) -> None:
+        self.client = client
+        self.frames: collections.Counter[str] = collections.Counter()
+        self.duplicates: collections.Counter[str] = collections.Counter()
+        self.refused: collections.Counter[tuple[str, str]] = collections.Counter()
+        self._edge = edge
+        self._instance = settings.instance
+        self._gap_s = settings.gap_limit_s
+        self._session_of = sessions
+        self._loop = asyncio.get_running_loop()
+        self._streams: collections.OrderedDict[str, _Stream] = collections.OrderedDict()
+        self._remembered = 0
+        self._idle: IdlePool[_Link] = IdlePool(IDLE_PUBLISHERS)
+        self._reporter = ProblemReporter(client.publish_problem)
+        self._flushing = False
+
+    def report(self, stream: str, error: schemas.MessageError) -> None:
+        """Count a frame that is not valid, and report it on its stream; nowhere without a stream."""
+        self.refused[self._edge, error.code] += 1
+        if stream:
+            problem = schemas.Problem.of(error, stream=stream, instance=self._instance)
+            self._reporter.report(problem, time.monotonic_ns())
+        if not self._flushing:
+            self._flushing = True
+            self._loop.call_later(FLUSH_S, self._flush)
+
+    async def send(
+        self, frame: JsonFrame, rules: InputSettings, repeats: str = "", traceparent: str = "", wait_s: float = 0.0
+    ) -> tuple[Sent, bool, Answer | None]:
+        """Hand a frame to the network, unless it was sent before.
+
+        Args:
+            frame: the frame.
+            rules: settings of its stream.
+            repeats: by which it is known again if it has no key.
+            traceparent: W3C trace context, unchecked.
+            wait_s: how long to wait for its tracks.
+
+        Returns:
+            Its numbers, whether it was sent before, and its tracks if they came in time.
+
+        Raises:
+            RefusedError: it is not sent now.
+            TransportError: the network cannot be used, or too many streams were opened.
+        """
+        name = frame.message.stream
+        async with self._used(name) as stream:
+            async with stream.lock:
+                mark = _mark(frame, repeats)
+                sent = None if frame.is_numbered else self._before(stream, frame, mark, rules)
+                if is_new := sent is None:
+                    sent = self._numbered(stream, frame, rules)
+                tracks: asyncio.Future[Answer] = self._loop.create_future()
+                if wait_s:
+                    stream.waiting.setdefault(sent[:2], []).append(tracks)
+                if is_new:
+                    await self._put(stream, frame, sent, traceparent)
+                    self._remember(stream, mark, sent)
+            counts = self.frames if is_new else self.duplicates
+            counts[self._edge] += 1
+            found = await self._tracks(stream, name, sent, tracks, wait_s, is_new=is_new) if wait_s else None
+            return sent, not is_new, found
+
+    @contextlib.asynccontextmanager
+    async def _used(self, name: str) -> AsyncIterator[_Stream]:
+        """Give a stream with its publisher."""
+        stream = self._streams.get(name) or _Stream()
+        self._streams[name] = stream
+        self._streams.move_to_end(name)
+        stream.users += 1
+        try:
+            async with stream.lock:
+                if not self.client.linked():
+                    raise TransportError("no link to a router")
+                if stream.link is None:
+                    stream.link = self._idle.take(name) or await asyncio.to_thread(self._open, name)
+                if stream.tracked is None:
+                    found = [one for one, _ in await asyncio.to_thread(self._cached, name)]
+                    stream.tracked = {one.stamp_ns: Sent(one.epoch, one.seq, one.stamp_ns) for one in found}
+            yield stream
+        finally:
+            stream.users -= 1
+            if not stream.users and stream.link is not None:
+                self._idle.keep(name, stream.link)
+                stream.link = None
+            self._forget()
+
+    def _before(self, stream: _Stream, frame: JsonFrame, mark: Hashable, rules: InputSettings) -> Sent | None:
+        """Return with which numbers a frame was sent; None of a new one.
+
+        Raises:
+            RefusedError: it cannot be told, or is earlier than what was tracked.
+        """
+        stamp_ns, tracked = frame.message.stamp_ns, stream.tracked or {}
+        if (sent := stream.sent.get(mark)) is not None or not frame.is_stamped or rules.clock != "sender":
+            return sent
+        if (sent := tracked.get(stamp_ns)) is not None:
+            return sent
+        if tracked and not stream.seq and stamp_ns < max(tracked):
+            expected = f"a stamp after {max(tracked)}, which was tracked before this edge began; or epoch and seq"
+            raise RefusedError("late", expected, str(stamp_ns))
+        return None
+
+    def _numbered(self, stream: _Stream, frame: JsonFrame, rules: InputSettings) -> Sent:
+        """Return the numbers of a new frame.
+
+        Raises:
+            RefusedError: it is not sent now.
+        """
+        message = frame.message
+        if stream.in_flight.full():
+            raise RefusedError("busy", f"less than {WINDOW} frames without tracks", f"{WINDOW} of the stream", 1.0)
+        if not frame.is_numbered and (left_s := stream.replaced_until - time.monotonic()) > 0:
+            raise RefusedError("duplicate_epoch", "one publisher of the stream", "another one that sends", left_s)
+        if not frame.is_stamped or rules.clock == "arrival":
+            stamp_ns = stream.clock.arrival()
+        else:
+            stamp_ns = message.stamp_ns if rules.clock == "sender" else stream.clock.moved(message.stamp_ns)
+        if frame.is_numbered:
+            return Sent(message.epoch, message.seq, stamp_ns)
+        return Sent(stream.epoch, stream.seq, stamp_ns)
+
+    async def _put(self, stream: _Stream, frame: JsonFrame, sent: Sent, traceparent: str) -> None:
+        assert stream.link is not None  # noqa: S101 - in use: said for the type checker
+        payload = schemas.encode(frame.message, **sent._asdict())
+        attachment, put = attachment_of(traceparent), stream.link.outgoing.detections
+        if len(payload) <= INLINE_BYTES:
+            put(payload, attachment)
+        else:
+            await asyncio.to_thread(put, payload, attachment)
+        stream.in_flight.add(sent.epoch, sent.seq)
+        stream.seq += not frame.is_numbered
+
+    def _remember(self, stream: _Stream, mark: Hashable, sent: Sent) -> None:
+        if mark is not None:
+            stream.sent[mark] = sent
+            self._remembered += 1
+            if len(stream.sent) > FRAMES:
+                stream.sent.popitem(last=False)
+                self._remembered -= 1
+
+    def _forget(self) -> None:
+        """Forget the least recently used streams beyond the bounds."""
+        while len(self._streams) > STREAMS or self._remembered > ALL_FRAMES:
+            name = next((name for name, stream in self._streams.items() if not stream.users), None)
+            if name is None:
+                return
+            self._remembered -= len(self._streams.pop(name).sent)
+
+    async def _tracks(
+        self,
+        stream: _Stream,
+        name: str,
+        sent: Sent,
+        tracks: asyncio.Future[Answer],
+        wait_s: float,
+        *,
+        is_new: bool,
+    ) -> Answer | None:
+        """Return the tracks of a frame, from the caches if it was sent before; None if they do not come in time."""
+        try:
+            if not is_new:
+                for head, answer in reversed(await asyncio.to_thread(self._cached, name)):
+                    if (head.epoch, head.seq) == sent[:2]:
+                        return answer
+            return await asyncio.wait_for(tracks, wait_s)
+        except TimeoutError:
+            return None
+        finally:
+            left = [one for one in stream.waiting.pop(sent[:2], ()) if one is not tracks]
+            if left:
+                stream.waiting[sent[:2]] = left
+
+    def _open(self, name: str) -> _Link:
+        """Subscribe to what comes back of a stream, and open its publisher."""
+        keys = self.client.keys
+        with contextlib.ExitStack() as opened:
+            subscriptions = []
+            for key, take in (
+                (keys.tracks(self._session_of(name)), self._take_tracks),
+                (keys.problems(name), self._take_problem),
+            ):
+                subscriptions.append(self.client.listen(key, partial(take, name)))
+                opened.callback(subscriptions[-1].close)
+            link = _Link(self.client.publish(name, CACHE, 0, lambda: None), tuple(subscriptions))
+            opened.pop_all()
+        return link
+
+    def _cached(self, name: str) -> list[tuple[_Head, Answer]]:
+        """Return the tracks of a stream that the services keep; may wait."""
+        answers = self.client.cached(self.client.keys.tracks(self._session_of(name)), timeout=HISTORY_S)
+        return [(head, one) for one in answers if (head := _head_of(one.payload, name)) is not None]
+
+    def _take_tracks(self, name: str, sample: Sample) -> None:
+        """Take tracks on a thread of the network."""
+        payload = sample.payload.to_bytes()
+        if (head := _head_of(payload, name)) is not None:
+            answer = Answer(str(sample.key_expr), payload, str(sample.encoding), ok=True)
+            self._call(self._tracked, name, (head.epoch, head.seq), answer)
+
+    def _take_problem(self, name: str, sample: Sample) -> None:
+        with contextlib.suppress(msgspec.DecodeError):
+            problem = _problem.decode(sample.payload.to_bytes())
+            if problem.code == "duplicate_epoch":
+                self._call(self._replaced, name, problem.received)
+
+    def _call(self, function: Callable[..., None], *arguments: Any) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(function, *arguments)
+
+    def _tracked(self, name: str, numbers: tuple[bytes, int], answer: Answer) -> None:
+        if (stream := self._streams.get(name)) is not None:
+            stream.in_flight.remove(*numbers)
+            for one in stream.waiting.pop(numbers, ()):
+                if not one.done():
+                    one.set_result(answer)
+
+    def _replaced(self, name: str, epoch: str) -> None:
+        if (stream := self._streams.get(name)) is not None and epoch == stream.epoch.hex():
+            stream.replaced_until = time.monotonic() + self._gap_s
+
+    def _flush(self) -> None:
+        self._flushing = False
+        self._reporter.flush(time.monotonic_ns())
+
+
+def _mark(frame: JsonFrame, repeats: str) -> Hashable:
+    """Return by what a frame is known when it comes again; None: by nothing."""
+    if frame.key or repeats:
+        return ("key", frame.key) if frame.key else ("repeats", repeats)
+    return frame.message.stamp_ns if frame.is_stamped else None
+
+
+def _head_of(payload: bytes, stream: str) -> _Head | None:
+    """Return the head of tracks that belong to a stream's detections."""
+    try:
+        head = _head.decode(payload)
+    except msgspec.DecodeError:
+        return None
+    return head if (head.sensor or head.stream) == stream else None

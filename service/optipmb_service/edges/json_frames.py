@@ -1,0 +1,340 @@
+"""Frames of detections in JSON: one object per detection, or the columns of `Detections`.
+
+Whatever a sender writes becomes a valid `Detections`, or an error with the path in the sender's document. Numbers and
+stamps that it does not give are left to the edge.
+"""
+
+from __future__ import annotations
+
+import re
+from datetime import datetime
+from fnmatch import fnmatchcase
+from functools import cache
+from math import nan
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import msgspec
+import numpy as np
+import optipmb_schemas as schemas
+from optipmb_schemas import codec
+from optipmb_schemas.errors import invalid, show
+from optipmb_schemas.json_form import EdgeDetections, EdgeObject
+
+from optipmb_service.settings import InputSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from optipmb import Georeference
+    from optipmb_service.settings import Settings
+
+MOST_FRAMES: Final = 256
+"""Frames of an array."""
+
+SECOND: Final = 1_000_000_000
+DIGITS: Final = 20
+UNKNOWN: Final = (nan, nan, nan)
+PLACES: Final = ("position", "lat and lon", "box", "foot")
+MODEL: Final = ("frame", "pose", "field_of_view", "relocation")
+"""Fields of a frame that are those of `Detections`."""
+
+_TIME: Final = re.compile(
+    r"([0-9]{4}-[0-9]{2}-[0-9]{2}[T ][0-9]{2}:[0-9]{2}:[0-9]{2})(?:[.,]([0-9]+))?(Z|[+-][0-9:]{4,5})"
+)
+_ELEMENT: Final = re.compile(r"(\w+)\[(\d+)\](.*)")
+_NAMES: Final = {"center": "position", "label": "class"}
+"""Fields of objects by those of `Detections`."""
+
+_KINDS: Final = {"float": "a number", "int": "an integer", "str": "a text", "array": "a list", "object": "a map"}
+"""Types of JSON by their names in errors of msgspec."""
+
+_frames: Final = msgspec.json.Decoder(list[msgspec.Raw])
+_frame: Final = msgspec.json.Decoder(EdgeDetections)
+
+
+class JsonFrame(NamedTuple):
+    """A frame of a sender.
+
+    Attributes:
+        message: its detections; numbers and stamp stand in for those that the sender does not give.
+        is_numbered: whether the sender gives `epoch` and `seq`.
+        is_stamped: whether it gives a stamp.
+        key: by which it knows the frame again; empty: it gives none.
+    """
+
+    message: schemas.Detections
+    is_numbered: bool
+    is_stamped: bool
+    key: str
+
+
+class FrameReader:
+    """Reads the frames of JSON senders by the settings.
+
+    Args:
+        settings: limits, places of sites, and inputs.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._limits = settings.limits.limits()
+        self._sites = settings.sites
+        self._inputs = settings.inputs
+        self._place = cache(self._place_of)
+
+    def split(self, payload: bytes) -> tuple[list[bytes], bool]:
+        """Return the frames of a document, and whether it is an array of them.
+
+        Raises:
+            MessageError: it is none, or has too many.
+        """
+        if payload.lstrip(b" \t\r\n")[:1] != b"[":
+            return [payload], False
+        try:
+            frames = [bytes(one) for one in _frames.decode(payload)]
+        except (ValueError, msgspec.DecodeError, RecursionError) as error:
+            raise _malformed(error, payload) from None
+        if not 1 <= len(frames) <= MOST_FRAMES:
+            expected = f"an array of 1 to {MOST_FRAMES} frames"
+            raise schemas.MessageError("too_large" if frames else "invalid_value", "", expected, str(len(frames)))
+        return frames, True
+
+    def rules(self, stream: str) -> InputSettings:
+        """Return the settings of a stream's frames."""
+        found = (one for pattern, one in self._inputs.items() if fnmatchcase(stream, pattern))
+        return next(found, _USUAL)
+
+    def read(self, payload: bytes, stream: str = "") -> JsonFrame:
+        """Return the frame of a document; `stream` is what the address says.
+
+        Raises:
+            MessageError: it is not valid, with the path in the document.
+        """
+        try:
+            frame = _frame.decode(payload)
+        except msgspec.ValidationError as error:
+            fields = codec.read_json_map(payload, self._limits, "a frame")
+            if fields.keys() & {"center", "label"}:
+                return self._columns(fields, stream)
+            raise _invalid(error, fields) from None
+        except (ValueError, msgspec.DecodeError, RecursionError) as error:
+            raise _malformed(error, payload) from None
+        given = {
+            name: value for name in EdgeDetections.__struct_fields__ if (value := getattr(frame, name)) is not None
+        }
+        header = _header(given, stream)
+        fields = {name: given[name] for name in MODEL if name in given}
+        fields |= self._objects(frame.objects, header["stream"], frame.frame)
+        try:
+            message = schemas.Detections(**header, **fields)
+        except schemas.MessageError as error:
+            raise _of_object(error, frame.objects, fields) from None
+        return self._framed(message, given)
+
+    def _columns(self, fields: dict[str, Any], stream: str) -> JsonFrame:
+        """Return the frame of a document with columns."""
+        if "objects" in fields:
+            raise schemas.MessageError("invalid_value", "objects", "objects or columns", "both")
+        for name, kinds in (
+            ("stream", str),
+            ("time", str),
+            ("key", str),
+            ("stamp_ns", (int, str)),
+            ("seq", (int, str)),
+        ):
+            value = fields.get(name)
+            if value is not None and (not isinstance(value, kinds) or isinstance(value, bool)):
+                raise invalid(name, "a text" if kinds is str else "an integer", value)
+        given = {name: value for name, value in fields.items() if value is not None}
+        return self._framed(codec.build(fields | _header(given, stream), schemas.Detections, self._limits), given)
+
+    def _framed(self, message: schemas.Detections, given: Mapping[str, Any]) -> JsonFrame:
+        if classes := self.rules(message.stream).classes:
+            names = [classes.get(name, name) for name in message.labels]
+            labels = tuple(dict.fromkeys(names))
+            numbers = np.array([labels.index(name) for name in names], np.int64)
+            message = message.model_copy(update={"labels": labels, "label": numbers[message.label]})
+        is_stamped = "time" in given or "stamp_ns" in given
+        return JsonFrame(message, "epoch" in given, is_stamped, given.get("key", ""))
+
+    def _objects(self, objects: Sequence[EdgeObject], stream: str, frame: str) -> dict[str, Any]:
+        """Return the columns of objects."""
+        most = self._limits.max_detections
+        if len(objects) > most:
+            raise schemas.MessageError("too_large", "objects", f"at most {most} objects", f"{len(objects)} objects")
+        names = [one.name for one in objects]
+        labels = {name: number for number, name in enumerate(dict.fromkeys(names))}
+        if len(labels) > self._limits.max_labels:
+            expected = f"at most {self._limits.max_labels} classes"
+            raise schemas.MessageError("too_large", "objects", expected, f"{len(labels)} classes")
+        for at, one in enumerate(objects):
+            _check(one, f"objects[{at}]")
+        columns: dict[str, Any] = {
+            "labels": tuple(labels),
+            "label": np.array([labels[name] for name in names], np.int64),
+            "score": np.array([_score(one) for one in objects], np.float64),
+            "center": np.array([_position(one) for one in objects], np.float64).reshape(-1, 3),
+            "yaw": _column([one.yaw for one in objects], nan),
+            "size": _column([one.size and [nan if n is None else n for n in one.size] for one in objects], UNKNOWN),
+            "velocity": _column([one.velocity for one in objects], UNKNOWN[:2]),
+            "position_covariance": _column([one.position_covariance for one in objects], (UNKNOWN,) * 3),
+        }
+        placed = [at for at, one in enumerate(objects) if one.lat is not None or one.heading is not None]
+        if placed:
+            self._move(objects, placed, columns, stream, frame)
+        return {name: column for name, column in columns.items() if column is not None}
+
+    def _move(
+        self, objects: Sequence[EdgeObject], placed: list[int], columns: dict[str, Any], stream: str, frame: str
+    ) -> None:
+        """Fill in the centres and headings of objects that have latitudes or true headings."""
+        first = f"objects[{placed[0]}].{'lat' if objects[placed[0]].lat is not None else 'heading'}"
+        site = stream.partition("/")[0]
+        if frame != "world":
+            raise schemas.MessageError("invalid_value", first, "frame world, for which it is known", frame)
+        if (place := self._place(site)) is None:
+            raise schemas.MessageError("invalid_value", first, f"`sites` with {site}", "a site without a place")
+        for at in placed:
+            one = objects[at]
+            if one.lat is not None:
+                columns["center"][at] = place.to_world(one.lat, one.lon or 0.0, one.alt)
+                if one.alt is None:
+                    columns["center"][at][2] = nan
+            if one.heading is not None:
+                if columns["yaw"] is None:
+                    columns["yaw"] = np.full(len(objects), nan)
+                axis = place.to_geographic(np.nan_to_num(columns["center"][at])).heading[0]
+                columns["yaw"][at] = np.radians((axis - one.heading + 180.0) % 360.0 - 180.0)
+
+    def _place_of(self, site: str) -> Georeference | None:
+        from optipmb import Georeference  # noqa: PLC0415 - the tracker, which a router does not load
+
+        one = self._sites.get(site)
+        return None if one is None else Georeference(one.origin, one.x_heading)
+
+
+_USUAL: Final = InputSettings()
+
+
+def _header(given: Mapping[str, Any], stream: str) -> dict[str, Any]:
+    """Return the header of a frame, with stand-ins for what it does not say."""
+    named = given.get("stream", stream)
+    if stream and named != stream:
+        raise invalid("stream", stream, named)
+    if not named:
+        raise schemas.MessageError("missing_field", "stream", "a stream, as site/node/sensor", "nothing")
+    if ("epoch" in given) != ("seq" in given):
+        absent = "seq" if "epoch" in given else "epoch"
+        raise schemas.MessageError("missing_field", absent, "both of epoch and seq, or neither", "one of them")
+    if "time" in given and "stamp_ns" in given:
+        raise schemas.MessageError("invalid_value", "stamp_ns", "time or stamp_ns", "both")
+    stamp_ns = _time(given["time"]) if "time" in given else _integer("stamp_ns", given.get("stamp_ns", 0))
+    seq = _integer("seq", given.get("seq", 0))
+    return {"stream": named, "epoch": given.get("epoch", bytes(16)), "seq": seq, "stamp_ns": stamp_ns}
+
+
+def _integer(name: str, value: int | str) -> int:
+    if isinstance(value, int):
+        return value
+    if value.isascii() and value.isdigit() and len(value) < DIGITS:
+        return int(value)
+    raise invalid(name, "an integer, or its digits as text", value)
+
+
+def _time(text: str) -> int:
+    """Return the nanoseconds since 1970 of an ISO 8601 text.
+
+    Raises:
+        MessageError: it is none, or says no zone.
+    """
+    expected = "ISO 8601 from 1970 on with Z or an offset, as 2026-11-27T08:00:00.100Z"
+    if (match := _TIME.fullmatch(text)) is None:
+        raise invalid("time", expected, text)
+    day, fraction, zone = match.groups()
+    try:
+        seconds = int(datetime.fromisoformat(f"{day}{'+00:00' if zone == 'Z' else zone}").timestamp())
+    except ValueError:
+        seconds = -1
+    if seconds < 0:
+        raise invalid("time", expected, text)
+    return seconds * SECOND + int((fraction or "0")[:9].ljust(9, "0"))
+
+
+def _check(one: EdgeObject, path: str) -> None:
+    """Refuse an object whose place, score or heading is missing or said twice."""
+    places = (one.position, one.lat if one.lat is not None else one.lon, one.box, one.foot)
+    said = [name for name, place in zip(PLACES, places, strict=True) if place is not None]
+    if len(said) != 1:
+        raise schemas.MessageError("invalid_value", path, f"one of {', '.join(PLACES)}", " and ".join(said) or "none")
+    if said[0] in PLACES[2:]:
+        expected = "`camera` in `inputs` of the stream, for what is in pixels"
+        raise schemas.MessageError("invalid_value", f"{path}.{said[0]}", expected, "no calibration")
+    if (one.lat is None) != (one.lon is None):
+        raise schemas.MessageError(
+            "missing_field", f"{path}.{'lat' if one.lat is None else 'lon'}", "a number", "nothing"
+        )
+    for name, other in (("score", "confidence"), ("yaw", "heading")):
+        if getattr(one, name) is not None and getattr(one, other) is not None:
+            raise schemas.MessageError("invalid_value", f"{path}.{other}", f"{name} or {other}", "both")
+
+
+def _score(one: EdgeObject) -> float:
+    score = one.confidence if one.score is None else one.score
+    return 1.0 if score is None else score
+
+
+def _position(one: EdgeObject) -> list[float]:
+    if one.position is None:
+        return list(UNKNOWN)
+    return [*(nan if number is None else number for number in one.position), nan][:3]
+
+
+def _column(values: list[Any], unknown: Any) -> Any:
+    """Return an array of the values, None as unknown; None when all are."""
+    if all(value is None for value in values):
+        return None
+    return np.array([unknown if value is None else value for value in values], np.float64)
+
+
+def _of_object(
+    error: schemas.MessageError, objects: Sequence[EdgeObject], fields: Mapping[str, Any]
+) -> schemas.MessageError:
+    """Return an error of the columns with its path in the sender's document."""
+    match = _ELEMENT.fullmatch(error.path)
+    if match is None or match[1] not in fields or match[1] in MODEL:
+        return error
+    name, number, rest = match[1], int(match[2]), match[3]
+    if name == "labels":
+        name, number = "class", fields["label"].tolist().index(number)
+    one = objects[number]
+    name = _NAMES.get(name, name)
+    if name == "position" and one.position is None:
+        name, rest = "lat", ""
+    elif name == "score" and one.score is None:
+        name = "confidence"
+    received = "null" if error.received == "nan" else error.received
+    return schemas.MessageError(error.code, f"objects[{number}].{name}{rest}", error.expected, received)
+
+
+def _malformed(error: Exception, payload: bytes) -> schemas.MessageError:
+    text = "deeper nesting" if isinstance(error, RecursionError) else str(error).removeprefix("JSON is malformed: ")
+    if "truncated" in text:
+        text = f"one cut short after {len(payload)} bytes"
+    return schemas.MessageError("malformed", "", "a JSON document in UTF-8", show(text)[1:-1])
+
+
+def _invalid(error: msgspec.ValidationError, document: Any) -> schemas.MessageError:
+    """Return an error of the types of fields as ours."""
+    text, _, place = str(error).partition(" - at `$")
+    path = place.rstrip("`").removeprefix(".")
+    for part in re.findall(r"\w+", path):
+        document = document[int(part) if part.isdigit() else part]
+    if match := re.fullmatch(r"Object missing required field `(.*)`", text):
+        return schemas.MessageError("missing_field", f"{path}.{match[1]}".removeprefix("."), "a value", "nothing")
+    if match := re.fullmatch(r"Object contains unknown field `(.*)`", text, re.DOTALL):
+        expected = f"one of {', '.join(EdgeDetections.__struct_fields__)}"
+        return schemas.MessageError("invalid_value", show(match[1])[1:-1], expected, "another field")
+    expected = re.sub(r", got .*| \| null|`", "", text.removeprefix("Expected ")).replace(" | ", " or ")
+    expected = re.sub(r"\w+", lambda word: _KINDS.get(word[0], word[0]), expected)
+    if text.startswith("Invalid enum value"):
+        expected = "world or sensor"
+    return invalid(path, expected, document)

@@ -1,0 +1,302 @@
+"""Detections by POST: the same tracks as over Zenoh, once for each frame, and clear answers to what is wrong."""
+
+import hashlib
+import json
+import re
+import shutil
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from json_senders import Edge, damaged, document, exists, post
+from optipmb_schemas import MessageError, encode_json
+from optipmb_service.edges.http import detections
+from optipmb_service.edges.json_frames import FrameReader
+from optipmb_service.settings import Settings, load
+from router import Node, Sensor, plain
+from routers import free_endpoint
+from watched import Watched, asked, served
+
+from optipmb import Georeference
+
+SENSOR = Sensor()
+STREAM = f"stream={SENSOR.stream}"
+PAGE = Path(__file__).parents[3] / "docs/json.md"
+SITE = (48.265, 11.67, 489.0)
+
+
+@pytest.fixture
+def endpoint(start: Any) -> str:
+    return str(start()[1])
+
+
+@pytest.fixture
+def edge(endpoint: str) -> Iterator[Edge]:
+    with Edge(endpoint) as one:
+        yield one
+
+
+def frame(seq: int, *names: str) -> dict[str, Any]:
+    return document(SENSOR.detections(seq), *names)
+
+
+def stamped(seq: int, **fields: Any) -> dict[str, Any]:
+    return {"stamp_ns": SENSOR.stamp_ns(seq), "objects": []} | fields
+
+
+def error(body: Any) -> tuple[str, str]:
+    (one,) = body["frames"]
+    return one["error"]["code"], one["error"]["path"]
+
+
+def test_the_same_frames_give_the_same_bytes(start: Any) -> None:
+    """Frames over Zenoh, as objects and as columns by POST give equal `Tracks`; empty frames count."""
+    messages = [SENSOR.detections(seq, **({"objects": 0} if seq == 3 else {})) for seq in range(6)]
+    found = []
+    for way in ("zenoh", "objects", "columns"):
+        endpoint = start()[1]
+        with Node(endpoint) as node, Edge(endpoint) as edge:
+            if way == "zenoh":
+                node.send(*messages)
+            elif way == "objects":
+                for one in messages:
+                    assert edge.post(document(one, "epoch", "seq"), STREAM).status == HTTPStatus.ACCEPTED
+            else:
+                answer = edge.post(b"[%b]" % b",".join(map(encode_json, messages)))
+                assert (answer.status, answer.body["accepted"]) == (HTTPStatus.ACCEPTED, len(messages))
+            tracks = node.tracks(SENSOR.stream, len(messages))
+            found.append([plain(one.model_copy(update={"session": "0" * 32})) for one in tracks])
+    assert found[0] == found[1] == found[2]
+
+
+def test_a_frame_that_is_sent_again_counts_once(endpoint: str) -> None:
+    """Each request is sent twice, and the edge started again between two frames: tracks come once, ids go on."""
+    with Node(endpoint) as node:
+        for first in (0, 4):
+            with Edge(endpoint) as edge:
+                if first:  # the answer to this one was lost with the edge before
+                    again = edge.post(frame(first - 1), f"{STREAM}&wait=5")
+                    assert again.body["frames"][0]["duplicate"]
+                    assert again.body["tracks"]["seq"] == first - 1
+                    assert error(edge.post(frame(0) | {"stamp_ns": 5}, STREAM).body) == ("late", "")
+                for seq in range(first, first + 4):
+                    answers = [edge.post(frame(seq), f"{STREAM}&wait=5&confirmed=0").body for _ in range(2)]
+                    assert [one["frames"][0]["duplicate"] for one in answers] == [False, True]
+                    assert answers[0]["tracks"]["objects"] == answers[1]["tracks"]["objects"]
+                    assert answers[0]["frames"][0]["seq"] == seq - first
+        tracks = node.tracks(SENSOR.stream, 8)
+    assert [one.stamp_ns for one in tracks] == [SENSOR.stamp_ns(seq) for seq in range(8)]
+    assert len({(one.session, *one.id.tolist()) for one in tracks}) == 1
+
+
+def test_keys_tell_frames_without_stamps(edge: Edge) -> None:
+    """A key in the frame or the header `Idempotency-Key` with the place in an array; with neither all are new."""
+    one = {"objects": [], "key": "a"}
+    assert [edge.post(one, STREAM).body["frames"][0]["duplicate"] for _ in range(2)] == [False, True]
+    two = [{"objects": []}] * 2
+    found = [edge.post(two, STREAM, idempotency_key="k").body["frames"] for _ in range(2)]
+    assert [[frame["duplicate"] for frame in frames] for frames in found] == [[False] * 2, [True] * 2]
+    assert [edge.post({"objects": []}, STREAM).body["frames"][0]["seq"] for _ in range(2)] == [3, 4]
+
+
+def test_damaged_documents_get_a_path(edge: Edge, endpoint: str) -> None:
+    """200 documents with a fault get 202 or an error whose path is in the document; another stream loses nothing."""
+    message = SENSOR.detections(0)
+    for text in damaged(document(message, "epoch", "seq"), 200):
+        answer = edge.post(text, "stream=site/node/damaged")
+        assert answer.status in {HTTPStatus.ACCEPTED, HTTPStatus.BAD_REQUEST}, (text, answer)
+        if answer.status == HTTPStatus.BAD_REQUEST:
+            path = error(answer.body)[1] if "frames" in answer.body else answer.body["path"]
+            assert exists(path, text), (path, text)
+    assert edge.post(frame(1), f"{STREAM}&wait=5").body["tracks"] is not None
+    assert edge.post(b" " * 10_000_000, STREAM).status == HTTPStatus.REQUEST_ENTITY_TOO_LARGE
+
+
+@pytest.mark.parametrize(
+    ("fields", "code", "path"),
+    [
+        ({"objects": [{"class": "car"}]}, "invalid_value", "objects[0]"),
+        ({"objects": [{"class": "car", "position": [0, 0], "foot": [1, 1]}]}, "invalid_value", "objects[0]"),
+        ({"objects": [{"class": "car", "box": [0, 0, 1, 1]}]}, "invalid_value", "objects[0].box"),
+        ({"objects": [{"class": "car", "lat": 1.0}]}, "missing_field", "objects[0].lon"),
+        ({"objects": [{"class": "car", "lat": 1.0, "lon": 1.0}]}, "invalid_value", "objects[0].lat"),
+        ({"objects": [{"class": "car", "position": [0, None]}]}, "invalid_value", "objects[0].position[1]"),
+        (
+            {"objects": [{"class": "car", "position": [0, 0], "confidence": 7}]},
+            "invalid_value",
+            "objects[0].confidence",
+        ),
+        (
+            {"objects": [{"class": "car", "position": [0, 0], "size": [1, -1, 1]}]},
+            "invalid_value",
+            "objects[0].size[1]",
+        ),
+        ({"objects": [{"class": "\n", "position": [0, 0]}]}, "invalid_value", "objects[0].class"),
+        ({"objects": [], "object": []}, "invalid_value", "object"),
+        ({"objects": [], "frame": "sensor"}, "missing_field", "pose"),
+        ({"objects": [], "frame": "map"}, "invalid_value", "frame"),
+        ({"objects": [], "time": "2026-11-27T08:00:00"}, "invalid_value", "time"),
+        ({"objects": [], "time": "2026-11-27T08:00:00Z", "stamp_ns": 1}, "invalid_value", "stamp_ns"),
+        ({"objects": [], "seq": 1}, "missing_field", "epoch"),
+        ({"objects": [], "stream": "a/b/c"}, "invalid_value", "stream"),
+    ],
+)
+def test_an_error_names_the_path(fields: dict[str, Any], code: str, path: str) -> None:
+    """In the sender's words: objects and their fields, not columns."""
+    with pytest.raises(MessageError) as raised:
+        FrameReader(Settings()).read(json.dumps(fields).encode(), SENSOR.stream)
+    assert (raised.value.code, raised.value.path) == (code, path)
+
+
+def test_latitude_and_heading_become_the_world(tmp_path: Path) -> None:
+    """By the place of the site, in which x points north here; classes have the names of the settings."""
+    settings = Settings(
+        sites={"site": {"origin": SITE, "x_heading": 0.0}}, inputs={"site/*/*": {"classes": {"Human": "pedestrian"}}}
+    )
+    place = Georeference(SITE, 0.0)
+    lat, lon, alt, heading = place.to_geographic([[300.0, -40.0, 1.0]], [0.3])
+    one = {"class": "Human", "lat": lat[0], "lon": lon[0], "alt": alt[0], "heading": heading[0]}
+    body = {
+        "objects": [one, {"class": "pedestrian", "position": [1, 2]}],
+        "time": "2026-11-27T09:00:00.000000001+01:00",
+    }
+    message = FrameReader(settings).read(json.dumps(body).encode(), SENSOR.stream).message
+    np.testing.assert_allclose(message.center, [[300.0, -40.0, 1.0], [1.0, 2.0, np.nan]], atol=1e-6)
+    assert message.yaw is not None
+    np.testing.assert_allclose(message.yaw, [0.3, np.nan], atol=1e-9)
+    assert (message.labels, message.label.tolist()) == (("pedestrian",), [0, 0])
+    assert message.stamp_ns == 1_795_766_400_000_000_001
+
+
+def test_a_page_of_a_stranger_cannot_send(edge: Edge) -> None:
+    """By its origin, and by what it can send without asking: other content types."""
+    assert edge.post(stamped(0), STREAM, origin="https://stranger.example").status == HTTPStatus.FORBIDDEN
+    for headers in ({"content_type": "text/plain"}, {"content_encoding": "gzip"}):
+        assert edge.post(stamped(0), STREAM, **headers).status == HTTPStatus.UNSUPPORTED_MEDIA_TYPE
+    assert edge.post(stamped(0), STREAM, origin=f"http://{edge.address}").status == HTTPStatus.ACCEPTED
+
+
+def test_pages_of_named_origins_may_send(watched: Watched) -> None:
+    """A browser asks before it sends: the answer allows POST with a content type and a token."""
+    asks = {"origin": "https://map.example", "access-control-request-method": "POST"}
+    asks["access-control-request-headers"] = "authorization,content-type,idempotency-key"
+    with served(watched, http_origins=["https://map.example"]) as address:
+        with asked(address, "/api/v1/detections", "OPTIONS", **asks) as response:
+            assert response.status == HTTPStatus.OK
+        with asked(address, "/api/v1/detections", "OPTIONS", **asks | {"origin": "https://other"}) as response:
+            assert response.status == HTTPStatus.BAD_REQUEST
+
+
+def test_tokens_send_their_own_streams(endpoint: str, tmp_path: Path) -> None:
+    """A node sends its streams, a viewer none; without tokens only a loopback address takes detections."""
+    names = {"node": "site/node", "viewer": "viewer/map", "service": "service/one"}
+    file = tmp_path / "tokens.json"
+    file.write_text(json.dumps({hashlib.sha256(token.encode()).hexdigest(): name for token, name in names.items()}))
+    both = [stamped(0, stream=SENSOR.stream), stamped(0, stream="site/other/lidar")]
+    with Edge(endpoint, http="0.0.0.0:8080", http_tokens=str(file)) as edge:
+        tokens = {name: {"authorization": f"Bearer {name}"} for name in ("", *names)}
+        assert edge.post(both).status == HTTPStatus.UNAUTHORIZED
+        answer = edge.post(both, **tokens["node"])
+        assert answer.status == HTTPStatus.MULTI_STATUS
+        assert answer.body["frames"][1]["error"]["code"] == "not_allowed"
+        for name in ("viewer", "service"):
+            assert edge.post(both, **tokens[name]).status == HTTPStatus.FORBIDDEN
+    with Edge(endpoint, http="0.0.0.0:8080") as edge:
+        answer = edge.post(both)
+        assert (answer.status, "set http_tokens" in answer.body["error"]) == (HTTPStatus.FORBIDDEN, True)
+
+
+def test_a_second_edge_of_a_stream_is_told(endpoint: str) -> None:
+    """The edge whose epoch another one has replaced answers 409."""
+    with Node(endpoint) as node, Edge(endpoint) as one, Edge(endpoint) as other:
+        assert one.post(stamped(0), f"{STREAM}&wait=5").body["tracks"] is not None
+        assert other.post(stamped(1), f"{STREAM}&wait=5").body["tracks"] is not None
+        assert one.post(stamped(2), STREAM).status == HTTPStatus.ACCEPTED
+        node.problem(SENSOR.stream, "duplicate_epoch")
+        ends = time.monotonic() + 60
+        while (answer := one.post(stamped(2 + 1), STREAM)).status != HTTPStatus.CONFLICT:
+            assert time.monotonic() < ends
+        assert error(answer.body)[0] == "duplicate_epoch"
+
+
+def test_a_sender_waits_while_nothing_is_tracked() -> None:
+    """64 frames of a stream without tracks: 429 and when to come again; without a network 503."""
+    with Edge(free_endpoint(), router=True) as edge:
+        frames = [stamped(seq) for seq in range(70)]
+        answer = edge.post(frames, STREAM)
+        assert (answer.status, answer.body["accepted"]) == (HTTPStatus.MULTI_STATUS, 64)
+        assert {one["error"]["code"] for one in answer.body["frames"][64:]} == {"busy"}
+        again = edge.post(frames[64:], STREAM)
+        assert (again.status, again.headers["retry-after"]) == (HTTPStatus.TOO_MANY_REQUESTS, "1")
+
+
+def test_without_a_network_nothing_is_taken(watched: Watched) -> None:
+    """503 before the service has a session."""
+    watched.network = None
+    with served(watched) as address:
+        answer = post(address, stamped(0), STREAM)
+        assert (answer.status, answer.headers["retry-after"]) == (HTTPStatus.SERVICE_UNAVAILABLE, "1")
+
+
+def test_a_body_has_a_bound_and_a_time(edge: Edge, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beyond `max_json_bytes`, also in chunks of unknown number, 413; one that does not come, 408."""
+    host, _, port = edge.address.rpartition(":")
+    head = b"POST /api/v1/detections HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\n"
+
+    def answer(text: bytes) -> bytes:
+        with socket.create_connection((host, int(port)), 60) as connection:
+            connection.sendall(head + text)
+            return connection.recv(100).split(b"\r\n")[0]
+
+    chunk = b"%x\r\n%b\r\n" % (2**16, b" " * 2**16)
+    assert b" 413 " in answer(b"transfer-encoding: chunked\r\n\r\n" + chunk * 33 + b"0\r\n\r\n")
+    assert b" 413 " in answer(b"expect: 100-continue\r\ncontent-length: 3000000\r\n\r\n")
+    monkeypatch.setattr(detections, "BODY_S", 0.05)
+    assert b" 408 " in answer(b"content-length: 10\r\n\r\n1")
+
+
+@pytest.mark.parametrize(
+    ("query", "path"),
+    [
+        ("streem=a/b/c", "streem"),
+        (f"{STREAM}&wait=6", "wait"),
+        (f"{STREAM}&fields=id", "fields"),
+        (f"{STREAM}&wait=1&min_existence=2", "min_existence"),
+    ],
+)
+def test_a_parameter_that_is_wrong_is_named(edge: Edge, query: str, path: str) -> None:
+    """Before the body is read."""
+    answer = edge.post(stamped(0), query)
+    assert (answer.status, answer.body["path"]) == (HTTPStatus.BAD_REQUEST, path)
+
+
+def test_refused_frames_are_problems_of_the_stream(endpoint: str, edge: Edge) -> None:
+    """Whoever watches the stream sees why nothing comes, and the metrics count it."""
+    with Node(endpoint) as node:
+        edge.post({"objects": [{"class": "car"}]}, STREAM)
+        assert node.problem(SENSOR.stream, "invalid_value").path == "objects[0]"
+    assert b'optipmb_inputs_refused_total{code="invalid_value",edge="http"} 1' in edge.health.metrics.text()
+
+
+@pytest.mark.skipif(not shutil.which("curl"), reason="needs curl")
+def test_the_commands_of_the_page(edge: Edge, tmp_path: Path) -> None:
+    """They run as they stand: a frame gives a track, of two frames one is refused; its settings are valid."""
+    text = PAGE.read_text(encoding="utf-8").partition("## Choose what you get")[0]
+    answers = []
+    for block in re.findall(r"```sh\n(.*?)```", text, re.DOTALL):
+        command = block.replace("127.0.0.1:8080", edge.address)
+        if command.startswith("curl"):
+            run = subprocess.run(command, shell=True, capture_output=True, check=True, timeout=60)  # noqa: S602 - of the page
+            answers.append(run.stdout)
+    first, _ = json.JSONDecoder().raw_decode(answers[0].decode())
+    assert [one["class"] for one in first["tracks"]["objects"]] == ["car"]
+    assert (json.loads(answers[1])["accepted"], json.loads(answers[1])["refused"]) == (1, 1)
+    file = tmp_path / "settings.toml"
+    file.write_text(re.findall(r"```toml\n(\[?http_senders.*?)```", text, re.DOTALL)[0])
+    assert load(file).settings.inputs["garage/*/cam*"].clock == "offset"
