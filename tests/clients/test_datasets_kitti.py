@@ -476,6 +476,8 @@ def test_detections_are_read_as_other_systems_write_them(change: Callable[[str],
         ("SECOND_iou", "kitti-second-iou"),
         ("VirConv-S", "kitti-virconv"),
         ("second_try", "auto"),
+        ("my_CasA", "kitti"),
+        ("casablanca", "auto"),
     ],
 )
 def test_the_profile_is_that_of_the_detector_that_is_named(tmp_path: Path, name: str, profile: str) -> None:

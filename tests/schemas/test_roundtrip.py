@@ -186,6 +186,7 @@ def tracks(draw: st.DrawFn) -> Tracks:
         covariance=draw(rows((n, 6, 6), -1e30, 1e30)),
         detection=draw(whole(n, -1, INT64)),
         measured=draw(st.none() | whole(n, 0, 7)),
+        confirmed=draw(st.none() | whole(n, 0, 1)),
         delivery=draw(st.none() | delivery),
         **column,
         **draw(paths(n)),
@@ -420,7 +421,9 @@ def test_a_selection_leaves_out_rows_and_fields(
         assert one == {name: all_of_it[name] for name in all_of_it if name in fields | {"id"} or not fields}
         assert all_of_it["class"] == message.labels[0]
     expected = (message.existence >= least) & (message.label == 0)
-    if confirmed:
+    if confirmed and message.confirmed is not None:
+        expected &= message.confirmed == 1
+    elif confirmed:
         expected &= (message.existence > 0.5) & (message.age > 0)
     assert [one["id"] for one in chosen] == message.id[expected].tolist()
 

@@ -4,10 +4,12 @@ Conventions: metres, seconds, radians, z up. Detections and clouds are in their 
 frame. Centres are geometric centres, sizes are length, width, height, stamps are nanoseconds.
 """
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -268,9 +270,10 @@ class Dataset(ABC):
 
 
 def profile_named(text: str, known: Mapping[str, str]) -> str:
-    """Return the profile of the first detector whose name is part of a text, in any case; `auto` of none."""
-    plain = "".join(letter for letter in text.lower() if letter.isalnum())
-    return next((profile for detector, profile in known.items() if detector in plain), "auto")
+    """Return the profile of the first detector whose name is words of a text, in any case; `auto` of none."""
+    words = re.findall(r"[a-z]+|\d+", text.lower())
+    runs = {*words, *map("".join, pairwise(words))}
+    return next((profile for detector, profile in known.items() if detector in runs), "auto")
 
 
 def chosen(names: Iterable[str], known: Mapping[str, _T], what: str, spelt: Callable[[str], str] = str) -> list[_T]:
