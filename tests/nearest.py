@@ -22,6 +22,7 @@ SOURCES = (".", "schemas", "service", "clients", "tests/support", "benchmarks", 
 """Folders that imports are looked up in."""
 WHOLE = {
     "optipmb": "tests/tracker/test_oracle.py",
+    "clients/optipmb_tools/run": "tests/clients/test_mistakes.py",
     "service/optipmb_service/session": "tests/service/stream/test_recorded.py",
     "service/optipmb_service/streams": "tests/service/stream/test_recorded.py",
 }
