@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import typer
 
-from optipmb_tools.commands.options import AsJson, DataOptions, plain_table, print_json, print_table
+from optipmb_tools.commands.options import AsJson, DataOptions, plain_table, print_json, print_table, reading
 from optipmb_tools.datasets.interface import class_like
 from optipmb_tools.datasets.motion import headings_along
 from optipmb_tools.datasets.table.findings import Finding
@@ -39,9 +39,9 @@ def check(data: DataOptions, *, as_json: AsJson = False) -> None:
         options = {option: str(value) for option, value in data.options(name).items()}
         found: list[Finding] = []
         try:
-            chosen = list(
-                TableDataset(root, options, lenient=True, findings=found).sequences(data.sequences or ["all"])
-            )
+            with reading(root):
+                table = TableDataset(root, options, lenient=True, findings=found)
+                chosen = list(table.sequences(data.sequences or ["all"]))
         except DatasetError as error:
             if error.path.startswith("--"):
                 raise

@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import typer
 from optipmb_client.errors import UsageError
 from rich.console import Console, Group, RenderableType
+from rich.status import Status
 from rich.table import Table
 
 from optipmb_tools.datasets import DATASETS, DataSequence, Dataset, dataset_at, open_dataset
@@ -31,6 +32,11 @@ Classes = Annotated[
     list[str] | None,
     typer.Option("--classes", metavar="NAME...", help="Only objects of these classes.", show_default=False),
 ]
+
+
+def reading(root: Path | None) -> Status:
+    """Say on a terminal, while the context lasts, that data are read, which takes seconds for millions of rows."""
+    return Console(stderr=True).status(f"reading {'a scene' if root is None else root.name}")
 
 
 def _out(out: Path) -> Path:
@@ -183,8 +189,9 @@ class DatasetOptions:
             DatasetError, UsageError: Any of it is not there, or not allowed.
         """
         name, root = self.named()
-        opened = open_dataset(name, root, self.detections, **self.options(name) | more)
-        chosen = list(opened.sequences(self.sequences or ["all"]))
+        with reading(root):
+            opened = open_dataset(name, root, self.detections, **self.options(name) | more)
+            chosen = list(opened.sequences(self.sequences or ["all"]))
         notes = [*opened.notes, *(note for one in chosen for note in one.notes)]
         for note in notes if self.verbose else in_short(notes):
             warn(note)
