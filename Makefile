@@ -12,7 +12,7 @@ KITTI = --dataset kitti --root $(DATA)/kitti --detections pointrcnn
 NUSCENES = --dataset nuscenes --root $(DATA)/nuscenes --detections centerpoint
 
 FUZZ_TARGETS := fuzz-messages fuzz-checkpoints fuzz-protobuf
-.PHONY: help kernels dist docs pictures release demo test accuracy alone bounds ray bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests check mutants lowest paths pythons repeat schemas wheel clean tune ablate
+.PHONY: help kernels dist docs pictures release image demo-files demo test accuracy alone bounds ray bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests check mutants lowest paths pythons repeat schemas wheel clean tune ablate
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
 	@echo "make install a virtual environment with everything, and compiled kernels"
@@ -40,6 +40,8 @@ help:
 	@echo "make pictures draw the pictures of the pages again, into docs/images"
 	@echo "make docs    build the documentation site into out/site and check its links"
 	@echo "make release test, build and check a release, and print what would publish it"
+	@echo "make image   build the image for PLATFORMS=linux/amd64,linux/arm64, and push it to PUSH=REPOSITORY"
+	@echo "make demo-files  record a generated scene for Foxglove and Rerun, into out/demo"
 	@echo "make clean   remove the virtual environment and everything generated"
 
 # The stamp is newer than what it was made from, so a second call installs nothing.
@@ -183,6 +185,15 @@ pictures: kernels
 # Everything that a release needs, up to publishing.
 release: $(VENV)/.installed
 	sh tests/release.sh $(BIN)
+
+# For several kinds of processors; PUSH names a repository of a registry.
+PLATFORMS ?= linux/amd64,linux/arm64
+PUSH ?=
+image: $(VENV)/.installed
+	sh docker/image.sh $$($(BIN)/python -c 'import optipmb; print(optipmb.__version__)') $(PLATFORMS) $(PUSH)
+
+demo-files: kernels
+	$(BIN)/python docs/demo_files.py out/demo
 
 bench: install
 	$(BENCH) --benchmark-compare

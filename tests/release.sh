@@ -8,11 +8,17 @@ version=$("$bin/python" -c 'import optipmb; print(optipmb.__version__)')
 grep -q "^## $version\( \|$\)" CHANGELOG.md || { echo "release: CHANGELOG.md has no section '## $version'"; exit 1; }
 if grep -q "^## $version (unreleased)" CHANGELOG.md; then echo "release: CHANGELOG.md still calls $version unreleased"; exit 1; fi
 if git rev-parse -q --verify "refs/tags/v$version" >/dev/null; then echo "release: the tag v$version is there already"; exit 1; fi
+# Addresses of a repository that has none yet; tests and documents name others of this kind as examples.
+places=$(git grep -l 'example\.invalid/optipmb\|@example\.invalid' -- ':!tests' || true)
+[ -z "$places" ] || { echo "release: put addresses in the place of example.invalid in" $places; exit 1; }
 make test wheel accuracy alone
 rm -rf dist
 "$bin/python" -m build --outdir dist .
 "$bin/python" -m build --wheel --outdir dist node
 "$bin/python" -m twine check --strict dist/*
+"$bin/python" -m cyclonedx_py requirements docker/requirements.lock --output-file out/sbom.cdx.json
 echo "release: dist/ is ready. To publish $version:"
 echo "  git tag -a v$version -m 'OptiPMB $version' && git push origin v$version"
 echo "  $bin/python -m twine upload dist/*"
+echo "  make image PUSH=REGISTRY/optipmb       # for amd64 and arm64, with out/sbom.cdx.json beside it"
+echo "  make demo-files                         # out/demo/demo.mcap and demo.rrd, for the addresses in docs/watching.md"

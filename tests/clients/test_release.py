@@ -1,12 +1,23 @@
-"""`make release` prepares everything and publishes nothing."""
+"""`make release` prepares everything and publishes nothing; what is published is as its readers expect it."""
 
+import importlib.metadata
 import os
+import re
+import runpy
 import subprocess
+import sys
+import tomllib
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import pytest
+from catkin_pkg.package import parse_package
+from trove_classifiers import classifiers
 
-SCRIPT = Path(__file__).parents[1] / "release.sh"
+ROOT = Path(__file__).parents[2]
+SCRIPT = ROOT / "tests" / "release.sh"
+ROS_PACKAGE = ROOT / "packaging" / "ros2" / "optipmb_ros"
 CHANGES = "# Changelog\n\n## 9.9.9 (2030-01-01)\n"
 
 
@@ -60,18 +71,24 @@ def test_it_tests_builds_checks_and_stops_before_publishing(checkout: Path) -> N
         "python -m build --outdir dist .",
         "python -m build --wheel --outdir dist node",
         "python -m twine check --strict dist/*",
+        "python -m cyclonedx_py requirements docker/requirements.lock --output-file out/sbom.cdx.json",
     ]
     assert "git tag -a v9.9.9" in done.stdout
     assert "twine upload dist/*" in done.stdout
     assert not subprocess.run(["git", "-C", checkout, "tag"], capture_output=True, check=True).stdout  # noqa: S607
 
 
-@pytest.mark.parametrize("wrong", ["changed", "unreleased", "missing", "tagged"])
+@pytest.mark.parametrize("wrong", ["changed", "unreleased", "missing", "tagged", "placeholder"])
 def test_what_is_not_ready_stops_it_at_once(checkout: Path, wrong: str) -> None:
     """Before any test runs, and with one line that says why."""
-    text = {"changed": CHANGES, "tagged": CHANGES, "missing": "# Changelog\n"}.get(wrong, "## 9.9.9 (unreleased)\n")
+    text = {**dict.fromkeys(("changed", "tagged", "placeholder"), CHANGES), "missing": "# Changelog\n"}.get(
+        wrong, "## 9.9.9 (unreleased)\n"
+    )
     (checkout / "CHANGELOG.md").write_text(text)
-    if wrong == "changed":
+    if wrong == "placeholder":
+        (checkout / "SECURITY.md").write_text("https://example.invalid/optipmb/security\n")
+        commit(checkout)
+    elif wrong == "changed":
         (checkout / "new").touch()
     elif text != CHANGES:
         commit(checkout)
@@ -82,3 +99,64 @@ def test_what_is_not_ready_stops_it_at_once(checkout: Path, wrong: str) -> None:
     assert len(done.stdout.splitlines()) == 1
     assert done.stdout.startswith("release: ")
     assert len(calls) == 1
+
+
+def test_the_project_is_described_in_words_that_indexes_know() -> None:
+    """Every classifier exists; the licence is said by SPDX alone."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert set(project["classifiers"]) <= classifiers
+    assert not [one for one in project["classifiers"] if one.startswith("License ::")]
+    assert project["license"] == "Apache-2.0"
+
+
+@pytest.mark.parametrize(
+    ("schema", "files"),
+    [
+        ("vendor.citation-file-format", ["CITATION.cff"]),
+        ("vendor.github-issue-config", [".github/ISSUE_TEMPLATE/config.yml"]),
+        (
+            "vendor.github-issue-forms",
+            [f".github/ISSUE_TEMPLATE/{n}.yml" for n in ("fault", "question", "wrong-tracks")],
+        ),
+    ],
+)
+def test_files_of_the_repository_fit_their_schemas(schema: str, files: list[str]) -> None:
+    """As those who show them read them."""
+    command = [Path(sys.executable).parent / "check-jsonschema", "--builtin-schema", schema, *(ROOT / f for f in files)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+
+
+def test_the_version_is_one() -> None:
+    """In the citation, in the package for ROS 2; the address for Rerun has the version that writes the file."""
+    version = importlib.metadata.version("optipmb")
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
+    package = parse_package(str(ROS_PACKAGE))
+    assert (package.version, package.licenses, package.get_build_type()) == (version, ["Apache-2.0"], "ament_python")
+    assert (
+        f"rerun-sdk=={re.findall(r'rerun.io/version/([0-9.]+)/', (ROOT / 'docs/watching.md').read_text())[0]}\n"
+        in (ROOT / "requirements.lock").read_text()
+    )
+
+
+class Part:
+    """What the launch file builds, with its arguments; a stand-in, because ROS 2 is not on PyPI."""
+
+    def __init__(self, *given: Any, **named: Any) -> None:
+        self.given, self.named = given, named
+
+
+def test_the_launch_file_starts_the_bridge(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command line of `optipmb-service ros2`, with the settings of the package, that can be changed one by one."""
+    for module in ("launch", "launch.actions", "launch.substitutions"):
+        fake = ModuleType(module)
+        for name in ("LaunchDescription", "DeclareLaunchArgument", "ExecuteProcess", "LaunchConfiguration"):
+            setattr(fake, name, type(name, (Part,), {}))
+        monkeypatch.setitem(sys.modules, module, fake)
+    launched = runpy.run_path(str(ROS_PACKAGE / "launch" / "bridge.launch.py"))["generate_launch_description"]()
+    *declared, process = launched.given[0]
+    values = {one.given[0]: one.named["default_value"] for one in declared}
+    words = [values[one.given[0]] if isinstance(one, Part) else one for one in process.named["cmd"]]
+    assert words[:-1] == ["optipmb-service", "ros2", "--connect", "tcp/127.0.0.1:7447", "--settings"]
+    assert tomllib.loads(Path(words[-1]).read_text())["ros2"]["streams"]
+    assert sorted(values) == ["connect", "domain", "program", "settings"]
