@@ -227,18 +227,18 @@ class SensorQueue:
         self.held_bytes = 0
         return count
 
-    def take(self, now_ns: int | None, waits: Callable[[PendingFrame], bool]) -> PendingFrame | None:
+    def take(self, now_ns: int | None, until_ns: Callable[[PendingFrame], int | None]) -> PendingFrame | None:
         """Return the next frame if it is ready, with its cloud, None otherwise.
 
         Args:
             now_ns: monotonic time; None: nothing waits any longer.
-            waits: whether a frame is held for others.
+            until_ns: until when a frame waits for others, None: it does not.
         """
         if not self.held:
             return None
         head, clouds = self.held[0], self.clouds
         full = self.held_bytes > self.policy.held_bytes or len(self.held) > MAX_HELD
-        if now_ns is not None and not full and waits(head):
+        if now_ns is not None and not full and until_ns(head) is not None:
             return None
         points = self._cloud(head) if clouds.newest_ns is not None else None
         head.missed = points is None and head.deadline_ns is not None

@@ -129,7 +129,7 @@ class Session:
         start = FilterState(transition.no_objects(incarnation.next_id), name, incarnation.starts, zones=zones)
         self._window = ReorderWindow(start, transition)
         self._restored = False
-        self.arrivals = Arrivals(self._policy)
+        self.arrivals = Arrivals(self._policy, self._sensors)
         self._now_ns = 0
         """When frames became ready last (monotonic)."""
         if not fused:
@@ -528,38 +528,15 @@ class Session:
         del self._quarantine[sensor]
         return []
 
-    def _is_early(self, frame_id: FrameId) -> bool:
-        """Return whether the earliest pending frame of a sensor waits for others that sources may still send."""
-        if not self.arrivals.waiting:
-            return False
-        held = {name: one.held[0].frame_id.stamp_ns for name, one in self._sensors.items() if one.held}
-        last = self._window.head.sensor(frame_id.sensor).tracked
-        return self.arrivals.waits(frame_id, self._now_ns, self._timeline, held, last)
-
-    def _is_ahead(self, pending: PendingFrame) -> bool:
-        """Return whether a frame waits for others, to learn whether its clock or time itself has gone on so far.
-
-        Most sensors decide. A frame on the old clock refuses it (`_process`).
-        """
-        timeline = self._timeline
-        if not isinstance(timeline, FusedTimeline) or not timeline.is_ahead(pending.frame_id):
-            return False
-        queues = self._sensors.items()
-        ahead = {name for name, one in queues if one.held and timeline.is_ahead(one.held[0].frame_id)}
-        return 2 * len(ahead) <= len(timeline.live().keys() | ahead) and self._now_ns < self._follows_ns(pending)
-
-    def _follows_ns(self, pending: PendingFrame) -> int:
-        """Return until when the frames of other sensors follow it (monotonic)."""
-        return pending.since_ns + self._policy.rewind_ns
-
-    def _waits(self, pending: PendingFrame) -> bool:
-        return self._is_early(pending.frame_id) or self._is_ahead(pending)
+    def _until_ns(self, pending: PendingFrame) -> int | None:
+        """Return until when (monotonic) a pending frame waits for others; None: it does not."""
+        last = self._window.head.sensor(pending.frame_id.sensor).tracked
+        return self.arrivals.until_ns(pending, self._now_ns, self._timeline, last)
 
     def _due_ns(self, pending: PendingFrame) -> int | None:
         """Return when a pending frame need not wait any longer (monotonic)."""
-        if self._is_early(pending.frame_id):
-            return self.arrivals.deadline_ns
-        return self._follows_ns(pending) if self._is_ahead(pending) else pending.deadline_ns
+        until_ns = self._until_ns(pending)
+        return pending.deadline_ns if until_ns is None else until_ns
 
     # Processing
 
@@ -661,7 +638,7 @@ class Session:
         if len(queues) > 1:
             queues.sort(key=lambda one: (one.held[0].frame_id.stamp_ns, one.held[0].frame_id.sensor))
         for one in queues:
-            if pending := one.take(now_ns, self._waits):
+            if pending := one.take(now_ns, self._until_ns):
                 return pending
         return None
 

@@ -301,15 +301,6 @@ class Timeline:
         epochs = (*epochs[:number], *epochs[number + 1 :], epochs[number])
         return replace(self, seen={**self.seen, frame_id.sensor: epochs})
 
-    def complete_until(self, frame_id: FrameId, processed: tuple[bytes, int] | None) -> bool:
-        """Return whether no frame of its sensor is missing between the last one processed of its epoch and this one."""
-        epochs = self.seen.get(frame_id.sensor, ())
-        number = number_of(epochs, frame_id.epoch)
-        first = processed[1] + 1 if processed is not None and processed[0] == frame_id.epoch else 0
-        if frame_id.seq - first > WINDOW or (number < 0 and frame_id.seq > first):
-            return False
-        return all(epochs[number].has(seq) for seq in range(first, frame_id.seq))
-
     def live(self) -> dict[str, int]:
         """Return the sensors of several that fed the session lately, each with its newest stamp."""
         newest_ns = max(self.clock.values(), default=0)

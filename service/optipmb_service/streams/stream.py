@@ -21,7 +21,6 @@ import structlog
 from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_client.trace_context import attachment_of
 
-from optipmb_service.session.arrivals import Arrivals
 from optipmb_service.session.checkpoint import CheckpointError, forgotten
 from optipmb_service.session.counts import MAX_COUNT, total
 from optipmb_service.session.problems import problem_of
@@ -39,6 +38,7 @@ if TYPE_CHECKING:
 
     from opentelemetry.context import Context
 
+    from optipmb_service.session.arrivals import Arrivals
     from optipmb_service.session.checkpoint import Checkpoint
     from optipmb_service.session.counts import MessageCounters
     from optipmb_service.session.fixed_rate import FixedRate
@@ -106,7 +106,6 @@ class Stream:
         """Encoded tracks and events that wait for the write lease, each with the time that its frame waited, ns."""
         self._ids = b""
         """Ids of the newest tracks, as the bytes of int64."""
-        self.arrivals = Arrivals(self._policy)
         self._resting: dict[str, int] = {}
         """Monotonic time until when messages of a sensor are refused that took too long."""
         self._changed = False
@@ -459,28 +458,29 @@ class Stream:
 
     def on_caches_answered(self, *streams: str) -> None:
         """Go on behind gaps: all that the caches of these streams held has come. Of several sensors all must have."""
-        self.arrivals.answer(*streams)
+        if self.session is not None:
+            self.session.arrivals.answer(*streams)
         self.ask(Stream._end_recovery, create=False)
 
     def _end_recovery(self) -> None:
         session = self.session
-        if session is None or not self.arrivals.waiting:
+        if session is None or not session.arrivals.waiting:
             return
-        now_ns = time.monotonic_ns()
+        now_ns, arrivals = time.monotonic_ns(), session.arrivals
         if self.fused:
             caches = self._streams.caches.awaited(self.name, session.sensors)
-            for stream in self.arrivals.to_ask(caches):
+            for stream in arrivals.to_ask(caches):
                 with contextlib.suppress(TransportError):  # the end
-                    self._streams.caches.ask_cache(stream, partial(self._take_cached, stream))
-            if not self.arrivals.complete(caches, now_ns):
+                    self._streams.caches.ask_cache(stream, partial(self._take_cached, arrivals, stream))
+            if not arrivals.complete(caches, now_ns):
                 return
         self._changed = True
         self.deliver(session.recovered(now_ns))
 
-    def _take_cached(self, stream: str, packets: list[Packet], complete: bool) -> None:  # noqa: FBT001 - as the network calls it
+    def _take_cached(self, arrivals: Arrivals, stream: str, packets: list[Packet], complete: bool) -> None:  # noqa: FBT001 - as the network calls it
         """Take what a cache held; one that has not answered is asked again. Called on any thread."""
         self.backlog.recover(packets)
-        then = partial(self.on_caches_answered if complete else self.arrivals.ask_again, stream)
+        then = partial(self.on_caches_answered if complete else arrivals.ask_again, stream)
         self.backlog.command(then, urgent=False)
 
     def look_in_log(self) -> None:
@@ -572,8 +572,7 @@ class Stream:
             self._open_publisher()
             session = self._restored(restored) if restored else self._new(incarnation, fence)
             self._counts.open(session)
-            session.arrivals.answer(*self.arrivals.answered)
-            self._changed, self.session, self.arrivals = False, session, session.arrivals
+            self._changed, self.session = False, session
             if restored:
                 self.durable = self.durable or session.final
                 self._check_zones(session)
@@ -718,7 +717,6 @@ class Stream:
         if (session := self.session) is None:
             return
         self.session, self._armed_ns, self._fixed_rate = None, None, None
-        self.arrivals = Arrivals(self._policy)
         self._unpublished.clear()  # another owner publishes it
         self._count_tracks(b"")
         if self._publisher is not None:

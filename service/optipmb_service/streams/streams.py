@@ -480,7 +480,7 @@ class Streams:
             if self.member.fence(stream.name) is None:
                 # It began at the very moment in which its partition was left.
                 stream.tell(Stream.on_lost)
-            if stream.fused and stream.arrivals.waiting and stream.backlog.idle:
+            if stream.fused and stream.session and stream.session.arrivals.waiting and stream.backlog.idle:
                 self.command(stream.name, Stream.on_caches_answered, urgent=False)  # or a publisher may be gone
             stream.sensors.look_for_silent(now_ns, self._settings.stale_s)
             if now_ns - stream.meter.active_ns > idle_ns and stream.backlog.idle:
