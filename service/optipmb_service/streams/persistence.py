@@ -305,42 +305,45 @@ class CheckpointWriter:
             for stream, one in taken.items()
             if stream not in mine and one[1] == self._member.fence(stream) is not None
         }
-        later = {} if self._ended.is_set() else lapsed
+        waiting = again = {} if self._ended.is_set() else lapsed
         try:
-            encoded = self._encoded({stream: checkpoint for stream, (checkpoint, _) in mine.items()}) if mine else {}
-            fenced = {
-                stream: Fenced(partition_key(partition_of(stream)), fence, data, seal(b"", checkpoint.incarnation))
-                for stream, data in encoded.items()
-                for checkpoint, fence in [mine[stream]]
-                if fence is not None
-            }
-            lost = self._store.save(fenced) if fenced else ()
+            self._save(mine)
         except Exception as error:
             if not isinstance(error, StoreError):
                 log.exception("internal_error", thread="checkpoints")
             self._failed(error)
-            with self._lock:
-                self._pending = mine | self._pending
+            again = mine | waiting
         else:
-            self.written += len(encoded) - len(lost)
-            for stream in encoded:
-                self._failed_streams.pop(stream, None)
-                if stream in lost:
-                    log.warning("checkpoint_refused", stream=stream)
-                else:
-                    self._kept(mine[stream][0])
-            if encoded and self._store_failure:
-                self._store_failure = ""
-                log.info("store_back")
-            if not (waited_for or later or self.failure):  # all sessions that changed have given their states
+            if not (waited_for or waiting or self.failure):  # all sessions that changed have given their states
                 self.complete_ns = time.monotonic_ns()
             self._whole = not (lapsed or self._failed_streams)
         with self._lock:
-            self._pending, self._writing = later | self._pending, {}
-            self._thens += [one for one in thens if one[0] in later]
+            self._pending, self._writing = again | self._pending, {}
+            self._thens += [one for one in thens if one[0] in waiting]
         for stream, then in thens:
-            if stream not in later:
+            if stream not in waiting:
                 then()
+
+    def _save(self, checkpoints: Mapping[str, tuple[Checkpoint, int | None]]) -> None:
+        """Encode and save checkpoints with their fences, and note what the store has taken."""
+        encoded = self._encoded({stream: one for stream, (one, _) in checkpoints.items()}) if checkpoints else {}
+        fenced = {
+            stream: Fenced(partition_key(partition_of(stream)), fence, data, seal(b"", checkpoint.incarnation))
+            for stream, data in encoded.items()
+            for checkpoint, fence in [checkpoints[stream]]
+            if fence is not None
+        }
+        lost = self._store.save(fenced) if fenced else ()
+        self.written += len(encoded) - len(lost)
+        for stream in encoded:
+            self._failed_streams.pop(stream, None)
+            if stream in lost:
+                log.warning("checkpoint_refused", stream=stream)
+            else:
+                self._kept(checkpoints[stream][0])
+        if encoded and self._store_failure:
+            self._store_failure = ""
+            log.info("store_back")
 
     def _encoded(self, checkpoints: Mapping[str, Checkpoint]) -> dict[str, bytes]:
         """Encode one after the other, with pauses between them.
