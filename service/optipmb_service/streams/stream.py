@@ -226,10 +226,29 @@ class Stream:
     # Messages
 
     def _receive(self, packet: Packet) -> None:
-        """Give a packet to the session, or begin one."""
-        if self.session is not None:
-            self._accept(self.session, packet)
-        elif not self._member.holds(self.name):
+        """Give a packet to the session, or begin one; who takes too much time is refused for a while."""
+        session, stream = self.session, self._stream_of(packet.origin)
+        if session is None:
+            self._begin(packet)
+            return
+        self._counts.receive(frame=packet.frame)
+        if self._resting and time.monotonic_ns() < self._resting.get(stream, 0):
+            self._counts.refuse(session, frame=packet.frame)
+            self._report_overload(stream, "a stream that took more just before")
+            return
+        self._changed = True
+        began_ns, processor_ns = time.perf_counter_ns(), time.thread_time_ns()
+        try:
+            if (message := self._read(packet, session)) is not None:
+                self._track(session, packet, message, time.perf_counter_ns() - began_ns)
+        finally:
+            # It took no more processor time than time, and to read the processor time is a system call.
+            if time.perf_counter_ns() - began_ns > self._step_limit_ns:
+                self._charge(stream, time.thread_time_ns() - processor_ns)
+
+    def _begin(self, packet: Packet) -> None:
+        """Begin a session with a valid packet, if there is room."""
+        if not self._member.holds(self.name):
             self.backlog.open(packet)
             self.backlog.leave()
         elif self._read(packet) is not None:
@@ -238,40 +257,6 @@ class Stream:
                 self._counts.refuse(None, frame=packet.frame)
             if why:
                 self.report("refused", "", why, "another one; there is room for no more sessions")
-
-    def _accept(self, session: Session, packet: Packet) -> None:
-        stream = self._stream_of(packet.origin)
-        if self._resting and time.monotonic_ns() < self._resting.get(stream, 0):
-            self._counts.receive(frame=packet.frame)
-            self._counts.refuse(session, frame=packet.frame)
-            self._report_overload(stream, "a stream that took more just before")
-            return
-        began_ns, processor_ns = time.perf_counter_ns(), time.thread_time_ns()
-        try:
-            self._track(session, packet, began_ns)
-        finally:
-            # It took no more processor time than time, and to read the processor time is a system call.
-            if time.perf_counter_ns() - began_ns > self._step_limit_ns:
-                self._charge(stream, time.thread_time_ns() - processor_ns)
-
-    def _track(self, session: Session, packet: Packet, began_ns: int) -> None:
-        self._changed = True
-        self._counts.receive(frame=packet.frame)
-        message = self._read(packet, session)
-        if message is None:
-            return
-        now_ns = time.monotonic_ns()
-        self.sensors.arrived(packet, message.stream)
-        decode_ns = time.perf_counter_ns() - began_ns
-        trace = self._traces.received(packet, message) if self._traces else None
-        ticket = Arrival(packet.wall_ns, packet.now_ns, decode_ns, trace)
-        if isinstance(message, schemas.Points):
-            outputs = session.on_points(message, now_ns, ticket=ticket)
-            if any(getattr(one, "code", "") in CLOUD_REFUSED for one in outputs):
-                self._counts.refuse(session, frame=False)
-        else:
-            outputs = session.on_detections(message, now_ns, arrived_ns=packet.now_ns, ticket=ticket)
-        self.deliver(outputs)
 
     def _read(self, packet: Packet, session: Session | None = None) -> schemas.Detections | schemas.Points | None:
         """Return the message of a packet; None after a refusal, which is counted with the session, if any."""
@@ -283,6 +268,21 @@ class Stream:
             what = (schemas.Detections if packet.frame else schemas.Points).__name__
             self.report(error.code, error.path, error.expected, error.received, what=what, stream=stream)
             return None
+
+    def _track(
+        self, session: Session, packet: Packet, message: schemas.Detections | schemas.Points, decode_ns: int
+    ) -> None:
+        now_ns = time.monotonic_ns()
+        self.sensors.arrived(packet, message.stream)
+        trace = self._traces.received(packet, message) if self._traces else None
+        ticket = Arrival(packet.wall_ns, packet.now_ns, decode_ns, trace)
+        if isinstance(message, schemas.Points):
+            outputs = session.on_points(message, now_ns, ticket=ticket)
+            if any(getattr(one, "code", "") in CLOUD_REFUSED for one in outputs):
+                self._counts.refuse(session, frame=False)
+        else:
+            outputs = session.on_detections(message, now_ns, arrived_ns=packet.now_ns, ticket=ticket)
+        self.deliver(outputs)
 
     def _stream_of(self, origin: str) -> str:
         return origin.removeprefix(self._prefix)
