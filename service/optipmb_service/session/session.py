@@ -20,7 +20,6 @@ import time
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
-import numpy as np
 import optipmb_schemas as schemas
 
 import optipmb
@@ -29,11 +28,12 @@ from optipmb.zones import ZoneState
 from optipmb_service.session import convert
 from optipmb_service.session.arrivals import Arrivals
 from optipmb_service.session.checkpoint import Checkpoint
+from optipmb_service.session.checks import SCORED_EVERY, ScoreCheck
 from optipmb_service.session.counts import Counters, Deliveries, total
+from optipmb_service.session.frame_problems import FrameProblems
 from optipmb_service.session.pending import PendingFrame, SensorQueue
-from optipmb_service.session.problems import problem_of, sentence
 from optipmb_service.session.state import FilterState, ProcessedFrame
-from optipmb_service.session.timeline import JUMP_FRAMES, FrameId, FusedTimeline, StreamTimeline, Verdict
+from optipmb_service.session.timeline import FrameId, FusedTimeline, StreamTimeline, Verdict
 from optipmb_service.session.transition import Transition
 from optipmb_service.session.values import (
     MAX_CLOUD_WAIT_NS,
@@ -53,8 +53,6 @@ from optipmb_service.session.window import ReorderWindow
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from numpy.typing import NDArray
-
     from optipmb_service.session.pending import Judged
     from optipmb_service.session.state import Inputs
     from optipmb_service.session.timeline import Decision, Timeline
@@ -65,12 +63,6 @@ if TYPE_CHECKING:
 
 FLUSH_NS: Final = SECOND
 """Longest time for all pending frames at a reset, a change of parameters or the end: others wait for them."""
-
-SCORED: Final = 100
-"""Detections of a class after which its share below the score filter is reported."""
-
-SCORED_EVERY: Final = 8
-"""Frames of which one is looked at for that: in each it would take a tenth of the session's time."""
 
 
 class Session:
@@ -108,19 +100,17 @@ class Session:
         nobody knows any more under which revision it was published. The tracks of a later run replace earlier ones.
         """
         self._fused = fused
-        self._instance = instance
         self._make = tracker
         self._clock = clock
         self._sensors: dict[str, SensorQueue] = {}
         self._quarantine: dict[str, str] = {}
-        self._blind: set[str] = set()
-        """Sensors of which it was reported that they have no field of view."""
         self._estimated = ""
         """Incarnation in which the motion of a sensor was reported as estimated."""
         self._deliveries = Deliveries()
         self._has_ready = False
         self._cloud_wait_ns: int | None = None
         self._policy = policy or Policy()
+        self._problems = FrameProblems(stream, instance, self._policy)
         self._limit_wait(self._policy.cloud_wait_ns)
         limits, transition = self._policy.jump_limits, self._transition(parameters)
         self._timeline: Timeline = FusedTimeline(limits) if fused else StreamTimeline(limits, {"": ()})
@@ -153,12 +143,12 @@ class Session:
         queue = self._queue(frame_id.sensor)
         if queue is None:
             self.refuse()
-            return [self._too_many(frame_id)]
+            return [self._problems.too_many_sensors(frame_id)]
         outputs: list[Output] = []
         if error := self._quarantine.get(frame_id.sensor):
             if self._timeline.knows(frame_id):
                 expected = "a reset or a restarted publisher: the session is quarantined"
-                return [self._refuse("quarantined", frame_id, "", expected, error)]
+                return self._refuse(self._problems.of("quarantined", frame_id, "", expected, error))
             outputs += self._end_quarantine(frame_id.sensor)
         if self._fused and not (self._restored or self.arrivals.waiting or self._window.head.counts.frames):
             self.arrivals.begin(frame_id.stamp_ns, since_ns, now_ns)
@@ -182,10 +172,10 @@ class Session:
         try:
             convert.cloud_of(message)
         except optipmb.FrameError as error:
-            return [self._problem("invalid_value", frame_id, error.path, error.expected, error.received)]
+            return [self._problems.of("invalid_value", frame_id, error.path, error.expected, error.received)]
         queue = self._queue(frame_id.sensor)
         if queue is None:
-            return [self._too_many(frame_id)]
+            return [self._problems.too_many_sensors(frame_id)]
         queue.clouds.add(message)
         amends = self._policy.late_clouds and frame_id.sensor not in self._quarantine
         outputs = self._amend(message, frame_id, ticket) if amends else []
@@ -483,8 +473,8 @@ class Session:
     # Settings
 
     def _transition(self, parameters: optipmb.Parameters) -> Transition:
-        self._scores: dict[str, tuple[NDArray[np.float64], NDArray[np.int64]]] = {}
-        """Score filter of each class; its detections, and those below it: by sensor where it has its own parameters."""
+        self._scores: dict[str, ScoreCheck] = {}
+        """By sensor where it has parameters of its own."""
         return Transition(self.stream, parameters, self._make, self._policy)
 
     def _limit_wait(self, cloud_wait_ns: int) -> None:
@@ -513,7 +503,6 @@ class Session:
         for name in self._timeline.silent([name for name, one in self._sensors.items() if not one.held])[:1]:
             del self._sensors[name]
             self._quarantine.pop(name, None)
-            self._blind.discard(name)
             self._scores.pop(name, None)
 
     def _follow(self, gone: Sequence[FrameId] = ()) -> None:
@@ -551,7 +540,6 @@ class Session:
         ticket: Any,
     ) -> list[Output]:
         """Process a frame that has a place, or hold it; return the outputs of all frames that it made ready."""
-        outputs: list[Output] = []
         parameters = self._window.transition.parameters_of(frame_id.sensor)
         detections = schemas.encoded(message)
         queue.remember(frame_id, detections)
@@ -561,19 +549,16 @@ class Session:
             self._timeline = self._timeline.note(frame_id)
             queue.timeline = judged[0].note(frame_id)
             self._follow()
-            return [self._refuse("invalid_value", frame_id, error.path, error.expected, error.received)]
-        queue.timeline = judged[2]
-        if found := queue.stamps.add(frame_id.stamp_ns, since_ns):
-            expected = "stamps in nanoseconds that advance with time"
-            outputs.append(self._problem("clock", frame_id, "stamp_ns", expected, found))
-        if self._policy.jumps == "report" and (found := queue.poses.add(message, self._policy)):
-            expected = "a pose where the motion of the sensor leads, or a `relocation`"
-            outputs.append(self._problem("world_jump", frame_id, "pose", expected, found))
-        if self._policy.needs_view and message.field_of_view is None and frame_id.sensor not in self._blind:
-            self._blind.add(frame_id.sensor)
-            outputs.append(self._problem("no_view", frame_id, "field_of_view", "where the sensor sees", "nothing"))
-        if frame_id.seq % SCORED_EVERY == 0 and not parameters.self_calibration:
-            outputs += self._low_scores(frame_id, frame, parameters)  # none is filtered of the upper half of a class
+            return self._refuse(
+                self._problems.of("invalid_value", frame_id, error.path, error.expected, error.received)
+            )
+        findings = [*queue.checks.add(message, since_ns, self._policy)]
+        if frame_id.seq % SCORED_EVERY == 0 and not parameters.self_calibration:  # it filters the lower half of none
+            sensor = "" if parameters is self.parameters else frame_id.sensor
+            if sensor not in self._scores:
+                self._scores[sensor] = ScoreCheck(parameters)
+            findings += self._scores[sensor].add(frame)
+        outputs: list[Output] = [self._problems.of(one.code, frame_id, *one[1:]) for one in findings]
         deadline_ns, inputs = queue.cloud_deadline_ns(message, since_ns), (message, frame, ignored)
         pending = PendingFrame(frame_id, detections, inputs, deadline_ns, ticket, judged, since_ns)
         waits = queue.held or deadline_ns is not None or queue.clouds.newest_ns is not None
@@ -593,9 +578,7 @@ class Session:
             self._timeline = timeline
             self._follow()
         if queue.reuses_number(frame_id, schemas.encoded(message), decision):
-            expected = "a number that no other frame of the epoch has, or a new epoch"
-            received = f"{frame_id.seq} again, in another frame, {_seconds(decision.place.jump_ns)} from the newest"
-            return [self._refuse("duplicate_seq", frame_id, "seq", expected, received)]
+            return self._refuse(self._problems.reused_number(frame_id, decision.place.jump_ns))
         return self._refused(frame_id, decision)
 
     def _reinstate(self, frame_id: FrameId) -> list[Output]:
@@ -711,11 +694,11 @@ class Session:
             self._estimated = self.session
             x, y, _ = self.density.sensor_motion.tolist()
             received = f"none, and what stands moves by {math.hypot(x, y):.1f} m/s: the motion is estimated"
-            outputs.append(self._problem("no_pose", frame_id, "pose", "the pose of a sensor that moves", received))
+            outputs.append(self._problems.of("no_pose", frame_id, "pose", "the pose of a sensor that moves", received))
         step_ns = (self._clock() - began_ns) // max(1, len(outcomes))
         for one in outcomes:
             if (one.unknown or one.fault or one.tracks is None) and not one.frame.revision:
-                outputs += self._left_out(one)
+                outputs += self._problems.left_out(one, self.parameters)
             if (tracks := one.tracks) is not None:
                 self._deliveries.corrected += one.frame.revision > 0
                 tracks.ticket, tracks.step_ns, tracks.run, tracks.final = ticket, step_ns, self.run, final
@@ -731,7 +714,7 @@ class Session:
             self._timeline = self._timeline.note(frame_id)
         self._follow()
         dump = self._window.transition.dump(self._window.base, placed, error)
-        problem = self._problem("internal", frame_id, "", "a step of the tracker without an error", reason)
+        problem = self._problems.of("internal", frame_id, "", "a step of the tracker without an error", reason)
         return [problem, Quarantined(reason, dump)]
 
     def _begin(self, state: FilterState, transition: Transition | None = None) -> None:
@@ -744,20 +727,14 @@ class Session:
 
     def _refused(self, frame_id: FrameId, decision: Decision) -> list[Output]:
         """Count and report a frame that has no place; of a duplicate there is nothing to report."""
-        jump_ns = decision.place.jump_ns
         if decision.verdict is Verdict.DUPLICATE:
             self._deliveries.duplicates += 1
             return []
-        if decision.verdict is Verdict.RETIRED:
-            silent = f"when the other has been silent for {self._policy.gap_limit_ns / SECOND:g} s"
-            expected = f"the publisher that began last; stop one of the two, this one is tracked again {silent}"
-            return [self._refuse("duplicate_epoch", frame_id, "epoch", expected, frame_id.epoch.hex())]
-        if decision.verdict is Verdict.JUMPED:
-            expected = "a stamp near those of the session's other sensors, or most of them on another clock"
+        if decision.verdict is Verdict.LATE:
+            self._deliveries.late += 1
+        else:
             self._deliveries.refused += 1
-            return [self._jumped("time_jump", frame_id, expected, jump_ns)]
-        self._deliveries.late += 1
-        return [self._jumped("late", frame_id, "a frame inside the window", jump_ns)]
+        return [self._problems.refused(frame_id, decision)]
 
     def _restarted(self, outcomes: Sequence[Outcome]) -> list[Output]:
         """Report the session id that frames started, the last one if there were several."""
@@ -766,52 +743,8 @@ class Session:
                 if begun.reason == "first":
                     return [begun]
                 frame_id, expected = one.frame.frame_id, "frames that continue the stream"
-                return [begun, self._jumped("restarted", frame_id, expected, begun.jump_ns, begun.reason)]
+                return [begun, self._problems.jumped("restarted", frame_id, expected, begun.jump_ns, begun.reason)]
         return []
-
-    def _low_scores(self, frame_id: FrameId, frame: optipmb.Frame, parameters: optipmb.Parameters) -> list[Output]:
-        """Count the detections below the score filter; report each class that loses most of them, once."""
-        sensor = "" if parameters is self.parameters else frame_id.sensor
-        if sensor not in self._scores:
-            limits = np.array([one.score_filter for one in parameters.classes.values()])
-            self._scores[sensor] = limits, np.zeros((2, len(limits)), np.int64)
-        filters, counts = self._scores[sensor]
-        labels, size = parameters.labels, len(filters)
-        counts[0] += np.bincount(frame.label, minlength=size)
-        low = frame.score < filters[frame.label]
-        if not low.any():
-            return []
-        counts[1] += np.bincount(frame.label[low], minlength=size)
-        given, removed = counts
-        problems: list[Output] = []
-        for index in np.flatnonzero((given >= SCORED) & (2 * removed > given)).tolist():
-            received = f"{removed[index]} of {given[index]} below {filters[index]:g}"
-            expected = f"most scores of {labels[index]} above the filter of the profile {parameters.name}"
-            problems.append(self._problem("score_filter", frame_id, f"{labels[index]}.score", expected, received))
-            filters[index] = 0.0  # reported
-        return problems
-
-    def _left_out(self, outcome: Outcome) -> list[Output]:
-        """Report objects of unknown classes, and a frame that was refused when its turn came."""
-        frame, parameters = outcome.frame, self.parameters
-        expected = f"one of {', '.join(parameters.classes)} (profile {parameters.name})"
-        problems: list[Output] = [
-            self._problem("unknown_class", frame.frame_id, "labels", expected, repr(label), count)
-            for label, count in (outcome.unknown or {}).items()
-        ]
-        if (fault := outcome.fault) is not None:
-            problems.append(self._problem("invalid_value", frame.frame_id, fault.path, fault.expected, fault.received))
-        if outcome.tracks is not None or fault is not None:
-            return problems
-        if frame.place.opens is Verdict.UNCONFIRMED:
-            expected = f"a stamp near the one before, or {JUMP_FRAMES} frames in a row that agree on the jump"
-            return [self._jumped("time_jump", frame.frame_id, expected, frame.place.jump_ns)]
-        if (effort := outcome.effort) is not None:
-            return [self._problem("overload", frame.frame_id, effort.path, effort.expected, effort.received)]
-        pose = frame.message.pose
-        received = "nothing" if pose is None else ", ".join(f"{value:.1f}" for value in pose.translation)
-        expected = f"a position within reach of the last one at {self._policy.max_speed:g} m/s"
-        return [self._problem("astray", frame.frame_id, "pose.translation", expected, received)]
 
     def _refuse_pending(self) -> list[Output]:
         """Refuse all pending frames, with a problem for each sensor: there was no time to process them."""
@@ -821,34 +754,11 @@ class Session:
             if one.held:
                 first, count = one.held[0].frame_id, one.clear()
                 self._deliveries.refused += count
-                problems.append(self._problem("overload", first, "", expected, "more", count))
+                problems.append(self._problems.of("overload", first, "", expected, "more", count))
         self._follow()
         return problems
 
-    def _too_many(self, frame_id: FrameId) -> schemas.Problem:
-        return self._problem("refused", frame_id, "stream", f"at most {MAX_SENSORS} sensors in a session", "another")
-
-    def _refuse(self, code: str, frame_id: FrameId, path: str, expected: str, received: str) -> schemas.Problem:
-        """Count a frame as refused; return the problem."""
+    def _refuse(self, problem: schemas.Problem) -> list[Output]:
+        """Count a frame as refused, and report it."""
         self._deliveries.refused += 1
-        return self._problem(code, frame_id, path, expected, received)
-
-    def _jumped(self, code: str, frame_id: FrameId, expected: str, jump_ns: int, reason: str = "") -> schemas.Problem:
-        """Return a problem of a frame that is so far from the newest one, for a restart with its reason."""
-        seconds = _seconds(jump_ns)
-        message = sentence(reason or code, f"Frame {frame_id.seq}", jump_ns, expected)
-        path, received = ("", f"{reason}, {seconds}") if reason else ("stamp_ns", seconds)
-        return self._problem(code, frame_id, path, expected, received, message=message)
-
-    def _problem(
-        self, code: str, frame_id: FrameId, path: str, expected: str, received: str, count: int = 1, **message: str
-    ) -> schemas.Problem:
-        """Return a problem of a frame, on the stream of its sensor."""
-        texts = {"path": path, "expected": expected, "received": received} | message
-        frame = {"seq": frame_id.seq, "stamp_ns": frame_id.stamp_ns, "count": count}
-        stream, subject = frame_id.sensor or self.stream, f"Frame {frame_id.seq}"
-        return problem_of(code, stream=stream, instance=self._instance, subject=subject, **texts, **frame)
-
-
-def _seconds(jump_ns: int) -> str:
-    return f"{jump_ns / SECOND:+.3f} s"
+        return [problem]
