@@ -505,8 +505,9 @@ class Session:
             self._quarantine.pop(name, None)
             self._scores.pop(name, None)
 
-    def _follow(self, gone: Sequence[FrameId] = ()) -> None:
-        """Give the timeline to the queues; `gone` are the frames that have left the window."""
+    def _follow(self, timeline: Timeline, gone: Sequence[FrameId] = ()) -> None:
+        """Go on with another timeline, and give it to the queues; `gone` are the frames that have left the window."""
+        self._timeline = timeline
         for one in self._sensors.values():
             one.follow(self._timeline, self._window.base, gone)
 
@@ -546,9 +547,8 @@ class Session:
         try:
             frame, ignored = convert.frame_of(parameters, message)
         except optipmb.FrameError as error:
-            self._timeline = self._timeline.note(frame_id)
             queue.timeline = judged[0].note(frame_id)
-            self._follow()
+            self._follow(self._timeline.note(frame_id))
             return self._refuse(
                 self._problems.of("invalid_value", frame_id, error.path, error.expected, error.received)
             )
@@ -575,8 +575,7 @@ class Session:
         judged_by, decision, timeline = judged
         queue.timeline = timeline
         if self._timeline is judged_by is not timeline:
-            self._timeline = timeline
-            self._follow()
+            self._follow(timeline)
         if queue.reuses_number(frame_id, schemas.encoded(message), decision):
             return self._refuse(self._problems.reused_number(frame_id, decision.place.jump_ns))
         return self._refused(frame_id, decision)
@@ -586,8 +585,7 @@ class Session:
         outputs = self.flush()
         if not self._fused:
             self._begin(self._window.head)  # in the window publishers follow each other by their first frames
-        self._timeline = self._timeline.reinstated(frame_id)
-        self._follow()
+        self._follow(self._timeline.reinstated(frame_id))
         return outputs
 
     def _advance(self, now_ns: int | None) -> list[Output]:
@@ -647,8 +645,8 @@ class Session:
             timeline = self._timeline
             if queue.held and isinstance(timeline, FusedTimeline) and timeline.is_ahead(queue.held[0].frame_id):
                 frame_id = queue.pop().frame_id
-                decision, self._timeline = timeline.doubted(frame_id)
-                self._follow()
+                decision, doubted = timeline.doubted(frame_id)
+                self._follow(doubted)
                 outputs += self._refused(frame_id, decision)
         return outputs
 
@@ -686,8 +684,7 @@ class Session:
         except Exception as error:  # noqa: BLE001 - a fault in one session's step must not end the others
             return self._fail(error, placed if inputs is None else [*window.frames, *placed], frame_id)
         gone = window.trim(self._policy)
-        self._timeline = timeline.settle(window.base, gone) if gone else timeline
-        self._follow(gone)
+        self._follow(timeline.settle(window.base, gone) if gone else timeline, gone)
         self._deliveries.inserted += inputs is None
         outputs = [] if self.session == before else self._restarted(outcomes)
         if self.parameters.sensor_motion and self._estimated != self.session and self.density.sensor_motion is not None:
@@ -710,9 +707,7 @@ class Session:
         reason = self._quarantine[frame_id.sensor] = f"{type(error).__name__}: {error}"[:MAX_ERROR]
         came = len(placed) - len(self._window.frames)  # none with a late cloud, whose numbers are no frame's
         self._deliveries.refused += came + self._sensors[frame_id.sensor].clear()
-        if came:
-            self._timeline = self._timeline.note(frame_id)
-        self._follow()
+        self._follow(self._timeline.note(frame_id) if came else self._timeline)
         dump = self._window.transition.dump(self._window.base, placed, error)
         problem = self._problems.of("internal", frame_id, "", "a step of the tracker without an error", reason)
         return [problem, Quarantined(reason, dump)]
@@ -720,8 +715,7 @@ class Session:
     def _begin(self, state: FilterState, transition: Transition | None = None) -> None:
         """Begin the window with a state when no frame is pending, with another transition when the profile changes."""
         self._window = ReorderWindow(state, transition or self._window.transition)
-        self._timeline = self._timeline.settle(state, self._timeline.frame_ids)
-        self._follow()
+        self._follow(self._timeline.settle(state, self._timeline.frame_ids))
 
     # Problems
 
@@ -755,7 +749,7 @@ class Session:
                 first, count = one.held[0].frame_id, one.clear()
                 self._deliveries.refused += count
                 problems.append(self._problems.of("overload", first, "", expected, "more", count))
-        self._follow()
+        self._follow(self._timeline)
         return problems
 
     def _refuse(self, problem: schemas.Problem) -> list[Output]:
