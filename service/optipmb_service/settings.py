@@ -137,7 +137,7 @@ class LimitSettings(BaseModel):
 Latitude = Annotated[float, Field(ge=-90, le=90)]
 Longitude = Annotated[float, Field(ge=-180, le=180)]
 Height = Annotated[float, Field(ge=-1e5, le=1e5)]
-Topic = Annotated[str, _form(r"((/[A-Za-z_][A-Za-z0-9_]*)+)?", "a topic looks like /lidar/points")]
+RosTopic = Annotated[str, _form(r"((/[A-Za-z_][A-Za-z0-9_]*)+)?", "a topic looks like /lidar/points")]
 
 
 class Ros2Stream(BaseModel):
@@ -145,7 +145,7 @@ class Ros2Stream(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    detections: Topic = Field(min_length=1)
+    detections: RosTopic = Field(min_length=1)
     """topic of the detections"""
     type: Literal[
         "vision_msgs/msg/Detection3DArray",
@@ -153,9 +153,9 @@ class Ros2Stream(BaseModel):
         "autoware_auto_perception_msgs/msg/DetectedObjects",
     ] = "vision_msgs/msg/Detection3DArray"
     """type of the detections"""
-    points: Topic = ""
+    points: RosTopic = ""
     """topic of the point clouds"""
-    tracks: Topic = ""
+    tracks: RosTopic = ""
     """topic of the tracks; default: `/tracks` below that of the detections"""
     classes: dict[str, str] = Field(default_factory=dict)
     """class names by those in the messages"""
@@ -189,11 +189,11 @@ class Ros2Settings(BaseModel):
     """name of the ROS 2 node"""
     fixed_frame: str = ""
     """frame of the tracks; default: the root of tf"""
-    odometry: Topic = ""
+    odometry: RosTopic = ""
     """topic of `nav_msgs/Odometry`, for poses that tf has not"""
     tf_wait_s: float = Field(default=0.5, ge=0, le=60)
     """longest wait of a message for its transform"""
-    diagnostics: Topic = "/diagnostics"
+    diagnostics: RosTopic = "/diagnostics"
     """topic of `diagnostic_msgs/DiagnosticArray`"""
     streams: Annotated[dict[str, Ros2Stream], AfterValidator(_streams)] = Field(default_factory=dict)
     """topics by stream (`site/node/sensor`)"""

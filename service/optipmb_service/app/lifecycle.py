@@ -37,7 +37,7 @@ from optipmb_service import __version__
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.telemetry import logs
 from optipmb_service.telemetry.certificates import Certificates
-from optipmb_service.telemetry.health import BEAT_S, ProcessHealth
+from optipmb_service.telemetry.health import BEAT_S, Component, ProcessHealth
 from optipmb_service.telemetry.metrics import GATEWAY_METRICS, NETWORK_METRICS, TLS_METRICS, Metrics
 from optipmb_service.zenoh.client import LISTENING, Client, certificates_of
 
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from pathlib import Path
     from types import FrameType
 
-    from optipmb_client.zenoh.session import KeyNumbers
+    from optipmb_client.zenoh.session import Session
 
     from optipmb_service.settings import Settings
 
@@ -273,14 +273,14 @@ async def unless(asked: StopRequest, work: Callable[[], _T]) -> _T | None:
     return result.result() if result.done() else None
 
 
-async def watch_keys(asked: StopRequest, used: Callable[[], KeyNumbers], most: int) -> None:
+async def watch_keys(asked: StopRequest, session: Callable[[], Session | None], most: int) -> None:
     """Have the process begin again before its network session has no number for keys any more.
 
     It does not where that would free few: keys that are open at the end are declared again.
     """
     while not asked.is_set():
-        keys = used()
-        if keys.declared >= most and keys.declared - keys.open >= GAINED * most:
+        keys = used.key_numbers if (used := session()) is not None else None
+        if keys is not None and keys.declared >= most and keys.declared - keys.open >= GAINED * most:
             log.warning("keys_used_up", declared=keys.declared, open=keys.open)
             asked.restart("keys_used_up")
         await asked.wait(KEYS_S)
@@ -289,6 +289,16 @@ async def watch_keys(asked: StopRequest, used: Callable[[], KeyNumbers], most: i
 def say_ready(what: str, name: str, endpoints: Iterable[str]) -> None:
     """Print the line that starters wait for, the only one on stdout: name and endpoints."""
     print(f"ready {what}={name} endpoints={','.join(endpoints)}", flush=True)  # noqa: T201 - it is the interface
+
+
+def report_ready(
+    settings: Settings, health: ProcessHealth, part: Component, what: str, name: str, **about: object
+) -> None:
+    """Say that this part of a process works: to health checks, to who has started it, and in the log."""
+    health.report(part)
+    settle()
+    say_ready(what, name, settings.endpoints or settings.connect)
+    log.info("ready", instance=settings.instance, **about, connect=settings.connect)
 
 
 def settle() -> None:
@@ -395,7 +405,7 @@ async def run(
             health.beat()
             await asyncio.sleep(BEAT_S)
 
-    tasks = [asyncio.create_task(beat())]
+    tasks = [asyncio.create_task(one) for one in (beat(), watch_keys(asked, health.session, settings.restart_keys))]
     try:
         health.tls = certificates = Certificates(_certificate_files(settings), fixed=LISTENING)
         health.metrics.add(TLS_METRICS, lambda: certificates)
@@ -425,11 +435,9 @@ async def run_client(settings: Settings, serve: Callable[[StopRequest, ProcessHe
         if client is None:
             return None
         health.metrics.add(NETWORK_METRICS, lambda: client)
-        watching = asyncio.create_task(watch_keys(asked, lambda: client.key_numbers, settings.restart_keys))
         try:
             await serve(asked, health, client)
         finally:
-            watching.cancel()
             asked.bound.begin()
             await asyncio.to_thread(client.close)
         return True

@@ -16,7 +16,7 @@ from optipmb_service.app.storage import nats_access
 from optipmb_service.cluster.message_log import LogMessage, LogWriter, MessageLog, Retention
 from optipmb_service.session.problems import problem_of
 from optipmb_service.streams.kept_tracks import order_of
-from optipmb_service.telemetry.health import Reporter
+from optipmb_service.telemetry.health import Component
 from optipmb_service.telemetry.problem_reporter import ProblemReporter
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ DRAIN_POLL_S: Final = 0.01
 MEGABYTE: Final = 2**20
 
 
-class LogBridge(Reporter):
+class LogBridge(Component):
     """From a network into the log; the client is closed by the caller, after this."""
 
     def __init__(self, settings: Settings, client: Client) -> None:

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
-from optipmb_service.app.lifecycle import grpc_edge, run, run_client, say_ready, settle, unless
-from optipmb_service.telemetry.health import BEAT_S, Reporter
+from optipmb_service.app.lifecycle import grpc_edge, report_ready, run, run_client, unless
+from optipmb_service.telemetry.health import BEAT_S, Component
 from optipmb_service.telemetry.metrics import LOG_METRICS, MQTT_METRICS, PROBLEM_METRICS
 from optipmb_service.zenoh.client import Client
 
@@ -30,9 +30,7 @@ HOUSEKEEPING_S: Final = 0.5
 async def run_router(settings: Settings) -> int:
     async def serve(asked: StopRequest, health: ProcessHealth) -> bool:
         router = Client(settings)
-        health.report(Reporter(router))
-        say_ready("router", settings.instance, settings.endpoints)
-        log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
+        report_ready(settings, health, Component(router), "router", settings.instance, listen=settings.endpoints)
         await asked.wait()
         health.ends()
         await asyncio.to_thread(router.close)
@@ -44,10 +42,7 @@ async def run_router(settings: Settings) -> int:
 async def run_gateway(settings: Settings) -> int:
     async def serve(asked: StopRequest, health: ProcessHealth, client: Client) -> None:
         with grpc_edge(settings, client, health.metrics) as address:
-            health.report(Reporter(client))
-            settle()
-            say_ready("grpc", address, settings.connect)
-            log.info("ready", instance=settings.instance, grpc=address, connect=settings.connect)
+            report_ready(settings, health, Component(client), "grpc", address, grpc=address)
             await asked.wait()
             health.ends()
 
@@ -60,11 +55,8 @@ async def run_mqtt(settings: Settings) -> int:
     async def serve(asked: StopRequest, health: ProcessHealth, client: Client) -> None:
         bridge = Bridge(settings, client)
         health.metrics.add(MQTT_METRICS, lambda: bridge)
-        health.report(bridge)
         running = asyncio.create_task(bridge.run())
-        settle()
-        say_ready("mqtt", settings.mqtt.broker, settings.connect)
-        log.info("ready", instance=settings.instance, broker=settings.mqtt.broker, connect=settings.connect)
+        report_ready(settings, health, bridge, "mqtt", settings.mqtt.broker, broker=settings.mqtt.broker)
         stop = asyncio.create_task(asked.wait())
         await asyncio.wait((stop, running), return_when=asyncio.FIRST_COMPLETED)
         health.ends()
@@ -88,10 +80,8 @@ async def run_ros2(settings: Settings) -> int:
         work = Work(settings, node)
         try:
             work.open()
-            health.report(work)
             streams = ",".join(settings.ros2.streams)
-            say_ready("ros2", streams, settings.connect)
-            log.info("ready", instance=settings.instance, streams=streams, connect=settings.connect)
+            report_ready(settings, health, work, "ros2", streams, streams=streams)
             while not asked.is_set():
                 await asyncio.to_thread(work.work, BEAT_S)
             health.ends()
@@ -109,10 +99,7 @@ async def run_log(settings: Settings) -> int:
     async def serve(asked: StopRequest, health: ProcessHealth, client: Client) -> None:
         bridge = LogBridge(settings, client)
         health.metrics.add(LOG_METRICS | PROBLEM_METRICS, lambda: bridge)
-        health.report(bridge)
-        settle()
-        say_ready("log", settings.instance, settings.connect)
-        log.info("ready", instance=settings.instance, connect=settings.connect)
+        report_ready(settings, health, bridge, "log", settings.instance)
         while not asked.is_set():
             await asked.wait(HOUSEKEEPING_S)
             bridge.reporter.flush(time.monotonic_ns())

@@ -29,7 +29,7 @@ from optipmb_service.streams.kept_tracks import TrackQuery
 from optipmb_service.streams.persistence import DAY_S, CheckpointWriter
 from optipmb_service.streams.queries import ServiceQueries, StreamQueries, members_of
 from optipmb_service.streams.streams import Scheduler, Streams
-from optipmb_service.telemetry.health import Reporter
+from optipmb_service.telemetry.health import Component
 from optipmb_service.telemetry.metrics import (
     NETWORK_METRICS,
     PROBLEM_METRICS,
@@ -43,8 +43,6 @@ from optipmb_service.zenoh.transport import Transport
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
-
-    from optipmb_client.zenoh.session import KeyNumbers
 
     from optipmb_service.settings import Settings
     from optipmb_service.streams.profiles import Profiles
@@ -60,7 +58,7 @@ TRACES_S: Final = 1.0  # for sending the last spans
 LEASES_S: Final = 1.0  # kept for releasing the leases, however long the checkpoints take
 
 
-class Service(Reporter):
+class Service(Component):
     """A service on the network, without signals or a loop of its own: `run` adds these, tests use it as it is.
 
     Args:
@@ -204,11 +202,6 @@ class Service(Reporter):
         unfinished = steps.unfinished(ends.left())
         self._transport.close()
         return ended and kept and not unfinished
-
-    @property
-    def key_numbers(self) -> KeyNumbers:
-        """Key numbers that its network session has used."""
-        return self.client().key_numbers
 
     @property
     def stuck(self) -> bool:

@@ -25,7 +25,7 @@ import structlog
 
 import optipmb
 from optipmb_service.app import lifecycle
-from optipmb_service.app.lifecycle import grpc_edge, leave, say_ready, settle, unless, watch_keys
+from optipmb_service.app.lifecycle import grpc_edge, leave, say_ready, settle, unless
 from optipmb_service.app.service import Service
 from optipmb_service.settings import Settings
 from optipmb_service.streams.profiles import Profiles
@@ -115,7 +115,6 @@ async def _serve(
     service.start(announce=parent is None)  # to the network the workers are one instance: the parent speaks for it
     health.report(service)
     settle()
-    watching = loop.create_task(watch_keys(asked, lambda: service.key_numbers, settings.restart_keys))
     with grpc_edge(settings, service.client(), health.metrics):
         # In this order: messages may come as soon as the ready line is out, and sessions log after this event.
         log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
@@ -131,7 +130,6 @@ async def _serve(
             if parent is not None and not service.stuck:  # else the parent is to replace this process
                 parent.say("beat")
         health.ends()
-    watching.cancel()
     return await asyncio.to_thread(service.stop, asked.bound.left())
 
 

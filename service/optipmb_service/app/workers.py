@@ -31,11 +31,11 @@ import structlog
 
 from optipmb_service import __version__
 from optipmb_service.app import lifecycle
-from optipmb_service.app.lifecycle import LATE_S, RESTART, SLICE_S, grpc_edge, say_ready, unless, watch_keys
+from optipmb_service.app.lifecycle import LATE_S, RESTART, SLICE_S, grpc_edge, say_ready, unless
 from optipmb_service.cluster.leases import ALIVE, instance_of
 from optipmb_service.streams.profiles import Fusion
 from optipmb_service.streams.queries import TEXT, UNDRAINED, drain_asked, guarded, move_asked
-from optipmb_service.telemetry.health import BEAT_S, Reporter
+from optipmb_service.telemetry.health import BEAT_S, Component
 from optipmb_service.telemetry.metrics import NETWORK_METRICS
 from optipmb_service.zenoh.transport import Transport
 
@@ -249,7 +249,7 @@ class Supervisor:
                 await self._asked.wait(again_s)
 
 
-class AggregateView(Reporter):
+class AggregateView(Component):
     """All workers of one instance: status and metrics asked of each and put together, and the moves.
 
     A worker that does not answer in time is left out and makes the state `degraded`. Its metrics go to the parent's.
@@ -439,7 +439,6 @@ async def serve_workers(
     client = transport.client()
     view = AggregateView(settings, supervisor, transport, health.metrics)
     health.report(view)
-    watching = asyncio.create_task(watch_keys(asked, lambda: client.key_numbers, settings.restart_keys))
     if await supervisor.start():
         transport.watch()
         transport.serve_service(view.answer, QUERIES)
@@ -451,7 +450,6 @@ async def serve_workers(
             await supervisor.end()  # before gRPC closes, which takes of the time that they have
     view.ends()
     health.ends()
-    watching.cancel()
     return await supervisor.stop()
 
 

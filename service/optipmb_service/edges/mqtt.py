@@ -30,7 +30,7 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
 from optipmb_service.edges.readers import Bounds, Feeds, Reader, Text, Wish, places_of
-from optipmb_service.telemetry.health import Reporter
+from optipmb_service.telemetry.health import Component
 
 if TYPE_CHECKING:
     import ssl
@@ -197,7 +197,7 @@ TAKEN_OVER_S: Final = 30.0
 """Pause after another client of this name has taken the connection."""
 
 
-class Bridge(Reporter):
+class Bridge(Component):
     """From the network to the broker. Create and run it on one loop.
 
     Args:

@@ -65,8 +65,8 @@ CLOUD_REFUSED: Final = {"invalid_value", "refused"}
 """Problems by which a session refuses a cloud: not valid, or of one sensor too many."""
 
 
-class Arrival(NamedTuple):
-    """Times of a frame's arrival, and of its decoding; its trace, where traces are recorded."""
+class Ticket(NamedTuple):
+    """Times of a frame's arrival and decoding, and its trace where traces are recorded; comes back with its tracks."""
 
     wall_ns: int
     now_ns: int
@@ -89,7 +89,7 @@ class Stream:
         self.session: Session | None = None
         self.fused = streams.fusion.is_session(name)
         self.meter = StreamMeter(time.monotonic_ns())
-        self.sensors = Sensors(name, self.meter, fused=self.fused)
+        self.sensors = SensorMeters(name, self.meter, fused=self.fused)
         self.log_check = LogCheck(streams.silent_ns)
         self._is_far = False
         self._streams = streams
@@ -275,7 +275,7 @@ class Stream:
         now_ns = time.monotonic_ns()
         self.sensors.arrived(packet, message.stream)
         trace = self._traces.received(packet, message) if self._traces else None
-        ticket = Arrival(packet.wall_ns, packet.now_ns, decode_ns, trace)
+        ticket = Ticket(packet.wall_ns, packet.now_ns, decode_ns, trace)
         if isinstance(message, schemas.Points):
             outputs = session.on_points(message, now_ns, ticket=ticket)
             if any(getattr(one, "code", "") in CLOUD_REFUSED for one in outputs):
@@ -337,14 +337,14 @@ class Stream:
 
     def _republish_events(self) -> None:
         """Publish the events of the window in this run, which voids later events of the run before."""
-        now = Arrival(time.time_ns(), time.monotonic_ns(), 0)
+        now = Ticket(time.time_ns(), time.monotonic_ns(), 0)
         for tracked in self.session.again() if self.session and self._policy.zones else ():
             tracked.ticket = now
             self._send(tracked, again=True)
 
     def _send(self, tracked: Tracked, *, again: bool = False) -> None:
         """Publish tracks and events of a frame, `again` events alone, now or when the write lease holds again."""
-        ticket: Arrival = tracked.ticket
+        ticket: Ticket = tracked.ticket
         passed_ns = time.monotonic_ns() - ticket.now_ns
         waited_ns = max(0, passed_ns - ticket.decode_ns - tracked.step_ns)
         delivery = self._delivery(tracked, waited_ns)
@@ -692,7 +692,7 @@ class Stream:
             key = (keys.detections if isinstance(message, schemas.Detections) else keys.points)(message.stream)
             payload = schemas.encode(message)
             came, parent = (wall_ns, now_ns), ""
-            if isinstance(ticket, Arrival):
+            if isinstance(ticket, Ticket):
                 came = ticket.wall_ns, ticket.now_ns
                 if self._traces and ticket.trace:
                     parent = self._traces.traceparent(ticket.trace.context)
@@ -764,7 +764,7 @@ def message_of(packet: Packet, stream: str, limits: schemas.Limits) -> schemas.D
     return message
 
 
-class Sensors:
+class SensorMeters:
     """Sensors of one session: when each sent last, and which fell silent.
 
     Written by the tracking thread; the control loop looks for silent ones.

@@ -25,7 +25,7 @@ STUCK_S: Final = 10.0  # a loop that has not turned for so long is stuck
 USABLE: Final = frozenset({"ready", "degraded"})
 
 
-class Reporter:
+class Component:
     """Part of a process that does its work, and reports its state; by default one without streams.
 
     Args:
@@ -83,7 +83,7 @@ class ProcessHealth:
         self.metrics = metrics
         self.tls: Certificates | None = None
         """The certificates of the process; None while they are not read."""
-        self._service = Reporter()
+        self._service = Component()
         self._began = False
         self._ending = False
         self._beat_ns = time.monotonic_ns()
@@ -93,7 +93,7 @@ class ProcessHealth:
         """Note that the control loop turns."""
         self._beat_ns = time.monotonic_ns()
 
-    def report(self, service: Reporter) -> None:
+    def report(self, service: Component) -> None:
         """Report the state of this part from now on."""
         self._service, self._began = service, True
 
@@ -129,9 +129,9 @@ class ProcessHealth:
         return self._service.status()
 
     def session(self) -> Session | None:
-        """Return the session for readers (`Reporter.session`); None while the service starts."""
+        """Return the session for readers (`Component.session`); None while the service starts."""
         return self._service.session()
 
     def detections_of(self, stream: str) -> str:
-        """Return the pattern of the streams whose detections belong to a stream (`Reporter.detections_of`)."""
+        """Return the pattern of the streams whose detections belong to a stream (`Component.detections_of`)."""
         return self._service.detections_of(stream)

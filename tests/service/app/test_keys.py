@@ -1,6 +1,8 @@
 """When a process restarts for the keys that it has declared, and when it does not."""
 
 import asyncio
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from optipmb_client.zenoh.session import KeyNumbers
@@ -24,7 +26,8 @@ TURNS = 20
 async def test_a_process_restarts_where_that_gives_it_numbers(keys: KeyNumbers, *, restarts: bool) -> None:
     """When enough are used up, unless reopening would need more than nine of ten of them again."""
     asked = StopRequest(NO_BOUND)
-    watching = asyncio.create_task(watch_keys(asked, lambda: keys, MOST))
+    session: Any = SimpleNamespace(key_numbers=keys)
+    watching = asyncio.create_task(watch_keys(asked, lambda: session, MOST))
     for _ in range(TURNS):
         await asyncio.sleep(0)
     assert (asked.is_set(), asked.restarts) == (restarts, restarts)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from optipmb_client.incoming import Answer, Arrival
     from optipmb_schemas.protobuf.convert import EncodedTracks
 
-    from optipmb_service.edges.grpc.selection import Selection
+    from optipmb_service.edges.grpc.selection import Filter
     from optipmb_service.zenoh.client import Client, Outgoing
 
     T = TypeVar("T")
@@ -68,7 +68,7 @@ class Item:
     events: schemas.Events | None = None
 
     @classmethod
-    def of_tracks(cls, tracks: EncodedTracks, selection: Selection = EVERYTHING) -> Item:
+    def of_tracks(cls, tracks: EncodedTracks, selection: Filter = EVERYTHING) -> Item:
         payload = selection.of(tracks.message()).SerializeToString() if selection.key else tracks.payload
         return cls(tracks.stream, b"".join((_TRACKS, varint(len(payload)), payload)), tracks)
 
@@ -92,7 +92,7 @@ class Listener:
     def __init__(
         self,
         take: Callable[[Item], None],
-        selection: Selection = EVERYTHING,
+        selection: Filter = EVERYTHING,
         passes: Callable[[EncodedTracks], bool] = lambda _: True,
     ) -> None:
         self.selection = selection

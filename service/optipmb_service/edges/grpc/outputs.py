@@ -13,7 +13,7 @@ from optipmb_schemas.protobuf import tracking_pb2 as pb
 
 from optipmb_service.edges.grpc.calls import EndCall
 from optipmb_service.edges.grpc.network import Item, Listener
-from optipmb_service.edges.grpc.selection import EventSelection, Selection
+from optipmb_service.edges.grpc.selection import EventSelection, Filter
 from optipmb_service.edges.readers import Outbox, Pace, listed
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ async def subscribe(call: Call) -> None:
     tracks = keys.matching(asked.pattern, "now" if asked.predict else "tracks")
     problems = keys.matching(asked.pattern, "problems")
     call.caller.may_read(asked.pattern)
-    selection, pace = Selection(asked.filter), Pace(asked.max_rate_hz, predict=asked.predict)
+    selection, pace = Filter(asked.filter), Pace(asked.max_rate_hz, predict=asked.predict)
     if asked.queue > MAX_QUEUE:
         raise schemas.MessageError("too_large", "queue", f"at most {MAX_QUEUE}", str(asked.queue))
     outbox = Outbox[bytes](asked.queue or QUEUE)
@@ -100,7 +100,7 @@ async def query_tracks(call: Call) -> None:
     asked = await call.request(pb.QueryTracksRequest)
     key = call.gateway.client.keys.matching(asked.pattern, "tracks")
     call.caller.may_read(asked.pattern)
-    selection = Selection(asked.filter)
+    selection = Filter(asked.filter)
     wanted = schemas.TracksRequest(
         from_ns=asked.from_ns if asked.HasField("from_ns") else 0,
         to_ns=asked.to_ns if asked.HasField("to_ns") else None,

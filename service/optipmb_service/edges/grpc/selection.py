@@ -22,7 +22,7 @@ CORNERS: Final = 3
 KINDS: Final = get_args(schemas.ZoneEvent.model_fields["kind"].annotation)
 
 
-class Selection:
+class Filter:
     """A filter as it was asked for.
 
     Args:
@@ -79,7 +79,7 @@ class Selection:
         return rows
 
 
-EVERYTHING: Final = Selection(pb.TrackFilter())
+EVERYTHING: Final = Filter(pb.TrackFilter())
 
 
 class EventSelection:

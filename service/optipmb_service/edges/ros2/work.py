@@ -18,7 +18,7 @@ from optipmb_schemas.ros2.tracks import TOPICS
 
 from optipmb_service.edges.ros2 import graph
 from optipmb_service.edges.ros2.bridge import DIAGNOSTICS, Bridge
-from optipmb_service.telemetry.health import STUCK_S, Reporter
+from optipmb_service.telemetry.health import STUCK_S, Component
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -46,7 +46,7 @@ ODOMETRY: Final = "nav_msgs/msg/Odometry"
 log = structlog.get_logger("optipmb_service")
 
 
-class Work(Reporter):
+class Work(Component):
     """The queue of the working thread, and what connects the node and the bridge."""
 
     def __init__(self, settings: Settings, node: Ros2Node) -> None:
