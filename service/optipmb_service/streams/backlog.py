@@ -226,16 +226,14 @@ class Backlog:
         if wakes and self._schedule is not None:
             self._schedule()
 
-    def cache_answered(self, stream: str, then: Command) -> bool:
-        """Note that a publisher's cache was received completely; `then` runs after its messages, if they are queued.
-
-        False when the backlog is closed.
-        """
+    def cache_answered(self, stream: str, then: Command) -> None:
+        """Note that a publisher's cache was received completely; `then` runs after its messages, if they are queued."""
         with self._lock:
-            if self.state != "live" or self._missed or self._held:
+            waits = self.state != "live" or bool(self._missed or self._held)
+            if waits:
                 self.answered.add(stream)
-                return True
-        return self.command(then, urgent=False)
+        if not waits:
+            self.command(then, urgent=False)
 
     # States
 
