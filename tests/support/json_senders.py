@@ -30,7 +30,9 @@ class Edge:
         self.client = Client(self.settings)
         self.health = ProcessHealth("edge", Metrics())
         self.health.report(Reporter(self.client))
-        self._server = Server(application(self.health, self.settings), "127.0.0.1:0")
+        self._server = Server(
+            application(self.health, self.settings), "127.0.0.1:0", self.settings.limits.max_json_bytes
+        )
         self.address = self._server.address
 
     def close(self) -> None:

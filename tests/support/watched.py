@@ -160,7 +160,8 @@ class Watched:
 
 @contextlib.contextmanager
 def served(source: Any, places: Any = None, **settings: Any) -> Iterator[str]:
-    server = Server(application(source, Settings(**settings), places), "127.0.0.1:0")
+    given = Settings(**settings)
+    server = Server(application(source, given, places), "127.0.0.1:0", given.limits.max_json_bytes)
     try:
         yield server.address
     finally:

@@ -348,7 +348,7 @@ def _monitoring(settings: Settings, health: ProcessHealth) -> Iterator[None]:
     endpoint = (*settings.connect, *settings.endpoints)[0]
     interface = functools.partial(document, settings.prefix, endpoint, settings.http)
     answers = application(health, settings, places_of(settings), interface, sessions_of(settings))
-    server = Server(answers, settings.http)
+    server = Server(answers, settings.http, settings.limits.max_json_bytes)
     log.info("http", address=server.address)
     try:
         yield

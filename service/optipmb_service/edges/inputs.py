@@ -284,7 +284,8 @@ class Inputs:
         """
         name = frame.message.stream
         async with self._used(name) as stream:
-            async with stream.lock:
+            async with stream.lock:  # taken once: frames of a stream go out in the order in which they came
+                await self._prepare(name, stream)
                 mark = _mark(frame, repeats)
                 sent = None if frame.is_numbered else self._before(stream, frame, mark, rules)
                 if is_new := sent is None:
@@ -302,20 +303,12 @@ class Inputs:
 
     @contextlib.asynccontextmanager
     async def _used(self, name: str) -> AsyncIterator[_Stream]:
-        """Give a stream with its publisher."""
+        """Give a stream; the last user leaves its publisher to the next one."""
         stream = self._streams.get(name) or _Stream()
         self._streams[name] = stream
         self._streams.move_to_end(name)
         stream.users += 1
         try:
-            async with stream.lock:
-                if not self.client.linked():
-                    raise TransportError("no link to a router")
-                if stream.link is None:
-                    stream.link = self._idle.take(name) or await asyncio.to_thread(self._open, name)
-                if stream.tracked is None:
-                    found = [one for one, _ in await asyncio.to_thread(self._cached, name)]
-                    stream.tracked = {one.stamp_ns: Sent(one.epoch, one.seq, one.stamp_ns) for one in found}
             yield stream
         finally:
             stream.users -= 1
@@ -323,6 +316,20 @@ class Inputs:
                 self._idle.keep(name, stream.link)
                 stream.link = None
             self._forget()
+
+    async def _prepare(self, name: str, stream: _Stream) -> None:
+        """Open the publisher of a stream, and ask once what of it was tracked.
+
+        Raises:
+            TransportError: the network cannot be used, or too many streams were opened.
+        """
+        if not self.client.linked():
+            raise TransportError("no link to a router")
+        if stream.link is None:
+            stream.link = self._idle.take(name) or await asyncio.to_thread(self._open, name)
+        if stream.tracked is None:
+            found = [one for one, _ in await asyncio.to_thread(self._cached, name)]
+            stream.tracked = {one.stamp_ns: Sent(one.epoch, one.seq, one.stamp_ns) for one in found}
 
     def _before(self, stream: _Stream, frame: JsonFrame, mark: Hashable, rules: InputSettings) -> Sent | None:
         """Return with which numbers a frame was sent; None of a new one.

@@ -1,15 +1,16 @@
 """Detections by POST: the same tracks as over Zenoh, once for each frame, and clear answers to what is wrong."""
 
+import contextlib
 import hashlib
 import json
 import re
 import shutil
-import socket
 import subprocess
 import time
 from collections.abc import Iterator
 from http import HTTPStatus
 from pathlib import Path
+from socket import create_connection as open_connection
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from optipmb_service.settings import Settings, load
 from router import Node, Sensor, plain
 from routers import free_endpoint
 from watched import Watched, asked, served
+from websocket import ABNF, WebSocket, WebSocketBadStatusException, create_connection
 
 from optipmb import Georeference
 
@@ -50,16 +52,26 @@ def stamped(seq: int, **fields: Any) -> dict[str, Any]:
     return {"stamp_ns": SENSOR.stamp_ns(seq), "objects": []} | fields
 
 
+@contextlib.contextmanager
+def socket(address: str, query: str, **options: Any) -> Iterator[WebSocket]:
+    options = {"suppress_origin": "origin" not in options, **options}
+    connection = create_connection(f"ws://{address}/api/v1/detections?{query}", timeout=60, **options)
+    try:
+        yield connection
+    finally:
+        connection.shutdown()
+
+
 def error(body: Any) -> tuple[str, str]:
     (one,) = body["frames"]
     return one["error"]["code"], one["error"]["path"]
 
 
 def test_the_same_frames_give_the_same_bytes(start: Any) -> None:
-    """Frames over Zenoh, as objects and as columns by POST give equal `Tracks`; empty frames count."""
+    """Frames over Zenoh, by POST as objects and columns, and over a WebSocket give equal `Tracks`; empty ones count."""
     messages = [SENSOR.detections(seq, **({"objects": 0} if seq == 3 else {})) for seq in range(6)]
     found = []
-    for way in ("zenoh", "objects", "columns"):
+    for way in ("zenoh", "objects", "columns", "socket"):
         endpoint = start()[1]
         with Node(endpoint) as node, Edge(endpoint) as edge:
             if way == "zenoh":
@@ -67,12 +79,18 @@ def test_the_same_frames_give_the_same_bytes(start: Any) -> None:
             elif way == "objects":
                 for one in messages:
                     assert edge.post(document(one, "epoch", "seq"), STREAM).status == HTTPStatus.ACCEPTED
+            elif way == "socket":
+                with socket(edge.address, STREAM) as connection:
+                    for index, one in enumerate(messages):
+                        connection.send(json.dumps(document(one, "epoch", "seq")))
+                        answer = json.loads(connection.recv())
+                        assert (answer["index"], answer["seq"], answer["duplicate"]) == (index, index, False)
             else:
                 answer = edge.post(b"[%b]" % b",".join(map(encode_json, messages)))
                 assert (answer.status, answer.body["accepted"]) == (HTTPStatus.ACCEPTED, len(messages))
             tracks = node.tracks(SENSOR.stream, len(messages))
             found.append([plain(one.model_copy(update={"session": "0" * 32})) for one in tracks])
-    assert found[0] == found[1] == found[2]
+    assert found[0] == found[1] == found[2] == found[3]
 
 
 def test_a_frame_that_is_sent_again_counts_once(endpoint: str) -> None:
@@ -182,6 +200,23 @@ def test_a_page_of_a_stranger_cannot_send(edge: Edge) -> None:
     assert edge.post(stamped(0), STREAM, origin=f"http://{edge.address}").status == HTTPStatus.ACCEPTED
 
 
+def test_a_socket_answers_each_text(edge: Edge) -> None:
+    """Also a wrong one, with its path; it ends at a message that is no text, and a stranger's page opens none."""
+    with socket(edge.address, STREAM) as connection:
+        for text in ('{"objects": [], "key": "a"}', "[]", '{"objects": [{}]}', '{"objects": [], "key": "a"}'):
+            connection.send(text)
+        found = [json.loads(connection.recv()) for _ in range(4)]
+        assert [one["index"] for one in found] == [0, 1, 2, 3]
+        assert [one.get("duplicate") for one in found] == [False, None, None, True]
+        assert [one["error"]["path"] for one in found[1:3]] == ["", "objects[0].class"]
+        connection.send(b"{}", ABNF.OPCODE_BINARY)
+        assert connection.recv_data(control_frame=True)[0] == ABNF.OPCODE_CLOSE
+    for query, origin in (("", "https://stranger.example"), ("streem=a", None)):
+        options = {"origin": origin} if origin else {}
+        with pytest.raises(WebSocketBadStatusException), socket(edge.address, query, **options):
+            pass
+
+
 def test_pages_of_named_origins_may_send(watched: Watched) -> None:
     """A browser asks before it sends: the answer allows POST with a content type and a token."""
     asks = {"origin": "https://map.example", "access-control-request-method": "POST"}
@@ -250,7 +285,7 @@ def test_a_body_has_a_bound_and_a_time(edge: Edge, monkeypatch: pytest.MonkeyPat
     head = b"POST /api/v1/detections HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\n"
 
     def answer(text: bytes) -> bytes:
-        with socket.create_connection((host, int(port)), 60) as connection:
+        with open_connection((host, int(port)), 60) as connection:
             connection.sendall(head + text)
             return connection.recv(100).split(b"\r\n")[0]
 

@@ -170,7 +170,7 @@ def test_an_address_in_use_is_one_error() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"127.0.0.1:{taken.getsockname()[1]}"
         with pytest.raises(ClientError, match=f"cannot listen on {address} for HTTP: Address already in use"):
-            Server(served_here, address)
+            Server(served_here, address, 4096)
         with ServiceProcess("--http", address) as service:
             assert service.wait_end() == 1
             assert service.errors.splitlines()[-1].startswith("optipmb-service: cannot listen on")

@@ -43,7 +43,8 @@ PROTOCOL: Final = "optipmb.v1"  # subprotocol of the WebSocket
 BEARER: Final = "bearer."  # a second subprotocol with the token of a browser, which can set no header
 NAMES: Final = 256
 RECENT: Final = 32  # newest messages of events, of more than a second, among which one has counts
-TRY_AGAIN, MALFORMED = 1013, 1008  # why a WebSocket was closed
+TRY_AGAIN, MALFORMED, TOO_BIG = 1013, 1008, 1009  # why a WebSocket was closed
+MESSAGE_CHARACTERS: Final = 4096  # largest message of a reader
 STREAMING: Final = {"cache-control": "no-store, no-transform", "x-accel-buffering": "no"}  # for proxies
 HEADERS: Final = {"cache-control": "no-store", "x-content-type-options": "nosniff", "referrer-policy": "no-referrer"}
 
@@ -400,8 +401,12 @@ class Api:
     ) -> None:
         """Change what a reader wants as often as it says so, until it goes."""
         while (message := await websocket.receive())["type"] != "websocket.disconnect":
+            text = message.get("text") or ""
+            if len(text) > MESSAGE_CHARACTERS:
+                await websocket.close(TOO_BIG)
+                return
             try:
-                wish = wish_of(msgspec.json.decode(message.get("text") or "", type=_Incoming).subscribe)
+                wish = wish_of(msgspec.json.decode(text, type=_Incoming).subscribe)
                 keys = wish.keys(self._readers.keys)
                 caller.may_read(wish.streams[0])
             except (msgspec.DecodeError, schemas.MessageError, NotAllowedError) as error:

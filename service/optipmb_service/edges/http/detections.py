@@ -1,8 +1,10 @@
-"""Detections by POST: frames in JSON from programs that have no client of ours."""
+"""Detections by POST and over a WebSocket: frames in JSON from programs that have no client of ours."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import itertools
 import math
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, Final, cast
@@ -13,10 +15,19 @@ from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_schemas.json_form import EXACT
 from starlette.requests import ClientDisconnect
 from starlette.responses import Response
-from starlette.routing import Route
+from starlette.routing import Route, WebSocketRoute
+from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from optipmb_service.edges.access import NotAllowedError
-from optipmb_service.edges.http.api import HEADERS, NoRoomError, RequestError, parameters_of, wish_of
+from optipmb_service.edges.http.api import (
+    HEADERS,
+    MALFORMED,
+    PROTOCOL,
+    NoRoomError,
+    RequestError,
+    parameters_of,
+    wish_of,
+)
 from optipmb_service.edges.inputs import Inputs, RefusedError
 from optipmb_service.edges.json_frames import FrameReader
 from optipmb_service.edges.readers import Publication
@@ -25,10 +36,10 @@ from optipmb_service.telemetry.metrics import INPUT_METRICS
 from optipmb_service.zenoh.client import TooManyStreamsError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from optipmb_schemas.json_form import Place, Selection
-    from starlette.requests import Request
+    from starlette.requests import HTTPConnection, Request
 
     from optipmb_service.edges.access import Caller
     from optipmb_service.edges.http.api import Readers
@@ -91,8 +102,9 @@ class Senders:
         self._is_open = bool(settings.http_tokens) or not settings.http or is_loopback(settings.http)
         self._inputs: Inputs | None = None
 
-    def routes(self) -> list[Route]:
-        return [Route("/api/v1/detections", self.post, methods=["POST"])]
+    def routes(self) -> list[Route | WebSocketRoute]:
+        path = "/api/v1/detections"
+        return [Route(path, self.post, methods=["POST"]), WebSocketRoute(path, self.socket)]
 
     async def post(self, request: Request) -> Response:
         """Hand the frames of a request to the network."""
@@ -101,10 +113,7 @@ class Senders:
         stream, wait_s = parameters.get("stream", ""), _wait(parameters)
         wish = wish_of({name: parameters[name] for name in SELECTION if name in parameters} | {"stream": "*/*/*"})
         inputs = self._opened()
-        if self.count >= self._settings.http_senders:
-            raise NoRoomError(f"{self._settings.http_senders} requests that send are here already")
-        self.count += 1
-        try:
+        with self._entered():
             _check_type(request)
             frames, is_array = self._frames.split(await self._body(request))
             if is_array and wait_s:
@@ -119,10 +128,39 @@ class Senders:
                 answer, retry_s = await sender.send(payload, path, repeats and f"{at} {repeats}", wait_s)
                 answers.append(({"index": at} | answer, retry_s))
             return self._answer(answers, wish.selection if wait_s else None)
+
+    async def socket(self, websocket: WebSocket) -> None:
+        """Hand the frames of a WebSocket to the network, each with an answer before the next."""
+        caller = await self._caller(websocket)
+        stream = parameters_of(websocket, ("stream",)).get("stream", "")
+        sender = _Sender(self._opened(), self._frames, caller, stream, websocket.headers.get("traceparent", ""))
+        with self._entered(), contextlib.suppress(WebSocketDisconnect):
+            await websocket.accept(PROTOCOL if PROTOCOL in websocket.scope["subprotocols"] else None)
+            for index in itertools.count():
+                if (message := await websocket.receive())["type"] == "websocket.disconnect":
+                    return
+                if (text := message.get("text")) is None:
+                    await websocket.close(MALFORMED, "texts are expected")
+                    return
+                answer, _ = await sender.send(text.encode(), "", "", 0.0)
+                await websocket.send_text(msgspec.json.encode({"index": index} | answer).decode())
+
+    @contextlib.contextmanager
+    def _entered(self) -> Iterator[None]:
+        """Count a sender meanwhile.
+
+        Raises:
+            NoRoomError: there are too many.
+        """
+        if self.count >= self._settings.http_senders:
+            raise NoRoomError(f"{self._settings.http_senders} requests and sockets that send are here already")
+        self.count += 1
+        try:
+            yield
         finally:
             self.count -= 1
 
-    async def _caller(self, request: Request) -> Caller:
+    async def _caller(self, request: HTTPConnection) -> Caller:
         """Return who sends.
 
         Raises:

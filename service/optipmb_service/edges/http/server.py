@@ -48,7 +48,6 @@ REQUESTS: Final = 64  # requests answered at once, without probes, readers and s
 HEAD_S: Final = 5.0  # longest time from the begin of a connection until its first request is complete
 KEEP_ALIVE_S: Final = 5
 HEAD_BYTES: Final = 16 * 1024
-MESSAGE_BYTES: Final = 4096  # largest message of a WebSocket's client
 SEND_S: Final = 30.0  # a connection whose peer takes nothing for so long is aborted
 SEND_BYTES: Final = 2**16  # what the system holds for a connection, so that it is soon known
 PING_S: Final = 20.0  # period of pings, and longest wait for their answers
@@ -184,12 +183,13 @@ class Server:
     Args:
         application: the application that it serves.
         address: `host:port` or `[v6]:port`; port 0 takes any free one.
+        message_bytes: largest message of a WebSocket's client.
 
     Raises:
         ClientError: the address cannot be listened on.
     """
 
-    def __init__(self, application: ASGIApp, address: str) -> None:
+    def __init__(self, application: ASGIApp, address: str, message_bytes: int) -> None:
         host, _, port = address.rpartition(":")
         host = host.strip("[]")
         try:
@@ -213,7 +213,7 @@ class Server:
                 timeout_graceful_shutdown=GRACE_S,
                 h11_max_incomplete_event_size=HEAD_BYTES,
                 ws=_Socket,
-                ws_max_size=MESSAGE_BYTES,
+                ws_max_size=message_bytes,
                 ws_ping_interval=PING_S,
                 ws_ping_timeout=PING_S,
                 ws_per_message_deflate=False,
