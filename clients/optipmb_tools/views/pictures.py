@@ -42,7 +42,7 @@ NARROWEST_M = 30.0
 SCALE_M = 10.0
 WIDTH_PX = 800
 LEGEND = 2.0  # its width, inches, on the right
-HEIGHTS = (0.45, 0.6)  # least and largest height of the view, as a share of its width
+HEIGHTS = (0.45, 0.64)  # least and largest height of the view, as a share of its width
 _SHADE, _DETECTION = "#8E8E8E", _INK
 
 # Of the ground
@@ -287,6 +287,9 @@ class _View:
         _, self._sensor = stack_poses(sequence.poses)
         places = tracks.center if len(tracks) else self._sensor
         low, high = np.quantile(places[:, :2], INSIDE, axis=0)
+        ground = [outline for kind, outline in sequence.areas if kind == "road"]
+        if ground and (np.ptp(np.vstack(ground), axis=0) < WIDEST_M).all():
+            low, high = np.vstack([low[None], *ground]).min(axis=0), np.vstack([high[None], *ground]).max(axis=0)
         lack = np.maximum(NARROWEST_M - (high - low), 0.0)
         low, high = low - MARGIN_M - 0.5 * lack, high + MARGIN_M + 0.5 * lack
         self._follows = bool((high - low).max() > WIDEST_M)
