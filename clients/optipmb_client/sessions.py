@@ -136,14 +136,40 @@ def move_stream(connection: Connection, instance: str, stream: str, worker: int,
     _order(connection, Keys(prefix).move(instance), MoveRequest(stream=stream, worker=worker), instance)
 
 
-def drain_service(connection: Connection, member: str, *, drains: bool = True, prefix: str = PREFIX) -> None:
+def drain_service(
+    connection: Connection,
+    member: str,
+    *,
+    drains: bool = True,
+    prefix: str = PREFIX,
+    patience_s: float = 0.0,
+    on_wait: Callable[[ServiceStatus], None] = lambda _: None,
+) -> None:
     """Have a service, or a worker of one, give all its streams to others; with `drains` false, take a share again.
+
+    Args:
+        connection: Where to ask.
+        member: Name of the service or worker.
+        drains: Whether to give the streams away.
+        prefix: First part of all keys.
+        patience_s: How long to ask again while it still holds streams.
+        on_wait: Is called with its status each time before it is asked again.
 
     Raises:
         ServiceUnavailable: No such service.
         ServiceRefused: There is no other one, or it did not take all streams in time.
     """
-    _order(connection, Keys(prefix).drain(member), DrainRequest(drain=drains), member)
+    keys = Keys(prefix)
+    deadline = time.monotonic() + patience_s
+    while True:
+        try:
+            return _order(connection, keys.drain(member), DrainRequest(drain=drains), member)
+        except ServiceRefused:
+            status = _ask(connection, keys.status(member), ServiceStatus)
+            if status is None or status.state != "draining" or time.monotonic() >= deadline:
+                raise
+            on_wait(status)
+            time.sleep(RETRY_S)
 
 
 def _order(connection: Connection, key: str, request: Message, instance: str) -> None:

@@ -5,7 +5,7 @@ import json
 import time
 
 import pytest
-from fake_service import FakeService
+from fake_service import Behaviour, FakeService
 from optipmb_client import Connection
 from optipmb_client.sessions import find_services
 from optipmb_schemas import Keys, MemberSummary, Problem, ServiceStatus
@@ -83,6 +83,18 @@ def test_a_service_that_does_not_answer_is_named(endpoint: str, capsys: pytest.C
     shown = capsys.readouterr()
     assert "slow is alive and does not answer" in shown.err
     assert shown.out.startswith("fake")
+
+
+def test_a_drain_is_awaited(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """`optipmb drain` asks until the others have all streams and says how many are left; --wait bounds it."""
+    for wait, status, asked in (("60", 0, 3), ("0", 1, 1)):
+        with FakeService(endpoint, Behaviour(slow_drains=2)) as service:
+            assert run(["drain", "fake", "--connect", endpoint, "--wait", wait]) == status
+            assert service.seen.drains == asked
+        shown = capsys.readouterr()
+        assert shown.out == ("" if status else "fake holds no streams\n")
+        assert shown.err.count("still holds streams: 1") == asked - 1
+        assert ("not all taken in time" in shown.err) == bool(status)
 
 
 def test_nobody_is_an_empty_list_after_the_patience(endpoint: str) -> None:

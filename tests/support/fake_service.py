@@ -10,6 +10,7 @@ from optipmb_client.incoming import Arrival
 from optipmb_client.zenoh.session import Session
 from optipmb_schemas import (
     Detections,
+    DrainRequest,
     Keys,
     MessageError,
     Points,
@@ -36,6 +37,8 @@ class Behaviour:
 
     answer: Callable[[Detections, Tracks], list[Tracks]] = lambda _, tracks: [tracks]
     profiles: tuple[str, ...] = ("kitti", "nuscenes", "scene")
+    slow_drains: int = 0
+    """How often a drain is refused because streams are left."""
 
 
 @dataclass
@@ -45,6 +48,7 @@ class Seen:
     parameters: list[tuple[str, SessionParameters]] = field(default_factory=list)
     closed: list[str] = field(default_factory=list)
     order: list[tuple[str, int]] = field(default_factory=list)  # topic and stamp
+    drains: int = 0
 
 
 class FakeService:
@@ -65,6 +69,8 @@ class FakeService:
         self._work(session.declare_subscriber(KEYS.all("points"), zenoh.handlers.FifoChannel(1000)), self._on_points)
         for what, answer in (("parameters", self._on_parameters), ("reset", self._on_reset)):
             self._work(session.declare_queryable(KEYS.all_queries(what), zenoh.handlers.FifoChannel(100)), answer)
+        drain = session.declare_queryable(KEYS.drain(self.instance), zenoh.handlers.FifoChannel(100))
+        self._work(drain, self._on_drain)
         self._work(
             session.declare_queryable(KEYS.status(self.instance), zenoh.handlers.FifoChannel(100)), self._on_status
         )
@@ -135,6 +141,17 @@ class FakeService:
             state = SessionState(stream=stream, session=SESSION, state="closed", profile="kitti")
             query.reply(query.key_expr, encode(state), encoding=encoding_of(SessionState))
 
+    def _on_drain(self, query: zenoh.Query) -> None:
+        with query:
+            self.seen.drains += 1
+            if self.seen.drains <= self._behaviour.slow_drains:
+                problem = Problem(
+                    stream="", instance=self.instance, code="invalid_value", message="drain: not all taken in time"
+                )
+                query.reply_err(encode(problem), encoding=encoding_of(Problem))
+                return
+            query.reply(query.key_expr, encode(DrainRequest()), encoding=encoding_of(DrainRequest))
+
     def _on_status(self, query: zenoh.Query) -> None:
         with query:
             summary = SessionSummary(stream="a/b/c", profile="kitti", state="running", rate_hz=9.97, frames=1234)
@@ -144,7 +161,7 @@ class FakeService:
                 version="1.2.3",
                 started_ns=1,
                 uptime_s=7300.0,
-                state="ready",
+                state="draining" if self.seen.drains else "ready",
                 sessions=(summary,),
                 frames=1234,
                 problems=(problem,),

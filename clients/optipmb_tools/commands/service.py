@@ -169,11 +169,24 @@ def drain(
     *,
     service: ServiceOptions,
     undo: Annotated[bool, typer.Option("--undo", help="Let it take its share of the streams again.")] = False,
+    wait: Annotated[
+        float, typer.Option(min=0.0, metavar="SECONDS", help="How long the others may need to take all streams.")
+    ] = 120.0,
     as_json: AsJson = False,
 ) -> None:
-    """Give all streams of a service to the others, each with its state; it takes none until it ends, or --undo."""
+    """Give all streams of a service to the others, each with its state, and wait until they have them.
+
+    It takes none until it ends, or --undo.
+    """
     with service.connection(2.0) as connection:
         name = member or only_service(connection, "MEMBER", prefix=service.prefix)
-        drain_service(connection, name, drains=not undo, prefix=service.prefix)
+        drain_service(
+            connection,
+            name,
+            drains=not undo,
+            prefix=service.prefix,
+            patience_s=wait,
+            on_wait=lambda status: warn(f"{name} still holds streams: {len(status.sessions)}"),
+        )
     text = f"{name} {'takes its share of the streams again' if undo else 'holds no streams'}"
     report({"command": "drain", "member": name, "drain": not undo}, text, as_json=as_json)
