@@ -502,11 +502,11 @@ class Settings(BaseSettings):
     """a process that is frozen or cut off for this long loses its streams to the others"""
     standby_s: float = Field(default=10.0, ge=0, le=600)
     """how long messages of streams that others track are kept for a takeover; longer than `lease_s` and `checkpoint_s`
-    together; with `cluster` also how far back the log is read without a checkpoint"""
+    together; with `cluster` also how far back the message log is read without a checkpoint"""
     standby_mb: int = Field(default=256, ge=1, le=65536)
     """megabytes kept so; clouds are dropped first"""
     log_s: float = Field(default=600.0, ge=10, le=864_000)
-    """age up to which `optipmb-service log` keeps detections, for a successor"""
+    """age up to which the message log (`optipmb-service log`) keeps detections, for a successor"""
     log_mb: int = Field(default=1024, ge=16, le=1_048_576)
     """megabytes of these; the oldest go first"""
     log_tracks_s: float = Field(default=3600.0, ge=0, le=8_640_000)

@@ -258,7 +258,7 @@ def mqtt_command(
 @app.command("log")
 @_taking(LogOptions)
 def log_command(**given: Unpack[LogOptions]) -> None:
-    """Put detections and tracks into the log of a cluster, a client of routers. SIGINT and SIGTERM end it."""
+    """Put detections and tracks into the message log of a cluster, a client of routers. SIGINT and SIGTERM end it."""
     settings = _client(given, cluster=[f"nats://{DEFAULT_NATS}"])
     _needed("optipmb_service.app.log_bridge", "cluster")
     leave_or_restart(asyncio.run(run_log(settings)))

@@ -46,7 +46,7 @@ class LogBridge(Component):
         if settings.log_tracks_s:
             keep["tracks"] = Retention(settings.log_tracks_s, settings.log_tracks_mb * MEGABYTE)
         self._log = MessageLog(settings.cluster, settings.prefix, nats_access(settings))
-        self.writer = LogWriter(self._log, keep, self._unlogged)
+        self.writer = LogWriter(self._log, keep, self._lost)
         self._subscriptions = [client.subscribe(client.keys.all(topic), self._take) for topic in keep]
 
     @property
@@ -83,13 +83,13 @@ class LogBridge(Component):
         frame = content.epoch, content.seq, content.stamp_ns, sensor
         self.writer.put(LogMessage(topic, stream, *frame, order, message.payload, message.encoding))
 
-    def _unlogged(self, stream: str, why: str) -> None:
+    def _lost(self, stream: str, why: str) -> None:
         problem = problem_of(
-            "unlogged",
+            "message_log",
             stream=stream,
             instance=self._instance,
-            expected="a log that takes the message",
+            expected="a message log that takes the message",
             received=why,
-            message=f"Not in the log: {why}.",
+            message=f"Not in the message log: {why}.",
         )
         self.reporter.report(problem, time.monotonic_ns())

@@ -306,7 +306,7 @@ def _found(topic: Topic, message: Msg) -> _Found:
         at_s = datetime.fromisoformat(headers["Nats-Time-Stamp"]).timestamp()
         return _Found(int(headers["Nats-Sequence"]), at_s, content)
     except (LookupError, ValueError) as error:
-        raise NatsError(f"in the log there is something else than messages: {error}") from error
+        raise NatsError(f"in the message log there is something else than messages: {error}") from error
 
 
 class LogReader:
@@ -369,7 +369,7 @@ class LogReader:
                     await self._read(stream, wanted.positions.get(stream), following, messages)
 
             if failure := await self._bounded(read):
-                log.warning("log_unread", streams=sorted(wanted.streams), error=failure)
+                log.warning("message_log_unread", streams=sorted(wanted.streams), error=failure)
             if messages or number == 0:
                 take(messages)
 
@@ -414,7 +414,7 @@ class LogReader:
             following[stream] = number
             messages.extend(kept)
         if cut:
-            log.warning("log_cut", stream=stream, frames=len(kept) + cut, kept=len(kept))
+            log.warning("message_log_cut", stream=stream, frames=len(kept) + cut, kept=len(kept))
 
     async def _tracks(
         self, stream: str, from_ns: int, take: Callable[[list[LogMessage]], bool], end: Callable[[str], None]
@@ -459,7 +459,7 @@ class LogWriter:
         self._at_once = AT_ONCE
         self._tries = 0
         self._tried: LogMessage | None = None
-        self._failure = "the log was not reached yet"
+        self._failure = "the message log was not reached yet"
         self.written = 0
         """Messages that are in the log by this writer."""
         self.repeated = 0
@@ -483,7 +483,7 @@ class LogWriter:
             while self._waiting and self.held_bytes > self._most:
                 dropped.append(self._take())
         for one in dropped:
-            self._lose(one, f"at most {self._most} bytes waiting for the log")
+            self._lose(one, f"at most {self._most} bytes waiting for the message log")
         if wakes:
             self._connection.soon(self._came.set)
 
@@ -582,11 +582,11 @@ class LogWriter:
     def _works(self) -> None:
         if self._failure:
             self._failure = ""
-            log.info("log_back")
+            log.info("message_log_back")
 
     def _failed(self, error: BaseException) -> None:
         if not self._failure:
-            log.error("log_failed", error=str(error))
+            log.error("message_log_failed", error=str(error))
         self._failure = self._connection.described(error)
 
 

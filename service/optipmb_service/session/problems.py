@@ -102,8 +102,9 @@ CODES: Final = {
         "In answers to `q/tracks`: there are more tracks than one answer takes.",
         "Ask again from `stamp_ns` on, as `optipmb_client.kept_tracks` does.",
     ),
-    "unlogged": (
-        "A message is not in the log: NATS was away for too long, or does not take it.",
+    "message_log": (
+        "A message is not in the message log: NATS was away for too long, or does not take it. In answers: it cannot be"
+        " read.",
         "Nothing for the tracks. See the NATS servers; a successor has to get the frame from the publisher's cache.",
     ),
     "internal": (

@@ -205,7 +205,7 @@ class Backlog:
         if wakes and self._schedule is not None:
             self._schedule()
         if len(kept) < len(packets):
-            log.warning("log_cut", stream=self.session, frames=len(packets), kept=len(kept))
+            log.warning("message_log_cut", stream=self.session, frames=len(packets), kept=len(kept))
 
     def command(self, command: Command, *, urgent: bool) -> bool:
         """Add a command before everything, or after the frames that wait; False when the backlog has no stream."""

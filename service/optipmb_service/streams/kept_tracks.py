@@ -187,7 +187,7 @@ class TrackQuery:
         except TransportError as error:
             log.warning("reply_failed", key=request.key, error=str(error))
         if failure:
-            last = self._problem("unlogged", stream, "", "a log that can be read", failure)
+            last = self._problem("message_log", stream, "", "a message log that can be read", failure)
         elif wanted.cut_ns is not None:
             received = f"more, from the stamp {wanted.cut_ns} on"
             last = self._problem("cut", stream, "", "as many tracks as one answer takes", received, wanted.cut_ns)

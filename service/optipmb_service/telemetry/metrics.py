@@ -228,15 +228,15 @@ INPUT_METRICS: Final = {
 """Metrics of a process that takes frames of senders of JSON."""
 
 LOG_METRICS: Final = {
-    "log_written_total": _counter("Messages put into the log.", lambda b: b.writer.written),
-    "log_repeated_total": _counter("Messages that another bridge had put there.", lambda b: b.writer.repeated),
-    "log_dropped_total": _counter(
+    "message_log_written_total": _counter("Messages put into the message log.", lambda b: b.writer.written),
+    "message_log_repeated_total": _counter("Messages that another bridge had put there.", lambda b: b.writer.repeated),
+    "message_log_dropped_total": _counter(
         "Messages not put there: too many waited, or NATS refused them.", lambda b: b.writer.dropped
     ),
-    "log_invalid_total": _counter("Messages that were not valid, so not put there.", lambda b: b.invalid),
-    "log_waiting_bytes": _gauge("Bytes waiting for NATS.", lambda b: b.writer.held_bytes),
+    "message_log_invalid_total": _counter("Messages that were not valid, so not put there.", lambda b: b.invalid),
+    "message_log_waiting_bytes": _gauge("Bytes waiting for NATS.", lambda b: b.writer.held_bytes),
 }
-"""Metrics of a bridge into the log."""
+"""Metrics of a bridge into the message log."""
 
 TLS_METRICS: Final = {
     "certificate_days": _gauge("Days until a certificate ends; below 0: it has ended.", lambda c: c.days(), "use"),

@@ -147,7 +147,7 @@ def test_a_search_that_fails_takes_no_room(monkeypatch: pytest.MonkeyPatch) -> N
     for _ in range(service_tracks.AT_ONCE + 1):
         query.answer(Mock(payload=b"", refuse=refused.put), SENSOR.stream)
         problem = refused.get(timeout=60.0)
-        assert (problem.code, problem.received) == ("unlogged", "ValueError: a mistake")
+        assert (problem.code, problem.received) == ("message_log", "ValueError: a mistake")
 
 
 def test_the_client_asks_part_by_part(
