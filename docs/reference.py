@@ -31,7 +31,7 @@ from optipmb_service.telemetry.logs import EVENTS
 from optipmb_service.telemetry.metrics import METRICS, NAMESPACE
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from pydantic import BaseModel
     from pydantic.fields import FieldInfo
@@ -89,6 +89,33 @@ TASKS: Final = (
 )
 """Settings by what somebody looks for; each setting is in one row at least."""
 
+SETTINGS: Final = {
+    "Name and network": "instance",
+    "Tracking": "profile",
+    "Time": "cloud_wait_s",
+    "Load and quotas": "queue_frames",
+    "State and other instances": "keep_days",
+    "Health and end": "stale_s",
+    "HTTP and gRPC": "http",
+    "Logs and traces": "log_format",
+}
+EVENTS_OF: Final = {
+    "Start and network": "log_lines_dropped",
+    "Sessions and their state": "leases_gone",
+    "Leases and the message log": "partitions_held",
+    "Streams, traces and bridges": "traces_lost",
+    "Workers": "worker_started",
+    "End": "stop_asked",
+}
+METRICS_OF: Final = {
+    "Process and network": "info",
+    "Frames and problems": "log_lines_dropped_total",
+    "Sessions and streams": "sessions",
+    "gRPC": "grpc_open_calls",
+    "Message log, MQTT and certificates": "message_log_written_total",
+}
+"""Sections of the long tables, each by its first row."""
+
 _TABLE: Final = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -125,15 +152,16 @@ def settings() -> str:
         *(("zones.NAME.", ZoneSettings), ("outputs.PATTERN.", OutputSettings)),
         *(("ros2.", Ros2Settings), ("ros2.streams.NAME.", Ros2Stream), ("mqtt.", MqttSettings)),
     )
-    rows = []
+    rows = {}
     for prefix, table in tables:
         meanings = docstrings(table)
-        rows += [
-            _setting(f"{prefix}{name}", field, meanings[name])
+        rows |= {
+            f"{prefix}{name}": _setting(f"{prefix}{name}", field, meanings[name])
             for name, field in table.model_fields.items()
             if f"{prefix}{name}" not in {"limits", "mqtt", "ros2"}
-        ]
-    return _table(("setting", "default", "allowed", "meaning"), rows)
+        }
+    nested = {prefix.strip("."): f"{prefix}{next(iter(table.model_fields))}" for prefix, table in tables if prefix}
+    return _sections(SETTINGS | nested, ("setting", "default", "allowed", "meaning"), rows)
 
 
 def docstrings(table: type) -> dict[str, str]:
@@ -157,16 +185,17 @@ def problems() -> str:
 
 def events() -> str:
     """Return the table of the log events."""
-    return _table(("event", "meaning"), [(f"`{event}`", text) for event, text in EVENTS.items()])
+    rows = {event: (f"`{event}`", text) for event, text in EVENTS.items()}
+    return _sections(EVENTS_OF, ("event", "meaning"), rows)
 
 
 def metrics() -> str:
     """Return the table of the metrics."""
-    rows = [
-        (f"`{NAMESPACE}{name}{'{' + ','.join(metric.labels) + '}' if metric.labels else ''}`", metric.meaning)
+    rows = {
+        name: (f"`{NAMESPACE}{name}{'{' + ','.join(metric.labels) + '}' if metric.labels else ''}`", metric.meaning)
         for name, metric in METRICS.items()
-    ]
-    return _table(("metric", "meaning"), rows)
+    }
+    return _sections(METRICS_OF, ("metric", "meaning"), rows)
 
 
 def _setting(name: str, field: FieldInfo, meaning: str) -> tuple[str, str, str, str]:
@@ -197,6 +226,22 @@ def _plain(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _sections(first: Mapping[str, str], head: Sequence[str], rows: Mapping[str, Sequence[str]]) -> str:
+    """Return a table in sections, each from its first row on.
+
+    Raises:
+        ValueError: a first row does not exist, or is not in the order of the rows.
+    """
+    order = list(rows)
+    places = [order.index(name) for name in first.values()]
+    if places != sorted({0, *places}):
+        raise ValueError(f"sections are not in the order of the rows: {', '.join(first)}")
+    parts = zip(first, pairwise([*places, len(order)]), strict=True)
+    return "\n".join(
+        f"### {title}\n\n{_table(head, [rows[name] for name in order[low:high]])}" for title, (low, high) in parts
+    )
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

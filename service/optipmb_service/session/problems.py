@@ -103,8 +103,7 @@ CODES: Final = {
         "Ask again from `stamp_ns` on, as `optipmb_client.kept_tracks` does.",
     ),
     "message_log": (
-        "A message is not in the message log: NATS was away for too long, or does not take it. In answers: it cannot be"
-        " read.",
+        "A message is not in the message log: NATS was away for too long, or does not take it.",
         "Nothing for the tracks. See the NATS servers; a successor has to get the frame from the publisher's cache.",
     ),
     "internal": (

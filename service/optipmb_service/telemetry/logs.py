@@ -76,8 +76,8 @@ EVENTS: Final = {
     "leases_slow": "Each renewal of the lease has taken more than a quarter of `lease_s`, the last one `took_s`: new"
     " streams begin late. Look for a slow disk or network, or raise `lease_s`.",
     "leases_in_time": "A renewal of the lease was in time again.",
-    "message_log_failed": "The message log cannot be written, for `error`: the bridge holds 256 MB of messages and tries"
-    " again.",
+    "message_log_failed": "The message log cannot be written, for `error`: the bridge holds 256 MB of messages and"
+    " tries again.",
     "message_log_back": "The message log can be written.",
     "message_log_unread": "The message log could not be read for the session of `streams`: frames may be missing.",
     "message_log_cut": "A session missed more of the message log than it takes at once: the oldest frames are left"
