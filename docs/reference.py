@@ -17,7 +17,10 @@ from typing import TYPE_CHECKING, Any, Final, Literal, get_args, get_origin
 from optipmb_service.session.problems import CODES
 from optipmb_service.settings import (
     FusedSettings,
+    InputSettings,
     LimitSettings,
+    MappingSettings,
+    MqttInput,
     MqttSettings,
     OutputSettings,
     Ros2Settings,
@@ -112,6 +115,7 @@ METRICS_OF: Final = {
     "Frames and problems": "log_lines_dropped_total",
     "Sessions and streams": "sessions",
     "gRPC": "grpc_open_calls",
+    "Senders of JSON": "inputs_frames_total",
     "Message log, MQTT and certificates": "message_log_written_total",
 }
 """Sections of the long tables, each by its first row."""
@@ -151,12 +155,14 @@ def settings() -> str:
         *(("fused.NAME.", FusedSettings), ("sensors.PATTERN.", SensorSettings)),
         *(("zones.NAME.", ZoneSettings), ("outputs.PATTERN.", OutputSettings)),
         *(("ros2.", Ros2Settings), ("ros2.streams.NAME.", Ros2Stream), ("mqtt.", MqttSettings)),
+        *(("inputs.PATTERN.", InputSettings), ("mqtt.inputs.STREAM.", MqttInput)),
+        ("mqtt.inputs.STREAM.mapping.", MappingSettings),
     )
     rows = {}
     for prefix, table in tables:
         meanings = docstrings(table)
         rows |= {
-            f"{prefix}{name}": _setting(f"{prefix}{name}", field, meanings[name])
+            f"{prefix}{name}": _setting(f"{prefix}{field.alias or name}", field, meanings[name])
             for name, field in table.model_fields.items()
             if f"{prefix}{name}" not in {"limits", "mqtt", "ros2"}
         }

@@ -199,6 +199,80 @@ class Ros2Settings(BaseModel):
     """topics by stream (`site/node/sensor`)"""
 
 
+PathText = Annotated[
+    str,
+    _form(
+        r"|= .+|@key|([^.\[\]*\s]+|\[\d+\])(\.[^.\[\]*\s]+|\[\d+\])*",
+        "a path looks like data.conf or box[0], a constant like '= car'",
+    ),
+]
+PathTexts = PathText | Annotated[tuple[PathText, ...], Field(min_length=2, max_length=3)]
+
+
+class MappingSettings(BaseModel):
+    """Where the objects of a payload are, and the paths of their fields below each object; empty: unknown."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, populate_by_name=True)
+
+    objects: Annotated[
+        str,
+        _form(
+            r"(\[\d*\]|[^.\[\]\s]+)(\.[^.\[\]\s]+|\[\d*\])*",
+            "a path of objects looks like data.targets[] or objects.*[]",
+        ),
+    ]
+    """path of the objects: names with dots, `[]` for each element, `*` for each value of a map"""
+    name: PathText = Field(alias="class", min_length=1)
+    """class; `= car`: a constant; `@key`: the key that `*` stood for"""
+    score: PathText = ""
+    """confidence"""
+    score_scale: float = Field(default=1.0, gt=0)
+    """factor of the confidence, as 0.01 for percent"""
+    position: PathTexts = ""
+    """centre, m: a path of a list, or a list with a path for x, y and z"""
+    size: PathTexts = ""
+    """length, width, height in m, likewise"""
+    yaw: PathText = ""
+    """heading counter-clockwise from x"""
+    velocity: PathTexts = ""
+    """velocity over ground, m/s, likewise"""
+    lat: PathText = ""
+    """latitude in degrees, in place of the position"""
+    lon: PathText = ""
+    """longitude in degrees"""
+    alt: PathText = ""
+    """height above the ellipsoid in m"""
+    heading: PathText = ""
+    """degrees clockwise from true north, in place of yaw"""
+    angle_unit: Literal["rad", "deg"] = "rad"
+    """unit of yaw"""
+    time: PathText = ""
+    """path of the time of the frame in the payload; default: arrival"""
+    time_unit: Literal["iso", "s", "ms", "us", "ns"] = "iso"
+    """form of the time: ISO 8601 text, or a number since 1970"""
+    time_zone: str = Field(default="", pattern=r"^(|Z|[+-]\d\d:\d\d)$")
+    """zone of ISO texts without one, as `+01:00`"""
+    frame: Literal["world", "sensor"] = "world"
+    """frame of all coordinates"""
+    pose: dict[Literal["translation", "quaternion"], tuple[float, ...]] | None = None
+    """pose of a fixed sensor whose frame is `sensor`: `{ translation = [x, y, z], quaternion = [w, x, y, z] }`"""
+
+
+class MqttInput(BaseModel):
+    """A topic of sensors whose payloads are detections of a stream."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    topic: str = Field(pattern=r"^[^#]+$", max_length=1024)
+    """topic; `+` stands for any part, which `{1}`, `{2}` … name in the stream"""
+    qos: Literal[0, 1, 2] = 1
+    """quality of service that the broker is asked for"""
+    format: Literal["optipmb", "mapped"] = "optipmb"
+    """form of payloads: frames as over HTTP, or those that `mapping` describes"""
+    mapping: MappingSettings | None = None
+    """paths of a payload, for the format `mapped`"""
+
+
 class MqttSettings(BaseModel):
     """An MQTT broker and its messages; used by `optipmb-service mqtt`."""
 
@@ -217,6 +291,8 @@ class MqttSettings(BaseModel):
     """what is published"""
     tracks_hz: float = Field(default=2.0, ge=0, le=1000)
     """highest rate of the tracks of a stream, in sensor time; 0: all frames"""
+    inputs: dict[str, MqttInput] = Field(default_factory=dict)
+    """topics that are read, by the stream that they feed, as `garage/gate/radar` or `garage/{1}/radar`"""
 
     @field_validator("streams")
     @classmethod
@@ -368,7 +444,7 @@ class OutputSettings(BaseModel):
 
 
 class InputSettings(BaseModel):
-    """How frames are read that come as JSON over HTTP."""
+    """How frames are read that come as JSON over HTTP or MQTT."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -716,6 +792,7 @@ def load(
     _check_fused(settings)
     _check_cluster(settings)
     _check_zones(settings)
+    _check_mqtt(settings)
     if settings.workers > 1 and settings.zenoh_config is not None and settings.is_router:
         # Its access control would be deaf to the workers, which come over a socket and without a certificate.
         raise SettingsInvalidError(
@@ -832,6 +909,37 @@ def _check_zones(settings: Settings) -> None:
     for pattern in {pattern for one in settings.zones.values() for pattern in one.streams}:
         if (count := len(settings.zones_of(pattern))) > MOST_ZONES:
             raise SettingsInvalidError(f"setting zones: at most {MOST_ZONES} for a session, {pattern} has {count}")
+
+
+def _check_mqtt(settings: Settings) -> None:
+    """Refuse input topics that are output topics or do not say their stream, and two for one stream.
+
+    Raises:
+        SettingsInvalidError: there are such.
+    """
+    seen: list[str] = []
+    for stream, one in settings.mqtt.inputs.items():
+        path, pattern = f"setting mqtt.inputs.{stream}", re.sub(r"\{\d\}", "*", stream)
+        try:
+            Keys().detections(pattern.replace("*", "x"))
+        except MessageError as error:
+            raise SettingsInvalidError(f"{path}: {error.expected}, received {stream!r}") from None
+        if other := next((each for each in seen if _overlap(each, pattern)), None):
+            raise SettingsInvalidError(f"{path}: one input for a stream, {other} has it, too")
+        seen.append(pattern)
+        parts = one.topic.split("/")
+        if any("+" in part and part != "+" for part in parts):
+            raise SettingsInvalidError(f"{path}.topic: + stands for a whole part, received {one.topic!r}")
+        wanted = {str(number) for number in range(1, parts.count("+") + 1)}
+        if set(re.findall(r"\{(\d)\}", stream)) != wanted:
+            numbers = ", ".join(f"{{{number}}}" for number in sorted(wanted)) or "no number in braces"
+            raise SettingsInvalidError(f"{path}.topic: a stream with {numbers} for {one.topic!r}")
+        output = re.escape(one.topic).replace(r"\+", "[^/]*")
+        kinds = (f"{settings.prefix}/x/x/x/{kind}" for kind in settings.mqtt.topics)
+        if one.topic.startswith(f"{settings.prefix}/") or any(re.fullmatch(output, kind) for kind in kinds):
+            raise SettingsInvalidError(f"{path}.topic: other topics than those that are published, {one.topic!r}")
+        if (one.format == "mapped") is not (one.mapping is not None):
+            raise SettingsInvalidError(f"{path}.mapping: with the format mapped, and only with it")
 
 
 def _read(file: Path) -> dict[str, Any]:

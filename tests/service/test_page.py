@@ -14,7 +14,7 @@ from optipmb_schemas import Code
 from optipmb_service.app import cli
 from optipmb_service.cluster import message_log, sqlite
 from optipmb_service.edges import inputs as edge_inputs
-from optipmb_service.edges import json_frames, mqtt, readers
+from optipmb_service.edges import json_frames, mqtt, mqtt_inputs, readers
 from optipmb_service.edges.grpc import calls, inputs, outputs
 from optipmb_service.edges.grpc.server import OPTIONS
 from optipmb_service.edges.http import detections, server
@@ -162,6 +162,8 @@ FIGURES = {
         f"for {mqtt.FORGET_S / 60:.0f} minutes what is as large",
         f"tries again after {mqtt.TAKEN_OVER_S:.0f} s",
         f"`http_senders` ({default('http_senders')})",
+        f"up to {mqtt_inputs.RECEIVED} with MQTT 5",
+        f"{mqtt_inputs.WAITING:,} messages with QoS 0",
         f"array of 1 to {json_frames.MOST_FRAMES} frames",
         f"up to {detections.WAIT_S:.0f} s; one frame",
         f"the body took longer than {detections.BODY_S:.0f} s",

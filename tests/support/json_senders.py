@@ -12,7 +12,7 @@ from typing import Any, Self
 from optipmb_schemas import Detections
 from optipmb_service.edges.http import Server, application
 from optipmb_service.settings import Settings, load
-from optipmb_service.telemetry.health import ProcessHealth, Reporter
+from optipmb_service.telemetry.health import Component, ProcessHealth
 from optipmb_service.telemetry.metrics import Metrics
 from optipmb_service.zenoh.client import Client
 
@@ -29,7 +29,7 @@ class Edge:
         self.settings: Settings = load(None, given).settings
         self.client = Client(self.settings)
         self.health = ProcessHealth("edge", Metrics())
-        self.health.report(Reporter(self.client))
+        self.health.report(Component(self.client))
         self._server = Server(
             application(self.health, self.settings), "127.0.0.1:0", self.settings.limits.max_json_bytes
         )

@@ -247,11 +247,23 @@ def mqtt_command(
     broker: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Broker; as mqtt://127.0.0.1:1883, or mqtts:// with TLS.")
     ] = None,
+    payload: Annotated[
+        Path | None, typer.Option("--try", metavar="FILE", help="Print what a payload becomes, and end.")
+    ] = None,
+    stream: Annotated[str, typer.Option("--input", metavar="STREAM", help="Stream in `mqtt.inputs`, of --try.")] = "",
     **given: Unpack[RouterOptions],
 ) -> None:
-    """Publish tracks and events as JSON to an MQTT broker, a client of routers. SIGINT and SIGTERM end it."""
+    """Connect a client of routers to an MQTT broker: tracks and events as JSON, detections. SIGINT, SIGTERM end it."""
     settings = _client({**given, "mqtt": broker and {"broker": broker}})
     _needed("optipmb_service.edges.mqtt", "mqtt")
+    if payload is not None:
+        from optipmb_service.edges.mqtt_inputs import tried  # noqa: PLC0415 - an extra that only this needs
+
+        try:
+            print(tried(settings, stream, payload.read_bytes()))  # noqa: T201 - it is what was asked for
+        except (OSError, ValueError) as error:
+            _wrong(str(error))
+        return
     leave_or_restart(asyncio.run(run_mqtt(settings)))
 
 

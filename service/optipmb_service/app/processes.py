@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
-from optipmb_service.app.lifecycle import grpc_edge, report_ready, run, run_client, unless
+from optipmb_service.app.lifecycle import grpc_edge, report_ready, run, run_client, sessions_of, unless
 from optipmb_service.telemetry.health import BEAT_S, Component
-from optipmb_service.telemetry.metrics import LOG_METRICS, MQTT_METRICS, PROBLEM_METRICS
+from optipmb_service.telemetry.metrics import INPUT_METRICS, LOG_METRICS, MQTT_METRICS, PROBLEM_METRICS
 from optipmb_service.zenoh.client import Client
 
 if TYPE_CHECKING:
@@ -53,8 +53,9 @@ async def run_mqtt(settings: Settings) -> int:
     from optipmb_service.edges.mqtt import Bridge  # noqa: PLC0415 - an extra that only this needs
 
     async def serve(asked: StopRequest, health: ProcessHealth, client: Client) -> None:
-        bridge = Bridge(settings, client)
+        bridge = Bridge(settings, client, sessions_of(settings))
         health.metrics.add(MQTT_METRICS, lambda: bridge)
+        health.metrics.add(INPUT_METRICS, lambda: bridge.inputs)
         running = asyncio.create_task(bridge.run())
         report_ready(settings, health, bridge, "mqtt", settings.mqtt.broker, broker=settings.mqtt.broker)
         stop = asyncio.create_task(asked.wait())

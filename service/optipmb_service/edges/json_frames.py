@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from optipmb import Georeference
+    from optipmb_service.edges.mapping import PayloadMapping
     from optipmb_service.settings import Settings
 
 MOST_FRAMES: Final = 256
@@ -103,26 +104,48 @@ class FrameReader:
         found = (one for pattern, one in self._inputs.items() if fnmatchcase(stream, pattern))
         return next(found, _USUAL)
 
-    def read(self, payload: bytes, stream: str = "") -> JsonFrame:
-        """Return the frame of a document; `stream` is what the address says.
+    def read(self, payload: bytes, stream: str = "", mapping: PayloadMapping | None = None) -> JsonFrame:
+        """Return the frame of a document.
+
+        Args:
+            payload: the document.
+            stream: what the address says; empty: nothing.
+            mapping: where its objects are, if it is of another maker.
 
         Raises:
             MessageError: it is not valid, with the path in the document.
         """
+        most = self._limits.max_json_bytes
+        if len(payload) > most:
+            raise schemas.MessageError("too_large", "", f"at most {most} bytes of JSON", f"{len(payload)} bytes")
         try:
-            frame = _frame.decode(payload)
+            if mapping is not None:
+                return self._mapped(msgspec.json.decode(payload), stream, mapping)
+            return self._made(_frame.decode(payload), stream)
         except msgspec.ValidationError as error:
             fields = codec.read_json_map(payload, self._limits, "a frame")
             if fields.keys() & {"center", "label"}:
                 return self._columns(fields, stream)
             raise _invalid(error, fields) from None
+        except schemas.MessageError:
+            raise
         except (ValueError, msgspec.DecodeError, RecursionError) as error:
             raise _malformed(error, payload) from None
-        given = {
-            name: value for name in EdgeDetections.__struct_fields__ if (value := getattr(frame, name)) is not None
-        }
+
+    def _mapped(self, payload: Any, stream: str, mapping: PayloadMapping) -> JsonFrame:
+        frame, places = mapping.frame(payload)
+        try:
+            return self._made(msgspec.convert(frame, EdgeDetections), stream)
+        except msgspec.ValidationError as error:
+            raise mapping.renamed(_invalid(error, frame), places) from None
+        except schemas.MessageError as error:
+            raise mapping.renamed(error, places) from None
+
+    def _made(self, frame: EdgeDetections, stream: str) -> JsonFrame:
+        values = ((name, getattr(frame, name)) for name in EdgeDetections.__struct_fields__)
+        given = {name: value for name, value in values if value is not None}
         header = _header(given, stream)
-        fields = {name: given[name] for name in MODEL if name in given}
+        fields: dict[str, Any] = {name: given[name] for name in MODEL if name in given}
         fields |= self._objects(frame.objects, header["stream"], frame.frame)
         try:
             message = schemas.Detections(**header, **fields)

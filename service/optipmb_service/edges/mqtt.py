@@ -15,6 +15,7 @@ import collections
 import contextlib
 import time
 from dataclasses import dataclass
+from functools import partial
 from math import inf
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 from urllib.parse import urlsplit
@@ -29,11 +30,14 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode, MQTTProtocolVersi
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
+from optipmb_service.edges.inputs import Inputs
+from optipmb_service.edges.mqtt_inputs import RECEIVED, MqttInputs
 from optipmb_service.edges.readers import Bounds, Feeds, Reader, Text, Wish, places_of
 from optipmb_service.telemetry.health import Component
 
 if TYPE_CHECKING:
     import ssl
+    from collections.abc import Callable
 
     from optipmb_service.edges.readers import Publication
     from optipmb_service.settings import Settings
@@ -93,9 +97,10 @@ class Link:
 
     Args:
         client: not connected yet.
+        take: takes a message, and a function that confirms it.
     """
 
-    def __init__(self, client: paho.Client) -> None:
+    def __init__(self, client: paho.Client, take: Callable[[Any, Callable[[], object]], None]) -> None:
         self._client = client
         self._loop = loop = asyncio.get_running_loop()
         self._under_way: dict[int, asyncio.Future[str]] = {}
@@ -106,7 +111,12 @@ class Link:
         client.on_disconnect = lambda _c, _d, _f, reason, _p: self._call(self._disconnected, reason)
         self.retained: asyncio.Queue[str] = asyncio.Queue()
         """Subscribed topics with a retained message."""
-        client.on_message = lambda _c, _d, one: self._call(self._heard, one.topic, one.retain)
+        self._take = take
+        self.denied: dict[str, str] = {}
+        """Why the broker refuses subscriptions, by topic."""
+        self._asked: dict[int, str] = {}
+        client.on_subscribe = lambda _c, _d, number, reasons, _p: self._call(self._subscribed, number, reasons)
+        client.on_message = lambda _c, _d, one: self._call(self._heard, one)
         client.on_publish = lambda _c, _d, number, reason, _p: self._call(self._published, number, reason)
 
     async def open(self, host: str, port: int) -> int:
@@ -115,8 +125,12 @@ class Link:
         Raises:
             LinkError: there is no connection.
         """
+        properties = None
+        if self._client.protocol == MQTTProtocolVersion.MQTTv5:
+            properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+            properties.ReceiveMaximum = RECEIVED
         try:
-            await asyncio.to_thread(self._client.connect, host, port)
+            await asyncio.to_thread(self._client.connect, host, port, properties=properties)
         except OSError as error:
             raise LinkError(str(error)) from None
         self._client.loop_start()
@@ -142,15 +156,18 @@ class Link:
         finally:
             del self._under_way[sent.mid]
 
-    def subscribe(self, pattern: str) -> None:
-        """Ask the broker for the topics of a pattern that have a retained message."""
-        self._client.subscribe(pattern, 1)
+    def subscribe(self, pattern: str, qos: int = 1) -> None:
+        """Ask the broker for the topics of a pattern."""
+        _, number = self._client.subscribe(pattern, qos)
+        if number is not None:
+            self._asked[number] = pattern
 
     async def close(self) -> None:
         self._client.disconnect()
         await asyncio.to_thread(self._client.loop_stop)
         # A client closes its sockets when nothing refers to it any more.
         self._client.on_connect = self._client.on_disconnect = self._client.on_message = self._client.on_publish = None
+        self._client.on_subscribe = None
 
     async def _answer(self, answer: asyncio.Future[T], seconds: float) -> T:
         await asyncio.wait((answer, self.ended), timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
@@ -175,9 +192,16 @@ class Link:
         if not self.ended.done():
             self.ended.set_result(error)
 
-    def _heard(self, topic: str, retain: bool) -> None:  # noqa: FBT001 - as paho has it
-        if retain:
-            self.retained.put_nowait(topic)
+    def _subscribed(self, number: int, reasons: list[Any]) -> None:
+        topic = self._asked.pop(number, "")
+        if why := next((str(reason) for reason in reasons if reason.is_failure), ""):
+            self.denied[topic] = why
+            log.warning("mqtt_refused", topic=topic, reason=why)
+
+    def _heard(self, message: Any) -> None:
+        if message.retain and message.topic.endswith(f"/{RETAINED}"):
+            self.retained.put_nowait(message.topic)
+        self._take(message, partial(self._client.ack, message.mid, message.qos))
 
     def _published(self, number: int, reason: Any) -> None:
         if (confirmed := self._under_way.get(number)) is not None and not confirmed.done():
@@ -203,13 +227,17 @@ class Bridge(Component):
     Args:
         settings: of the process.
         client: on the network; it is closed by the caller, after this.
+        sessions: returns the session that a stream feeds.
 
     Raises:
         ClientError: a certificate or the credentials cannot be used.
     """
 
-    def __init__(self, settings: Settings, client: Client) -> None:
+    def __init__(self, settings: Settings, client: Client, sessions: Callable[[str], str] = str) -> None:
         super().__init__(client)
+        self.inputs = Inputs(settings, client, "mqtt", sessions)
+        self._sources = MqttInputs(settings, self.inputs)
+        self._denied: dict[str, str] = {}
         self.connected = False
         self.published: collections.Counter[str] = collections.Counter()
         self.refused: collections.Counter[str] = collections.Counter()
@@ -256,8 +284,9 @@ class Bridge(Component):
         """Why nothing can be received or published, or not everything; empty while it can."""
         if self.unlinked or not self.connected:
             return self.unlinked or f"mqtt: {self._why}"
-        for topic, reason in tuple(self._refusing.items())[:1]:
-            return f"mqtt: {len(self._refusing)} topics are refused, as {topic}: {reason}"
+        refusing = self._refusing | self._denied
+        for topic, reason in tuple(refusing.items())[:1]:
+            return f"mqtt: {len(refusing)} topics are refused, as {topic}: {reason}"
         return ""
 
     async def run(self) -> None:
@@ -281,6 +310,7 @@ class Bridge(Component):
                     self._version = MQTTProtocolVersion.MQTTv311
             finally:
                 self.connected = False
+                self._sources.end()
                 await link.close()
             await asyncio.sleep(pause_s)
 
@@ -291,6 +321,9 @@ class Bridge(Component):
         self._note(self._alive, await link.publish(self._alive, b"1", 1, retain=True))
         self.connected, self._why = True, ""
         log.info("mqtt_connected", broker=self._mqtt.broker, protocol=self._version.name, most_bytes=self._most)
+        self._denied = link.denied
+        for topic, qos in self._sources.topics:
+            link.subscribe(topic, qos)
         publishing = asyncio.create_task(self._publish(link))
         clearing = asyncio.create_task(self._clear(link))
         try:
@@ -323,7 +356,11 @@ class Bridge(Component):
 
     def _link(self) -> Link:
         client = paho.Client(
-            CallbackAPIVersion.VERSION2, self._identifier, protocol=self._version, reconnect_on_failure=False
+            CallbackAPIVersion.VERSION2,
+            self._identifier,
+            protocol=self._version,
+            reconnect_on_failure=False,
+            manual_ack=True,
         )
         client.connect_timeout = ANSWER_S
         if self._user:
@@ -331,7 +368,7 @@ class Bridge(Component):
         if self._tls is not None:
             client.tls_set_context(self._tls)
         client.will_set(self._alive, b"0", 1, retain=True)
-        return Link(client)
+        return Link(client, self._sources.take)
 
     def _receive(self, one: Publication) -> None:
         """Take a message, on any thread."""

@@ -1,0 +1,145 @@
+"""Detections over MQTT: payloads of the topics of the settings become frames.
+
+The settings map topics to streams; no payload names another one. A message is confirmed when its frame has gone to the
+network, so the broker keeps what comes while that is away.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import re
+from typing import TYPE_CHECKING, Any, Final
+
+import optipmb_schemas as schemas
+import structlog
+from optipmb_client.errors import ConnectionFailed as TransportError
+
+from optipmb_service.edges.inputs import RefusedError
+from optipmb_service.edges.json_frames import FrameReader
+from optipmb_service.edges.mapping import PayloadMapping
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from optipmb_service.edges.inputs import Inputs
+    from optipmb_service.settings import MqttInput, Settings
+
+RECEIVED: Final = 64
+"""Unconfirmed messages that the broker may have under way to the bridge (MQTT 5)."""
+
+WAITING: Final = 1024
+"""Messages without confirmation (QoS 0) that may wait for the network; further ones are left out."""
+
+PAUSE_S: Final = 0.2
+"""Time until a frame that could not be sent is tried again."""
+
+log = structlog.get_logger("optipmb_service")
+
+
+class _Input:
+    """A row of the settings: which topics feed which streams, and how their payloads are read."""
+
+    def __init__(self, stream: str, topic: str, mapping: PayloadMapping | None) -> None:
+        self._stream = stream
+        self._topic = re.compile(re.escape(topic).replace(r"\+", "([^/]*)"))
+        self.mapping = mapping
+
+    def stream_of(self, topic: str) -> str | None:
+        """Return the stream that a topic feeds; None: another input has it."""
+        if (match := self._topic.fullmatch(topic)) is None:
+            return None
+        return re.sub(r"\{(\d)\}", lambda part: match[int(part[1])], self._stream)
+
+
+class MqttInputs:
+    """Takes the messages of input topics. Create and use it on one loop.
+
+    Args:
+        settings: with the inputs.
+        inputs: takes the frames.
+    """
+
+    def __init__(self, settings: Settings, inputs: Inputs) -> None:
+        self.topics = [(one.topic, one.qos) for one in settings.mqtt.inputs.values()]
+        self._frames = FrameReader(settings)
+        self._inputs = inputs
+        self._rows = [_Input(stream, one.topic, _mapping(one)) for stream, one in settings.mqtt.inputs.items()]
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    def take(self, message: Any, confirm: Callable[[], object]) -> None:
+        """Take a message of paho's; `confirm` is called when it is done with."""
+        if message.retain:  # it is old
+            confirm()
+            return
+        if not message.qos and len(self._tasks) >= WAITING:
+            self._inputs.refused["mqtt", "busy"] += 1
+            return
+        task = asyncio.create_task(self._taken(message, confirm))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    def end(self) -> None:
+        """Take nothing more."""
+        for task in self._tasks:
+            task.cancel()
+
+    async def _taken(self, message: Any, confirm: Callable[[], object]) -> None:
+        try:
+            with contextlib.suppress(schemas.MessageError):  # it is reported
+                await self._send(message)
+        except Exception:
+            log.exception("internal_error", topic=message.topic)  # one message must not end the others
+        confirm()
+
+    async def _send(self, message: Any) -> None:
+        """Send the frame of a message, as soon as that is possible.
+
+        Raises:
+            MessageError: it is not valid.
+        """
+        found = ((row, stream) for row in self._rows if (stream := row.stream_of(message.topic)) is not None)
+        row, stream = next(found)
+        try:
+            self._inputs.client.keys.detections(stream)
+        except schemas.MessageError as error:
+            self._inputs.report("", error)
+            raise
+        try:
+            frame = self._frames.read(message.payload, stream, row.mapping)
+        except schemas.MessageError as error:
+            self._inputs.report(stream, error)
+            raise
+        correlation = getattr(message.properties, "CorrelationData", b"")
+        while True:
+            try:
+                await self._inputs.send(frame, self._frames.rules(stream), correlation.hex())
+            except TransportError:
+                pass
+            except RefusedError as error:
+                if error.code != "busy":
+                    self._inputs.refused["mqtt", error.code] += 1
+                    return
+            else:
+                return
+            await asyncio.sleep(PAUSE_S)
+
+
+def _mapping(one: MqttInput) -> PayloadMapping | None:
+    return None if one.mapping is None else PayloadMapping(one.mapping)
+
+
+def tried(settings: Settings, name: str, payload: bytes) -> str:
+    """Return the detections that a payload of an input becomes, as JSON; `{1}` in its name stands for itself.
+
+    Raises:
+        ValueError: there is no such input, or the payload is not valid.
+    """
+    one = settings.mqtt.inputs.get(name)
+    if one is None:
+        raise ValueError(
+            f"option --input: one of {', '.join(settings.mqtt.inputs) or 'mqtt.inputs'}, received {name!r}"
+        )
+    stream = re.sub(r"\{(\d)\}", r"\1", name)
+    frame = FrameReader(settings).read(payload, stream, _mapping(one))
+    return schemas.encode_json(frame.message).decode()

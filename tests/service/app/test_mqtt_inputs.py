@@ -1,0 +1,197 @@
+"""Detections over MQTT: topics feed the streams of the settings, and payloads of other makers become frames."""
+
+import asyncio
+import contextlib
+import json
+import re
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from broker import mosquitto
+from json_senders import document, exists
+from optipmb_schemas import MessageError
+from optipmb_service.edges.json_frames import FrameReader
+from optipmb_service.edges.mapping import PayloadMapping
+from optipmb_service.settings import MappingSettings, Settings, SettingsInvalidError, load
+from optipmb_service.zenoh.client import Client
+from router import Node, Sensor, plain
+
+paho = pytest.importorskip("paho.mqtt.client")
+CallbackAPIVersion = pytest.importorskip("paho.mqtt.enums").CallbackAPIVersion
+mqtt = pytest.importorskip("optipmb_service.edges.mqtt")
+mqtt_inputs = pytest.importorskip("optipmb_service.edges.mqtt_inputs")
+
+SENSOR = Sensor()
+PAGE = Path(__file__).parents[3] / "docs/json.md"
+RADAR = {
+    "objects": "data.targets[]",
+    "class": "kind",
+    "score": "conf",
+    "score_scale": 0.01,
+    "position": ["pos.x", "pos.y"],
+    "yaw": "angle",
+    "angle_unit": "deg",
+    "time": "ts",
+    "time_unit": "ms",
+}
+
+
+@contextlib.contextmanager
+def publisher(address: str) -> Iterator[Any]:
+    client = paho.Client(CallbackAPIVersion.VERSION2, protocol=paho.MQTTv5)
+    connected = threading.Event()
+    client.on_connect = lambda *_: connected.set()
+    client.connect_async("127.0.0.1", int(address.rpartition(":")[2]))
+    client.reconnect_delay_set(0.1, 0.1)
+    client.loop_start()
+    assert connected.wait(60)
+    try:
+        yield client
+    finally:
+        client.disconnect()
+        client.loop_stop()
+        client.on_connect = None
+
+
+async def until(true: Callable[[], bool]) -> None:
+    async with asyncio.timeout(60):
+        while not true():  # noqa: ASYNC110 - nothing tells of it
+            await asyncio.sleep(0.01)
+
+
+def send(client: Any, topic: str, payload: Any, **options: Any) -> None:
+    text = payload if isinstance(payload, bytes) else json.dumps(payload).encode()
+    client.publish(topic, text, qos=1, **options).wait_for_publish(60)
+
+
+async def test_frames_over_mqtt_give_the_same_bytes(start: Any, tmp_path: Path) -> None:
+    """As over Zenoh; repeated and retained ones are left out, a wrong one is a problem and does not end the bridge."""
+    messages = [SENSOR.detections(seq) for seq in range(5)]
+    endpoint = start()[1]
+    with Node(endpoint) as node:
+        node.send(*messages)
+        expected = [plain(one) for one in await asyncio.to_thread(node.tracks, SENSOR.stream, len(messages))]
+    endpoint = start()[1]
+    inputs = {"site/{1}/lidar": {"topic": "sensors/+/det"}, "yard/late/lidar": {"topic": "late"}}
+    with mosquitto(tmp_path) as address, Node(endpoint) as node, publisher(address) as client:
+        send(client, "late", document(messages[0]), retain=True)
+        given = {"connect": [endpoint], "instance": "bridge", "mqtt": {"broker": address, "inputs": inputs}}
+        settings = load(None, given).settings
+        network = await asyncio.to_thread(Client, settings)
+        bridge = mqtt.Bridge(settings, network)
+        running = asyncio.create_task(bridge.run())
+        await until(lambda: bridge.connected)
+        send(client, "sensors/node/det", b'{"objects": [{"class": 1}]}')
+        send(client, "sensors/no de/det", document(messages[0]))
+        assert (await asyncio.to_thread(node.problem, SENSOR.stream, "invalid_value")).path == "objects[0].class"
+        for one in messages:
+            for _ in range(2):
+                send(client, "sensors/node/det", document(one, "epoch", "seq"))
+        for _ in range(2):
+            send(client, "sensors/node/det", document(SENSOR.detections(len(messages))))
+        tracks = await asyncio.to_thread(node.tracks, SENSOR.stream, len(messages))
+        await until(lambda: bridge.inputs.duplicates["mqtt"] == 1)
+        assert [plain(one) for one in tracks[: len(messages)]] == expected
+        assert sum(bridge.inputs.refused.values()) == 2
+        assert bridge.inputs.frames["mqtt"] == 2 * len(messages) + 1, "the retained one is old"
+        running.cancel()
+        await asyncio.wait([running])
+        await asyncio.to_thread(network.close)
+
+
+def read(settings: dict[str, Any], payload: Any) -> Any:
+    text = payload if isinstance(payload, bytes) else json.dumps(payload).encode()
+    return FrameReader(Settings()).read(text, SENSOR.stream, PayloadMapping(MappingSettings(**settings)))
+
+
+def test_a_payload_of_another_maker_becomes_a_frame() -> None:
+    """Paths, percent, degrees, milliseconds; no targets are an empty frame."""
+    target = {"kind": "car", "conf": 90, "pos": {"x": 1.5, "y": 2}, "angle": 90, "more": [1]}
+    frame = read(
+        RADAR, {"ts": 1_795_766_400_250, "data": {"targets": [target, {"kind": "car", "pos": {"x": 0, "y": 0}}]}}
+    )
+    message = frame.message
+    assert frame.is_stamped
+    assert message.stamp_ns == 1_795_766_400_250_000_000
+    np.testing.assert_allclose(message.center, [[1.5, 2, np.nan], [0, 0, np.nan]])
+    np.testing.assert_allclose(message.score, [0.9, 1.0])
+    np.testing.assert_allclose(message.yaw, [np.pi / 2, np.nan])
+    assert len(read(RADAR, {"ts": 1, "data": {"targets": []}}).message.label) == 0
+
+
+def test_a_map_of_classes_and_a_fixed_sensor() -> None:
+    """`*` and `@key` take classes from the keys of a map; a time of a zone; the pose of the settings."""
+    pose = {"translation": [1, 2, 3], "quaternion": [1, 0, 0, 0]}
+    settings = {"objects": "objects.*[]", "class": "@key", "position": "at", "time": "t", "time_zone": "+01:00"}
+    payload = {"t": "2026-11-27T09:00:00", "objects": {"car": [{"at": [1, 2, 3]}], "bus": [], "van": [{"at": [4, 5]}]}}
+    message = read(settings | {"frame": "sensor", "pose": pose}, payload).message
+    assert message.labels == ("car", "van")
+    assert message.stamp_ns == 1_795_766_400_000_000_000
+    assert message.pose is not None
+    assert read(settings | {"class": "= bus"}, payload).message.labels == ("bus",)
+
+
+@pytest.mark.parametrize(
+    ("payload", "path"),
+    [
+        ({"ts": 1}, "data"),
+        ({"ts": 1, "data": {"targets": {}}}, "data.targets"),
+        ({"data": {"targets": []}}, "ts"),
+        ({"ts": "1", "data": {"targets": []}}, "ts"),
+        ({"ts": 1, "data": {"targets": [{"pos": {"x": 1, "y": 1}}]}}, "data.targets[0].kind"),
+        ({"ts": 1, "data": {"targets": [{"kind": "car", "pos": {"x": 1, "y": "1"}}]}}, "data.targets[0].pos.y"),
+        ({"ts": 1, "data": {"targets": [{"kind": "car"}]}}, "data.targets[0]"),
+        (
+            {"ts": 1, "data": {"targets": [{"kind": "car", "pos": {"x": 1, "y": 1}, "conf": 200}]}},
+            "data.targets[0].conf",
+        ),
+        (b"{", ""),
+        (b"[" * 100_000, ""),
+    ],
+)
+def test_an_error_names_the_path_in_the_payload(payload: Any, path: str) -> None:
+    """Of the sender's document, not of ours."""
+    with pytest.raises(MessageError) as raised:
+        read(RADAR, payload)
+    assert raised.value.path == path
+    assert isinstance(payload, bytes) or exists(path, json.dumps(payload).encode())
+
+
+@pytest.mark.parametrize(
+    ("inputs", "path"),
+    [
+        ({"a/b": {"topic": "x"}}, "mqtt.inputs.a/b"),
+        ({"a/b/c": {"topic": "x/+"}}, "mqtt.inputs.a/b/c.topic"),
+        ({"a/{1}/c": {"topic": "x"}}, "mqtt.inputs.a/{1}/c.topic"),
+        ({"a/{1}/c": {"topic": "x/+"}, "a/b/c": {"topic": "y"}}, "mqtt.inputs.a/b/c"),
+        ({"a/b/c": {"topic": "optipmb/v1/a/b/c/tracks"}}, "mqtt.inputs.a/b/c.topic"),
+        ({"a/b/c": {"topic": "x", "format": "yaml"}}, "mqtt.inputs.a/b/c.format"),
+        ({"a/b/c": {"topic": "x", "format": "mapped"}}, "mqtt.inputs.a/b/c.mapping"),
+        (
+            {"a/b/c": {"topic": "x", "format": "mapped", "mapping": {"objects": "a b", "class": "c"}}},
+            "mqtt.inputs.a/b/c.mapping.objects",
+        ),
+    ],
+)
+def test_inputs_that_cannot_work_are_refused(inputs: Any, path: str) -> None:
+    """At the start, with the path in the settings."""
+    with pytest.raises(SettingsInvalidError, match=f"^setting {re.escape(path)}\\b"):
+        load(None, {"mqtt": {"inputs": inputs}})
+
+
+def test_the_settings_of_the_page(tmp_path: Path) -> None:
+    """They are accepted as they stand; --try shows what a payload becomes."""
+    text = PAGE.read_text(encoding="utf-8")
+    file = tmp_path / "settings.toml"
+    file.write_text(re.findall(r"```toml\n(\[mqtt\.inputs.*?)```", text, re.DOTALL)[0])
+    settings = load(file).settings
+    payload = re.findall(r"```json\n(\{\"ts\".*?)```", text, re.DOTALL)[0]
+    (name,) = [name for name, one in settings.mqtt.inputs.items() if one.mapping]
+    made = json.loads(mqtt_inputs.tried(settings, name, payload.encode()))
+    assert (made["labels"], made["score"]) == (["car"], [0.9])
+    with pytest.raises(ValueError, match="option --input"):
+        mqtt_inputs.tried(settings, "a/b/c", b"{}")
