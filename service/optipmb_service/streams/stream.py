@@ -525,36 +525,39 @@ class Stream:
         return True
 
     def _load(self) -> None:
-        """Have the session restored on the thread of the store, and missed frames read from the log."""
-        streams, fence = self._streams, self._member.fence(self.name)
-        taken: list[Checkpoint] = []
+        """Have the session restored, then missed frames read from the log, then `_on_loaded` called."""
+        fence = self._member.fence(self.name)
+        self._streams.checkpoints.recall(
+            self.name, partial(self._restore, fence), partial(self._fetch, fence), self._note_unread
+        )
 
-        def restore(checkpoint: Checkpoint) -> Session:
-            now_ns = time.monotonic_ns()
-            if self._unread != Incarnation():
-                raise CheckpointError("older than one of another format, whose ids would be given out again")
-            taken[:] = [checkpoint]
-            if checkpoint.fused is not self.fused:
-                raise CheckpointError(f"of {'several streams' if checkpoint.fused else 'one stream'}, by `fuse` then")
-            return Session.restore(
-                checkpoint, now_ns, self._policy, fence=fence or 1, instance=streams.instance, tracker=streams.tracker
-            )
+    def _restore(self, fence: int | None, checkpoint: Checkpoint) -> tuple[Session, Checkpoint]:
+        """Return the session of a checkpoint; on the thread of the store."""
+        now_ns, streams = time.monotonic_ns(), self._streams
+        if self._unread != Incarnation():
+            raise CheckpointError("older than one of another format, whose ids would be given out again")
+        if checkpoint.fused is not self.fused:
+            raise CheckpointError(f"of {'several streams' if checkpoint.fused else 'one stream'}, by `fuse` then")
+        session = Session.restore(
+            checkpoint, now_ns, self._policy, fence=fence or 1, instance=streams.instance, tracker=streams.tracker
+        )
+        return session, checkpoint
 
-        def unread(incarnation: Incarnation) -> None:
-            self._unread = self._unread.after(incarnation)
+    def _note_unread(self, incarnation: Incarnation) -> None:
+        self._unread = self._unread.after(incarnation)
 
-        def load(restored: Session | None) -> None:
-            def loaded(packets: list[Packet]) -> None:
-                self.backlog.recover(packets)
-                self.backlog.command(partial(self._on_loaded, restored, fence), urgent=True)
+    def _fetch(self, fence: int | None, found: tuple[Session, Checkpoint] | None) -> None:
+        """Read the frames after a checkpoint from the log, if there is one; on the thread of the store."""
+        restored, checkpoint = found or (None, None)
 
-            if streams.log is None:
-                loaded([])
-            else:
-                checkpoint = taken[-1] if restored and taken else None
-                streams.log.fetch(self.name, checkpoint, loaded, self.backlog.recover)
+        def loaded(packets: list[Packet]) -> None:
+            self.backlog.recover(packets)
+            self.backlog.command(partial(self._on_loaded, restored, fence), urgent=True)
 
-        streams.checkpoints.recall(self.name, restore, load, unread)
+        if self._streams.log is None:
+            loaded([])
+        else:
+            self._streams.log.fetch(self.name, checkpoint, loaded, self.backlog.recover)
 
     def _on_loaded(self, restored: Session | None, fence: int | None) -> None:
         """Begin a session, or go on with the one that was kept, unless the stream was lost."""
