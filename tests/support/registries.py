@@ -53,9 +53,6 @@ class Around:
     def forget(self, _: str) -> None:
         """Nothing is still to be written."""
 
-    def awaited(self, *_: object) -> dict[str, bool]:
-        return {}
-
     def holds(self, _: str) -> bool:
         return True
 
@@ -94,6 +91,7 @@ def streams_of(
         Settings(instance="test", store="none", step_limit_s=60, **settings),  # kernels may have to be compiled
         profiles or Profiles.read("nuscenes", {}),
         open_publisher=parts.open_publisher,
+        ask_cache=lambda *_: None,
         reporter=reporter or ProblemReporter(lambda _: None),
         scheduler=parts,
         member=parts,
@@ -104,7 +102,6 @@ def streams_of(
         tracker=tracker,
     )
     streams.traces = traces
-    streams.caches = parts
     return streams
 
 

@@ -112,6 +112,7 @@ class Service(Component):
             settings,
             profiles,
             open_publisher=self._transport.open_publisher,
+            ask_cache=self._transport.ask_cache,
             reporter=self._reporter,
             scheduler=self._scheduler,
             member=self._member,
@@ -128,7 +129,6 @@ class Service(Component):
             self._transport,
             standby=not settings.cluster,
             linger_s=settings.lease_s,
-            idle_s=settings.idle_s,
         )
         self._metrics.add(PROBLEM_METRICS | STREAM_METRICS, self._figures)
         self._metrics.add(NETWORK_METRICS, self.client)

@@ -27,7 +27,6 @@ import structlog
 
 from optipmb_service.cluster.leases import PARTITIONS, Change, partition_of
 from optipmb_service.session.values import SECOND
-from optipmb_service.streams.directory import StreamDirectory
 from optipmb_service.zenoh.inputs import Input
 
 if TYPE_CHECKING:
@@ -77,22 +76,15 @@ class Intake:
         inputs: the network.
         standby: whether detections that no cache holds are received for a takeover.
         linger_s: how long streams are received whose partition was left, unless its holder has asked before.
-        idle_s: silence after which a stream without a token is announced no longer.
     """
 
-    def __init__(
-        self, streams: Streams, member: Member, inputs: Transport, *, standby: bool, linger_s: float, idle_s: float
-    ) -> None:
+    def __init__(self, streams: Streams, member: Member, inputs: Transport, *, standby: bool, linger_s: float) -> None:
         self._streams = streams
         self._member = member
         self._inputs = inputs
         self._standby = standby
         self._linger_ns = round(linger_s * SECOND)
-        session_of = streams.fusion.session_of
-        self._directory = StreamDirectory(
-            streams.instance, round(idle_s * SECOND), lambda stream: streams.tracked(session_of(stream))
-        )
-        streams.caches = self
+        self._directory = streams.directory
         self._subscribed: set[Input] = set()
         self._known: dict[str, bool] = {}
         """The streams whose inputs are in line, each with whether its publisher has a cache."""
@@ -174,24 +166,6 @@ class Intake:
         """Wait until the next members have asked for the partitions left here; False after `timeout` seconds."""
         with self._given:
             return self._given.wait_for(lambda: not self._owed, timeout)
-
-    def awaited(self, session: str, sensors: Iterable[str]) -> dict[str, bool]:
-        """Return the streams of a session whose caches may hold something, each with whether its publisher is there.
-
-        Args:
-            session: its name.
-            sensors: streams that were there before; their publishers may come back.
-        """
-        session_of = self._streams.fusion.session_of
-        common = self._streams.fusion.feeds(session)
-        return self._directory.awaited(common, lambda one: session_of(one) == session, sensors, time.monotonic_ns())
-
-    def ask_cache(self, stream: str, then: Callable[[list[Packet], bool], None]) -> None:
-        """Call `then` soon with what the caches of a stream hold, all frames, and with whether all have answered.
-
-        It is called on a thread that it must not keep.
-        """
-        self._inputs.ask_cache(stream, then)
 
     # From the network
 

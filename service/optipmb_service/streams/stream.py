@@ -468,10 +468,13 @@ class Stream:
             return
         now_ns, arrivals = time.monotonic_ns(), session.arrivals
         if self.fused:
-            caches = self._streams.caches.awaited(self.name, session.sensors)
+            streams, fusion = self._streams, self._streams.fusion
+            caches = streams.directory.awaited(
+                fusion.feeds(self.name), lambda one: fusion.session_of(one) == self.name, session.sensors, now_ns
+            )
             for stream in arrivals.to_ask(caches):
                 with contextlib.suppress(TransportError):  # the end
-                    self._streams.caches.ask_cache(stream, partial(self._take_cached, arrivals, stream))
+                    streams.ask_cache(stream, partial(self._take_cached, arrivals, stream))
             if not arrivals.complete(caches, now_ns):
                 return
         self._changed = True

@@ -26,6 +26,7 @@ from optipmb_service.session.problems import problem_of
 from optipmb_service.session.values import SECOND, Policy
 from optipmb_service.streams.admission import Admission
 from optipmb_service.streams.backlog import MEGABYTE, Backlog, Bounds, ByteBudget
+from optipmb_service.streams.directory import StreamDirectory
 from optipmb_service.streams.profiles import FUSED, Fusion
 from optipmb_service.streams.stream import Stream
 
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     from optipmb_service.session.checkpoint import Checkpoint
     from optipmb_service.session.values import Incarnation
     from optipmb_service.settings import Settings
-    from optipmb_service.streams.intake import Intake
     from optipmb_service.streams.persistence import CheckpointWriter
     from optipmb_service.streams.profiles import Profiles
     from optipmb_service.streams.recovery import Log
@@ -94,6 +94,7 @@ class Streams:
         settings: in force.
         profiles: the parameters that can be had.
         open_publisher: opens the publishers of a stream (`Transport.open_publisher`).
+        ask_cache: asks the caches of a stream (`Transport.ask_cache`).
         reporter: takes problems.
         scheduler: runs the streams.
         member: knows which streams are tracked here.
@@ -105,15 +106,13 @@ class Streams:
         traces: records spans of frames, where it is asked for.
     """
 
-    caches: Intake
-    """Publishers' caches; set before anything is received."""
-
     def __init__(  # noqa: PLR0913 - the parts that it brings together
         self,
         settings: Settings,
         profiles: Profiles,
         *,
         open_publisher: Callable[..., StreamPublisher],
+        ask_cache: Callable[[str, Callable[[list[Packet], bool], None]], None],
         reporter: ProblemReporter,
         scheduler: Scheduler,
         member: Member,
@@ -126,6 +125,7 @@ class Streams:
     ) -> None:
         self.profiles = profiles
         self.open_publisher = open_publisher
+        self.ask_cache = ask_cache
         self.reporter = reporter
         self.scheduler = scheduler
         self.member = member
@@ -138,6 +138,11 @@ class Streams:
         self.instance = settings.instance
         self.keys = schemas.Keys(settings.prefix)
         self.fusion = Fusion.of(settings)
+        self.directory = StreamDirectory(
+            settings.instance,
+            round(settings.idle_s * SECOND),
+            lambda stream: self.tracked(self.fusion.session_of(stream)),
+        )
         self.limits = settings.limits.limits()
         self.policy = policy_of(settings)
         self._zone = cache(settings.zone)

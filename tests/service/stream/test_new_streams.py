@@ -128,8 +128,9 @@ def member_of(network: Network, held: set[int]) -> tuple[Intake, Any]:
         take_up=lambda *_: None,
         changed=lambda *_: None,
     )
+    streams.directory = directory.StreamDirectory("m", 3600 * SECOND, streams.tracked)
     untyped: Any = streams, Holding(held), network
-    return Intake(*untyped, standby=False, linger_s=10.0, idle_s=3600.0), streams
+    return Intake(*untyped, standby=False, linger_s=10.0), streams
 
 
 class Turning:
