@@ -12,7 +12,7 @@ KITTI = --dataset kitti --root $(DATA)/kitti --detections pointrcnn
 NUSCENES = --dataset nuscenes --root $(DATA)/nuscenes --detections centerpoint
 
 FUZZ_TARGETS := fuzz-messages fuzz-checkpoints fuzz-protobuf
-.PHONY: help kernels dist docs pictures release image demo-files demo test accuracy alone bounds ray bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests check mutants lowest paths pythons repeat schemas wheel clean tune ablate
+.PHONY: help kernels dist docs pictures release image demo-files compare demo test accuracy alone bounds ray bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests check mutants lowest paths pythons repeat schemas wheel clean tune ablate
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
 	@echo "make install a virtual environment with everything, and compiled kernels"
@@ -30,6 +30,7 @@ help:
 	@echo "make repeat  run make test N=10 times in fresh clones, with LOAD=0 processes that compute beside it"
 	@echo "make bench   time the tracker, its kernels, the codec and the service, beside the saved baseline"
 	@echo "make figures measure the tracker's figures of docs/performance.md, beside other trackers, and write the page"
+	@echo "make compare evaluate the tracks of two other trackers beside ours, on the sample"
 	@echo "make load    measure what the service carries on this machine, as docs/performance.md has it"
 	@echo "make kills   kill the service a hundred times while recorded frames stream through it, and compare (needs KITTI)"
 	@echo "make soak    load the service for an hour, and see that nothing grows and every message is counted"
@@ -206,8 +207,16 @@ baseline: install
 PEERS := out/peers
 $(PEERS)/.installed:
 	$(PYTHON) -m venv $(PEERS)
-	$(PEERS)/bin/python -m pip install --quiet "stonesoup==1.9.*" "motpy==0.0.10" "norfair==2.*"
+	$(PEERS)/bin/python -m pip install --quiet "stonesoup==1.9.*" "norfair==2.*" "trackers==2.*"
 	touch $@
+
+COMPARED := out/compare
+compare: install $(PEERS)/.installed
+	mkdir -p $(COMPARED)
+	$(BIN)/optipmb track examples/crossing.csv --out $(COMPARED)/optipmb --full
+	$(PEERS)/bin/python benchmarks/peer_tracks.py examples/crossing.csv $(COMPARED)
+	$(BIN)/optipmb evaluate examples/crossing.csv --truth examples/crossing_truth.csv --tracks $(COMPARED)/optipmb \
+		--tracks $(COMPARED)/norfair.csv --tracks $(COMPARED)/bytetrack.csv --plot $(COMPARED)/compared.png
 
 figures: install $(PEERS)/.installed
 	mkdir -p out

@@ -1,20 +1,20 @@
 """Other trackers from PyPI on the same scenes: `python benchmarks/peers.py [SIZE...]`, in an environment of their own.
 
     python -m venv out/peers
-    out/peers/bin/pip install stonesoup motpy norfair
+    out/peers/bin/pip install stonesoup norfair trackers
     out/peers/bin/python benchmarks/peers.py
 
 Prints one JSON object: tracker, objects, and the milliseconds of processor time of each frame after the first few.
 What a tracker needs as input (its own detection objects) is made before the clock starts. A tracker that needs longer
 than `PATIENCE_S` for a frame is not given larger scenes. Each is set up as its documentation shows, with a gate of 4 m
-and prediction over the period of the scene; none of them receives the classes, most have no oriented boxes.
+and prediction over the period of the scene; none of them receives the classes, most have no oriented boxes. BoxMOT
+is not among them: it needs torch with the libraries of CUDA, several GB for trackers that run without.
 """
 
 from __future__ import annotations
 
 import datetime as dt
 import json
-import logging
 import sys
 import time
 from typing import TYPE_CHECKING, Any
@@ -80,20 +80,19 @@ def stone_soup(_: int) -> tuple[Callable[[SceneFrame], Any], Step]:
     return prepare, step
 
 
-def motpy(_: int) -> tuple[Callable[[SceneFrame], Any], Step]:
-    """Constant velocity, Hungarian algorithm on the overlap of boxes that are parallel to the axes."""
-    from motpy import Detection, MultiObjectTracker
+def bytetrack(_: int) -> tuple[Callable[[SceneFrame], Any], Step]:
+    """ByteTrack of the package trackers: Kalman filter of boxes in an image, two rounds of the Hungarian algorithm."""
+    from supervision import Detections
+    from trackers import ByteTrackTracker
 
-    logging.getLogger("motpy").setLevel(logging.ERROR)
-    model = {"order_pos": 1, "dim_pos": 2, "order_size": 0, "dim_size": 2, "q_var_pos": 10.0, "r_var_pos": 0.1}
-    tracker = MultiObjectTracker(dt=PERIOD_S, model_spec=model)
+    tracker = ByteTrackTracker(frame_rate=1.0 / PERIOD_S, minimum_iou_threshold=0.05)
 
-    def prepare(frame: SceneFrame) -> list[Any]:
+    def prepare(frame: SceneFrame) -> Any:
         low, high = frame.center[:, :2] - frame.size[:, :2] / 2, frame.center[:, :2] + frame.size[:, :2] / 2
-        boxes = np.hstack([low, high])
-        return [Detection(box=box, score=score) for box, score in zip(boxes, frame.score, strict=True)]
+        none = np.zeros(len(low), dtype=int)
+        return Detections(np.hstack([low, high]), confidence=np.asarray(frame.score), class_id=none)
 
-    return prepare, tracker.step
+    return prepare, tracker.update
 
 
 def norfair(_: int) -> tuple[Callable[[SceneFrame], Any], Step]:
@@ -108,7 +107,7 @@ def norfair(_: int) -> tuple[Callable[[SceneFrame], Any], Step]:
     return prepare, lambda detections: tracker.update(detections=detections)
 
 
-PEERS = {"Stone Soup": stone_soup, "motpy": motpy, "norfair": norfair}
+PEERS = {"Stone Soup": stone_soup, "ByteTrack": bytetrack, "norfair": norfair}
 
 
 def timed(peer: Callable[[int], tuple[Callable[[SceneFrame], Any], Step]], objects: int) -> list[float]:

@@ -95,16 +95,21 @@ def test_the_tracks_that_are_shown_are_the_confirmed_ones(bench: Bench) -> None:
 
 
 def test_trackers_are_compared_by_mota_and_identity_switches(bench: Bench) -> None:
-    """A row for each tracker begins with MOTA in percent and identity switches of the tracks that it shows."""
+    """A row for each tracker begins with MOTA, switches and IDF1 of the tracks it shows; bars are drawn of them."""
     late = np.where(cars()["t"] < 2.0, cars()["id"], cars()["id"] + 2)
     bench.evaluate(cars(), cars())
     tables = [bench.table("changes.csv", cars(id=late)), bench.folder / "truth.csv"]
     asked = ("--truth", bench.folder / "truth.csv", *(word for one in tables for word in ("--tracks", one)))
-    lines = bench.run("evaluate", bench.folder / "d.csv", *asked).stdout.splitlines()
+    drawn = bench.folder / "drawn.png"
+    lines = bench.run("evaluate", bench.folder / "d.csv", *asked, "--plot", drawn).stdout.splitlines()
+    assert drawn.read_bytes()[1:4] == b"PNG"
     head = next(place for place, line in enumerate(lines) if line.startswith("tracks"))
-    assert lines[head].split()[1:4] == ["MOTA", "IDS", "HOTA"]
-    rows = [line.split()[1:3] for line in lines[head + 1 : head + 3]]
-    assert rows == [["98.00", "2"], ["100.00", "0"]]
+    assert lines[head].split()[1:5] == ["MOTA", "IDS", "IDF1", "HOTA"]
+    rows = [line.split()[1:4] for line in lines[head + 1 : head + 3]]
+    assert rows == [["98.00", "2", "60.00"], ["100.00", "0", "100.00"]]
+    done = bench.run("evaluate", bench.folder / "d.csv", *asked[:4], "--plot", drawn)
+    assert done.returncode == 2
+    assert "expected a .png of several --tracks" in done.stderr
 
 
 def test_the_unit_of_time_reaches_truth_and_own_tracks(bench: Bench) -> None:

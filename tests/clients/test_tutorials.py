@@ -75,6 +75,16 @@ def test_coming_from_another_tracker(capsys: pytest.CaptureFixture[str]) -> None
     assert run("docs/migrate.md", "norfair, motpy, SORT", capsys).splitlines()[-1].startswith("[1] [[3.2")
 
 
+def test_trackers_side_by_side(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The commands of the page compare two tables of tracks, and draw them."""
+    text = (ROOT / "docs/compare.md").read_text()
+    for line in re.findall(r"^```sh\n(.*?)^```", text, re.DOTALL | re.MULTILINE)[0].splitlines():
+        done = run_here(capsys, *shlex.split(line)[1:])
+        assert done.returncode == 0, done.stderr
+    assert done.stdout.count("online.csv") == 3
+    assert (folder / "compared.png").stat().st_size > 10_000
+
+
 def test_tuning(capsys: pytest.CaptureFixture[str]) -> None:
     """A profile is estimated, loads, and tracks a scene that it has not seen."""
     pytest.importorskip("optuna")

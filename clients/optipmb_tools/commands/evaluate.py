@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class MatchingOptions:
-    """Options of how boxes are compared."""
+    """Options of how boxes are compared, and figures drawn."""
 
     iou: Annotated[
         float | None, typer.Option(min=0.0, max=1.0, help="Boxes match from this 3D intersection over union on.")
@@ -42,6 +42,9 @@ class MatchingOptions:
     ] = None
     cutoff: Annotated[float, typer.Option(min=0.01, help="Cut-off distance of GOSPA and OSPA, in metres.")] = 2.0
     order: Annotated[float, typer.Option(min=1.0, help="Order of GOSPA and OSPA.")] = 2.0
+    plot: Annotated[
+        Path | None, typer.Option("--plot", help="With several --tracks: also draw their figures, as a .png.")
+    ] = None
 
     def rules(self, dataset: str) -> "Rules":
         """Return the rules of CLEAR MOT."""
@@ -102,8 +105,10 @@ def evaluate(
     The best threshold is the one on the mean score of a track that gives the highest MOTA.
     """
     needed("optipmb evaluate", "evaluation", "scipy")
-    from optipmb_tools.commands.tables import comparison_tables  # noqa: PLC0415  loads the solvers of scipy
+    from optipmb_tools.commands.tables import comparison_tables, shares  # noqa: PLC0415  loads the solvers of scipy
 
+    if how.plot is not None and (len(tracks) == 1 or how.plot.suffix != ".png"):
+        raise UsageError(f"--plot {how.plot}: expected a .png of several --tracks, received {len(tracks)} of them")
     more = {"tracks": " ".join(map(str, tracks))} if data.named()[0] == "table" else {}
     opened = data.open(**more)
     column = _column(by, opened.name)
@@ -122,9 +127,13 @@ def evaluate(
         print_json({**report, "trackers": {place: one.parts for place, one in reports.items()}})
     elif as_json:
         print_json({**report, "tracks": tracks[0], **first.parts})
-    else:
-        distinct = len({one.name for one in tracks}) == len(reports)
-        compared = {Path(one).name if distinct else one: (each.clear, each.figures) for one, each in reports.items()}
+    distinct = len({one.name for one in tracks}) == len(reports)
+    compared = {Path(one).name if distinct else one: (each.clear, each.figures) for one, each in reports.items()}
+    if how.plot is not None:
+        from optipmb_tools.views.comparison import draw_comparison  # noqa: PLC0415  an extra
+
+        draw_comparison(how.plot, shares(compared))
+    if not as_json:
         shown = comparison_tables(compared) if others else first.tables
         for table in shown:
             print_table(table)
@@ -156,7 +165,9 @@ class _Evaluated:
             parts = self.parts["classes"][one.name]
             official = parts.get("nuscenes")
             known = official or parts["confirmed"] or (one.ab3dmot[0].summary() if one.ab3dmot else parts["best"])
-            found[one.name] = {title: known[title.lower() if official else title] for title in ("MOTA", "IDS")}
+            found[one.name] = {
+                title: known.get(title.lower() if official else title) for title in ("MOTA", "IDS", "AMOTA")
+            }
         return found
 
 

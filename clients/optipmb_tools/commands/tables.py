@@ -10,7 +10,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from optipmb_tools.evaluation.figures import FIGURES, cell
+from optipmb_tools.evaluation.figures import FIGURES, cell, defined
 
 if TYPE_CHECKING:
     from optipmb_tools.evaluation import ClassResult
@@ -28,8 +28,9 @@ _NUSCENES = ("amota", "amotp", "recall", "mota", "motp", "gt", "tp", "fp", "fn",
 _HOTA = ("HOTA", "DetA", "AssA")
 _DIRECTIONS = ("along", "across", "height", "heading", "length", "width", "tall")
 _GOSPA = ("GOSPA", "localisation", "missed", "false", "OSPA")
-_COMPARED = ("MOTA", "IDS")
-_DISTANCES = ("GOSPA", "OSPA", "localisation", "missed", "false")
+_COMPARED = ("AMOTA", "MOTA", "IDS", "IDF1", "HOTA", "DetA", "AssA", "LocA", "GOSPA", "OSPA", "localisation", "missed",
+             "false", "velocity_error", "NEES", "coverage")  # fmt: skip
+_DRAWN = ("AMOTA", "MOTA", "IDF1", "HOTA", "DetA", "AssA")
 SETS = "tracks"  # which of them a row is about
 
 
@@ -91,18 +92,40 @@ def figure_tables(
 
 
 def comparison_tables(trackers: "Mapping[str, Compared]") -> Iterator[RenderableType]:
-    """Yield a table for each class with the figures of several trackers, of the tracks that a picture shows."""
-    for name in dict.fromkeys(one.name for _, figures in trackers.values() for one in figures):
-        table = _empty(("tracks", *_COMPARED, *_HOTA, "LocA", *_DISTANCES))
-        for place, (clear, figures) in trackers.items():
-            for one in (one.confirmed or one.best or one.everything for one in figures if one.name == name):
-                table.add_row(
-                    place,
-                    *_cells(clear[name], _COMPARED),
-                    *_cells(one.hota.summary(), (*_HOTA, "LocA")),
-                    *_cells(one.gospa.summary(), _DISTANCES),
-                )
-        yield _titled(f"{name}: MOTA and HOTA of centres in percent; GOSPA and OSPA in metres", table)
+    """Yield a table for each class with the figures of several trackers, of the tracks that a picture shows.
+
+    Columns that no tracker has a figure for are left out.
+    """
+    for name, rows in _compared(trackers).items():
+        heads = [one for one in _COMPARED if any(values[one] is not None for values in rows.values())]
+        table = _empty(("tracks", *(FIGURES[one].title for one in heads)))
+        for place, values in rows.items():
+            table.add_row(place, *_cells(values, heads))
+        yield _titled(f"{name}: shares in percent, HOTA and IDF1 of centres; GOSPA and OSPA in metres", table)
+
+
+def shares(trackers: "Mapping[str, Compared]") -> dict[str, dict[str, dict[str, float | None]]]:
+    """Return the shares by class, tracker and name, for a picture of them."""
+    return {
+        name: {place: {one: values[one] for one in _DRAWN if values[one] is not None} for place, values in rows.items()}
+        for name, rows in _compared(trackers).items()
+    }
+
+
+def _compared(trackers: "Mapping[str, Compared]") -> "dict[str, dict[str, Mapping[str, float | None]]]":
+    """Return the figures of `_COMPARED` by class and tracker."""
+    found: dict[str, dict[str, Mapping[str, float | None]]] = {}
+    for place, (clear, figures) in trackers.items():
+        for one in figures:
+            tracks = one.confirmed or one.best or one.everything
+            protocol = one.ab3dmot[0].summary() if one.ab3dmot else {}
+            calibration: Mapping[str, Any] = one.calibration.summary() if one.calibration else {}
+            known = {**clear[one.name], **tracks.hota.summary(), **tracks.gospa.summary(), **tracks.identity.summary()}
+            known |= {"AMOTA": protocol.get("AMOTA", clear[one.name]["AMOTA"]), "velocity_error": one.velocity_error}
+            known |= {name: calibration.get(name) for name in ("NEES", "coverage")}
+            values = {name: None if value is None else defined(value) for name, value in known.items()}
+            found.setdefault(one.name, {})[place] = values
+    return found
 
 
 def _protocol(figures: "Sequence[ClassFigures]") -> Table:

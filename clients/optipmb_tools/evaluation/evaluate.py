@@ -22,6 +22,7 @@ from optipmb_tools.evaluation.errors import ErrorResult, evaluate_errors
 from optipmb_tools.evaluation.figures import defined
 from optipmb_tools.evaluation.gospa import CUTOFF, ORDER, GospaResult, evaluate_gospa
 from optipmb_tools.evaluation.hota import HotaResult, evaluate_hota
+from optipmb_tools.evaluation.identity import IdentityResult, evaluate_identity, velocity_errors
 from optipmb_tools.evaluation.tracks import By, read_compared, read_full_tracks, result_file
 from optipmb_tools.results import FullTable, ResultTable
 from optipmb_tools.results.nuscenes import read_nuscenes_results, result_table, scene_file
@@ -112,6 +113,7 @@ class TrackFigures:
     hota_2d: HotaResult | None  # KITTI only
     hota: HotaResult  # of centres in the plane
     gospa: GospaResult
+    identity: IdentityResult  # of centres in the plane
 
 
 @dataclass(frozen=True)
@@ -125,6 +127,7 @@ class ClassFigures:
     confirmed: TrackFigures | None  # of the tracks that are shown; None where the files do not tell
     calibration: CalibrationResult | None  # where the tracks were kept with all columns
     errors: ErrorResult | None  # likewise
+    velocity_error: float  # mean distance of velocities from those of objects, m/s; NaN where none are known
 
     @property
     def shown(self) -> TrackFigures:
@@ -138,6 +141,8 @@ class ClassFigures:
             "hota_2d": {key: one.hota_2d.summary() if one and one.hota_2d else None for key, one in parts.items()},
             "hota_centre": {key: one.hota.summary() if one else None for key, one in parts.items()},
             "gospa": {key: one.gospa.summary() if one else None for key, one in parts.items()},
+            "identity": {key: one.identity.summary() if one else None for key, one in parts.items()},
+            "velocity_error": defined(self.velocity_error),
             "calibration": self.calibration.summary() if self.calibration else None,
             "errors": self.errors.summary() if self.errors else None,
         }
@@ -238,6 +243,7 @@ def evaluate_figures(
                 hota_2d=evaluate_hota(flat, hota_2d_rules()) if flat else None,
                 hota=evaluate_hota(plane, near),
                 gospa=evaluate_gospa(zip(kept, frames, strict=True), far, settings.order),
+                identity=evaluate_identity(plane, near),
             )
 
         def from_score(threshold: float) -> TrackFigures:
@@ -247,6 +253,10 @@ def evaluate_figures(
 
         boxes = local_cases(ab3dmot_rules(min(settings.limits)))
         protocol = tuple(evaluate_ab3dmot(boxes, limit) for limit in settings.limits if local)
+        shown = (
+            (one.sequence.stamps, one.truth, one.tracks.shown) for one in recordings if one.tracks.velocity is not None
+        )
+        errors = np.concatenate([np.empty(0), *(velocity_errors(*one, name, near) for one in shown)])
         threshold = thresholds.get(name, protocol[0].threshold if protocol else -np.inf)
         return ClassFigures(
             name=name,
@@ -256,6 +266,7 @@ def evaluate_figures(
             confirmed=of_cases(-np.inf, [], cases(near, shown=True), cases(far, shown=True)) if told else None,
             calibration=evaluate_calibration([part[1:] for part in whole], name, near) if whole else None,
             errors=evaluate_errors(whole, name, near) if whole else None,
+            velocity_error=float(errors.mean()) if len(errors) else np.nan,
         )
 
     return [of_class(name) for name in names if name in present]

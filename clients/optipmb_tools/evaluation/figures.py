@@ -30,7 +30,7 @@ FIGURES: Mapping[str, Figure] = {
     **_named("share", "sAMOTA", "AMOTA", "MOTA", "precision", "recall", "MT", "ML"),
     **_named("match", "AMOTP", "MOTP"),
     **_named("count", "GT", "TP", "FP", "FN", "IDS", "FRAG", summed=True),
-    **_named("share", "HOTA", "DetA", "AssA", "LocA", "HOTA, all"),
+    **_named("share", "HOTA", "DetA", "AssA", "LocA", "IDF1", "HOTA, all"),
     **_named("metres", "GOSPA", "localisation", "missed", "false", "OSPA"),
     **_named("plain", "score", "threshold", "NEES"),
     # The benchmark of nuScenes, by its own names.
@@ -46,6 +46,7 @@ FIGURES: Mapping[str, Figure] = {
     "coverage": Figure("in 95 %", "share"),
     "error": Figure("error m", "metres"),
     "expected_error": Figure("expected m", "metres"),
+    "velocity_error": Figure("velocity m/s", "plain"),
     "backward": Figure("backward", "share"),
     "predicted": Figure("predicted", "share"),
     "observed": Figure("observed", "share"),

@@ -184,7 +184,7 @@ def _from_table(path: Path, sequence: DataSequence, by: By) -> ResultTable:
         else:
             joined = table.object[boxes.row[rows]]
             identity = np.where(joined < 0, identity, joined)
-    center, yaw, _ = table.in_world(rows)
+    center, yaw, velocity = table.in_world(rows)
     return ResultTable(
         labels=labels,
         frame=frame,
@@ -196,6 +196,7 @@ def _from_table(path: Path, sequence: DataSequence, by: By) -> ResultTable:
         score=boxes.score[rows],
         box2d=np.full((len(rows), 4), np.nan),
         notes=(*table.notes, *notes),
+        velocity=None if boxes.velocity is None else velocity,
         confirmed=None if table.confirmed is None else table.confirmed[boxes.row[rows]],
     )
 

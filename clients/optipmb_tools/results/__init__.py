@@ -70,6 +70,7 @@ class ResultTable(BoxTable):
     box2d: Floats  # (R, 4) x1 y1 x2 y2 in pixels; NaN where there is no image
     notes: tuple[str, ...] = ()  # assumptions about them, a line each
     confirmed: Bools | None = None  # (R,) None where the file does not tell
+    velocity: Floats | None = None  # (R, 2) in the world, NaN where unknown; None where the file does not tell
 
     @property
     def shown(self) -> Self:

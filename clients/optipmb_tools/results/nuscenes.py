@@ -266,7 +266,6 @@ def result_table(results: Submission, scene: str, samples: Sequence[str]) -> Res
         DatasetError: A sample is missing, or an id stands twice in a sample.
     """
     boxes = results.boxes(*samples)
-    boxes.pop("velocity")
     names = [[name for name, _ in results.rows[token]] for token in samples]
     for token, ids in zip(samples, names, strict=True):
         if twice := [name for i, name in enumerate(ids) if name in ids[:i]]:
