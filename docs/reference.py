@@ -44,10 +44,8 @@ MOST_ALLOWED: Final = 60
 
 TASKS: Final = (
     ("port, address, network interface, IP", "`listen`, `connect`, `http`, `grpc`, `router`"),
-    (
-        "TLS, certificates, password, token, user",
-        "`zenoh_config`, `grpc_tls`, `grpc_names`, `grpc_tokens`, `http_tokens`, `cluster_tls`, `cluster_credentials`",
-    ),
+    ("TLS, certificates", "`zenoh_config`, `grpc_tls`, `http_tls`, `cluster_tls`"),
+    ("password, token, user", "`grpc_names`, `grpc_tokens`, `http_tokens`, `cluster_credentials`"),
     ("detector, KITTI, nuScenes, classes, score threshold", "`profile`, `profiles`; see [Tuning](tuning.md)"),
     (
         "latency, delay, waiting for LiDAR clouds",

@@ -602,6 +602,8 @@ class Settings(BaseSettings):
     """at shutdown, time for frames already received"""
     http: Address = ""
     """address of health, metrics and live page, as `127.0.0.1:8080`"""
+    http_tls: Path | None = None
+    """folder with `key.pem` and `cert.pem` for HTTPS, read again when they change; default: no TLS"""
     http_hosts: Names = ()
     """host names with a dot by which the page may be asked for, besides addresses and names without; `*`: any"""
     http_origins: Names = ()
@@ -688,11 +690,13 @@ class Settings(BaseSettings):
 
     @property
     def unprotected(self) -> tuple[str, ...]:
-        """Addresses beyond this machine where everybody who reaches them may publish and command."""
+        """Addresses beyond this machine where everybody on the way may publish and command, or learn tokens."""
         endpoints = () if self.zenoh_config else self.endpoints
         addresses = [(one, one.partition("/")[2].partition("?")[0].partition("#")[0]) for one in endpoints]
         if self.grpc_tls is None and not self.grpc_tokens and self.grpc:
             addresses.append((f"grpc {self.grpc}", self.grpc))
+        if self.http_tls is None and self.http_tokens:
+            addresses.append((f"http {self.http}", self.http))
         return tuple(said for said, address in addresses if address.rpartition(":")[0] and not is_loopback(address))
 
     @property

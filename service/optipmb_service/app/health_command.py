@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import http.client
 import os
+import ssl
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -20,19 +21,26 @@ TIMEOUT_S: Final = 3.0
 EVERYWHERE: Final = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}  # noqa: S104 - what a service may listen on, not us
 
 
-def ask(address: str, *, ready: bool) -> tuple[bool, str]:
+def ask(address: str, *, ready: bool, certificate: Path | None = None) -> tuple[bool, str]:
     """Ask at an address, as the setting `http` has it.
 
     Args:
         address: `host:port`; a host that means all interfaces is asked on the loopback.
         ready: ask whether it can be used; otherwise whether it is alive.
+        certificate: folder of the setting `http_tls`, whose certificate is to answer.
 
     Returns:
         Whether the answer is yes, and its text, one line.
     """
     host, _, port = address.rpartition(":")
-    connection = http.client.HTTPConnection(EVERYWHERE.get(host, host).strip("[]"), int(port), timeout=TIMEOUT_S)
+    place = EVERYWHERE.get(host, host).strip("[]"), int(port)
+    connection = http.client.HTTPConnection(*place, timeout=TIMEOUT_S)
     try:
+        if certificate is not None:
+            context = ssl.create_default_context(cafile=str(certificate / "cert.pem"))
+            context.check_hostname = False  # it is this very certificate that is asked for, under any name
+            context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
+            connection = http.client.HTTPSConnection(*place, timeout=TIMEOUT_S, context=context)
         connection.request("GET", "/readyz" if ready else "/healthz")
         response = connection.getresponse()
         return response.status == http.client.OK, response.read().decode(errors="replace")
@@ -53,26 +61,28 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--ready", action="store_true", help="ask whether it can be used, not only alive")
     given = parser.parse_args(arguments)
     try:
-        address = _address(given.http, given.settings)
+        address, certificate = _address(given.http, given.settings)
     except ValueError as error:
         print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a wrong use
         return 2
-    well, text = ask(address, ready=given.ready)
+    well, text = ask(address, ready=given.ready, certificate=certificate)
     print(text)  # noqa: T201 - the answer
     return 0 if well else 1
 
 
-def _address(option: str | None, file: Path | None) -> str:
-    """Return where to ask.
+def _address(option: str | None, file: Path | None) -> tuple[str, Path | None]:
+    """Return where to ask, and the folder of its certificate.
 
     Raises:
         ValueError: nothing says where.
     """
-    address = option or os.environ.get("OPTIPMB_HTTP", "")
-    if file is not None and not address:
+    address, folder = option or os.environ.get("OPTIPMB_HTTP", ""), os.environ.get("OPTIPMB_HTTP_TLS", "")
+    certificate = Path(folder) if folder else None
+    if file is not None and not (address and certificate):
         from optipmb_service.settings import load  # noqa: PLC0415 - only this needs the libraries behind it
 
-        address = load(file).settings.http
+        settings = load(file).settings
+        address, certificate = address or settings.http, settings.http_tls
     if not address.rpartition(":")[2].isdecimal():
         raise ValueError(f"setting http: expected where to ask, as 127.0.0.1:8080, received {address!r}")
-    return address
+    return address, certificate

@@ -318,6 +318,8 @@ def _certificate_files(settings: Settings) -> dict[str, Path]:
     for use, folder in (("grpc", settings.grpc_tls if settings.grpc else None), ("cluster", settings.cluster_tls)):
         if folder is not None:
             files |= {use: folder / "cert.pem", f"{use}_authority": folder / "ca.pem"}
+    if settings.http_tls is not None and settings.http:
+        files["http"] = settings.http_tls / "cert.pem"
     return files
 
 
@@ -348,7 +350,7 @@ def _monitoring(settings: Settings, health: ProcessHealth) -> Iterator[None]:
     endpoint = (*settings.connect, *settings.endpoints)[0]
     interface = functools.partial(document, settings.prefix, endpoint, settings.http)
     answers = application(health, settings, places_of(settings), interface, sessions_of(settings))
-    server = Server(answers, settings.http, settings.limits.max_json_bytes)
+    server = Server(answers, settings.http, settings.limits.max_json_bytes, settings.http_tls)
     log.info("http", address=server.address)
     try:
         yield

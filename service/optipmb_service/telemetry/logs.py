@@ -34,12 +34,13 @@ EVENTS: Final = {
     "grpc_connections": "The limit of open files allows fewer connections than the setting.",
     "grpc_invalid": "An invalid message from the network was not forwarded to callers.",
     "edge_invalid": "An invalid message from the network was left out over HTTP or MQTT, or in a list of streams.",
+    "http_certificates": "Changed files of `http_tls` cannot be used; the certificate before holds.",
     "grpc_certificates": "Renewed certificates cannot be read; the previous ones stay in use.",
     "certificate_ends": "Certificates that end within a week, and the `days` that they hold: renew them.",
     "certificate_ended": "A certificate has ended: no link with it can be opened. Renew it, and restart what listens"
     " with it.",
     "unprotected": "Everybody who reaches these `addresses` may publish, read and command: there is neither TLS nor"
-    " access control. See `security.md`.",
+    " access control. Of `http`: tokens cross the network readable, without `http_tls`. See `security.md`.",
     "unknown_environment": "Variables `OPTIPMB_…` that are not settings, usually misspelt.",
     "peer_connected": "A node, router or service has connected.",
     "tracker_message": "A `text` of the tracker: it compiles, for up to a minute.",

@@ -30,10 +30,12 @@ from uvicorn.protocols.websockets.wsproto_impl import WSProtocol
 from optipmb_service.edges.http.api import STATUS, Api, Readers, parameters_of, refuse
 from optipmb_service.edges.http.detections import Senders
 from optipmb_service.edges.http.page import page
+from optipmb_service.edges.http.tls import ServerCertificate
 from optipmb_service.telemetry.metrics import CONTENT_TYPE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
+    from pathlib import Path
 
     from optipmb_schemas.json_form import Place
     from starlette.requests import Request
@@ -91,6 +93,8 @@ def application(
         body: dict[str, object] = {"ready": well, "state": health.state()}
         if failure := health.failure():
             body["failure"] = failure
+        if settings.unprotected:
+            body["unprotected"] = settings.unprotected
         return _answer(body, well=well)
 
     # No coroutine: Starlette runs it on a thread, so that making the metrics of many streams delays no other answer.
@@ -184,12 +188,14 @@ class Server:
         application: the application that it serves.
         address: `host:port` or `[v6]:port`; port 0 takes any free one.
         message_bytes: largest message of a WebSocket's client.
+        certificate: folder with `key.pem` and `cert.pem`; default: no TLS.
 
     Raises:
-        ClientError: the address cannot be listened on.
+        ClientError: the address cannot be listened on, or the certificate not used.
     """
 
-    def __init__(self, application: ASGIApp, address: str, message_bytes: int) -> None:
+    def __init__(self, application: ASGIApp, address: str, message_bytes: int, certificate: Path | None = None) -> None:
+        context = None if certificate is None else ServerCertificate(certificate).context
         host, _, port = address.rpartition(":")
         host = host.strip("[]")
         try:
@@ -200,25 +206,26 @@ class Server:
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BYTES)  # connections inherit it
         bound = self._socket.getsockname()
         self.address = f"[{bound[0]}]:{bound[1]}" if family == socket.AF_INET6 else f"{bound[0]}:{bound[1]}"
-        self._server = uvicorn.Server(
-            uvicorn.Config(
-                application,
-                loop="asyncio",
-                http=_Connection,
-                lifespan="off",
-                log_config=None,
-                access_log=False,
-                server_header=False,
-                timeout_keep_alive=KEEP_ALIVE_S,
-                timeout_graceful_shutdown=GRACE_S,
-                h11_max_incomplete_event_size=HEAD_BYTES,
-                ws=_Socket,
-                ws_max_size=message_bytes,
-                ws_ping_interval=PING_S,
-                ws_ping_timeout=PING_S,
-                ws_per_message_deflate=False,
-            )
+        config = uvicorn.Config(
+            application,
+            loop=f"{__name__}:_Loop",
+            http=_Connection,
+            lifespan="off",
+            log_config=None,
+            access_log=False,
+            server_header=False,
+            timeout_keep_alive=KEEP_ALIVE_S,
+            timeout_graceful_shutdown=GRACE_S,
+            h11_max_incomplete_event_size=HEAD_BYTES,
+            ws=_Socket,
+            ws_max_size=message_bytes,
+            ws_ping_interval=PING_S,
+            ws_ping_timeout=PING_S,
+            ws_per_message_deflate=False,
         )
+        config.load()
+        config.ssl = context
+        self._server = uvicorn.Server(config)
         self._thread = threading.Thread(target=self._server.run, args=([self._socket],), name="http", daemon=True)
         self._thread.start()
 
@@ -227,6 +234,16 @@ class Server:
         self._server.should_exit = True
         self._thread.join(2 * GRACE_S)
         self._socket.close()
+
+
+class _Loop(asyncio.SelectorEventLoop):
+    """A loop whose servers end a connection that does not complete its handshake soon."""
+
+    async def create_server(self, *arguments: Any, **options: Any) -> asyncio.Server:
+        """Listen as the base class does."""
+        if options.get("ssl") is not None:
+            options["ssl_handshake_timeout"] = HEAD_S
+        return await super().create_server(*arguments, **options)
 
 
 class _Bounded(asyncio.Protocol):
