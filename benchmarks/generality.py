@@ -223,7 +223,7 @@ def track(clip: Clip, parameters: Parameters, *, posed: bool, hindsight: float) 
     if hindsight:
         ends = np.searchsorted(clip.stamps, clip.stamps + round(hindsight * 1e9), "right").tolist()
         later = [[found[k] for k in range(index + 1, end)] for index, end in enumerate(ends)]
-        found = {index: with_hindsight(one, later[index], parameters) for index, one in found.items()}
+        found = {index: with_hindsight(one, later[index], parameters, same_axes=posed) for index, one in found.items()}
     table = full_table(parameters.labels, found)
     confirmed, when = stacked(list(found.values()), "confirmed").astype(np.bool_), table.frame
     rotation, translation = clip.rotation[when], clip.translation[when]

@@ -49,7 +49,7 @@ def test_predicted_paths_are_written_with_all_columns(dataset: Dataset, tmp_path
 
 
 def test_hindsight_is_of_the_seconds_after_a_frame(dataset: Dataset) -> None:
-    """Existence and `confirmed` of every frame are by the frames of the next half second; nothing else changes."""
+    """Existence, `confirmed` and velocity are by the frames of the next half second; nothing else changes."""
     (sequence,), parameters = dataset.sequences(["0000"]), read_profile("scene")
     plain, found = (track_whole(parameters, sequence, hindsight_s=seconds).tracks for seconds in (0.0, 0.5))
     told = {}
@@ -58,8 +58,9 @@ def test_hindsight_is_of_the_seconds_after_a_frame(dataset: Dataset) -> None:
         told[index] = Tracks(**columns | {"confirmed": columns["confirmed"].astype(np.bool_)})
     for index, one in found.items():
         later = [told[k] for k in range(index + 1, 20) if plain[k].stamp_ns - one.stamp_ns <= 500_000_000]
-        wanted = with_hindsight(told[index], later, parameters)
+        wanted = with_hindsight(told[index], later, parameters, same_axes=True)
         changed = {"existence": wanted.existence, "confirmed": wanted.confirmed.astype(np.int64)}
+        changed["velocity"] = wanted.velocity
         assert one == plain[index].model_copy(update=changed)
     assert any(one != plain[index] for index, one in found.items())
 

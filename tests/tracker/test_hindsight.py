@@ -1,4 +1,4 @@
-"""Existence and `confirmed` of tracks in hindsight."""
+"""Existence, `confirmed` and velocity of tracks in hindsight."""
 
 from __future__ import annotations
 
@@ -46,3 +46,29 @@ def test_clutter_that_fades_was_never_confirmed() -> None:
     """A track that is confirmed when it begins, and doubted in all frames after, is not in hindsight."""
     found = with_hindsight(tracks({1: 0.6}), [tracks({1: 0.2})] * 3, PARAMETERS)
     assert found.confirmed.tolist() == [False]
+
+
+def test_velocity_of_a_first_frame_is_told_by_the_frames_after_it() -> None:
+    """An object that brakes along a bend: later velocities are taken back; in other axes the velocity stays."""
+    found = []
+    for k in range(6):
+        seconds, turn = 0.1 * k, 0.2 * 0.1 * k
+        one = tracks({3: 0.9, 4: 0.9})
+        speed = np.array([12.0 - 2.0 * seconds, 0.2])
+        if k == 0:
+            speed[0] = 0.0
+        covariance = np.broadcast_to(np.diag([0.1, 0.1, 100.0 if k == 0 else 0.25, 0.01, 0.01, 0.1]), (2, 6, 6)).copy()
+        columns = {
+            "velocity": speed[:, None] * np.array([math.cos(turn), math.sin(turn)]),
+            "yaw": np.full(2, turn),
+            "yaw_rate": np.full(2, 0.2),
+            "acceleration": np.array([-2.0, 0.0]),
+            "age": np.full(2, seconds),
+            "covariance": covariance,
+        }
+        found.append(one.replaced(**columns))
+    seen = with_hindsight(found[0], found[1:], PARAMETERS, same_axes=True)
+    assert seen.velocity[0] == pytest.approx([12.0, 0.0], abs=0.05)
+    assert np.linalg.norm(seen.velocity[1]) < 0.01  # less than a standard deviation: it stands
+    stays = with_hindsight(found[0], found[1:], PARAMETERS)
+    assert stays.velocity.tobytes() == found[0].velocity.tobytes()

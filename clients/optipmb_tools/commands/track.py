@@ -149,7 +149,7 @@ def track(
 
     From a bag of ROS 2, --out FILE.mcap makes a bag with the tracks as TrackedObjects, Detection3DArray and markers.
 
-    A profile may also be a TOML file here. Existence and confirmed also use the second after each frame; with
+    A profile may also be a TOML file here. Existence, confirmed and velocity also use the second after each frame; with
     --hindsight 0, replaying the same data through a service gives the same files.
     With --rejoin, a table also says which tracks are of the same object; ids stay (docs/gaps.md).
     With --smooth, positions, headings and velocities also use later frames, which no service can.

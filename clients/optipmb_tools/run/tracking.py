@@ -172,21 +172,29 @@ def track_whole(
         for index, one in smoother.tracks():
             paths = predict_tracks(one, parameters.horizons, parameters) if parameters.horizons else None
             found[index] = found[index].model_copy(update=fields_of(one, paths))
-    _use_hindsight(found, extracted, hindsight_s, parameters)
+    _use_hindsight(found, extracted, hindsight_s, parameters, same_axes=not (smooth or estimated))
     counts = clouds, detections, dict(left_out), estimated
     return Tracked(found, *counts, learned_noise(density), tuple(steps), time.monotonic() - begun)
 
 
 def _use_hindsight(
-    frames: dict[int, Tracks], extracted: Mapping[int, optipmb.Tracks], seconds: float, parameters: Parameters
+    frames: dict[int, Tracks],
+    extracted: Mapping[int, optipmb.Tracks],
+    seconds: float,
+    parameters: Parameters,
+    *,
+    same_axes: bool,
 ) -> None:
-    """Write existence and `confirmed` in hindsight of some seconds to the messages of all frames; 0: leave them."""
+    """Write existence, `confirmed` and velocity in hindsight to the messages of all frames; 0 s: leave them."""
     order = sorted(frames) if seconds else []
     stamps = np.array([frames[index].stamp_ns for index in order], np.int64)
     ends = np.searchsorted(stamps, stamps + round(seconds * 1e9), "right").tolist()
     for place, (index, end) in enumerate(zip(order, ends, strict=True)):
-        one = with_hindsight(extracted[index], (extracted[k] for k in order[place + 1 : end]), parameters)
+        later = (extracted[k] for k in order[place + 1 : end])
+        one = with_hindsight(extracted[index], later, parameters, same_axes=same_axes)
         changed = {"existence": one.existence, "confirmed": one.confirmed.astype(np.int64)}
+        if same_axes:
+            changed["velocity"] = one.velocity
         frames[index] = frames[index].model_copy(update=changed)
 
 
