@@ -206,7 +206,7 @@ PathText = Annotated[
         "a path looks like data.conf or box[0], a constant like '= car'",
     ),
 ]
-PathTexts = PathText | Annotated[tuple[PathText, ...], Field(min_length=2, max_length=3)]
+PathTexts = PathText | Annotated[tuple[PathText, ...], Field(min_length=2, max_length=4)]
 
 
 class MappingSettings(BaseModel):
@@ -244,6 +244,14 @@ class MappingSettings(BaseModel):
     """height above the ellipsoid in m"""
     heading: PathText = ""
     """degrees clockwise from true north, in place of yaw"""
+    box: PathTexts = ""
+    """box in pixels, in place of the position, with a `camera` in `inputs`: a path of a list, or four paths"""
+    box_form: Literal["xyxy", "xywh", "cxcywh"] = "xyxy"
+    """numbers of a box: its corners; left, top, width, height; or the same with its centre"""
+    box_unit: Literal["px", "image"] = "px"
+    """unit of boxes and feet: pixels, or width and height of the image"""
+    foot: PathTexts = ""
+    """column and row where the object stands, in place of a box"""
     angle_unit: Literal["rad", "deg"] = "rad"
     """unit of yaw"""
     time: PathText = ""
@@ -453,6 +461,8 @@ class InputSettings(BaseModel):
     keeps their intervals and puts several sensors on one clock"""
     classes: dict[str, str] = Field(default_factory=dict)
     """names of classes by those of the sender, as `{ Human = "pedestrian" }`; others stay"""
+    camera: Path | None = None
+    """file of the calibration by which boxes and feet in pixels become places on the ground"""
 
 
 def _default_instance() -> str:
@@ -812,6 +822,7 @@ def missing_files(settings: Settings) -> list[str]:
     named: dict[str, Any] = {name: getattr(settings, name) for name in FILES}
     named |= {"profile": settings.profile} | {f"profiles.{key}": value for key, value in settings.profiles.items()}
     named |= {f"sensors.{key}.profile": one.profile for key, one in settings.sensors.items()}
+    named |= {f"inputs.{key}.camera": str(one.camera) for key, one in settings.inputs.items() if one.camera}
     return [
         f"setting {name}: {value}: no such file"
         for name, value in named.items()

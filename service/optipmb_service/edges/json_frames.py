@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import msgspec
 import numpy as np
 import optipmb_schemas as schemas
+from optipmb_client.errors import ClientError
 from optipmb_schemas import codec
 from optipmb_schemas.errors import invalid, show
 from optipmb_schemas.json_form import EdgeDetections, EdgeObject
@@ -24,8 +25,9 @@ from optipmb_service.settings import InputSettings
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+    from pathlib import Path
 
-    from optipmb import Georeference
+    from optipmb import Georeference, GroundCamera
     from optipmb_service.edges.mapping import PayloadMapping
     from optipmb_service.settings import Settings
 
@@ -74,6 +76,9 @@ class FrameReader:
 
     Args:
         settings: limits, places of sites, and inputs.
+
+    Raises:
+        ClientError: a calibration cannot be used.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -81,6 +86,11 @@ class FrameReader:
         self._sites = settings.sites
         self._inputs = settings.inputs
         self._place = cache(self._place_of)
+        self._cameras = {
+            one.camera: _calibration(f"inputs.{pattern}.camera", one.camera)
+            for pattern, one in settings.inputs.items()
+            if one.camera is not None
+        }
 
     def split(self, payload: bytes) -> tuple[list[bytes], bool]:
         """Return the frames of a document, and whether it is an array of them.
@@ -135,22 +145,27 @@ class FrameReader:
     def _mapped(self, payload: Any, stream: str, mapping: PayloadMapping) -> JsonFrame:
         frame, places = mapping.frame(payload)
         try:
-            return self._made(msgspec.convert(frame, EdgeDetections), stream)
+            return self._made(msgspec.convert(frame, EdgeDetections), stream, mapping.box_unit)
         except msgspec.ValidationError as error:
             raise mapping.renamed(_invalid(error, frame), places) from None
         except schemas.MessageError as error:
             raise mapping.renamed(error, places) from None
 
-    def _made(self, frame: EdgeDetections, stream: str) -> JsonFrame:
+    def _made(self, frame: EdgeDetections, stream: str, box_unit: str = "px") -> JsonFrame:
         values = ((name, getattr(frame, name)) for name in EdgeDetections.__struct_fields__)
         given = {name: value for name, value in values if value is not None}
         header = _header(given, stream)
         fields: dict[str, Any] = {name: given[name] for name in MODEL if name in given}
+        rows: Sequence[int] = range(len(frame.objects))
         fields |= self._objects(frame.objects, header["stream"], frame.frame)
+        if frame.objects and (frame.objects[0].box is not None or frame.objects[0].foot is not None):
+            rows = self._on_ground(frame.objects, header["stream"], fields, box_unit)
+        elif not frame.objects:
+            self._see(fields, self._camera(header["stream"]))
         try:
             message = schemas.Detections(**header, **fields)
         except schemas.MessageError as error:
-            raise _of_object(error, frame.objects, fields) from None
+            raise _of_object(error, frame.objects, fields, rows) from None
         return self._framed(message, given)
 
     def _columns(self, fields: dict[str, Any], stream: str) -> JsonFrame:
@@ -189,8 +204,10 @@ class FrameReader:
         if len(labels) > self._limits.max_labels:
             expected = f"at most {self._limits.max_labels} classes"
             raise schemas.MessageError("too_large", "objects", expected, f"{len(labels)} classes")
-        for at, one in enumerate(objects):
-            _check(one, f"objects[{at}]")
+        places = [_check(one, f"objects[{at}]") for at, one in enumerate(objects)]
+        for at, place in enumerate(places):
+            if place != places[0] and {place, places[0]} & set(PLACES[2:]):
+                raise schemas.MessageError("invalid_value", f"objects[{at}]", f"{places[0]}, as before it", place)
         columns: dict[str, Any] = {
             "labels": tuple(labels),
             "label": np.array([labels[name] for name in names], np.int64),
@@ -205,6 +222,62 @@ class FrameReader:
         if placed:
             self._move(objects, placed, columns, stream, frame)
         return {name: column for name, column in columns.items() if column is not None}
+
+    def _camera(self, stream: str) -> GroundCamera | None:
+        path = self.rules(stream).camera
+        return None if path is None else self._cameras[path]
+
+    def _on_ground(
+        self, objects: Sequence[EdgeObject], stream: str, fields: dict[str, Any], box_unit: str
+    ) -> Sequence[int]:
+        """Replace pixels by places on the ground; return which objects have one."""
+        from optipmb import FrameError  # noqa: PLC0415 - as above
+
+        name = "foot" if objects[0].box is None else "box"
+        if (camera := self._camera(stream)) is None:
+            expected = "`camera` in `inputs` of the stream, for what is in pixels"
+            raise schemas.MessageError("invalid_value", f"objects[0].{name}", expected, "no calibration")
+        is_fixed = camera.mount == "fixed"
+        if is_fixed and "pose" in fields:
+            raise schemas.MessageError("invalid_value", "pose", "none, for the camera is fixed in the world", "a pose")
+        if not is_fixed and "pose" not in fields:
+            raise schemas.MessageError("missing_field", "pose", "the pose of the vehicle at each frame", "nothing")
+        if "position_covariance" in fields:
+            at = next(at for at, one in enumerate(objects) if one.position_covariance is not None)
+            path = f"objects[{at}].position_covariance"
+            raise schemas.MessageError("invalid_value", path, "none beside pixels", "one")
+        fields["frame"] = "world" if is_fixed else "sensor"
+        pixels = np.array([getattr(one, name) for one in objects], np.float64)
+        if box_unit == "image":
+            pixels *= np.resize(np.array(camera.image, np.float64), pixels.shape[1])
+        renamed = self.rules(stream).classes
+        labels = [renamed.get(one.name, one.name) for one in objects]
+        pose: Any = fields.get("pose")  # that there is one is all that it looks at
+        given: dict[str, Any] = {name: pixels}
+        try:
+            found = camera.detections(label=labels, score=fields["score"], pose=pose, **given)
+        except FrameError as error:
+            match = re.fullmatch(r"\w+\[(\d+)\]", error.path)
+            path = f"objects[{match[1]}].{name}" if match else "objects"
+            raise schemas.MessageError("invalid_value", path, error.expected, error.received) from None
+        rows = found["row"]
+        for column in ("label", "score", "yaw", "size", "velocity"):
+            if column in fields:
+                fields[column] = fields[column][rows]
+        fields |= {column: found[column] for column in ("center", "position_covariance")}
+        self._see(fields, camera)
+        return list(rows.tolist())
+
+    @staticmethod
+    def _see(fields: dict[str, Any], camera: GroundCamera | None) -> None:
+        """Fill in the field of view of a fixed camera, if the frame says none."""
+        if camera is None or camera.mount != "fixed" or fields.keys() & {"pose", "field_of_view"}:
+            return
+        view = camera.field_of_view
+        if view is not None and view.pose is not None:
+            fields["pose"] = {"translation": view.pose.translation, "quaternion": view.pose.quaternion}
+            sides = ("azimuth", "elevation", "range")
+            fields["field_of_view"] = {side: np.array(getattr(view, side), np.float64) for side in sides}
 
     def _move(
         self, objects: Sequence[EdgeObject], placed: list[int], columns: dict[str, Any], stream: str, frame: str
@@ -236,6 +309,15 @@ class FrameReader:
 
 
 _USUAL: Final = InputSettings()
+
+
+def _calibration(setting: str, path: Path) -> GroundCamera:
+    from optipmb import GroundCamera, ParameterError  # noqa: PLC0415 - the tracker, which a router does not load
+
+    try:
+        return GroundCamera.read(path)
+    except ParameterError as error:
+        raise ClientError(f"setting {setting}: {error}") from error
 
 
 def _header(given: Mapping[str, Any], stream: str) -> dict[str, Any]:
@@ -282,15 +364,12 @@ def _time(text: str) -> int:
     return seconds * SECOND + int((fraction or "0")[:9].ljust(9, "0"))
 
 
-def _check(one: EdgeObject, path: str) -> None:
-    """Refuse an object whose place, score or heading is missing or said twice."""
+def _check(one: EdgeObject, path: str) -> str:
+    """Return how an object says its place; refuse one whose place, score or heading is missing or said twice."""
     places = (one.position, one.lat if one.lat is not None else one.lon, one.box, one.foot)
     said = [name for name, place in zip(PLACES, places, strict=True) if place is not None]
     if len(said) != 1:
         raise schemas.MessageError("invalid_value", path, f"one of {', '.join(PLACES)}", " and ".join(said) or "none")
-    if said[0] in PLACES[2:]:
-        expected = "`camera` in `inputs` of the stream, for what is in pixels"
-        raise schemas.MessageError("invalid_value", f"{path}.{said[0]}", expected, "no calibration")
     if (one.lat is None) != (one.lon is None):
         raise schemas.MessageError(
             "missing_field", f"{path}.{'lat' if one.lat is None else 'lon'}", "a number", "nothing"
@@ -298,6 +377,7 @@ def _check(one: EdgeObject, path: str) -> None:
     for name, other in (("score", "confidence"), ("yaw", "heading")):
         if getattr(one, name) is not None and getattr(one, other) is not None:
             raise schemas.MessageError("invalid_value", f"{path}.{other}", f"{name} or {other}", "both")
+    return said[0]
 
 
 def _score(one: EdgeObject) -> float:
@@ -319,7 +399,7 @@ def _column(values: list[Any], unknown: Any) -> Any:
 
 
 def _of_object(
-    error: schemas.MessageError, objects: Sequence[EdgeObject], fields: Mapping[str, Any]
+    error: schemas.MessageError, objects: Sequence[EdgeObject], fields: Mapping[str, Any], rows: Sequence[int]
 ) -> schemas.MessageError:
     """Return an error of the columns with its path in the sender's document."""
     match = _ELEMENT.fullmatch(error.path)
@@ -327,11 +407,14 @@ def _of_object(
         return error
     name, number, rest = match[1], int(match[2]), match[3]
     if name == "labels":
-        name, number = "class", fields["label"].tolist().index(number)
+        name, label = "class", fields["labels"][number]
+        number = next(at for at, each in enumerate(objects) if each.name == label)
+    else:
+        number = rows[number]
     one = objects[number]
     name = _NAMES.get(name, name)
     if name == "position" and one.position is None:
-        name, rest = "lat", ""
+        name, rest = "lat" if one.lat is not None else "foot" if one.box is None else "box", ""
     elif name == "score" and one.score is None:
         name = "confidence"
     received = "null" if error.received == "nan" else error.received

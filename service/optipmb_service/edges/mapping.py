@@ -23,7 +23,8 @@ EACH: Final = "[]"
 ANY: Final = "*"
 CONSTANT: Final = "= "
 KEY: Final = "@key"
-FIELDS: Final = ("class", "score", "position", "size", "yaw", "velocity", "lat", "lon", "alt", "heading")
+FIELDS: Final = ("class", "score", "position", "size", "yaw", "velocity", "lat", "lon", "alt", "heading", "box", "foot")
+CORNERS: Final = 4
 UNITS: Final = {"s": 9, "ms": 6, "us": 3, "ns": 0}
 """Decimal digits between a unit of time and nanoseconds."""
 
@@ -34,11 +35,15 @@ _OBJECT: Final = re.compile(r"objects\[(\d+)\](?:\.(\w+)(?:\[(\d+)\])?)?.*")
 class PayloadMapping:
     """Frames of payloads by the settings of an input.
 
+    Attributes:
+        box_unit: of boxes and feet.
+
     Args:
         settings: paths and units.
     """
 
     def __init__(self, settings: MappingSettings) -> None:
+        self.box_unit = settings.box_unit
         self._settings = settings
         self._paths: dict[str, Any] = {
             name: path for name in FIELDS if (path := getattr(settings, "name" if name == "class" else name))
@@ -96,6 +101,12 @@ class PayloadMapping:
             made["score"] *= settings.score_scale
         if settings.angle_unit == "deg" and _is_number(made.get("yaw")):
             made["yaw"] = math.radians(made["yaw"])
+        box, form = made.get("box"), settings.box_form
+        if form != "xyxy" and isinstance(box, list) and len(box) == CORNERS and all(map(_is_number, box)):
+            x, y, width, height = box
+            if form == "cxcywh":
+                x, y = x - 0.5 * width, y - 0.5 * height
+            made["box"] = [x, y, x + width, y + height]
         return made
 
     def _time(self, value: Any) -> dict[str, Any]:

@@ -1,0 +1,123 @@
+"""Pixel boxes of JSON senders: by the camera of the settings they become places on the ground."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from optipmb_client.errors import ClientError
+from optipmb_schemas import Detections, MessageError
+from optipmb_service.edges.json_frames import FrameReader
+from optipmb_service.edges.mapping import PayloadMapping
+from optipmb_service.settings import MappingSettings, load
+
+from optipmb import GroundCamera
+
+STREAM = "garage/gate/cam"
+PAGE = Path(__file__).parents[3] / "docs/cameras.md"
+BOXES = [[1135.0, 699.0, 1255.0, 763.0], [900.0, 900.0, 1000.0, 1079.5], [400.0, 640.0, 440.0, 720.0]]
+"""The second has its foot outside the image."""
+
+
+@pytest.fixture
+def calibration(tmp_path: Path) -> Path:
+    """The calibration of the page."""
+    file = tmp_path / "gate.toml"
+    file.write_text(re.findall(r"```toml\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)[0])
+    return file
+
+
+def reader(calibration: Path) -> FrameReader:
+    inputs = {"garage/*/cam*": {"camera": str(calibration), "classes": {"Human": "pedestrian"}}}
+    return FrameReader(load(None, {"inputs": inputs}).settings)
+
+
+def read(calibration: Path, body: dict[str, Any], mapping: dict[str, Any] | None = None) -> Detections:
+    given = None if mapping is None else PayloadMapping(MappingSettings(**mapping))
+    return reader(calibration).read(json.dumps(body).encode(), STREAM, given).message
+
+
+def objects(**fields: Any) -> list[dict[str, Any]]:
+    names = ("car", "car", "Human")
+    return [{"class": name, "box": box, **fields} for name, box in zip(names, BOXES, strict=True)]
+
+
+def test_boxes_become_places_with_covariances(calibration: Path) -> None:
+    """Those of `GroundCamera`, by the names of the settings; frames without objects say what the camera sees, too."""
+    camera = GroundCamera.read(calibration)
+    expected = camera.detections(BOXES, ["car", "car", "pedestrian"], [0.5] * 3)
+    message = read(calibration, {"objects": objects(score=0.5)})
+    np.testing.assert_array_equal(message.center, expected["center"])
+    np.testing.assert_array_equal(message.position_covariance, expected["position_covariance"])
+    assert [message.labels[label] for label in message.label] == ["car", "pedestrian"]
+    view = camera.field_of_view
+    empty = read(calibration, {"objects": []})
+    for one in (message, empty):
+        assert view is not None
+        assert one.field_of_view is not None
+        assert one.field_of_view.range.tolist() == list(view.range)
+    foot = [{"class": "car", "foot": [1195.0, 763.0]}]
+    standing = camera.detections(foot=[[1195.0, 763.0]], label=["car"])
+    np.testing.assert_array_equal(read(calibration, {"objects": foot}).center, standing["center"])
+
+
+def test_boxes_of_other_makers(calibration: Path) -> None:
+    """Shares of the image, and left, top, width, height, give the same detections as pixels."""
+    expected = read(calibration, {"objects": objects()})
+    shares = [[x1 / 1920, y1 / 1080, x2 / 1920, y2 / 1080] for x1, y1, x2, y2 in BOXES]
+    sides = ("left", "top", "right", "bottom")
+    scenes = [
+        {"class": {"type": one["class"]}, "bounding_box": dict(zip(sides, share, strict=True))}
+        for one, share in zip(objects(), shares, strict=True)
+    ]
+    axis = {"objects": "frame.observations[]", "class": "class.type", "box_unit": "image"}
+    axis |= {"box": [f"bounding_box.{side}" for side in sides]}
+    by_shares = read(calibration, {"frame": {"observations": scenes}}, axis)
+    np.testing.assert_allclose(by_shares.center, expected.center, atol=1e-6)
+    boxes = [[x1, y1, x2 - x1, y2 - y1] for x1, y1, x2, y2 in BOXES]
+    groups = {one["class"]: [] for one in objects()}
+    for one, box in zip(objects(), boxes, strict=True):
+        groups[one["class"]].append({"bounding_box_px": box})
+    by_sides = {"objects": "objects.*[]", "class": "@key", "box": "bounding_box_px", "box_form": "xywh"}
+    np.testing.assert_allclose(read(calibration, {"objects": groups}, by_sides).center, expected.center, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("fields", "path"),
+    [
+        ({"objects": [{"class": "car", "box": [5, 0, 1, 9]}]}, "objects[0].box"),
+        ({"objects": [{"class": "car", "box": [0, 0, 9, 9]}, {"class": "car", "position": [0, 0]}]}, "objects[1]"),
+        ({"objects": [{"class": "car", "box": [0, 0, 9, 9], "yaw": 1e9}]}, None),
+        ({"objects": objects(size=[1, -1, 1])}, "objects[0].size[1]"),
+        ({"objects": [*objects()[1:], {"class": "car", "box": BOXES[0], "size": [-1, 1, 1]}]}, "objects[2].size[0]"),
+        ({"objects": objects(position_covariance=np.eye(3).tolist())}, "objects[0].position_covariance"),
+        ({"objects": objects(), "pose": {"translation": [0, 0, 0], "quaternion": [1, 0, 0, 0]}}, "pose"),
+    ],
+)
+def test_an_error_names_the_box(calibration: Path, fields: dict[str, Any], path: str | None) -> None:
+    """Also where boxes before it have no place; what belongs to a box without a place is not looked at."""
+    if path is None:
+        assert len(read(calibration, fields).label) == 0
+        return
+    with pytest.raises(MessageError) as raised:
+        read(calibration, fields)
+    assert raised.value.path == path
+
+
+def test_a_camera_on_a_vehicle_needs_its_pose(calibration: Path) -> None:
+    """With a pose the places are in the frame of the vehicle."""
+    calibration.write_text('mount = "vehicle"\n' + calibration.read_text())
+    with pytest.raises(MessageError) as raised:
+        read(calibration, {"objects": objects()})
+    assert (raised.value.code, raised.value.path) == ("missing_field", "pose")
+    pose = {"translation": [9, 9, 0], "quaternion": [1, 0, 0, 0]}
+    assert read(calibration, {"objects": objects(), "pose": pose}).frame == "sensor"
+
+
+def test_a_calibration_that_cannot_be_used_is_one_error(calibration: Path) -> None:
+    """At the start, with the path in the settings and in the file."""
+    calibration.write_text("image = [1920, 1080]")
+    with pytest.raises(ClientError, match=r"^setting inputs\.garage/\*/cam\*\.camera: \S+gate\.toml: "):
+        reader(calibration)
