@@ -11,7 +11,7 @@ DATA ?= data
 KITTI = --dataset kitti --root $(DATA)/kitti --detections pointrcnn
 NUSCENES = --dataset nuscenes --root $(DATA)/nuscenes --detections centerpoint
 
-FUZZ_TARGETS := fuzz-messages fuzz-checkpoints fuzz-protobuf
+FUZZ_TARGETS := fuzz-messages fuzz-checkpoints fuzz-protobuf fuzz-frames
 .PHONY: help kernels dist docs pictures release image demo-files compare demo test accuracy alone bounds ray bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests check mutants lowest paths pythons repeat schemas wheel clean tune ablate
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"

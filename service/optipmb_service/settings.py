@@ -275,8 +275,8 @@ class MqttInput(BaseModel):
     """topic; `+` stands for any part, which `{1}`, `{2}` … name in the stream"""
     qos: Literal[0, 1, 2] = 1
     """quality of service that the broker is asked for"""
-    format: Literal["optipmb", "mapped"] = "optipmb"
-    """form of payloads: frames as over HTTP, or those that `mapping` describes"""
+    format: Literal["optipmb", "axis", "scenescape", "mapped"] = "optipmb"
+    """form of payloads: frames as over HTTP, a known maker's, or that which `mapping` describes"""
     mapping: MappingSettings | None = None
     """paths of a payload, for the format `mapped`"""
 

@@ -1,5 +1,6 @@
 """Writes the first files of the corpora: `python tests/fuzz/seeds.py`, with tests/support on the path."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,13 @@ def main() -> None:
         name = type(message).__name__
         _write("messages", f"{name}.msgpack", kind + schemas.encode(message))
         _write("messages", f"{name}.json", kind + schemas.encode_json(message))
+    one = {"class": "car", "lat": 48.0, "lon": 11.0, "alt": None, "heading": 90, "score": 0.5, "size": [4, 2, None]}
+    two = {"class": "bus", "position": [1, 2, None], "velocity": [0, 1], "yaw": 1.5, "confidence": 1}
+    numbers = {"epoch": "0" * 32, "seq": "1", "stamp_ns": 5, "key": "a", "stream": "a/b/c"}
+    _write("frames", "objects", json.dumps({"objects": [one, two], **numbers}).encode())
+    _write("frames", "columns", schemas.encode_json(messages[0]))
+    groups = {"car": [{"class": "car", "x": 1, "y": 2.5}]}
+    _write("frames", "mapped", json.dumps({"objects": groups, "time": "2026-11-27T08:00:00.100+01:00"}).encode())
     asked = pb.TrackFilter(classes=["car"], area=pb.Polygon(x=[0, 1, 1], y=[0, 0, 1]), fields=["center"])
     requests = [
         pb.TrackRequest(detections=convert.to_proto(messages[0])),

@@ -9,17 +9,23 @@ import optipmb_schemas as schemas
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf.convert import transcode
-from optipmb_service.edges.grpc.selection import Selection
+from optipmb_service.edges.grpc.selection import Filter
+from optipmb_service.edges.json_frames import FrameReader
+from optipmb_service.edges.mapping import PayloadMapping
 from optipmb_service.edges.readers import Pace
 from optipmb_service.session.checkpoint import CheckpointError, decode_checkpoint, encode_checkpoint, seal
 from optipmb_service.session.convert import density_of
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Incarnation, Policy
+from optipmb_service.settings import MappingSettings, Settings
 from router import Sensor
 
 LIMITS = schemas.Limits(max_bytes=2**16, max_json_bytes=2**16, max_values=2**12)
 REQUESTS = (pb.TrackRequest, pb.PublishRequest, pb.SubscribeRequest, pb.SetParametersRequest)
-CONFIRMED = Selection(pb.TrackFilter(confirmed_only=True, classes=["car"], area=pb.Polygon(x=[0, 9, 0], y=[0, 0, 9])))
+CONFIRMED = Filter(pb.TrackFilter(confirmed_only=True, classes=["car"], area=pb.Polygon(x=[0, 9, 0], y=[0, 0, 9])))
+SITES = {"a": {"origin": [48.0, 11.0, 500.0]}}
+FRAMES = FrameReader(Settings(sites=SITES, limits={"max_json_bytes": 2**16}))
+MAPPING = PayloadMapping(MappingSettings(objects="objects.*[]", name="class", position=("x", "y"), time="time"))
 POLICY = Policy(checkpoint_bytes=2000)
 """So little that a restored session must go over its first frames again before it can be written down."""
 
@@ -73,7 +79,7 @@ def protobuf(data: bytes) -> None:
     try:
         request = convert.parse(data[1:], kind)
         if isinstance(request, pb.SubscribeRequest):
-            Selection(request.filter)
+            Filter(request.filter)
             Pace(request.max_rate_hz).passes("a/b/c", 0)
             schemas.Keys().matching(request.pattern, "tracks")
         elif isinstance(request, pb.SetParametersRequest):
@@ -87,12 +93,20 @@ def protobuf(data: bytes) -> None:
         return
 
 
+def frames(data: bytes) -> None:
+    """A frame in JSON becomes detections that are read again as they are, or is refused; so is a mapped payload."""
+    for mapping in (None, MAPPING):
+        with contextlib.suppress(schemas.MessageError):
+            message = FRAMES.read(data, "a/b/c", mapping).message
+            assert schemas.decode(schemas.encode(message), schemas.Detections) == message
+
+
 def _answer(session: Session) -> bytes:
     session.state()
     density_of(session.density, stream=session.stream, session=session.session, parameters=session.parameters)
     return encode_checkpoint(session.snapshot())
 
 
-TARGETS = {"messages": messages, "checkpoints": checkpoints, "protobuf": protobuf}
-HEADS = {"messages": 1, "checkpoints": 0, "protobuf": 1}
+TARGETS = {"messages": messages, "checkpoints": checkpoints, "protobuf": protobuf, "frames": frames}
+HEADS = {"messages": 1, "checkpoints": 0, "protobuf": 1, "frames": 0}
 """How many bytes stand before the map."""

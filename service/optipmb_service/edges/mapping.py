@@ -14,10 +14,12 @@ from typing import TYPE_CHECKING, Any, Final
 import optipmb_schemas as schemas
 from optipmb_schemas.errors import invalid
 
+from optipmb_service.settings import MappingSettings
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from optipmb_service.settings import MappingSettings
+    from optipmb_service.settings import MqttInput
 
 EACH: Final = "[]"
 ANY: Final = "*"
@@ -30,6 +32,39 @@ UNITS: Final = {"s": 9, "ms": 6, "us": 3, "ns": 0}
 
 _STEP: Final = re.compile(r"\[\d*\]|[^.\[\]]+")
 _OBJECT: Final = re.compile(r"objects\[(\d+)\](?:\.(\w+)(?:\[(\d+)\])?)?.*")
+
+
+FORMATS: Final[dict[str, dict[str, Any]]] = {
+    "axis": {
+        "objects": "frame.observations[]",
+        "class": "class.type",
+        "score": "class.score",
+        "box": tuple(f"bounding_box.{side}" for side in ("left", "top", "right", "bottom")),
+        "box_unit": "image",
+        "time": "frame.timestamp",
+    },
+    "scenescape": {
+        "objects": "objects.*[]",
+        "class": "category",
+        "score": "confidence",
+        "box": tuple(f"bounding_box_px.{side}" for side in ("x", "y", "width", "height")),
+        "box_form": "xywh",
+        "position": "translation",
+        "size": "size",
+        "lat": "lat_long_alt[0]",
+        "lon": "lat_long_alt[1]",
+        "alt": "lat_long_alt[2]",
+        "time": "timestamp",
+    },
+}
+"""Mappings of known makers: Axis' scene description, and detections of SceneScape."""
+
+
+def mapping_of(one: MqttInput) -> PayloadMapping | None:
+    """Return how the payloads of an input are mapped; None: they are frames."""
+    if one.format in FORMATS:
+        return PayloadMapping(MappingSettings(**FORMATS[one.format]))
+    return None if one.mapping is None else PayloadMapping(one.mapping)
 
 
 class PayloadMapping:

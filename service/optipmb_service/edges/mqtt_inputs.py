@@ -17,13 +17,14 @@ from optipmb_client.errors import ConnectionFailed as TransportError
 
 from optipmb_service.edges.inputs import RefusedError
 from optipmb_service.edges.json_frames import FrameReader
-from optipmb_service.edges.mapping import PayloadMapping
+from optipmb_service.edges.mapping import mapping_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from optipmb_service.edges.inputs import Inputs
-    from optipmb_service.settings import MqttInput, Settings
+    from optipmb_service.edges.mapping import PayloadMapping
+    from optipmb_service.settings import Settings
 
 RECEIVED: Final = 64
 """Unconfirmed messages that the broker may have under way to the bridge (MQTT 5)."""
@@ -64,7 +65,7 @@ class MqttInputs:
         self.topics = [(one.topic, one.qos) for one in settings.mqtt.inputs.values()]
         self._frames = FrameReader(settings)
         self._inputs = inputs
-        self._rows = [_Input(stream, one.topic, _mapping(one)) for stream, one in settings.mqtt.inputs.items()]
+        self._rows = [_Input(stream, one.topic, mapping_of(one)) for stream, one in settings.mqtt.inputs.items()]
         self._tasks: set[asyncio.Task[None]] = set()
 
     def take(self, message: Any, confirm: Callable[[], object]) -> None:
@@ -125,10 +126,6 @@ class MqttInputs:
             await asyncio.sleep(PAUSE_S)
 
 
-def _mapping(one: MqttInput) -> PayloadMapping | None:
-    return None if one.mapping is None else PayloadMapping(one.mapping)
-
-
 def tried(settings: Settings, name: str, payload: bytes) -> str:
     """Return the detections that a payload of an input becomes, as JSON; `{1}` in its name stands for itself.
 
@@ -141,5 +138,5 @@ def tried(settings: Settings, name: str, payload: bytes) -> str:
             f"option --input: one of {', '.join(settings.mqtt.inputs) or 'mqtt.inputs'}, received {name!r}"
         )
     stream = re.sub(r"\{(\d)\}", r"\1", name)
-    frame = FrameReader(settings).read(payload, stream, _mapping(one))
+    frame = FrameReader(settings).read(payload, stream, mapping_of(one))
     return schemas.encode_json(frame.message).decode()

@@ -10,8 +10,8 @@ import pytest
 from optipmb_client.errors import ClientError
 from optipmb_schemas import Detections, MessageError
 from optipmb_service.edges.json_frames import FrameReader
-from optipmb_service.edges.mapping import PayloadMapping
-from optipmb_service.settings import MappingSettings, load
+from optipmb_service.edges.mapping import PayloadMapping, mapping_of
+from optipmb_service.settings import MappingSettings, MqttInput, load
 
 from optipmb import GroundCamera
 
@@ -82,6 +82,31 @@ def test_boxes_of_other_makers(calibration: Path) -> None:
         groups[one["class"]].append({"bounding_box_px": box})
     by_sides = {"objects": "objects.*[]", "class": "@key", "box": "bounding_box_px", "box_form": "xywh"}
     np.testing.assert_allclose(read(calibration, {"objects": groups}, by_sides).center, expected.center, atol=1e-6)
+
+
+def test_known_makers(calibration: Path) -> None:
+    """Axis' scene description and SceneScape's detections, as their schemas have them, become the same detections."""
+    expected = read(calibration, {"objects": objects(score=0.5), "time": "2026-11-27T08:00:00.5Z"})
+    sides = ("left", "top", "right", "bottom")
+    observations, groups = [], {}
+    for one in objects():
+        x1, y1, x2, y2 = one["box"]
+        share = dict(zip(sides, (x1 / 1920, y1 / 1080, x2 / 1920, y2 / 1080), strict=True))
+        kind = {"type": one["class"], "score": 0.5}
+        observations.append({"bounding_box": share, "class": kind, "track_id": "9", "timestamp": "…"})
+        box = {"x": x1, "y": y1, "width": x2 - x1, "height": y2 - y1}
+        found = {"id": 1, "category": one["class"], "confidence": 0.5, "bounding_box_px": box}
+        groups.setdefault(one["class"], []).append(found)
+    payloads = {
+        "axis": {"frame": {"timestamp": "2026-11-27T08:00:00.500Z", "observations": observations, "operations": []}},
+        "scenescape": {"id": "cam1", "timestamp": "2026-11-27T08:00:00.500Z", "rate": 9.8, "objects": groups},
+    }
+    for name, payload in payloads.items():
+        mapping = mapping_of(MqttInput(topic="x", format=name))
+        found = reader(calibration).read(json.dumps(payload).encode(), STREAM, mapping).message
+        assert (found.stamp_ns, found.labels) == (expected.stamp_ns, expected.labels)
+        np.testing.assert_allclose(found.center, expected.center, atol=1e-6)
+        np.testing.assert_allclose(found.score, expected.score)
 
 
 @pytest.mark.parametrize(
