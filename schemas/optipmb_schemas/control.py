@@ -121,7 +121,7 @@ class SessionState(Message):
     clouds_missed: Count = Field(default=0, description="Frames that waited for a cloud in vain.")
     repaired: Count = Field(default=0, description="Covariances repaired after a loss of rank by rounding.")
     clouds_refused: Count = Field(default=0, description="Points messages not valid, or that could not be taken.")
-    tracks: Count = Field(default=0, description="Tracks extracted at the newest frame.")
+    tracks: Count = Field(default=0, description="Confirmed tracks of the newest frame.")
     bernoullis: Count = Field(default=0, description="Bernoulli components now.")
     poissons: Count = Field(default=0, description="Poisson components now.")
     next_id: Count = Field(default=0, description="Lower bound of the next new track id.")
@@ -174,7 +174,7 @@ class SessionSummary(Message):
     refused: Count = Field(default=0, description="Detections messages not valid, or that could not be tracked.")
     shed: Count = Field(default=0, description="Frames dropped because the queue was full.")
     gaps: Count = Field(default=0, description="Frames missing.")
-    tracks: Count = Field(default=0, description="Tracks extracted at the newest frame.")
+    tracks: Count = Field(default=0, description="Confirmed tracks of the newest frame.")
     queue: Count = Field(default=0, description="Frames waiting now.")
     age_s: NonNegative | None = Field(default=None, description="Seconds since the last frame arrived.")
     worker: Count | None = Field(

@@ -78,7 +78,7 @@ class FilterState:
         starts: incarnations so far.
         generation: see `timeline`; of the last frame tracked.
         last: the last frame processed, tracked or not.
-        tracks: number of tracks at the last frame tracked.
+        tracks: number of confirmed tracks at the last frame tracked.
         counts: of the frames.
         sensors: each sensor by its stream; the only one of a stream's own session by an empty name.
         zones: state of the zones; None: it has none.

@@ -357,7 +357,7 @@ class Transition:
             starts=before.starts,
             generation=frame.place.generation,
             last=frame_id,
-            tracks=len(result.tracks),
+            tracks=int(result.tracks.confirmed.sum()),
             counts=_counted(before, frame, frames=1, gaps=gap, clouds_used=used, repaired=repaired),
             sensors=_sensors(before, frame_id.sensor, known),
             zones=zones,

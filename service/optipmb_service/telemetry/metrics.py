@@ -183,14 +183,14 @@ STREAM_METRICS: Final = {
         "Time since the last frame of the longest silent stream.",
         lambda s: max((one.age_s or 0.0 for one in s.sessions), default=0.0),
     ),
-    "tracks": _gauge("Tracks in the newest frames.", lambda s: sum(one.tracks for one in s.sessions)),
+    "tracks": _gauge("Confirmed tracks in the newest frames.", lambda s: sum(one.tracks for one in s.sessions)),
     "bernoullis": _gauge("Bernoulli components.", lambda s: sum(len(one.bernoulli) for one in s.densities)),
     "poissons": _gauge("Poisson components.", lambda s: sum(len(one.poisson) for one in s.densities)),
     "stream_frames_total": _counter("Frames tracked.", _each(lambda one: one.frames), "stream"),
     "stream_shed_total": _counter("Frames dropped from a full queue.", _each(lambda one: one.shed), "stream"),
     "stream_queue_frames": _gauge("Frames waiting.", _each(lambda one: one.queue), "stream"),
     "stream_age_seconds": _gauge("Time since the last frame.", _each(lambda one: one.age_s), "stream"),
-    "stream_tracks": _gauge("Tracks in the newest frame.", _each(lambda one: one.tracks), "stream"),
+    "stream_tracks": _gauge("Confirmed tracks in the newest frame.", _each(lambda one: one.tracks), "stream"),
     "stream_latency_seconds": _gauge(
         "Median and 99th percentile of the last 512 latencies.",
         lambda s: {

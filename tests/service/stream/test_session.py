@@ -346,6 +346,14 @@ def test_other_names_of_a_class_are_tracked() -> None:
         assert (one.labels, len(one.id)) == (other.labels, len(other.id))
 
 
+def test_the_state_counts_the_tracks_that_are_shown() -> None:
+    """One of three objects has a low score: its track is published, not confirmed, and not counted."""
+    one = session()
+    (published,) = tracks(feed(one, [0], score=np.array([0.9, 0.9, 0.35])))
+    assert published.confirmed is not None
+    assert (len(published.id), one.state().tracks) == (3, published.confirmed.sum()) == (3, 2)
+
+
 def test_reset_forgets_tracks_but_not_frames() -> None:
     """After a reset there are no tracks, ids go on, and frames seen before stay duplicates."""
     one = session()
