@@ -26,7 +26,7 @@ help:
 	@echo "make ray     track on Ray clusters, with workers and a node killed, which takes a minute"
 	@echo "make lowest  test the wheel with the oldest packages that it may be installed with"
 	@echo "make pythons test the wheel with the newest Python that this machine has"
-	@echo "make paths   go the first ten minutes of four users, from empty environments with the wheel, and print what they take"
+	@echo "make paths   go the first ten minutes of six users, from empty environments with the wheel, and print what they take"
 	@echo "make repeat  run make test N=10 times in fresh clones, with LOAD=0 processes that compute beside it"
 	@echo "make bench   time the tracker, its kernels, the codec and the service, beside the saved baseline"
 	@echo "make figures measure the tracker's figures of docs/performance.md, beside other trackers, and write the page"
@@ -141,7 +141,7 @@ lowest: dist
 	$(BIN)/python tests/lowest.py >out/lowest.txt
 	sh tests/elsewhere.sh $(PYTHON) out/dist out/lowest.txt
 
-# What stands in the README, from pip install to tracks; PATHS=csv, python, node or kitti walks one of them alone.
+# What stands on the first pages, from pip install to tracks, with processor time and halts; PATHS=start, csv, python, node, web or kitti walks one of them alone.
 PATHS ?=
 paths: dist
 	$(BIN)/python tests/paths.py out/dist $(PATHS)
