@@ -143,10 +143,7 @@ def stages() -> dict[str, dict[str, float]]:
         taken = []
         with pytest.MonkeyPatch.context() as patch:
             for stage in STAGES:
-                owner, attribute = optipmb.tracker, stage
-                if stage == "detection_probability":
-                    owner, attribute = optipmb.Tracker, "_detection_probabilities"
-                patch.setattr(owner, attribute, clocked(stage, getattr(owner, attribute)))
+                patch.setattr(optipmb.tracker, stage, clocked(stage, getattr(optipmb.tracker, stage)))
             for _ in range(ROUNDS * CALLS):
                 tracker.step(density, frame)
                 taken.append(tuple(spent.values()))
