@@ -265,6 +265,25 @@ def tracks_json(tracks: Tracks, selection: Selection = EVERYTHING, place: Place 
     return msgspec.json.encode(EdgeTracks(**_about(tracks), objects=objects, predicted_to_ns=time_ns))
 
 
+def features_json(frames: Iterable[bytes]) -> bytes:
+    """Return frames of tracks (`tracks_json`) as a GeoJSON text: a point for each track that has a place.
+
+    Properties are the fields of the track and those of its frame.
+    """
+    features = []
+    for text in frames:
+        about = msgspec.json.decode(text)
+        del about["type"]
+        for one in about.pop("objects"):
+            if "lat" not in one:  # farther than 100 km from the origin of its site
+                continue
+            coordinates = [one.pop(name) for name in ("lon", "lat", "alt")]
+            point = {"type": "Point", "coordinates": coordinates}
+            name = f"{about['stream']}/{one['id']}"
+            features.append({"type": "Feature", "id": name, "geometry": point, "properties": about | one})
+    return msgspec.json.encode({"type": "FeatureCollection", "features": features})
+
+
 def event_json(events: Events, place: Place | None = None) -> list[bytes]:
     """Return each event of a message as a text."""
     about = _about(events)

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 import structlog
+from geojson_pydantic import FeatureCollection
 from optipmb_client.errors import ClientError
 from optipmb_schemas import (
     ServiceStatus,
@@ -46,6 +47,8 @@ from websocket import (
     WebSocketBadStatusException,
     create_connection,
 )
+
+from optipmb import Georeference
 
 ALL = "garage/*/*"
 DEADLINE_S = 60.0
@@ -136,6 +139,28 @@ def test_all_topics_come_on_one_connection(session: Session, address: str) -> No
         assert next(found_texts) == zones_json(events(2))
     session.cache = [(key_of(events(4)), events(4))]
     assert get(address, f"zones?stream={STREAM}")[1] == [json.loads(zones_json(events(4)) or b"")]
+
+
+def test_a_map_gets_the_newest_tracks_as_points(session: Session, watched: Watched) -> None:
+    """GeoJSON where the site has a place, with longitude first; elsewhere the answer names the setting."""
+    session.cache = [(key_of(one), one) for one in (tracks(3), tracks(4, "other/rig/a"))]
+    with served(watched, {"garage": Georeference((48.0, 11.0, 500.0)).to_geographic}) as address:
+        query = f"tracks?stream={ALL}&confirmed=0"
+        (frame,) = get(address, query)[1]
+        with asked(address, f"/api/v1/{query}&format=geojson") as response:
+            assert response.headers["content-type"] == "application/geo+json"
+            found = FeatureCollection.model_validate_json(response.read())
+        assert [one.id for one in found.features] == [f"{frame['stream']}/{one['id']}" for one in frame["objects"]]
+        for feature, one in zip(found.features, frame["objects"], strict=True):
+            assert feature.geometry is not None
+            assert list(feature.geometry.coordinates) == [one["lon"], one["lat"], one["alt"]]
+            assert feature.properties is not None
+            assert (feature.properties["stamp_ns"], feature.properties["class"]) == (frame["stamp_ns"], one["class"])
+        few = get(address, f"{query}&format=geojson&fields=speed")[1]["features"][0]
+        assert (len(few["geometry"]["coordinates"]), "speed" in few["properties"]) == (3, True)
+        assert "class" not in few["properties"]
+        assert get(address, "tracks?stream=other/*/*&format=geojson")[1]["path"] == "sites"
+        assert get(address, f"{query}&format=kml")[1]["path"] == "format"
 
 
 def test_the_newest_frame_is_that_of_the_latest_run(session: Session, address: str) -> None:

@@ -17,7 +17,7 @@ import msgspec
 import optipmb_schemas as schemas
 from msgspec import Meta, Struct
 from optipmb_client.errors import ConnectionFailed as TransportError
-from optipmb_schemas.json_form import FIELDS, Selection
+from optipmb_schemas.json_form import FIELDS, Selection, features_json
 from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -272,6 +272,7 @@ class _Asked(Struct, frozen=True):
 
 
 PARAMETERS: Final = _Asked.__struct_fields__
+FORMAT: Final = "format"  # of `GET /api/v1/tracks`
 SELECTION: Final = frozenset({"stream", "classes", "confirmed", "min_existence", "fields", "predict"})
 
 
@@ -353,12 +354,22 @@ class Api:
         return _array(texts)
 
     async def tracks(self, request: Request) -> Response:
-        """Answer with the newest frame of each stream."""
-        _, wish = await self._asked(request, SELECTION)
+        """Answer with the newest frame of each stream, as JSON or as the points of a map."""
+        _, wish = await self._asked(request, SELECTION | {FORMAT})
+        if (form := request.query_params.get(FORMAT, "json")) not in {"json", "geojson"}:
+            raise schemas.MessageError("invalid_value", FORMAT, "json or geojson", ascii(form)[:80])
         if wish.predict:
             raise schemas.MessageError("invalid_value", "predict", "0 here: `stream` and `ws` predict", "1")
         (key,) = wish.keys(self._readers.keys)
-        return _array([one.tracks(wish.selection, self._readers.stale_s) for one in await self._newest(key)])
+        newest, selection = await self._newest(key), wish.selection
+        if form == "json":
+            return _array([one.tracks(selection, self._readers.stale_s) for one in newest])
+        if nowhere := [one.message.stream for one in newest if one.place is None]:
+            raise schemas.MessageError("invalid_value", "sites", f"the place of the site of {nowhere[0]}", "none")
+        if selection.fields:
+            selection = msgspec.structs.replace(selection, fields=selection.fields | {"lat", "lon", "alt"})
+        text = features_json(one.tracks(selection, self._readers.stale_s) for one in newest)
+        return Response(text, media_type="application/geo+json", headers=HEADERS)
 
     async def zones(self, request: Request) -> Response:
         """Answer with the newest counts of the zones of each stream."""
@@ -423,7 +434,8 @@ class Api:
     async def _asked(self, connection: HTTPConnection, known: Iterable[str] = PARAMETERS) -> tuple[Caller, Wish]:
         """Return the caller and a wish that it may read."""
         caller = await self._readers.caller(connection)
-        wish = wish_of(parameters_of(connection, known))
+        parameters = parameters_of(connection, known)
+        wish = wish_of({name: value for name, value in parameters.items() if name != FORMAT})
         wish.keys(self._readers.keys)
         caller.may_read(wish.streams[0])
         return caller, wish
