@@ -26,8 +26,8 @@ along and across the heading:
     sigma^2 = mean of nu epsilon        E[nu epsilon] = R where the filter is right
 
 with `PRIOR_PAIRS` pairs of the profile's noise. The scatter is R of the class, and R' of the published box. The errors
-of a detector last, too: the offset of a box from its object, which no filter sees, is 1.5 to 2.5 times the scatter with
-each of five detectors. `LASTING_RATIO` times the scatter is added to the published covariance.
+of a detector last, too: no filter sees the offset of a box from its object. It is larger along the heading, where half
+of an object is hidden, than across. `LASTING_RATIO` times the scatter is added to the published covariance.
 
 A threshold never excludes the upper half of the scores of a class. Detections that are filtered out teach nothing, so
 that otherwise a detector of low scores would remain silent for ever.
@@ -96,7 +96,8 @@ LEAST_NOISE, MOST_NOISE = 0.02, 2.0
 """Bounds of a learned standard deviation, m."""
 OUTLYING: Final = 9.0
 """Squared standard deviations that a pair counts for at most: a half-hidden object jumps."""
-LASTING_RATIO: Final = 1.7
+LASTING_RATIO: Final = (0.0, 1.5, 1.0)
+"""Lasting errors in units of the scatter, by column of it."""
 LEAST_PART: Final = 1.0
 """Part of the profile's variance that R has at least, so that the box of a half-hidden object stays with its track."""
 
@@ -332,7 +333,7 @@ def use_scatter(scatter: Array, table: Classes) -> None:
 @kernel
 def lasting(own: Array, axis: int, prior: float) -> float:
     """Return the variance of the lasting error along an axis, m^2, with the standard deviation of the profile, m."""
-    total = PRIOR_PAIRS * prior * prior + LASTING_RATIO * LASTING_RATIO * own[axis]
+    total = PRIOR_PAIRS * prior * prior + LASTING_RATIO[axis] ** 2 * own[axis]
     variance: float = total / (PRIOR_PAIRS + own[PAIRS])
     return min(variance, MOST_NOISE * MOST_NOISE)
 
@@ -445,6 +446,9 @@ def learned_noise(density: Density) -> tuple[str, ...]:
     own, lines = density.self_calibration, []
     for name, row in zip(density.labels, () if own is None else own.scatter.tolist(), strict=own is not None):
         if row[PAIRS] >= PRIOR_PAIRS:
-            scatter = math.sqrt(0.5 * (row[ALONG] + row[ACROSS]) / row[PAIRS])
-            lines.append(f"{name}: {scatter:.2f} m scatter, {LASTING_RATIO * scatter:.2f} m lasting")
+            white, last = (
+                math.sqrt(0.5 * (along**2 * row[ALONG] + across**2 * row[ACROSS]) / row[PAIRS])
+                for along, across in ((1.0, 1.0), LASTING_RATIO[ALONG:])
+            )
+            lines.append(f"{name}: {white:.2f} m scatter, {last:.2f} m lasting")
     return tuple(lines)

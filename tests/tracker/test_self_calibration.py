@@ -269,7 +269,7 @@ def test_learned_noise_goes_to_the_state_the_box_and_the_covariance() -> None:
         of_box = 1.0 / (1.0 / own["reported_position"] + 1.0 / measured) if own["reported_position"] else measured
         assert of_box == pytest.approx(min(reported, measured), rel=1e-9)
         for s, name in ((1, "knot_along"), (2, "knot_across")):
-            variance = (50.0 * curve[0, :2] ** 2 + LASTING_RATIO**2 * one[s]) / (50.0 + one[0])
+            variance = (50.0 * curve[0, :2] ** 2 + LASTING_RATIO[s] ** 2 * one[s]) / (50.0 + one[0])
             np.testing.assert_allclose(own[name][:2] ** 2, np.minimum(variance, MOST_NOISE**2), rtol=1e-12)
             assert lasting(one, s, 0.15) == pytest.approx(min(variance[0], MOST_NOISE**2), rel=1e-12)
 
