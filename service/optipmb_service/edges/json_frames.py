@@ -431,7 +431,7 @@ def _malformed(error: Exception, payload: bytes) -> schemas.MessageError:
 def _invalid(error: msgspec.ValidationError, document: Any) -> schemas.MessageError:
     """Return an error of the types of fields as ours."""
     text, _, place = str(error).partition(" - at `$")
-    path = place.rstrip("`").removeprefix(".")
+    path = place.rstrip("`").partition("[...]")[0].removeprefix(".")  # `[...]` is a value of a map of any names
     for part in re.findall(r"\w+", path):
         document = document[int(part) if part.isdigit() else part]
     if match := re.fullmatch(r"Object missing required field `(.*)`", text):
@@ -443,4 +443,6 @@ def _invalid(error: msgspec.ValidationError, document: Any) -> schemas.MessageEr
     expected = re.sub(r"\w+", lambda word: _KINDS.get(word[0], word[0]), expected)
     if text.startswith("Invalid enum value"):
         expected = "world or sensor"
+    elif text == "Number out of range":
+        expected = "a number of 64 bits"
     return invalid(path, expected, document)
