@@ -14,10 +14,11 @@ from matplotlib.patches import Ellipse, Rectangle
 from optipmb_tools.cli import run
 from optipmb_tools.datasets import open_dataset
 from optipmb_tools.run import profiles
-from optipmb_tools.run.rejoining import Gaps, Rejoin, motion_of, motion_scores, tracklets
+from optipmb_tools.run.rejoining import Rejoin, tracklets
 from optipmb_tools.run.tracking import track_whole
 
 import optipmb
+from optipmb.rejoin import motion_of, motion_score
 from optipmb.zones import Zone, ZoneState, observe
 
 if TYPE_CHECKING:
@@ -303,17 +304,15 @@ def draw_gap(axes: Axes) -> None:
     object_of = dict(zip(objects.id.tolist(), objects.object.tolist(), strict=True))
     earlier, later = np.flatnonzero([parameters.labels[one] == "car" for one in found.label.tolist()]).tolist()
     ends = found.take(np.array([earlier]))
-    seconds = (found.first_ns[[later]] - ends.last_ns) * 1e-9
+    seconds = float(found.first_ns[later] - ends.last_ns[0]) * 1e-9
     x, y = np.meshgrid(np.arange(0.0, 62.0, 0.25), np.arange(-18.0, 16.0, 0.25))
-    grid = np.column_stack((x.ravel(), y.ravel())) - ends.end
-    one = Gaps(grid, ends.end_velocity, ends.end_variance, *np.full((2, 1), np.nan), seconds, 35.0 * seconds)
-    many = Gaps(
-        grid,
-        *(np.broadcast_to(column, (len(grid), *np.shape(column)[1:])) for column in one[1:3]),
-        np.full_like(grid, np.nan),
-        *(np.repeat(column, len(grid)) for column in one[4:]),
-    )
-    density = np.exp(motion_scores(many, motion_of("car"))).reshape(x.shape)
+    way, variance, reach = tuple(ends.end_velocity[0].tolist()), float(ends.end_variance[0]), 35.0 * seconds
+    here, unknown, car = ends.end[0].tolist(), (np.nan, np.nan), np.array(motion_of("car"))
+    scores = [
+        motion_score((one - here[0], two - here[1]), way, variance, unknown, np.nan, seconds, reach, car)
+        for one, two in zip(x.ravel().tolist(), y.ravel().tolist(), strict=True)
+    ]
+    density = np.exp(scores).reshape(x.shape)
     axes.contourf(
         x,
         y,

@@ -46,6 +46,7 @@ from optipmb.parameters import (
     profiles,
 )
 from optipmb.paths import PredictedPaths, predict_tracks
+from optipmb.rejoin import Rejoin
 from optipmb.relocation import Relocation
 from optipmb.tracker import Diagnostics, Modules, StepResult, Tracker
 from optipmb.warm import warm_up
@@ -77,6 +78,7 @@ __all__ = [
     "Poissons",
     "Pose",
     "PredictedPaths",
+    "Rejoin",
     "Relocation",
     "ScoreCalibration",
     "Sensor",

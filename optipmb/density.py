@@ -21,6 +21,7 @@ import numpy as np
 
 from optipmb.compiled import kernel
 from optipmb.errors import DensityError
+from optipmb.lost_objects import Beginnings, Lost, Places, Rejoining, Statistics, Tracklets
 from optipmb.rows import Column, Rows, arrays_of, record, shown, views_of
 
 if TYPE_CHECKING:
@@ -222,6 +223,7 @@ class Density:
         sensor: (5,) velocity, m/s, and turn rate, rad/s, with which what stands passes a sensor without poses, the
             evidence that it moves so, and the time over which that was found, s (`optipmb.sensor_motion`); None where
             it stands or frames have poses.
+        rejoining: lost objects and what else joining needs; None where tracks are not joined.
     """
 
     stamp_ns: int
@@ -233,6 +235,7 @@ class Density:
     class_probability: Array | None = None
     self_calibration: SelfCalibration | None = None
     sensor: Array | None = None
+    rejoining: Rejoining | None = None
 
     @property
     def sensor_motion(self) -> Array | None:
@@ -280,6 +283,9 @@ SENSOR: Final = "sensor"
 MOST_COUNTED: Final = 1e9
 """Bound of stored counts of scores and of the sensor's motion, far above all that the tracker makes."""
 
+JOINING: Final = (Tracklets, Places, Lost, Beginnings, Statistics)
+"""Records of `Density.rejoining`, in the order of its fields."""
+
 ROUNDING: Final = 1e-6
 """By how much the sum of probabilities may differ from 1."""
 
@@ -326,8 +332,10 @@ def columns_of(density: Density) -> dict[str, NDArray[Any]]:
     return columns | _others(density)
 
 
-def _records(density: Density) -> list[Bernoullis | Poissons | Misses]:
-    return [rows for rows in (density.bernoulli, density.poisson, density.misses) if rows is not None]
+def _records(density: Density) -> list[Rows]:
+    own = density.rejoining
+    joining = () if own is None else (own.live, own.places, own.lost, own.beginnings, own.classes)
+    return [rows for rows in (density.bernoulli, density.poisson, density.misses, *joining) if rows is not None]
 
 
 def _others(density: Density) -> dict[str, NDArray[Any]]:
@@ -373,8 +381,9 @@ def columns_in(parts: Mapping[str, bytes], classes: int) -> dict[str, NDArray[An
         DensityError: a part is missing, is not whole rows, or has a flag that is neither 0 nor 1.
     """
     columns: dict[str, NDArray[Any]] = {}
-    for kind in (Bernoullis, Poissons, Misses):
-        if kind is not Misses or kind.part in parts:
+    kinds: tuple[type[Rows], ...] = (Bernoullis, Poissons, Misses, *JOINING)
+    for kind in kinds:
+        if kind in {Bernoullis, Poissons} or kind.part in parts:
             rows = kind.of(_words(parts, kind.part, kind.width))
             columns |= {f"{kind.part}.{name}": column for name, column in rows.columns()}
             for name, one in kind.described.items():
@@ -462,7 +471,43 @@ def density_of(stamp_ns: int, next_id: int, columns: Mapping[str, Any], labels: 
         if not (isinstance(motion, np.ndarray) and motion.shape == (5,) and (np.abs(motion) <= MOST_COUNTED).all()):
             raise DensityError(SENSOR, f"(5,) finite numbers up to {MOST_COUNTED:g}", shown(motion))
         motion = np.array(motion, np.float64)
-    return Density(stamp_ns, next_id, bernoulli, poisson, tuple(labels), misses, pi, own, motion)
+    joining = _rejoining(columns, stamp_ns, next_id, len(labels)) if f"{Tracklets.part}.id" in columns else None
+    return Density(stamp_ns, next_id, bernoulli, poisson, tuple(labels), misses, pi, own, motion, joining)
+
+
+def _rejoining(columns: Mapping[str, Any], stamp_ns: int, next_id: int, classes: int) -> Rejoining:
+    """Return the state of the joining of tracks, whose rows fit together."""
+    live, places, lost, begun, known = (_rows(kind, columns) for kind in JOINING)
+    found = Rejoining(live, places, lost, begun, known)  # type: ignore[arg-type]  # in this order
+    for rows in (found.live, found.lost):
+        for name, column, low, high in (
+            ("id", np.diff(rows.id, prepend=0), 1, next_id),
+            ("id", rows.id, 1, next_id - 1),
+            ("label", rows.label, 0, classes - 1),
+            ("object", rows.object - rows.id, -next_id, 0),
+            ("object", rows.object, -1 if rows is found.live else 0, next_id - 1),
+            ("first_ns", rows.first_ns, 0, stamp_ns),
+            ("last_ns", rows.last_ns - rows.first_ns, 0, stamp_ns),
+            ("last_ns", rows.last_ns, 0, stamp_ns),
+            ("detections", rows.detections, 0, MOST_COUNTED),
+            ("probability", rows.probability, 0.0, 1.0),
+        ):
+            if column.size and not low <= column.min() <= column.max() <= high:
+                raise DensityError(f"{rows.part}.{name}", f"from {low} to {high}", f"{column.min()} to {column.max()}")
+    for path, length, expected in (
+        (Places.part, len(found.places), len(found.live)),
+        (Statistics.part, len(found.classes), classes),
+    ):
+        if length != expected:
+            raise DensityError(path, f"{expected} rows", str(length))
+    for path, column, most in (
+        (f"{Places.part}.count", found.places.count, MOST_COUNTED),
+        (f"{Beginnings.part}.kind", found.beginnings.kind, classes - 1),
+        (f"{Beginnings.part}.stamp_ns", found.beginnings.stamp_ns, stamp_ns),
+    ):
+        if column.size and not 0 <= column.min() <= column.max() <= most:
+            raise DensityError(path, f"from 0 to {most}", f"{column.min()} to {column.max()}")
+    return found
 
 
 def _self_calibration(columns: Mapping[str, Any], shapes: Mapping[str, tuple[tuple[int, ...], Any]]) -> SelfCalibration:
@@ -495,7 +540,7 @@ def _rows(kind: type[_Rows], columns: Mapping[str, Any]) -> _Rows:
     rows = kind(**found)
     for name, column in rows.columns():
         if column.dtype.kind == "f" and not np.isfinite(column).all():
-            good = np.isfinite(column) | (np.isnan(column) if name == "auxiliary" else False)
+            good = np.isfinite(column) | (np.isnan(column) if name == "auxiliary" or kind in JOINING else False)
             if good.all():
                 continue
             row = np.argwhere(~good)[0]

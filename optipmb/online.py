@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from optipmb.ground_camera import GroundCamera
     from optipmb.parameters import Parameters
     from optipmb.paths import PredictedPaths
+    from optipmb.rejoin import Rejoin
     from optipmb.rows import Array, Index
     from optipmb.tracker import Modules
 
@@ -85,6 +86,8 @@ class OnlineTracks:
         sensor_motion: (3,) velocity, m/s, and turn rate, rad/s, with which what stands passes the sensor, where the
             motion of the sensor is estimated; None elsewhere.
         measured: (N,) uint8, the known parts of each track: 1 the heading, 2 the size, 4 the height, added up.
+        object: (N,) int64 id of the first track of the object, -1 while that is not decided; None without `rejoin`.
+        object_probability: (N,) that all joins of the object are right, 1 without a join; None without `rejoin`.
 
     The other attributes are the columns of `optipmb.Tracks`.
     """
@@ -113,6 +116,8 @@ class OnlineTracks:
     paths: PredictedPaths | None = None
     class_probability: Array | None = None
     sensor_motion: Array | None = None
+    object: Index | None = None
+    object_probability: Array | None = None
 
     def __len__(self) -> int:
         return len(self.tracks)
@@ -168,6 +173,8 @@ class OnlineTracks:
             "yaw_rate": self.yaw_rate,
             "acceleration": self.acceleration,
             **{column: getattr(self, column) for column in plain},
+            **({} if self.object is None else {"object": self.object}),
+            **({} if self.object_probability is None else {"object_probability": self.object_probability}),
         }
 
     def to_arrow(self) -> pa.Table:
@@ -304,6 +311,7 @@ class OnlineTracker:
         modules: which modules of the paper are on.
         unknown_classes: `refuse` raises for a detection of a class that the profile lacks, `leave out` counts it in
             `OnlineTracks.left_out`. Names that mean the same are one: `car`, `Car` and `vehicle.car`.
+        rejoin: how tracks of the same object are joined over gaps; None: they are not.
 
     Attributes:
         parameters: the profile.
@@ -314,11 +322,16 @@ class OnlineTracker:
     """
 
     def __init__(
-        self, profile: Parameters | str = "generic", *, modules: Modules | None = None, unknown_classes: str = "refuse"
+        self,
+        profile: Parameters | str = "generic",
+        *,
+        modules: Modules | None = None,
+        unknown_classes: str = "refuse",
+        rejoin: Rejoin | None = None,
     ) -> None:
         if unknown_classes not in {"refuse", "leave out"}:
             raise FrameError("unknown_classes", "'refuse' or 'leave out'", repr(unknown_classes))
-        self._tracker = Tracker(profile, modules)
+        self._tracker = Tracker(profile, modules, rejoin=rejoin)
         self.parameters = self._tracker.parameters
         self._names = np.asarray(self.parameters.labels, dtype=np.object_)
         self._leave_out = unknown_classes == "leave out"
@@ -415,6 +428,8 @@ class OnlineTracker:
             class_probability=result.class_probability,
             sensor_motion=result.density.sensor_motion,
             measured=np.full(len(tracks), 7, np.uint8) if result.measured is None else result.measured,
+            object=None if result.joined is None else result.joined.object,
+            object_probability=None if result.joined is None else result.joined.probability,
         )
         self._latest = online.summary
         return online

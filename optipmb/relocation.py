@@ -79,6 +79,8 @@ class Relocation(NamedTuple):
         if not any(self):
             return density
         moved = replace(density, bernoulli=self._rows(density.bernoulli), poisson=self._rows(density.poisson))
+        if density.rejoining is not None:
+            moved = replace(moved, rejoining=density.rejoining.moved(self))
         if density.sensor is None:
             return moved
         cos, sin = math.cos(self.theta), math.sin(self.theta)

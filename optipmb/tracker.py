@@ -31,6 +31,7 @@ from optipmb.parameters import Parameters, load_profile
 from optipmb.paths import paths_of
 from optipmb.predict import predict
 from optipmb.preprocess import Measurements, preprocess
+from optipmb.rejoin import Kinds, Rejoin, rejoin_tracks
 from optipmb.rows import record
 from optipmb.self_calibration import calibrated, followed
 from optipmb.sensor_motion import follow_sensor
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
 
     from optipmb.frame import Frame
     from optipmb.paths import PredictedPaths
+    from optipmb.rejoin import Joined
     from optipmb.rows import Array, Columns, Index
     from optipmb.table import Classes
 
@@ -187,6 +189,7 @@ class StepResult:
         class_probability: (N, C) of each track and class, where classes have a group in common.
         measured: (N,) uint8, the known parts of each track: 1 the heading, by a detection or by its motion, 2 the size,
             4 the height, added up; defaults stand for the others. None: everything of all tracks is known.
+        joined: the objects of the tracks; None where the tracker does not join them.
     """
 
     density: Density
@@ -195,6 +198,7 @@ class StepResult:
     paths: PredictedPaths | None = None
     class_probability: Array | None = None
     measured: NDArray[np.uint8] | None = None
+    joined: Joined | None = None
 
 
 class Tracker:
@@ -218,6 +222,7 @@ class Tracker:
 
     Args:
         profile: parameters, or the name or file of a profile.
+        rejoin: how tracks are joined over gaps; None: they are not.
 
     Attributes:
         parameters: the profile.
@@ -228,16 +233,23 @@ class Tracker:
     """
 
     def __init__(
-        self, profile: Parameters | str, modules: Modules | None = None, *, max_pairs: int = UNLIMITED
+        self,
+        profile: Parameters | str,
+        modules: Modules | None = None,
+        *,
+        max_pairs: int = UNLIMITED,
+        rejoin: Rejoin | None = None,
     ) -> None:
         if profile == "auto":
             expected = "'generic', which is auto at 10 Hz, or generic_parameters(labels, period)"
             raise ParameterError("profile", expected, "'auto', which needs a whole recording")
         self._max_pairs = max_pairs
+        self._rejoin = rejoin
         self.parameters = parameters = profile if isinstance(profile, Parameters) else load_profile(profile)
         self.modules = modules if modules is not None else Modules()
         self._labels = parameters.labels
         self._table = ClassTable.of(parameters)
+        self._kinds = Kinds.of(parameters)
         self._horizons = np.array(parameters.horizons, np.float64)
 
     def initial(self, next_id: int = 1) -> Density:
@@ -305,13 +317,17 @@ class Tracker:
 
         # Track extraction
         shown = objects.words, posterior.missed_from_ns, after.measurement, tuple(z), tuple(moment)
-        tracks = Tracks.of(extract(*shown, modules.ote, table.classes))
+        tracks, joined = Tracks.of(extract(*shown, modules.ote, table.classes)), None
+        if self._rejoin is not None:
+            joined = rejoin_tracks(density.rejoining, posterior, tracks, self._rejoin, self._kinds)
+            posterior, tracks = joined.density, joined.tracks
+            objects, pi = posterior.bernoulli, posterior.class_probability
         paths = paths_of(tracks, self._horizons, table) if self._horizons.size else None
         pi = None if pi is None else pi[np.searchsorted(objects.id, tracks.id)]
         removed, repaired = (frame.score.shape[0], below_score, suppressed), repaired + after.repaired
         diagnostics = Diagnostics(cloud is not None, *removed, after.detected, born, repaired)
         measured = None if all_measured(objects.words) else measured_bits(objects, tracks.id)
-        return StepResult(posterior, tracks, diagnostics, paths, pi, measured)
+        return StepResult(posterior, tracks, diagnostics, paths, pi, measured, joined)
 
     def _moment(self, density: Density, frame: Frame) -> Moment:
         """Return the time of a frame; refuse the past, and other classes, for which kernels read out of bounds."""

@@ -21,6 +21,7 @@ from optipmb.frame import PointCloud, Pose, make_frame
 from optipmb.geometry import bev_iou
 from optipmb.parameters import load_profile, parse_parameters
 from optipmb.paths import predict_tracks
+from optipmb.rejoin import Kinds, Rejoin, match, pair_scores
 from optipmb.sensor_motion import Pairs, common_motion, sideways
 from optipmb.tracker import Modules, Tracker, update
 from optipmb.zones import Shapes, Zone, crossings, locate
@@ -90,7 +91,7 @@ def _run() -> None:
         "calibration": curve | {"memory": 0.5, "missed": 1.0},
     }
     parameters = parse_parameters(document)
-    tracker = Tracker(parameters)
+    tracker = Tracker(parameters, rejoin=Rejoin())
     posterior = tracker.initial()
     pose = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
     cloud = PointCloud(np.zeros((8, 3), np.float32), pose)
@@ -125,6 +126,10 @@ def _run() -> None:
     pairs = Pairs(place, label, place, label)
     common_motion(pairs, np.zeros(3), 0.0, 0.0, 0.0)
     sideways(pairs, place, np.zeros(1), np.zeros(1, np.bool_))
+    no_pairs = np.zeros(0, np.int64)
+    kinds = Kinds.of(parameters)
+    pair_scores(np.zeros(0), no_pairs, no_pairs, kinds.kind, kinds.motion, 60.0)
+    match(no_pairs, no_pairs, np.zeros(0), np.zeros(0, np.bool_), 0)
     line = Zone("line", line=((0.0, 0.0), (1.0, 0.0)))
     locate(np.zeros((1, 3)), np.zeros((1, 2)), *Shapes.of([line]))
     crossings(np.array(line.line), 0.0, 0.0, 0.0, 0.0)

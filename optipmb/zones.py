@@ -5,7 +5,8 @@
     state, events = observe(zones, state, stamp_ns, tracks, labels)
 
 `observe` is pure, as the step of the tracker is. Only frames in which a track was detected move it. Events of a track
-come when it is confirmed.
+come when it is confirmed. Where tracks are joined over gaps (`optipmb.rejoin`), they come when its object is decided.
+Then a track goes on with the visits of the object's track before, as if that had been detected again.
 """
 
 from __future__ import annotations
@@ -103,6 +104,8 @@ class Event(NamedTuple):
     how: How = ""
     dwell_s: float = 0.0
     direction: Literal["left", "right", ""] = ""
+    object: int | None = None
+    """id of the first track of the object; set when the event is sent"""
 
 
 class Visit(NamedTuple):
@@ -147,6 +150,8 @@ class ZoneState:
     """the zones that it is of, as `Zone.digest`"""
     session: str = ""
     """in which the ids of its tracks are unique"""
+    objects: Mapping[int, int] = field(default_factory=dict)
+    """object of each track, where it is decided and tracks are joined"""
 
 
 class Shapes(NamedTuple):
@@ -245,6 +250,7 @@ def observe(
     tracks: Tracks,
     labels: Sequence[str],
     shapes: Shapes | None = None,
+    objects: Index | None = None,
 ) -> tuple[ZoneState, tuple[Event, ...]]:
     """Return the state after a frame, and its events ordered by time, zone and id.
 
@@ -255,8 +261,12 @@ def observe(
         tracks: of the frame.
         labels: the classes.
         shapes: the zones as arrays, where they are at hand.
+        objects: (N,) id of the first track of the object of each track, -1 while that is not decided; None: tracks are
+            not joined.
     """
-    known = dict(state.tracks)
+    known, numbers = dict(state.tracks), dict(state.objects)
+    if objects is not None:
+        _rejoined(zones, known, numbers, stamp_ns, dict(zip(tracks.id.tolist(), objects.tolist(), strict=True)))
     events: list[Event] = []
     rows = np.flatnonzero(tracks.detection >= 0)
     identities = tracks.id.tolist()
@@ -280,7 +290,7 @@ def observe(
             else:
                 seen = seen._replace(held=(*seen.held, *more))
         known[identity] = seen
-    for row in np.flatnonzero(tracks.confirmed).tolist():
+    for row in np.flatnonzero(tracks.confirmed if objects is None else objects >= 0).tolist():
         seen_now = known.get(identities[row])
         if seen_now is not None and not seen_now.confirmed:
             events += seen_now.held
@@ -288,7 +298,7 @@ def observe(
     times = [_ns(one.lost_s) for one in zones if one.polygon] or [_ns(Zone.lost_s)]
     soonest_ns, longest_ns = min(times), max(times)
     here = set(identities)
-    for identity in state.tracks:
+    for identity in tuple(known):
         silent_ns = stamp_ns - known[identity].stamp_ns
         if silent_ns <= soonest_ns:
             continue
@@ -297,7 +307,35 @@ def observe(
         known[identity] = seen
         if silent_ns > longest_ns and identity not in here:
             del known[identity]
-    return _counted(replace(state, tracks=known), events)
+    events = [one._replace(object=numbers.get(one.id)) for one in events] if numbers else events
+    kept = {identity: number for identity, number in numbers.items() if identity in known}
+    return _counted(replace(state, tracks=known, objects=kept), events)
+
+
+def _rejoined(
+    zones: Sequence[Zone], known: dict[int, Seen], numbers: dict[int, int], stamp_ns: int, objects: Mapping[int, int]
+) -> None:
+    """Let tracks whose objects are decided now go on with what is known of these; long gaps cross no line.
+
+    Args:
+        zones: the zones and lines.
+        known: the tracks.
+        numbers: the objects that are decided.
+        stamp_ns: of the frame.
+        objects: of the tracks of the frame.
+    """
+    before = {number: identity for identity, number in numbers.items()}
+    for identity, number in objects.items():
+        if number < 0 or identity in numbers:
+            continue
+        numbers[identity] = number
+        last = before.get(number)
+        if last is None or (seen := known.pop(last, None)) is None:
+            continue
+        del numbers[last]
+        silent_ns = stamp_ns - seen.stamp_ns
+        far = {one.name: (-1, seen.place) for one in zones if one.line and silent_ns > _ns(one.lost_s)}
+        known[identity] = seen._replace(near={**seen.near, **far})
 
 
 def adapted(zones: Sequence[Zone], state: ZoneState) -> ZoneState:
@@ -349,7 +387,8 @@ def relocated(state: ZoneState, relocation: Relocation) -> ZoneState:
 def end(zones: Sequence[Zone], state: ZoneState) -> tuple[ZoneState, tuple[Event, ...]]:
     """Return the state after a session ends, whose ids mean nothing to the next one, and its last events."""
     events = [event for identity, one in state.tracks.items() for event in _lost(zones, identity, one, 0, "ended")[1]]
-    return _counted(replace(state, tracks={}), events)
+    events = [one._replace(object=state.objects.get(one.id)) for one in events]
+    return _counted(replace(state, tracks={}, objects={}), events)
 
 
 def _moved(

@@ -13,52 +13,54 @@ from numpy.typing import NDArray
 from optipmb_schemas import Tracks
 from optipmb_tools.datasets import open_dataset
 from optipmb_tools.run import rejoining
-from optipmb_tools.run.rejoining import Gaps, Rejoin, Tracklets, joins, matching, tracklets
+from optipmb_tools.run.rejoining import Rejoin, joins, matching, tracklets
 from optipmb_tools.table_files import read_table
 from scipy.linalg import expm
 from scipy.optimize import Bounds, LinearConstraint, milp
 
-from optipmb import Parameters, generic_parameters
+from optipmb import Parameters, generic_parameters, rejoin
+from optipmb.lost_objects import Tracklets
 
 Array = NDArray[np.float64]
 GENERIC = generic_parameters(gaps.CLASSES, 0.1)
 
 
-def gap_of(seconds: float, **known: Any) -> Gaps:
-    """Return one gap of an object that moves along at 5 m/s."""
-    values = {"velocity": (5.0, 0.0), "variance": 0.04, "offset": (0.0, 0.0), "later": (np.nan, np.nan)} | known
-    columns = (values["offset"], values["velocity"], values["variance"], values["later"], values.get("later_variance"))
-    spread = [np.array([one if one is not None else np.nan], dtype=np.float64) for one in columns]
-    return Gaps(*spread, np.array([seconds]), np.array([35.0 * seconds + 3.0]))
+CAR = np.array(rejoin.motion_of("car"))
+
+
+def score_of(seconds: float, **known: Any) -> float:
+    """Return the score of a gap of an object that moves along at 5 m/s."""
+    values = {"offset": (0.0, 0.0), "later": (np.nan, np.nan), "later_variance": np.nan} | known
+    reach = 35.0 * seconds + 3.0
+    return rejoin.motion_score(
+        values["offset"], (5.0, 0.0), 0.04, values["later"], values["later_variance"], seconds, reach, CAR
+    )
 
 
 @pytest.mark.parametrize("seconds", [0.3, 2.0, 30.0])
 @pytest.mark.parametrize("axis", [0, 1])
 def test_motion_models_are_those_of_their_differential_equations(seconds: float, axis: int) -> None:
     """Factors and covariances equal the matrix exponentials of Van Loan (1978)."""
-    motion = rejoining.motion_of("car")
+    motion = rejoin.motion_of("car")
     noise = (motion.keeps_along, motion.keeps_across)[axis], (motion.wanders_along, motion.wanders_across)[axis]
-    stays, *others = rejoining.models(motion, axis, gap_of(seconds))
-    assert all(float(one[0]) == 0.0 for one in stays)
+    models = rejoin.keeps(seconds, 0.04, noise[0]), rejoin.wanders(seconds, 0.04, noise[1], motion.memory)
     for model, rate, density in zip(
-        others, (0.0, 1.0 / motion.memory), (noise[0] ** 2, 2.0 * noise[1] ** 2 / motion.memory), strict=True
+        models, (0.0, 1.0 / motion.memory), (noise[0] ** 2, 2.0 * noise[1] ** 2 / motion.memory), strict=True
     ):
         drift, block = np.array([[0.0, 1.0], [0.0, -rate]]), np.zeros((4, 4))
         block[:2, :2], block[2:, 2:], block[1, 3] = -drift, drift.T, density
         whole = expm(block * seconds)
         step = whole[2:, 2:].T
         spread = step @ whole[:2, 2:] + step @ np.diag((0.0, 0.04)) @ step.T
-        found = (model.place, model.speed, model.variance, model.covariance, model.speed_variance)
         expected = (step[0, 1], step[1, 1], spread[0, 0], spread[0, 1], spread[1, 1])
-        assert np.concatenate(found) == pytest.approx(expected, rel=1e-9)
+        assert model == pytest.approx(expected, rel=1e-9)
 
 
 def test_the_density_of_places_is_that_of_sampled_paths() -> None:
     """Of paths that are simulated step by step, as many end in a region as the density says."""
     rng, count, steps, seconds = np.random.default_rng(1), 20_000, 60, 3.0
-    motion, dt = rejoining.motion_of("car"), seconds / 60
-    gap = gap_of(seconds)
-    mode = rng.choice(4, count, p=rejoining.WEIGHTS[1])
+    motion, dt, farthest = rejoin.motion_of("car"), seconds / 60, 35.0 * seconds + 3.0
+    mode = rng.choice(4, count, p=rejoin.WEIGHTS[1])
     place, speed = np.zeros((count, 2)), np.array((5.0, 0.0)) + 0.2 * rng.standard_normal((count, 2))
     keeps = np.array((motion.keeps_along, motion.keeps_across))
     wanders = np.array((motion.wanders_along, motion.wanders_across))
@@ -68,27 +70,22 @@ def test_the_density_of_places_is_that_of_sampled_paths() -> None:
         wandering = -dt * speed / motion.memory + wanders * np.sqrt(2.0 / motion.memory) * white
         speed += np.where((mode == 1)[:, None], keeps * white, wandering)
     place[mode == 0] = 0.0
-    angle, radius = rng.uniform(-np.pi, np.pi, count), gap.reach * np.sqrt(rng.random(count))
+    angle, radius = rng.uniform(-np.pi, np.pi, count), farthest * np.sqrt(rng.random(count))
     anywhere = np.column_stack((radius * np.cos(angle), radius * np.sin(angle)))
     place = np.where(
         (mode == 3)[:, None], anywhere, place + np.sqrt(2.0) * motion.noise * rng.standard_normal((count, 2))
     )
-    x, y = np.meshgrid(np.arange(-119.75, 120.0, 0.5), np.arange(-119.75, 120.0, 0.5))
-    grid = np.column_stack((x.ravel(), y.ravel()))
-    many = Gaps(grid, *(np.repeat(one, len(grid), axis=0) for one in gap[1:]))
-    mass = 0.25 * np.exp(rejoining.motion_scores(many, motion))
-    inside = np.linalg.norm(grid, axis=1) < gap.reach
-    assert mass[inside].sum() == pytest.approx(1.0, abs=0.01)
     for low, high in (((-2, -2), (2, 2)), ((10, -2), (20, 2)), ((2, -1), (10, 1)), ((0, 2), (40, 20))):
-        expected = mass[((grid > low) & (grid < high)).all(axis=1)].sum()
+        across = [np.arange(a + 0.125, b, 0.25) for a, b in zip(low, high, strict=True)]
+        spots = [(x, y) for x in across[0].tolist() for y in across[1].tolist()]
+        expected = 0.0625 * sum(np.exp(score_of(seconds, offset=spot)) for spot in spots)
         assert ((place > low) & (place < high)).all(axis=1).mean() == pytest.approx(expected, abs=0.012)
 
 
 def test_velocities_that_agree_are_evidence() -> None:
     """A later track with the velocity of the earlier one scores higher than one against it or with none."""
-    motion = rejoining.motion_of("car")
     scores = [
-        float(rejoining.motion_scores(gap_of(2.0, offset=(10.0, 0.0), later=later, later_variance=variance), motion)[0])
+        score_of(2.0, offset=(10.0, 0.0), later=later, later_variance=variance)
         for later, variance in (((5.0, 0.0), 0.04), ((np.nan, np.nan), np.nan), ((-5.0, 0.0), 0.04))
     ]
     assert scores == sorted(scores, reverse=True)
@@ -210,28 +207,9 @@ def test_joins_do_not_depend_on_axes_origin_and_names(tracks: dict[int, Tracks])
     assert list(other.values()) == pytest.approx(list(plain.values()), abs=1e-4)
 
 
-def cars(*paths: tuple[float, float, Array | tuple[float, float], tuple[float, float]]) -> list[dict[str, Any]]:
-    """Return frames over 10 s of cars, each given from and until a time, with its first place and its velocity."""
-    frames = []
-    for k in range(100):
-        here = [(place, way) for begin, end, place, way in paths if begin <= k / 10 < end]
-        center = np.array([(x + vx * k / 10, y + vy * k / 10, 0.8) for (x, y), (vx, vy) in here]).reshape(-1, 3)
-        yaw = np.array([np.arctan2(vy, vx) for _, (vx, vy) in here])
-        count = len(here)
-        given = {
-            "stamp_ns": k * 10**8,
-            "labels": gaps.CLASSES,
-            "center": center,
-            "yaw": yaw,
-            "score": np.full(count, 0.9),
-        }
-        frames.append(given | {"size": np.tile(gaps.SIZES[0], (count, 1)), "label": np.zeros(count, np.int64)})
-    return frames
-
-
 def test_a_car_behind_a_building_is_the_same_object() -> None:
     """A car that is hidden for four seconds and goes on as before is joined; its first id is the object."""
-    rows = rows_of(gaps.tracked(cars((0, 3, (0, 0), (8, 0)), (7, 10, (0, 0), (8, 0))), GENERIC), Rejoin())
+    rows = rows_of(gaps.tracked(gaps.cars((0, 3, (0, 0), (8, 0)), (7, 10, (0, 0), (8, 0))), GENERIC), Rejoin())
     one, number, _ = rows[-1]
     assert one.id.tolist() == [2]
     assert number.tolist() == [1]
@@ -239,21 +217,21 @@ def test_a_car_behind_a_building_is_the_same_object() -> None:
 
 def test_of_two_equal_candidates_none_is_joined() -> None:
     """Of two cars that appear as mirror images ahead of where one was lost, neither is it."""
-    frames = cars((0, 3, (0, 0), (8, 0)), (7, 10, (0, 2.5), (8, 0)), (7, 10, (0, -2.5), (8, 0)))
+    frames = gaps.cars((0, 3, (0, 0), (8, 0)), (7, 10, (0, 2.5), (8, 0)), (7, 10, (0, -2.5), (8, 0)))
     (probability,) = pairs_of(gaps.tracked(frames, GENERIC)).values()
     assert probability == pytest.approx(0.5, abs=0.01)
 
 
 def test_a_gap_beyond_the_limit_is_not_joined() -> None:
     """A gap of four seconds is not joined where three are allowed."""
-    tracks = gaps.tracked(cars((0, 3, (0, 0), (8, 0)), (7, 10, (0, 0), (8, 0))), GENERIC)
+    tracks = gaps.tracked(gaps.cars((0, 3, (0, 0), (8, 0)), (7, 10, (0, 0), (8, 0))), GENERIC)
     objects = Rejoin(gap_s=3.0).objects(tracks, GENERIC)
     assert (objects.object == objects.id).all()
 
 
 def test_what_is_unknown_of_a_box_counts_nothing() -> None:
     """Points without size and heading are joined by their places."""
-    frames = cars((0, 3, (0, 0), (8, 0)), (7, 10, (0, 0), (8, 0)))
+    frames = gaps.cars((0, 3, (0, 0), (8, 0)), (7, 10, (0, 0), (8, 0)))
     for one in frames:
         del one["size"], one["yaw"]
     found = gaps.tracked(frames, GENERIC)
@@ -267,22 +245,21 @@ def test_sizes_of_an_object_agree() -> None:
     """Equal sizes are evidence in a class of many sizes, another size is evidence against, and bounds hold."""
     rng = np.random.default_rng(4)
     size = np.log(gaps.SIZES[0]) + 0.15 * rng.standard_normal((200, 3))
-    size[1], size[2], size[3] = size[0] + 0.01, size[0] + 0.5, np.nan
-    kind, zero = np.zeros(200, np.int64), np.zeros(3, np.int64)
-    same, other, unknown = rejoining.size_scores(size, kind, zero, np.array((1, 2, 3)))
-    assert 0.0 < same <= rejoining.SIZE_BOUNDS[1]
-    assert other == rejoining.SIZE_BOUNDS[0]
+    count, mean, square = np.full(3, 200.0), size.mean(axis=0), 200.0 * size.var(axis=0)
+    others = size[0] + 0.01, size[0] + 0.5, np.full(3, np.nan)
+    same, other, unknown = (rejoin.size_score(size[0], one, count, mean, square, 2) for one in others)
+    assert 0.0 < same <= rejoin.SIZE_BOUNDS[1]
+    assert other == rejoin.SIZE_BOUNDS[0]
     assert unknown == 0.0
 
 
 def test_where_others_begin_a_join_needs_more() -> None:
     """The rate of new objects is higher around other beginnings, and lower where these were no new objects."""
     place = np.array(((0.0, 0.0), (1.0, 0.0), (50.0, 0.0)))
-    columns = {name: np.zeros(3) for name in ("begin_variance", "end_variance", "yaw")}
-    columns |= {name: np.zeros((3, 2)) for name in ("begin_velocity", "end_velocity")}
-    times = np.array((0, 10, 20)) * 10**9
-    zero = np.zeros(3, np.int64)
-    found = Tracklets(np.arange(3), zero, times, times + 10**9, place, place, size=np.zeros((3, 3)), **columns)
+    found = Tracklets.of(np.zeros(3 * Tracklets.width))
+    zero, found.begin[:] = np.zeros(3, np.int64), place
+    found.first_ns[:] = np.array((0, 10, 20)) * 10**9
+    found.last_ns[:] = found.first_ns + 10**9
     near, _, far = rejoining.rates(found, zero, np.full(3, 1e4), np.ones(3))
     assert near > 5.0 * far
     assert rejoining.rates(found, zero, np.full(3, 1e4), np.full(3, 0.1))[0] < 0.2 * near

@@ -270,6 +270,25 @@ def record(name: str, seed: int, seconds: float = 120.0) -> Recording:
     return Recording(frames, sources, truths, dict(enumerate(label.tolist())))
 
 
+def cars(*paths: tuple[float, float, tuple[float, float], tuple[float, float]]) -> list[dict[str, Any]]:
+    """Return frames over 10 s of cars, each given from and until a time, with its first place and its velocity."""
+    frames = []
+    for k in range(100):
+        here = [(place, way) for begin, end, place, way in paths if begin <= k / 10 < end]
+        center = np.array([(x + vx * k / 10, y + vy * k / 10, 0.8) for (x, y), (vx, vy) in here]).reshape(-1, 3)
+        yaw = np.array([np.arctan2(vy, vx) for _, (vx, vy) in here])
+        count = len(here)
+        given = {
+            "stamp_ns": k * 10**8,
+            "labels": CLASSES,
+            "center": center,
+            "yaw": yaw,
+            "score": np.full(count, 0.9),
+        }
+        frames.append(given | {"size": np.tile(SIZES[0], (count, 1)), "label": np.zeros(count, np.int64)})
+    return frames
+
+
 def tracked(frames: list[dict[str, Any]], parameters: optipmb.Parameters) -> dict[int, Tracks]:
     """Return the tracks of each frame as messages."""
     tracker = optipmb.Tracker(parameters)

@@ -26,7 +26,6 @@ from optipmb_tools.commands.options import (
     say,
     warn,
 )
-from optipmb_tools.extras import needed
 from optipmb_tools.files import remove_unfinished
 from optipmb_tools.results.exports import check_export, is_features, is_openlabel
 from optipmb_tools.table_files import is_table
@@ -99,12 +98,10 @@ class TrackOptions:
 
         Raises:
             UsageError: A value is out of its bounds.
-            ClientError: scipy is not installed.
         """
         if self.rejoin is None:
             return None
-        needed("optipmb track --rejoin", "evaluation", "scipy")
-        from optipmb_tools.run.rejoining import Rejoin  # noqa: PLC0415  loads the solvers of scipy
+        from optipmb_tools.run.rejoining import Rejoin  # noqa: PLC0415  only with this option
 
         return Rejoin(self.rejoin, *() if self.min_probability is None else (self.min_probability,))
 

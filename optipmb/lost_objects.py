@@ -1,0 +1,158 @@
+"""State of the joining of tracks (`optipmb.rejoin`), as arrays."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from optipmb.rows import Column, Rows, record
+
+if TYPE_CHECKING:
+    from optipmb.relocation import Relocation
+
+PLACES: Final = 13
+"""Places of a live track that are kept."""
+
+
+class Tracklets(Rows):
+    """Tracks between their first and last detections, world frame, ascending ids; unknown values are NaN.
+
+    Attributes:
+        id: (N,) int64.
+        label: (N,) int64 class.
+        object: (N,) int64 id of the first track of the object; -1: not decided.
+        first_ns: (N,) int64 stamp of the first detection.
+        last_ns: (N,) int64 of the last.
+        detections: (N,) int64 how many; of all tracks of the object.
+        confirmed: (N,) bool, whether it ever was.
+        probability: (N,) that all joins of the object are right.
+        begin: (N, 2) place at the first detection, m.
+        end: (N, 2) at the last.
+        begin_velocity: (N, 2) over the first second, m/s.
+        begin_variance: (N,) of either component.
+        end_velocity: (N, 2) over the last second.
+        end_variance: (N,).
+        yaw: (N,) last heading, rad.
+        size: (N, 3) mean logarithms of length, width and height.
+    """
+
+    part = "rejoin.tracks"
+    __slots__ = ()
+
+    id = Column(np.int64)
+    label = Column(np.int64)
+    object = Column(np.int64)
+    first_ns = Column(np.int64)
+    last_ns = Column(np.int64)
+    detections = Column(np.int64)
+    confirmed = Column(np.bool_)
+    probability = Column(np.float64)
+    begin = Column(np.float64, 2)
+    end = Column(np.float64, 2)
+    begin_velocity = Column(np.float64, 2)
+    begin_variance = Column(np.float64)
+    end_velocity = Column(np.float64, 2)
+    end_variance = Column(np.float64)
+    yaw = Column(np.float64)
+    size = Column(np.float64, 3)
+
+
+class Lost(Tracklets):
+    """Objects whose last track has ended."""
+
+    part = "rejoin.lost"
+    __slots__ = ()
+
+
+class Places(Rows):
+    """The last places of each live track, in turn in `PLACES` slots.
+
+    Attributes:
+        count: (N,) int64 how many there were; the next one is in slot `count % PLACES`.
+        stamp_ns: (N, `PLACES`) int64.
+        place: (N, `PLACES` * 2) m.
+    """
+
+    part = "rejoin.places"
+    __slots__ = ()
+
+    count = Column(np.int64)
+    stamp_ns = Column(np.int64, PLACES)
+    place = Column(np.float64, PLACES * 2)
+
+
+class Beginnings(Rows):
+    """Where tracks have begun lately.
+
+    Attributes:
+        id: (N,) int64 of the track.
+        kind: (N,) int64 first class of its group.
+        stamp_ns: (N,) int64 of the first detection.
+        place: (N, 2) m.
+        new: (N,) probability that it was a new object.
+    """
+
+    part = "rejoin.beginnings"
+    __slots__ = ()
+
+    id = Column(np.int64)
+    kind = Column(np.int64)
+    stamp_ns = Column(np.int64)
+    place = Column(np.float64, 2)
+    new = Column(np.float64)
+
+
+class Statistics(Rows):
+    """Of each class (C,), that of a group in the row of its first class.
+
+    Attributes:
+        since_ns: (C,) int64 stamp from which beginnings are counted.
+        count: (C, 3) tracks whose length, width and height are known.
+        mean: (C, 3) of their logarithms.
+        square: (C, 3) sum of squared differences from it.
+    """
+
+    part = "rejoin.classes"
+    __slots__ = ()
+
+    since_ns = Column(np.int64)
+    count = Column(np.float64, 3)
+    mean = Column(np.float64, 3)
+    square = Column(np.float64, 3)
+
+
+@record
+class Rejoining:
+    """State of the joining of tracks between two frames."""
+
+    live: Tracklets
+    places: Places
+    lost: Lost
+    beginnings: Beginnings
+    classes: Statistics
+
+    @classmethod
+    def empty(cls, classes: int, stamp_ns: int) -> Rejoining:
+        """Return the state before the first frame."""
+        none = np.zeros((classes, 3))
+        since = Statistics(since_ns=np.full(classes, stamp_ns), count=none, mean=none, square=none)
+        return cls(Tracklets.empty(), Places.empty(), Lost.empty(), Beginnings.empty(), since)
+
+    def moved(self, relocation: Relocation) -> Rejoining:
+        """Return the state in a world that has moved."""
+        turn = relocation._replace(x=0.0, y=0.0)
+
+        def tracks(rows: Any) -> Any:
+            points = {name: relocation.points(getattr(rows, name)) for name in ("begin", "end")}
+            ways = {name: turn.points(getattr(rows, name)) for name in ("begin_velocity", "end_velocity")}
+            return rows.replaced(yaw=rows.yaw + relocation.theta, **points, **ways)
+
+        places = relocation.points(self.places.place.reshape(-1, 2)).reshape(-1, PLACES * 2)
+        return Rejoining(
+            tracks(self.live),
+            self.places.replaced(place=places),
+            tracks(self.lost),
+            self.beginnings.replaced(place=relocation.points(self.beginnings.place)),
+            self.classes,
+        )

@@ -1,0 +1,197 @@
+"""Tracks joined over gaps while tracking: what objects are, when they are decided, and the state between frames."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import gaps
+import numpy as np
+import pytest
+
+import optipmb
+from optipmb import OnlineTracker, ParameterError, Rejoin, Relocation, Tracker, generic_parameters
+
+GENERIC = generic_parameters(gaps.CLASSES, 0.1)
+HIDDEN = gaps.cars((0, 3, (0, 0), (8, 0)), (7, 10, (0, 0), (8, 0)))
+"""A car that is hidden for four seconds and goes on as before."""
+
+
+def steps(frames: list[dict[str, Any]], how: Rejoin, change: Any = None) -> Iterator[optipmb.StepResult]:
+    """Yield the results of a tracker, whose density `change` replaces before each frame."""
+    tracker = Tracker(GENERIC, rejoin=how)
+    density = tracker.initial()
+    for given in frames:
+        result = tracker.step(density, optipmb.make_frame(GENERIC, **given)[0])
+        density = result.density if change is None else change(result.density)
+        yield result
+
+
+def objects(frames: list[dict[str, Any]], how: Rejoin, change: Any = None) -> list[dict[int, tuple[int, float]]]:
+    """Return object and probability of each track of each frame."""
+    found = []
+    for one in steps(frames, how, change):
+        assert one.joined is not None
+        columns = one.joined.object.tolist(), one.joined.probability.tolist()
+        found.append(dict(zip(one.tracks.id.tolist(), zip(*columns, strict=True), strict=True)))
+    return found
+
+
+def test_a_car_behind_a_building_is_the_same_object() -> None:
+    """After 0.3 s of detections the second track has the object of the first, and a probability; before it has -1."""
+    tracker, found = OnlineTracker(GENERIC, rejoin=Rejoin()), {}
+    for one in HIDDEN:
+        given = {name: value for name, value in one.items() if name not in {"labels", "stamp_ns"}}
+        tracks = tracker.update(given, stamp_ns=one["stamp_ns"])
+        assert tracks.object is not None
+        found[one["stamp_ns"]] = dict(zip(tracks.id.tolist(), tracks.object.tolist(), strict=True))
+    assert found[200_000_000] == {1: -1}
+    assert found[2_900_000_000] == {1: 1}
+    assert found[7_200_000_000] == {2: -1}
+    assert found[7_300_000_000] == found[9_900_000_000] == {2: 1}
+    assert tracks.object_probability is not None
+    assert 0.99 <= tracks.object_probability[0] < 1.0
+    assert tracks.columns()["object"].tolist() == [1]
+
+
+@pytest.mark.parametrize("more", [(), ((7, 10, (0, -2.5), (8, 0)),)])
+def test_without_a_sure_candidate_it_is_a_new_object(more: Any) -> None:
+    """A gap beyond the limit, or two cars that appear as mirror images ahead, make new objects."""
+    first = (7, 10, (0, 2.5 if more else 0), (8, 0))
+    last = objects(gaps.cars((0, 3, (0, 0), (8, 0)), first, *more), Rejoin(gap_s=60.0 if more else 3.0))[-1]
+    assert all(number == identity for identity, (number, _) in last.items())
+    assert all(probability == 1.0 for _, probability in last.values())
+
+
+@pytest.fixture(scope="module", params=["street", "square"])
+def frames(request: pytest.FixtureRequest) -> list[dict[str, Any]]:
+    return gaps.record(request.param, 7, 40.0).frames
+
+
+SOME = Rejoin(min_probability=0.6)
+
+
+def test_an_object_is_one_track_in_a_frame(frames: list[dict[str, Any]]) -> None:
+    """The object of a track is -1, then for ever that of a confirmed track of no higher id; once in a frame."""
+    confirmed: set[int] = set()
+    known: dict[int, tuple[int, float]] = {}
+    joins = 0
+    for one in steps(frames, SOME):
+        assert one.joined is not None
+        confirmed |= set(one.tracks.id[one.tracks.confirmed].tolist())
+        number, probability = one.joined.object, one.joined.probability
+        assert len(np.unique(number[number >= 0])) == (number >= 0).sum()
+        assert set(number[number >= 0].tolist()) <= confirmed
+        assert (number <= one.tracks.id).all()
+        joins += one.joined.joins
+        for identity, *value in zip(one.tracks.id.tolist(), number.tolist(), probability.tolist(), strict=True):
+            before = known.get(identity, (-1, 1.0))
+            assert before in ((-1, 1.0), tuple(value))
+            known[identity] = value[0], value[1]
+    assert joins == sum(number not in {-1, identity} for identity, (number, _) in known.items()) > 0
+    assert all(0.0 < probability <= 1.0 for _, probability in known.values())
+
+
+def test_objects_follow_from_the_stored_state(frames: list[dict[str, Any]]) -> None:
+    """A density that is written and read between all frames gives the same objects, and the same bytes."""
+
+    def read(density: optipmb.Density) -> optipmb.Density:
+        parts = optipmb.bytes_of(density)
+        columns = optipmb.columns_in(parts, len(density.labels))
+        found = optipmb.density_of(density.stamp_ns, density.next_id, columns, density.labels)
+        assert optipmb.bytes_of(found) == parts
+        return found
+
+    assert objects(frames, SOME, read) == objects(frames, SOME)
+
+
+def test_a_stored_state_that_does_not_fit_is_refused(frames: list[dict[str, Any]]) -> None:
+    """An object above the id of its track, or places of other tracks, are named."""
+    *_, last = steps(frames, SOME)
+    columns = optipmb.columns_of(last.density)
+    state = last.density.stamp_ns, last.density.next_id
+    for name, value in (
+        ("rejoin.tracks.object", columns["rejoin.tracks.id"] + 1),
+        ("rejoin.lost.label", columns["rejoin.lost.label"] + 9),
+        ("rejoin.places.count", columns["rejoin.places.count"] - 90),
+    ):
+        with pytest.raises(optipmb.DensityError, match=name):
+            optipmb.density_of(*state, columns | {name: value}, last.density.labels)
+
+
+def test_a_world_that_moves_keeps_objects() -> None:
+    """A motion of the world while the car is hidden changes no join."""
+    motion = Relocation(100.0, -30.0, 2.0, 1.2)
+
+    def there(one: dict[str, Any]) -> dict[str, Any]:
+        center = np.array([motion.place(tuple(place)) for place in one["center"].tolist()]).reshape(-1, 3)
+        return one | {"center": center, "yaw": one["yaw"] + motion.theta}
+
+    moved = [there(one) if one["stamp_ns"] >= 5 * 10**9 else one for one in HIDDEN]
+
+    def change(density: optipmb.Density) -> optipmb.Density:
+        return motion.density(density) if density.stamp_ns == 49 * 10**8 else density
+
+    (number, probability), *_ = objects(moved, Rejoin(), change)[-1].values()
+    (expected, other), *_ = objects(HIDDEN, Rejoin())[-1].values()
+    assert number == expected == 1
+    assert probability == pytest.approx(other, abs=1e-4)
+
+
+def test_the_oldest_lost_objects_are_dropped() -> None:
+    """No more than `most` are kept, those lost last, and the others are counted."""
+    cars = [(0.2 * n, 0.2 * n + 1.0, (10.0 * n, 0.0), (0.0, 0.0)) for n in range(30)]
+    dropped = 0
+    for one in steps(gaps.cars(*cars), Rejoin(most=4)):
+        assert one.joined is not None
+        assert one.density.rejoining is not None
+        assert len(one.density.rejoining.lost) <= 4
+        dropped += one.joined.dropped
+    lost = one.density.rejoining.lost
+    assert dropped > 10
+    assert lost.id.min() > dropped
+
+
+def test_without_joining_the_state_is_dropped() -> None:
+    """A tracker that does not join tracks steps the same density, and forgets what joining needs."""
+    *_, last = steps(HIDDEN[:20], Rejoin())
+    frame, _ = optipmb.make_frame(GENERIC, **HIDDEN[20])
+    plain, joining = Tracker(GENERIC), Tracker(GENERIC, rejoin=Rejoin())
+    one, other = (tracker.step(last.density, frame) for tracker in (plain, joining))
+    assert one.joined is None
+    assert one.density.rejoining is None
+    assert one.tracks.words.tobytes() == other.tracks.words.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("value", "path"),
+    [({"gap_s": 0.0}, "gap_s"), ({"min_probability": 0.4}, "min_probability"), ({"most": 0}, "most"),
+     ({"decide_s": 5.1}, "decide_s"), ({"gap_s": float("nan")}, "gap_s")],
+)  # fmt: skip
+def test_settings_out_of_bounds_are_named(value: dict[str, Any], path: str) -> None:
+    """A value out of its bounds raises an error that names it."""
+    with pytest.raises(ParameterError, match=f"rejoin.{path}"):
+        Rejoin(**value)
+
+
+def test_most_joins_are_right() -> None:
+    """In a street and a car park of the generator at most one join in thirty is wrong, and many gaps are bridged."""
+    right = wrong = 0
+    for name in ("street", "car park"):
+        recording = gaps.record(name, 41, 60.0)
+        begun: dict[int, int] = {}
+        ended: dict[int, int] = {}
+        last: dict[int, int] = {}
+        for source, one in zip(recording.source, steps(recording.frames, Rejoin()), strict=True):
+            assert one.joined is not None
+            rows = zip(one.tracks.id.tolist(), one.tracks.detection.tolist(), one.joined.object.tolist(), strict=True)
+            for identity, detection, number in rows:
+                if detection >= 0:
+                    begun.setdefault(identity, int(source[detection]))
+                if number >= 0 and number in last and last[number] != identity:
+                    same = ended[last[number]] == begun[identity]
+                    right, wrong = right + same, wrong + (not same)
+                if number >= 0:
+                    last[number] = identity
+                if detection >= 0:
+                    ended[identity] = int(source[detection])
+    assert right >= 20
+    assert wrong <= right / 30
