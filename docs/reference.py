@@ -23,6 +23,7 @@ from optipmb_service.settings import (
     MqttInput,
     MqttSettings,
     OutputSettings,
+    RejoinSettings,
     Ros2Settings,
     Ros2Stream,
     SensorSettings,
@@ -85,6 +86,7 @@ TASKS: Final = (
     ("zones, lines, counting, alarms", "`zones`; see [Zones](zones.md)"),
     ("latitude, longitude, map", "`sites`; see [Latitude and longitude](operation.md#latitude-and-longitude)"),
     ("output at a fixed rate, prediction to now", "`outputs`; see [Fixed rate](fixed-rate.md)"),
+    ("the same object after a gap", "`rejoin`; see [Gaps](gaps.md)"),
     ("localisation, poses, jumps of the pose", "`max_speed`, `jumps`"),
     ("clouds on one host", "`shared_memory`"),
 )
@@ -151,7 +153,7 @@ def settings() -> str:
     tables: tuple[tuple[str, type[BaseModel]], ...] = (
         *(("", Settings), ("limits.", LimitSettings), ("sites.NAME.", SiteSettings)),
         *(("fused.NAME.", FusedSettings), ("sensors.PATTERN.", SensorSettings)),
-        *(("zones.NAME.", ZoneSettings), ("outputs.PATTERN.", OutputSettings)),
+        *(("zones.NAME.", ZoneSettings), ("outputs.PATTERN.", OutputSettings), ("rejoin.PATTERN.", RejoinSettings)),
         *(("ros2.", Ros2Settings), ("ros2.streams.NAME.", Ros2Stream), ("mqtt.", MqttSettings)),
         *(("inputs.PATTERN.", InputSettings), ("mqtt.inputs.STREAM.", MqttInput)),
         ("mqtt.inputs.STREAM.mapping.", MappingSettings),

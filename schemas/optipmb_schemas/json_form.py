@@ -66,6 +66,13 @@ class EdgeTrack(Struct, frozen=True, rename={"kind": "class"}):
     velocity: Annotated[tuple[float, float], Meta(description="Velocity in m/s along x and y.")] | UnsetType = UNSET
     age_s: Annotated[float, Meta(description="Seconds since its first detection.")] | UnsetType = UNSET
     seen_s: Annotated[float, Meta(description="Seconds since its last detection.")] | UnsetType = UNSET
+    object: (
+        Annotated[int, Meta(description="Id of the first track of its object; -1: not decided. Absent: not joined.")]
+        | UnsetType
+    ) = UNSET
+    object_probability: (
+        Annotated[float, Meta(description="Probability that all joins of the object are right.")] | UnsetType
+    ) = UNSET
     lat: Lat | UnsetType = UNSET
     lon: Lon | UnsetType = UNSET
     alt: Alt | UnsetType = UNSET
@@ -123,6 +130,7 @@ class EdgeEvent(_Frame, frozen=True, tag="event", kw_only=True, rename={"name": 
     lat: Lat | UnsetType = UNSET
     lon: Lon | UnsetType = UNSET
     alt: Alt | UnsetType = UNSET
+    object: Annotated[int, Meta(description="Id of the first track of its object.")] | UnsetType = UNSET
     event_id: Annotated[str, Meta(description="Where a reader goes on: `after`. Absent over MQTT.")] | UnsetType = UNSET
 
 
@@ -233,6 +241,14 @@ def shown_rows(
     return np.asarray((existence > CONFIRMED_EXISTENCE) & (age > 0.0))
 
 
+def _objects(tracks: Tracks, rows: NDArray[np.int64]) -> dict[str, Iterable[Any]]:
+    """Return the fields of the objects of rows."""
+    if tracks.object is None or tracks.object_probability is None:
+        return dict.fromkeys(("object", "object_probability"), repeat(UNSET))
+    probability = np.round(tracks.object_probability[rows].astype(np.float64), DIGITS)
+    return {"object": tracks.object[rows].tolist(), "object_probability": probability.tolist()}
+
+
 def tracks_json(tracks: Tracks, selection: Selection = EVERYTHING, place: Place | None = None) -> bytes:
     """Return the selected tracks of a frame as one text."""
     rows = np.flatnonzero(selection.rows(tracks))
@@ -256,6 +272,7 @@ def tracks_json(tracks: Tracks, selection: Selection = EVERYTHING, place: Place 
         "class": map(tracks.labels.__getitem__, tracks.label[rows].tolist()),
         "confirmed": shown(tracks)[rows].tolist(),
         **{name: np.round(column[rows], DIGITS).tolist() for name, column in numbers.items()},
+        **_objects(tracks, rows),
         **dict(zip(PLACE, _placed(tracks.center[rows], yaw[rows], place), strict=True)),
     }
     if selection.fields:
@@ -307,6 +324,7 @@ def event_json(events: Events, place: Place | None = None) -> list[bytes]:
                 how=one.how or UNSET,
                 dwell_s=UNSET if one.dwell_s is None else round(one.dwell_s, DIGITS),
                 direction=one.direction or UNSET,
+                object=UNSET if one.object is None else one.object,
                 lat=lat,
                 lon=lon,
                 alt=alt,

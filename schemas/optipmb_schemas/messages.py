@@ -310,6 +310,14 @@ class Tracks(ResultMessage):
         description="Probability of each class of `labels`; `label` changes with it. Absent: the profile has no groups "
         "of classes, and a track keeps its class.",
     )
+    object: Annotated[Integers, Array("i8", ("N",), -1, INT64)] | None = Field(
+        default=None,
+        description="Id of the first track of the object, which may have had others before. Equal to `id`: a new "
+        "object. -1: not decided. Absent, as is the next: the session does not join tracks over gaps.",
+    )
+    object_probability: Annotated[Singles, Array("f4", ("N",), 0, 1)] | None = Field(
+        default=None, description="That all joins of the object are right: their product. 1 without a join."
+    )
     horizons: Horizons | None = Field(
         default=None,
         description="Times of the predicted paths after `stamp_ns`, s, ascending. Absent, as are the next three: the "
@@ -411,6 +419,9 @@ class ZoneEvent(Message):
     dwell_s: NonNegative | None = Field(default=None, description="Of `left` and `stayed`: seconds inside.")
     direction: Literal["left", "right"] | None = Field(
         default=None, description="Of `crossed`: to which side of the line, seen from its first point to its last."
+    )
+    object: Count | None = Field(
+        default=None, description="Id of the first track of its object; absent where tracks are not joined over gaps."
     )
 
 

@@ -465,6 +465,21 @@ class InputSettings(BaseModel):
     """file of the calibration by which boxes and feet in pixels become places on the ground"""
 
 
+class RejoinSettings(BaseModel):
+    """Joining of tracks of the same object over gaps."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    gap_s: float = Field(default=60.0, gt=0, le=600)
+    """longest gap"""
+    min_probability: float = Field(default=0.99, ge=0.5, lt=1)
+    """least probability of a join; below it a track is a new object"""
+    decide_s: float = Field(default=0.3, ge=0, le=5)
+    """time from the first detection of a track to its decision"""
+    most: int = Field(default=1000, ge=1, le=10_000)
+    """lost objects that are kept; then the oldest are dropped"""
+
+
 def _default_instance() -> str:
     """Return a name that two services do not share."""
     host = re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname()[:HOST_CHARACTERS]) or "host"
@@ -655,6 +670,9 @@ class Settings(BaseSettings):
     """tracks predicted to now, at a fixed rate, by stream pattern (as `garage/*/fused`); the first match applies"""
     inputs: dict[Pattern, InputSettings] = Field(default_factory=dict)
     """frames that come as JSON, by stream pattern (as `garage/*/cam*`); the first match applies"""
+    rejoin: dict[Pattern, RejoinSettings] = Field(default_factory=dict)
+    """joining of tracks of the same object over gaps, by session pattern; the first match applies; equal on all members
+    of a cluster"""
     ros2: Ros2Settings = Ros2Settings()
     """topics of ROS 2, for `optipmb-service ros2`"""
     mqtt: MqttSettings = MqttSettings()
@@ -683,6 +701,10 @@ class Settings(BaseSettings):
     def output_of(self, session: str) -> OutputSettings | None:
         """Return the output at a fixed rate of a session; None: it has none."""
         return next((one for pattern, one in self.outputs.items() if fnmatchcase(session, pattern)), None)
+
+    def rejoin_of(self, session: str) -> RejoinSettings | None:
+        """Return how tracks of a session are joined over gaps; None: they are not."""
+        return next((one for pattern, one in self.rejoin.items() if fnmatchcase(session, pattern)), None)
 
     def zone(self, name: str, site: str) -> Zone:
         return self.zones[name].zone(name, self.sites.get(site))

@@ -73,6 +73,8 @@ def _examples() -> list[Message]:
         confirmed=np.array([1, 0]),
         measured=np.array([7, 4]),
         class_probability=np.array([[0.25, 0.75], [1.0, 0.0]], dtype="f4"),
+        object=np.array([3, -1]),
+        object_probability=np.array([0.995, 1.0], dtype="f4"),
         velocity=np.array([[1.0, 2.0], [0.0, 0.5]]),
         yaw_rate=np.array([0.01, 0.0]),
         acceleration=np.array([0.5, -0.5]),

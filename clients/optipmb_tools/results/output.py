@@ -94,6 +94,8 @@ def track_columns(
     columns["detection_row"] = np.array(detection, dtype=np.float64)
     if objects is not None:
         columns |= objects.columns(columns["id"], stamps)
+    elif parts and all(one.object is not None for one in parts):  # of a service that joins tracks
+        columns |= {name: stacked(parts, name) for name in ("object", "object_probability")}
     if georeference is not None:
         columns |= georeference.to_geographic(stacked(parts, "center"), columns["yaw"])._asdict()
     if full:

@@ -162,7 +162,7 @@ class Delivery(_message.Message):
     def __init__(self, instance: _Optional[str] = ..., received_ns: _Optional[int] = ..., published_ns: _Optional[int] = ..., queue_ms: _Optional[float] = ..., decode_ms: _Optional[float] = ..., step_ms: _Optional[float] = ..., run: _Optional[int] = ..., final_session: _Optional[str] = ..., final_ns: _Optional[int] = ...) -> None: ...
 
 class Tracks(_message.Message):
-    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "sensor", "session", "revision", "profile", "cloud_used", "gap", "ignored", "world", "labels", "predicted_to_ns", "id", "label", "center", "size", "yaw", "heading_confidence", "velocity", "yaw_rate", "acceleration", "existence", "score", "covariance", "age", "time_since_detection", "detection", "confirmed", "measured", "class_probability", "horizons", "path_position", "path_yaw", "path_covariance", "relocation", "delivery")
+    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "sensor", "session", "revision", "profile", "cloud_used", "gap", "ignored", "world", "labels", "predicted_to_ns", "id", "label", "center", "size", "yaw", "heading_confidence", "velocity", "yaw_rate", "acceleration", "existence", "score", "covariance", "age", "time_since_detection", "detection", "confirmed", "measured", "class_probability", "object", "object_probability", "horizons", "path_position", "path_yaw", "path_covariance", "relocation", "delivery")
     STREAM_FIELD_NUMBER: _ClassVar[int]
     EPOCH_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
@@ -195,6 +195,8 @@ class Tracks(_message.Message):
     CONFIRMED_FIELD_NUMBER: _ClassVar[int]
     MEASURED_FIELD_NUMBER: _ClassVar[int]
     CLASS_PROBABILITY_FIELD_NUMBER: _ClassVar[int]
+    OBJECT_FIELD_NUMBER: _ClassVar[int]
+    OBJECT_PROBABILITY_FIELD_NUMBER: _ClassVar[int]
     HORIZONS_FIELD_NUMBER: _ClassVar[int]
     PATH_POSITION_FIELD_NUMBER: _ClassVar[int]
     PATH_YAW_FIELD_NUMBER: _ClassVar[int]
@@ -233,16 +235,18 @@ class Tracks(_message.Message):
     confirmed: Array
     measured: Array
     class_probability: Array
+    object: Array
+    object_probability: Array
     horizons: Array
     path_position: Array
     path_yaw: Array
     path_covariance: Array
     relocation: Relocation
     delivery: Delivery
-    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., sensor: _Optional[str] = ..., session: _Optional[str] = ..., revision: _Optional[int] = ..., profile: _Optional[str] = ..., cloud_used: _Optional[bool] = ..., gap: _Optional[int] = ..., ignored: _Optional[int] = ..., world: _Optional[int] = ..., labels: _Optional[_Iterable[str]] = ..., predicted_to_ns: _Optional[int] = ..., id: _Optional[_Union[Array, _Mapping]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., heading_confidence: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., yaw_rate: _Optional[_Union[Array, _Mapping]] = ..., acceleration: _Optional[_Union[Array, _Mapping]] = ..., existence: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., covariance: _Optional[_Union[Array, _Mapping]] = ..., age: _Optional[_Union[Array, _Mapping]] = ..., time_since_detection: _Optional[_Union[Array, _Mapping]] = ..., detection: _Optional[_Union[Array, _Mapping]] = ..., confirmed: _Optional[_Union[Array, _Mapping]] = ..., measured: _Optional[_Union[Array, _Mapping]] = ..., class_probability: _Optional[_Union[Array, _Mapping]] = ..., horizons: _Optional[_Union[Array, _Mapping]] = ..., path_position: _Optional[_Union[Array, _Mapping]] = ..., path_yaw: _Optional[_Union[Array, _Mapping]] = ..., path_covariance: _Optional[_Union[Array, _Mapping]] = ..., relocation: _Optional[_Union[Relocation, _Mapping]] = ..., delivery: _Optional[_Union[Delivery, _Mapping]] = ...) -> None: ...
+    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., sensor: _Optional[str] = ..., session: _Optional[str] = ..., revision: _Optional[int] = ..., profile: _Optional[str] = ..., cloud_used: _Optional[bool] = ..., gap: _Optional[int] = ..., ignored: _Optional[int] = ..., world: _Optional[int] = ..., labels: _Optional[_Iterable[str]] = ..., predicted_to_ns: _Optional[int] = ..., id: _Optional[_Union[Array, _Mapping]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., heading_confidence: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., yaw_rate: _Optional[_Union[Array, _Mapping]] = ..., acceleration: _Optional[_Union[Array, _Mapping]] = ..., existence: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., covariance: _Optional[_Union[Array, _Mapping]] = ..., age: _Optional[_Union[Array, _Mapping]] = ..., time_since_detection: _Optional[_Union[Array, _Mapping]] = ..., detection: _Optional[_Union[Array, _Mapping]] = ..., confirmed: _Optional[_Union[Array, _Mapping]] = ..., measured: _Optional[_Union[Array, _Mapping]] = ..., class_probability: _Optional[_Union[Array, _Mapping]] = ..., object: _Optional[_Union[Array, _Mapping]] = ..., object_probability: _Optional[_Union[Array, _Mapping]] = ..., horizons: _Optional[_Union[Array, _Mapping]] = ..., path_position: _Optional[_Union[Array, _Mapping]] = ..., path_yaw: _Optional[_Union[Array, _Mapping]] = ..., path_covariance: _Optional[_Union[Array, _Mapping]] = ..., relocation: _Optional[_Union[Relocation, _Mapping]] = ..., delivery: _Optional[_Union[Delivery, _Mapping]] = ...) -> None: ...
 
 class ZoneEvent(_message.Message):
-    __slots__ = ("zone", "kind", "n", "id", "label", "at_ns", "position", "speed", "yaw", "how", "dwell_s", "direction")
+    __slots__ = ("zone", "kind", "n", "id", "label", "at_ns", "position", "speed", "yaw", "how", "dwell_s", "direction", "object")
     ZONE_FIELD_NUMBER: _ClassVar[int]
     KIND_FIELD_NUMBER: _ClassVar[int]
     N_FIELD_NUMBER: _ClassVar[int]
@@ -255,6 +259,7 @@ class ZoneEvent(_message.Message):
     HOW_FIELD_NUMBER: _ClassVar[int]
     DWELL_S_FIELD_NUMBER: _ClassVar[int]
     DIRECTION_FIELD_NUMBER: _ClassVar[int]
+    OBJECT_FIELD_NUMBER: _ClassVar[int]
     zone: str
     kind: str
     n: int
@@ -267,7 +272,8 @@ class ZoneEvent(_message.Message):
     how: str
     dwell_s: float
     direction: str
-    def __init__(self, zone: _Optional[str] = ..., kind: _Optional[str] = ..., n: _Optional[int] = ..., id: _Optional[int] = ..., label: _Optional[int] = ..., at_ns: _Optional[int] = ..., position: _Optional[_Iterable[float]] = ..., speed: _Optional[float] = ..., yaw: _Optional[float] = ..., how: _Optional[str] = ..., dwell_s: _Optional[float] = ..., direction: _Optional[str] = ...) -> None: ...
+    object: int
+    def __init__(self, zone: _Optional[str] = ..., kind: _Optional[str] = ..., n: _Optional[int] = ..., id: _Optional[int] = ..., label: _Optional[int] = ..., at_ns: _Optional[int] = ..., position: _Optional[_Iterable[float]] = ..., speed: _Optional[float] = ..., yaw: _Optional[float] = ..., how: _Optional[str] = ..., dwell_s: _Optional[float] = ..., direction: _Optional[str] = ..., object: _Optional[int] = ...) -> None: ...
 
 class ZoneCount(_message.Message):
     __slots__ = ("zone", "inside", "entered", "left", "appeared", "lost", "to_left", "to_right")
@@ -342,7 +348,7 @@ class Problem(_message.Message):
     def __init__(self, stream: _Optional[str] = ..., instance: _Optional[str] = ..., code: _Optional[str] = ..., path: _Optional[str] = ..., expected: _Optional[str] = ..., received: _Optional[str] = ..., message: _Optional[str] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., count: _Optional[int] = ..., reported_ns: _Optional[int] = ...) -> None: ...
 
 class SessionState(_message.Message):
-    __slots__ = ("stream", "session", "state", "profile", "epoch", "seq", "stamp_ns", "received", "frames", "duplicates", "late", "inserted", "corrected", "refused", "shed", "gaps", "new_epochs", "clouds_used", "clouds_missed", "repaired", "clouds_refused", "tracks", "bernoullis", "poissons", "next_id", "queue", "digest")
+    __slots__ = ("stream", "session", "state", "profile", "epoch", "seq", "stamp_ns", "received", "frames", "duplicates", "late", "inserted", "corrected", "refused", "shed", "gaps", "new_epochs", "clouds_used", "clouds_missed", "repaired", "clouds_refused", "rejoined", "lost_dropped", "lost_objects", "tracks", "bernoullis", "poissons", "next_id", "queue", "digest")
     STREAM_FIELD_NUMBER: _ClassVar[int]
     SESSION_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
@@ -364,6 +370,9 @@ class SessionState(_message.Message):
     CLOUDS_MISSED_FIELD_NUMBER: _ClassVar[int]
     REPAIRED_FIELD_NUMBER: _ClassVar[int]
     CLOUDS_REFUSED_FIELD_NUMBER: _ClassVar[int]
+    REJOINED_FIELD_NUMBER: _ClassVar[int]
+    LOST_DROPPED_FIELD_NUMBER: _ClassVar[int]
+    LOST_OBJECTS_FIELD_NUMBER: _ClassVar[int]
     TRACKS_FIELD_NUMBER: _ClassVar[int]
     BERNOULLIS_FIELD_NUMBER: _ClassVar[int]
     POISSONS_FIELD_NUMBER: _ClassVar[int]
@@ -391,13 +400,16 @@ class SessionState(_message.Message):
     clouds_missed: int
     repaired: int
     clouds_refused: int
+    rejoined: int
+    lost_dropped: int
+    lost_objects: int
     tracks: int
     bernoullis: int
     poissons: int
     next_id: int
     queue: int
     digest: str
-    def __init__(self, stream: _Optional[str] = ..., session: _Optional[str] = ..., state: _Optional[str] = ..., profile: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., received: _Optional[int] = ..., frames: _Optional[int] = ..., duplicates: _Optional[int] = ..., late: _Optional[int] = ..., inserted: _Optional[int] = ..., corrected: _Optional[int] = ..., refused: _Optional[int] = ..., shed: _Optional[int] = ..., gaps: _Optional[int] = ..., new_epochs: _Optional[int] = ..., clouds_used: _Optional[int] = ..., clouds_missed: _Optional[int] = ..., repaired: _Optional[int] = ..., clouds_refused: _Optional[int] = ..., tracks: _Optional[int] = ..., bernoullis: _Optional[int] = ..., poissons: _Optional[int] = ..., next_id: _Optional[int] = ..., queue: _Optional[int] = ..., digest: _Optional[str] = ...) -> None: ...
+    def __init__(self, stream: _Optional[str] = ..., session: _Optional[str] = ..., state: _Optional[str] = ..., profile: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., received: _Optional[int] = ..., frames: _Optional[int] = ..., duplicates: _Optional[int] = ..., late: _Optional[int] = ..., inserted: _Optional[int] = ..., corrected: _Optional[int] = ..., refused: _Optional[int] = ..., shed: _Optional[int] = ..., gaps: _Optional[int] = ..., new_epochs: _Optional[int] = ..., clouds_used: _Optional[int] = ..., clouds_missed: _Optional[int] = ..., repaired: _Optional[int] = ..., clouds_refused: _Optional[int] = ..., rejoined: _Optional[int] = ..., lost_dropped: _Optional[int] = ..., lost_objects: _Optional[int] = ..., tracks: _Optional[int] = ..., bernoullis: _Optional[int] = ..., poissons: _Optional[int] = ..., next_id: _Optional[int] = ..., queue: _Optional[int] = ..., digest: _Optional[str] = ...) -> None: ...
 
 class SessionParameters(_message.Message):
     __slots__ = ("profile", "cloud_wait_s", "horizons", "restart", "values", "sensors", "session")

@@ -132,8 +132,10 @@ def _object(tracks: Tracks, row: int, key: bytes) -> Fields:
             number = _CLASSES.get(tracks.labels[c].lower(), 0)
             classes[number] = classes.get(number, 0.0) + probability
     by_probability = sorted(classes.items(), key=lambda one: -one[1])
+    objects = getattr(tracks, "object", None)
+    identity = int(tracks.id[row] if objects is None or objects[row] < 0 else objects[row])
     return {
-        "object_id": {"uuid": np.frombuffer(key + int(tracks.id[row]).to_bytes(8, "big"), np.uint8)},
+        "object_id": {"uuid": np.frombuffer(key + identity.to_bytes(8, "big"), np.uint8)},
         "existence_probability": float(tracks.existence[row]),
         "classification": [{"label": number, "probability": probability} for number, probability in by_probability],
         "shape": {"dimensions": _vector(tracks.size[row].tolist())},

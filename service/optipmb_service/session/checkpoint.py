@@ -25,7 +25,7 @@ from optipmb_schemas.model import first_error
 from pydantic import BaseModel, Field, ValidationError
 
 import optipmb
-from optipmb.zones import MOST, Seen, ZoneState
+from optipmb.zones import MOST, Event, Seen, ZoneState
 from optipmb_service.session import convert
 from optipmb_service.session.counts import MAX_COUNT, Count, Deliveries, FrameCounts
 from optipmb_service.session.state import UNPLACED, FilterState, ProcessedFrame, SensorState
@@ -58,6 +58,8 @@ MAX_BYTES: Final = 2**28
 MAX_PROFILES: Final = 64
 """Profiles whose form in checkpoints is remembered."""
 
+JOINING: Final = frozenset({"rejoined", "lost_dropped"})
+"""Counts that are left out while they are 0, as in sessions that do not join tracks."""
 ZONE_BYTES: Final = MOST // 8
 _msgpack: Any = msgpack  # its type information is partial
 _profiles: dict[int, tuple[optipmb.Parameters, bytes]] = {}
@@ -253,21 +255,41 @@ def _packed(value: Any) -> Any:
         return {"detections": value.detections, "points": points, "missed": value.missed, "revision": value.revision}
     table = {name: getattr(value, name) for name in value.__match_args__}
     if isinstance(value, ZoneState):
-        tracks = sorted(value.tracks.items())
-        packed = [(number, one.known.to_bytes(ZONE_BYTES, "big"), one._replace(known=0)) for number, one in tracks]
-        counts = {
-            zone: {name: sorted(one.items()) for name, one in sorted(names.items())}
-            for zone, names in sorted(value.counts.items())
-        }
-        return table | {"tracks": packed, "counts": counts, "numbers": dict(sorted(value.numbers.items()))}
+        return _packed_zones(value, table)
     if isinstance(value, FilterState):
         density, sensors = value.density, dict(sorted(value.sensors.items()))
         clock = {"stamp_ns": density.stamp_ns, "next_id": density.next_id}
-        for name in ("zones", "worlds"):
-            if table[name] is None:
-                del table[name]
-        return clock | table | {"density": optipmb.bytes_of(density), "sensors": sensors}
-    return table
+        absent = {name for name in ("zones", "worlds") if table[name] is None}
+        kept = {name: one for name, one in table.items() if name not in absent}
+        return clock | kept | {"density": optipmb.bytes_of(density), "sensors": sensors}
+    absent = {name for name in JOINING if table.get(name) == 0}
+    return {name: one for name, one in table.items() if name not in absent}
+
+
+def _packed_zones(value: ZoneState, table: dict[str, Any]) -> dict[str, Any]:
+    tracks = sorted(value.tracks.items())
+    packed = [(number, one.known.to_bytes(ZONE_BYTES, "big"), _unsent(one)) for number, one in tracks]
+    table |= {"objects": sorted(value.objects.items())}
+    if not value.objects:
+        del table["objects"]
+    counts = {
+        zone: {name: sorted(one.items()) for name, one in sorted(names.items())}
+        for zone, names in sorted(value.counts.items())
+    }
+    return table | {"tracks": packed, "counts": counts, "numbers": dict(sorted(value.numbers.items()))}
+
+
+def _unsent(seen: Seen) -> Seen:
+    """Return a track without the zones that know it; events that were not sent have no object yet."""
+
+    def event(one: Event) -> Any:
+        return one[:-1]
+
+    visits = {
+        name: one if one.entered is None else one._replace(entered=event(one.entered))
+        for name, one in seen.visits.items()
+    }
+    return seen._replace(known=0, visits=visits, held=tuple(map(event, seen.held)))
 
 
 def _packed_profile(parameters: optipmb.Parameters) -> bytes:
@@ -297,11 +319,12 @@ class _Zones(BaseModel):
     numbers: dict[str, Count]
     zones: tuple[str, ...]
     session: str
+    objects: tuple[tuple[Count, Count], ...] = ()
 
     def state(self) -> ZoneState:
         tracks = {number: one._replace(known=int.from_bytes(known, "big")) for number, known, one in self.tracks}
         counts = {zone: {name: dict(one) for name, one in by_name.items()} for zone, by_name in self.counts.items()}
-        return ZoneState(tracks, counts, self.numbers, self.zones, self.session)
+        return ZoneState(tracks, counts, self.numbers, self.zones, self.session, dict(self.objects))
 
 
 class _State(BaseModel):

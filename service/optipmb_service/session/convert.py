@@ -170,6 +170,8 @@ def tracks_of(result: optipmb.StepResult, stream: str, frame_id: FrameId, **fiel
     others: dict[str, Any] = {}
     if result.measured is not None or result.class_probability is not None:
         others |= schemas.track_fields(measured=result.measured, class_probability=result.class_probability)
+    if (joined := result.joined) is not None:
+        others |= schemas.track_fields(object=joined.object, object_probability=joined.probability)
     if (paths := result.paths) is not None:
         others |= schemas.path_fields(paths.horizons, paths.mean, paths.covariance)
     if not optipmb.sound(tracks):

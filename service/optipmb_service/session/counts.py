@@ -58,6 +58,8 @@ class FrameCounts:
         effort: refused because they need too much computing.
         unconfirmed: refused because their stamps jumped and no others agreed.
         repaired: covariances that had lost rank in rounding and were repaired.
+        rejoined: tracks that were joined with an earlier one of the same object.
+        lost_dropped: lost objects that were dropped because there were too many.
     """
 
     frames: Count = 0
@@ -69,6 +71,8 @@ class FrameCounts:
     effort: Count = 0
     unconfirmed: Count = 0
     repaired: Count = 0
+    rejoined: Count = 0
+    lost_dropped: Count = 0
 
 
 @dataclass

@@ -27,7 +27,7 @@ from optipmb.self_calibration import learned_noise
 from optipmb.zones import ZoneState
 from optipmb_service.session import convert
 from optipmb_service.session.arrivals import Arrivals
-from optipmb_service.session.checkpoint import Checkpoint
+from optipmb_service.session.checkpoint import JOINING, Checkpoint
 from optipmb_service.session.checks import SCORED_EVERY, ScoreCheck
 from optipmb_service.session.counts import Counters, Deliveries, total
 from optipmb_service.session.frame_problems import FrameProblems
@@ -88,7 +88,7 @@ class Session:
         fused: bool = False,
         instance: str = "session",
         incarnation: Incarnation | None = None,
-        tracker: Callable[[optipmb.Parameters], optipmb.Tracker] = optipmb.Tracker,
+        tracker: Callable[..., optipmb.Tracker] = optipmb.Tracker,
         clock: Callable[[], int] = time.perf_counter_ns,
     ) -> None:
         incarnation = incarnation or Incarnation()
@@ -292,7 +292,7 @@ class Session:
         *,
         fence: int = 1,
         instance: str = "session",
-        tracker: Callable[[optipmb.Parameters], optipmb.Tracker] = optipmb.Tracker,
+        tracker: Callable[..., optipmb.Tracker] = optipmb.Tracker,
         clock: Callable[[], int] = time.perf_counter_ns,
     ) -> Self:
         """Return the session that a checkpoint was taken of. It is `recovering` for a while.
@@ -457,7 +457,12 @@ class Session:
             seq=last.seq if last else None,
             stamp_ns=last.stamp_ns if last else None,
             shed=shed,
-            **{name: count for name, count in asdict(counters).items() if name in schemas.SessionState.names},
+            **{
+                name: count
+                for name, count in asdict(counters).items()
+                if name in schemas.SessionState.names and (count or name not in JOINING)
+            },
+            lost_objects=None if density.rejoining is None else len(density.rejoining.lost),
             tracks=head.tracks,
             bernoullis=len(density.bernoulli),
             poissons=len(density.poisson),

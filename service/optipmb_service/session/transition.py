@@ -89,14 +89,15 @@ class Transition:
         self,
         stream: str,
         parameters: optipmb.Parameters,
-        tracker: Callable[[optipmb.Parameters], optipmb.Tracker],
+        tracker: Callable[..., optipmb.Tracker],
         policy: Policy,
     ) -> None:
         self.stream = stream
         self.parameters = parameters
-        self._trackers = [(parameters, tracker(parameters))]
+        joining = {} if policy.rejoin is None else {"rejoin": policy.rejoin}
+        self._make: Callable[..., optipmb.Tracker] = functools.partial(tracker, **joining)
+        self._trackers = [(parameters, self._make(parameters))]
         """Each with its parameters: that of the profile, and those of sensors that differ."""
-        self._make = tracker
         self._of: dict[str, int] = {}
         """Index of the tracker of each sensor, where some differ."""
         self._policy = policy
@@ -335,7 +336,7 @@ class Transition:
             **({"world": before.worlds.number} if before.worlds else {}),
             labels=self.parameters.labels,
         )
-        zones, tracks.events = self._zones(before, result.tracks, frame_id.stamp_ns)
+        zones, tracks.events = self._zones(before, result, frame_id.stamp_ns)
         second = None if before.last is None else before.last.stamp_ns // SECOND
         if (
             self._policy.zones
@@ -344,7 +345,9 @@ class Transition:
         ):
             tracks.counts = {one.name: zones.counts.get(one.name, {}) for one in self._policy.zones}
         unknown = self._unknown(message, sensor.reported) if ignored else {}
-        repaired = int(result.diagnostics.repaired)
+        more = {"repaired": int(result.diagnostics.repaired)}
+        if result.joined is not None:
+            more |= {"rejoined": result.joined.joins, "lost_dropped": result.joined.dropped}
         known = SensorState(
             cursor=sensor.cursor.after(frame_id, frame.place),
             tracked=(frame_id.epoch, max(highest, frame_id.seq)),
@@ -358,7 +361,7 @@ class Transition:
             generation=frame.place.generation,
             last=frame_id,
             tracks=int(result.tracks.confirmed.sum()),
-            counts=_counted(before, frame, frames=1, gaps=gap, clouds_used=used, repaired=repaired),
+            counts=_counted(before, frame, frames=1, gaps=gap, clouds_used=used, **more),
             sensors=_sensors(before, frame_id.sensor, known),
             zones=zones,
             worlds=before.worlds,
@@ -366,7 +369,7 @@ class Transition:
         return after, Outcome(frame, tracks, begun, unknown)
 
     def _zones(
-        self, before: FilterState, tracks: optipmb.Tracks, stamp_ns: int
+        self, before: FilterState, result: optipmb.StepResult, stamp_ns: int
     ) -> tuple[ZoneState | None, tuple[Event, ...]]:
         """Return what is known of the zones after a frame, and its events."""
         zones = self._policy.zones
@@ -379,8 +382,9 @@ class Transition:
         if state.session != before.session:
             state, ended = end(zones, state)
             state = replace(state, session=before.session)
+        objects = None if result.joined is None else result.joined.object
         labels = self.parameters.labels
-        state, events = observe(zones, state, stamp_ns, tracks, labels, self._shapes)
+        state, events = observe(zones, state, stamp_ns, result.tracks, labels, self._shapes, objects)
         return state, (*ended, *events)
 
     def _unknown(self, message: schemas.Detections, reported: frozenset[str]) -> dict[str, int]:
@@ -474,6 +478,7 @@ def set_clock(density: optipmb.Density, stamp_ns: int) -> optipmb.Density:
         bernoulli=moved(density.bernoulli, "born_ns", "seen_ns"),
         poisson=moved(density.poisson, "born_ns"),
         misses=None if density.misses is None else moved(density.misses, "missed_from_ns", "looked_ns"),
+        rejoining=None,  # no object is of another session
     )
 
 

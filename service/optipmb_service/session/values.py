@@ -91,6 +91,7 @@ class Policy:
         astray_frames: frames in a row that agree on another place until the session restarts there.
         jumps: reaction to poses that jump within reach: `report` or `off`.
         zones: those whose events the session finds.
+        rejoin: how tracks are joined over gaps; None: they are not.
         sensors: how the frames of the sensors of a fused session are used.
         needs_view: whether a sensor without field of view is reported.
         has_place: whether the setting `sites` has a place of its world frame.
@@ -116,6 +117,7 @@ class Policy:
     jumps: Literal["off", "report"] = "report"
     at_once: int = 2**62
     zones: tuple[Zone, ...] = ()
+    rejoin: optipmb.Rejoin | None = None
     sensors: optipmb.Sensors = ALIKE
     needs_view: bool = False
     has_place: bool = False

@@ -84,13 +84,13 @@ class Profiles:
         """Return a profile by its name, None when there is none."""
         return self.known.get(name)
 
-    def trackers(
-        self, make: Callable[[optipmb.Parameters], optipmb.Tracker]
-    ) -> Callable[[optipmb.Parameters], optipmb.Tracker]:
+    def trackers(self, make: Callable[..., optipmb.Tracker]) -> Callable[..., optipmb.Tracker]:
         """Return what gives all streams of a profile one tracker, for it keeps nothing of them (0.6 ms each)."""
         made = {parameters.name: make(parameters) for parameters in self.known.values()}
 
-        def tracker(parameters: optipmb.Parameters) -> optipmb.Tracker:
+        def tracker(parameters: optipmb.Parameters, **joining: optipmb.Rejoin) -> optipmb.Tracker:
+            if joining:
+                return make(parameters, **joining)
             found = made.get(parameters.name)
             same = found is not None and (found.parameters is parameters or found.parameters == parameters)
             return found if found is not None and same else make(parameters)

@@ -298,7 +298,10 @@ class Streams:
         sensors = self.fusion.sensors_of(session, self.profiles.sensors)
         needs_view = bool(sensors.uses) or session in self.fusion.sites
         has_place = site in self._settings.sites
-        return replace(self.policy, zones=tuple(zones), sensors=sensors, needs_view=needs_view, has_place=has_place)
+        how = self._settings.rejoin_of(session)
+        rejoin = None if how is None else optipmb.Rejoin(**how.model_dump())
+        policy = replace(self.policy, zones=tuple(zones), sensors=sensors, needs_view=needs_view, has_place=has_place)
+        return replace(policy, rejoin=rejoin)
 
     def fixed_rate_for(self, session: str) -> FixedRate | None:
         """Return the output of a session at a fixed rate; None: it has none."""

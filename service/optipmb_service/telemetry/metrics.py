@@ -166,6 +166,14 @@ STREAM_METRICS: Final = {
         "Clouds not valid, or that could not be taken.", lambda s: s.totals.clouds_refused
     ),
     "repaired_total": _counter("Covariances repaired after a loss of rank by rounding.", lambda s: s.totals.repaired),
+    "rejoined_total": _counter("Tracks joined with an earlier one of the same object.", lambda s: s.totals.rejoined),
+    "lost_dropped_total": _counter(
+        "Lost objects dropped because there were too many.", lambda s: s.totals.lost_dropped
+    ),
+    "lost_objects": _gauge(
+        "Lost objects that may still be joined.",
+        lambda s: sum(len(one.rejoining.lost) for one in s.densities if one.rejoining is not None),
+    ),
     "sessions": _gauge(
         "Sessions.", lambda s: _states(SESSION_STATES, Counter(one.state for one in s.sessions)), "state"
     ),

@@ -169,6 +169,8 @@ def live_frame(tracks: Publication, *detections: Publication, place: Place | Non
     )
     confirmed = shown(message)
     numbers = np.round(rows[confirmed][:_MOST], 3).tolist()
+    if message.object is not None:
+        numbers = [[*one, number] for one, number in zip(numbers, message.object[confirmed].tolist(), strict=False)]
     heads = zip(message.id[confirmed].tolist(), message.label[confirmed].tolist(), numbers, strict=False)
     sensor, found = _seen(detections)
     frame: dict[str, Any] = {

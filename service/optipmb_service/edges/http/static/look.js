@@ -8,8 +8,11 @@ const COLOURS = [ // of Okabe and Ito, as they are, darker and lighter
   "#5BA7D6", "#EE9157", "#4FC39F", "#E0A9C8", "#93D0F2", "#F2C14D", "#B99A4F"];
 const DARK = matchMedia("(prefers-color-scheme: dark)");
 const TRAIL_S = 5, ASK_MS = 2000, AGAIN_MS = 1000, SILENT_MS = 2000, EDGE = 44, SLOW = 0.3, KNOWN = 0.95, NAMED = 4; // NAMED: pixels per metre from which classes are written
-const ID = 0, LABEL = 1, X = 2, Y = 3, LENGTH = 4, WIDTH = 5, YAW = 6, VX = 7, VY = 8, EXISTENCE = 9, SCORE = 10, AGE = 11, MISSED = 12, FACING = 13;
+const ID = 0, LABEL = 1, X = 2, Y = 3, LENGTH = 4, WIDTH = 5, YAW = 6, VX = 7, VY = 8, EXISTENCE = 9, SCORE = 10, AGE = 11, MISSED = 12, FACING = 13, OBJECT = 14;
 
+const ENDS = 5000; // objects whose last places are kept
+
+const object = (track) => (track[OBJECT] >= 0 ? track[OBJECT] : track[ID]);
 const at = (id) => document.getElementById(id);
 const made = (tag, text) => Object.assign(document.createElement(tag), { textContent: text });
 const canvas = at("canvas"), pen = canvas.getContext("2d");
@@ -17,7 +20,7 @@ const view = { x: 0, y: 0, scale: 6, follow: true }; // centre in metres, pixels
 const fingers = new Map(); // pointer id -> [x, y]
 let chosen = decodeURIComponent(location.hash.slice(1));
 let asking = 0, token = sessionStorage.getItem("token") || "", ink = {};
-let frame = null, trails = new Map(), names = [], selected = null, source = null, came = 0, dirty = true, moved = 0, fitted = false;
+let frame = null, trails = new Map(), ends = new Map(), gaps = new Map(), names = [], selected = null, source = null, came = 0, dirty = true, moved = 0, fitted = false;
 
 // What the service says
 
@@ -91,7 +94,7 @@ function choose(stream) {
   if (stream !== chosen) history.replaceState(null, "", `#${encodeURIComponent(stream)}`);
   chosen = stream;
   frame = selected = null;
-  trails = new Map();
+  [trails, ends, gaps] = [new Map(), new Map(), new Map()];
   fitted = false;
   for (const row of at("streams").rows) row.setAttribute("aria-selected", row.cells[0].textContent === stream);
   showZones();
@@ -147,13 +150,19 @@ function showZones() {
 
 function receive(next) {
   came = performance.now();
-  if (frame !== null && (next.session !== frame.session || next.time < frame.time)) trails = new Map();
+  if (frame !== null && (next.session !== frame.session || next.time < frame.time)) [trails, ends, gaps] = [new Map(), new Map(), new Map()];
   frame = next;
   for (const track of frame.tracks) {
     const trail = trails.get(track[ID]) || [];
     trail.push([track[X], track[Y], frame.time]);
     trails.set(track[ID], trail);
+    const before = ends.get(object(track)); // where the object was last, and the track that it was
+    if (before && before[2] !== track[ID]) gaps.set(track[ID], [before, trail[0]]);
+    ends.delete(object(track)); // the latest at the end
+    ends.set(object(track), [track[X], track[Y], track[ID]]);
+    if (ends.size > ENDS) ends.delete(ends.keys().next().value);
   }
+  for (const id of gaps.keys()) if (!trails.has(id)) gaps.delete(id);
   for (const [id, trail] of trails) {
     while (trail.length > 0 && frame.time - trail[0][2] > TRAIL_S) trail.shift();
     if (trail.length === 0) trails.delete(id);
@@ -238,6 +247,7 @@ function draw() {
       pen.globalAlpha = shown.has(id) ? sure(shown.get(id)) : 0.25; // a track that has ended fades
       line(trail, colour(id), 1.5);
     }
+    for (const [id, gap] of gaps) if (shown.has(id)) line(gap, colour(id), 0.6);
     for (const track of frame.tracks) box(track);
     pen.globalAlpha = 1;
     if (frame.sensor !== null) sensor(...frame.sensor);
@@ -315,7 +325,7 @@ function box(track) {
   pen.lineWidth = 3;
   pen.setLineDash([]);
   pen.strokeStyle = ink.veil;
-  const name = bold || view.scale > NAMED ? `${track[ID]} ${frame.labels[track[LABEL]]}` : track[ID];
+  const name = bold || view.scale > NAMED ? `${object(track)} ${frame.labels[track[LABEL]]}` : object(track);
   let above = py - 4;
   const wide = pen.measureText(name).width, taken = ([x, y, w]) => Math.abs(x - px) < (w + wide) / 2 && Math.abs(y - above) < 12;
   while (names.some(taken) && above > py - 20) above -= 13; // above the names that are there, near its box
@@ -349,7 +359,7 @@ function tell() {
   at("details").hidden = !track;
   if (!track) return;
   const rows = {
-    "track": track[ID], "class": frame.labels[track[LABEL]],
+    "track": track[ID], ...(track[OBJECT] >= 0 ? { "object": track[OBJECT] } : {}), "class": frame.labels[track[LABEL]],
     "existence": track[EXISTENCE].toFixed(3), "score": track[SCORE].toFixed(2),
     "speed": `${Math.hypot(track[VX], track[VY]).toFixed(1)} m/s`, "x, y": `${track[X].toFixed(1)}, ${track[Y].toFixed(1)} m`,
     "faces": `${(track[YAW] * 180 / Math.PI).toFixed(0)}° at ${(100 * track[FACING]).toFixed(1)} %`,

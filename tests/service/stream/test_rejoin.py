@@ -1,0 +1,215 @@
+"""Tracks joined over gaps in sessions: as the library does, in any order of frames, after restores, and in zones."""
+
+import json
+import random
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gaps
+import msgpack
+import pytest
+from optipmb_schemas import Detections, Tracks, decode, encode
+from optipmb_schemas.json_form import tracks_json
+from optipmb_schemas.protobuf.convert import from_proto, to_proto
+from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import Policy, Tracked
+from optipmb_service.settings import SettingsInvalidError, load
+from sessions import Merged, plain, tracks
+
+from optipmb import OnlineTracker, Rejoin, generic_parameters
+from optipmb.zones import Event, Zone
+
+GENERIC = generic_parameters(gaps.CLASSES, 0.1)
+HOW = Rejoin(min_probability=0.6)
+POLICY = Policy(rejoin=HOW)
+FRAMES = gaps.record("street", 7, 25.0).frames
+STREAM = "site/node/camera"
+
+
+def message_of(seq: int, given: dict[str, Any]) -> Detections:
+    return Detections(stream=STREAM, epoch=bytes(16), seq=seq, frame="world", **given)
+
+
+MESSAGES = [message_of(seq, one) for seq, one in enumerate(FRAMES)]
+fresh = partial(Session, STREAM, GENERIC)
+
+
+def in_order(policy: Policy = POLICY, messages: list[Detections] = MESSAGES) -> tuple[list[Tracked], Session]:
+    session = fresh(policy)
+    outputs = [one for message in messages for one in session.on_detections(message, 0)]
+    return [one for one in outputs if isinstance(one, Tracked)], session
+
+
+def test_a_session_joins_as_the_library_does() -> None:
+    """Ids, objects, probabilities and states of each frame are those of `OnlineTracker`, byte for byte."""
+    found, _ = in_order()
+    tracker, joined = OnlineTracker(GENERIC, rejoin=HOW), 0
+    for one, given in zip(found, FRAMES, strict=True):
+        columns = {name: value for name, value in given.items() if name not in {"labels", "stamp_ns"}}
+        expected, message = tracker.update(columns, stamp_ns=given["stamp_ns"]), one.tracks
+        assert one.estimates.words.tobytes() == expected.tracks.words.tobytes()
+        assert message.object is not None
+        assert expected.object is not None
+        assert expected.object_probability is not None
+        assert message.object.tobytes() == expected.object.tobytes()
+        assert message.object_probability is not None
+        assert message.object_probability.tobytes() == expected.object_probability.astype("f4").tobytes()
+        joined += ((message.object >= 0) & (message.object != message.id)).sum()
+    assert joined
+
+
+def test_messages_carry_objects() -> None:
+    """In msgpack, protobuf and JSON; a track without a decision has -1."""
+    found, _ = in_order()
+    numbers: set[int] = set()
+    for one in found[::10]:
+        message = one.tracks
+        assert plain(decode(encode(message), Tracks)) == plain(message)
+        assert plain(from_proto(to_proto(message), Tracks)) == plain(message)
+        rows = json.loads(tracks_json(message))["objects"]
+        assert message.object is not None
+        assert [row["object"] for row in rows] == message.object.tolist()
+        assert all(0.0 <= row["object_probability"] <= 1.0 for row in rows)
+        numbers |= {row["object"] - row["id"] for row in rows if row["object"] >= 0} | {
+            min(row["object"], 0) for row in rows
+        }
+    assert {-1, 0} < numbers
+
+
+def test_without_the_setting_nothing_is_added() -> None:
+    """Messages, state and checkpoint have no field of it, and the tracks are the same until a join removes one."""
+    found, session = in_order(Policy())
+    assert {"object", "object_probability"} & json.loads(tracks_json(found[-1].tracks))["objects"][0].keys() == set()
+    assert not any(
+        "rejoin" in name or name == "lost_dropped" for name in names_in(encode_checkpoint(session.snapshot()))
+    )
+    joined, _ = in_order()
+    assert found[20].estimates.words.tobytes() == joined[20].estimates.words.tobytes()
+
+
+def names_in(data: bytes) -> set[str]:
+    """Return all names in the body of a checkpoint."""
+    body = msgpack.unpackb(data[data.index(b"\xa8software") - 1 :], strict_map_key=False)
+    found, rest = set(), [body]
+    while rest:
+        one = rest.pop()
+        if isinstance(one, dict):
+            found |= set(one)
+            rest += one.values()
+        elif isinstance(one, list):
+            rest += one
+    return found
+
+
+def test_an_older_checkpoint_begins_with_an_empty_list() -> None:
+    """A session restored from one without the setting has the tracks, whose objects are decided once more."""
+    _, before = in_order(Policy(), MESSAGES[:100])
+    session = Session.restore(decode_checkpoint(encode_checkpoint(before.snapshot())), 0, POLICY)
+    found = tracks([one for message in MESSAGES[100:110] for one in session.on_detections(message, 0)])
+    assert found[0].object is not None
+    assert found[-1].object is not None
+    assert (found[0].object == -1).all()
+    assert (found[-1].object == found[-1].id).sum() > 5
+
+
+def test_late_frames_give_the_objects_of_the_order() -> None:
+    """Frames that come in another order within the window end in the same messages and the same state."""
+    found, one = in_order()
+    expected, merged, session = Merged(), Merged(), fresh(POLICY)
+    expected.take(found)
+    order, chance = list(range(len(MESSAGES))), random.Random(3)
+    for k in range(0, len(order) - 6, 6):
+        part = order[k : k + 6]
+        chance.shuffle(part)
+        order[k : k + 6] = part
+    for seq in order:
+        merged.take(session.on_detections(MESSAGES[seq], 0))
+    assert merged.plain() == expected.plain()
+    assert state_bytes(session.snapshot()) == state_bytes(one.snapshot())
+
+
+def test_twenty_kills_change_no_object() -> None:
+    """A session that goes on from a checkpoint some frames old, again and again, has the same objects and state."""
+    found, one = in_order()
+    expected, merged, session = Merged(), Merged(), fresh(POLICY)
+    expected.take(found)
+    for begin in range(0, len(MESSAGES), 12):
+        stored = encode_checkpoint(session.snapshot())
+        for message in MESSAGES[begin : begin + 4]:
+            merged.take(session.on_detections(message, 0), session.run)  # lost with the process
+        session = Session.restore(decode_checkpoint(stored), 0, POLICY)
+        for message in MESSAGES[begin : begin + 12]:
+            merged.take(session.on_detections(message, 0), session.run)
+        merged.take(session.recovered(0), session.run)
+    assert merged.plain() == expected.plain()
+    assert state_bytes(session.snapshot()) == state_bytes(one.snapshot())
+
+
+def test_a_reset_forgets_lost_objects() -> None:
+    """No object of a session is of another one."""
+    _, session = in_order(messages=MESSAGES[:200])
+    assert (session.state().lost_objects or 0) > 0
+    assert (session.state().rejoined or 0) > 0
+    session.reset()
+    found = tracks([one for message in MESSAGES[200:] for one in session.on_detections(message, 0)])
+    assert session.state().next_id > 0
+    for one in found:
+        assert one.object is not None
+        assert (one.object[one.object >= 0] >= found[0].id.min()).all()
+
+
+YARD = Zone("yard", polygon=((-5, -5), (200, -5), (200, 5), (-5, 5)), dwell_s=(6.0,), lost_s=6.0)
+SHORT = Zone("short", polygon=((-5, -5), (200, -5), (200, 5), (-5, 5)))
+GATE = Zone("gate", line=((40.0, -9.0), (40.0, 9.0)), lost_s=6.0)
+LATE = Zone("late", line=((40.0, -9.0), (40.0, 9.0)))
+
+
+def test_a_visit_over_a_gap_is_one() -> None:
+    """Within `lost_s` a visit goes on and a line is crossed meanwhile; beyond, the object is lost and returns."""
+    cars = gaps.cars((0, 3, (0, 0), (8, 0)), (7, 10, (0, 0), (8, 0)))
+    messages = [message_of(seq, one) for seq, one in enumerate(cars)]
+    found, _ = in_order(Policy(zones=(YARD, SHORT, GATE, LATE), rejoin=Rejoin()), messages)
+    events: list[Event] = [event for one in found for event in one.events]
+    about = [(one.zone, one.kind, one.how, one.id, one.object) for one in events]
+    assert about == [
+        ("short", "entered", "appeared", 1, 1),
+        ("yard", "entered", "appeared", 1, 1),
+        ("short", "left", "lost", 1, 1),
+        ("gate", "crossed", "", 2, 1),
+        ("yard", "stayed", "", 2, 1),
+        ("short", "entered", "appeared", 2, 1),
+    ]
+    assert 4 * 10**9 < events[3].at_ns < 6 * 10**9
+    counts = [one.counts for one in found if one.counts][-1]
+    inside = {
+        name: {kind: one.get(kind, {}).get("car", 0) for kind in ("entered", "left", "inside")}
+        for name, one in counts.items()
+    }
+    assert inside["yard"] == {"entered": 1, "left": 0, "inside": 1}
+    assert inside["short"] == {"entered": 2, "left": 1, "inside": 1}
+    told = encode(found[-1].tracks)
+    assert decode(told, Tracks).object is not None
+
+
+def test_zones_by_object_survive_late_frames_and_restores() -> None:
+    """Events and state are those of the order, with kills between."""
+    policy = Policy(zones=(YARD, SHORT, GATE), rejoin=HOW)
+    _, one = in_order(policy)
+    session = fresh(policy)
+    for seq in [k ^ 1 for k in range(len(MESSAGES))]:
+        if seq % 60 == 1:
+            session = Session.restore(decode_checkpoint(encode_checkpoint(session.snapshot())), 0, policy)
+        session.on_detections(MESSAGES[seq], 0)
+    session.recovered(0)
+    assert state_bytes(session.snapshot()) == state_bytes(one.snapshot())
+
+
+@pytest.mark.parametrize("value", ["gap_s = 0", "min_probability = 1.0", "most = 0", "decide_s = 6", "other = 1"])
+def test_settings_out_of_bounds_are_named(value: str, tmp_path: Path) -> None:
+    """The path of the setting is in the error."""
+    path = tmp_path / "settings.toml"
+    path.write_text(f'[rejoin."site/*/*"]\n{value}\n')
+    with pytest.raises(SettingsInvalidError, match=rf"rejoin.site/\*/\*.{value.split(maxsplit=1)[0]}"):
+        load(path)
