@@ -86,7 +86,7 @@ types: $(VENV)/.installed
 
 # Before processes that would each compile them.
 kernels: $(VENV)/.installed
-	$(BIN)/optipmb warm-up
+	$(BIN)/optipmb warm-up --all
 
 # More than two processors: what starts processes and waits for them leaves half of the time free. The order of files
 # is that of tests/conftest.py: those with few and long tests would otherwise come last, with nothing beside them.

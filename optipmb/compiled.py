@@ -64,6 +64,8 @@ STEPS: Final = 4
 
 PROCESSES: Final = "OPTIPMB_COMPILE_PROCESSES"
 """Environment variable: how many processes compile; 0 compiles each kernel at its first call, in its own process."""
+REJOIN: Final = f"{__package__}.rejoin"
+"""Module whose kernels take as long to compile as all others, and few trackers need."""
 MOST_PROCESSES: Final = 4
 """More are not faster: one kernel takes a third of the time."""
 
@@ -76,7 +78,9 @@ class _Progress(event.Listener):
 
     def __init__(self) -> None:
         self.kernels: set[str] = set()
-        """All kernels of the modules imported so far."""
+        """Kernels of the modules imported so far that every tracker needs."""
+        self.others: set[str] = set()
+        """Those that few need: they are compiled at their first call, by the process that calls them."""
         self.compiled: set[str] = set()
         self.built: set[str] | None = None
         """Kernels that helper processes compiled; None until one was missing."""
@@ -86,7 +90,7 @@ class _Progress(event.Listener):
 
     def on_start(self, event: Any) -> None:
         """Announce the first compilation of this process."""
-        if self._name(event) in self.kernels:
+        if self._name(event) in self.kernels | self.others:
             self.announce()
 
     def on_end(self, event: Any) -> None:
@@ -177,7 +181,8 @@ def _compiled(function: F, *, nogil: bool) -> F:
     options: Any = config  # it has names that are set at run time
     if options.DISABLE_JIT:
         return calls.recorded(function)
-    progress.kernels.add(f"{function.__module__}.{function.__qualname__}")
+    common = function.__module__ != REJOIN
+    (progress.kernels if common else progress.others).add(f"{function.__module__}.{function.__qualname__}")
     jit = partial(numba.njit, nogil=nogil, error_model="numpy", no_cfunc_wrapper=True)
     try:
         compiled: Any = jit(cache=True)(function)
@@ -192,7 +197,7 @@ def _compiled(function: F, *, nogil: bool) -> F:
             options.CACHE_DIR = usual
     cache = compiled._cache._cache_file  # noqa: SLF001 - numba has no public name for it
     cache._source_stamp = _SOURCES  # noqa: SLF001 - as above
-    cache.__class__ = _PackageIndex if function.__module__.startswith(f"{__package__}.") else _Index
+    cache.__class__ = _PackageIndex if common and function.__module__.startswith(f"{__package__}.") else _Index
     return cast("F", compiled)
 
 
@@ -215,7 +220,7 @@ class _Index(IndexDataCacheFile):
 
 
 class _PackageIndex(_Index):
-    """An index of the package: where one kernel has no machine code, helper processes compile all of them."""
+    """An index of the package: where one kernel has no machine code, helper processes compile all that all need."""
 
     def load(self, key: Any) -> Any:
         """Return the machine code of one kernel, None where it has to be compiled here."""

@@ -19,7 +19,7 @@ from optipmb.extract import sound
 from optipmb.field_of_view import FieldOfView
 from optipmb.frame import PointCloud, Pose, make_frame
 from optipmb.geometry import bev_iou
-from optipmb.parameters import load_profile, parse_parameters
+from optipmb.parameters import Parameters, load_profile, parse_parameters
 from optipmb.paths import predict_tracks
 from optipmb.rejoin import Kinds, Rejoin, match, pair_scores
 from optipmb.sensor_motion import Pairs, common_motion, sideways
@@ -45,17 +45,22 @@ def compilations() -> int:
     return here + len(compiled.progress.built or ())
 
 
-def warm_up() -> int:
+def warm_up(*, rejoin: bool = False) -> int:
     """Compile all kernels, or load them from the cache, by running a few frames through a tracker.
 
     The first call after an installation compiles, in several processes, for up to a minute; later processes load the
     machine code (under a second). Call it before the first frame that is waited for.
 
+    Args:
+        rejoin: Also the kernels that join tracks over gaps (`Rejoin`), which takes another half minute.
+
     Returns:
         How many kernels had to be compiled; none in a prepared installation.
     """
     before = compilations()
-    _run()
+    parameters = _run()
+    if rejoin:
+        _run_rejoining(parameters)
     return compilations() - before
 
 
@@ -82,7 +87,8 @@ def build() -> None:
         known[name].compile(signature)
 
 
-def _run() -> None:
+def _run() -> Parameters:
+    """Call all kernels that every tracker needs; return the parameters of one."""
     curve = dict.fromkeys(("evidence", "existence", "along", "across"), (0.1, 0.9))
     document = load_profile("nuscenes").model_dump() | {"self_calibration": True}
     document["classes"]["pedestrian"] |= {
@@ -91,7 +97,7 @@ def _run() -> None:
         "calibration": curve | {"memory": 0.5, "missed": 1.0},
     }
     parameters = parse_parameters(document)
-    tracker = Tracker(parameters, rejoin=Rejoin())
+    tracker = Tracker(parameters)
     posterior = tracker.initial()
     pose = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
     cloud = PointCloud(np.zeros((8, 3), np.float32), pose)
@@ -126,10 +132,17 @@ def _run() -> None:
     pairs = Pairs(place, label, place, label)
     common_motion(pairs, np.zeros(3), 0.0, 0.0, 0.0)
     sideways(pairs, place, np.zeros(1), np.zeros(1, np.bool_))
-    no_pairs = np.zeros(0, np.int64)
-    kinds = Kinds.of(parameters)
-    pair_scores(np.zeros(0), no_pairs, no_pairs, kinds.kind, kinds.motion, 60.0)
-    match(no_pairs, no_pairs, np.zeros(0), np.zeros(0, np.bool_), 0)
     line = Zone("line", line=((0.0, 0.0), (1.0, 0.0)))
     locate(np.zeros((1, 3)), np.zeros((1, 2)), *Shapes.of([line]))
     crossings(np.array(line.line), 0.0, 0.0, 0.0, 0.0)
+    return parameters
+
+
+def _run_rejoining(parameters: Parameters) -> None:
+    empty, kinds = np.zeros(0, np.int64), Kinds.of(parameters)
+    pair_scores(np.zeros(0), empty, empty, kinds.kind, kinds.motion, 60.0)
+    match(empty, empty, np.zeros(0), np.zeros(0, np.bool_), 0)
+    tracker = Tracker(parameters, rejoin=Rejoin())
+    boxes: dict[str, Any] = {"label": [0], "center": [[0.0, 0.0, 0.0]], "score": [0.9]}
+    frame, _ = make_frame(parameters, stamp_ns=0, labels=("pedestrian",), **boxes)
+    tracker.step(tracker.initial(), frame)

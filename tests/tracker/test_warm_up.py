@@ -34,7 +34,7 @@ from optipmb.warm import compilations, kernels
 from optipmb.zones import Zone, ZoneState, observe
 from scenes import Options, random_parameters, scene
 
-compiled = optipmb.warm_up()
+compiled = optipmb.warm_up(rejoin=True)
 known = {name: len(kernel.signatures) for name, kernel in kernels().items()}
 
 def read_only(array):
@@ -45,7 +45,7 @@ zones = (Zone("a", polygon=((-30, -30), (30, -30), (0.0, 30.0))), Zone("b", line
 baselines = (optipmb.Modules(**{name: False}) for name in ("adp", "habm", "rpp", "ote"))
 for seed, modules in enumerate([optipmb.Modules(), optipmb.Modules(), *baselines]):
     parameters = optipmb.parse_parameters(random_parameters(seed, calibrated=seed % 2 == 0))
-    tracker = optipmb.Tracker(parameters, modules)
+    tracker = optipmb.Tracker(parameters, modules, rejoin=optipmb.Rejoin() if seed else None)
     density, state = tracker.initial(), ZoneState()
     for given in scene(seed, Options(frames=25, objects=25)):
         columns = given.columns()
@@ -88,7 +88,7 @@ def fresh() -> dict[str, Any]:
 
 def test_after_a_warm_up_nothing_is_compiled() -> None:
     """The first process may prepare; the next one loads everything, and no frame brings a kernel anything new."""
-    optipmb.warm_up()
+    optipmb.warm_up(rejoin=True)
     assert fresh() == {"compiled": 0, "later": 0, "grown": []}
 
 

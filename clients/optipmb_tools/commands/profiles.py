@@ -70,12 +70,18 @@ def _list(*, as_json: bool) -> None:
     print_table(table)
 
 
-def warm_up(*, as_json: AsJson = False) -> None:
+def warm_up(
+    *,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Also what joins tracks over gaps, for another half minute.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
     """Compile the tracker into its cache, as the last step of an installation or of an image."""
     from optipmb_tools.run import profiles as library  # noqa: PLC0415  the help does not load the tracker
 
     begun = time.monotonic()
-    compiled = library.warm_up()
+    compiled = library.warm_up(rejoin=everything)
     seconds = round(time.monotonic() - begun, 1)
     text = f"compiled {compiled} kernels in {seconds} s" if compiled else f"all kernels were compiled ({seconds} s)"
     report({"command": "warm-up", "compiled": compiled, "seconds": seconds}, text, as_json=as_json)

@@ -17,6 +17,7 @@ import mmap
 import signal
 import sys
 import threading
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -104,7 +105,7 @@ async def _serve(
         # The loop's time and the deadlines are one clock, the monotonic one.
         loop.call_soon_threadsafe(loop.call_at, at_ns / 1e9, wake)
 
-    await unless(asked, warm_up)
+    await unless(asked, partial(warm_up, rejoin=bool(settings.rejoin)))
     if asked.is_set():
         return None
     if not settings.is_router:
@@ -133,8 +134,8 @@ async def _serve(
     return await asyncio.to_thread(service.stop, asked.bound.left())
 
 
-def warm_up() -> None:
-    """Compile the kernels, or load them.
+def warm_up(*, rejoin: bool = False) -> None:
+    """Compile the kernels, or load them, with `rejoin` also those that join tracks over gaps.
 
     With its array functions numba loads scipy's linear algebra where that is installed: 15 of 220 MB, and a twelfth of
     the processor time of the start, for functions that no kernel uses. It does without where there is none, so it is
@@ -146,7 +147,7 @@ def warm_up() -> None:
             import_module("numba.np.arraymath")
         finally:
             del sys.modules[UNUSED]
-    optipmb.warm_up()
+    optipmb.warm_up(rejoin=rejoin)
     _release_compiler()
 
 
