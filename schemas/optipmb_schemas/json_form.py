@@ -216,11 +216,22 @@ class Selection(Struct, frozen=True):
 
     def rows(self, tracks: Tracks) -> NDArray[np.bool_]:
         """Return which rows of the tracks (N,) are wanted."""
-        rows: NDArray[np.bool_] = tracks.existence >= self.min_existence
+        return self.rows_of(tracks.labels, tracks.label, tracks.existence, tracks.age, tracks.confirmed)
+
+    def rows_of(
+        self,
+        labels: Iterable[str],
+        label: NDArray[Any],
+        existence: NDArray[np.float64],
+        age: NDArray[np.float64],
+        confirmed: NDArray[Any] | None,
+    ) -> NDArray[np.bool_]:
+        """Return as `rows` by columns (N,)."""
+        rows: NDArray[np.bool_] = existence >= self.min_existence
         if self.confirmed:
-            rows &= shown(tracks)
+            rows &= shown_rows(confirmed, existence, age)
         if self.classes:
-            rows &= np.isin(tracks.label, [at for at, name in enumerate(tracks.labels) if name in self.classes])
+            rows &= np.isin(label, [at for at, name in enumerate(labels) if name in self.classes])
         return rows
 
 

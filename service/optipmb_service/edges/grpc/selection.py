@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, get_args
 import numpy as np
 import optipmb_schemas as schemas
 from optipmb_client.merging import FinalEvents
-from optipmb_schemas.json_form import shown_rows
+from optipmb_schemas.json_form import Selection
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf.convert import column, select
@@ -46,9 +46,7 @@ class Filter:
             raise schemas.MessageError(
                 "invalid_value", "filter.min_existence", "a number in [0, 1]", f"{asked.min_existence:g}"
             )
-        self._classes = frozenset(asked.classes)
-        self._confirmed = asked.confirmed_only
-        self._min_existence = asked.min_existence
+        self._selection = Selection(frozenset(asked.classes), asked.confirmed_only, asked.min_existence)
         self._area = _polygon(asked.area) if asked.HasField("area") else None
         paths = ["horizons"] if set(schemas.PATHS).intersection(asked.fields) else []
         self._fields = frozenset((*asked.fields, "id", *paths)) if asked.fields else None
@@ -66,14 +64,9 @@ class Filter:
         return chosen
 
     def _rows(self, tracks: pb.Tracks) -> NDArray[np.bool_]:
-        existence = column(tracks.existence)
-        rows: NDArray[np.bool_] = existence >= self._min_existence
-        if self._classes:
-            wanted = [number for number, name in enumerate(tracks.labels) if name in self._classes]
-            rows &= np.isin(column(tracks.label), wanted)
-        if self._confirmed:
-            confirmed = column(tracks.confirmed) if tracks.HasField("confirmed") else None
-            rows &= shown_rows(confirmed, existence, column(tracks.age))
+        label, existence, age = (column(one) for one in (tracks.label, tracks.existence, tracks.age))
+        confirmed = column(tracks.confirmed) if tracks.HasField("confirmed") else None
+        rows = self._selection.rows_of(tracks.labels, label, existence, age, confirmed)
         if self._area is not None:
             rows &= _inside(column(tracks.center)[:, :2], self._area)
         return rows
