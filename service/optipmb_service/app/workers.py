@@ -94,6 +94,7 @@ class Worker:
         """Monotonic time of its last sign of life."""
         self._changed = changed
         self._process: Process | None = None
+        self._ending = False
 
     def set(self, state: State) -> None:
         self.state = state
@@ -114,6 +115,8 @@ class Worker:
             assert process.stdin is not None  # noqa: S101 - it was asked for: said for the type checker
             assert process.stdout is not None  # noqa: S101 - likewise
             process.stdin.write(json.dumps(order).encode() + b"\n")
+            if self._ending:  # asked while this process began
+                process.stdin.close()
             async for line in process.stdout:
                 with contextlib.suppress(ValueError):  # what a library prints is no event
                     self.hear(json.loads(line))
@@ -131,7 +134,8 @@ class Worker:
             self.set("ready")
 
     def end(self) -> None:
-        """Ask the process to end."""
+        """Ask the process to end, also one that is about to begin."""
+        self._ending = True
         if self._process is not None and self._process.stdin is not None:
             self._process.stdin.close()
 
