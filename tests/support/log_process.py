@@ -40,7 +40,7 @@ class LogProcess(ServiceProcess):
             return ""
 
     def figure(self, name: str) -> float:
-        found = re.search(rf"^optipmb_log_{name} (\S+)$", self.ask("/metrics"), re.MULTILINE)
+        found = re.search(rf"^optipmb_message_log_{name} (\S+)$", self.ask("/metrics"), re.MULTILINE)
         return float(found[1]) if found else 0.0
 
     @property
