@@ -122,7 +122,8 @@ def test_the_example_page_draws_tracks(service: ServiceProcess, tmp_path: Path) 
             for seq in range(10_000):
                 if over.wait(0.05):
                     return
-                node.send(SENSOR.detections(seq))
+                center = SENSOR.detections(min(seq, 40)).center  # then they wait within the picture
+                node.send(SENSOR.detections(seq, center=center))
 
     thread = threading.Thread(target=publish, daemon=True)
     thread.start()
