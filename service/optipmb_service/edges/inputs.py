@@ -155,8 +155,7 @@ class InFlight:
         while len(self._frames) >= most:
             self._changed.clear()
             try:
-                async with asyncio.timeout(self._progress + STALL_S - time.monotonic()):
-                    await self._changed.wait()
+                await asyncio.wait_for(self._changed.wait(), self._progress + STALL_S - time.monotonic())
             except TimeoutError:
                 self._frames.clear()
 
@@ -410,8 +409,7 @@ class Inputs:
                 for head, answer in reversed(await asyncio.to_thread(self._cached, name)):
                     if (head.epoch, head.seq) == sent[:2]:
                         return answer
-            async with asyncio.timeout(wait_s):
-                return await tracks
+            return await asyncio.wait_for(tracks, wait_s)
         except TimeoutError:
             return None
         finally:

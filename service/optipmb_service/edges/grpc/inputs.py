@@ -174,8 +174,7 @@ class _Inputs:
         if isinstance(message, schemas.Points):
             if not self._waited and not outgoing.points_wanted:
                 with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(WANTED_S):
-                        await self._matched.wait()
+                    await asyncio.wait_for(self._matched.wait(), WANTED_S)
             self._waited = True
             if not outgoing.points_wanted:
                 return
