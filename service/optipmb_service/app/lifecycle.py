@@ -249,7 +249,8 @@ class StopRequest:
     async def wait(self, seconds: float | None = None) -> None:
         """Wait until the end is asked for, at most so long."""
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._event.wait(), seconds)
+            async with asyncio.timeout(seconds):
+                await self._event.wait()
 
 
 async def unless(asked: StopRequest, work: Callable[[], _T]) -> _T | None:

@@ -155,7 +155,8 @@ class InFlight:
         while len(self._frames) >= most:
             self._changed.clear()
             try:
-                await asyncio.wait_for(self._changed.wait(), self._progress + STALL_S - time.monotonic())
+                async with asyncio.timeout(self._progress + STALL_S - time.monotonic()):
+                    await self._changed.wait()
             except TimeoutError:
                 self._frames.clear()
 
@@ -409,7 +410,8 @@ class Inputs:
                 for head, answer in reversed(await asyncio.to_thread(self._cached, name)):
                     if (head.epoch, head.seq) == sent[:2]:
                         return answer
-            return await asyncio.wait_for(tracks, wait_s)
+            async with asyncio.timeout(wait_s):
+                return await tracks
         except TimeoutError:
             return None
         finally:

@@ -335,11 +335,9 @@ class Bridge(Component):
                 log.warning("mqtt_unsent", messages=len(self._unsent))
             raise
         finally:
-            left = {publishing, clearing}
-            while left:  # again: `wait_for` of Python 3.11 loses a cancellation as an item comes
-                for one in left:
-                    one.cancel()
-                _, left = await asyncio.wait(left, timeout=0.1)
+            publishing.cancel()
+            clearing.cancel()
+            await asyncio.wait((publishing, clearing))
         if publishing.cancelled():
             raise link.ended.result()
         publishing.result()

@@ -157,7 +157,8 @@ class Outbox(Generic[T]):
                 if self._waiting or self._closed:
                     return bool(self._waiting)
                 self._changed.clear()
-            await asyncio.wait_for(self._changed.wait(), seconds)
+            async with asyncio.timeout(seconds):  # `wait_for` of Python 3.11 loses a cancellation as an item comes
+                await self._changed.wait()
 
     def take_now(self) -> tuple[T, int] | None:
         """Return the next item, and how many were left out before it; None when none waits."""

@@ -130,7 +130,8 @@ class Call:
             EndCall: none comes.
         """
         try:
-            return await asyncio.wait_for(self.read(), FIRST_S)
+            async with asyncio.timeout(FIRST_S):
+                return await self.read()
         except TimeoutError:
             code = grpc.StatusCode.DEADLINE_EXCEEDED
             raise EndCall(code, f"no message came within {FIRST_S:g} s of the call") from None

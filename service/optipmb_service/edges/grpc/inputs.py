@@ -174,7 +174,8 @@ class _Inputs:
         if isinstance(message, schemas.Points):
             if not self._waited and not outgoing.points_wanted:
                 with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(self._matched.wait(), WANTED_S)
+                    async with asyncio.timeout(WANTED_S):
+                        await self._matched.wait()
             self._waited = True
             if not outgoing.points_wanted:
                 return

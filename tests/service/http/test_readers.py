@@ -1,0 +1,25 @@
+"""Readers of any edge, without a network."""
+
+import asyncio
+
+import pytest
+from optipmb_service.edges.readers import Outbox
+
+
+async def test_a_reader_is_cancelled_also_as_an_item_comes() -> None:
+    """One that waits and is cancelled in the turn of the loop in which an item comes does not read on."""
+    outbox: Outbox[str] = Outbox()
+
+    async def read() -> None:
+        while await outbox.take(60.0):
+            pass
+
+    reading = asyncio.create_task(read())
+    await asyncio.sleep(0.0)
+    outbox.put("a/b/c", "item", 4)
+    await asyncio.sleep(0.0)
+    await asyncio.sleep(0.0)
+    reading.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        async with asyncio.timeout(10.0):
+            await reading
