@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import pytest
 from broker import Broker
 from browser import browser, console, wait
@@ -122,8 +123,9 @@ def test_the_example_page_draws_tracks(service: ServiceProcess, tmp_path: Path) 
             for seq in range(10_000):
                 if over.wait(0.05):
                     return
-                center = SENSOR.detections(min(seq, 40)).center  # then they wait within the picture
-                node.send(SENSOR.detections(seq, center=center))
+                one = SENSOR.detections(min(seq, 40))  # then they wait within the picture, however late the browser
+                velocity = one.velocity if seq < 40 else np.zeros((len(one.center), 2))
+                node.send(SENSOR.detections(seq, center=one.center, velocity=velocity))
 
     thread = threading.Thread(target=publish, daemon=True)
     thread.start()
