@@ -108,6 +108,16 @@ MOST_PAIRS: Final = 4000
 of which the lowest are."""
 _NS: Final = 1e-9
 
+_BOUNDS: Final = MappingProxyType(
+    {
+        "gap_s": (math.nextafter(0.0, 1.0), 600.0, "a time in (0, 600] s"),
+        "min_probability": (0.5, math.nextafter(1.0, 0.0), "a number in [0.5, 1)"),
+        "decide_s": (0.0, 5.0, "a time in [0, 5] s"),
+        "most": (1, 10_000, "a number in [1, 10000]"),
+    }
+)
+"""Least and largest values of `Rejoin`."""
+
 
 @dataclass(frozen=True)
 class Rejoin:
@@ -129,14 +139,10 @@ class Rejoin:
     most: int = 1000
 
     def __post_init__(self) -> None:
-        for name, good, expected in (
-            ("gap_s", 0.0 < self.gap_s <= 600.0, "a time in (0, 600] s"),  # noqa: PLR2004  named in the message
-            ("min_probability", 0.5 <= self.min_probability < 1.0, "a number in [0.5, 1)"),  # noqa: PLR2004  as above
-            ("decide_s", 0.0 <= self.decide_s <= 5.0, "a time in [0, 5] s"),  # noqa: PLR2004  as above
-            ("most", 1 <= self.most <= 10_000, "a number in [1, 10000]"),  # noqa: PLR2004  as above
-        ):
-            if not good:
-                raise ParameterError(f"rejoin.{name}", expected, str(getattr(self, name)))
+        for name, (least, most, expected) in _BOUNDS.items():
+            value = getattr(self, name)
+            if not least <= value <= most:
+                raise ParameterError(f"rejoin.{name}", expected, f"{value:g}")
 
 
 TrackletArrays: Final = arrays_of(Tracklets, "TrackletArrays", __name__)

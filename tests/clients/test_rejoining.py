@@ -300,7 +300,7 @@ def test_a_table_says_which_tracks_are_one_object(
     ("words", "text"),
     [
         (("track", "{table}", "--rejoin", "--out", "{out}"), "--rejoin: expected a table as --out"),
-        (("track", "{table}", "--rejoin", "0", "--out", "{out}.csv"), "expected a gap in (0, 600] s, received 0"),
+        (("track", "{table}", "--rejoin", "0", "--out", "{out}.csv"), "expected a time in (0, 600] s, received 0"),
         (("track", "{table}", "--rejoin", "601", "--out", "{out}.csv"), "received 601"),
         (
             ("track", "{table}", "--min-probability", "0.9", "--out", "{out}.csv"),

@@ -13,7 +13,7 @@ from optipmb_client.errors import UsageError
 from optipmb_schemas import Tracks
 from optipmb_schemas.json_form import shown
 
-from optipmb import Parameters
+from optipmb import ParameterError, Parameters, rejoin
 from optipmb.lost_objects import Tracklets
 from optipmb.rejoin import (
     FIT_NS,
@@ -45,10 +45,11 @@ class Rejoin:
     min_probability: float = 0.98
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.gap_s <= 600.0:  # noqa: PLR2004  the bounds are named in the message
-            raise UsageError(f"--rejoin: expected a gap in (0, 600] s, received {self.gap_s:g}")
-        if not 0.5 <= self.min_probability < 1.0:  # noqa: PLR2004  as above
-            raise UsageError(f"--min-probability: expected a number in [0.5, 1), received {self.min_probability:g}")
+        try:
+            rejoin.Rejoin(self.gap_s, self.min_probability)
+        except ParameterError as error:
+            option = "--rejoin" if error.path.endswith("gap_s") else "--min-probability"
+            raise UsageError(f"{option}: expected {error.expected}, received {error.received}") from error
 
     def objects(self, tracks: Mapping[int, Tracks], parameters: Parameters) -> Objects:
         """Return the object of each track of a recording, given the tracks by frame in a fixed world frame."""

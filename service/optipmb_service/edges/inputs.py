@@ -210,6 +210,11 @@ class _Stream:
     users: int = 0
     link: _Link | None = None
 
+    def leave(self, sent: Sent, tracks: asyncio.Future[Answer]) -> None:
+        """Wait for the tracks of a frame no more."""
+        if left := [one for one in self.waiting.pop(sent[:2], ()) if one is not tracks]:
+            self.waiting[sent[:2]] = left
+
 
 class _Link:
     """Publisher and subscriptions of a stream."""
@@ -295,7 +300,11 @@ class Inputs:
                 if wait_s:
                     stream.waiting.setdefault(sent[:2], []).append(tracks)
                 if is_new:
-                    await self._put(stream, frame, sent, traceparent)
+                    try:
+                        await self._put(stream, frame, sent, traceparent)
+                    except BaseException:
+                        stream.leave(sent, tracks)
+                        raise
                     self._remember(stream, mark, sent)
             counts = self.frames if is_new else self.duplicates
             counts[self._edge] += 1
@@ -415,9 +424,7 @@ class Inputs:
         except TimeoutError:
             return None
         finally:
-            left = [one for one in stream.waiting.pop(sent[:2], ()) if one is not tracks]
-            if left:
-                stream.waiting[sent[:2]] = left
+            stream.leave(sent, tracks)
 
     def _open(self, name: str) -> _Link:
         """Subscribe to what comes back of a stream, and open its publisher."""

@@ -127,7 +127,7 @@ class Link:
         """
         properties = None
         if self._client.protocol == MQTTProtocolVersion.MQTTv5:
-            properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+            properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]  # of paho
             properties.ReceiveMaximum = RECEIVED
         try:
             await asyncio.to_thread(self._client.connect, host, port, properties=properties)
@@ -144,7 +144,7 @@ class Link:
         """
         properties = None
         if self._client.protocol == MQTTProtocolVersion.MQTTv5:
-            properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
+            properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]  # of paho
             properties.ContentType = "application/json"
         sent = self._client.publish(topic, payload, qos, retain, properties)
         confirmed: asyncio.Future[str] = self._loop.create_future()
