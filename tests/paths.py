@@ -186,6 +186,7 @@ def start(base: Path, wheel: Path, _node: Path) -> None:
     for command in commands:
         program, *words = command
         if program == "optipmb-service":
+            words[words.index("--http") + 1] = f"127.0.0.1:{free_port()}"
             service = place.start(program, *words[:-1], "--listen", f"tcp/127.0.0.1:{port}")
         elif program == "kill" and service is not None:
             service.terminate()
