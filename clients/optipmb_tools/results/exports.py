@@ -70,7 +70,7 @@ def iso_times(stamps: Ints) -> NDArray[np.str_]:
 
 
 def write_features(path: Path, columns: Columns) -> list[str]:
-    """Write columns of tracks (`track_columns`, with latitudes) as GeoJSON or MF-JSON; return notes on what is not in.
+    """Write columns of tracks (`track_columns`, with latitudes) as GeoJSON or MF-JSON; return notes on omitted tracks.
 
     The file appears complete, or not at all.
 

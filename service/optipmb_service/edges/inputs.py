@@ -1,7 +1,7 @@
 """Frames of senders that have no publisher of their own: numbers, repetitions, and the way to the network.
 
-The service tracks a frame once by its epoch and number. A sender that gives none gets those of the edge, one epoch for
-each stream and process. What it sends again is known by its key or stamp. After a restart of the edge, the services'
+The service tracks a frame once by its epoch and number. The edge numbers frames that have none, with one epoch for each
+stream and process. It recognises repeated frames by their key or stamp. After a restart of the edge, the services'
 caches say which stamps were tracked: a new epoch that repeats one would restart the session.
 """
 
@@ -328,7 +328,7 @@ class Inputs:
             self._forget()
 
     async def _prepare(self, name: str, stream: _Stream) -> None:
-        """Open the publisher of a stream, and ask once what of it was tracked.
+        """Open the publisher of a stream, and ask once for its tracked frames.
 
         Raises:
             TransportError: the network cannot be used, or too many streams were opened.
@@ -345,7 +345,7 @@ class Inputs:
         """Return with which numbers a frame was sent; None of a new one.
 
         Raises:
-            RefusedError: it cannot be told, or is earlier than what was tracked.
+            RefusedError: it is earlier than a frame that was tracked before this edge began.
         """
         stamp_ns, tracked = frame.message.stamp_ns, stream.tracked or {}
         if (sent := stream.sent.get(mark)) is not None or not frame.is_stamped or rules.clock != "sender":
@@ -427,7 +427,7 @@ class Inputs:
             stream.leave(sent, tracks)
 
     def _open(self, name: str) -> _Link:
-        """Subscribe to what comes back of a stream, and open its publisher."""
+        """Subscribe to the tracks and problems of a stream, and open its publisher."""
         keys = self.client.keys
         with contextlib.ExitStack() as opened:
             subscriptions = []
@@ -480,7 +480,7 @@ class Inputs:
 
 
 def _mark(frame: JsonFrame, repeats: str) -> Hashable:
-    """Return by what a frame is known when it comes again; None: by nothing."""
+    """Return the mark of a frame by which a repeated one is recognised; None without key and stamp."""
     if frame.key or repeats:
         return ("key", frame.key) if frame.key else ("repeats", repeats)
     return frame.message.stamp_ns if frame.is_stamped else None

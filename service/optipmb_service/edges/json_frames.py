@@ -1,6 +1,6 @@
 """Frames of detections in JSON: one object per detection, or the columns of `Detections`.
 
-Whatever a sender writes becomes a valid `Detections`, or an error with the path in the sender's document. Numbers and
+A document becomes a valid `Detections`, or an error with the path in the sender's document. Numbers and
 stamps that it does not give are left to the edge.
 """
 
@@ -39,14 +39,14 @@ DIGITS: Final = 20
 UNKNOWN: Final = (nan, nan, nan)
 PLACES: Final = ("position", "lat and lon", "box", "foot")
 MODEL: Final = ("frame", "pose", "field_of_view", "relocation")
-"""Fields of a frame that are those of `Detections`."""
+"""Fields of a frame with the names and values of `Detections`."""
 
 _TIME: Final = re.compile(
     r"([0-9]{4}-[0-9]{2}-[0-9]{2}[T ][0-9]{2}:[0-9]{2}:[0-9]{2})(?:[.,]([0-9]+))?(Z|[+-][0-9:]{4,5})"
 )
 _ELEMENT: Final = re.compile(r"(\w+)\[(\d+)\](.*)")
 _NAMES: Final = {"center": "position", "label": "class"}
-"""Fields of objects by those of `Detections`."""
+"""Fields of objects by the columns of `Detections`."""
 
 _KINDS: Final = {"float": "a number", "int": "an integer", "str": "a text", "array": "a list", "object": "a map"}
 """Types of JSON by their names in errors of msgspec."""
@@ -59,7 +59,7 @@ class JsonFrame(NamedTuple):
     """A frame of a sender.
 
     Attributes:
-        message: its detections; numbers and stamp stand in for those that the sender does not give.
+        message: its detections; numbers and stamp are placeholders where the sender gives none.
         is_numbered: whether the sender gives `epoch` and `seq`.
         is_stamped: whether it gives a stamp.
         key: by which it knows the frame again; empty: it gives none.
@@ -235,7 +235,7 @@ class FrameReader:
 
         name = "foot" if objects[0].box is None else "box"
         if (camera := self._camera(stream)) is None:
-            expected = "`camera` in `inputs` of the stream, for what is in pixels"
+            expected = "`camera` in `inputs` of the stream, for pixels"
             raise schemas.MessageError("invalid_value", f"objects[0].{name}", expected, "no calibration")
         is_fixed = camera.mount == "fixed"
         if is_fixed and "pose" in fields:
@@ -321,7 +321,7 @@ def _calibration(setting: str, path: Path) -> GroundCamera:
 
 
 def _header(given: Mapping[str, Any], stream: str) -> dict[str, Any]:
-    """Return the header of a frame, with stand-ins for what it does not say."""
+    """Return the header of a frame, with placeholders for fields that it lacks."""
     named = given.get("stream", stream)
     if stream and named != stream:
         raise invalid("stream", stream, named)

@@ -1,7 +1,7 @@
 """Detections over MQTT: payloads of the topics of the settings become frames.
 
 The settings map topics to streams; no payload names another one. A message is confirmed when its frame has gone to the
-network, so the broker keeps what comes while that is away.
+network, so the broker keeps messages while that is away.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Checks of the messages of a session that report what is doubtful; they decide about nothing else."""
+"""Checks that report doubtful messages of a session, and change nothing."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class SensorChecks:
         self._is_blind = False
 
     def add(self, message: schemas.Detections, arrived_ns: int, policy: Policy) -> Iterator[Finding]:
-        """Yield what is doubtful in a frame that arrived (monotonic)."""
+        """Yield problems of a frame that arrived (monotonic)."""
         if found := self._stamps.add(message.stamp_ns, arrived_ns):
             yield Finding("clock", "stamp_ns", "stamps in nanoseconds that advance with time", found)
         if policy.jumps == "report" and (found := self._poses.add(message, policy)):

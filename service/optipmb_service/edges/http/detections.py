@@ -165,7 +165,7 @@ class Senders:
 
         Raises:
             NoTokenError: the token is missing or not valid.
-            NotAllowedError: nobody may, without tokens.
+            NotAllowedError: without tokens detections are taken on a loopback address alone.
         """
         if not self._is_open:
             raise NotAllowedError("set http_tokens: without them detections are taken on a loopback address alone")
