@@ -390,6 +390,7 @@ _SMALL_MAP: Final = 16
 """Fields from which on the head of a map has three bytes."""
 
 _PLAIN: Final = frozenset({str, bytes, int, float, bool})  # what msgpack takes as it is
+_AS_IS: Final = _PLAIN | {np.ndarray}
 
 
 def _scalar(value: Any) -> Any:
@@ -429,12 +430,22 @@ def _is_encoding(payload: bytes, message: Message) -> bool:
 
 def _parts(kind: type[Message], values: dict[str, Any]) -> list[Any]:
     """Return the encoding in parts, bytes and the memory of arrays."""
-    fields = [(name, value) for name in kind.names if (value := values[name]) is not None]
-    parts: list[Any] = [_head(len(fields))]
-    offset, plain = len(parts[0]), {}
-    for name, value in fields:
+    fields = {
+        name: value if type(value) in _AS_IS else _plain(value, blocks=True)
+        for name in kind.names
+        if (value := values[name]) is not None
+    }
+    head = _head(len(fields))
+    return [head, *_field_parts(kind, fields, len(head))]
+
+
+def _field_parts(kind: type[Message], fields: dict[str, Any], offset: int) -> list[Any]:
+    """Return fields, arrays and plain values, in parts; the first one begins at `offset`."""
+    parts: list[Any] = []
+    plain = {}
+    for name, value in fields.items():
         if type(value) is not np.ndarray:
-            plain[name] = value if type(value) in _PLAIN else _plain(value, blocks=True)
+            plain[name] = value
             continue
         if plain:
             parts.append(_without_head(plain))
@@ -461,13 +472,13 @@ def encode_columns(
         header: the fields before the arrays, but for None.
         names: of the array fields in their order; they have numbers of 8 bytes, and no length but N may vary.
         columns: of float64, the numbers of all arrays as their bytes.
-        others: the fields behind the arrays, likewise; a message in one as its fields.
+        others: the fields behind these arrays, likewise, and further arrays; a message in one as such or as its fields.
     """
     parts: list[Any] = [_head(len(header) + len(names) + len(others)), _without_head(header)]
-    heads, places = _column_heads(kind, names, columns.size, (len(parts[0]) + len(parts[1])) % ALIGNMENT)
+    heads, places, end = _column_heads(kind, names, columns.size, (len(parts[0]) + len(parts[1])) % ALIGNMENT)
     parts += chain.from_iterable(zip(heads, map(columns.data.cast("B").__getitem__, places), strict=True))
-    parts.append(_without_head(others))
-    return b"".join(parts)
+    fields = {name: _plain(one, blocks=True) if isinstance(one, Message) else one for name, one in others.items()}
+    return b"".join(parts + _field_parts(kind, fields, end))
 
 
 def encoded(message: Message) -> bytes:
@@ -544,14 +555,14 @@ def _small_head(kind: type[Message], name: str, shape: tuple[int, ...]) -> tuple
 @lru_cache(1024)
 def _column_heads(
     kind: type[Message], names: tuple[str, ...], size: int, offset: int
-) -> tuple[tuple[bytes, ...], tuple[slice, ...]]:
-    """Return the bytes before the data of each array, and the place of each in the data of all, in bytes.
+) -> tuple[tuple[bytes, ...], tuple[slice, ...], int]:
+    """Return the bytes before the data of each array, the place of each in the data of all, and where the last ends.
 
     Args:
         kind: type of the message.
         names: of the arrays, whose numbers have 8 bytes; each has N rows, and no other length but by its description.
         size: how many numbers all have together.
-        offset: where the first one begins, up to multiples of `ALIGNMENT`.
+        offset: where the first one begins, up to multiples of `ALIGNMENT`, as is the end.
     """
     rows = [tuple(map(int, kind.arrays[name].shape[1:])) for name in names]
     count = size // sum(map(prod, rows))
@@ -561,7 +572,7 @@ def _column_heads(
         head, _ = _small_head(kind, name, (count, *row))
         heads.append(head or _large_head(name, kind.arrays[name].dtype, (count, *row), offset))
         offset += len(heads[-1]) + place.stop - place.start
-    return tuple(heads), tuple(places)
+    return tuple(heads), tuple(places), offset
 
 
 @lru_cache(1024)

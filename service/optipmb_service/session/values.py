@@ -165,7 +165,7 @@ class Tracked:
     Attributes:
         estimates: tracks of the tracker, with numbers that a message may hold.
         header: the fields of the message before the columns, those without a value left out.
-        others: the fields behind the columns: classes and predicted paths, where the profile has them.
+        others: the fields behind the columns: classes, objects and predicted paths, where the session has them.
         ticket: value that the caller gave with the detections.
         step_ns: time that conversion and tracking took.
         run: see `Session.run`.
@@ -195,10 +195,8 @@ class Tracked:
 
     def encoded(self, delivery: dict[str, Any]) -> bytes:
         """Return the bytes of the message with a delivery part of these values, all that it has, in its order."""
-        if self.others:
-            return schemas.encode(self.tracks, delivery=schemas.Delivery.trusted(delivery))
-        words = self.estimates.words
-        return schemas.encode_columns(schemas.Tracks, self.header, COLUMNS, words, {"delivery": delivery})
+        words, others = self.estimates.words, self.others | {"delivery": delivery}
+        return schemas.encode_columns(schemas.Tracks, self.header, COLUMNS, words, others)
 
     def encoded_events(self, delivery: dict[str, Any], durable: Reached | None) -> bytes | None:
         """Return the bytes of the message with the events and counts of zones, None where there are none.

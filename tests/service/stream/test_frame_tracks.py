@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import optipmb_schemas as schemas
+import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from optipmb_service.session.convert import tracks_of
@@ -11,6 +12,7 @@ from optipmb_service.session.timeline import FrameId
 from optipmb_service.session.values import Tracked
 
 import optipmb
+from optipmb.rejoin import Joined
 
 FRAME = FrameId(b"0" * 16, 1, 2)
 PARAMETERS = optipmb.load_profile("generic")
@@ -62,16 +64,23 @@ def test_bytes_are_those_of_the_message(*, count: int, node: int, sensor: bool, 
         np.testing.assert_array_equal(getattr(message, name), column)
 
 
-def test_paths_and_classes_are_in_the_bytes() -> None:
-    """What only some profiles have comes behind the columns, as in the message."""
-    one = sound_tracks(3)
-    mean, covariance = np.zeros((3, 2, 6)), np.broadcast_to(np.eye(6), (3, 2, 6, 6))
-    paths = optipmb.PredictedPaths(one.id, one.label, np.array([0.5, 1.0]), mean, covariance)
-    probability = np.full((3, len(PARAMETERS.labels)), 1 / len(PARAMETERS.labels))
-    tracks = made(one, paths, probability)
-    message = schemas.decode(tracks.encoded(delivery(0)), schemas.Tracks)
+@pytest.mark.parametrize("count", [0, 3, 130])
+def test_what_few_sessions_have_is_in_the_bytes(count: int) -> None:
+    """Paths, classes, objects and a motion of the world come behind the columns, as in the message, also large ones."""
+    one = sound_tracks(count)
+    mean, covariance = np.zeros((count, 5, 6)), np.broadcast_to(np.eye(6), (count, 5, 6, 6))
+    paths = optipmb.PredictedPaths(one.id, one.label, np.arange(0.5, 3.0, 0.5), mean, covariance)
+    classes = np.full((count, len(PARAMETERS.labels)), 1 / len(PARAMETERS.labels))
+    joined = Joined(None, one, one.id // 2, np.full(count, 0.9), 0, 0)  # type: ignore[arg-type]  # of the tracks alone
+    tracks = made(one, paths, classes, np.full(count, 7), joined)
+    tracks.others["relocation"] = schemas.Relocation(world=1, translation=np.ones(3), quaternion=np.eye(4)[0])
+    payload = tracks.encoded(delivery(0))
+    assert payload == schemas.encode(tracks.tracks, delivery=schemas.Delivery(**delivery(0)))
+    message = schemas.decode(payload, schemas.Tracks)
     assert message.path_position is not None
     assert message.class_probability is not None
-    assert message.path_position.shape == (3, 2, 2)
-    assert message.class_probability.shape == probability.shape
+    assert message.object is not None
+    assert message.path_position.shape == (count, 5, 2)
+    assert message.class_probability.shape == classes.shape
+    assert message.object.tolist() == (one.id // 2).tolist()
     assert message.delivery == schemas.Delivery(**delivery(0))
