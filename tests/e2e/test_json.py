@@ -6,6 +6,9 @@ import itertools
 import json
 import queue
 import re
+import shlex
+import shutil
+import subprocess
 import threading
 import urllib.request
 from collections.abc import Iterator
@@ -14,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from broker import Broker
+from broker import Broker, mosquitto
 from browser import browser, console, wait
 from optipmb_schemas.json_form import Selection, tracks_json
 from readers import received
@@ -25,6 +28,7 @@ from watched import plain
 from websocket import create_connection
 
 PAGE = Path(__file__).parents[2] / "examples/json/index.html"
+JSON_PAGE = Path(__file__).parents[2] / "docs/json.md"
 SENSOR = Sensor()
 FRAMES = 30
 CONFIRMED = Selection(confirmed=True)
@@ -112,6 +116,39 @@ async def test_every_edge_gives_the_text_of_the_published_tracks(service: Servic
             status, _ = await asyncio.to_thread(bridge.end)
             assert status == 0
         assert await broker.wait(2, "/alive") == [b"1", b"0"]
+
+
+@pytest.mark.skipif(shutil.which("mosquitto_pub") is None, reason="mosquitto-clients are not installed")
+def test_a_car_drives_through_a_zone_by_curl_and_mosquitto_pub_alone(tmp_path: Path) -> None:
+    """The commands of the page, at the speed of this machine: both streams have the events, and no log has an error."""
+    section = JSON_PAGE.read_text().partition("### A car through a zone\n")[2].partition("\n#")[0]
+    (tmp_path / "garage.toml").write_text(re.findall(r"```toml\n(.*?)```", section, re.DOTALL)[0])
+    _, programs, senders = re.findall(r"```sh\n(.*?)```", section, re.DOTALL)
+    starting, bridging, reading = programs.splitlines()
+    senders = senders.replace("sleep 0.1", ":").replace("$(date +%s%N)", "$((1795766400000000000 + x * 100000000))")
+    settings = ("--settings", str(tmp_path / "garage.toml"))
+    assert starting.split() == ["optipmb-service", "--settings", "garage.toml", "--http", "127.0.0.1:8080"]
+    assert bridging.split()[:4] == ["optipmb-service", "mqtt", "--settings", "garage.toml"]
+    with (
+        mosquitto(tmp_path) as broker,
+        ServiceProcess(*settings, "--http", "127.0.0.1:0", "--log-format", "json") as service,
+    ):
+        port = broker.rpartition(":")[2]
+        service.wait_ready()
+        options = ("mqtt", *settings, "--connect", service.endpoint, "--broker", broker)
+        reader = [*shlex.split(reading), "-t", "optipmb/v1/mqtt/+/alive", "-p", port, "-C", "5", "-W", "60"]
+        with ServiceProcess(*options, listen=False) as bridge:
+            bridge.wait_ready()
+            with subprocess.Popen(reader, stdout=subprocess.PIPE, text=True) as events:
+                assert events.stdout is not None
+                assert events.stdout.readline() == "1\n", "the retained topic says that it has subscribed"
+                senders = senders.replace("127.0.0.1:8080", address_of(service)).replace("_pub", f"_pub -p {port}")
+                subprocess.run(["bash", "-ec", senders], cwd=tmp_path, check=True, timeout=120)
+                found = [json.loads(line) for line in events.stdout]
+            assert "internal_error" not in bridge.errors
+    happened = {(one["stream"], one["kind"], one["how"], one["n"]) for one in found}
+    streams = ("garage/gate/radar", "garage/gate/lidar")
+    assert happened == {(stream, kind, "crossed", 1) for stream in streams for kind in ("entered", "left")}
 
 
 def test_the_example_page_draws_tracks(service: ServiceProcess, tmp_path: Path) -> None:

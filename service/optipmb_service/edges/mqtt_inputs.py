@@ -70,13 +70,14 @@ class MqttInputs:
 
     def take(self, message: Any, confirm: Callable[[], object]) -> None:
         """Take a message of paho's; `confirm` is called when it is done with."""
-        if message.retain:  # it is old
+        found = ((row, stream) for row in self._rows if (stream := row.stream_of(message.topic)) is not None)
+        if (target := next(found, None)) is None or message.retain:  # counts that the bridge publishes; an old message
             confirm()
             return
         if not message.qos and len(self._tasks) >= WAITING:
             self._inputs.refused["mqtt", "busy"] += 1
             return
-        task = asyncio.create_task(self._taken(message, confirm))
+        task = asyncio.create_task(self._taken(message, confirm, *target))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
@@ -85,22 +86,20 @@ class MqttInputs:
         for task in self._tasks:
             task.cancel()
 
-    async def _taken(self, message: Any, confirm: Callable[[], object]) -> None:
+    async def _taken(self, message: Any, confirm: Callable[[], object], row: _Input, stream: str) -> None:
         try:
             with contextlib.suppress(schemas.MessageError):  # it is reported
-                await self._send(message)
+                await self._send(message, row, stream)
         except Exception:
             log.exception("internal_error", topic=message.topic)  # one message must not end the others
         confirm()
 
-    async def _send(self, message: Any) -> None:
+    async def _send(self, message: Any, row: _Input, stream: str) -> None:
         """Send the frame of a message, as soon as that is possible.
 
         Raises:
             MessageError: it is not valid.
         """
-        found = ((row, stream) for row in self._rows if (stream := row.stream_of(message.topic)) is not None)
-        row, stream = next(found)
         try:
             self._inputs.client.keys.detections(stream)
         except schemas.MessageError as error:
