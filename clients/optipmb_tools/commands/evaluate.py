@@ -1,7 +1,7 @@
 """`optipmb evaluate`: result files against the truth."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -111,7 +111,7 @@ def evaluate(
         raise UsageError(f"--plot {how.plot}: expected a .png of several --tracks, received {len(tracks)} of them")
     more = {"tracks": " ".join(map(str, tracks))} if data.named()[0] == "table" else {}
     opened = data.open(**more)
-    column = _column(by, opened.name)
+    column = _column(by)
     spelt = {label.lower(): label for label in opened.labels}
     names = tuple(one if one in opened.labels else spelt.get(one.lower(), one) for one in classes or opened.labels)
     note = cache(warn)  # prints each assumption once
@@ -139,10 +139,8 @@ def evaluate(
             print_table(table)
 
 
-def _column(by: str, dataset: str) -> "By":
+def _column(by: str) -> "By":
     if by == "object":
-        if dataset == "nuscenes":
-            raise UsageError("--by object: the result files of nuScenes have no such column")
         return "object"
     if by != "id":
         raise UsageError(f"--by: expected id or object, received {by}")
@@ -171,6 +169,19 @@ class _Evaluated:
         return found
 
 
+@dataclass(frozen=True)
+class _Protocol:
+    """Figures of one tracker by the protocol of its data set."""
+
+    parts: dict[str, dict[str, Any]]
+    """Figures of each class, for programs."""
+    best: dict[str, float]
+    """Threshold of the tracks that are also evaluated without the others, by class."""
+    tables: "Sequence[RenderableType]" = ()
+    overall: dict[str, Any] = field(default_factory=dict)
+    """Figures over all classes, where the protocol has them."""
+
+
 def _evaluated(
     opened: Data,
     tracks: Path,
@@ -182,7 +193,7 @@ def _evaluated(
     every: bool,
     by: "By",
 ) -> _Evaluated:
-    from optipmb_tools.commands.tables import clear_table, figure_tables, nuscenes_table  # noqa: PLC0415  as above
+    from optipmb_tools.commands.tables import figure_tables  # noqa: PLC0415  as above
     from optipmb_tools.evaluation import evaluate_files  # noqa: PLC0415  as above
     from optipmb_tools.evaluation.evaluate import (  # noqa: PLC0415  as above
         Evaluation,
@@ -190,38 +201,25 @@ def _evaluated(
         class_average,
         figures_of,
     )
-    from optipmb_tools.evaluation.nuscenes import evaluate_nuscenes  # noqa: PLC0415  as above
 
     asked = opened.dataset.arguments
-    head: list[RenderableType] = []
-    overall: dict[str, Any] = {}
     settings = Settings((how.iou,), how.cutoff, how.order) if how.iou else Settings(cutoff=how.cutoff, order=how.order)
     if opened.name == "nuscenes" and asked.root is not None:
-        if how.iou is not None or how.distance is not None:
-            raise UsageError("--iou and --distance: the benchmark of nuScenes has its own rules")
-        scores = evaluate_nuscenes(asked.root, tracks, opened.names)
-        head = [nuscenes_table(scores, names)]
-        overall = {"overall": scores.to_json()["overall"]}
-        parts = {name: {"nuscenes": one.to_json()} for name, one in scores.classes.items() if name in names}
-        best = {name: scores.classes[name].best.threshold for name in parts}
+        protocol = _nuscenes(asked.root, opened.names, tracks, names, how, by)
     else:
         results = evaluate_files(opened.sequences, tracks, names, how.rules(opened.name), note, by=by)
-        parts = {one.name: _figures(one) for one in results}
-        best = {} if opened.name == "kitti" else {one.name: one.sweep.thresholds[one.sweep.best] for one in results}
-        if opened.name != "kitti" or how.distance is not None:  # AB3DMOT's protocol gives them at its own threshold
-            head = [clear_table(results, metres=how.iou is None, every=every)]
+        protocol = (_kitti if opened.name == "kitti" else _clear_mot)(results, how, every=every)
     here = opened.sequences if executor.here else None
     executor.start(figures_of, Evaluation(asked, tuple(opened.names), tracks, settings, names, here, by))
-    tasks = [(name, best.get(name)) for name in names]
+    tasks = [(name, protocol.best.get(name)) for name in names]
     found = bulk.values(executor, tasks, lambda task: f"{task[0]} of {tracks}", warn)
     figures = [one for each in found for one in each]
     if not figures:
         raise UsageError(f"{tracks}: neither the truth nor the tracks have objects of these classes")
-    by_class = {one.name: {**parts.get(one.name, {}), **one.summary()} for one in figures}
-    average = class_average(figures) if overall else None
-    if average is not None:
-        overall["overall"]["hota_centre"] = average
-    tables = (*head, *figure_tables(figures, how.cutoff, average, every=every))
+    by_class = {one.name: {**protocol.parts.get(one.name, {}), **one.summary()} for one in figures}
+    average = class_average(figures) if protocol.overall else None
+    overall = {"overall": {**protocol.overall, "hota_centre": average}} if average is not None else {}
+    tables = (*protocol.tables, *figure_tables(figures, how.cutoff, average, every=every))
     return _Evaluated({**overall, "classes": by_class}, figures, tables)
 
 
@@ -233,3 +231,34 @@ def _figures(result: "ClassResult") -> dict[str, Any]:
         "best": {"score": result.sweep.thresholds[best], **result.sweep.results[best].summary()},
         "sequences": {name: single.summary() for name, single in result.sequences.items()},
     }
+
+
+def _clear_mot(results: "Sequence[ClassResult]", how: MatchingOptions, *, every: bool) -> _Protocol:
+    from optipmb_tools.commands.tables import clear_table  # noqa: PLC0415  as above
+
+    best = {one.name: one.sweep.thresholds[one.sweep.best] for one in results}
+    return _Protocol(
+        {one.name: _figures(one) for one in results}, best, [clear_table(results, metres=how.iou is None, every=every)]
+    )
+
+
+def _kitti(results: "Sequence[ClassResult]", how: MatchingOptions, *, every: bool) -> _Protocol:
+    """Return CLEAR MOT figures, without what AB3DMOT's protocol gives: thresholds, and figures by its own measure."""
+    found = _clear_mot(results, how, every=every)
+    return replace(found, best={}, tables=found.tables if how.distance is not None else ())
+
+
+def _nuscenes(
+    root: Path, sequences: list[str], tracks: Path, names: tuple[str, ...], how: MatchingOptions, by: "By"
+) -> _Protocol:
+    from optipmb_tools.commands.tables import nuscenes_table  # noqa: PLC0415  as above
+    from optipmb_tools.evaluation.nuscenes import evaluate_nuscenes  # noqa: PLC0415  as above
+
+    if how.iou is not None or how.distance is not None:
+        raise UsageError("--iou and --distance: the benchmark of nuScenes has its own rules")
+    if by != "id":
+        raise UsageError(f"--by {by}: the result files of nuScenes have no such column")
+    scores = evaluate_nuscenes(root, tracks, sequences)
+    parts = {name: {"nuscenes": one.to_json()} for name, one in scores.classes.items() if name in names}
+    best = {name: scores.classes[name].best.threshold for name in parts}
+    return _Protocol(parts, best, [nuscenes_table(scores, names)], scores.to_json()["overall"])

@@ -316,39 +316,18 @@ def _process(paths: Sequence[Trajectory], period: float) -> dict[str, float]:
     error; position follows the model within the error of labels, and keeps what the profile has.
     """
     window = max(WINDOW_S, 4.0 * period)
-    changes: list[Floats] = []
-    errors: list[Floats] = []
-    for path in paths:
-        for part in _unbroken(path, 1.5 * period):
-            motion = fit_motion(part.time, part.position, part.yaw, window)
-            if len(motion.time) < 2:  # noqa: PLR2004  a change is between two
-                continue
-            # Most cars stand, most of the time; noise is for what moves.
-            moves = np.maximum(np.abs(motion.speed[1:]), np.abs(motion.speed[:-1])) > MOVING
-            tau = np.diff(motion.time)
-            foreseen = 0.5 * (motion.acceleration[1:] + motion.acceleration[:-1])
-            turned = 0.5 * (motion.turn_rate[1:] + motion.turn_rate[:-1])
-            changes.append(
-                np.column_stack(
-                    [
-                        np.diff(motion.speed) - foreseen * tau,
-                        np.diff(motion.acceleration),
-                        np.diff(motion.heading) - turned * tau,
-                        np.diff(motion.turn_rate),
-                    ]
-                )
-                / np.sqrt(tau)[:, None]
-            )
-            errors.append((motion.variance[1:] + motion.variance[:-1]) / tau[:, None])
-            changes[-1], errors[-1] = changes[-1][moves], errors[-1][moves]
-    if sum(map(len, changes)) < LEAST_PAIRS:
+    parts = [part for path in paths for part in _unbroken(path, 1.5 * period)]
+    motions = [fit_motion(part.time, part.position, part.yaw, window) for part in parts]
+    changes = [motion.changes() for motion in motions if len(motion.time) > 1]
+    if sum(len(rates) for rates, _ in changes) < LEAST_PAIRS:
         return {}
-    table, noise = np.concatenate(changes), np.median(np.concatenate(errors), axis=0)
+    rates, variances = (np.concatenate(one) for one in zip(*changes, strict=True))
+    fitted = np.median(variances, axis=0).tolist()
     found = {}
-    for column, key in enumerate(("speed", "acceleration", "heading", "turn_rate")):
-        square = spread(table[:, column]) ** 2
+    for key, rate, own in zip(("speed", "acceleration", "heading", "turn_rate"), rates.T, fitted, strict=True):
+        square = spread(rate) ** 2
         # A tenth remains in any case: that the fit explains all of it is chance.
-        found[f"process_noise.{key}"] = math.sqrt(max(square - float(noise[column]), 0.1 * square))
+        found[f"process_noise.{key}"] = math.sqrt(max(square - own, 0.1 * square))
     return found
 
 
@@ -462,6 +441,30 @@ class Motion:
     turn_rate: Floats  # (W,) rad/s
     variance: Floats
     """(W, 4) of the errors of speed, acceleration, heading and turn rate that the scatter of the points leaves"""
+
+    def changes(self) -> tuple[Floats, Floats]:
+        """Return the changes between neighbouring windows that the motion does not predict, and their variances.
+
+        Windows between which the object stands are left out: most cars stand, most of the time.
+
+        Returns:
+            (N, 4) of speed, acceleration, heading and turn rate, over the root of the time between the windows; and
+            (N, 4) variances of these by the fit.
+        """
+        tau = np.diff(self.time)
+        acceleration = 0.5 * (self.acceleration[1:] + self.acceleration[:-1])
+        turn_rate = 0.5 * (self.turn_rate[1:] + self.turn_rate[:-1])
+        changes = np.column_stack(
+            [
+                np.diff(self.speed) - acceleration * tau,
+                np.diff(self.acceleration),
+                np.diff(self.heading) - turn_rate * tau,
+                np.diff(self.turn_rate),
+            ]
+        )
+        variances = (self.variance[1:] + self.variance[:-1]) / tau[:, None]
+        moves = np.maximum(np.abs(self.speed[1:]), np.abs(self.speed[:-1])) > MOVING
+        return (changes / np.sqrt(tau)[:, None])[moves], variances[moves]
 
 
 def fit_motion(time: Floats, position: Floats, yaw: Floats, window: float) -> Motion:
