@@ -41,6 +41,7 @@ class Arrivals:
         self._rewind_ns = policy.rewind_ns
         self._margin_ns = policy.rewind_ns // 2
         self._queues = queues
+        self._resumed = False
         self._asked: set[str] = set()
         self.answered: dict[str, None] = {}
         """Sources of which all has come, in the order of their answers."""
@@ -58,8 +59,8 @@ class Arrivals:
         """First stamp of a session that was restored before it may have known all its sensors."""
 
     def begin(self, stamp_ns: int, arrived_ns: int, now_ns: int) -> None:
-        """Wait for the other sensors of a fused session, whose first frame has come."""
-        if self._wait_ns:
+        """Wait for the other sensors of a fused session, whose first frame has come; not after a restore."""
+        if self._wait_ns and not (self._resumed or self.waiting):
             self._first, self.deadline_ns = (stamp_ns, arrived_ns), now_ns + self._wait_ns
 
     def resume(self, now_ns: int, young_ns: int | None) -> None:
@@ -69,7 +70,12 @@ class Arrivals:
             now_ns: monotonic time.
             young_ns: first stamp of a fused session that may not know all its sensors; None: it knows them.
         """
-        self._young_ns, self.deadline_ns = young_ns, now_ns + self._wait_ns
+        self._resumed, self._young_ns, self.deadline_ns = True, young_ns, now_ns + self._wait_ns
+
+    def end_at_deadline(self, now_ns: int) -> None:
+        """Wait no longer if the deadline has passed."""
+        if self.deadline_ns is not None and now_ns >= self.deadline_ns:
+            self.end()
 
     @property
     def waiting(self) -> bool:

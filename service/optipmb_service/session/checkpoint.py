@@ -27,7 +27,7 @@ from pydantic import BaseModel, Field, ValidationError
 import optipmb
 from optipmb.zones import MOST, Event, Seen, ZoneState
 from optipmb_service.session import convert
-from optipmb_service.session.counts import MAX_COUNT, Count, Deliveries, FrameCounts
+from optipmb_service.session.counts import MAX_COUNT, Count, Deliveries, FrameCounts, present
 from optipmb_service.session.state import UNPLACED, FilterState, ProcessedFrame, SensorState
 from optipmb_service.session.timeline import EPOCHS, WINDOW, FrameId, SeenNumbers
 from optipmb_service.session.values import (
@@ -58,8 +58,6 @@ MAX_BYTES: Final = 2**28
 MAX_PROFILES: Final = 64
 """Profiles whose form in checkpoints is remembered."""
 
-JOINING: Final = frozenset({"rejoined", "lost_dropped"})
-"""Counts that are left out while they are 0, as in sessions that do not join tracks."""
 ZONE_BYTES: Final = MOST // 8
 _msgpack: Any = msgpack  # its type information is partial
 _profiles: dict[int, tuple[optipmb.Parameters, bytes]] = {}
@@ -123,6 +121,12 @@ class Checkpoint:
     def incarnation(self) -> Incarnation:
         """Numbers that a later session continues."""
         return self.head.incarnation(self.run)
+
+    @property
+    def young_ns(self) -> int | None:
+        """First stamp of a fused session so near its beginning that there may be sensors it does not know yet."""
+        stamps = [frame.frame_id.stamp_ns for frame in self.window if self.fused and self.base.last is None]
+        return min(stamps, default=None)
 
 
 def forgotten(checkpoint: Checkpoint) -> Checkpoint:
@@ -262,8 +266,7 @@ def _packed(value: Any) -> Any:
         absent = {name for name in ("zones", "worlds") if table[name] is None}
         kept = {name: one for name, one in table.items() if name not in absent}
         return clock | kept | {"density": optipmb.bytes_of(density), "sensors": sensors}
-    absent = {name for name in JOINING if table.get(name) == 0}
-    return {name: one for name, one in table.items() if name not in absent}
+    return present(table)
 
 
 def _packed_zones(value: ZoneState, table: dict[str, Any]) -> dict[str, Any]:

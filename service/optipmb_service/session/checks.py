@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 import optipmb
-from optipmb_service.session.values import SECOND
+from optipmb_service.session.values import MAX_SENSORS, SECOND
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     import optipmb_schemas as schemas
 
+    from optipmb_service.session.timeline import FrameId
     from optipmb_service.session.values import Policy
 
 CHECKED_FRAMES: Final = 20
@@ -67,6 +68,36 @@ class SensorChecks:
         if policy.needs_view and message.field_of_view is None and not self._is_blind:
             self._is_blind = True
             yield Finding("no_view", "field_of_view", "where the sensor sees", "nothing")
+
+
+class ScoreChecks:
+    """Checks of the scores of a session: one for its profile, and one for each sensor with parameters of its own.
+
+    Args:
+        parameters: the profile of the session.
+    """
+
+    def __init__(self, parameters: optipmb.Parameters) -> None:
+        self._parameters = parameters
+        self._checks: dict[str, ScoreCheck] = {}
+        """By sensor, with an empty name that of the profile."""
+
+    def add(self, frame_id: FrameId, frame: optipmb.Frame, parameters: optipmb.Parameters) -> Iterator[Finding]:
+        """Yield the classes that lose most of their detections, looking at one frame of some.
+
+        Args:
+            frame_id: identity of the frame.
+            frame: its detections.
+            parameters: those of its sensor.
+        """
+        if frame_id.seq % SCORED_EVERY or parameters.self_calibration:  # which filters the lower half of none
+            return
+        sensor = "" if parameters is self._parameters else frame_id.sensor
+        if sensor not in self._checks:
+            if len(self._checks) > MAX_SENSORS:
+                self._checks.clear()
+            self._checks[sensor] = ScoreCheck(parameters)
+        yield from self._checks[sensor].add(frame)
 
 
 class ScoreCheck:

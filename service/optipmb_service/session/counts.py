@@ -7,12 +7,18 @@ is a row of `STREAM_METRICS`.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from pydantic import Field
 
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
 MAX_COUNT: Final = 2**61
 """Where counters end, so that neither one more nor the sum of two leaves the 64 bits of a message."""
+
+JOINING: Final = frozenset({"rejoined", "lost_dropped"})
+"""Counts of sessions that join tracks."""
 
 Count = Annotated[int, Field(strict=True, ge=0, le=MAX_COUNT)]
 
@@ -23,6 +29,11 @@ def total(*counts: int) -> int:
     A publisher chooses its sequence numbers, and all numbers between two of them count as missing.
     """
     return min(sum(counts), MAX_COUNT)
+
+
+def present(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values by name without counts of joining that are 0, as in sessions that do not join tracks."""
+    return {name: value for name, value in table.items() if name not in JOINING or value}
 
 
 @dataclass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 from optipmb_service.session.problems import problem_of, sentence
@@ -9,12 +10,13 @@ from optipmb_service.session.timeline import JUMP_FRAMES, Verdict
 from optipmb_service.session.values import MAX_SENSORS, SECOND
 
 if TYPE_CHECKING:
+    import numpy as np
     import optipmb_schemas as schemas
 
     import optipmb
     from optipmb_service.session.timeline import Decision, FrameId
     from optipmb_service.session.transition import Outcome
-    from optipmb_service.session.values import Policy
+    from optipmb_service.session.values import Begun, Policy
 
 
 class FrameProblems:
@@ -47,6 +49,20 @@ class FrameProblems:
         path, received = ("", f"{reason}, {apart}") if reason else ("stamp_ns", apart)
         return self.of(code, frame_id, path, expected, received, message=message)
 
+    def invalid(self, frame_id: FrameId, error: optipmb.FrameError) -> schemas.Problem:
+        """Return the problem of a frame or cloud with a wrong value."""
+        return self.of("invalid_value", frame_id, error.path, error.expected, error.received)
+
+    def no_pose(self, frame_id: FrameId, motion: np.ndarray) -> schemas.Problem:
+        """Return the problem of a sensor without poses that moves, by (3,) its estimated velocity."""
+        x, y, _ = motion.tolist()
+        received = f"none, and what stands moves by {math.hypot(x, y):.1f} m/s: the motion is estimated"
+        return self.of("no_pose", frame_id, "pose", "the pose of a sensor that moves", received)
+
+    def restarted(self, frame_id: FrameId, begun: Begun) -> schemas.Problem:
+        """Return the problem of a frame that started a session id."""
+        return self.jumped("restarted", frame_id, "frames that continue the stream", begun.jump_ns, begun.reason)
+
     def refused(self, frame_id: FrameId, decision: Decision) -> schemas.Problem:
         """Return the problem of a frame that has no place."""
         if decision.verdict is Verdict.RETIRED:
@@ -76,7 +92,7 @@ class FrameProblems:
             for label, count in (outcome.unknown or {}).items()
         ]
         if (fault := outcome.fault) is not None:
-            problems.append(self.of("invalid_value", frame_id, fault.path, fault.expected, fault.received))
+            problems.append(self.invalid(frame_id, fault))
         if outcome.tracks is not None or fault is not None:
             return problems
         if place.opens is Verdict.UNCONFIRMED:

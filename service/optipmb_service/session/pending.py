@@ -1,4 +1,4 @@
-"""Frames and clouds of one sensor awaiting processing.
+"""Frames and clouds of the sensors of a session that await processing.
 
 A frame is held for its point cloud and, while the session recovers, for frames before it that may still come. The queue
 has a timeline of the processed frames with the pending ones: a frame is judged by it when it arrives, and by the
@@ -17,12 +17,14 @@ from typing import TYPE_CHECKING, Any, Final
 from optipmb_service.session.checks import SensorChecks
 from optipmb_service.session.state import size_of
 from optipmb_service.session.timeline import JUMP_FRAMES, WINDOW, FusedTimeline, Order, Verdict
+from optipmb_service.session.values import MAX_SENSORS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterator, Sequence
 
     import optipmb_schemas as schemas
 
+    from optipmb_service.session.checkpoint import Checkpoint
     from optipmb_service.session.state import FilterState, Inputs
     from optipmb_service.session.timeline import Decision, FrameId, Timeline
     from optipmb_service.session.values import Policy
@@ -99,6 +101,8 @@ class SensorQueue:
         self._claim = b"", -1, 0, 0
         """Epoch and number of the last frame of a publisher that another one has succeeded, how many came in a row, and
         the stamp of the first of them."""
+        self.quarantine = ""
+        """Error for which its frames are refused; empty while they are not."""
         self.held: list[PendingFrame] = []
         """The frames, in order."""
         self.held_bytes = 0
@@ -244,6 +248,71 @@ class SensorQueue:
         return self.clouds.get(
             frame_id.epoch, frame_id.stamp_ns, lambda one: self.timeline.knows(frame_id._replace(epoch=one))
         )
+
+
+class SensorQueues(dict[str, SensorQueue]):
+    """Queue of each sensor of a session by its stream; of the only one of a stream's own session by an empty name.
+
+    Args:
+        policy: how long frames wait.
+    """
+
+    def __init__(self, policy: Policy) -> None:
+        super().__init__()
+        self._policy = policy
+
+    def set_policy(self, policy: Policy) -> None:
+        """Let all sensors follow a policy."""
+        self._policy = policy
+        for one in self.values():
+            one.policy = policy
+
+    def open(self, name: str, timeline: Timeline) -> SensorQueue | None:
+        """Return the queue of a sensor, an empty one for a new sensor; None when there are too many.
+
+        For a new sensor the one that fed the session longest ago is forgotten, unless that was lately.
+        """
+        if (queue := self.get(name)) is not None:
+            return queue
+        if len(self) >= MAX_SENSORS:
+            for silent in timeline.silent([name for name, one in self.items() if not one.held])[:1]:
+                del self[silent]
+        if len(self) >= MAX_SENSORS:
+            return None
+        queue = self[name] = SensorQueue(self._policy, timeline)
+        return queue
+
+    def resume(self, checkpoint: Checkpoint, timeline: Timeline) -> None:
+        """Open the queues of the sensors of a checkpoint."""
+        self.clear()
+        for name in {**checkpoint.head.sensors, **checkpoint.quarantine} if checkpoint.fused else ("",):
+            if (queue := self.open(name, timeline)) is not None:
+                queue.clouds.newest_ns = checkpoint.newest_cloud_ns.get(name)
+                queue.quarantine = checkpoint.quarantine.get(name, "")
+        for frame in checkpoint.window:
+            if (queue := self.get(frame.frame_id.sensor)) is not None:
+                queue.remember(frame.frame_id, frame.detections)
+
+    @property
+    def held(self) -> int:
+        """Number of pending frames; may be called by any thread."""
+        return sum(len(one) for one in tuple(self.values()))
+
+    @property
+    def is_full(self) -> bool:
+        """Whether the pending frames of a sensor take more memory than they may."""
+        return any(one.held_bytes > self._policy.held_bytes for one in self.values())
+
+    def bytes_beside(self, used: Container[int]) -> int:
+        """Return the bytes of pending frames, and of all clouds but some, given by `id`; for any thread."""
+        return sum(one.held_bytes + one.clouds.bytes_beside(used) for one in tuple(self.values()))
+
+    def take(self, now_ns: int | None, until_ns: Callable[[PendingFrame], int | None]) -> PendingFrame | None:
+        """Return the earliest of the frames that are ready, with its cloud; arguments as of `SensorQueue.take`."""
+        queues = [one for one in self.values() if one.held]
+        if len(queues) > 1:
+            queues.sort(key=lambda one: (one.held[0].frame_id.stamp_ns, one.held[0].frame_id.sensor))
+        return next((frame for one in queues if (frame := one.take(now_ns, until_ns))), None)
 
 
 class CloudBuffer:

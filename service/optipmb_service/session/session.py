@@ -15,7 +15,6 @@ publisher.
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
@@ -27,18 +26,17 @@ from optipmb.self_calibration import learned_noise
 from optipmb.zones import ZoneState
 from optipmb_service.session import convert
 from optipmb_service.session.arrivals import Arrivals
-from optipmb_service.session.checkpoint import JOINING, Checkpoint
-from optipmb_service.session.checks import SCORED_EVERY, ScoreCheck
-from optipmb_service.session.counts import Counters, Deliveries, total
+from optipmb_service.session.checkpoint import Checkpoint
+from optipmb_service.session.checks import ScoreChecks
+from optipmb_service.session.counts import Counters, Deliveries, present, total
 from optipmb_service.session.frame_problems import FrameProblems
-from optipmb_service.session.pending import PendingFrame, SensorQueue
+from optipmb_service.session.pending import PendingFrame, SensorQueues
 from optipmb_service.session.state import FilterState, ProcessedFrame
 from optipmb_service.session.timeline import FrameId, FusedTimeline, StreamTimeline, Verdict
 from optipmb_service.session.transition import Transition
 from optipmb_service.session.values import (
     MAX_CLOUD_WAIT_NS,
     MAX_ERROR,
-    MAX_SENSORS,
     SECOND,
     Begun,
     Incarnation,
@@ -53,7 +51,7 @@ from optipmb_service.session.window import ReorderWindow
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from optipmb_service.session.pending import Judged
+    from optipmb_service.session.pending import Judged, SensorQueue
     from optipmb_service.session.state import Inputs
     from optipmb_service.session.timeline import Decision, Timeline
     from optipmb_service.session.transition import Outcome
@@ -102,14 +100,13 @@ class Session:
         self._fused = fused
         self._make = tracker
         self._clock = clock
-        self._sensors: dict[str, SensorQueue] = {}
-        self._quarantine: dict[str, str] = {}
         self._estimated = ""
         """Incarnation in which the motion of a sensor was reported as estimated."""
         self._deliveries = Deliveries()
         self._has_ready = False
         self._cloud_wait_ns: int | None = None
         self._policy = policy or Policy()
+        self._queues = SensorQueues(self._policy)
         self._problems = FrameProblems(stream, instance, self._policy)
         self._limit_wait(self._policy.cloud_wait_ns)
         limits, transition = self._policy.jump_limits, self._transition(parameters)
@@ -118,12 +115,11 @@ class Session:
         zones = ZoneState(numbers=incarnation.events) if incarnation.events else None
         start = FilterState(transition.no_objects(incarnation.next_id), name, incarnation.starts, zones=zones)
         self._window = ReorderWindow(start, transition)
-        self._restored = False
-        self.arrivals = Arrivals(self._policy, self._sensors)
+        self.arrivals = Arrivals(self._policy, self._queues)
         self._now_ns = 0
         """When frames became ready last (monotonic)."""
         if not fused:
-            self._queue("")
+            self._queues.open("", self._timeline)
 
     # Messages
 
@@ -140,17 +136,18 @@ class Session:
         """
         frame_id = self._frame_id(message)
         since_ns = now_ns if arrived_ns is None else arrived_ns
-        queue = self._queue(frame_id.sensor)
+        queue = self._queues.open(frame_id.sensor, self._timeline)
         if queue is None:
             self.refuse()
             return [self._problems.too_many_sensors(frame_id)]
         outputs: list[Output] = []
-        if error := self._quarantine.get(frame_id.sensor):
+        if queue.quarantine:
             if self._timeline.knows(frame_id):
                 expected = "a reset or a restarted publisher: the session is quarantined"
-                return self._refuse(self._problems.of("quarantined", frame_id, "", expected, error))
-            outputs += self._end_quarantine(frame_id.sensor)
-        if self._fused and not (self._restored or self.arrivals.waiting or self._window.head.counts.frames):
+                return self._refuse(self._problems.of("quarantined", frame_id, "", expected, queue.quarantine))
+            queue.quarantine = ""  # the density of other sensors goes on
+            outputs += [] if self._fused else self.reset("quarantine")
+        if self._fused and not self._window.head.counts.frames:
             self.arrivals.begin(frame_id.stamp_ns, since_ns, now_ns)
         judged = queue.judge(frame_id)
         if queue.is_alive(frame_id, judged[1]):
@@ -172,12 +169,12 @@ class Session:
         try:
             convert.cloud_of(message)
         except optipmb.FrameError as error:
-            return [self._problems.of("invalid_value", frame_id, error.path, error.expected, error.received)]
-        queue = self._queue(frame_id.sensor)
+            return [self._problems.invalid(frame_id, error)]
+        queue = self._queues.open(frame_id.sensor, self._timeline)
         if queue is None:
             return [self._problems.too_many_sensors(frame_id)]
         queue.clouds.add(message)
-        amends = self._policy.late_clouds and frame_id.sensor not in self._quarantine
+        amends = self._policy.late_clouds and not queue.quarantine
         outputs = self._amend(message, frame_id, ticket) if amends else []
         return [*outputs, *self._advance(now_ns)]
 
@@ -190,7 +187,7 @@ class Session:
         """When `on_tick` is due (monotonic, ns), 0: at once; None while no frame waits."""
         if self._has_ready:
             return 0
-        due = [self._due_ns(one.held[0]) for one in self._sensors.values() if one.held]
+        due = [self._due_ns(one.held[0]) for one in self._queues.values() if one.held]
         return min((one for one in due if one is not None), default=None)
 
     def refuse(self) -> None:
@@ -206,7 +203,8 @@ class Session:
     def reset(self, reason: Reason = "reset") -> list[Output]:
         """Discard the density; frames seen before stay seen, track ids go on, a quarantine ends."""
         outputs = self.flush()
-        self._quarantine.clear()
+        for queue in self._queues.values():
+            queue.quarantine = ""
         head, transition = self._window.head, self._window.transition
         session = transition.name(head.last, head.starts + 1)
         self._begin(head.begun_anew(transition.no_objects(head.density.next_id), session))
@@ -267,13 +265,13 @@ class Session:
         It refers to values that never change: cheap, to be encoded later.
         """
         base, window = self._window.portable(self._policy.checkpoint_bytes)
-        newest = {name: one.clouds.newest_ns for name, one in self._sensors.items()}
+        newest = {name: one.clouds.newest_ns for name, one in self._queues.items()}
         return Checkpoint(
             stream=self.stream,
             parameters=self.parameters,
             fused=self._fused,
             cloud_wait_ns=self._cloud_wait_ns,
-            quarantine=dict(self._quarantine),
+            quarantine={name: one.quarantine for name, one in self._queues.items() if one.quarantine},
             seen=self._timeline.seen,
             base=base,
             window=window,
@@ -322,31 +320,17 @@ class Session:
         if one._cloud_wait_ns is not None:
             one._limit_wait(one._cloud_wait_ns)
         one.run = total(checkpoint.run, fence)
-        one._restored = True
         one._deliveries = replace(checkpoint.deliveries)
-        one._quarantine = dict(checkpoint.quarantine)
-        # Of the beginning of a session: other sensors may have been there that it does not know yet.
-        is_young = checkpoint.fused and checkpoint.base.last is None
-        stamps = (frame.frame_id.stamp_ns for frame in checkpoint.window if is_young)
-        one.arrivals.resume(now_ns, min(stamps, default=None))
         one._timeline = type(one._timeline).resume(one._policy.jump_limits, checkpoint)
-        places = one._timeline.places()
-        frames = [replace(frame, place=places[frame.frame_id]) for frame in checkpoint.window]
-        frames.sort(key=lambda frame: frame.order)
-        one._window = ReorderWindow(checkpoint.base, one._window.transition, frames, checkpoint.head)
-        one._sensors.clear()
-        for name in checkpoint.head.sensors if checkpoint.fused else ("",):
-            if (queue := one._queue(name)) is not None:
-                queue.clouds.newest_ns = checkpoint.newest_cloud_ns.get(name)
-        for frame in checkpoint.window:
-            if (queue := one._sensors.get(frame.frame_id.sensor)) is not None:
-                queue.remember(frame.frame_id, frame.detections)
+        one._window = ReorderWindow.resume(checkpoint, one._window.transition, one._timeline.places())
+        one._queues.resume(checkpoint, one._timeline)
+        one.arrivals.resume(now_ns, checkpoint.young_ns)
         return one
 
     @property
     def sensors(self) -> set[str]:
         """The sensors that it knows of, by stream; of one stream an empty name."""
-        return set(self._sensors)
+        return set(self._queues)
 
     def recovered(self, now_ns: int) -> list[Output]:
         """End the recovery: all that the caches had is here. Return the outputs of frames that waited for it."""
@@ -363,7 +347,7 @@ class Session:
     def unprocessed(self) -> list[tuple[schemas.Detections | schemas.Points, Any]]:
         """Return the messages that are in no snapshot: clouds without their frame, pending frames with their ticket."""
         used = frozenset(id(frame.points) for frame in self._window.frames)
-        return [one for queue in self._sensors.values() for one in queue.unprocessed(used)]
+        return [one for queue in self._queues.values() for one in queue.unprocessed(used)]
 
     # State
 
@@ -404,7 +388,7 @@ class Session:
     @property
     def held(self) -> int:
         """Number of pending frames; may be called by any thread."""
-        return sum(len(one) for one in tuple(self._sensors.values()))
+        return self._queues.held
 
     @property
     def held_bytes(self) -> int:
@@ -414,13 +398,12 @@ class Session:
         """
         frames = self._window.frames
         used = frozenset(id(frame.points) for frame in frames)
-        waiting = [one.held_bytes + one.clouds.bytes_beside(used) for one in tuple(self._sensors.values())]
-        return sum(frame.weight for frame in frames) + sum(waiting)
+        return sum(frame.weight for frame in frames) + self._queues.bytes_beside(used)
 
     @property
     def quarantine(self) -> str:
         """The error for which frames are refused, of any sensor; empty while none are."""
-        return next(iter(self._quarantine.values()), "")
+        return next((one.quarantine for one in self._queues.values() if one.quarantine), "")
 
     @property
     def cloud_wait_s(self) -> float:
@@ -444,7 +427,7 @@ class Session:
         condition: Condition = "running" if counters.frames else "new"
         if closed:
             condition = "closed"
-        elif self._quarantine and self._quarantine.keys() >= self._sensors.keys():
+        elif self._queues and all(one.quarantine for one in self._queues.values()):
             condition = "quarantined"
         elif self.arrivals.recovering:
             condition = "recovering"
@@ -457,11 +440,7 @@ class Session:
             seq=last.seq if last else None,
             stamp_ns=last.stamp_ns if last else None,
             shed=shed,
-            **{
-                name: count
-                for name, count in asdict(counters).items()
-                if name in schemas.SessionState.names and (count or name not in JOINING)
-            },
+            **{n: count for n, count in present(asdict(counters)).items() if n in schemas.SessionState.names},
             lost_objects=None if density.rejoining is None else len(density.rejoining.lost),
             tracks=head.tracks,
             bernoullis=len(density.bernoulli),
@@ -478,50 +457,23 @@ class Session:
     # Settings
 
     def _transition(self, parameters: optipmb.Parameters) -> Transition:
-        self._scores: dict[str, ScoreCheck] = {}
-        """By sensor where it has parameters of its own."""
+        self._scores = ScoreChecks(parameters)
         return Transition(self.stream, parameters, self._make, self._policy)
 
     def _limit_wait(self, cloud_wait_ns: int) -> None:
         if self._fused:  # a frame that waited for its cloud must still find its place
             cloud_wait_ns = min(cloud_wait_ns, self._policy.rewind_ns // 2)
         self._policy = replace(self._policy, cloud_wait_ns=cloud_wait_ns)
-        for one in self._sensors.values():
-            one.policy = self._policy
+        self._queues.set_policy(self._policy)
 
     def _frame_id(self, message: schemas.Detections | schemas.Points) -> FrameId:
         return FrameId(message.epoch, message.seq, message.stamp_ns, message.stream if self._fused else "")
 
-    # Sensors
-
-    def _queue(self, name: str) -> SensorQueue | None:
-        """Return the queue of a sensor, an empty one for a new sensor; None when there are too many."""
-        queue = self._sensors.get(name)
-        if queue is None and len(self._sensors) >= MAX_SENSORS:
-            self._forget_silent()
-        if queue is None and len(self._sensors) < MAX_SENSORS:
-            queue = self._sensors[name] = SensorQueue(self._policy, self._timeline)
-        return queue
-
-    def _forget_silent(self) -> None:
-        """Make room for a sensor: the one that fed the session longest ago goes, if that is not lately."""
-        for name in self._timeline.silent([name for name, one in self._sensors.items() if not one.held])[:1]:
-            del self._sensors[name]
-            self._quarantine.pop(name, None)
-            self._scores.pop(name, None)
-
     def _follow(self, timeline: Timeline, gone: Sequence[FrameId] = ()) -> None:
         """Go on with another timeline, and give it to the queues; `gone` are the frames that have left the window."""
         self._timeline = timeline
-        for one in self._sensors.values():
+        for one in self._queues.values():
             one.follow(self._timeline, self._window.base, gone)
-
-    def _end_quarantine(self, sensor: str) -> list[Output]:
-        """End the quarantine of a sensor whose publisher was restarted; the density of others goes on."""
-        if not self._fused:
-            return self.reset("quarantine")
-        del self._quarantine[sensor]
-        return []
 
     def _until_ns(self, pending: PendingFrame) -> int | None:
         """Return until when (monotonic) a pending frame waits for others; None: it does not."""
@@ -554,20 +506,16 @@ class Session:
         except optipmb.FrameError as error:
             queue.timeline = judged[0].note(frame_id)
             self._follow(self._timeline.note(frame_id))
-            return self._refuse(
-                self._problems.of("invalid_value", frame_id, error.path, error.expected, error.received)
-            )
-        findings = [*queue.checks.add(message, since_ns, self._policy)]
-        if frame_id.seq % SCORED_EVERY == 0 and not parameters.self_calibration:  # it filters the lower half of none
-            sensor = "" if parameters is self.parameters else frame_id.sensor
-            if sensor not in self._scores:
-                self._scores[sensor] = ScoreCheck(parameters)
-            findings += self._scores[sensor].add(frame)
+            return self._refuse(self._problems.invalid(frame_id, error))
+        findings = [
+            *queue.checks.add(message, since_ns, self._policy),
+            *self._scores.add(frame_id, frame, parameters),
+        ]
         outputs: list[Output] = [self._problems.of(one.code, frame_id, *one[1:]) for one in findings]
         deadline_ns, inputs = queue.cloud_deadline_ns(message, since_ns), (message, frame, ignored)
         pending = PendingFrame(frame_id, detections, inputs, deadline_ns, ticket, judged, since_ns)
         waits = queue.held or deadline_ns is not None or queue.clouds.newest_ns is not None
-        if len(self._sensors) == 1 and not waits and not self.arrivals.waiting:  # mostly
+        if len(self._queues) == 1 and not waits and not self.arrivals.waiting:  # mostly
             self._now_ns, self._has_ready = now_ns, False
             return [*outputs, *self._process(pending)]
         queue.add(pending)
@@ -602,31 +550,19 @@ class Session:
         """
         if now_ns is not None:
             self._now_ns = now_ns
-            if (deadline_ns := self.arrivals.deadline_ns) is not None and now_ns >= deadline_ns:
-                self.arrivals.end()
+            self.arrivals.end_at_deadline(now_ns)
         outputs: list[Output] = []
-        self._has_ready, taken, policy = False, 0, self._policy
+        self._has_ready, taken = False, 0
         ends_ns = self._clock() + FLUSH_NS if now_ns is None else None
-        while pending := self._next_ready(now_ns):
+        while pending := self._queues.take(now_ns, self._until_ns):
             outputs += self._process(pending)
             taken += 1
             if ends_ns is not None and self._clock() >= ends_ns:
                 return [*outputs, *self._refuse_pending()]
-            full = any(one.held_bytes > policy.held_bytes for one in self._sensors.values())
-            if ends_ns is None and taken >= policy.at_once and not full:
+            if ends_ns is None and taken >= self._policy.at_once and not self._queues.is_full:
                 self._has_ready = self.held > 0
                 break
         return outputs
-
-    def _next_ready(self, now_ns: int | None) -> PendingFrame | None:
-        """Take the earliest of the frames that are ready; None while none is."""
-        queues = [one for one in self._sensors.values() if one.held]
-        if len(queues) > 1:
-            queues.sort(key=lambda one: (one.held[0].frame_id.stamp_ns, one.held[0].frame_id.sensor))
-        for one in queues:
-            if pending := one.take(now_ns, self._until_ns):
-                return pending
-        return None
 
     def _process(self, pending: PendingFrame) -> list[Output]:
         """Put a frame in its place."""
@@ -646,7 +582,7 @@ class Session:
     def _refuse_ahead(self) -> list[Output]:
         """Refuse the first frame of each sensor that is ahead, as another one goes on; those after it follow it."""
         outputs: list[Output] = []
-        for queue in self._sensors.values():
+        for queue in self._queues.values():
             timeline = self._timeline
             if queue.held and isinstance(timeline, FusedTimeline) and timeline.is_ahead(queue.held[0].frame_id):
                 frame_id = queue.pop().frame_id
@@ -694,9 +630,7 @@ class Session:
         outputs = [] if self.session == before else self._restarted(outcomes)
         if self.parameters.sensor_motion and self._estimated != self.session and self.density.sensor_motion is not None:
             self._estimated = self.session
-            x, y, _ = self.density.sensor_motion.tolist()
-            received = f"none, and what stands moves by {math.hypot(x, y):.1f} m/s: the motion is estimated"
-            outputs.append(self._problems.of("no_pose", frame_id, "pose", "the pose of a sensor that moves", received))
+            outputs.append(self._problems.no_pose(frame_id, self.density.sensor_motion))
         step_ns = (self._clock() - began_ns) // max(1, len(outcomes))
         for one in outcomes:
             if (one.unknown or one.fault or one.tracks is None) and not one.frame.revision:
@@ -709,9 +643,10 @@ class Session:
 
     def _fail(self, error: Exception, placed: list[ProcessedFrame], frame_id: FrameId) -> list[Output]:
         """Quarantine the sensor; the frame that failed and the pending ones go, unprocessed."""
-        reason = self._quarantine[frame_id.sensor] = f"{type(error).__name__}: {error}"[:MAX_ERROR]
+        queue = self._queues[frame_id.sensor]
+        reason = queue.quarantine = f"{type(error).__name__}: {error}"[:MAX_ERROR]
         came = len(placed) - len(self._window.frames)  # none with a late cloud, whose numbers are no frame's
-        self._deliveries.refused += came + self._sensors[frame_id.sensor].clear()
+        self._deliveries.refused += came + queue.clear()
         self._follow(self._timeline.note(frame_id) if came else self._timeline)
         dump = self._window.transition.dump(self._window.base, placed, error)
         problem = self._problems.of("internal", frame_id, "", "a step of the tracker without an error", reason)
@@ -741,15 +676,14 @@ class Session:
             if (begun := one.begun) is not None:
                 if begun.reason == "first":
                     return [begun]
-                frame_id, expected = one.frame.frame_id, "frames that continue the stream"
-                return [begun, self._problems.jumped("restarted", frame_id, expected, begun.jump_ns, begun.reason)]
+                return [begun, self._problems.restarted(one.frame.frame_id, begun)]
         return []
 
     def _refuse_pending(self) -> list[Output]:
         """Refuse all pending frames, with a problem for each sensor: there was no time to process them."""
         problems: list[Output] = []
         expected = f"at most {FLUSH_NS / SECOND:g} s for all frames that waited"
-        for one in self._sensors.values():
+        for one in self._queues.values():
             if one.held:
                 first, count = one.held[0].frame_id, one.clear()
                 self._deliveries.refused += count

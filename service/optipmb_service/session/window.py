@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     import optipmb_schemas as schemas
 
+    from optipmb_service.session.checkpoint import Checkpoint
     from optipmb_service.session.state import FilterState, Inputs, ProcessedFrame
     from optipmb_service.session.timeline import FrameId, Placement
     from optipmb_service.session.transition import Outcome, Transition
@@ -51,6 +52,15 @@ class ReorderWindow:
             self._after[-1] = head
         self.head = self.state(len(self._frames))
         """The present state."""
+
+    @classmethod
+    def resume(
+        cls, checkpoint: Checkpoint, transition: Transition, places: Mapping[FrameId, Placement]
+    ) -> ReorderWindow:
+        """Return the window of a checkpoint, whose frames have these places."""
+        frames = [replace(frame, place=places[frame.frame_id]) for frame in checkpoint.window]
+        frames.sort(key=lambda frame: frame.order)
+        return cls(checkpoint.base, transition, frames, checkpoint.head)
 
     @property
     def frames(self) -> tuple[ProcessedFrame, ...]:
