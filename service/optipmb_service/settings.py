@@ -56,7 +56,7 @@ DEFAULT_LISTEN: Final = "tcp/127.0.0.1:7447"
 DEFAULT_GRPC: Final = "127.0.0.1:50051"
 DEFAULT_NATS: Final = "127.0.0.1:4222"
 DEFAULT_MQTT: Final = "mqtt://127.0.0.1:1883"
-MOST_ZONES: Final = 256  # as `optipmb.zones.MOST`, which the settings do not import
+MOST_ZONES: Final = 256  # as `optipmb.zones.MOST`; a test compares what settings repeat of the tracker
 
 
 def _form(pattern: str, expected: str) -> AfterValidator:

@@ -39,7 +39,6 @@ __all__ = [
     "selected_frames",
 ]
 
-DATASETS = ("kitti", "nuscenes", "scene", "mcap", "rosbag", "table")
 _ROS2_MCAP = b"\x04\x00\x00\x00ros2"  # profile in the header of an MCAP file of ROS 2
 _HEAD = 64
 
@@ -151,6 +150,7 @@ def _scene(_root: Path, _: str | Path | None, options: _Options) -> Dataset:
 
 
 _OPEN = {"kitti": _kitti, "nuscenes": _nuscenes, "scene": _scene, "mcap": _mcap, "rosbag": _rosbag, "table": _table}
+DATASETS = tuple(_OPEN)
 
 
 def _check(options: _Options, *known: str) -> None:

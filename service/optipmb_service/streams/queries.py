@@ -110,6 +110,7 @@ class StreamQueries:
         self._streams = streams
         self._tracks = tracks
         self._keys = streams.keys
+        self._profiles = streams.sessions.profiles
         self._digests = ThreadPoolExecutor(1, "digest")
         self._room_for_wildcards = threading.Semaphore(MOST_WILDCARDS)
         self._commands: dict[str, tuple[_Command, bool]] = {
@@ -174,7 +175,7 @@ class StreamQueries:
             asked = self._payload(request, schemas.SessionParameters())
         except schemas.MessageError:
             return False
-        known = asked.profile is None or self._streams.profiles.named(asked.profile) is not None
+        known = asked.profile is None or self._profiles.named(asked.profile) is not None
         return known and asked != schemas.SessionParameters()
 
     def _answer_many(self, request: Query) -> None:
@@ -247,7 +248,7 @@ class StreamQueries:
 
     def _density(self, stream: Stream, request: Query) -> None:
         session = stream.session
-        parameters = session.parameters if session else self._streams.profiles.of(stream.name)
+        parameters = session.parameters if session else self._profiles.of(stream.name)
         message = density_of(
             session.density if session else optipmb.Density.empty(parameters.labels),
             stream=stream.name,
@@ -276,9 +277,9 @@ class StreamQueries:
     def _parameters(self, stream: Stream, request: Query) -> None:
         empty = schemas.SessionParameters()
         asked = self._payload(request, empty)
-        parameters = None if asked.profile is None else self._streams.profiles.named(asked.profile)
+        parameters = None if asked.profile is None else self._profiles.named(asked.profile)
         if asked.profile is not None and parameters is None:
-            expected = f"one of {', '.join(self._streams.profiles.names)}"
+            expected = f"one of {', '.join(self._profiles.names)}"
             raise schemas.MessageError("invalid_value", "profile", expected, repr(asked.profile))
         if asked != empty:
             if stream.session is None:
@@ -289,18 +290,18 @@ class StreamQueries:
 
     def _in_force(self, stream: Stream) -> schemas.SessionParameters:
         session = stream.session
-        parameters: optipmb.Parameters = session.parameters if session else self._streams.profiles.of(stream.name)
+        parameters: optipmb.Parameters = session.parameters if session else self._profiles.of(stream.name)
         return schemas.SessionParameters(
             profile=parameters.name,
-            cloud_wait_s=session.cloud_wait_s if session else self._streams.policy.cloud_wait_ns / SECOND,
+            cloud_wait_s=session.cloud_wait_s if session else stream.policy.cloud_wait_ns / SECOND,
             horizons=np.array(parameters.horizons, np.float64),
             values=parameters.model_dump(mode="json"),
-            sensors=self._streams.policy_for(stream.name).sensors.shown() or None,
+            sensors=stream.policy.sensors.shown() or None,
             session=session.session if session else None,
         )
 
     def _nothing(self, stream: str, state: Literal["new", "closed"]) -> schemas.SessionState:
-        profile = self._streams.profiles.of(stream).name
+        profile = self._profiles.of(stream).name
         return schemas.SessionState(stream=stream, session=NO_SESSION, state=state, profile=profile)
 
     def _payload(self, request: Query, empty: _T) -> _T:

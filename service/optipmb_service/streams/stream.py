@@ -24,7 +24,6 @@ from optipmb_client.trace_context import attachment_of
 from optipmb_service.session.checkpoint import CheckpointError, forgotten
 from optipmb_service.session.counts import MAX_COUNT, total
 from optipmb_service.session.problems import problem_of
-from optipmb_service.session.session import Session
 from optipmb_service.session.values import MAX_SENSORS, SECOND, Begun, Incarnation, Quarantined, Tracked
 from optipmb_service.settings import FARTHEST
 from optipmb_service.streams.counters import StreamCounters
@@ -42,6 +41,7 @@ if TYPE_CHECKING:
     from optipmb_service.session.checkpoint import Checkpoint
     from optipmb_service.session.counts import MessageCounters
     from optipmb_service.session.fixed_rate import FixedRate
+    from optipmb_service.session.session import Session
     from optipmb_service.session.values import Output, Reached
     from optipmb_service.streams.backlog import Backlog
     from optipmb_service.streams.streams import Streams
@@ -93,7 +93,7 @@ class Stream:
         self.log_check = LogCheck(streams.silent_ns)
         self._is_far = False
         self._streams = streams
-        self._policy = streams.policy_for(name)
+        self.policy = streams.sessions.policy(name)
         self.durable: Reached | None = None if streams.checkpoints.durable else (MAX_COUNT, 0, "")
         """How far the newest checkpoint is that a process would go on from; None: there is none."""
         self._member = streams.member
@@ -328,8 +328,8 @@ class Stream:
             self.report("clock", "stamp_ns", 'system time, or `clock = "arrival"` in `outputs`', wrong)
 
     def _open_publisher(self) -> None:
-        self._fixed_rate = self._streams.fixed_rate_for(self.name)
-        kinds = {"events": bool(self._policy.zones), "now": self._fixed_rate is not None}
+        self._fixed_rate = self._streams.sessions.fixed_rate(self.name)
+        kinds = {"events": bool(self.policy.zones), "now": self._fixed_rate is not None}
         try:
             self._publisher = self._streams.open_publisher(self.name, **kinds)
         except TransportError as error:
@@ -338,7 +338,7 @@ class Stream:
     def _republish_events(self) -> None:
         """Publish the events of the window in this run, which voids later events of the run before."""
         now = Ticket(time.time_ns(), time.monotonic_ns(), 0)
-        for tracked in self.session.again() if self.session and self._policy.zones else ():
+        for tracked in self.session.again() if self.session and self.policy.zones else ():
             tracked.ticket = now
             self._send(tracked, again=True)
 
@@ -433,7 +433,7 @@ class Stream:
 
     def _check_zones(self, session: Session) -> None:
         """Report the classes of zones that the profile lacks."""
-        for zone in self._policy.zones:
+        for zone in self.policy.zones:
             for label in zone.classes:
                 if label not in session.parameters.labels:
                     expected = f"one of {', '.join(session.parameters.labels)} (profile {session.parameters.name})"
@@ -441,7 +441,7 @@ class Stream:
 
     def _check_place(self, tracked: Tracked) -> None:
         """Report, once, tracks that are far from the place of the site: as of coordinates of a grid, such as UTM."""
-        if self._is_far or not self._policy.has_place:
+        if self._is_far or not self.policy.has_place:
             return
         far = abs(tracked.estimates.center[:, :2]).max(axis=1, initial=0.0) > FARTHEST
         if far.any():
@@ -536,15 +536,12 @@ class Stream:
 
     def _restore(self, fence: int | None, checkpoint: Checkpoint) -> tuple[Session, Checkpoint]:
         """Return the session of a checkpoint; on the thread of the store."""
-        now_ns, streams = time.monotonic_ns(), self._streams
+        now_ns = time.monotonic_ns()
         if self._unread != Incarnation():
             raise CheckpointError("older than one of another format, whose ids would be given out again")
         if checkpoint.fused is not self.fused:
             raise CheckpointError(f"of {'several streams' if checkpoint.fused else 'one stream'}, by `fuse` then")
-        session = Session.restore(
-            checkpoint, now_ns, self._policy, fence=fence or 1, instance=streams.instance, tracker=streams.tracker
-        )
-        return session, checkpoint
+        return self._streams.sessions.restored(checkpoint, self.policy, now_ns, fence or 1), checkpoint
 
     def _note_unread(self, incarnation: Incarnation) -> None:
         self._unread = self._unread.after(incarnation)
@@ -593,30 +590,17 @@ class Stream:
         self._streams.metrics.restored()
         frames = session.counters.frames
         log.info("session_restored", stream=self.name, session=session.session, frames=frames)
-        if configured := self._configured(session):
+        if configured := self._streams.sessions.differing_profile(session):
             in_force = session.parameters.name
             log.warning("profile_differs", stream=self.name, profile=in_force, configured=configured)
         return session
 
     def _new(self, incarnation: Incarnation, fence: int | None) -> Session:
         numbers = incarnation.after(self._unread)
-        session = Session(
-            self.name,
-            self._streams.profiles.of(self.name),
-            self._policy,
-            fused=self.fused,
-            instance=self._streams.instance,
-            incarnation=replace(numbers, run=total(numbers.run, fence or 0)),
-            tracker=self._streams.tracker,
-        )
+        numbers = replace(numbers, run=total(numbers.run, fence or 0))
+        session = self._streams.sessions.new(self.name, self.policy, numbers)
         log.info("session_opened", stream=self.name, profile=session.parameters.name)
         return session
-
-    def _configured(self, session: Session) -> str | None:
-        """Return the name of the configured profile if the session tracks with other parameters, else None."""
-        wanted, in_force = self._streams.profiles.of(self.name), session.parameters
-        same = in_force is wanted or in_force.model_copy(update={"horizons": wanted.horizons}) == wanted
-        return None if same else wanted.name
 
     def _proceed(self) -> None:
         """Go on with messages that came while a session was about to begin or end."""
@@ -751,7 +735,7 @@ class Stream:
             return None
         degraded = any(now_ns < until for until in tuple(self._resting.values()))
         summary = self.sensors.summary(self._counts.state(session), now_ns, degraded=degraded)
-        more = {"configured": self._configured(session), "learned": session.learned}
+        more = {"configured": self._streams.sessions.differing_profile(session), "learned": session.learned}
         return summary.model_copy(update=more)
 
 

@@ -9,8 +9,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from dataclasses import replace
-from functools import cache, lru_cache, partial
+from functools import lru_cache, partial
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -18,16 +17,15 @@ import optipmb_schemas as schemas
 import structlog
 
 import optipmb
-from optipmb.zones import MOST
 from optipmb_service.cluster.leases import Change, partition_of
 from optipmb_service.session.counts import MessageCounters
-from optipmb_service.session.fixed_rate import FixedRate
 from optipmb_service.session.problems import problem_of
-from optipmb_service.session.values import SECOND, Policy
+from optipmb_service.session.values import SECOND
 from optipmb_service.streams.admission import Admission
 from optipmb_service.streams.backlog import MEGABYTE, Backlog, Bounds, ByteBudget
 from optipmb_service.streams.directory import StreamDirectory
 from optipmb_service.streams.profiles import FUSED, Fusion
+from optipmb_service.streams.session_factory import PARTS, SessionFactory
 from optipmb_service.streams.stream import Stream
 
 if TYPE_CHECKING:
@@ -68,9 +66,6 @@ RIVAL_LEASES: Final = 3
 
 KEPT_AT_ONCE: Final = 8
 """States that are given to the checkpoint writer before waiting frames have their turn; they take less than a frame."""
-
-PARTS: Final = 4
-"""Parts of a stream's memory: queue, clouds, pending frames, window."""
 
 SWEEP_REST: Final = 200
 """Rest after a look at all sessions, in times of the processor time that it took."""
@@ -123,7 +118,6 @@ class Streams:
         tracker: Callable[[optipmb.Parameters], Any] = optipmb.Tracker,
         traces: Traces | None = None,
     ) -> None:
-        self.profiles = profiles
         self.open_publisher = open_publisher
         self.ask_cache = ask_cache
         self.reporter = reporter
@@ -133,7 +127,6 @@ class Streams:
         self.log = log
         self.arm = arm
         self.metrics = metrics
-        self.tracker = tracker
         self.traces = traces
         self.instance = settings.instance
         self.keys = schemas.Keys(settings.prefix)
@@ -144,8 +137,7 @@ class Streams:
             lambda stream: self.tracked(self.fusion.session_of(stream)),
         )
         self.limits = settings.limits.limits()
-        self.policy = policy_of(settings)
-        self._zone = cache(settings.zone)
+        self.sessions = SessionFactory(settings, profiles, self.fusion, tracker, self._report)
         self.queue_frames = settings.queue_frames
         self.step_limit_ns = round(settings.step_limit_s * SECOND)
         self.silent_ns = round(settings.lease_s * SECOND)
@@ -286,27 +278,6 @@ class Streams:
                     del self._backlogs[stream.name]
 
     # Present streams
-
-    def policy_for(self, session: str) -> Policy:
-        """Return the policy of a session, with its zones and sensors."""
-        names = self._settings.zones_of(session)
-        if len(names) > MOST:
-            expected, received = f"at most {MOST} zones and lines for a session", f"{len(names)}; the last are left out"
-            self._report("refused", session, expected, received, path="zones")
-        site, known = session.partition("/")[0], self._settings.zones
-        zones = (self._zone(name, site if known[name].geo else "") for name in names[:MOST])
-        sensors = self.fusion.sensors_of(session, self.profiles.sensors)
-        needs_view = bool(sensors.uses) or session in self.fusion.sites
-        has_place = site in self._settings.sites
-        how = self._settings.rejoin_of(session)
-        rejoin = None if how is None else optipmb.Rejoin(**how.model_dump())
-        policy = replace(self.policy, zones=tuple(zones), sensors=sensors, needs_view=needs_view, has_place=has_place)
-        return replace(policy, rejoin=rejoin)
-
-    def fixed_rate_for(self, session: str) -> FixedRate | None:
-        """Return the output of a session at a fixed rate; None: it has none."""
-        output = self._settings.output_of(session)
-        return None if output is None else FixedRate(output)
 
     def tracking(self) -> list[Stream]:
         """Return the streams that have a session, by name."""
@@ -729,23 +700,3 @@ class Rivals:
                 self.doubted.add(stream)
                 if stream in self._asked_again:
                     yield stream, shared[stream]
-
-
-def policy_of(settings: Settings) -> Policy:
-    """Return the policy of sessions by the settings."""
-    part = settings.stream_mb * MEGABYTE // PARTS
-    return Policy(
-        gap_limit_ns=round(settings.gap_limit_s * SECOND),
-        cloud_wait_ns=round(settings.cloud_wait_s * SECOND),
-        cloud_memory_ns=round(settings.cloud_memory_s * SECOND),
-        clouds=settings.queue_clouds,
-        cloud_bytes=part,
-        held_bytes=part,
-        rewind_bytes=part,
-        rewind_ns=round(settings.rewind_s * SECOND),
-        late_clouds=settings.late_clouds,
-        recovery_wait_ns=round(settings.recovery_wait_s * SECOND),
-        max_speed=settings.max_speed,
-        jumps=settings.jumps,
-        at_once=1,  # other streams have their turn between two frames
-    )

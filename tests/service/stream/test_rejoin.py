@@ -2,6 +2,8 @@
 
 import json
 import random
+from collections.abc import Callable
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,10 +17,10 @@ from optipmb_schemas.protobuf.convert import from_proto, to_proto
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Policy, Tracked
-from optipmb_service.settings import SettingsInvalidError, load
+from optipmb_service.settings import MOST_ZONES, RejoinSettings, SettingsInvalidError, load
 from sessions import Merged, plain, tracks
 
-from optipmb import OnlineTracker, Rejoin, generic_parameters
+from optipmb import OnlineTracker, Rejoin, generic_parameters, zones
 from optipmb.zones import Event, Zone
 
 GENERIC = generic_parameters(gaps.CLASSES, 0.1)
@@ -213,3 +215,24 @@ def test_settings_out_of_bounds_are_named(value: str, tmp_path: Path) -> None:
     path.write_text(f'[rejoin."site/*/*"]\n{value}\n')
     with pytest.raises(SettingsInvalidError, match=rf"rejoin.site/\*/\*.{value.split(maxsplit=1)[0]}"):
         load(path)
+
+
+def test_settings_have_the_bounds_of_the_library() -> None:
+    """The settings, which do not import the tracker, repeat its bounds and defaults without a difference."""
+    assert RejoinSettings().model_dump() == asdict(Rejoin())
+    limits = {"minimum", "exclusiveMinimum", "maximum", "exclusiveMaximum"}
+    for name, described in RejoinSettings.model_json_schema()["properties"].items():
+        ends = [described[one] for one in sorted(limits & described.keys())]
+        assert len(ends) == 2
+        step = 1 if described["type"] == "integer" else 1e-9
+        for value in [end + change for end in ends for change in (-step, 0, step)]:
+            assert is_accepted(RejoinSettings, name, value) == is_accepted(Rejoin, name, value), (name, value)
+    assert MOST_ZONES == zones.MOST
+
+
+def is_accepted(kind: Callable[..., object], name: str, value: float) -> bool:
+    try:
+        kind(**{name: value})
+    except ValueError:
+        return False
+    return True
