@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal, get_args, get_origin
 
 from optipmb_service.session.problems import CODES
 from optipmb_service.settings import (
+    CpmSensor,
+    CpmSettings,
     FusedSettings,
     InputSettings,
     LimitSettings,
@@ -83,6 +85,7 @@ TASKS: Final = (
     ("curl, POST, sensors without a client", "`http_senders`, `inputs`; see [JSON](json.md#send-detections)"),
     ("gRPC clients", "`grpc`, `grpc_calls`, `grpc_connections`; see [gRPC](grpc.md)"),
     ("MQTT broker", "`mqtt`; see [MQTT](json.md#mqtt)"),
+    ("C-ITS, V2X, CPM", "`cpm`; see [Standards](standards.md#collective-perception-messages)"),
     ("zones, lines, counting, alarms", "`zones`; see [Zones](zones.md)"),
     ("latitude, longitude, map", "`sites`; see [Latitude and longitude](operation.md#latitude-and-longitude)"),
     ("output at a fixed rate, prediction to now", "`outputs`; see [Fixed rate](fixed-rate.md)"),
@@ -154,6 +157,7 @@ def settings() -> str:
         *(("", Settings), ("limits.", LimitSettings), ("sites.NAME.", SiteSettings)),
         *(("fused.NAME.", FusedSettings), ("sensors.PATTERN.", SensorSettings)),
         *(("zones.NAME.", ZoneSettings), ("outputs.PATTERN.", OutputSettings), ("rejoin.PATTERN.", RejoinSettings)),
+        *(("cpm.PATTERN.", CpmSettings), ("cpm.PATTERN.sensors.", CpmSensor)),
         *(("ros2.", Ros2Settings), ("ros2.streams.NAME.", Ros2Stream), ("mqtt.", MqttSettings)),
         *(("inputs.PATTERN.", InputSettings), ("mqtt.inputs.STREAM.", MqttInput)),
         ("mqtt.inputs.STREAM.mapping.", MappingSettings),

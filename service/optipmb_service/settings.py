@@ -295,8 +295,13 @@ class MqttSettings(BaseModel):
     system's authorities"""
     streams: Patterns = ("*/*/*",)
     """patterns of streams, each part a name or `*`, that do not overlap"""
-    topics: tuple[Literal["tracks", "events", "zones", "problems"], ...] = ("tracks", "events", "zones", "problems")
-    """what is published"""
+    topics: tuple[Literal["tracks", "events", "zones", "problems", "cpm"], ...] = (
+        "tracks",
+        "events",
+        "zones",
+        "problems",
+    )
+    """what is published; `cpm`: collective perception messages of the streams that `cpm` names"""
     tracks_hz: float = Field(default=2.0, ge=0, le=1000)
     """highest rate of the tracks of a stream, in sensor time; 0: all frames"""
     inputs: dict[str, MqttInput] = Field(default_factory=dict)
@@ -463,6 +468,43 @@ class InputSettings(BaseModel):
     """names of classes by those of the sender, as `{ Human = "pedestrian" }`; others stay"""
     camera: Path | None = None
     """file of the calibration by which boxes and feet in pixels become places on the ground"""
+
+
+SENSOR_TYPES: Final = (
+    *("undefined", "radar", "lidar", "monovideo", "stereovision", "nightvision", "ultrasonic", "pmd"),
+    *("inductionloop", "sphericalcamera", "uwb", "acoustic", "localaggregation", "itsaggregation"),
+)
+"""Types of sensors in their order in ETSI TS 102 894-2."""
+
+
+class CpmSensor(BaseModel):
+    """A sensor of a station."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    id: int = Field(ge=0, le=255)
+    """number of the sensor in its messages"""
+    type: Annotated[str, _form("|".join(SENSOR_TYPES), f"one of {', '.join(SENSOR_TYPES)}")]
+    """kind of sensor, as `lidar`"""
+
+    @property
+    def number(self) -> int:
+        return SENSOR_TYPES.index(self.type)
+
+
+class CpmSettings(BaseModel):
+    """Collective perception messages (ETSI TS 103 324) of a stream."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    station_id: int = Field(ge=0, le=2**32 - 1)
+    """number of the station"""
+    source_uuid: str = Field(default="", max_length=256)
+    """name of the sender in JSON; default: `com_optipmb_` and the station's number"""
+    rate_hz: float = Field(default=10.0, ge=1, le=10)
+    """highest rate of the messages, in sensor time"""
+    sensors: tuple[CpmSensor, ...] = Field(default=(), max_length=128)
+    """sensors that the messages name once a second"""
 
 
 class RejoinSettings(BaseModel):
@@ -673,12 +715,23 @@ class Settings(BaseSettings):
     rejoin: dict[Pattern, RejoinSettings] = Field(default_factory=dict)
     """joining of tracks of the same object over gaps, by session pattern; the first match applies; equal on all members
     of a cluster"""
+    cpm: dict[Pattern, CpmSettings] = Field(default_factory=dict)
+    """stations that send collective perception messages over MQTT, by stream pattern, whose site is in
+    `sites`; the first match applies"""
     ros2: Ros2Settings = Ros2Settings()
     """topics of ROS 2, for `optipmb-service ros2`"""
     mqtt: MqttSettings = MqttSettings()
     """a broker of MQTT, for `optipmb-service mqtt`"""
     limits: LimitSettings = LimitSettings()
     """bounds on what one message may hold"""
+
+    @field_validator("cpm")
+    @classmethod
+    def _check_places(cls, value: dict[str, CpmSettings], info: ValidationInfo) -> dict[str, CpmSettings]:
+        for pattern in value:
+            if (site := pattern.partition("/")[0]) not in info.data.get("sites", {}):
+                raise ValueError(f"{pattern}: a site that is in sites, received {site}")
+        return value
 
     def zones_of(self, session: str) -> list[str]:
         """Return the names of the zones of a session, or of all that a pattern matches."""

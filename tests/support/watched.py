@@ -120,7 +120,8 @@ class Session:
 
 def key_of(message: Any) -> str:
     topics = {"Tracks": "tracks", "Events": "events", "Detections": "detections", "Problem": "problems"}
-    return f"{KEYS.prefix}/{message.stream}/{topics[type(message).__name__]}"
+    topic = "now" if getattr(message, "predicted_to_ns", None) is not None else topics[type(message).__name__]
+    return f"{KEYS.prefix}/{message.stream}/{topic}"
 
 
 class Watched:

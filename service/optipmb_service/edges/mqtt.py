@@ -1,4 +1,4 @@
-"""The bridge to an MQTT broker: publishes tracks, events, counts and problems as JSON.
+"""The bridge to an MQTT broker: publishes tracks, events, counts, problems and CPM as JSON.
 
 Topics are the keys of the network. The bridge stores nothing, and reads only the retained counts from the broker. While
 the broker is away, events and the newest counts wait. Tracks and problems are dropped, because they would be outdated.
@@ -30,6 +30,7 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode, MQTTProtocolVersi
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
+from optipmb_service.edges.cpm import SEGMENTS, Station, station_of
 from optipmb_service.edges.inputs import Inputs
 from optipmb_service.edges.mqtt_inputs import RECEIVED, MqttInputs
 from optipmb_service.edges.readers import Bounds, Feeds, Reader, Text, Wish, places_of
@@ -64,7 +65,9 @@ ANSWER_S: Final = 10.0
 LAST_S: Final = 1.0
 """The same at the end."""
 
-QOS: Final = {"tracks": 0, "problems": 0, "events": 1, "zones": 1}
+QOS: Final = {"tracks": 0, "problems": 0, "events": 1, "zones": 1, "cpm": 0}
+OBJECTS: Final = 128
+"""Objects of a CPM in JSON."""
 RETAINED: Final = "zones"
 KEPT: Final = frozenset({"events"})  # topics of the network that wait for the broker
 OLD: Final = frozenset({1, 132})  # how brokers of 3.1.1, and of 5, refuse the version of the protocol
@@ -230,7 +233,7 @@ class Bridge(Component):
         sessions: returns the session that a stream feeds.
 
     Raises:
-        ClientError: a certificate or the credentials cannot be used.
+        ClientError: a certificate or the credentials cannot be used, or CPM have no station.
     """
 
     def __init__(self, settings: Settings, client: Client, sessions: Callable[[str], str] = str) -> None:
@@ -241,6 +244,12 @@ class Bridge(Component):
         self.connected = False
         self.published: collections.Counter[str] = collections.Counter()
         self.refused: collections.Counter[str] = collections.Counter()
+        self.left_out: collections.Counter[str] = collections.Counter()
+        """Objects without a place in the CPM, by reason."""
+        if "cpm" in settings.mqtt.topics and not settings.cpm:
+            raise ClientError('settings mqtt.topics: "cpm" needs a station, [cpm."site/*/*"]')
+        self._settings = settings
+        self._stations: dict[str, Station | None] = {}
         self._keys = client.keys
         self._why = "not connected yet"
         self._mqtt = settings.mqtt
@@ -292,6 +301,8 @@ class Bridge(Component):
     async def run(self) -> None:
         """Publish until it is cancelled; connect again and again."""
         keys = self._wish.keys(self._keys)
+        if "cpm" in self._wish.topics and self._settings.outputs:
+            keys += [self._keys.matching(one, "now") for one in self._wish.streams]
         await asyncio.to_thread(self._feeds.join, keys, self._receive)
         self._reader.read(self._feeds.logs(keys))
         pause_s = RETRY_S
@@ -373,7 +384,22 @@ class Bridge(Component):
     def _receive(self, one: Publication) -> None:
         """Take a message, on any thread."""
         if self.connected or one.topic in KEPT:
-            self._reader.receive(one)
+            if one.topic != "now":
+                self._reader.receive(one)
+            if one.topic in {"tracks", "now"} and "cpm" in self._wish.topics and one.message is not None:
+                self._perceive(one.message, predicted=one.topic == "now")
+
+    def _perceive(self, tracks: schemas.Tracks, *, predicted: bool) -> None:
+        """Queue the CPM that are due after a frame."""
+        stream = tracks.stream
+        if stream not in self._stations:
+            self._stations[stream] = station_of(self._settings, stream, OBJECTS)
+        station = self._stations[stream]
+        if station is not None and station.predicted == predicted:
+            for message in station.messages(tracks, self.left_out):
+                payload = station.json(message, time.time_ns())
+                text = Text("cpm", stream, partial(bytes, payload))
+                self._reader.outbox.put(f"cpm {stream}", text, len(payload), SEGMENTS)
 
     async def _publish(self, link: Link) -> None:
         """Publish waiting messages, a few at once; messages that an ended connection left, one by one."""

@@ -400,7 +400,7 @@ class Wish:
         Raises:
             MessageError: a pattern is none.
         """
-        named = {"zones": "events", "tracks": "now" if self.predict else "tracks"}
+        named = {"zones": "events", "tracks": "now" if self.predict else "tracks", "cpm": "tracks"}
         topics = {named.get(topic, topic) for topic in self.topics}
         try:
             return [keys.matching(one, topic) for topic in sorted(topics) for one in self.streams]  # type: ignore[arg-type]
@@ -500,7 +500,7 @@ class Reader:
         if message is None:
             return
         stream, size, put = message.stream, len(one.payload), self.outbox.put
-        if one.topic in {"tracks", "now"}:
+        if one.topic in {"tracks", "now"} and "tracks" in topics:
             with self._lock:
                 self._newest.pop(stream, None)
                 self._newest[stream] = one  # the newest is last

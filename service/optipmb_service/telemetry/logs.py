@@ -93,6 +93,8 @@ EVENTS: Final = {
     "mqtt_connected": "The bridge has a connection to the `broker`, in this version of the `protocol`.",
     "mqtt_disconnected": "The broker cannot be used, for `reason`: the bridge holds 10,000 events and tries again.",
     "mqtt_refused": "The broker does not take messages of `topic`, for `reason`: they are left out.",
+    "cpm_left_out": "The first `objects` of a `stream` without a place in its CPM, for `reason`:"
+    " [standards](standards.md#collective-perception-messages) has them.",
     "mqtt_unsent": "So many `messages` were on their way to the broker when the bridge ended.",
     "ros2_mismatch": "An endpoint has another type, definition or quality of service; `message` says which.",
     "publisher_failed": "The tracks of a stream cannot be published; the network is closing.",

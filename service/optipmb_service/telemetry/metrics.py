@@ -261,6 +261,7 @@ MQTT_METRICS: Final = {
     ),
     "mqtt_refused_total": _counter("Messages that the broker did not take.", lambda b: b.refused, "reason"),
     "mqtt_skipped_total": _counter("Messages replaced by newer ones before the broker took them.", lambda b: b.skipped),
+    "mqtt_cpm_left_out_total": _counter("Objects left out of CPM.", lambda b: b.left_out, "reason"),
     "mqtt_events_lost_total": _counter("Events lost while the broker was away, or refused.", lambda b: b.lost),
 }
 """Metrics of the bridge to MQTT."""

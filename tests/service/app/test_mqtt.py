@@ -22,13 +22,17 @@ mqtt = pytest.importorskip("optipmb_service.edges.mqtt")
 TOPIC = f"optipmb/v1/{STREAM}"
 ALIVE = "optipmb/v1/mqtt/one/alive"
 CONFIRMED = Selection(confirmed=True)
+AT = 1_167_609_600 * 10**9  # 2007-01-01, 94,694,401,000 ms in TimestampIts
 
 
 @contextlib.asynccontextmanager
-async def bridging(session: Session, broker: Broker | str, **settings: Any) -> AsyncIterator[Any]:
+async def bridging(
+    session: Session, broker: Broker | str, process: Settings | None = None, **settings: Any
+) -> AsyncIterator[Any]:
     address = broker if isinstance(broker, str) else f"mqtt://127.0.0.1:{broker.port}"
     network: Any = session
-    bridge = mqtt.Bridge(Settings(instance="one", mqtt=MqttSettings(broker=address, **settings)), network)
+    chosen = {"instance": "one", "mqtt": MqttSettings(broker=address, **settings)}
+    bridge = mqtt.Bridge((process or Settings()).model_copy(update=chosen), network)
     running = asyncio.create_task(bridge.run())
     try:
         yield bridge
@@ -82,6 +86,30 @@ async def test_topics_are_keys_and_payloads_the_texts_of_readers(session: Sessio
         assert dict(bridge.published) == {"tracks": 2, "events": 2, "zones": 1, "problems": 2}
         assert broker.refused == ([] if 5 in versions else [5])
     assert broker.of("/alive") == [b"1", b"0"]
+
+
+CPM = {"sites": {"garage": {"origin": (48.0, 11.0, 500.0)}}, "cpm": {"garage/*/*": {"station_id": 4711}}}
+
+
+@pytest.mark.parametrize("outputs", [{}, {"garage/*/*": {}}])
+async def test_collective_perception_messages_have_a_topic_of_their_own(session: Session, outputs: Any) -> None:
+    """Of the states that `outputs` predicts where a stream has them; other topics only where they are wanted."""
+    async with (
+        Broker() as broker,
+        bridging(session, broker, Settings(**CPM, outputs=outputs), topics=["cpm"]) as bridge,
+    ):
+        await until(lambda: bridge.connected)
+        now = AT + 10**8
+        one = tracks(1).model_copy(update={"stamp_ns": AT})
+        session.publish(one, one.model_copy(update={"predicted_to_ns": now}))
+        (text,) = await broker.wait(1, "/cpm")
+        message = json.loads(text)["message"]
+        assert (message["station_id"], len(message["perceived_object_container"])) == (4711, 1)
+        assert message["management_container"]["reference_time"] == 94_694_401_000 + (100 if outputs else 0)
+        assert {one.topic for one in broker.messages} == {ALIVE, f"{TOPIC}/cpm"}
+    with pytest.raises(ClientError, match="needs a station"):
+        async with bridging(session, broker, topics=["cpm"]):
+            pass
 
 
 async def test_events_wait_for_the_broker_and_tracks_do_not(session: Session) -> None:
