@@ -44,10 +44,11 @@ def write_openlabel(
     for index, time in zip(order, times, strict=True):
         one = tracks[index]
         objects = {}
-        for row, (number, label) in enumerate(zip(one.id.tolist(), one.label.tolist(), strict=True)):
+        cuboids = _cuboids(one, full=full)
+        for number, label, cuboid in zip(one.id.tolist(), one.label.tolist(), cuboids, strict=True):
             seen.setdefault(number, []).append(index)
             kinds[number] = one.labels[label]
-            objects[str(number)] = {"object_data": {"cuboid": [_cuboid(one, row, full=full)]}}
+            objects[str(number)] = {"object_data": {"cuboid": [cuboid]}}
         frames[str(index)] = {"frame_properties": {"timestamp": time}, **({"objects": objects} if objects else {})}
     systems: dict[str, Any] = {"world": {"type": "scene_cs", "parent": "", "children": []}}
     poses = sequence.poses
@@ -83,27 +84,31 @@ def write_openlabel(
     write_whole(path, json.dumps({"openlabel": content}, allow_nan=False).encode())
 
 
-def _cuboid(tracks: Tracks, row: int, *, full: bool) -> dict[str, Any]:
-    half = 0.5 * float(tracks.yaw[row])
-    turn = (0.0, 0.0, np.sin(half), np.cos(half))
-    box = np.concatenate([tracks.center[row], turn, tracks.size[row]])
-    numbers = {name: float(getattr(tracks, name)[row]) for name in ("existence", "score", "yaw_rate")}
-    vectors = {"velocity": tracks.velocity[row]}
+def _cuboids(tracks: Tracks, *, full: bool) -> list[dict[str, Any]]:
+    """Return the cuboid of each track of a frame."""
+    half, zero = 0.5 * tracks.yaw, np.zeros(len(tracks.id))
+    boxes = np.column_stack([tracks.center, zero, zero, np.sin(half), np.cos(half), tracks.size])
+    numbers = {name: _rounded(getattr(tracks, name)) for name in ("existence", "score", "yaw_rate")}
+    vectors = {"velocity": _rounded(tracks.velocity)}
     if full:
-        vectors["covariance"] = tracks.covariance[row][_UPPER]
-    return {
-        "name": "box",
-        "val": _rounded(box),
-        "coordinate_system": "world",
-        "attributes": {
-            "num": [{"name": name, "val": round(value, _DIGITS)} for name, value in numbers.items()],
-            "boolean": [{"name": "confirmed", "val": bool(shown(tracks)[row])}],
-            "vec": [{"name": name, "val": _rounded(values)} for name, values in vectors.items()],
-        },
-    }
+        vectors["covariance"] = _rounded(tracks.covariance[:, *_UPPER])
+    confirmed = shown(tracks).tolist()
+    return [
+        {
+            "name": "box",
+            "val": box,
+            "coordinate_system": "world",
+            "attributes": {
+                "num": [{"name": name, "val": values[row]} for name, values in numbers.items()],
+                "boolean": [{"name": "confirmed", "val": confirmed[row]}],
+                "vec": [{"name": name, "val": values[row]} for name, values in vectors.items()],
+            },
+        }
+        for row, box in enumerate(_rounded(boxes))
+    ]
 
 
-def _rounded(values: Floats) -> list[float]:
+def _rounded(values: Floats) -> list[Any]:
     return (np.round(values, _DIGITS) + 0.0).tolist()  # type: ignore[no-any-return]  # numpy's tolist
 
 

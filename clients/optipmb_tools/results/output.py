@@ -67,7 +67,7 @@ def track_columns(
     parts = [tracks[index] for index in order]
     frame = np.repeat(np.array(order, dtype=np.int64), [len(one.id) for one in parts])
     stamps = np.repeat(np.array([one.stamp_ns for one in parts], dtype=np.int64), [len(one.id) for one in parts])
-    names = [name for one in parts for name in np.asarray(one.labels, np.str_)[one.label]]
+    names = [np.asarray(one.labels, np.str_)[one.label] for one in parts]
     numbers = None if sequence is None else sequence.numbers
     columns: Columns = {} if sequence is None else {one: each[frame] for one, each in sequence.frame_columns.items()}
     if sequence is not None and sequence.time_column and sequence.times is not None:
@@ -76,7 +76,7 @@ def track_columns(
     else:
         columns = {"sequence": np.full(len(frame), name)} | columns | {"stamp_ns": stamps}
     columns |= {"frame": frame if numbers is None else numbers[frame]}
-    columns |= {"id": stacked(parts, "id"), "class": np.array(names, dtype=np.str_)}
+    columns |= {"id": stacked(parts, "id"), "class": np.concatenate([np.empty(0, np.str_), *names])}
     age, unseen, velocity = (stacked(parts, name) for name in ("age", "time_since_detection", "velocity"))
     unknown = (age == unseen) & (velocity == 0.0).all(axis=1)  # detected once, by a detector that gives none
     columns |= dict(zip("xyz", stacked(parts, "center").T, strict=True))
@@ -86,12 +86,14 @@ def track_columns(
     columns |= {name: stacked(parts, name) for name in ("yaw_rate", "acceleration", "score", "existence")}
     columns["confirmed"] = np.concatenate([np.empty(0, np.int64), *(shown(one).astype(np.int64) for one in parts)])
     columns |= {"age": age, "time_since_detection": unseen}
-    detection: list[float] = []
+    detections = []
     for index, part in zip(order, parts, strict=True):
-        rows = None if sequence is None else sequence.rows(index)
-        place = part.detection.tolist()
-        detection += [np.nan if one < 0 else one if rows is None else rows[one] for one in place]
-    columns["detection_row"] = np.array(detection, dtype=np.float64)
+        known = part.detection >= 0
+        place = np.where(known, part.detection, np.nan)
+        if sequence is not None and (rows := sequence.rows(index)) is not None:
+            place[known] = rows[part.detection[known]]
+        detections.append(place)
+    columns["detection_row"] = np.concatenate([np.empty(0), *detections])
     if objects is not None:
         columns |= objects.columns(columns["id"], stamps)
     elif parts and all(one.object is not None for one in parts):  # of a service that joins tracks
