@@ -163,6 +163,8 @@ class Ros2Stream(BaseModel):
     """use the covariances of the detections' positions"""
     fixed: bool = False
     """the sensor does not move and its frame is the world"""
+    cpm: bool = False
+    """publish collective perception messages on `/cpm` below the topic of the tracks, by the station of `cpm`"""
 
     @property
     def tracks_topic(self) -> str:
@@ -716,7 +718,7 @@ class Settings(BaseSettings):
     """joining of tracks of the same object over gaps, by session pattern; the first match applies; equal on all members
     of a cluster"""
     cpm: dict[Pattern, CpmSettings] = Field(default_factory=dict)
-    """stations that send collective perception messages over MQTT, by stream pattern, whose site is in
+    """stations that send collective perception messages over MQTT and to ROS 2, by stream pattern, whose site is in
     `sites`; the first match applies"""
     ros2: Ros2Settings = Ros2Settings()
     """topics of ROS 2, for `optipmb-service ros2`"""
@@ -731,6 +733,19 @@ class Settings(BaseSettings):
         for pattern in value:
             if (site := pattern.partition("/")[0]) not in info.data.get("sites", {}):
                 raise ValueError(f"{pattern}: a site that is in sites, received {site}")
+        return value
+
+    @field_validator("ros2", "mqtt")
+    @classmethod
+    def _check_stations(cls, value: Ros2Settings | MqttSettings, info: ValidationInfo) -> Ros2Settings | MqttSettings:
+        patterns = info.data.get("cpm", {})
+        if isinstance(value, MqttSettings):
+            if "cpm" in value.topics and not patterns:
+                raise ValueError('topics: "cpm" needs a station, [cpm."site/*/*"]')
+            return value
+        for name, one in value.streams.items():
+            if one.cpm and not any(fnmatchcase(name, pattern) for pattern in patterns):
+                raise ValueError(f"streams.{name}.cpm: needs a station, [cpm.PATTERN] that matches")
         return value
 
     def zones_of(self, session: str) -> list[str]:

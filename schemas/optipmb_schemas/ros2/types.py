@@ -15,6 +15,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 
 from optipmb_schemas.errors import MessageError, cut
+from optipmb_schemas.ros2 import cpm
 
 __all__ = ["AUTOWARE", "Types", "own_types"]
 
@@ -141,13 +142,14 @@ class Types:
     Args:
         carried: Definitions that came with the data, by type; they take the place of ours, because they are what the
             data were written with.
+        perception: Whether the types of collective perception messages are among them.
 
     Raises:
         MessageError: A definition that came with the data cannot be read.
     """
 
-    def __init__(self, carried: Mapping[str, MessageDefinition] | None = None) -> None:
-        self._store = _own_store()
+    def __init__(self, carried: Mapping[str, MessageDefinition] | None = None, *, perception: bool = False) -> None:
+        self._store = _own_store(perception=perception)
         self._carried: dict[str, Any] = {}
         for name, definition in (carried or {}).items():
             if definition.format != MessageDefinitionFormat.NONE:
@@ -206,7 +208,7 @@ class Types:
 
 
 @functools.cache
-def _own_store() -> Any:
+def _own_store(*, perception: bool = False) -> Any:
     """Return the store of rosbags with the definitions made here; to make it takes longer than to read a small bag."""
     store = get_typestore(Stores.ROS2_JAZZY)
     ours: dict[str, Any] = {}
@@ -214,14 +216,16 @@ def _own_store() -> Any:
         for lines in text.strip().split("\n\n"):
             kind, _, fields = lines.partition("\n")
             ours |= get_types_from_msg(fields, f"{package}/{kind}")
+    for kind, fields in cpm.definitions() if perception else ():
+        ours |= get_types_from_msg(fields, f"{cpm.PACKAGE}/{kind}")
     store.register(ours)
     return store
 
 
 @functools.cache
-def own_types() -> Types:
-    """Return the types without any that came with data."""
-    return Types()
+def own_types(*, perception: bool = False) -> Types:
+    """Return the types without any that came with data, with those of collective perception where asked for."""
+    return Types(perception=perception)
 
 
 def _carried_store(name: str, definition: MessageDefinition) -> Any:

@@ -233,7 +233,7 @@ class Bridge(Component):
         sessions: returns the session that a stream feeds.
 
     Raises:
-        ClientError: a certificate or the credentials cannot be used, or CPM have no station.
+        ClientError: a certificate or the credentials cannot be used.
     """
 
     def __init__(self, settings: Settings, client: Client, sessions: Callable[[str], str] = str) -> None:
@@ -246,8 +246,6 @@ class Bridge(Component):
         self.refused: collections.Counter[str] = collections.Counter()
         self.left_out: collections.Counter[str] = collections.Counter()
         """Objects without a place in the CPM, by reason."""
-        if "cpm" in settings.mqtt.topics and not settings.cpm:
-            raise ClientError('settings mqtt.topics: "cpm" needs a station, [cpm."site/*/*"]')
         self._settings = settings
         self._stations: dict[str, Station | None] = {}
         self._keys = client.keys

@@ -4,6 +4,7 @@
 """
 
 import collections
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -12,6 +13,8 @@ from typing import Any
 import jsonschema
 import numpy as np
 import pytest
+from optipmb_schemas.ros2.cpm import CPM, cpm_fields, definitions
+from optipmb_schemas.ros2.types import own_types
 from optipmb_service.edges.cpm import Station, station_of
 from optipmb_service.settings import Settings, SettingsInvalidError, load
 from tracks_message import tracks_message
@@ -284,6 +287,50 @@ def test_objects_without_a_place_are_left_out_and_counted() -> None:
     assert counted == {"far": 1, "id": 1, "many": 40, "clock": 2}
 
 
+def plain(message: Any) -> Any:
+    """Return a message of ROS 2 without what it needs for numbers, lists, choices and fields that are absent."""
+    if isinstance(message, list):
+        return [plain(one) for one in message]
+    if not dataclasses.is_dataclass(message):
+        return message
+    found = {one.name: getattr(message, one.name) for one in dataclasses.fields(message) if one.name[0] != "_"}
+    present = {name.removesuffix("_is_present"): one for name, one in found.items() if name.endswith("_is_present")}
+    kept = [name for name in found if not name.endswith("_is_present") and present.get(name, True)]
+    if "choice" in found:
+        kept = [kept[1 + found["choice"]]]
+    if kept in (["value"], ["array"]):
+        return plain(found[kept[0]])
+    return {name: plain(found[name]) for name in kept}
+
+
+def test_the_message_of_ros_has_what_json_has() -> None:
+    """Through its bytes: the same numbers under the names of the ASN.1, and no field that JSON lacks."""
+    sender = station(most=20, sensors=[{"id": 3, "type": "radar"}])
+    known = {"measured": np.arange(40) % 8, "label": np.arange(40) % len(LABELS), "velocity": [3.0, -4.0], "yaw": -0.9}
+    first, second = texts(sender, frame(0, range(40), **known))
+    types = own_types(perception=True)
+    read = plain(types.read(CPM, types.write(types.new(CPM, **cpm_fields(first["message"], 300)))))
+    assert read["header"] == {"protocol_version": 2, "message_id": 14, "station_id": 4711}
+    management = first["message"]["management_container"]
+    given = read["payload"]["management_container"]
+    ellipse = {"semi_major_confidence": 4095, "semi_minor_confidence": 4095, "semi_major_orientation": 3601}
+    altitude = {"altitude_value": 48_900, "altitude_confidence": 15}
+    place = management["reference_position"] | {"position_confidence_ellipse": ellipse, "altitude": altitude}
+    assert given == management | {"reference_position": place}
+    sensors, perceived = read["payload"]["cpm_containers"]
+    assert (sensors["container_id"], perceived["container_id"]) == (3, 5)
+    named = sensors["container_data_sensor_information_container"]
+    assert named == first["message"]["sensor_information_container"]
+    perceived = perceived["container_data_perceived_object_container"]
+    assert perceived["number_of_perceived_objects"] == 255
+    renamed = json.dumps(first["message"]["perceived_object_container"])
+    for theirs, name in (("vehicle", "vehicle_sub_class"), ("vru", "vru_sub_class"), ("other", "other_sub_class")):
+        renamed = renamed.replace(f'"{theirs}"', f'"{name}"')
+    assert perceived["perceived_objects"] == json.loads(renamed.replace("motorcylist", "motorcyclist"))
+    assert "sensor_information_container" not in second["message"]
+    assert len(dict(definitions())) == 120
+
+
 @pytest.mark.parametrize(
     ("text", "error"),
     [
@@ -293,6 +340,8 @@ def test_objects_without_a_place_are_left_out_and_counted() -> None:
         ),
         ('[cpm."*/*/*"]\nstation_id = 1', "a site that is in sites, received *"),
         ('[sites.a]\norigin = [1, 2, 3]\n[cpm."a/*/*"]\nsource_uuid = "x"', "station_id"),
+        ('[mqtt]\ntopics = ["cpm"]', 'setting mqtt (from the file): topics: "cpm" needs a station'),
+        ('[ros2.streams."a/b/c"]\ndetections = "/d"\ncpm = true', "streams.a/b/c.cpm: needs a station"),
         ('[sites.a]\norigin = [1, 2, 3]\n[cpm."a/*/*"]\nstation_id = 1\nsensors = [{id = 1, type = "sonar"}]', "sonar"),
     ],
 )

@@ -4,9 +4,10 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
-import optipmb_schemas as schemas
 import pytest
 from optipmb_client.incoming import Arrival
+from optipmb_schemas import encode, encoding_of
+from optipmb_schemas.ros2.cpm import CPM
 from optipmb_schemas.ros2.tracks import TRACKED
 from optipmb_schemas.ros2.types import own_types
 from optipmb_service.edges.ros2.graph import Endpoint, Node
@@ -38,37 +39,74 @@ def test_more_than_can_be_handled_keeps_nothing_waiting_that_is_due(monkeypatch:
     assert time.monotonic() < gives_up
 
 
+class Bridging:
+    """A bridge whose node is a stand-in: what it subscribes to is called, what it publishes is kept."""
+
+    def __init__(self, stream: str, **given: Any) -> None:
+        self.stream = stream
+        self.published: list[tuple[str, Any]] = []
+        self._receive: dict[str, Any] = {}
+        types = own_types(perception=True)
+
+        def publish(topic: str, message: Any) -> None:
+            types.write(message)
+            self.published.append((topic, message))
+
+        def ignore(*_: Any, **__: Any) -> None:
+            """Do nothing."""
+
+        node: Any = SimpleNamespace(types=types, publish=publish, client=None, join=self._receive.__setitem__)
+        node.advertise = node.subscribe = node.watch = ignore
+        node.listened = lambda _: False
+        node.endpoint = lambda kind, topic, type_, qos: Endpoint(Node(0, "", "", "", 0), 0, kind, topic, type_, "", qos)
+        self._work = Work(load(None, {"store": "none", **given}).settings, node)
+        self._work.open()
+        self._work._bridge._streams[stream].epoch = bytes(16)
+
+    def receive(self, *messages: Any, topic: str = "tracks") -> None:
+        for message in messages:
+            arrival = Arrival(f"optipmb/v1/{self.stream}/{topic}", encode(message), encoding_of(message), 0)
+            self._receive[self.stream](arrival)
+        while self._work._queue:
+            self._work.work(0.05)
+
+    def of(self, kind: str) -> list[Any]:
+        return [one for _, one in self.published if one.__msgtype__ == kind]
+
+
 def test_tracks_that_ros_cannot_hold_keep_no_others_waiting() -> None:
     """Tracks after January 2038 are logged with their key, and tracks of the next frames are published."""
-    given: dict[str, Any] = {}
-    published: list[Any] = []
-
-    def publish(topic: str, message: Any) -> None:
-        types.write(message)
-        published.append(message)
-
-    def ignore(*_: Any, **__: Any) -> None:
-        """Do nothing."""
-
-    types = own_types()
-    node: Any = SimpleNamespace(types=types, publish=publish, client=None, join=given.__setitem__)
-    node.advertise = node.subscribe = node.watch = ignore
-    node.listened = lambda _: False
-    node.endpoint = lambda kind, topic, type_, qos: Endpoint(Node(0, "", "", "", 0), 0, kind, topic, type_, "", qos)
     stream = "garage/robot-1/lidar"
-    settings = load(None, {"store": "none", "ros2": {"streams": {stream: {"detections": "/boxes"}}}}).settings
-    work = Work(settings, node)
-    work.open()
-    work._bridge._streams[stream].epoch = bytes(16)
+    bridging = Bridging(stream, ros2={"streams": {stream: {"detections": "/boxes"}}})
+    stamps = (10**18, 2**62, 10**18 + 10**8)
     with capture_logs() as logs:
-        for seq, stamp_ns in enumerate((10**18, 2**62, 10**18 + 10**8)):
-            message = tracks_message(stream, seq, [1], stamp_ns=stamp_ns)
-            key = f"optipmb/v1/{stream}/tracks"
-            given[stream](Arrival(key, schemas.encode(message), schemas.encoding_of(message), 0))
-        while work._queue:
-            work.work(0.05)
-    stamps = [one.header.stamp for one in published if one.__msgtype__ == TRACKED]
-    assert [one.sec * 10**9 + one.nanosec for one in stamps] == [10**18, 10**18 + 10**8]
+        bridging.receive(*(tracks_message(stream, seq, [1], stamp_ns=one) for seq, one in enumerate(stamps)))
+    found = [one.header.stamp for one in bridging.of(TRACKED)]
+    assert [one.sec * 10**9 + one.nanosec for one in found] == [10**18, 10**18 + 10**8]
     ((what, said),) = [(one["key"], one["message"]) for one in logs if one["event"] == "problem"]
-    assert what == key
+    assert what == f"optipmb/v1/{stream}/tracks"
     assert "2147483647" in said
+
+
+@pytest.mark.parametrize("outputs", [{}, {"garage/*/*": {}}])
+def test_collective_perception_messages_have_a_topic_below_the_tracks(outputs: dict[str, Any]) -> None:
+    """Of twenty objects each, of the states that `outputs` predicts where the stream has them."""
+    stream = "garage/robot-1/lidar"
+    about: dict[str, Any] = {
+        "sites": {"garage": {"origin": (48.0, 11.0, 500.0)}},
+        "cpm": {"garage/*/*": {"station_id": 7}},
+    }
+    about["ros2"] = {"streams": {stream: {"detections": "/boxes", "cpm": True}}}
+    bridging = Bridging(stream, outputs=outputs, **about)
+    at = 1_167_609_600 * 10**9  # 2007-01-01, 94,694,401,000 ms in TimestampIts
+    one = tracks_message(stream, 0, range(25), stamp_ns=at, confirmed=1)
+    bridging.receive(one)
+    bridging.receive(one.model_copy(update={"predicted_to_ns": at + 10**8}), topic="now")
+    found = [(topic, message.payload) for topic, message in bridging.published if message.__msgtype__ == CPM]
+    assert [topic for topic, _ in found] == ["/boxes/tracks/cpm"] * 2
+    times = {payload.management_container.reference_time.value for _, payload in found}
+    assert times == {94_694_401_000 + (100 if outputs else 0)}
+    containers = [payload.cpm_containers.value.array[0] for _, payload in found]
+    objects = [one.container_data_perceived_object_container for one in containers]
+    assert [len(one.perceived_objects.array) for one in objects] == [20, 5]
+    assert {one.number_of_perceived_objects.value for one in objects} == {25}

@@ -17,7 +17,10 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 import optipmb_schemas as schemas
 from optipmb_schemas.ros2 import arrays, tracks
+from optipmb_schemas.ros2.cpm import CPM, cpm_fields
 from optipmb_schemas.ros2.transforms import TransformError, Transforms
+
+from optipmb_service.edges.cpm import Station, station_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -40,6 +43,8 @@ RESTART_S: Final = 5.0
 """Longest wait for a session that is to restart."""
 CLOUDS_S: Final = 2.0
 """Without a cloud for so long none is waited for."""
+OBJECTS: Final = 20
+"""Objects of a CPM, so that its encoding fits into one packet on the air."""
 CLOCK_BACK_NS: Final = 5 * 10**9
 """Stamps of detections that go back by more: the clock was set back, as of a simulation that restarts."""
 
@@ -92,6 +97,10 @@ class _Stream:
     """The newest of the bridge."""
     service_problem: str = ""
     """The newest of the service."""
+    station: Station | None = None
+    """Sender of its CPM."""
+    left_out: collections.Counter[str] = field(default_factory=collections.Counter)
+    """Objects without a place in the CPM, by reason."""
 
 
 class Bridge:
@@ -104,6 +113,8 @@ class Bridge:
         self._node = node
         self._transforms = Transforms(kept=KEPT, frames=FRAMES)
         self._streams = {name: _Stream(name, topics) for name, topics in settings.ros2.streams.items()}
+        for name, one in self._streams.items():
+            one.station = station_of(settings, name, OBJECTS) if one.topics.cpm else None
 
     def take_transforms(self, message: Any, *, static: bool) -> None:
         """Apply a `TFMessage`; messages that waited for it go out.
@@ -189,6 +200,23 @@ class Bridge:
         for end, one in made:
             self._node.publish(stream.topics.tracks_topic + end, one)
         stream.shown_ns = message.stamp_ns
+        if stream.station is not None and not stream.station.predicted:
+            self._perceive(stream, stream.station, message)
+
+    def take_predicted(self, message: schemas.Tracks) -> None:
+        """Publish the CPM of predicted tracks.
+
+        Raises:
+            MessageError: ROS has no place for a value of theirs.
+        """
+        stream = self._streams[message.stream]
+        if stream.station is not None and message.epoch == stream.epoch and message.session != stream.ended:
+            self._perceive(stream, stream.station, message)
+
+    def _perceive(self, stream: _Stream, station: Station, message: schemas.Tracks) -> None:
+        for one in station.messages(message, stream.left_out):
+            made = self._node.types.new(CPM, **cpm_fields(one["message"], station.perceived))
+            self._node.publish(f"{stream.topics.tracks_topic}/cpm", made)
 
     def take_problem(self, problem: schemas.Problem) -> None:
         """Note a problem that the service reports of a stream."""
@@ -215,6 +243,7 @@ class Bridge:
                 "tracks": one.tracks,
                 "latency_ms": f"{one.latency_ms:.1f}",
                 "problems": one.problems,
+                "cpm_left_out": one.left_out.total(),
                 "last_problem": one.problem,
                 "last_service_problem": one.service_problem,
             }

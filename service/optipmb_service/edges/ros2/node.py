@@ -52,7 +52,8 @@ class Ros2Node:
     def __init__(self, settings: Settings) -> None:
         self.client = Client(settings)
         """The client of the service."""
-        self.types = own_types()
+        self.types = own_types(perception=any(one.cpm for one in settings.ros2.streams.values()))
+        self._predicted = {name for name, one in settings.ros2.streams.items() if one.cpm and settings.output_of(name)}
         self._domain = settings.ros2.domain
         self._node = graph.Node(self._domain, self.client.id, settings.ros2.node)
         self._entities = 0
@@ -130,9 +131,11 @@ class Ros2Node:
     # The service
 
     def join(self, stream: str, receive: Callable[[Arrival], object]) -> None:
-        """Open the publishers of a stream, and hand over its tracks and problems."""
+        """Open the publishers of a stream, and hand over its tracks and problems, and what CPM are made of."""
         self._outgoing[stream] = self.client.publish(stream, CACHE, cache_clouds=0, wanted=lambda: None)
-        for key in (self.client.keys.tracks(stream), self.client.keys.problems(stream)):
+        keys = self.client.keys
+        now = [keys.now(stream)] if stream in self._predicted else []
+        for key in (keys.tracks(stream), keys.problems(stream), *now):
             self.client.subscribe(key, receive)
 
     def send(self, stream: str, message: schemas.Detections | schemas.Points) -> None:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import optipmb_schemas as schemas
 import structlog
 from optipmb_schemas.ros2.arrays import CLOUD
+from optipmb_schemas.ros2.cpm import CPM
 from optipmb_schemas.ros2.tracks import TOPICS
 
 from optipmb_service.edges.ros2 import graph
@@ -114,7 +115,8 @@ class Work(Component):
             ours[subscription(stream.detections, stream.type, SENSOR)] = partial(bridge.take, name, "detections")
             if stream.points:
                 ours[subscription(stream.points, CLOUD, SENSOR)] = partial(bridge.take, name, "points")
-            ours |= {publisher(stream.tracks_topic + end, kind, OFFERED): None for end, kind in TOPICS.items()}
+            topics = TOPICS | ({"/cpm": CPM} if stream.cpm else {})
+            ours |= {publisher(stream.tracks_topic + end, kind, OFFERED): None for end, kind in topics.items()}
         if ros2.diagnostics:
             ours[publisher(ros2.diagnostics, DIAGNOSTICS, OFFERED)] = None
         return ours
@@ -140,7 +142,9 @@ class Work(Component):
 
     def _come_back(self, one: Arrival) -> None:
         try:
-            if one.key.endswith("/tracks"):
+            if one.key.endswith("/now"):
+                self._bridge.take_predicted(one.read(schemas.Tracks))
+            elif one.key.endswith("/tracks"):
                 self._bridge.take_tracks(one.read(schemas.Tracks))
             else:
                 self._bridge.take_problem(one.read(schemas.Problem))
