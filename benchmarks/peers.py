@@ -4,11 +4,12 @@
     out/peers/bin/pip install stonesoup norfair trackers
     out/peers/bin/python benchmarks/peers.py
 
-Prints one JSON object: tracker, objects, and the milliseconds of processor time of each frame after the first few.
-What a tracker needs as input (its own detection objects) is made before the clock starts. A tracker that needs longer
-than `PATIENCE_S` for a frame is not given larger scenes. Each is set up as its documentation shows, with a gate of 4 m
-and prediction over the period of the scene; none of them receives the classes, most have no oriented boxes. BoxMOT
-is not among them: it needs torch with the libraries of CUDA, several GB for trackers that run without.
+Prints one JSON object: tracker and version, objects, and the milliseconds of processor time of each frame after the
+first few. What a tracker needs as input (its own detection objects) is made before the clock starts. A tracker that
+needs longer than `PATIENCE_S` for a frame is not given larger scenes. Each is set up as its documentation shows, with a
+gate of 4 m and prediction over the period of the scene; none of them receives the classes, most have no oriented boxes.
+BoxMOT is not among them: it needs torch with the libraries of CUDA, several GB for trackers that run without, and its
+licence is the AGPL.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import datetime as dt
 import json
 import sys
 import time
+from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -107,7 +109,11 @@ def norfair(_: int) -> tuple[Callable[[SceneFrame], Any], Step]:
     return prepare, lambda detections: tracker.update(detections=detections)
 
 
-PEERS = {"Stone Soup": stone_soup, "ByteTrack": bytetrack, "norfair": norfair}
+PEERS = {
+    ("Stone Soup", "stonesoup"): stone_soup,
+    ("ByteTrack", "trackers"): bytetrack,
+    ("norfair", "norfair"): norfair,
+}
 
 
 def timed(peer: Callable[[int], tuple[Callable[[SceneFrame], Any], Step]], objects: int) -> list[float]:
@@ -127,13 +133,14 @@ def timed(peer: Callable[[int], tuple[Callable[[SceneFrame], Any], Step]], objec
 def main(sizes: list[int]) -> None:
     """Time every peer that is installed, in growing scenes."""
     found: dict[str, dict[int, list[float]]] = {}
-    for name, peer in PEERS.items():
+    for (tracker, package), peer in PEERS.items():
+        try:
+            name = f"{tracker} {version(package)}"
+        except PackageNotFoundError as error:
+            print(f"{tracker}: not installed ({error})", file=sys.stderr)
+            continue
         for objects in sizes:
-            try:
-                times = timed(peer, objects)
-            except ImportError as error:
-                print(f"{name}: not installed ({error})", file=sys.stderr)
-                break
+            times = timed(peer, objects)
             found.setdefault(name, {})[objects] = times
             print(f"{name}, {objects} objects: {np.median(times):.2f} ms", file=sys.stderr)
             if np.median(times) > 1e3 * PATIENCE_S:

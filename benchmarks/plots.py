@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 # Okabe and Ito's palette.
 BLUE, ORANGE, GREEN, RED, PURPLE, SKY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9"
-PEER_STYLES = {"Stone Soup": (RED, "s"), "motpy": (ORANGE, "^"), "norfair": (PURPLE, "D")}
+PEER_STYLES = {"Stone Soup": (RED, "s"), "ByteTrack": (ORANGE, "^"), "norfair": (PURPLE, "D")}
 DPI = 110
 STAGES = ("predict", "preprocess", "detection_probability", "update", "extract")
 """The parts of a step, by the names of their functions."""
@@ -25,7 +25,7 @@ def scaling(found: dict[str, Any], path: Path) -> None:
     step, floor = found["dense"]["step"], found["dense"]["bare"]
     sizes = list(step)
     for name, times in found["peers"].items():
-        colour, marker = PEER_STYLES.get(name, (SKY, "v"))
+        colour, marker = PEER_STYLES.get(name.rpartition(" ")[0], (SKY, "v"))
         known = [int(size) for size in times]
         axes.loglog(known, [np.median(times[str(n)]) for n in known], color=colour, marker=marker, label=name)
     medians = [step[n]["median"] for n in sizes]

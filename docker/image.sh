@@ -15,6 +15,6 @@ for platform in $(echo "$platforms" | tr , ' '); do
   images="$images $name-$arch"
 done
 if [ -n "$repository" ]; then
-  docker manifest create "$name" $images
+  docker manifest create --amend "$name" $images
   docker manifest push "$name"
 fi
