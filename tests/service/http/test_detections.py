@@ -62,6 +62,15 @@ def socket(address: str, query: str, **options: Any) -> Iterator[WebSocket]:
         connection.shutdown()
 
 
+def cut(edge: Edge, body: Any) -> bool:
+    """Send a request, and end the connection before the answer has come."""
+    payload = json.dumps(body).encode()
+    head = f"POST /api/v1/detections?{STREAM} HTTP/1.1\r\nhost: {edge.address}\r\ncontent-type: application/json\r\n"
+    with open_connection((edge.address.rpartition(":")[0], int(edge.address.rpartition(":")[2]))) as connection:
+        connection.sendall(f"{head}content-length: {len(payload)}\r\n\r\n".encode() + payload)
+    return True
+
+
 def error(body: Any) -> tuple[str, str]:
     (one,) = body["frames"]
     return one["error"]["code"], one["error"]["path"]
@@ -94,20 +103,23 @@ def test_the_same_frames_give_the_same_bytes(start: Any) -> None:
 
 
 def test_a_frame_that_is_sent_again_counts_once(endpoint: str) -> None:
-    """Each request is sent twice, and the edge started again between two frames: tracks come once, ids go on."""
+    """Each request is cut before its answer and sent twice more, over two edges: tracks come once, ids go on."""
     with Node(endpoint) as node:
         for first in (0, 4):
             with Edge(endpoint) as edge:
                 if first:  # the answer to this one was lost with the edge before
-                    again = edge.post(frame(first - 1), f"{STREAM}&wait=5")
+                    again = edge.post(frame(first), f"{STREAM}&wait=5")
                     assert again.body["frames"][0]["duplicate"]
-                    assert again.body["tracks"]["seq"] == first - 1
+                    assert again.body["tracks"]["seq"] == first
                     assert error(edge.post(frame(0) | {"stamp_ns": 5}, STREAM).body) == ("late", "")
-                for seq in range(first, first + 4):
+                for seq in range(first + (first > 0), first + 4):
+                    cut(edge, frame(seq))
                     answers = [edge.post(frame(seq), f"{STREAM}&wait=5&confirmed=0").body for _ in range(2)]
-                    assert [one["frames"][0]["duplicate"] for one in answers] == [False, True]
+                    assert answers[1]["frames"][0]["duplicate"]
                     assert answers[0]["tracks"]["objects"] == answers[1]["tracks"]["objects"]
-                    assert answers[0]["frames"][0]["seq"] == seq - first
+                    assert answers[0]["frames"][0]["seq"] == seq - first - (first > 0)
+                if not first:  # a server that sees the end of a connection first does not read the request
+                    until(lambda: cut(edge, frame(4)) and len(node.tracks_seen.items) == 5, "tracks of frame 4")
         tracks = node.tracks(SENSOR.stream, 8)
     assert [one.stamp_ns for one in tracks] == [SENSOR.stamp_ns(seq) for seq in range(8)]
     assert len({(one.session, *one.id.tolist()) for one in tracks}) == 1
