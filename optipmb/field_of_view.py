@@ -42,9 +42,6 @@ FARTHEST: Final = 1e9
 ROUNDING: Final = 1e-9
 """By how much an interval may be wider than the full turn, rad."""
 
-LONGEST_UNSEEN_S: Final = 6.0
-"""Time since the last detection, s, from which an object out of view is missed."""
-
 _NO_LIMIT: Final = 2.0
 """No sine and no cosine is larger."""
 
@@ -199,7 +196,7 @@ def look(view: FieldOfView | None, prior: Density, moment: Moment, table: ClassT
     missed for long. A Poisson component that is out of view ages no further.
 
     With p_s = 1 nothing else would end them, so this holds for a while only: all time counts as missed for an object
-    that was not detected for `LONGEST_UNSEEN_S`, and for a component whose gate no longer holds one standard deviation
+    that was not detected for `unseen_time`, and for a component whose gate no longer holds one standard deviation
     of its position.
 
     A sensor looks at a class with its attention (`optipmb.Sensor`): a miss counts for that part of the time, and the
@@ -228,7 +225,7 @@ def look(view: FieldOfView | None, prior: Density, moment: Moment, table: ClassT
         counted = in_view * attention
         looked_ns = misses.looked_ns + np.rint(attention * (looked_ns - misses.looked_ns)).astype(np.int64)
     time, missed_from_ns = count_looks(counted, misses.looked_ns, misses.missed_from_ns, tuple(moment))
-    lost = now_ns - bernoulli.seen_ns > LONGEST_UNSEEN_S * 1e9
+    lost = now_ns - bernoulli.seen_ns > table.unseen_time * 1e9
     missed_from_ns[lost] = misses.missed_from_ns[lost]
     if len(poisson):
         xx, xy, yy = poisson.covariance[:, X, X], poisson.covariance[:, X, Y], poisson.covariance[:, Y, Y]

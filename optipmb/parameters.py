@@ -331,6 +331,11 @@ class Parameters(ParameterTable):
     self_calibration: bool = Field(
         default=False, exclude_if=not_, description="true: scores are calibrated by `optipmb.self_calibration`"
     )
+    unseen_time: Positive = Field(
+        default=6.0,
+        exclude_if=(6.0).__eq__,
+        description="time, s, since its last detection from which an object out of view is missed",
+    )
     starts_tracks: bool = Field(
         default=True, exclude_if=bool, description="false: detections continue tracks, and start and announce none"
     )

@@ -151,6 +151,7 @@ class ClassTable:
         classes: (C,) array of `CLASS`, for kernels; `table["gate"]` is a column of it.
         period: nominal period, s.
         detection_time: s that p_d holds for, zero per frame (`optipmb.detection_probability.over_time`).
+        unseen_time: s since its last detection from which an object out of view is missed.
         confusion: (C, C) Lambda of `optipmb.class_posterior`; (0, 0) where no two classes have a group in common.
         attention: (C,) of `optipmb.Sensor`; None where all are 1.
     """
@@ -158,6 +159,7 @@ class ClassTable:
     classes: Sequence[ClassRow]
     period: float
     detection_time: float
+    unseen_time: float
     confusion: Array
     attention: Array | None
 
@@ -204,7 +206,8 @@ class ClassTable:
         confusion = _confusion(classes, np.array([p.class_confusion for p in rows]))
         attention = np.array([p.attention for p in rows])
         narrow = None if (attention == 1.0).all() else attention
-        table = cls(classes, parameters.nominal_period, parameters.detection_time, confusion, narrow)
+        times = parameters.nominal_period, parameters.detection_time, parameters.unseen_time
+        table = cls(classes, *times, confusion, narrow)
         table.restrict(parameters)
         return table
 

@@ -262,6 +262,8 @@ class MappingSettings(BaseModel):
     """form of the time: ISO 8601 text, or a number since 1970"""
     time_zone: str = Field(default="", pattern=r"^(|Z|[+-]\d\d:\d\d)$")
     """zone of ISO texts without one, as `+01:00`"""
+    leave_out: dict[PathText, bool | str] = Field(default_factory=dict)
+    """values by their paths in the payload; a payload with one of them has no objects"""
     frame: Literal["world", "sensor"] = "world"
     """frame of all coordinates"""
     pose: dict[Literal["translation", "quaternion"], tuple[float, ...]] | None = None
@@ -277,7 +279,7 @@ class MqttInput(BaseModel):
     """topic; `+` stands for any part, which `{1}`, `{2}` … name in the stream"""
     qos: Literal[0, 1, 2] = 1
     """quality of service that the broker is asked for"""
-    format: Literal["optipmb", "axis", "scenescape", "mapped"] = "optipmb"
+    format: Literal["optipmb", "axis", "frigate", "scenescape", "mapped"] = "optipmb"
     """form of payloads: frames as over HTTP, a known maker's, or that which `mapping` describes"""
     mapping: MappingSettings | None = None
     """paths of a payload, for the format `mapped`"""
@@ -470,6 +472,14 @@ class InputSettings(BaseModel):
     """names of classes by those of the sender, as `{ Human = "pedestrian" }`; others stay"""
     camera: Path | None = None
     """file of the calibration by which boxes and feet in pixels become places on the ground"""
+    complete: bool | None = None
+    """`false`: a frame has some of the objects and says nothing of the others; default: `true`, and `false` for the
+    format `frigate`"""
+    missing_s: float = Field(default=10.0, gt=0, le=3600)
+    """time after the last report of an object from which it counts as missed, with `complete = false`"""
+
+
+_USUAL: Final = InputSettings()
 
 
 SENSOR_TYPES: Final = (
@@ -756,6 +766,21 @@ class Settings(BaseSettings):
             for name, one in sorted(self.zones.items())
             if any(fnmatchcase(session, pattern) for pattern in one.streams) and (not one.geo or site in self.sites)
         ]
+
+    def input_of(self, stream: str) -> InputSettings:
+        """Return how frames of a stream are read that come as JSON."""
+        one = next((one for pattern, one in self.inputs.items() if fnmatchcase(stream, pattern)), _USUAL)
+        if one.complete is None and any(
+            each.format == "frigate" and fnmatchcase(stream, re.sub(r"\{\d\}", "*", name))
+            for name, each in self.mqtt.inputs.items()
+        ):
+            return one.model_copy(update={"complete": False})
+        return one
+
+    def missing_s(self, session: str) -> float | None:
+        """Return the time without a report after which objects count as missed; None: that of the profile."""
+        one = self.input_of(session)
+        return one.missing_s if one.complete is False else None
 
     @property
     def fused_sessions(self) -> dict[str, FusedSettings]:

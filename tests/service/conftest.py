@@ -41,7 +41,7 @@ def start(_compiled: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
             given = {"listen": [endpoint], "instance": "test", "grace_s": 0.2, "store": "none", "profile": "nuscenes"}
             given |= options
             settings = load(None, given).settings
-            profiles = Profiles.read(settings.profile, settings.profiles, settings.sensors)
+            profiles = Profiles.read(settings.profile, settings.profiles, settings.sensors, settings.missing_s)
             service = Service(settings, profiles, arm, tracker)
             stack.callback(service.stop)
             service.start()

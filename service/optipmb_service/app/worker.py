@@ -74,7 +74,7 @@ class Parent:
 def run(settings: Settings, parent: Parent | None = None) -> int:
     """Track until SIGINT or SIGTERM, or until the parent says so; returns the exit status."""
     try:
-        profiles = Profiles.read(settings.profile, settings.profiles, settings.sensors)
+        profiles = Profiles.read(settings.profile, settings.profiles, settings.sensors, settings.missing_s)
         profiles.check_zones(settings.zones)
     except optipmb.ParameterError as error:
         if parent is None or parent.index == 0:  # of all workers one says it

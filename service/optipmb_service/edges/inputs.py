@@ -22,6 +22,7 @@ from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_client.incoming import Answer
 from optipmb_client.trace_context import attachment_of
 
+from optipmb_service.edges.json_frames import separate
 from optipmb_service.telemetry.problem_reporter import ProblemReporter
 from optipmb_service.zenoh.client import IdlePool
 
@@ -161,6 +162,19 @@ class InFlight:
                 self._frames.clear()
 
 
+async def put(publish: Callable[[bytes, bytes | None], object], payload: bytes, traceparent: str) -> None:
+    """Hand a message to the network with its trace context, which is unchecked.
+
+    Raises:
+        TransportError: the network cannot be used.
+    """
+    attachment = attachment_of(traceparent)
+    if len(payload) <= INLINE_BYTES:
+        publish(payload, attachment)
+    else:
+        await asyncio.to_thread(publish, payload, attachment)
+
+
 class _Clock:
     """Stamps of frames that do not keep the sender's. Created for each stream."""
 
@@ -292,24 +306,44 @@ class Inputs:
         async with self._used(name) as stream:
             async with stream.lock:  # taken once: frames of a stream go out in the order in which they came
                 await self._prepare(name, stream)
-                mark = _mark(frame, repeats)
-                sent = None if frame.is_numbered else self._before(stream, frame, mark, rules)
-                if is_new := sent is None:
-                    sent = self._numbered(stream, frame, rules)
-                tracks: asyncio.Future[Answer] = self._loop.create_future()
-                if wait_s:
-                    stream.waiting.setdefault(sent[:2], []).append(tracks)
-                if is_new:
-                    try:
-                        await self._put(stream, frame, sent, traceparent)
-                    except BaseException:
-                        stream.leave(sent, tracks)
-                        raise
-                    self._remember(stream, mark, sent)
+                parts = separate(frame) if rules.complete is False else [frame]
+                for at, one in enumerate(parts):
+                    tracks = self._loop.create_future() if wait_s and one is parts[-1] else None
+                    mark = _mark(one, repeats, at)
+                    sent, is_new = await self._handed(stream, one, mark, rules, traceparent, tracks)
             counts = self.frames if is_new else self.duplicates
             counts[self._edge] += 1
-            found = await self._tracks(stream, name, sent, tracks, wait_s, is_new=is_new) if wait_s else None
+            found = await self._tracks(stream, name, sent, tracks, wait_s, is_new=is_new) if tracks else None
             return sent, not is_new, found
+
+    async def _handed(
+        self,
+        stream: _Stream,
+        frame: JsonFrame,
+        mark: Hashable,
+        rules: InputSettings,
+        traceparent: str,
+        tracks: asyncio.Future[Answer] | None,
+    ) -> tuple[Sent, bool]:
+        """Send a frame, unless it was sent before, and wait for its tracks; return its numbers, and whether it is new.
+
+        Raises:
+            RefusedError: it is not sent now.
+        """
+        sent = None if frame.is_numbered else self._before(stream, frame, mark, rules)
+        if is_new := sent is None:
+            sent = self._numbered(stream, frame, rules)
+        if tracks is not None:
+            stream.waiting.setdefault(sent[:2], []).append(tracks)
+        if is_new:
+            try:
+                await self._put(stream, frame, sent, traceparent)
+            except BaseException:
+                if tracks is not None:
+                    stream.leave(sent, tracks)
+                raise
+            self._remember(stream, mark, sent)
+        return sent, is_new
 
     @contextlib.asynccontextmanager
     async def _used(self, name: str) -> AsyncIterator[_Stream]:
@@ -378,12 +412,7 @@ class Inputs:
 
     async def _put(self, stream: _Stream, frame: JsonFrame, sent: Sent, traceparent: str) -> None:
         assert stream.link is not None  # noqa: S101 - in use: said for the type checker
-        payload = schemas.encode(frame.message, **sent._asdict())
-        attachment, put = attachment_of(traceparent), stream.link.outgoing.detections
-        if len(payload) <= INLINE_BYTES:
-            put(payload, attachment)
-        else:
-            await asyncio.to_thread(put, payload, attachment)
+        await put(stream.link.outgoing.detections, schemas.encode(frame.message, **sent._asdict()), traceparent)
         stream.in_flight.add(sent.epoch, sent.seq)
         stream.seq += not frame.is_numbered
 
@@ -479,10 +508,10 @@ class Inputs:
         self._reporter.flush(time.monotonic_ns())
 
 
-def _mark(frame: JsonFrame, repeats: str) -> Hashable:
-    """Return the mark of a frame by which a repeated one is recognised; None without key and stamp."""
+def _mark(frame: JsonFrame, repeats: str, part: int) -> Hashable:
+    """Return the mark of a part of a frame by which a repeated one is recognised; None without key and stamp."""
     if frame.key or repeats:
-        return ("key", frame.key) if frame.key else ("repeats", repeats)
+        return ("key", frame.key, part) if frame.key else ("repeats", repeats, part)
     return frame.message.stamp_ns if frame.is_stamped else None
 
 

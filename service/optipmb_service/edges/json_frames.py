@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import re
 from datetime import datetime
-from fnmatch import fnmatchcase
 from functools import cache
-from math import nan
+from math import atan2, hypot, nan, pi, sqrt
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
@@ -20,8 +19,6 @@ from optipmb_client.errors import ClientError
 from optipmb_schemas import codec
 from optipmb_schemas.errors import invalid, show
 from optipmb_schemas.json_form import EdgeDetections, EdgeObject
-
-from optipmb_service.settings import InputSettings
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -40,6 +37,21 @@ UNKNOWN: Final = (nan, nan, nan)
 PLACES: Final = ("position", "lat and lon", "box", "foot")
 MODEL: Final = ("frame", "pose", "field_of_view", "relocation")
 """Fields of a frame with the names and values of `Detections`."""
+
+SEPARATE: Final = ("epoch", "field_of_view")
+"""Fields of a frame that cannot hold for each of its objects alone."""
+
+COLUMNS: Final = ("label", "center", "size", "yaw", "score", "velocity", "position_covariance")
+STEP_NS: Final = 1000
+"""Distance of the frames of separate objects."""
+
+BESIDE: Final = (2.0, 0.02, 3.0)
+"""How far a separate object is looked at: to each side in m, and at least in rad; in range in m."""
+
+NOWHERE: Final = schemas.FieldOfView(
+    azimuth=np.array([-pi, pi]), elevation=np.array([-0.5 * pi, 0.5 * pi]), range=np.array([9e8, 1e9])
+)
+"""The field of view of a frame without objects that says nothing."""
 
 _TIME: Final = re.compile(
     r"([0-9]{4}-[0-9]{2}-[0-9]{2}[T ][0-9]{2}:[0-9]{2}:[0-9]{2})(?:[.,]([0-9]+))?(Z|[+-][0-9:]{4,5})"
@@ -71,6 +83,46 @@ class JsonFrame(NamedTuple):
     key: str
 
 
+def separate(frame: JsonFrame) -> list[JsonFrame]:
+    """Return a frame for each object of one that says nothing of other objects; one that looks nowhere without any.
+
+    The field of view of each holds the object alone, 2 m to both sides and at least 3 m and three standard deviations
+    in range. Stamps are 1 us apart.
+    """
+    message = frame.message
+    places = np.nan_to_num(message.center)
+    if message.frame == "world" and message.pose is not None:
+        from optipmb import Pose  # noqa: PLC0415 - the tracker, which a router does not load
+
+        pose = Pose(message.pose.translation, message.pose.quaternion)
+        places = (places - pose.translation) @ pose.rotation
+    if not len(places):
+        return [frame._replace(message=message.model_copy(update={"field_of_view": NOWHERE}))]
+    frames = []
+    spread = message.position_covariance
+    variances = np.full(len(places), nan) if spread is None else spread[:, 0, 0] + spread[:, 1, 1]
+    for at, (place, variance) in enumerate(zip(places.tolist(), variances.tolist(), strict=True)):
+        values: dict[str, Any] = {
+            name: column[at : at + 1] for name in COLUMNS if (column := getattr(message, name)) is not None
+        }
+        values |= {"field_of_view": _beside(place, variance), "stamp_ns": message.stamp_ns + at * STEP_NS}
+        frames.append(frame._replace(message=message.model_copy(update=values)))
+    return frames
+
+
+def _beside(place: list[float], variance: float) -> schemas.FieldOfView:
+    """Return a field of view that holds a place, from the sensor, whose variance in m^2 may be unknown."""
+    (x, y, _), (aside, angle, deep) = place, BESIDE
+    middle, width = atan2(y, x), min(pi, max(angle, aside / max(hypot(x, y), angle)))
+    distance, deep = hypot(*place), max(deep, 3.0 * sqrt(variance))
+    return NOWHERE.model_copy(
+        update={
+            "azimuth": np.array([middle - width, middle + width]),
+            "range": np.array([max(0.0, distance - deep), distance + deep]),
+        }
+    )
+
+
 class FrameReader:
     """Reads the frames of JSON senders by the settings.
 
@@ -84,7 +136,7 @@ class FrameReader:
     def __init__(self, settings: Settings) -> None:
         self._limits = settings.limits.limits()
         self._sites = settings.sites
-        self._inputs = settings.inputs
+        self.rules = settings.input_of
         self._place = cache(self._place_of)
         self._cameras = {
             one.camera: _calibration(f"inputs.{pattern}.camera", one.camera)
@@ -108,11 +160,6 @@ class FrameReader:
             expected = f"an array of 1 to {MOST_FRAMES} frames"
             raise schemas.MessageError("too_large" if frames else "invalid_value", "", expected, str(len(frames)))
         return frames, True
-
-    def rules(self, stream: str) -> InputSettings:
-        """Return the settings of a stream's frames."""
-        found = (one for pattern, one in self._inputs.items() if fnmatchcase(stream, pattern))
-        return next(found, _USUAL)
 
     def read(self, payload: bytes, stream: str = "", mapping: PayloadMapping | None = None) -> JsonFrame:
         """Return the frame of a document.
@@ -186,7 +233,11 @@ class FrameReader:
         return self._framed(codec.build(fields | _header(given, stream), schemas.Detections, self._limits), given)
 
     def _framed(self, message: schemas.Detections, given: Mapping[str, Any]) -> JsonFrame:
-        if classes := self.rules(message.stream).classes:
+        rules = self.rules(message.stream)
+        if rules.complete is False and (name := next((one for one in SEPARATE if one in given), "")):
+            expected = "none, for each object becomes a frame by `complete` in `inputs`"
+            raise schemas.MessageError("invalid_value", name, expected, "one")
+        if classes := rules.classes:
             names = [classes.get(name, name) for name in message.labels]
             labels = tuple(dict.fromkeys(names))
             numbers = np.array([labels.index(name) for name in names], np.int64)
@@ -306,9 +357,6 @@ class FrameReader:
 
         one = self._sites.get(site)
         return None if one is None else Georeference(one.origin, one.x_heading)
-
-
-_USUAL: Final = InputSettings()
 
 
 def _calibration(setting: str, path: Path) -> GroundCamera:

@@ -1,7 +1,7 @@
 """JSON of other makers as frames: where the objects of a payload are, and which of their fields are which of ours.
 
 A path is names with dots between them, `[0]` for an element of a list, and in the path of the objects `[]` for each
-element and `*` for each value of a map.
+element and `*` for each value of a map, or a list in its place.
 """
 
 from __future__ import annotations
@@ -30,6 +30,9 @@ CORNERS: Final = 4
 UNITS: Final = {"s": 9, "ms": 6, "us": 3, "ns": 0}
 """Decimal digits between a unit of time and nanoseconds."""
 
+LARGEST: Final = 1e300
+"""Larger integers of JSON are no numbers of 64 bits; no sum and no product of others is infinite."""
+
 _STEP: Final = re.compile(r"\[\d*\]|[^.\[\]]+")
 _OBJECT: Final = re.compile(r"objects\[(\d+)\](?:\.(\w+)(?:\[(\d+)\])?)?.*")
 
@@ -42,6 +45,15 @@ FORMATS: Final[dict[str, dict[str, Any]]] = {
         "box": tuple(f"bounding_box.{side}" for side in ("left", "top", "right", "bottom")),
         "box_unit": "image",
         "time": "frame.timestamp",
+    },
+    "frigate": {
+        "objects": "after",
+        "class": "label",
+        "score": "score",
+        "box": "box",
+        "time": "after.frame_time",
+        "time_unit": "s",
+        "leave_out": {"type": "end", "after.false_positive": True},
     },
     "scenescape": {
         "objects": "objects.*[]",
@@ -57,7 +69,7 @@ FORMATS: Final[dict[str, dict[str, Any]]] = {
         "time": "timestamp",
     },
 }
-"""Mappings of known makers: Axis' scene description, and detections of SceneScape."""
+"""Mappings of known makers: Axis' scene description, events of Frigate, and detections of SceneScape."""
 
 
 def mapping_of(one: MqttInput) -> PayloadMapping | None:
@@ -94,7 +106,8 @@ class PayloadMapping:
         Raises:
             MessageError: it has no objects where they should be, or no time.
         """
-        found = list(_elements(payload, self._objects))
+        is_left_out = any(_at(payload, path) == value for path, value in self._settings.leave_out.items())
+        found = [] if is_left_out else list(_elements(payload, self._objects))
         frame: dict[str, Any] = {"objects": [self._object(value, key) for value, _, key in found]}
         frame["frame"] = self._settings.frame
         if self._settings.pose is not None:
@@ -158,7 +171,7 @@ class PayloadMapping:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < LARGEST
 
 
 def _elements(value: Any, steps: list[str], path: str = "", key: str = "") -> Iterator[tuple[Any, str, str]]:
@@ -178,6 +191,9 @@ def _elements(value: Any, steps: list[str], path: str = "", key: str = "") -> It
             if number >= len(value):
                 raise schemas.MessageError("missing_field", f"{path}[{number}]", "a value", "nothing")
             yield from _elements(value[number], rest, f"{path}[{number}]", key)
+        return
+    if step == ANY and isinstance(value, list) and rest[:1] == [EACH]:  # a list of what a map has by keys
+        yield from _elements(value, rest, path, key)
         return
     if not isinstance(value, dict):
         raise invalid(path, "a map", value)

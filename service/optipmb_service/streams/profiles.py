@@ -34,16 +34,22 @@ class Profiles:
         patterns: pairs of stream pattern and profile name, the first that matches holds.
         known: all profiles by the name that the settings give, and by the name inside the file.
         sensors: those of fused sessions that differ.
+        missing_s: returns after which time, s, objects out of view count as missed; None: as in the profile.
     """
 
     default: str
     patterns: tuple[tuple[str, str], ...]
     known: Mapping[str, optipmb.Parameters]
     sensors: optipmb.Sensors = ALIKE
+    missing_s: Callable[[str], float | None] = lambda _: None
 
     @classmethod
     def read(
-        cls, default: str, patterns: Mapping[str, str], sensors: Mapping[str, SensorSettings] | None = None
+        cls,
+        default: str,
+        patterns: Mapping[str, str],
+        sensors: Mapping[str, SensorSettings] | None = None,
+        missing_s: Callable[[str], float | None] = lambda _: None,
     ) -> Profiles:
         """Load every profile named, and the tracker's own.
 
@@ -57,7 +63,7 @@ class Profiles:
         for parameters in tuple(known.values()):
             known.setdefault(parameters.name, parameters)
         tables = {pattern: one.model_dump() for pattern, one in (sensors or {}).items()}
-        return cls(default, tuple(patterns.items()), known, optipmb.Sensors.read(tables))
+        return cls(default, tuple(patterns.items()), known, optipmb.Sensors.read(tables), missing_s)
 
     def check_zones(self, zones: Mapping[str, ZoneSettings]) -> None:
         """Check the classes of zones.
@@ -75,10 +81,9 @@ class Profiles:
 
     def of(self, stream: str) -> optipmb.Parameters:
         """Return the parameters of a stream, `site/node/sensor`."""
-        for pattern, name in self.patterns:
-            if fnmatchcase(stream, pattern):
-                return self.known[name]
-        return self.known[self.default]
+        found = (name for pattern, name in self.patterns if fnmatchcase(stream, pattern))
+        parameters, missing_s = self.known[next(found, self.default)], self.missing_s(stream)
+        return parameters if missing_s is None else parameters.model_copy(update={"unseen_time": missing_s})
 
     def named(self, name: str) -> optipmb.Parameters | None:
         """Return a profile by its name, None when there is none."""

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from optipmb_client.errors import ClientError
 from optipmb_schemas import Detections, MessageError
-from optipmb_service.edges.json_frames import FrameReader
+from optipmb_service.edges.json_frames import FrameReader, separate
 from optipmb_service.edges.mapping import PayloadMapping, mapping_of
 from optipmb_service.settings import MappingSettings, MqttInput, load
+from scipy.spatial.transform import Rotation
 
 from optipmb import GroundCamera
 
@@ -97,16 +98,60 @@ def test_known_makers(calibration: Path) -> None:
         box = {"x": x1, "y": y1, "width": x2 - x1, "height": y2 - y1}
         found = {"id": 1, "category": one["class"], "confidence": 0.5, "bounding_box_px": box}
         groups.setdefault(one["class"], []).append(found)
+    listed = [one for group in groups.values() for one in group]
     payloads = {
         "axis": {"frame": {"timestamp": "2026-11-27T08:00:00.500Z", "observations": observations, "operations": []}},
         "scenescape": {"id": "cam1", "timestamp": "2026-11-27T08:00:00.500Z", "rate": 9.8, "objects": groups},
     }
+    payloads["scenescape as a list"] = payloads["scenescape"] | {"objects": listed}
     for name, payload in payloads.items():
-        mapping = mapping_of(MqttInput(topic="x", format=name))
+        mapping = mapping_of(MqttInput(topic="x", format=name.partition(" ")[0]))
         found = reader(calibration).read(json.dumps(payload).encode(), STREAM, mapping).message
         assert (found.stamp_ns, found.labels) == (expected.stamp_ns, expected.labels)
         np.testing.assert_allclose(found.center, expected.center, atol=1e-6)
         np.testing.assert_allclose(found.score, expected.score)
+
+
+def test_events_of_frigate(calibration: Path) -> None:
+    """Each has one object, or none when it has ended or was a false positive; their stream is incomplete by default."""
+    expected = read(calibration, {"objects": objects(score=0.5)[:1]})
+    mapping = mapping_of(MqttInput(topic="frigate/events", format="frigate"))
+    after = {"label": "car", "score": 0.5, "box": BOXES[0], "frame_time": 5.25, "false_positive": False}
+
+    def made(kind: str, **fields: Any) -> Detections:
+        event = {"type": kind, "before": {}, "after": after | fields}
+        return reader(calibration).read(json.dumps(event).encode(), STREAM, mapping).message
+
+    found = made("update")
+    np.testing.assert_array_equal(found.center, expected.center)
+    assert (found.stamp_ns, found.score.tolist()) == (5_250_000_000, [0.5])
+    assert len(made("end").label) == len(made("new", false_positive=True).label) == 0
+    rows = {"garage/{1}/cam": {"topic": "+/events", "format": "frigate"}}
+    settings = load(None, {"mqtt": {"inputs": rows}, "inputs": {"garage/b/*": {"complete": True}}}).settings
+    found = [settings.missing_s(stream) for stream in ("garage/a/cam", "garage/b/cam", "garage/a/lidar")]
+    assert found == [10.0, None, None]
+
+
+def test_separate_objects_are_alone_in_view(calibration: Path) -> None:
+    """Each frame of an incomplete one looks at its object, and at none that is more than a few metres away."""
+    boxes = [[300, 700, 420, 760], [1135, 699, 1255, 763], [1700, 800, 1900, 900]]
+    frame = reader(calibration).read(
+        json.dumps({"objects": [{"class": "car", "box": box} for box in boxes], "stamp_ns": 5}).encode(), STREAM
+    )
+    parts = [one.message for one in separate(frame)]
+    assert [one.stamp_ns for one in parts] == [5, 1005, 2005]
+    for at, part in enumerate(parts):
+        np.testing.assert_array_equal(part.center[0], frame.message.center[at])
+        assert part.pose is not None
+        assert part.field_of_view is not None
+        w, x, y, z = part.pose.quaternion
+        places = np.nan_to_num(frame.message.center) - part.pose.translation
+        places = Rotation.from_quat([x, y, z, w]).inv().apply(places)
+        low, high = part.field_of_view.azimuth
+        near, far = part.field_of_view.range
+        angle, distance = np.arctan2(places[:, 1], places[:, 0]), np.linalg.norm(places, axis=1)
+        seen = (low < angle) & (angle < high) & (near < distance) & (distance < far)
+        assert seen.tolist() == [one == at for one in range(3)]
 
 
 @pytest.mark.parametrize(

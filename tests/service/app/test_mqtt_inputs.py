@@ -5,18 +5,18 @@ import contextlib
 import json
 import re
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from broker import mosquitto
-from json_senders import document, exists
+from json_senders import damaged, document, exists
 from optipmb_schemas import MessageError
 from optipmb_service.edges.json_frames import FrameReader
-from optipmb_service.edges.mapping import PayloadMapping
-from optipmb_service.settings import MappingSettings, Settings, SettingsInvalidError, load
+from optipmb_service.edges.mapping import PayloadMapping, mapping_of
+from optipmb_service.settings import MappingSettings, MqttInput, Settings, SettingsInvalidError, load
 from optipmb_service.zenoh.client import Client
 from router import Node, Sensor, plain
 
@@ -38,6 +38,31 @@ RADAR = {
     "time": "ts",
     "time_unit": "ms",
 }
+SIDES = {"left": 0.59, "top": 0.64, "right": 0.65, "bottom": 0.7}
+STAMP = "2026-11-27T08:00:00.500Z"
+PAYLOADS = {
+    "optipmb": document(SENSOR.detections(0)),
+    "mapped": {"ts": 5, "data": {"targets": [{"kind": "car", "conf": 90, "pos": {"x": 1.5, "y": 2}, "angle": 90}] * 2}},
+    "axis": {
+        "frame": {"timestamp": STAMP, "observations": [{"bounding_box": SIDES, "class": {"type": "car", "score": 1}}]}
+    },
+    "frigate": {
+        "type": "update",
+        "before": {"label": "car"},
+        "after": {
+            "label": "car",
+            "score": 0.8,
+            "box": [1135, 699, 1255, 763],
+            "frame_time": 5.25,
+            "false_positive": False,
+        },
+    },
+    "scenescape": {
+        "timestamp": STAMP,
+        "objects": {"car": [{"category": "car", "confidence": 0.5, "translation": [1, 2, 0], "size": [4, 2, 1]}] * 2},
+    },
+}
+CAMERA = "garage/gate/cam"
 
 
 @contextlib.contextmanager
@@ -79,28 +104,87 @@ async def test_frames_over_mqtt_give_the_same_bytes(start: Any, tmp_path: Path) 
     inputs = {"site/{1}/lidar": {"topic": "sensors/+/det"}, "yard/late/lidar": {"topic": "late"}}
     with mosquitto(tmp_path) as address, Node(endpoint) as node, publisher(address) as client:
         send(client, "late", document(messages[0]), retain=True)
-        given = {"connect": [endpoint], "instance": "bridge", "mqtt": {"broker": address, "inputs": inputs}}
-        settings = load(None, given).settings
-        network = await asyncio.to_thread(Client, settings)
-        bridge = mqtt.Bridge(settings, network)
-        running = asyncio.create_task(bridge.run())
-        await until(lambda: bridge.connected)
-        send(client, "sensors/node/det", b'{"objects": [{"class": 1}]}')
-        send(client, "sensors/no de/det", document(messages[0]))
-        assert (await asyncio.to_thread(node.problem, SENSOR.stream, "invalid_value")).path == "objects[0].class"
-        for one in messages:
+        async with bridged(endpoint, address, inputs) as bridge:
+            send(client, "sensors/node/det", b'{"objects": [{"class": 1}]}')
+            send(client, "sensors/no de/det", document(messages[0]))
+            assert (await asyncio.to_thread(node.problem, SENSOR.stream, "invalid_value")).path == "objects[0].class"
+            for one in messages:
+                for _ in range(2):
+                    send(client, "sensors/node/det", document(one, "epoch", "seq"))
             for _ in range(2):
-                send(client, "sensors/node/det", document(one, "epoch", "seq"))
-        for _ in range(2):
-            send(client, "sensors/node/det", document(SENSOR.detections(len(messages))))
-        tracks = await asyncio.to_thread(node.tracks, SENSOR.stream, len(messages))
-        await until(lambda: bridge.inputs.duplicates["mqtt"] == 1)
-        assert [plain(one) for one in tracks[: len(messages)]] == expected
-        assert sum(bridge.inputs.refused.values()) == 2
-        assert bridge.inputs.frames["mqtt"] == 2 * len(messages) + 1, "the retained one is old"
+                send(client, "sensors/node/det", document(SENSOR.detections(len(messages))))
+            tracks = await asyncio.to_thread(node.tracks, SENSOR.stream, len(messages))
+            await until(lambda: bridge.inputs.duplicates["mqtt"] == 1)
+            assert [plain(one) for one in tracks[: len(messages)]] == expected
+            assert sum(bridge.inputs.refused.values()) == 2
+            assert bridge.inputs.frames["mqtt"] == 2 * len(messages) + 1, "the retained one is old"
+
+
+async def test_damaged_payloads_end_nothing(start: Any, tmp_path: Path) -> None:
+    """200 payloads of Frigate with a fault and 10 MB of spaces are frames or refused; another stream loses nothing."""
+    endpoint = start()[1]
+    inputs = {
+        SENSOR.stream: {"topic": "sensor"},
+        "yard/damaged/lidar": {"topic": "damaged"},
+        CAMERA: {"topic": "frigate", "format": "frigate"},
+    }
+    given = {CAMERA: {"camera": str(calibration(tmp_path))}}
+    with mosquitto(tmp_path) as address, Node(endpoint) as node, publisher(address) as client:
+        async with bridged(endpoint, address, inputs, inputs=given) as bridge:
+            for number, text in enumerate([*damaged(PAYLOADS["frigate"], 200), b" " * 10_000_000]):
+                send(client, "frigate", text)
+                if number % 20 == 0:
+                    send(client, "damaged", text)
+                    send(client, "sensor", document(SENSOR.detections(number // 20)))
+            tracks = await asyncio.to_thread(node.tracks, SENSOR.stream, 11)
+            counts = bridge.inputs
+            await until(
+                lambda: sum(sum(one.values()) for one in (counts.frames, counts.duplicates, counts.refused)) == 223
+            )
+            assert counts.refused["mqtt", "too_large"] == 2
+    assert [one.stamp_ns for one in tracks] == list(map(SENSOR.stamp_ns, range(11)))
+
+
+@pytest.mark.parametrize("name", ["optipmb", "mapped", "axis", "frigate", "scenescape"])
+def test_damaged_payloads_get_a_path(name: str, tmp_path: Path) -> None:
+    """An error in one of 200 payloads with a fault names a place that is in the payload."""
+    settings = load(None, {"inputs": {CAMERA: {"camera": str(calibration(tmp_path))}}}).settings
+    reader, refused = FrameReader(settings), []
+    mapping = mapping_of(MqttInput(topic="x", format=name, mapping=RADAR if name == "mapped" else None))
+    reader.read(json.dumps(PAYLOADS[name]).encode(), CAMERA, mapping)
+    for text in damaged(PAYLOADS[name], 200):
+        try:
+            reader.read(text, CAMERA, mapping)
+        except MessageError as error:
+            refused.append((error.path, text))
+    assert len(refused) > 100
+    # A map that the mapping expects may be missing.
+    assert [one for one in refused if not (exists(*one) or exists(one[0].rpartition(".")[0], one[1]))] == []
+
+
+@contextlib.asynccontextmanager
+async def bridged(endpoint: str, address: str, topics: Any, **more: Any) -> AsyncIterator[Any]:
+    """Run the bridge of a broker with these inputs."""
+    given = {"connect": [endpoint], "instance": "bridge", "mqtt": {"broker": address, "inputs": topics}}
+    settings = load(None, given | more).settings
+    network = await asyncio.to_thread(Client, settings)
+    bridge = mqtt.Bridge(settings, network)
+    running = asyncio.create_task(bridge.run())
+    try:
+        await until(lambda: bridge.connected)
+        yield bridge
+    finally:
         running.cancel()
         await asyncio.wait([running])
         await asyncio.to_thread(network.close)
+
+
+def calibration(folder: Path) -> Path:
+    """Write the calibration of the page on cameras."""
+    text = (PAGE.parent / "cameras.md").read_text(encoding="utf-8")
+    file = folder / "gate.toml"
+    file.write_text(re.findall(r"```toml\n(.*?)```", text, re.DOTALL)[0])
+    return file
 
 
 def read(settings: dict[str, Any], payload: Any) -> Any:

@@ -23,7 +23,7 @@ from optipmb_service.settings import Settings, load
 from router import Node, Sensor, plain, until
 from routers import free_endpoint
 from watched import Watched, asked, served
-from websocket import ABNF, WebSocket, WebSocketBadStatusException, create_connection
+from websocket import ABNF, WebSocket, WebSocketBadStatusException, WebSocketException, create_connection
 
 from optipmb import Georeference
 
@@ -125,6 +125,43 @@ def test_a_frame_that_is_sent_again_counts_once(endpoint: str) -> None:
     assert len({(one.session, *one.id.tolist()) for one in tracks}) == 1
 
 
+def test_incomplete_frames_say_nothing_of_other_objects(start: Any) -> None:
+    """An object without a report for 9 s keeps its id, and ends after `missing_s`; frames sent again count once."""
+    rules = {"site/*/lidar": {"complete": False, "missing_s": 10}}
+    endpoint = start(inputs=rules, profile="generic")[1]
+
+    def document_of(tick: int) -> dict[str, Any]:
+        parked = [{"class": "car", "position": [20, 5, 1], "size": [4.4, 1.8, 1.6], "yaw": 0}]
+        driving = [{"class": "car", "position": [tick - 60, -15, 1], "size": [4.4, 1.8, 1.6], "yaw": 0}]
+        return {"stamp_ns": 10**18 + tick * 2 * 10**8, "objects": driving + parked * (tick < 10 or tick == 55)}
+
+    with Node(endpoint) as node, Edge(endpoint, inputs=rules) as edge:
+        count = 0
+        for first in range(0, 120, 20):
+            documents = [document_of(tick) for tick in range(first, first + 20)]
+            answers = [edge.post(documents, STREAM).body["frames"] for _ in range(2)]
+            assert [{one["duplicate"] for one in frames} for frames in answers] == [{False}, {True}]
+            count += sum(len(one["objects"]) for one in documents)
+            tracks = node.tracks(SENSOR.stream, count)
+        empty = edge.post({"stamp_ns": 10**18 + 25 * 10**9, "objects": []}, STREAM)
+        assert empty.status == HTTPStatus.ACCEPTED
+        last = node.tracks(SENSOR.stream, count + 1)[-1]
+        view = {"azimuth": [-1, 1], "elevation": [-1, 1], "range": [0, 9]}
+        for name in ("epoch", "field_of_view"):
+            fields = {"epoch": "0" * 32, "seq": 1, "field_of_view": view}
+            given = {one: fields[one] for one in (("epoch", "seq") if name == "epoch" else (name,))}
+            assert error(edge.post({"objects": []} | given, STREAM).body)[1] == name
+    parked_ids = [set(one.id[np.abs(one.center[:, 1] - 5) < 3].tolist()) for one in tracks]
+    drivers = [set(one.id[np.abs(one.center[:, 1] + 15) < 3].tolist()) for one in tracks]
+    (parked,) = parked_ids[20]
+    again = 10 + 55
+    assert all(ids == {parked} for ids in parked_ids[20 : again + 2])
+    assert parked_ids[-1] == set()
+    assert len(set.union(*drivers)) == 1
+    assert len(tracks) == count
+    assert len(last.id) == 1
+
+
 def test_keys_tell_frames_without_stamps(edge: Edge) -> None:
     """A key in the frame or the header `Idempotency-Key` with the place in an array; with neither all are new."""
     one = {"objects": [], "key": "a"}
@@ -135,17 +172,28 @@ def test_keys_tell_frames_without_stamps(edge: Edge) -> None:
     assert [edge.post({"objects": []}, STREAM).body["frames"][0]["seq"] for _ in range(2)] == [3, 4]
 
 
-def test_damaged_documents_get_a_path(edge: Edge, endpoint: str) -> None:
-    """200 documents with a fault get 202 or an error whose path is in the document; another stream loses nothing."""
-    message = SENSOR.detections(0)
-    for text in damaged(document(message, "epoch", "seq"), 200):
-        answer = edge.post(text, "stream=site/node/damaged")
-        assert answer.status in {HTTPStatus.ACCEPTED, HTTPStatus.BAD_REQUEST}, (text, answer)
-        if answer.status == HTTPStatus.BAD_REQUEST:
-            path = error(answer.body)[1] if "frames" in answer.body else answer.body["path"]
-            assert exists(path, text), (path, text)
-    assert edge.post(frame(1), f"{STREAM}&wait=5").body["tracks"] is not None
-    assert edge.post(b" " * 10_000_000, STREAM).status == HTTPStatus.REQUEST_ENTITY_TOO_LARGE
+@pytest.mark.parametrize("way", ["post", "socket"])
+def test_damaged_documents_get_a_path(edge: Edge, endpoint: str, way: str) -> None:
+    """200 documents with a fault are accepted or get an error whose path is in them; another stream loses nothing."""
+    query, valid = "stream=site/node/damaged", document(SENSOR.detections(0), "epoch", "seq")
+    with Node(endpoint) as node, socket(edge.address, query) as connection, socket(edge.address, query) as large:
+        for number, damage in enumerate(damaged(valid, 200)):
+            text = damage if way == "post" else damage.decode(errors="replace").encode()
+            if way == "socket":
+                connection.send(text.decode())
+                answers = [json.loads(connection.recv())]
+                assert answers[0]["index"] == number
+            else:
+                answer = edge.post(text, query)
+                assert answer.status in {HTTPStatus.ACCEPTED, HTTPStatus.BAD_REQUEST}, (text, answer)
+                answers = answer.body.get("frames", [{"error": answer.body}])
+            assert all(exists(one["error"]["path"], text) for one in answers if "error" in one), (answers, text)
+            if number % 20 == 0:
+                assert edge.post(frame(number // 20), STREAM).status == HTTPStatus.ACCEPTED
+        assert edge.post(b" " * 10_000_000, STREAM).status == HTTPStatus.REQUEST_ENTITY_TOO_LARGE
+        with pytest.raises((WebSocketException, OSError, ValueError)):  # it is closed, while it sends or after
+            json.loads(large.send(" " * 10_000_000) and large.recv())
+        assert [one.stamp_ns for one in node.tracks(SENSOR.stream, 10)] == list(map(SENSOR.stamp_ns, range(10)))
 
 
 @pytest.mark.parametrize(

@@ -8,12 +8,11 @@ import contextlib
 from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_schemas as schemas
-from optipmb_client.trace_context import attachment_of
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
 from optipmb_service.edges.grpc.network import Item, Listener
-from optipmb_service.edges.inputs import CACHE, INLINE_BYTES, WINDOW, InFlight
+from optipmb_service.edges.inputs import CACHE, WINDOW, InFlight, put
 from optipmb_service.edges.readers import Outbox
 
 if TYPE_CHECKING:
@@ -179,13 +178,8 @@ class _Inputs:
             self._waited = True
             if not outgoing.points_wanted:
                 return
-        put = outgoing.detections if isinstance(message, schemas.Detections) else outgoing.points
-        payload = schemas.encoded(message)
-        attachment = attachment_of(self._traceparent)
-        if len(payload) <= INLINE_BYTES:
-            put(payload, attachment)
-        else:
-            await asyncio.to_thread(put, payload, attachment)
+        publish = outgoing.detections if isinstance(message, schemas.Detections) else outgoing.points
+        await put(publish, schemas.encoded(message), self._traceparent)
 
     def _read(self, payload: bytes) -> Input:
         request = convert.parse(payload, self._kind)
