@@ -210,6 +210,19 @@ class Check:
         what = "JSON and gRPC give the replay's stream; the bridges to MQTT and ROS 2 and a service with traces start"
         self.show("consumers", what)
 
+    def senders(self) -> None:
+        """Send a frame by the command that the first service prints."""
+        found = re.search(r"'(http://\S+)' -H 'authorization: (\S+ \S+)' .* -d '(.*)'", self.stack.log("service-a"))
+        if found is None:
+            raise CheckError("the log of service-a has no command that sends detections")
+        headers = {"authorization": found[2], "content-type": "application/json"}
+        request = urllib.request.Request(found[1], found[3].encode(), headers)  # noqa: S310 - of the compose file
+        with urllib.request.urlopen(request, timeout=30) as answer:  # noqa: S310
+            body = json.load(answer)
+        if not body["accepted"] or not body["tracks"]:
+            raise CheckError(f"service-a answers {body}")
+        self.show("senders", "the `curl` command in the log of service-a sends a frame and gets its tracks")
+
     def takeover(self) -> None:
         """Replay a scene, kill the service that tracks it, and compare the result with tracking in one process."""
         client = self.stack.container(CLIENT)
@@ -358,6 +371,7 @@ def main(arguments: list[str]) -> int:
             check.confinement,
             check.network,
             check.consumers,
+            check.senders,
             check.takeover,
             check.metrics,
             check.stop,
