@@ -73,6 +73,7 @@ LISTS: Final = (
     *BOX_LISTS,
     "detections",
     "objects",
+    "cuboids",
     "predictions",
     "annotations",
 )  # names of lists of all boxes of a frame
@@ -626,7 +627,7 @@ def _kitti_frame(path: Path) -> list[_Record]:
 
 
 def read_json(path: Path) -> list[_Record]:
-    """Return the records of a JSON file: an array of them, or an object with the boxes of a frame.
+    """Return the records of a JSON file: an array, an object with nothing but an array, or the boxes of a frame.
 
     Raises:
         DatasetError: It is something else.
@@ -644,6 +645,8 @@ def read_json(path: Path) -> list[_Record]:
         raise DatasetError(path, "a table", f"results of nuScenes, which are read by {how}")
     if isinstance(content, dict) and any(name in content for name in LISTS):
         content = [content]
+    elif isinstance(content, dict) and len(content) == 1:
+        (content,) = content.values()
     if not isinstance(content, list) or not all(isinstance(one, dict) for one in content):
         expected = f"an array of objects, or an object with a list {', '.join(LISTS)}"
         raise DatasetError(path, expected, repr(str(content)[:60]))

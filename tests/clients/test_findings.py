@@ -84,6 +84,14 @@ def test_wrong_headings_are_refused_beside_jitter(
     assert troubles(tmp_path / "d.csv", columns, heading=name) == []
 
 
+def test_wrong_headings_are_refused_without_sizes(tmp_path: Path) -> None:
+    """Centres with the bearings of a compass, clockwise from north, are refused with the option of their axis."""
+    columns = {name: one for name, one in street().items() if name not in {"l", "w", "h"}}
+    columns["heading"] = np.degrees(0.5 * np.pi - columns.pop("yaw")) % 360.0
+    assert any("heading=y-clockwise" in one for one in troubles(tmp_path / "d.csv", columns))
+    assert troubles(tmp_path / "d.csv", columns, heading="y-clockwise") == []
+
+
 def test_an_object_reported_twice_hides_no_wrong_heading(tmp_path: Path) -> None:
     """A car that is detected twice makes no moving sensor of headings from another axis, and is named."""
     columns = street(parked=4)

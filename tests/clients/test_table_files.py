@@ -221,7 +221,7 @@ def test_objects_of_a_file_are_its_rows(tmp_path: Path) -> None:
     columns = {name: values.tolist() for name, values in boxes(vx=np.ones(3 * FRAMES), vy=np.ones(3 * FRAMES)).items()}
     records = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
     expected = flat(tmp_path, vx=np.ones(3 * FRAMES), vy=np.ones(3 * FRAMES))
-    for content in (records, {"version": 1, "detections": records}):
+    for content in (records, {"version": 1, "detections": records}, {"frames": records}):
         (tmp_path / "d.json").write_text(json.dumps(content))
         assert frames_of(tmp_path / "d.json") == expected
 

@@ -195,7 +195,13 @@ def _columns_of(reading: Reading, columns: Columns) -> dict[str, Column]:
     if "camera" in reading.options:
         chosen |= dict.fromkeys(METRES, NOTHING)
     taken = {role: name for role, name in chosen.items() if name in columns or name == NOTHING}
-    return find_columns(columns, taken, [name for name, one in columns.items() if _has_no_number(one)])
+    words = {name for name, one in columns.items() if _has_no_number(one)}
+    found = find_columns(columns, taken, words)
+    used = {one.name for one in found.values()}
+    for role, one in find_columns(columns, taken).items():  # refused when it is read, as a number is expected
+        if role not in found and one.name in words - used and _has_units(columns[one.name]):
+            found[role] = one
+    return found
 
 
 class _Table:
@@ -232,7 +238,8 @@ class _Table:
         if values.dtype.kind not in "iuf":
             texts = ["" if text.strip() in NO_VALUE else text for text in values.tolist()]
             bad = np.array([text != "" and not is_number(text) for text in texts], dtype=np.bool_)
-            expected = f"a number in column {name} (--option invalid=skip leaves such rows out)"
+            remedy = f"column.{role}=none ignores it" if bad.all() else "invalid=skip leaves such rows out"
+            expected = f"a number in column {name} (--option {remedy})"
             if not self._reading.skips:
                 self._reading.first(role, bad, expected, values)
             values = np.array([float(text) if is_number(text) else np.nan for text in texts])
@@ -286,7 +293,7 @@ class _Table:
         pose = self._checked_poses(stamp)
         world = _world(center, row, pose)[:, :2]
         motion = _Motion(row, pose, find_moves(series[row], stamp[row] / 1e9, world, kind))
-        yaw = self._heading(motion, size, yaw, yaw_unit if turned else "none", strict=scored)
+        yaw = self._heading(motion, size, yaw, yaw_unit if turned else "none", centres=centres, strict=scored)
         looks = scored and pose is None and "sensor" not in found and self._placed is None
         reports = find_reports(series[row], stamp[row] / 1e9, world, kind) if looks else None
         if reports is not None:
@@ -411,6 +418,9 @@ class _Table:
         if self._placed is not None:
             return np.insert(self._placed.center[:, :2], 2, 0.0, axis=1)
         origin, found = self._reading.options.get("origin"), self._found
+        if origin is None and "lat" in found and "lon" in found and "x" not in found:
+            expected = "x and y in metres, or an origin for the latitudes (--option origin=LAT,LON,HEIGHT)"
+            raise DatasetError(self._reading.path, expected, f"columns {found['lat'].name}, {found['lon'].name}")
         if "x" in found or "lat" not in found or origin is None:
             return np.column_stack([self._numbers("x"), self._numbers("y"), self._numbers("z", 0.0)])
         alt = self._numbers("alt") if self._height == "alt" else None
@@ -599,9 +609,11 @@ class _Table:
         parts = np.column_stack([self._numbers(role, 0.0) for role in roles])  # about z alone w and z are enough
         return read_turn(self._reading, topic, parts, named=named)
 
-    def _heading(self, motion: "_Motion", size: Floats, yaw: Floats, unit: str | None, *, strict: bool) -> Floats:
+    def _heading(
+        self, motion: "_Motion", size: Floats, yaw: Floats, unit: str | None, *, centres: bool, strict: bool
+    ) -> Floats:
         reading, moves = self._reading, motion.moves
-        long = moves.take(size[moves.start, :2].max(axis=1) > 1.3 * size[moves.start, :2].min(axis=1))
+        long = moves.take((size[moves.start, :2].max(axis=1) > 1.3 * size[moves.start, :2].min(axis=1)) | centres)
         unposed = motion.pose is None
         found = yaw
         if unit != "none":
@@ -894,6 +906,11 @@ def _with_frame_numbers(reading: Reading, columns: Columns) -> Columns:
             kind, numbers = frame_numbers([reading.path / text for text in texts.tolist()])
             return columns | {name if kind == "frame" else kind: np.array(numbers)[place]}
     return columns
+
+
+def _has_units(texts: NDArray[np.str_]) -> bool:
+    """Tell whether each text of a column begins with a number, as `87%` and `4.5 m`."""
+    return all(re.match(r"[-+]?\.?\d", text.strip()) for text in texts.tolist() if text.strip() not in NO_VALUE)
 
 
 def _has_no_number(values: NDArray[Any]) -> bool:
