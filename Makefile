@@ -135,6 +135,7 @@ dist: $(VENV)/.installed
 	rm -rf out/dist
 	$(BIN)/python -m build --wheel --outdir out/dist . >out/build.log || { cat out/build.log; exit 1; }
 	$(BIN)/python -m build --wheel --outdir out/dist node >>out/build.log || { cat out/build.log; exit 1; }
+	$(BIN)/python -m twine check --strict out/dist/* >>out/build.log || { cat out/build.log; exit 1; }
 
 # The wheel with the oldest packages that pyproject.toml allows; and with the newest Python on this machine.
 lowest: dist

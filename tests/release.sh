@@ -12,7 +12,7 @@ if git rev-parse -q --verify "refs/tags/v$version" >/dev/null; then echo "releas
 places=$(git grep -l 'example\.invalid/optipmb\|@example\.invalid' -- ':!tests' || true)
 [ -z "$places" ] || { echo "release: put addresses in the place of example.invalid in" $places; exit 1; }
 make test wheel accuracy alone
-rm -rf dist
+rm -rf dist && mkdir -p out
 "$bin/python" -m build --outdir dist .
 "$bin/python" -m build --wheel --outdir dist node
 "$bin/python" -m twine check --strict dist/*
