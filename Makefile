@@ -158,6 +158,7 @@ repeat:
 
 schemas: $(VENV)/.installed
 	$(BIN)/python -m optipmb_schemas.export --check --page docs/messages.md --asyncapi schemas/asyncapi.json schemas/json
+	$(BIN)/python -m optipmb_schemas.protobuf.export --check schemas
 	$(BIN)/python docs/reference.py --check docs/reference.md
 
 wheel: kernels dist

@@ -12,8 +12,12 @@ import sys
 import tempfile
 import textwrap
 from pathlib import Path
-from typing import Final
+from types import UnionType
+from typing import Final, Union, get_args, get_origin
 
+from pydantic.fields import FieldInfo
+
+from optipmb_schemas.arrays import Array
 from optipmb_schemas.control import Problem, SessionParameters, SessionState, SessionSummary
 from optipmb_schemas.export import bring_up_to_date, read
 from optipmb_schemas.messages import (
@@ -51,15 +55,18 @@ MODELS: Final[tuple[type[Message], ...]] = (
 
 WIDTH: Final = 120
 
-_FIELD: Final = re.compile(r"  (?:optional |repeated )?[\w.]+ (\w+) = \d+;")
+_FIELD: Final = re.compile(r"  (?:optional |repeated )?[\w.]+ (\w+) = (\d+);")
+_SCALARS: Final = {int: "int64", float: "double", bool: "bool", str: "string", bytes: "bytes"}
 _HEADER: Final = "# Generated from tracking.proto by `python -m optipmb_schemas.protobuf.export`. Not to be edited.\n"
 
 
 def commented(source: str) -> str:
     """Return the text of the .proto file with the descriptions of the models as comments.
 
+    An optional number, text or array that a model has and its message lacks is added with the next free number.
+
     Raises:
-        ValueError: a message does not have exactly the fields of its model, in their order.
+        ValueError: a message does not have exactly the other fields of its model, in their order.
     """
     for model in MODELS:
         begin = re.search(rf"(?:^//.*\n)*^message {model.__name__} {{\n", source, re.MULTILINE)
@@ -67,6 +74,11 @@ def commented(source: str) -> str:
             raise ValueError(f"{SOURCE}: no message {model.__name__}")
         end = source.index("\n}\n", begin.end()) + 1
         lines = [line for line in source[begin.end() : end].splitlines() if not line.startswith("  //")]
+        fields = {match[1]: int(match[2]) for line in lines if (match := _FIELD.fullmatch(line))}
+        for place, (name, field) in enumerate(model.model_fields.items()):
+            if name not in fields and (kind := _kind_of(field)):
+                fields[name] = max(fields.values()) + 1
+                lines.insert(place, f"  {kind} {name} = {fields[name]};")
         names = [match[1] for line in lines if (match := _FIELD.fullmatch(line))]
         if names != [name for name in model.model_fields if name in names] or len(names) != len(model.model_fields):
             odd = sorted(set(names) ^ set(model.model_fields)) or "their order"
@@ -81,6 +93,19 @@ def commented(source: str) -> str:
         head = [*_comment((model.__doc__ or "").partition("\n")[0], ""), f"message {model.__name__} {{"]
         source = source[: begin.start()] + "\n".join([*head, *described, ""]) + source[end:]
     return source
+
+
+def _kind_of(field: FieldInfo) -> str:
+    """Return the type of a new field in protobuf; empty: it is to be written by hand."""
+    kind, *others = (
+        get_args(field.annotation) if get_origin(field.annotation) in {Union, UnionType} else (field.annotation,)
+    )
+    if field.is_required() or get_origin(kind) is tuple:
+        return ""
+    if any(isinstance(one, Array) for one in (*field.metadata, *getattr(kind, "__metadata__", ()))):
+        return "Array"
+    scalar = _SCALARS.get(getattr(kind, "__origin__", kind), "")
+    return f"optional {scalar}" if scalar and others else scalar
 
 
 def generated(proto: Path) -> dict[str, str]:
