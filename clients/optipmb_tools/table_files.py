@@ -361,6 +361,9 @@ def _read_text(pa: Any, path: Path, kind: str, options: Mapping[str, str]) -> An
         table = parsed(decimal or ".")
     except pa.ArrowInvalid:
         table = parsed(decimal or ".", threads=False)  # raises with the number of the row
+    names = [name for name in table.column_names if name]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise DatasetError(path, "every column once", f"{twice[0]!r} twice")
     if decimal is None and _has_commas(pa, path, table):
         table = parsed(",")
     if rounded := _rounded(pa, table):
@@ -370,8 +373,8 @@ def _read_text(pa: Any, path: Path, kind: str, options: Mapping[str, str]) -> An
         for name in rounded:
             if pc.all(pc.match_substring_regex(texts[name], r"^\s*-?\d+\s*$")).as_py():
                 table = table.set_column(table.column_names.index(name), name, texts[name])
-    names = enumerate(table.column_names)  # a separator at the end of the lines gives one without name and values
-    return table.select([place for place, name in names if name or table.column(place).null_count < len(table)])
+    places = enumerate(table.column_names)  # a separator at the end of the lines gives one without name and values
+    return table.select([place for place, name in places if name or table.column(place).null_count < len(table)])
 
 
 def _has_commas(pa: Any, path: Path, table: Any) -> bool:

@@ -84,6 +84,7 @@ MISTAKES: list[tuple[str, Any, list[str], int, str]] = [
     ),
     ("latitudes without an origin", boxes(x=None, lat=boxes()["x"], lon=boxes()["y"]), [], 2, "--option origin=LAT"),
     ("no header", "0.0,1,2,3,4,5,6,7,8\n", [], 2, "a first line with the names of the columns"),
+    ("a column twice", "t,x,y,x\n0,1,2,3\n", [], 2, "expected every column once, received 'x' twice"),
     ("an empty file", "", [], 2, "expected a table, received an empty file"),
     ("a header alone", "t,x,y,z,l,w,h,yaw,score,class\n", [], 2, "expected rows, received none"),
     ("no such file", None, [], 2, "expected a table (.csv), received no such file"),
