@@ -123,7 +123,7 @@ class SessionSeam:
 
     def _configure(self, asked: schemas.SessionParameters) -> None:
         horizons = None if asked.horizons is None else asked.horizons.tolist()
-        profile = PROFILES.named(asked.profile or "")
+        profile = PROFILES.known.get(asked.profile or "")
         try:
             outputs = self._session.configure(profile, asked.cloud_wait_s, horizons, restart=asked.restart)
         except RefusedError as error:

@@ -82,12 +82,16 @@ class Profiles:
     def of(self, stream: str) -> optipmb.Parameters:
         """Return the parameters of a stream, `site/node/sensor`."""
         found = (name for pattern, name in self.patterns if fnmatchcase(stream, pattern))
-        parameters, missing_s = self.known[next(found, self.default)], self.missing_s(stream)
-        return parameters if missing_s is None else parameters.model_copy(update={"unseen_time": missing_s})
+        return self._used(self.known[next(found, self.default)], stream)
 
-    def named(self, name: str) -> optipmb.Parameters | None:
-        """Return a profile by its name, None when there is none."""
-        return self.known.get(name)
+    def named(self, name: str, stream: str) -> optipmb.Parameters | None:
+        """Return the parameters of a stream in a profile, None when there is none of this name."""
+        parameters = self.known.get(name)
+        return None if parameters is None else self._used(parameters, stream)
+
+    def _used(self, parameters: optipmb.Parameters, stream: str) -> optipmb.Parameters:
+        missing_s = self.missing_s(stream)
+        return parameters if missing_s is None else parameters.model_copy(update={"unseen_time": missing_s})
 
     def trackers(self, make: Callable[..., optipmb.Tracker]) -> Callable[..., optipmb.Tracker]:
         """Return what gives all streams of a profile one tracker, for it keeps nothing of them (0.6 ms each)."""

@@ -175,7 +175,7 @@ class StreamQueries:
             asked = self._payload(request, schemas.SessionParameters())
         except schemas.MessageError:
             return False
-        known = asked.profile is None or self._profiles.named(asked.profile) is not None
+        known = asked.profile is None or asked.profile in self._profiles.known
         return known and asked != schemas.SessionParameters()
 
     def _answer_many(self, request: Query) -> None:
@@ -277,7 +277,7 @@ class StreamQueries:
     def _parameters(self, stream: Stream, request: Query) -> None:
         empty = schemas.SessionParameters()
         asked = self._payload(request, empty)
-        parameters = None if asked.profile is None else self._profiles.named(asked.profile)
+        parameters = None if asked.profile is None else self._profiles.named(asked.profile, stream.name)
         if asked.profile is not None and parameters is None:
             expected = f"one of {', '.join(self._profiles.names)}"
             raise schemas.MessageError("invalid_value", "profile", expected, repr(asked.profile))

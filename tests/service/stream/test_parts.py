@@ -147,6 +147,13 @@ def test_profiles_that_cannot_be_named_in_messages_are_refused(tmp_path: Path) -
         Profiles.read(str(own), {})
 
 
+def test_every_profile_of_an_incomplete_stream_keeps_objects_for_its_time() -> None:
+    """That of the settings, and one that is asked for by its name."""
+    profiles = Profiles.read("generic", {"a/*/*": "kitti"}, None, lambda stream: 9.0 if stream == "a/b/c" else None)
+    found = (profiles.of("a/b/c"), profiles.named("nuscenes", "a/b/c"), profiles.of("a/b/d"))
+    assert [(one.name, one.unseen_time) for one in found if one] == [("kitti", 9.0), ("nuscenes", 9.0), ("kitti", 6.0)]
+
+
 @pytest.mark.parametrize(
     ("variable", "value", "says"),
     [
