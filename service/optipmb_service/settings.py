@@ -498,6 +498,10 @@ class CpmSensor(BaseModel):
     """number of the sensor in its messages"""
     type: Annotated[str, _form("|".join(SENSOR_TYPES), f"one of {', '.join(SENSOR_TYPES)}")]
     """kind of sensor, as `lidar`"""
+    stream: Annotated[
+        str, _form(r"([A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+){2})?", "a stream looks like site/node/sensor")
+    ] = ""
+    """stream of its detections, whose newest field of view is its perception region over MQTT; default: no region"""
 
     @property
     def number(self) -> int:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from numpy.typing import NDArray
-    from optipmb_schemas import Tracks
+    from optipmb_schemas import Detections, Tracks
 
     from optipmb_service.settings import CpmSettings, Settings
 
@@ -45,6 +45,9 @@ MOVED_M: Final = 4.0
 FASTER: Final = 0.5  # m/s
 TURNED: Final = math.radians(4.0)
 FAR_M: Final = 1310.7
+NEAR_M: Final = 327.67
+"""Farthest coordinate of a sensor."""
+TURN: Final = 2.0 * math.pi - 1e-6
 NUMBERS: Final = 2**16  # of objects
 SOON: Final = 1e-6  # of a second: times are compared as floating point numbers
 
@@ -80,8 +83,9 @@ class Station:
 
     def __init__(self, settings: Settings, stream: str, cpm: CpmSettings, most: int) -> None:
         self._stream, self._cpm, self._most = stream, cpm, most
-        self._site = settings.sites[stream.partition("/")[0]]
-        lat, lon, alt = self._site.origin
+        site = settings.sites[stream.partition("/")[0]]
+        lat, lon, alt = site.origin
+        self._turn = math.radians(90.0 - site.x_heading)  # of the x axis, counter-clockwise from east
         self._position = {
             "latitude": round(lat * 1e7),
             "longitude": round(lon * 1e7),
@@ -91,6 +95,7 @@ class Station:
         self._pace = Pace(cpm.rate_hz, predict=True)
         self._included: dict[int, tuple[float, ...]] = {}  # time, east, north, speed, heading, by id
         self._sensors_s = -math.inf
+        self._regions: dict[str, dict[str, Any]] = {}
         self._noted: set[str] = set()
         self.perceived = 0
         self.predicted = settings.output_of(stream) is not None
@@ -101,13 +106,18 @@ class Station:
         about = {"message_type": "cpm", "source_uuid": source, "timestamp": now_ns // 10**6, "version": "2.1.1"}
         return json.dumps(about | message, separators=(",", ":")).encode()
 
+    def see(self, detections: Detections) -> None:
+        """Take the field of view of a frame as the region of its sensor."""
+        shape = _radial(detections, self._turn)
+        self._regions[detections.stream] = {} if shape is None else {"perception_region_shape": {"radial": shape}}
+
     def messages(self, tracks: Tracks, left_out: Counter[str]) -> Iterator[dict[str, Any]]:
         """Yield the messages that are due after a frame, if any; count confirmed tracks without a place in them."""
         stamp_ns = tracks.stamp_ns if tracks.predicted_to_ns is None else tracks.predicted_to_ns
         if tracks.revision or not self._pace.passes(self._stream, stamp_ns):
             return
         now = stamp_ns / 1e9
-        turn = math.radians(90.0 - self._site.x_heading)  # of the x axis, counter-clockwise from east
+        turn = self._turn
         places = np.column_stack([tracks.center[:, :2] @ _axes(turn).T, tracks.center[:, 2]])
         objects = _objects(tracks, self._rows(tracks, now, places, turn, left_out), places, turn)
         parts = [objects[at : at + self._most] for at in range(0, len(objects), self._most)]
@@ -127,7 +137,9 @@ class Station:
             message = {"protocol_version": 2, "station_id": self._cpm.station_id, "management_container": management}
             if sensors and number == 1:
                 message["sensor_information_container"] = [
-                    {"sensor_id": one.id, "sensor_type": one.number, "shadowing_applies": True} for one in sensors
+                    {"sensor_id": one.id, "sensor_type": one.number, "shadowing_applies": True}
+                    | self._regions.get(one.stream, {})
+                    for one in sensors
                 ]
             if part:
                 message["perceived_object_container"] = part
@@ -234,6 +246,32 @@ def _objects(tracks: Tracks, rows: NDArray[np.int64], places: Values, turn: floa
             one["position"]["z_coordinate"] = z[row]
         objects.append(one)
     return objects
+
+
+def _radial(detections: Detections, turn: float) -> dict[str, Any] | None:
+    """Return the horizontal sector of a field of view, clockwise from north; None without one, or too far away."""
+    view, pose = detections.field_of_view, detections.pose
+    if view is None:
+        return None
+    place, yaw = np.zeros(3), turn
+    if pose is not None:
+        place = np.append(_axes(turn) @ pose.translation[:2], pose.translation[2])
+        w, x, y, z = pose.quaternion.tolist()
+        yaw += math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    if (np.abs(place) > NEAR_M).any():
+        return None
+    begin, end = view.azimuth.tolist()
+    angles = (
+        np.array([0.0, 3599.0]) if abs(end - begin) > TURN else 900.0 - 10.0 * np.degrees(yaw + np.array([end, begin]))
+    )
+    start, stop = (np.ceil(np.round(angles, 6)).astype(int) % 3600).tolist()
+    numbers = np.ceil(np.round(place / 0.01, 6)).astype(int).tolist()
+    return {
+        "range": min(4095, math.ceil(round(10.0 * view.range[1], 6))),
+        "stationary_horizontal_opening_angle_start": start,
+        "stationary_horizontal_opening_angle_end": stop,
+        "shape_reference_point": {f"{axis}_coordinate": one for axis, one in zip("xyz", numbers, strict=True)},
+    }
 
 
 def _axes(turn: float) -> Values:

@@ -68,6 +68,8 @@ LAST_S: Final = 1.0
 QOS: Final = {"tracks": 0, "problems": 0, "events": 1, "zones": 1, "cpm": 0}
 OBJECTS: Final = 128
 """Objects of a CPM in JSON."""
+SEE_S: Final = 0.5
+"""Time between two looks at the field of view of a sensor: CPM have it once a second."""
 RETAINED: Final = "zones"
 KEPT: Final = frozenset({"events"})  # topics of the network that wait for the broker
 OLD: Final = frozenset({1, 132})  # how brokers of 3.1.1, and of 5, refuse the version of the protocol
@@ -248,6 +250,7 @@ class Bridge(Component):
         """Objects without a place in the CPM, by reason."""
         self._settings = settings
         self._stations: dict[str, Station | None] = {}
+        self._seen: dict[str, float] = {}  # when the field of view of a sensor was taken, monotonic
         self._keys = client.keys
         self._why = "not connected yet"
         self._mqtt = settings.mqtt
@@ -302,6 +305,9 @@ class Bridge(Component):
         if "cpm" in self._wish.topics and self._settings.outputs:
             keys += [self._keys.matching(one, "now") for one in self._wish.streams]
         await asyncio.to_thread(self._feeds.join, keys, self._receive)
+        for stream in {one.stream for station in self._settings.cpm.values() for one in station.sensors if one.stream}:
+            if "cpm" in self._wish.topics:
+                await asyncio.to_thread(self._feeds.join, [self._keys.detections(stream)], partial(self._see, stream))
         self._reader.read(self._feeds.logs(keys))
         pause_s = RETRY_S
         while True:
@@ -398,6 +404,15 @@ class Bridge(Component):
                 payload = station.json(message, time.time_ns())
                 text = Text("cpm", stream, partial(bytes, payload))
                 self._reader.outbox.put(f"cpm {stream}", text, len(payload), SEGMENTS)
+
+    def _see(self, stream: str, one: Publication) -> None:
+        """Take the field of view of a sensor, once a second."""
+        now = time.monotonic()
+        if now - self._seen.get(stream, -inf) >= SEE_S and one.message is not None:
+            self._seen[stream] = now
+            for station in tuple(self._stations.values()):
+                if station is not None:
+                    station.see(one.message)
 
     async def _publish(self, link: Link) -> None:
         """Publish waiting messages, a few at once; messages that an ended connection left, one by one."""

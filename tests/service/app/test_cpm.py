@@ -13,6 +13,7 @@ from typing import Any
 import jsonschema
 import numpy as np
 import pytest
+from optipmb_schemas import Detections
 from optipmb_schemas.ros2.cpm import CPM, cpm_fields, definitions
 from optipmb_schemas.ros2.types import own_types
 from optipmb_service.edges.cpm import Station, station_of
@@ -71,7 +72,20 @@ PLACE = _map(
     ),
     altitude=_pair(-100_000, 800_001, 0, 15),
 )
-SENSOR = _map(sensor_id=_whole(0, 255), sensor_type=_whole(0, 31), shadowing_applies={"type": "boolean"})
+POINT = _map(**{f"{axis}_coordinate": _whole(-32_768, 32_767) for axis in "xyz"})
+RADIAL = _map(
+    range=_whole(0, 4095),
+    stationary_horizontal_opening_angle_start=_whole(0, 3601),
+    stationary_horizontal_opening_angle_end=_whole(0, 3601),
+    shape_reference_point=POINT,
+)
+SENSOR = _map(
+    "perception_region_shape",
+    sensor_id=_whole(0, 255),
+    sensor_type=_whole(0, 31),
+    perception_region_shape=_map(radial=RADIAL),
+    shadowing_applies={"type": "boolean"},
+)
 MANAGEMENT = _map(
     "segmentation_info",
     reference_time=_whole(0, 4_398_046_511_103),
@@ -268,6 +282,49 @@ def test_sensors_are_named_once_a_second() -> None:
     found = [texts(sender, frame(seq, [])) for seq in range(11)]
     assert [seq for seq, one in enumerate(found) if one] == [0, 10]
     assert [one["sensor_type"] for one in found[10][0]["message"]["sensor_information_container"]] == [2, 3]
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "expected"),
+    [((-math.pi / 4, math.pi / 2), (3600 - 900, 450)), ((-math.pi, math.pi), (0, 3599))],
+)
+def test_the_region_of_a_sensor_is_its_newest_field_of_view(
+    azimuth: tuple[float, float], expected: tuple[int, int]
+) -> None:
+    """A sector clockwise from north, at the place of the sensor; none without a field of view, or too far away."""
+    sender = station(x_heading=0.0, sensors=[{"id": 3, "type": "lidar", "stream": "garage/gate/lidar"}])
+    view = {"azimuth": azimuth, "elevation": [-1, 1], "range": [0, 80.05]}
+    about: dict[str, Any] = {
+        "stream": "garage/gate/lidar",
+        "epoch": bytes(16),
+        "seq": 0,
+        "stamp_ns": 1,
+        "frame": "sensor",
+    }
+    about |= {
+        "center": np.empty((0, 3)),
+        "size": np.empty((0, 3)),
+        "yaw": [],
+        "score": [],
+        "label": [],
+        "labels": ["Car"],
+    }
+    found = []
+    for place, given in (((10.0, 20.0, 3.0), view), ((10.0, 400.0, 3.0), view), ((10.0, 20.0, 3.0), None)):
+        pose = {"translation": place, "quaternion": [1.0, 0.0, 0.0, 0.0]}
+        sender.see(Detections(**about, pose=pose, field_of_view=given))
+        found += texts(sender, frame(10 * len(found), []))
+    first, *others = (one["message"]["sensor_information_container"][0] for one in found)
+    radial = first["perception_region_shape"]["radial"]
+    angles = radial["stationary_horizontal_opening_angle_start"], radial["stationary_horizontal_opening_angle_end"]
+    assert (angles, radial["range"]) == (expected, 801)
+    assert radial["shape_reference_point"] == {"x_coordinate": -2000, "y_coordinate": 1000, "z_coordinate": 300}
+    assert all("perception_region_shape" not in one for one in others)
+    types = own_types(perception=True)
+    message = cpm_fields(found[0]["message"], 0)
+    sensor = plain(types.read(CPM, types.write(types.new(CPM, **message))))["payload"]["cpm_containers"][0]
+    (sensor,) = sensor["container_data_sensor_information_container"]
+    assert sensor["perception_region_shape"] == {"radial": radial}
 
 
 def test_objects_without_a_place_are_left_out_and_counted() -> None:

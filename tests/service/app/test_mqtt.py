@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from broker import Broker, mosquitto
 from optipmb_client.errors import ClientError
+from optipmb_schemas import Detections
 from optipmb_schemas.json_form import Selection, event_json, problem_json, tracks_json, zones_json
 from optipmb_service.settings import MqttSettings, Settings
 from watched import PROBLEM, STREAM, Session, events, plain, settled, tracks
@@ -107,6 +108,28 @@ async def test_collective_perception_messages_have_a_topic_of_their_own(session:
         assert (message["station_id"], len(message["perceived_object_container"])) == (4711, 1)
         assert message["management_container"]["reference_time"] == 94_694_401_000 + (100 if outputs else 0)
         assert {one.topic for one in broker.messages} == {ALIVE, f"{TOPIC}/cpm"}
+
+
+async def test_the_field_of_view_of_a_sensor_is_in_the_messages(session: Session) -> None:
+    """Of the stream that the settings name; the next time that the sensors are named."""
+    cpm = {"garage/*/*": {"station_id": 1, "sensors": [{"id": 1, "type": "lidar", "stream": "garage/rig/eye"}]}}
+    async with Broker() as broker, bridging(session, broker, Settings(**CPM | {"cpm": cpm}), topics=["cpm"]) as bridge:
+        await until(lambda: bridge.connected)
+        view = {"azimuth": [-1, 1], "elevation": [-1, 1], "range": [0, 50]}
+        header = {"stream": "garage/rig/eye", "epoch": bytes(16), "seq": 0, "stamp_ns": AT, "frame": "world"}
+        none = {
+            "center": np.empty((0, 3)),
+            "size": np.empty((0, 3)),
+            "yaw": [],
+            "score": [],
+            "label": [],
+            "labels": ["car"],
+        }
+        session.publish(tracks(1).model_copy(update={"stamp_ns": AT}))
+        session.publish(Detections(**header, **none, field_of_view=view))
+        session.publish(tracks(2).model_copy(update={"stamp_ns": AT + 10**9}))
+        found = [json.loads(one)["message"]["sensor_information_container"][0] for one in await broker.wait(2, "/cpm")]
+        assert ["perception_region_shape" in one for one in found] == [False, True]
 
 
 async def test_events_wait_for_the_broker_and_tracks_do_not(session: Session) -> None:
