@@ -44,9 +44,9 @@ INTERVALS: Final = {"$__rate_interval": "20s"}
 """Grafana's own variables: four scrape intervals."""
 TERMINATED: Final = 128 + signal.SIGTERM
 STATUSES: Final = {"replay": TERMINATED}
-"""Exit statuses after the stop signal that are not 0: the replay is interrupted in what it does."""
+"""Exit statuses after the stop signal that are not 0: the replay is interrupted."""
 MIDDLE_S: Final = (5.0, 15.0)
-"""Since its start; it takes twenty seconds, and its container then starts anew."""
+"""Since its start; it takes twenty seconds, and its container then starts again."""
 CONFINED: Final = """\
 id -u
 sed -n 's/^\\(CapEff\\|CapBnd\\|NoNewPrivs\\|Seccomp\\):\\t*/\\1=/p' /proc/1/status

@@ -25,7 +25,7 @@ NAMES: Final = re.compile(
     r"(^|/)(\.pypirc|pip\.conf|\.netrc|\.npmrc|\.git|\.git-credentials|\.env|id_(rsa|dsa|ecdsa|ed25519)|\.aws|\.ssh"
     r"|\.docker|ca\.crt|.*\.key|.*\.p12|.*\.pfx)$"
 )
-"""Files that hold settings, keys and passwords of whoever builds."""
+"""Files that hold settings, keys and passwords of the person who builds."""
 CONTENTS: Final = {
     "a private key": re.compile(rb"-----BEGIN [A-Z ]{0,20}PRIVATE KEY-----\s+[A-Za-z0-9+/=]{40}"),
     "a token": re.compile(

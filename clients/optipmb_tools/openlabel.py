@@ -180,7 +180,7 @@ def _time(path: Path, place: str, value: str | float | None) -> dict[str, Any]:
 def _objects(
     path: Path, place: str, number: int, frame: _Frame, static: Mapping[str, _Object]
 ) -> Iterator[tuple[str, str, str, _Data]]:
-    """Yield place, id, class and data of the objects of a frame, then of those that stand in it."""
+    """Yield place, id, class and data of the objects of a frame, then of standing ones."""
     for name, value in frame.objects.items():
         one = _converted(path, f"{place}.objects.{name}", value, _Object)
         known = static.get(name, one)

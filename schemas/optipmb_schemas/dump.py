@@ -46,7 +46,7 @@ class DumpedFrame:
     Attributes:
         detections: the message.
         points: its cloud.
-        anew: whether the density is empty before it, but for the next track id.
+        anew: whether the frame starts with an empty density, in which only the next track id goes on.
     """
 
     detections: Annotated[Detections, BeforeValidator(lambda data: _stored(data, Detections)), _ENCODED]

@@ -296,7 +296,7 @@ def tracks_json(tracks: Tracks, selection: Selection = EVERYTHING, place: Place 
 def features_json(frames: Iterable[bytes]) -> bytes:
     """Return frames of tracks (`tracks_json`) as a GeoJSON text: a point for each track that has a place.
 
-    Properties are the fields of the track and those of its frame.
+    Properties are the fields of the track and of its frame.
     """
     features = []
     for text in frames:

@@ -127,7 +127,7 @@ class ClassFigures:
     confirmed: TrackFigures | None  # of the tracks that are shown; None where the files do not tell
     calibration: CalibrationResult | None  # where the tracks were kept with all columns
     errors: ErrorResult | None  # likewise
-    velocity_error: float  # mean distance of velocities from those of objects, m/s; NaN where none are known
+    velocity_error: float  # mean error of velocities, m/s; NaN where none are known
 
     @property
     def shown(self) -> TrackFigures:

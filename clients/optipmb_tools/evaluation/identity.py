@@ -50,7 +50,7 @@ def _identity(case: Case) -> IdentityResult:
 
 
 def velocity_errors(stamps: Ints, truth: Truth, tracks: ResultTable, name: str, rules: Rules) -> Floats:
-    """Return the distances (N,), m/s, of the velocities of matched tracks of one class from those of their objects.
+    """Return the errors (N,), m/s, of the velocities of matched tracks of one class.
 
     Args:
         stamps: (F,) of the frames, ns.

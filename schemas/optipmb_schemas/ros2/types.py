@@ -224,7 +224,7 @@ def _own_store(*, perception: bool = False) -> Any:
 
 @functools.cache
 def own_types(*, perception: bool = False) -> Types:
-    """Return the types without any that came with data, with those of collective perception where asked for."""
+    """Return the types without any that came with data; with `perception` also those for collective perception."""
     return Types(perception=perception)
 
 

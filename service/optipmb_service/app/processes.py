@@ -1,4 +1,4 @@
-"""Processes beside the members: the router, the gRPC gateway, and the bridges to MQTT, ROS 2 and the message log.
+"""Processes that do not track: the router, the gRPC gateway, and the bridges to MQTT, ROS 2 and the message log.
 
 Each works until SIGINT or SIGTERM and returns the exit status, as `lifecycle.run` does.
 """

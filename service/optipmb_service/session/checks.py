@@ -33,7 +33,7 @@ STEADY: Final = (1.0, 5.0, math.radians(1.0), 0.5)
 """How far a pose may be from where the motion of a sensor leads: m, m/s^2, rad and rad/s^2."""
 
 CERTAIN: Final = 3.0
-"""Factor by which the ratio of arrival and stamps may differ from that of a unit."""
+"""Factor by which the ratio of arrival and stamps may differ from the ratio of a unit."""
 
 SCORED: Final = 100
 """Detections of a class after which its share below the score filter is reported."""
@@ -80,7 +80,7 @@ class ScoreChecks:
     def __init__(self, parameters: optipmb.Parameters) -> None:
         self._parameters = parameters
         self._checks: dict[str, ScoreCheck] = {}
-        """By sensor, with an empty name that of the profile."""
+        """By sensor; the check of the profile has an empty name."""
 
     def add(self, frame_id: FrameId, frame: optipmb.Frame, parameters: optipmb.Parameters) -> Iterator[Finding]:
         """Yield the classes that lose most of their detections, looking at one frame of some.
@@ -88,7 +88,7 @@ class ScoreChecks:
         Args:
             frame_id: identity of the frame.
             frame: its detections.
-            parameters: those of its sensor.
+            parameters: of its sensor.
         """
         if frame_id.seq % SCORED_EVERY or parameters.self_calibration:  # which filters the lower half of none
             return

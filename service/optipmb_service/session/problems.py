@@ -115,7 +115,7 @@ CODES: Final = {
         "Reset the session, or restart the publisher.",
     ),
 }
-"""Every code of a problem: what it means, and what to do."""
+"""Meaning and remedy of every code of a problem."""
 
 SENTENCES: Final = {
     "late": "{subject}: it came too late, {apart} the newest one.",

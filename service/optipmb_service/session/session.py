@@ -94,8 +94,8 @@ class Session:
         self.run = incarnation.run
         """Number that grows whenever a session of the stream begins or is restored, by whichever process.
 
-        A frame that was tracked before a crash may be tracked again after it, with others that were missing then, and
-        nobody knows any more under which revision it was published. The tracks of a later run replace earlier ones.
+        A frame that was tracked before a crash may be tracked again after it, with others that were missing then. Its
+        last revision is not known any more, so the tracks of a later run replace earlier ones.
         """
         self._fused = fused
         self._make = tracker

@@ -97,7 +97,7 @@ class Transition:
         joining = {} if policy.rejoin is None else {"rejoin": policy.rejoin}
         self._make: Callable[..., optipmb.Tracker] = functools.partial(tracker, **joining)
         self._trackers = [(parameters, self._make(parameters))]
-        """Each with its parameters: that of the profile, and those of sensors that differ."""
+        """Trackers with their parameters: of the profile, and of sensors that differ."""
         self._of: dict[str, int] = {}
         """Index of the tracker of each sensor, where some differ."""
         self._policy = policy
@@ -371,7 +371,7 @@ class Transition:
     def _zones(
         self, before: FilterState, result: optipmb.StepResult, stamp_ns: int
     ) -> tuple[ZoneState | None, tuple[Event, ...]]:
-        """Return what is known of the zones after a frame, and its events."""
+        """Return the state of the zones after a frame, and its events."""
         zones = self._policy.zones
         ended: tuple[Event, ...] = ()
         if not zones:  # their numbers go on when they come back

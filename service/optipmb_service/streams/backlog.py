@@ -120,7 +120,7 @@ class Backlog:
         self.session = session
         self.state: Literal["foreign", "opening", "live"] = "foreign"
         self.unasked = False
-        """Whether the member that is to track the session has yet to ask for what is held."""
+        """Whether the member that is to track the session has yet to ask for the held messages."""
         self.answered: set[str] = set()
         """Streams whose publishers' caches have been received completely."""
         self.closed = False

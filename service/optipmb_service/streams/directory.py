@@ -50,7 +50,7 @@ class _Known:
     announced: bool = False
     """Whether this instance does."""
     seen_ns: int = 0
-    """When this instance noticed a message last; of those that it announces."""
+    """When this instance noticed a message last; of streams that it announces."""
     left_ns: int | None = None
     """Monotonic time at which the last token went; None while there is one."""
 

@@ -55,7 +55,7 @@ REST: Final = 2.0
 MOST_REST_S: Final = 0.5
 
 DRAIN_S: Final = 0.5
-"""Longest wait, before messages are given to another member, for those that are on their way through this process."""
+"""Longest wait for messages under way in this process, before the held ones are given to another member."""
 
 DRAIN_POLL_S: Final = 0.005
 
@@ -98,7 +98,7 @@ class Intake:
         self._left: dict[int, int] = {}
         self._received: set[int] = set()
         self._owed: set[str] = set()
-        """Sessions that have left, as long as the member that has them has not asked for what is held of them."""
+        """Sessions that have left, until their new member has asked for their held messages."""
         self._given = threading.Condition()
         self._wake = threading.Event()
         self._hurry = threading.Event()

@@ -33,7 +33,7 @@ class Profiles:
         default: name of the profile of streams that no pattern names, as the settings give it.
         patterns: pairs of stream pattern and profile name, the first that matches holds.
         known: all profiles by the name that the settings give, and by the name inside the file.
-        sensors: those of fused sessions that differ.
+        sensors: settings of sensors of fused sessions.
         missing_s: returns after which time, s, objects out of view count as missed; None: as in the profile.
     """
 

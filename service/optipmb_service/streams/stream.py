@@ -57,7 +57,7 @@ TURN_NS: Final = 5_000_000
 """Time after which they have it in any case."""
 
 REST: Final = 9
-"""Rest of a sensor after a message beyond the limit, in times of what it took: it has a tenth of the time at most."""
+"""Rest of a sensor after a message beyond the limit, as a multiple of its time: it gets a tenth of the time at most."""
 
 MILLISECOND: Final = 1e6
 

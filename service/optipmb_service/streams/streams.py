@@ -56,7 +56,7 @@ MAX_NEWCOMERS: Final = 16_384
 """Sessions whose first messages wait for room."""
 
 MAX_BACKLOGS: Final = 65_536
-"""Beyond so many, those that are empty are forgotten at once."""
+"""Backlogs from which on empty ones are forgotten at once."""
 
 MAX_KEYS: Final = 8192
 """Keys whose stream is remembered."""
@@ -165,7 +165,7 @@ class Streams:
         self._newcomers: dict[str, None] = {}
         """Sessions that wait for room, in order."""
         self._coming: set[str] = set()
-        """Sessions that the intake is about to take up."""
+        """Sessions that the intake is about to open."""
         self._past = MessageCounters()
         """Counts of streams that have ended, and of messages that came to none."""
         self._sweeps_ns = 0

@@ -55,7 +55,7 @@ class Input(NamedTuple):
 
 
 PACKET_BYTES: Final = 512
-"""Bytes of a message beside its payload, nearly."""
+"""Bytes of a message without its payload, nearly."""
 
 
 @dataclass(slots=True)

@@ -24,7 +24,7 @@ METRES: Final = (
     *("x", "y", "z", "lat", "lon", "alt", "l", "w", "h", "yaw", "vx", "vy", "cov_xx", "cov_xy", "cov_yy"),
     *("qw", "qx", "qy", "qz"),
 )
-"""Meanings that no column has beside pixel boxes."""
+"""Meanings that no column has in a table of pixel boxes."""
 _LOW: Final = (("x1", "xmin", "x_min", "left", "x"), ("y1", "ymin", "y_min", "top", "y"))
 _HIGH: Final = (("x2", "xmax", "x_max", "right"), ("y2", "ymax", "y_max", "bottom"))
 _FORMS: Final = {"xyxy": (*_LOW, *_HIGH), "xywh": (*_LOW, ("w", "width"), ("h", "height")), "uv": (("u",), ("v",))}
