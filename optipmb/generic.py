@@ -24,6 +24,7 @@ REACH: Final = (  # the gate, m, and the standard deviation of an unknown speed,
     ("pedestrian", (1.8, 2.0)), ("bicycle", (2.5, 5.0)), ("motorcycle", (2.5, 12.0)), (OTHER, (2.5, 10.0)),
 )  # fmt: skip
 GATE_DEVIATIONS: Final = 2.75
+VELOCITY_DEVIATIONS: Final = 2.45  # holds 95 % of the velocities of sound detections
 
 REMEMBERED_S: Final = 2.0
 """How long an object is kept without a detection."""
@@ -74,6 +75,7 @@ def _of_class(kind: str, period: float) -> dict[str, Any]:
         "survival": 1.0,
         "gate": gate,
         "gate_deviations": GATE_DEVIATIONS,
+        "velocity_gate": VELOCITY_DEVIATIONS,
         "detection": 0.8,
         "expected_points": 10.0,
         "detection_floor": 0.6,

@@ -264,6 +264,12 @@ class ClassParameters(ParameterTable):
         description="the gate holds the way of so many standard deviations of the speed, or eta_dist where that is "
         "more; the paper: 0",
     )
+    velocity_gate: NonNegative = Field(
+        default=0.0,
+        exclude_if=not_,
+        description="standard deviations from the prediction, of the velocity or the position of a detection, from "
+        "which its velocity is left out; 0: it never is (the paper)",
+    )
     birth_over_clutter: bool = Field(
         default=False,
         description="true: a detection from eta_score on is born unless a Poisson component explains it better than "

@@ -68,6 +68,7 @@ class ClassRow(Protocol):
     survival: float
     gate: float
     gate_deviations: float
+    velocity_gate: float
     detection: float
     expected_points: float
     detection_floor: float

@@ -97,6 +97,8 @@ def ukf_updates(
             sigma[MEASURED] = variance * position[m, 3]
         sigma[2] = sigma[3] = own.noise_velocity
         sigma[4] = own.noise_heading
+        if own.velocity_gate > 0.0 and velocity_doubtful(z, sigma, mean[n], covariance[n], own.velocity_gate):
+            z[2] = z[3] = math.nan
         if ukf_update(mean[n], covariance[n], z, sigma, buffers, mean_out[k], covariance_out[k]) > 0:
             repaired += 1
         if heading_unknown(covariance_out[k]):
@@ -107,6 +109,28 @@ def ukf_updates(
         elif math.isnan(z[4]) and covariance_out[k, PHI, PHI] > LOST * LOST:
             lose_heading(mean_out[k], covariance_out[k])
     return repaired
+
+
+@kernel
+def velocity_doubtful(z: Array, sigma: Array, mean: Array, covariance: Array, deviations: float) -> bool:
+    """Tell whether the velocity of a detection, or its position, lies beyond so many deviations of the prediction.
+
+    Some detectors report the motion of an object after it has stopped. Its boxes stay behind the predicted ones then,
+    until its velocity is left out; after that the velocity is far from the one that the boxes show. `z`, `sigma`,
+    `mean` and `covariance` are as in `ukf_update`, and the distances ``nu' S^-1 nu``.
+    """
+    limit = deviations * deviations
+    s_xx, s_yy = covariance[X, X] + sigma[0] ** 2, covariance[Y, Y] + sigma[1] ** 2
+    s_xy = covariance[X, Y] + sigma[MEASURED]
+    dx, dy = z[0] - mean[X], z[1] - mean[Y]
+    if s_yy * dx * dx - 2.0 * s_xy * dx * dy + s_xx * dy * dy > limit * (s_xx * s_yy - s_xy * s_xy):
+        return True
+    cos, sin, v = math.cos(mean[PHI]), math.sin(mean[PHI]), mean[V]
+    along, across = cos * z[2] + sin * z[3] - v, cos * z[3] - sin * z[2]
+    arm = 1.0 if heading_unknown(covariance) else v * v  # without heading, phi stands for the speed across
+    s_along, s_across = covariance[V, V] + sigma[2] ** 2, arm * covariance[PHI, PHI] + sigma[3] ** 2
+    far: bool = along * along / s_along + across * across / s_across > limit
+    return far
 
 
 @kernel

@@ -127,9 +127,23 @@ def measure(x: Array, *, with_velocity: bool) -> Array:
     return np.array([px, py, v * np.cos(phi), v * np.sin(phi), phi] if with_velocity else [px, py, phi])
 
 
+def believed(m: Array, P: Array, z: Measurement, c: Any) -> Array | None:
+    """The velocity of a measurement, None where it or the position is beyond the velocity gate."""
+    if z.velocity is None or not c.velocity_gate:
+        return z.velocity
+    noise, forward = c.measurement_noise, np.array([math.cos(m[3]), math.sin(m[3])])
+    axes = np.array([forward, [-forward[1], forward[0]]])
+    place, speed = z.xy - m[:2], axes @ z.velocity - [m[2], 0]
+    S = P[:2, :2] + noise.position**2 * np.eye(2)
+    S_v = np.diag([P[2, 2], m[2] ** 2 * P[3, 3]]) + noise.velocity**2 * np.eye(2)
+    far = max(place @ np.linalg.inv(S) @ place, speed @ np.linalg.inv(S_v) @ speed)
+    return None if far > c.velocity_gate**2 else z.velocity
+
+
 def ukf_update(m: Array, P: Array, z: Measurement, c: Any) -> tuple[Array, Array]:
     """Eq. (UKF Update) with the parameters `c` of the class."""
-    known = z.velocity is not None
+    velocity = believed(m, P, z, c)
+    known = velocity is not None
     points = sigma_points(m, P)
     images = [measure(x, with_velocity=known) for x in points]
     z_hat = np.mean(images, axis=0)
@@ -137,7 +151,7 @@ def ukf_update(m: Array, P: Array, z: Measurement, c: Any) -> tuple[Array, Array
     deviations = [noise.position] * 2 + ([noise.velocity] * 2 if known else []) + [noise.heading]
     S = np.mean([np.outer(y - z_hat, y - z_hat) for y in images], axis=0) + np.diag(np.square(deviations))
     C = np.mean([np.outer(x - m, y - z_hat) for x, y in zip(points, images, strict=True)], axis=0)
-    nu = np.concatenate([z.xy, z.velocity if z.velocity is not None else [], [z.yaw]]) - z_hat
+    nu = np.concatenate([z.xy, [] if velocity is None else velocity, [z.yaw]]) - z_hat
     nu[-1] = fold(nu[-1])
     K = C @ np.linalg.inv(S)
     mean = m + K @ nu

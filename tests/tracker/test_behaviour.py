@@ -196,6 +196,21 @@ def test_missed_frames_widen_and_weaken_a_track() -> None:
     assert len(results[-1].density.bernoulli.id) == 0
 
 
+@pytest.mark.parametrize("stop", [30, 0])
+def test_a_stopped_car_that_reports_its_old_velocity_keeps_its_track(stop: int) -> None:
+    """One id, confirmed, at its place and at rest, also if it has never moved; another car keeps its speed."""
+    tracker, x = optipmb.OnlineTracker("generic"), 0.0
+    for k in range(90):
+        x += 0.5 * (k < stop)
+        center = [[x, 0.0, 0.0], [0.8 * k, 10.0, 0.0]]
+        given = {"center": center, "velocity": [[5.0, 0.0], [8.0, 0.0]], "size": [[4.5, 1.9, 1.6]] * 2}
+        tracks = tracker.update(t=0.1 * k, yaw=[0.0, 0.0], score=[0.9, 0.8], label=["car", "car"], **given)
+    assert tracks.id.tolist() == [1, 2]
+    assert tracks.confirmed.all()
+    assert np.abs(tracks.center[:, :2] - [[x, 0.0], [71.2, 10.0]]).max() < 0.1
+    assert np.abs(tracks.velocity - [[0.0, 0.0], [8.0, 0.0]]).max() < 0.3
+
+
 def test_an_irregular_stream_keeps_its_track() -> None:
     """Between 20 ms and 300 ms apart, the same object at constant speed keeps its id and its speed."""
     rng = np.random.default_rng(2)

@@ -35,7 +35,7 @@ def noise(rng: np.random.Generator) -> SimpleNamespace:
     deviations = SimpleNamespace(
         position=rng.uniform(0.05, 1), velocity=rng.uniform(0.1, 2), heading=rng.uniform(0.02, 1)
     )
-    return SimpleNamespace(measurement_noise=deviations)
+    return SimpleNamespace(measurement_noise=deviations, velocity_gate=0.0)
 
 
 def updated(mean: Array, covariance: Array, z: textbook.Measurement, c: SimpleNamespace) -> tuple[Array, Array]:
