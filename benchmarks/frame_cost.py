@@ -1,23 +1,25 @@
 """Cost of a frame in the service, part by part, compared with another version of the code in one run.
 
-python benchmarks/frame_cost.py [--beside DIR] [--objects N] [--points N] [--rounds N]
+python benchmarks/frame_cost.py [--beside DIR] [--objects N] [--points N] [--scene NAME] [--rejoin] [--rounds N]
 
 A frame goes its way through one process, with everything real but the network and the store: a packet is handed over,
 decoded, tracked and published, and every tenth frame a checkpoint is encoded. What counts is the processor time of the
 thread. `--beside` names a checkout of another version: rounds of the two follow each other, each in a process of its
-own, and the medians of the rounds are compared.
+own, and the medians of the rounds are compared. `--rejoin` compares a session that joins tracks over gaps with one that
+does not, which take each frame in turns.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import subprocess
 import sys
 import time
 from pathlib import Path
-from statistics import median
+from statistics import fmean, median
 from typing import TYPE_CHECKING, Any
 
 import load
@@ -27,6 +29,7 @@ from optipmb_service.session import convert
 from optipmb_service.session.checkpoint import encode_checkpoint
 from optipmb_service.session.session import Session
 from optipmb_service.streams import stream as stream_module
+from optipmb_service.streams.profiles import Profiles
 from optipmb_service.streams.stream import Stream
 from optipmb_service.streams.streams import Streams
 from optipmb_service.telemetry.logs import configure
@@ -35,12 +38,13 @@ from optipmb_service.telemetry.problem_reporter import ProblemReporter
 from optipmb_service.zenoh.inputs import Packet
 
 import optipmb
+from optipmb import tracker as tracker_module
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
 HERE = Path(__file__).resolve().parents[1]
-STREAM = "site-of-load/node/lidar1"
+STREAM, JOINING = "site-of-load/node/lidar1", "site-of-load/node/lidar2"
 WARM = 100
 FRAMES = 400
 RATE_HZ = 10.0
@@ -77,30 +81,24 @@ class Parts:
         return taken
 
 
-def packets(objects: int, points: int) -> Iterator[list[Any]]:
-    """Yield the messages of each frame, its cloud first."""
-    keys = schemas.Keys()
-    frames = load.generated(objects, points, RATE_HZ)
-    for k in range(WARM + FRAMES):
-        begins = load.head(STREAM, bytes(16), load.FIRST + k, 10**18 + round(k * 1e9 / RATE_HZ))
-        made = []
-        detections, cloud = frames.detections[k % len(frames)], frames.clouds[k % len(frames)]
-        bodies = (
-            (cloud, keys.points(STREAM), schemas.Points),
-            (detections, keys.detections(STREAM), schemas.Detections),
-        )
-        for body, key, kind in bodies:
-            if body is not None:
-                payload = load.message(body, begins)
-                encoding = schemas.encoding_of(kind)
-                made.append(Packet(key, payload, len(payload), encoding, time.time_ns(), time.monotonic_ns()))
-        yield made
+def packets(stream: str, frames: load.Frames, k: int) -> Iterator[Packet]:
+    """Yield the messages of frame k, its cloud first."""
+    keys, begins = schemas.Keys(), load.head(stream, bytes(16), load.FIRST + k, 10**18 + round(k * 1e9 / RATE_HZ))
+    bodies = (
+        (frames.clouds[k % len(frames)], keys.points(stream), schemas.Points),
+        (frames.detections[k % len(frames)], keys.detections(stream), schemas.Detections),
+    )
+    for body, key, kind in bodies:
+        if body is not None:
+            payload = load.message(body, begins)
+            yield Packet(key, payload, len(payload), schemas.encoding_of(kind), time.time_ns(), time.monotonic_ns())
 
 
-def measured(objects: int, points: int) -> dict[str, float]:
-    """Return the median microseconds of each part of a frame."""
+def measured(options: argparse.Namespace) -> list[dict[str, float]]:
+    """Return the median microseconds of each part of a frame, of each session."""
     sys.path.append(str(HERE / "tests" / "support"))
-    from registries import Around, streams_of  # noqa: PLC0415 - found by the path above
+    import gaps  # noqa: PLC0415 - found by the path above
+    from registries import Around, streams_of  # noqa: PLC0415 - likewise
 
     class Counting(Around):
         published = 0
@@ -120,6 +118,7 @@ def measured(objects: int, points: int) -> dict[str, float]:
         ("conversion", convert, "cloud_of"),
         ("conversion", convert, "tracks_of"),
         ("step", optipmb.Tracker, "step"),
+        ("joining", tracker_module, "rejoin_tracks"),
         ("publishing", Stream, "_send"),
         ("metrics", Metrics, "received"),
         ("metrics", Metrics, "published"),
@@ -129,24 +128,39 @@ def measured(objects: int, points: int) -> dict[str, float]:
     for part, owner, name in timed:
         setattr(owner, name, parts.time(part, getattr(owner, name)))
     network, problems = Counting(), list[schemas.Problem]()
-    streams: Any = streams_of(network, reporter=ProblemReporter(problems.append), tracker=optipmb.Tracker)
-    rows: list[dict[str, float]] = []
-    checkpoints: list[float] = []
-    for k, frame in enumerate(packets(objects, points)):
-        for packet in frame:
+    streams: Any = streams_of(
+        network,
+        reporter=ProblemReporter(problems.append),
+        tracker=optipmb.Tracker,
+        profiles=Profiles.read("generic" if options.scene else "nuscenes", {}),
+        rejoin={JOINING: {}},
+    )
+    frames = load.generated(options.objects, options.points, RATE_HZ)
+    if options.scene:
+        frames = load.listed(gaps.record(options.scene, 1, (WARM + FRAMES) / RATE_HZ).frames)
+    names = (STREAM, JOINING) if options.rejoin else (STREAM,)
+    rows: dict[str, list[dict[str, float]]] = {name: [] for name in names}
+    checkpoints: dict[str, list[float]] = {name: [] for name in names}
+    for k, name in itertools.product(range(WARM + FRAMES), names):
+        for packet in packets(name, frames, k):
             streams.receive(packet)
         network.run()
         row = parts.taken()
         if k >= WARM:
-            rows.append(row)
+            rows[name].append(row)
             if k % CHECKPOINT_EVERY == 0:
                 began_ns = time.thread_time_ns()
-                encode_checkpoint(streams.of(STREAM).session.snapshot())
-                checkpoints.append((time.thread_time_ns() - began_ns) / 1e3 / CHECKPOINT_EVERY)
-    if network.published != WARM + FRAMES or problems:
+                encode_checkpoint(streams.of(name).session.snapshot())
+                checkpoints[name].append((time.thread_time_ns() - began_ns) / 1e3 / CHECKPOINT_EVERY)
+    if network.published != len(names) * (WARM + FRAMES) or problems:
         raise RuntimeError(f"{network.published} frames were answered, {problems[:1]}")
-    medians = {part: median(row[part] for row in rows) for part in rows[0]}
-    return medians | {"checkpoint": median(checkpoints), "sum": sum(medians.values()) + median(checkpoints)}
+    found = []
+    for name in names:
+        medians = {part: median(row[part] for row in rows[name]) for part in rows[name][0]}
+        medians["checkpoint"] = median(checkpoints[name])
+        mean = fmean(sum(row.values()) for row in rows[name]) + fmean(checkpoints[name])
+        found.append(medians | {"sum": sum(medians.values()), "mean of the sum": mean})
+    return found
 
 
 def roots(tree: Path) -> str:
@@ -156,19 +170,19 @@ def roots(tree: Path) -> str:
 
 def rounds(trees: Sequence[Path], options: argparse.Namespace) -> list[dict[str, float]]:
     """Measure the checkouts side by side; return the medians of the rounds."""
-    seen: list[list[dict[str, float]]] = [[] for _ in trees]
-    command = [sys.executable, __file__, "--one", "--objects", str(options.objects), "--points", str(options.points)]
+    seen: list[list[list[dict[str, float]]]] = []
     for _ in range(options.rounds):
         started = [
-            subprocess.Popen(  # noqa: S603 - it calls itself, with numbers
-                command, env=os.environ | {"PYTHONPATH": roots(tree)}, stdout=subprocess.PIPE, text=True
+            subprocess.Popen(  # noqa: S603 - it calls itself, with its own options
+                [sys.executable, __file__, "--one", *sys.argv[1:]],
+                env=os.environ | {"PYTHONPATH": roots(tree)},
+                stdout=subprocess.PIPE,
+                text=True,
             )
             for tree in trees
         ]
-        answers = [process.communicate()[0] for process in started]
-        for rows, answer in zip(seen, answers, strict=True):
-            rows.append(json.loads(answer))
-    return [{part: median(row[part] for row in rows) for part in rows[0]} for rows in seen]
+        seen.append([one for process in started for one in json.loads(process.communicate()[0])])
+    return [{part: median(row[part] for row in rows) for part in rows[0]} for rows in zip(*seen, strict=True)]
 
 
 def main() -> None:
@@ -177,19 +191,21 @@ def main() -> None:
     parser.add_argument("--beside", type=Path, help="checkout of another version")
     parser.add_argument("--objects", type=int, default=40)
     parser.add_argument("--points", type=int, default=0)
+    parser.add_argument("--scene", help="one of tests/support/gaps.py in the place of objects that drive in circles")
+    parser.add_argument("--rejoin", action="store_true", help="compare a session that joins tracks over gaps")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--one", action="store_true", help="one round of the packages on the search path, as JSON")
     options = parser.parse_args()
     if options.one:
-        print(json.dumps(measured(options.objects, options.points)))
+        print(json.dumps(measured(options)))
         return
     trees = [*([options.beside.resolve()] if options.beside else []), HERE]
     results = rounds(trees, options)
-    print("| part | " + " | ".join(["before", "after", "ratio"] if options.beside else ["us"]) + " |")
+    print("| part | " + " | ".join(["us"] if len(results) == 1 else ["before", "after", "ratio"]) + " |")
     for part in results[0]:
         values = [result[part] for result in results]
-        shown = [f"{value:.1f}" for value in values] + [f"{values[-1] / values[0]:.2f}"] * (len(values) - 1)
-        print(f"| {part} | " + " | ".join(shown) + " |")
+        ratio = f"{values[-1] / values[0]:.2f}" if values[0] else "-"
+        print(f"| {part} | " + " | ".join([*(f"{value:.1f}" for value in values), *[ratio] * (len(values) - 1)]) + " |")
 
 
 if __name__ == "__main__":

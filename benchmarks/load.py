@@ -138,6 +138,12 @@ def recorded(sequences: Sequence[DataSequence], *, clouds: bool) -> Frames:
     return Frames(tuple(detections), tuple(shelf), objects, float(np.mean(points)))
 
 
+def listed(frames: Sequence[dict[str, Any]]) -> Frames:
+    """Return frames that are given by the fields of their detections in the world frame."""
+    bodies = tuple(_body(Detections(**_ANY | one | {"stamp_ns": _ANY["stamp_ns"]}, frame="world")) for one in frames)
+    return Frames(bodies, (None,) * len(bodies), float(np.mean([len(one["label"]) for one in frames])), 0.0)
+
+
 def _recorded(frame: DetectionFrame, *, with_cloud: bool) -> bytes:
     pose = Pose(translation=frame.pose.translation, quaternion=frame.pose.quaternion)
     columns = {name: values for name, values in frame.columns.items() if name != "position_covariance"}

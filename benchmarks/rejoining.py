@@ -1,14 +1,17 @@
-"""Tracks joined over gaps: `python benchmarks/rejoining.py --root data`.
+"""Tracks joined over gaps: `python benchmarks/rejoining.py --root data [--online]`.
 
 Prints the tables of docs/gaps.md as Markdown: four generated scenes (`tests/support/gaps.py`), the generated traffic
 with lasting objects, and with `--root` KITTI and nuScenes. A join is right if the earlier track ended on the object on
-which the later one began. Profile `auto`.
+which the later one began, by the last and the first five detections. Profile `auto`. With `--online` tracks are joined
+while tracking: rows that are not decided have no identity, and joins below the least probability are those of a second
+run.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,16 +20,18 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 
-from gaps import CLASSES, FALSE_OBJECT, SCENES, SIZES, Judged, judge, owners, record, tracked
+from gaps import CLASSES, FALSE_OBJECT, SCENES, SIZES, Judged, decided, ends_of, followed, judge, owners, record
 from generality import DETECTORS, identity_f1, sequences_of
 from optipmb_tools.datasets import Truth, open_dataset
 from optipmb_tools.evaluation.cases import default_rules, prepare
-from optipmb_tools.evaluation.clear import clear
+from optipmb_tools.evaluation.clear import clear, combine
+from optipmb_tools.evaluation.hota import evaluate_hota
 from optipmb_tools.results import full_table, stacked
 from optipmb_tools.run import profiles
-from optipmb_tools.run.rejoining import Rejoin
-from optipmb_tools.run.tracking import track_whole
+from optipmb_tools.run.rejoining import Rejoin, joins, tracklets
+from optipmb_tools.run.tracking import tracker_frame
 
+import optipmb
 from optipmb import generic_parameters
 
 if TYPE_CHECKING:
@@ -34,13 +39,17 @@ if TYPE_CHECKING:
 
     from gaps import Recording
     from optipmb_schemas import Tracks
-    from optipmb_tools.geometry import Ints
+    from optipmb_tools.evaluation.cases import Case
+    from optipmb_tools.evaluation.clear import ClearResult
+    from optipmb_tools.geometry import Floats, Ints
 
-    from optipmb import Parameters
+    from optipmb import Frame, Parameters
+    from optipmb.lost_objects import Tracklets
 
 LENGTHS = (1, 2, 3, 5, 10, 20, 40)
 LEVELS = (0.8, 0.9, 0.95, 0.98, 0.99, 1.01)
 NEAR_M = 2.0
+RULES = default_rules("scene")
 
 
 def truth_of(recording: Recording, labels: dict[int, int]) -> Truth:
@@ -55,19 +64,50 @@ def truth_of(recording: Recording, labels: dict[int, int]) -> Truth:
     )
 
 
-def identities(tracks: dict[int, Tracks], parameters: Parameters, truth: Truth) -> list[tuple[float, int]]:
-    """Return IDF1 and switches of the confirmed tracks, by id and by object."""
-    objects, rules = Rejoin().objects(tracks, parameters), default_rules("scene")
+def ids_of(tracks: dict[int, Tracks]) -> Ints:
+    """Return the id of each row."""
+    return stacked(list(tracks.values()), "id")
+
+
+@dataclass(frozen=True)
+class How:
+    """How tracks are joined."""
+
+    least: float
+    online: bool
+
+    def tracked(self, frames: Sequence[Frame], parameters: Parameters, least: float = 0.0) -> dict[int, Tracks]:
+        """Return the tracks of frames, joined while tracking if that is asked for."""
+        how = optipmb.Rejoin(min_probability=least or self.least)
+        return followed(frames, parameters, how if self.online else None)
+
+    def joins(self, tracks: dict[int, Tracks], parameters: Parameters) -> tuple[Tracklets, tuple[Ints, Ints, Floats]]:
+        """Return the confirmed tracks and the joins."""
+        found = tracklets(tracks, parameters.labels)
+        return found, decided(tracks, found) if self.online else joins(found, parameters, Rejoin.gap_s)
+
+    def numbers(self, tracks: dict[int, Tracks], parameters: Parameters) -> Ints:
+        """Return the object of each row, -1 of one that has none."""
+        if self.online:
+            return stacked(list(tracks.values()), "object").astype(np.int64)
+        stamps = np.repeat([one.stamp_ns for one in tracks.values()], [len(one.id) for one in tracks.values()])
+        identity = ids_of(tracks)
+        number = Rejoin(min_probability=self.least).objects(tracks, parameters).columns(identity, stamps)["object"]
+        return np.where(number < 0, identity, number)
+
+
+def cases_by(number: Ints, tracks: dict[int, Tracks], parameters: Parameters, truth: Truth) -> list[Case]:
+    """Return the cases of the classes with the confirmed tracks, given the identity of each row, or -1."""
     table, sure = full_table(parameters.labels, tracks), stacked(list(tracks.values()), "confirmed") > 0
-    stamps = np.array([tracks[index].stamp_ns for index in sorted(tracks)])
-    joined = objects.columns(table.id, stamps[np.searchsorted(sorted(tracks), table.frame)])["object"]
-    found = []
-    for number in (table.id, np.where(joined < 0, table.id, joined)):
-        shown = table.take(sure)
-        object.__setattr__(shown, "id", number[sure])
-        cases = [prepare(truth, shown, name, rules) for name in truth.labels]
-        found.append((identity_f1(cases, -np.inf), sum(clear(case, rules).switches for case in cases)))
-    return found
+    rows = sure & (number >= 0)
+    shown = table.take(rows)
+    object.__setattr__(shown, "id", number[rows])
+    return [prepare(truth, shown, name, RULES) for name in truth.labels]
+
+
+def counts_of(cases: Sequence[Case]) -> ClearResult:
+    """Return the CLEAR figures of all classes together."""
+    return combine(clear(case, RULES) for case in cases)
 
 
 def owners_by_place(tracks: dict[int, Tracks], truth: Truth) -> dict[int, tuple[int, int]]:
@@ -81,7 +121,7 @@ def owners_by_place(tracks: dict[int, Tracks], truth: Truth) -> dict[int, tuple[
             if detection >= 0 and len(near):
                 apart = np.linalg.norm(truth.center[near, :2] - place[:2], axis=1)
                 own.append(int(truth.id[near[apart.argmin()]]) if apart.min() < NEAR_M else FALSE_OBJECT)
-    return {one: (own[0], own[-1]) if own else (FALSE_OBJECT, FALSE_OBJECT) for one, own in rows.items()}
+    return {one: ends_of(own) if own else (FALSE_OBJECT, FALSE_OBJECT) for one, own in rows.items()}
 
 
 def line(*cells: object) -> None:
@@ -96,20 +136,26 @@ def head(*cells: object) -> None:
     line(*["---"] * len(cells))
 
 
-def generated(seeds: Sequence[int], least: float) -> None:
+def generated(seeds: Sequence[int], how: How) -> None:
     """Print the tables of the four scenes."""
-    parameters = generic_parameters(CLASSES, 0.1)
-    every, rows = Judged(), []
+    parameters, least = generic_parameters(CLASSES, 0.1), how.least
+    every, unsure, rows = Judged(), Judged(), []
     for name in SCENES:
         here, figures = Judged(), []
         for seed in seeds:
             recording = record(name, seed)
-            tracks = tracked(recording.frames, parameters)
-            here += judge(tracks, owners(tracks, recording.source), parameters)
-            figures.append(identities(tracks, parameters, truth_of(recording, recording.labels)))
+            frames = [optipmb.make_frame(parameters, **one)[0] for one in recording.frames]
+            tracks = how.tracked(frames, parameters)
+            here += judge(*how.joins(tracks, parameters), owners(tracks, recording.source))
+            if how.online:
+                other = how.tracked(frames, parameters, LEVELS[0])
+                unsure += judge(*how.joins(other, parameters), owners(other, recording.source))
+            numbers, truth = (ids_of(tracks), how.numbers(tracks, parameters)), truth_of(recording, recording.labels)
+            cases = [cases_by(one, tracks, parameters, truth) for one in numbers]
+            figures.append([(identity_f1(one, -np.inf), counts_of(one).switches) for one in cases])
         every += here
-        one = np.array(figures)  # (S, 2, 2)
-        score, switches = 100.0 * one[:, :, 0].mean(axis=0), one[:, :, 1].sum(axis=0).astype(int)
+        table = np.array(figures)  # (S, 2, 2)
+        score, switches = 100.0 * table[:, :, 0].mean(axis=0), table[:, :, 1].sum(axis=0).astype(int)
         rows.append((name, here, score, switches))
     head("share of true gaps joined, %", *(f"{a} to {b} s" for a, b in pairwise(LENGTHS)))
     for name, one in (*((row[0], row[1]) for row in rows), ("all", every)):
@@ -122,14 +168,25 @@ def generated(seeds: Sequence[int], least: float) -> None:
         share = f"{100.0 * right / max(right + wrong, 1):.1f}"
         line(name, right, wrong, share, *(f"{value:.1f}" for value in score), *switches.tolist())
     head("probability", "joins", "right, %")
+    join = (unsure if how.online else every).join
     for low, high in pairwise(LEVELS):
-        known = every.join[(every.join[:, 0] >= low) & (every.join[:, 0] < high) & ~np.isnan(every.join[:, 1])]
+        known = join[(join[:, 0] >= low) & (join[:, 0] < high) & ~np.isnan(join[:, 1])]
         line(f"{low:g} to {min(high, 1.0):g}", len(known), f"{100.0 * known[:, 1].mean():.0f}" if len(known) else "-")
 
 
-def recorded(root: Path | None, frames: int, least: float) -> None:
+def recorded(root: Path | None, frames: int, how: How) -> None:
     """Print the table of the traffic of the product and, with a root, of KITTI and nuScenes."""
-    head("data", "confirmed tracks", "true gaps", "right", "wrong", "of unlabelled objects", "IDF1 by id", "by object")
+    cells = (
+        "data",
+        "confirmed tracks",
+        "true gaps",
+        "right",
+        "wrong",
+        "of unlabelled objects",
+        "IDF1 by id",
+        "by object",
+    )
+    head(*cells, "figures by id")
     traffic = [
         one
         for seed in range(4)
@@ -138,31 +195,49 @@ def recorded(root: Path | None, frames: int, least: float) -> None:
     sets = {"generated traffic": traffic}
     sets |= {name: list(sequences_of(root, name, fast=False)) for name in DETECTORS} if root else {}
     for name, sequences in sets.items():
-        found, tracked_ids, figures = Judged(), 0, []
+        judged, tracked_ids, figures, same = Judged(), 0, [], True
         for sequence in sequences:
             parameters = profiles.profile_for("auto", [sequence])
-            tracks = track_whole(parameters, sequence).tracks
+            given = list(sequence.frames())
+            made = [tracker_frame(parameters, sequence.name, one) for one in given]
             truth = sequence.truth()
             if truth is None:
                 raise SystemExit(f"{sequence.name}: no annotations")
+
+            order = [one.index for one in given]
+            tracks, plain = (
+                dict(zip(order, one.tracked(made, parameters).values(), strict=True))
+                for one in (how, replace(how, online=False))
+            )
             shown: list[Ints] = [one.id[one.confirmed > 0] for one in tracks.values() if one.confirmed is not None]
             tracked_ids += len(np.unique(np.concatenate(shown)))
-            found += judge(tracks, owners_by_place(tracks, truth), parameters, whole=False)
-            figures.append([score for score, _ in identities(tracks, parameters, truth)])
+            judged += judge(*how.joins(tracks, parameters), owners_by_place(tracks, truth), whole=False)
+            by_id, by_object = (
+                cases_by(one, tracks, parameters, truth) for one in (ids_of(tracks), how.numbers(tracks, parameters))
+            )
+            without = cases_by(ids_of(plain), plain, parameters, truth)
+            same &= counts_of(without) == counts_of(by_id)
+            same &= evaluate_hota(without, RULES).summary() == evaluate_hota(by_id, RULES).summary()
+            figures.append([identity_f1(one, -np.inf) for one in (by_id, by_object)])
         score = 100.0 * np.mean(figures, axis=0)
-        line(name, tracked_ids, len(found.gap), *found.counts(least), *(f"{value:.1f}" for value in score))
+        shares = (f"{value:.1f}" for value in score)
+        line(name, tracked_ids, len(judged.gap), *judged.counts(how.least), *shares, "equal" if same else "different")
 
 
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--root", type=Path, help="folder with kitti/, nuscenes/ and nuscenes-more/")
-    parser.add_argument("--seeds", type=int, nargs="+", default=range(21, 27))
+    parser.add_argument("--seeds", type=int, nargs="*", default=range(21, 27))
     parser.add_argument("--frames", type=int, default=900, help="of the generated traffic")
-    parser.add_argument("--min-probability", type=float, default=Rejoin.min_probability)
+    parser.add_argument("--online", action="store_true", help="join while tracking")
+    parser.add_argument("--min-probability", type=float, help="default: that of the product")
     given = parser.parse_args()
-    generated(given.seeds, given.min_probability)
-    recorded(given.root, given.frames, given.min_probability)
+    default = optipmb.Rejoin.min_probability if given.online else Rejoin.min_probability
+    how = How(given.min_probability or default, given.online)
+    if given.seeds:
+        generated(given.seeds, how)
+    recorded(given.root, given.frames, how)
 
 
 if __name__ == "__main__":

@@ -36,18 +36,19 @@ ZONES: dict[str, dict[str, Any]] = {
     for y in (-12, 0)
 } | {f"line-{x}": {"streams": ["*/kitti/*"], "line": [[x, -20], [x, 20]]} for x in range(5, 85, 10)}
 """Eight zones and eight lines where the recorded vehicles start."""
+JOINS = optipmb.Rejoin(min_probability=0.6)
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _compiled() -> None:
-    optipmb.warm_up()
+    optipmb.warm_up(rejoin=True)
 
 
 def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Fault 1: four recorded streams, SIGKILL in the middle, a new process: all is as without a kill.
 
-    The tracks of every frame, repetitions set aside, the digest of the state and the events of zones are byte-equal to
-    an undisturbed session; events that were final did not change. Every round has a moment of its
+    The tracks of every frame and their objects, repetitions set aside, the digest of the state and the events of zones
+    are byte-equal to an undisturbed session; events that were final did not change. Every round has a moment of its
     own.
     """
     root = kitti_root()
@@ -58,6 +59,8 @@ def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[
     zones = tuple(ZoneSettings(**one).zone(name) for name, one in sorted(ZONES.items()))
     final, number = 0, 0
     settings = {"zones": json.dumps(ZONES), "profile": "kitti", "queue_clouds": FRAMES, "stream_mb": 1024} | waits
+    settings["rejoin"] = json.dumps({"*/kitti/*": {"min_probability": JOINS.min_probability}})
+    policy = Policy(zones=zones, rejoin=JOINS)
     with Fleet(tmp_path, **settings) as fleet, Connection(fleet.endpoint) as connection:
         service = fleet.service("one")
         for round_ in range(KILLS):
@@ -79,7 +82,7 @@ def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[
             replay.finish(RESTART_S)
             outages.append(_outage(replay, killed))
             for recording in recordings:
-                tracks, digest, events = undisturbed(recording.messages, "kitti", Policy(zones=zones))
+                tracks, digest, events = undisturbed(recording.messages, "kitti", policy)
                 result = replay.results[recording.stream]
                 assert [result.tracks[seq] for seq in range(FRAMES)] == [{one} for one in tracks], (round_, SEED)
                 state = replay.state(recording.stream)

@@ -4,17 +4,19 @@ A street behind buildings, a car park, a sensor that turns to and fro, and a squ
 end and begin behind what hides them, stop, and leave their slot to another one.
 """
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 from optipmb_schemas import Tracks
-from optipmb_tools.run.rejoining import Rejoin, joins, tracklets
+from optipmb_tools.run.rejoining import Rejoin
 from optipmb_tools.run.tracking import fields_of
 
 import optipmb
+from optipmb.lost_objects import Tracklets
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -27,6 +29,8 @@ PLACE: Final = np.array([0.12, 0.06, 0.08])
 FALSE: Final = 0.3
 """False detections in a frame."""
 FALSE_OBJECT: Final = -1
+END: Final = 5
+"""Detections at an end of a track that tell on which object it is."""
 
 
 @dataclass
@@ -289,27 +293,69 @@ def cars(*paths: tuple[float, float, tuple[float, float], tuple[float, float]]) 
     return frames
 
 
-def tracked(frames: list[dict[str, Any]], parameters: optipmb.Parameters) -> dict[int, Tracks]:
-    """Return the tracks of each frame as messages."""
-    tracker = optipmb.Tracker(parameters)
+def tracked(
+    frames: list[dict[str, Any]], parameters: optipmb.Parameters, how: optipmb.Rejoin | None = None
+) -> dict[int, Tracks]:
+    """Return the tracks of each frame, given by the arguments of `make_frame`, as messages."""
+    return followed((optipmb.make_frame(parameters, **given)[0] for given in frames), parameters, how)
+
+
+def followed(
+    frames: Iterable[optipmb.Frame], parameters: optipmb.Parameters, how: optipmb.Rejoin | None = None
+) -> dict[int, Tracks]:
+    """Return the tracks of each frame as messages, with their objects if they are joined while tracking."""
+    tracker = optipmb.Tracker(parameters, rejoin=how)
     density, found = tracker.initial(), {}
-    for k, given in enumerate(frames):
-        result = tracker.step(density, optipmb.make_frame(parameters, **given)[0])
-        density = result.density
-        header = {"stream": "a/b/c", "epoch": bytes(16), "seq": k, "stamp_ns": given["stamp_ns"], "session": "0" * 32}
+    for k, frame in enumerate(frames):
+        result = tracker.step(density, frame)
+        density, joined = result.density, result.joined
+        header = {"stream": "a/b/c", "epoch": bytes(16), "seq": k, "stamp_ns": frame.stamp_ns, "session": "0" * 32}
         header |= {"profile": parameters.name, "cloud_used": False, "labels": parameters.labels}
-        found[k] = Tracks.trusted(header | fields_of(result.tracks, None, measured=result.measured))
+        others: dict[str, Any] = {"measured": result.measured}
+        if joined is not None:
+            others |= {"object": joined.object, "object_probability": joined.probability}
+        found[k] = Tracks.trusted(header | fields_of(result.tracks, None, **others))
     return found
 
 
+def decided(tracks: dict[int, Tracks], found: Tracklets) -> tuple[Ints, Ints, Floats]:
+    """Return the joins of a tracker: rows of the earlier and of the later tracks, and their probabilities."""
+    row = dict(zip(found.id.tolist(), range(len(found)), strict=True))
+    newest: dict[int, tuple[int, float]] = {}  # track of each object, and the probability of its chain
+    before, after, probability = [], [], []
+    for one in tracks.values():
+        if one.object is None or one.object_probability is None:
+            raise ValueError("tracks without objects")
+        columns = one.id.tolist(), one.object.tolist(), one.object_probability.tolist()
+        for identity, number, product in zip(*columns, strict=True):
+            last, chain = newest.get(number, (identity, 1.0))
+            if number < 0 or (last == identity and number in newest):
+                continue
+            newest[number] = identity, product
+            if last != identity:
+                before.append(row[last])
+                after.append(row[identity])
+                probability.append(product / chain)
+    return np.array(before, dtype=np.int64), np.array(after, dtype=np.int64), np.array(probability)
+
+
 def owners(tracks: dict[int, Tracks], source: list[Ints]) -> dict[int, tuple[int, int]]:
-    """Return the objects on which each track began and ended, by its first and last detections."""
+    """Return the objects on which each track began and ended."""
     rows: dict[int, list[int]] = {}
     for k, one in tracks.items():
         for identity, detection in zip(one.id.tolist(), one.detection.tolist(), strict=True):
             if detection >= 0:
                 rows.setdefault(identity, []).append(int(source[k][detection]))
-    return {identity: (own[0], own[-1]) for identity, own in rows.items()}
+    return {identity: ends_of(own) for identity, own in rows.items()}
+
+
+def ends_of(objects: list[int]) -> tuple[int, int]:
+    """Return the objects of most of the first and of the last `END` detections of a track.
+
+    A single detection at an end may be a false one, or of an object that passes through this one.
+    """
+    (first,), (last,) = (Counter(own).most_common(1) for own in (objects[:END], objects[: -END - 1 : -1]))
+    return first[0], last[0]
 
 
 @dataclass(frozen=True)
@@ -335,26 +381,24 @@ class Judged:
 
 
 def judge(
-    tracks: dict[int, Tracks],
+    found: Tracklets,
+    joined: tuple[Ints, Ints, Floats],
     owner: dict[int, tuple[int, int]],
-    parameters: optipmb.Parameters,
     *,
     whole: bool = True,
 ) -> Judged:
-    """Return the true gaps of a recording and its joins, with any probability.
+    """Return the true gaps of a recording and its joins, of any probability.
 
     A join is right if the earlier track ended on the object on which the later one began. Without `whole` annotations,
     an object may lack one.
     """
-    how = Rejoin()
-    found = tracklets(tracks, parameters.labels)
-    before, after, probability = joins(found, parameters, how.gap_s)
+    before, after, probability = joined
     by = dict(zip(zip(before.tolist(), after.tolist(), strict=True), probability.tolist(), strict=True))
     begun, ended = (np.array([owner[one][end] for one in found.id.tolist()], dtype=np.int64) for end in (0, 1))
     gaps = []
     for j in np.flatnonzero(begun != FALSE_OBJECT).tolist():
         gap = (found.first_ns[j] - found.last_ns) * 1e-9
-        same = np.flatnonzero((ended == begun[j]) & (gap > 0.0) & (gap <= how.gap_s))
+        same = np.flatnonzero((ended == begun[j]) & (gap > 0.0) & (gap <= Rejoin.gap_s))
         if len(same):
             i = int(same[gap[same].argmin()])
             gaps.append((gap[i], by.get((i, j), 0.0)))

@@ -6,6 +6,7 @@ from typing import Any
 import gaps
 import numpy as np
 import pytest
+from optipmb_tools.run.rejoining import tracklets
 
 import optipmb
 from optipmb import OnlineTracker, ParameterError, Rejoin, Relocation, Tracker, generic_parameters
@@ -174,24 +175,12 @@ def test_settings_out_of_bounds_are_named(value: dict[str, Any], path: str) -> N
 
 def test_most_joins_are_right() -> None:
     """In a street and a car park of the generator at most one join in thirty is wrong, and many gaps are bridged."""
-    right = wrong = 0
+    judged = gaps.Judged()
     for name in ("street", "car park"):
         recording = gaps.record(name, 41, 60.0)
-        begun: dict[int, int] = {}
-        ended: dict[int, int] = {}
-        last: dict[int, int] = {}
-        for source, one in zip(recording.source, steps(recording.frames, Rejoin()), strict=True):
-            assert one.joined is not None
-            rows = zip(one.tracks.id.tolist(), one.tracks.detection.tolist(), one.joined.object.tolist(), strict=True)
-            for identity, detection, number in rows:
-                if detection >= 0:
-                    begun.setdefault(identity, int(source[detection]))
-                if number >= 0 and number in last and last[number] != identity:
-                    same = ended[last[number]] == begun[identity]
-                    right, wrong = right + same, wrong + (not same)
-                if number >= 0:
-                    last[number] = identity
-                if detection >= 0:
-                    ended[identity] = int(source[detection])
+        tracks = gaps.tracked(recording.frames, GENERIC, Rejoin())
+        found = tracklets(tracks, GENERIC.labels)
+        judged += gaps.judge(found, gaps.decided(tracks, found), gaps.owners(tracks, recording.source))
+    right, wrong, _ = judged.counts(0.0)
     assert right >= 20
     assert wrong <= right / 30

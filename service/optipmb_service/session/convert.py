@@ -17,6 +17,7 @@ import optipmb_schemas as schemas
 
 import optipmb
 from optipmb.frame import frame_of_checked
+from optipmb.rows import read_only
 from optipmb.table import ClassTable
 from optipmb_service.session.values import Tracked
 
@@ -170,8 +171,9 @@ def tracks_of(result: optipmb.StepResult, stream: str, frame_id: FrameId, **fiel
     others: dict[str, Any] = {}
     if result.measured is not None or result.class_probability is not None:
         others |= schemas.track_fields(measured=result.measured, class_probability=result.class_probability)
-    if (joined := result.joined) is not None:
-        others |= schemas.track_fields(object=joined.object, object_probability=joined.probability)
+    if (joined := result.joined) is not None:  # ids of tracks and products of probabilities
+        probability = joined.probability.astype(np.float32)
+        others |= {"object": read_only(joined.object), "object_probability": read_only(probability)}
     if (paths := result.paths) is not None:
         others |= schemas.path_fields(paths.horizons, paths.mean, paths.covariance)
     if not optipmb.sound(tracks):
