@@ -134,7 +134,7 @@ class Rejoin:
     """
 
     gap_s: float = 60.0
-    min_probability: float = 0.99
+    min_probability: float = 0.97
     decide_s: float = 0.3
     most: int = 1000
 
@@ -456,6 +456,8 @@ def match(i: Index, j: Index, value: Array, wanted: Flags, rows: int) -> tuple[F
     distance, via = state[0], state[1]
     graph = i, j, value, first, by_row, start
     for source in range(rows):
+        if first[source] == first[source + 1]:
+            continue
         _shortest(source, False, graph, mates, state, nodes[start[part[source]] : start[part[source] + 1]])
         if not distance[count] < 0.0:
             continue
@@ -539,21 +541,23 @@ def _fit(rows: Tracklets, k: int, seen: Places, n: int, noise: float) -> None:
 
 
 @kernel
-def _copy(source: Array, n: int, target: Array, k: int, layout: Index, width: int) -> None:
-    """Write row `n` of the words of a record to row `k` of those of another."""
+def _copy(source: Array, rows: Index, target: Array, places: Index, layout: Index) -> None:
+    """Write rows of the words of a record to places in those of another, column by column."""
+    width = layout[-1, 0] + layout[-1, 1]
     many, most = source.shape[0] // width, target.shape[0] // width
     for c in range(layout.shape[0]):
         begin, size = layout[c, 0], layout[c, 1]
-        for s in range(size):
-            target[begin * most + k * size + s] = source[begin * many + n * size + s]
+        for k in range(rows.shape[0]):
+            n, place = begin * many + rows[k] * size, begin * most + places[k] * size
+            for s in range(size):
+                target[place + s] = source[n + s]
 
 
 @kernel
-def _selected(source: Array, rows: Index, layout: Index, width: int) -> Array:
+def _selected(source: Array, rows: Index, layout: Index) -> Array:
     """Return the words of the rows."""
-    target = np.empty(rows.shape[0] * width)
-    for k in range(rows.shape[0]):
-        _copy(source, rows[k], target, k, layout, width)
+    target = np.empty(rows.shape[0] * (layout[-1, 0] + layout[-1, 1]))
+    _copy(source, rows, target, np.arange(rows.shape[0]), layout)
     return target
 
 
@@ -627,17 +631,17 @@ def follow(
     same = count == before
     for k in range(count):
         same &= row[k] == k
-    words = live_words.copy() if same else np.zeros(count * _TRACKLET)
-    spots = place_words.copy() if same else np.zeros(count * _PLACE)
+    if same:
+        words, spots = live_words.copy(), place_words.copy()
+    else:
+        words, spots = np.zeros(count * _TRACKLET), np.zeros(count * _PLACE)
+        stays = np.flatnonzero(row[:count] >= 0)
+        _copy(live_words, row[stays], words, stays, _TRACKLETS)
+        _copy(place_words, row[stays], spots, stays, _PLACES)
     rows, seen = tracklets_in(words), places_in(spots)
     for k in range(count):
         n = source[k]
-        if same:
-            pass
-        elif row[k] >= 0:
-            _copy(live_words, row[k], words, k, _TRACKLETS, _TRACKLET)
-            _copy(place_words, row[k], spots, k, _PLACES, _PLACE)
-        else:
+        if row[k] < 0:
             rows.id[k], rows.object[k], rows.first_ns[k], rows.probability[k] = tracks.id[n], -1, stamp_ns, 1.0
             rows.begin[k], rows.size[k] = tracks.center[n, :2], math.nan
         if n >= 0 and tracks.detection[n] >= 0:
@@ -653,18 +657,14 @@ def follow(
     if leaves.shape[0]:
         lost = tracklets_in(lost_words)
         merged = np.empty(lost_words.shape[0] + leaves.shape[0] * _TRACKLET)
-        place = np.searchsorted(lost.id, live.id[leaves]) + np.arange(leaves.shape[0])
-        added, k = 0, 0
-        for n in range(lost.id.shape[0] + leaves.shape[0]):
-            if added < leaves.shape[0] and place[added] == n:
-                _copy(live_words, leaves[added], merged, n, _TRACKLETS, _TRACKLET)
-                _fit(
-                    tracklets_in(merged), n, places_in(place_words), leaves[added], motion[live.label[leaves[added]], 0]
-                )
-                added += 1
-            else:
-                _copy(lost_words, k, merged, n, _TRACKLETS, _TRACKLET)
-                k += 1
+        places = np.searchsorted(lost.id, live.id[leaves]) + np.arange(leaves.shape[0])
+        others = np.ones(lost.id.shape[0] + leaves.shape[0], np.bool_)
+        others[places] = False
+        _copy(lost_words, np.arange(lost.id.shape[0]), merged, np.flatnonzero(others), _TRACKLETS)
+        _copy(live_words, leaves, merged, places, _TRACKLETS)
+        after, seen = tracklets_in(merged), places_in(place_words)
+        for n in range(leaves.shape[0]):
+            _fit(after, places[n], seen, leaves[n], motion[live.label[leaves[n]], 0])
         return words, spots, merged
     return words, spots, lost_words
 
@@ -797,13 +797,12 @@ def decide(
         else:
             ends[row] = True
     if not kept.all():
-        lost_words = _selected(lost_words, np.flatnonzero(kept), _TRACKLETS, _TRACKLET)
+        lost_words = _selected(lost_words, np.flatnonzero(kept), _TRACKLETS)
     recent = np.flatnonzero(begun.stamp_ns >= stamp_ns - RECENT_NS)
     recent = recent[max(0, recent.shape[0] + decided.shape[0] - MOST_BEGINNINGS) :]
     more = np.empty((recent.shape[0] + decided.shape[0]) * _BEGINNING)
     rows = beginnings_in(more)
-    for n in range(recent.shape[0]):
-        _copy(begun_words, recent[n], more, n, _BEGINNINGS, _BEGINNING)
+    _copy(begun_words, recent, more, np.arange(recent.shape[0]), _BEGINNINGS)
     for n in range(decided.shape[0]):
         at, m = recent.shape[0] + n, decided[n]
         k = young[m]
@@ -874,8 +873,8 @@ def advance(
             ends, stays = live.id[rows], np.ones(count, np.bool_)
             stays[rows] = False
             others = np.flatnonzero(stays)
-            live_words = _selected(live_words, others, _TRACKLETS, _TRACKLET)
-            place_words = _selected(place_words, others, _PLACES, _PLACE)
+            live_words = _selected(live_words, others, _TRACKLETS)
+            place_words = _selected(place_words, others, _PLACES)
             live = tracklets_in(live_words)
     lost = tracklets_in(lost_words)
     dropped, inside = 0, 0
@@ -884,7 +883,7 @@ def advance(
     if inside < lost.last_ns.shape[0] or inside > most:
         rows = np.flatnonzero((stamp_ns - lost.last_ns) * _NS <= gap_s)
         dropped = max(0, inside - most)
-        lost_words = _selected(lost_words, rows[_newest(lost.last_ns[rows], most)], _TRACKLETS, _TRACKLET)
+        lost_words = _selected(lost_words, rows[_newest(lost.last_ns[rows], most)], _TRACKLETS)
     shown = tracks_in(track_words)
     objects, probability, k = np.full(shown.id.shape[0], -1), np.ones(shown.id.shape[0]), 0
     for n in range(shown.id.shape[0]):
