@@ -309,7 +309,7 @@ def check_fitting(density: Density, labels: tuple[str, ...]) -> None:
     `density_of` and the tracker make fitting ones; one that a caller assembled or wrote to may not fit.
 
     Raises:
-        DensityError: names the column, what it should hold and what it holds.
+        DensityError: names the column, the expected content and the content found.
     """
     misses, objects, pi, own = density.misses, density.bernoulli, density.class_probability, density.self_calibration
     good = pi is None or (isinstance(pi, np.ndarray) and pi.shape == (len(objects), len(labels)))

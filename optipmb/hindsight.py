@@ -9,12 +9,12 @@ with log odds of at most `SURE`. The track is confirmed from `confirm_from` on, 
 depends on those frames alone. Recordings and outputs with a delay use this function.
 
 Tracks are thus confirmed from their first frames on, in which their speed is hardly known. The velocity of a track is
-the mean of those of the later frames j, taken back over the time d between with their acceleration a along the heading
-u and turn rate omega:
+the mean of its velocities in the later frames j, taken back over the time d between with their acceleration a along the
+heading u and turn rate omega:
 
     v' = sum w_j R(-omega_j d) (v_j - a_j d u_j) / sum w_j,    w_j = 1 / (P_vv,j + `AGILITY` d^2)
 
-It is weighted as in `optipmb.calibration`, with the variance 1 / max w_j. The covariance stays that of the frame.
+It is weighted as in `optipmb.calibration`, with the variance 1 / max w_j. The covariance of the frame stays.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def with_hindsight(
         tracks: of the frame.
         later: of the frames within the time after it, in the same session.
         parameters: the profile.
-        same_axes: all frames are in the same axes, which those of an estimated sensor motion are not.
+        same_axes: all frames are in the same axes; with an estimated motion of the sensor they are not.
     """
     total, count = _log_odds(tracks.existence), np.ones(len(tracks))
     weight = 1.0 / np.maximum(tracks.covariance[:, V, V], LEAST_VARIANCE)

@@ -104,7 +104,7 @@ class Beginnings(Rows):
 
 
 class Statistics(Rows):
-    """Of each class (C,), that of a group in the row of its first class.
+    """Of each class (C,); the row of its first class holds a group.
 
     Attributes:
         since_ns: (C,) int64 stamp from which beginnings are counted.

@@ -453,11 +453,11 @@ class Sensor:
     """How the frames of one of several sensors of a session are used (not in the paper).
 
     The density does not depend on parameters other than the classes, so the frames of a sensor go through a `Tracker`
-    with parameters of their own: those of the session, with the measurement side of another profile (`MEASUREMENT`).
-    Motion, survival, extraction and limits stay those of the session.
+    with the parameters of the session and the measurement side of another profile (`MEASUREMENT`).
+    Motion, survival, extraction and limits are not replaced.
 
     A miss of a sensor that detects less says less. With p the detection probability of a class in the profile of the
-    session and q in that of the sensor, it says as much as so many misses of the session's:
+    session and q in the sensor's, it says as much as so many misses of the session's:
 
         attention a = min[1, ln(1 - q) / ln(1 - p)]
 
@@ -466,7 +466,7 @@ class Sensor:
     0: its detections are left out, and nothing of it is missed.
 
     Attributes:
-        profile: whose measurement side holds; None: that of the session.
+        profile: whose measurement side holds; None: the session's own.
         starts_tracks: whether its detections start and announce tracks.
         trust_size: whether sizes and heights of its boxes are used; else they count as unknown.
         trust_heading: whether their headings are used.
@@ -522,7 +522,7 @@ class Sensors:
         return cls(tuple((pattern, _sensor(f"sensors.{pattern}", table)) for pattern, table in tables.items()))
 
     def parameters(self, session: Parameters, sensor: str) -> Parameters:
-        """Return the parameters of the frames of a sensor; those of the session where it is an ordinary one."""
+        """Return the parameters of the frames of a sensor; an ordinary one has the session's."""
         for pattern, use in self.uses:
             if fnmatchcase(sensor, pattern if "/" in sensor else pattern.rpartition("/")[2]):
                 return use.parameters(session)

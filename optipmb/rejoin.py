@@ -354,7 +354,7 @@ def _shortest(
         graph: of the pairs row, column, value; first pair of each row and the pairs by row; first node.
         mates: pair of each node, or -1.
         state: receives the distances and the pair before each column; marks; queue.
-        nodes: those of the connected part.
+        nodes: all of the connected part.
     """
     i, j, value, first, by_row, _ = graph
     distance, via, queued, queue = state
@@ -425,7 +425,7 @@ def _parts(i: Index, j: Index, rows: int, count: int) -> tuple[Index, Index, Ind
 
 @kernel
 def match(i: Index, j: Index, value: Array, wanted: Flags, rows: int) -> tuple[Flags, Array, Array]:
-    """Find the matching with the largest sum, and what it depends on.
+    """Find the matching with the largest sum, and its margins.
 
     Args:
         i: (P,) rows, each below `rows`.
@@ -542,7 +542,7 @@ def _fit(rows: Tracklets, k: int, seen: Places, n: int, noise: float) -> None:
 
 @kernel
 def _copy(source: Array, rows: Index, target: Array, places: Index, layout: Index) -> None:
-    """Write rows of the words of a record to places in those of another, column by column."""
+    """Write rows of the words of a record to places in another's, column by column."""
     width = layout[-1, 0] + layout[-1, 1]
     many, most = source.shape[0] // width, target.shape[0] // width
     for c in range(layout.shape[0]):
@@ -572,7 +572,7 @@ def _detect(
     stamp_ns: int,
     noise: float,
 ) -> None:
-    """Write a detection, of row `n` of the tracks, to row `k`; `parts` tells what is known: heading, size, height."""
+    """Write a detection, of row `n` of the tracks, to row `k`; `parts`: are heading, size, height known?"""
     x, y, count = tracks.center[n, 0], tracks.center[n, 1], seen.count[k]
     if count == 0 or stamp_ns - seen.stamp_ns[k, (count - 1) % PLACES] >= SPACING_NS:
         slot = count % PLACES
@@ -697,7 +697,7 @@ def decide(
     kinds: Columns,
     limits: tuple[float, float],
 ) -> tuple[Array, Array, Index]:
-    """Decide on new tracks: write their objects to the words of the live tracks, and sizes to those of the classes.
+    """Decide on new tracks: write their objects to the words of the live tracks, and sizes to the words of the classes.
 
     Args:
         given: words of the live tracks, the lost objects, the beginnings and the classes.
@@ -899,7 +899,7 @@ class Joined(NamedTuple):
 
     Attributes:
         density: the posterior; objects that were joined while they were not detected are no longer in it.
-        tracks: those of the frame without these.
+        tracks: of the frame, without these objects.
         object: (N,) int64 id of the first track of the object, -1 while that is not decided.
         probability: (N,) that all joins of the object are right, 1 without a join.
         joins: of the frame.

@@ -315,7 +315,7 @@ def observe(
 def _rejoined(
     zones: Sequence[Zone], known: dict[int, Seen], numbers: dict[int, int], stamp_ns: int, objects: Mapping[int, int]
 ) -> None:
-    """Let tracks whose objects are decided now go on with what is known of these; long gaps cross no line.
+    """Let tracks whose objects are decided now continue their visits; long gaps cross no line.
 
     Args:
         zones: the zones and lines.

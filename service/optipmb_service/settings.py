@@ -782,7 +782,7 @@ class Settings(BaseSettings):
         return one
 
     def missing_s(self, session: str) -> float | None:
-        """Return the time without a report after which objects count as missed; None: that of the profile."""
+        """Return the time without a report after which objects count as missed; None: `unseen_time` of the profile."""
         one = self.input_of(session)
         return one.missing_s if one.complete is False else None
 

@@ -233,7 +233,7 @@ class Results:
         """Write the table in the order of the names, or the file of a benchmark that holds all sequences.
 
         Sequences that were not taken are missing in the table; a file of a benchmark is written of all or not at all.
-        Return notes on what is not in the file.
+        Return notes on omissions.
         """
         parts = [written for _, written in sorted(self._taken.items()) if not isinstance(written, Path)]
         if parts:

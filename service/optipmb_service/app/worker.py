@@ -135,7 +135,7 @@ async def _serve(
 
 
 def warm_up(*, rejoin: bool = False) -> None:
-    """Compile the kernels, or load them, with `rejoin` also those that join tracks over gaps.
+    """Compile the kernels, or load them, with `rejoin` also the kernels that join tracks over gaps.
 
     With its array functions numba loads scipy's linear algebra where that is installed: 15 of 220 MB, and a twelfth of
     the processor time of the start, for functions that no kernel uses. It does without where there is none, so it is

@@ -1,8 +1,8 @@
 """Collective Perception Messages (CPM, ETSI TS 103 324 V2.1.1) of confirmed tracks, for MQTT and ROS 2.
 
 A message is a map with the names of the JSON form of Orange's its-client; both edges are written from it. Positions are
-in metres east, north and up of the site's origin, angles counter-clockwise from east. The reference time is that of the
-states, so the same tracks give the same messages.
+in metres east, north and up of the site's origin, angles counter-clockwise from east. The reference time is the time
+of the states, so the same tracks give the same messages.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Station:
 
     Attributes:
         perceived: confirmed tracks of the newest frame.
-        predicted: whether its states are those of `outputs`.
+        predicted: whether its states come from `outputs`.
     """
 
     def __init__(self, settings: Settings, stream: str, cpm: CpmSettings, most: int) -> None:
@@ -290,7 +290,7 @@ def _pairs(
         unit: of the values and the intervals.
         limits: least and greatest number.
         variance: (n,) variances in the square of the unit of `values`; None: not known.
-        confidence: greatest number of an interval and the one that stands for wider ones; that of unknown ones.
+        confidence: greatest number of an interval and the ones for wider and for unknown ones.
     """
     numbers = np.clip(np.ceil(np.round(values / unit, 6)), *limits).astype(int).tolist()
     if variance is None:
