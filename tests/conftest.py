@@ -11,6 +11,7 @@ import forked
 import guard
 import hypothesis
 import pytest
+from hypothesis.internal.conjecture import providers
 
 HERE = Path(__file__).parent
 
@@ -36,6 +37,9 @@ WAITING = ("docker", "e2e", "grpc", "service")
 # The same thirty examples in every run, unless a test says otherwise; `--hypothesis-profile default` looks at more.
 hypothesis.settings.register_profile("same", derandomize=True, deadline=None, database=None, max_examples=30)
 hypothesis.settings.load_profile("same")
+# It also draws constants of the modules that are loaded, and those depend on the tests that a process ran before. There
+# is no setting for it.
+providers.is_local_module_file = lambda _path: False
 
 
 @pytest.hookimpl(wrapper=True)
