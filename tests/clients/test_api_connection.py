@@ -140,10 +140,10 @@ def test_what_a_publisher_sent_before_its_first_sample_came_is_not_lost(
             small.put(b"%d" % number)
         receiver.subscribe("a/*", inbox)
         sent, deadline = 5, time.monotonic() + 60.0
-        while not inbox.pending and time.monotonic() < deadline:
+        while inbox.pending < sent and time.monotonic() < deadline:
             small.put(b"%d" % sent)
             sent += 1
-            time.sleep(0.01)  # the subscription is on its way to the publisher; there is no event for it
+            time.sleep(0.05)  # the subscription is on its way to the publisher; there is no event for it
         received = [inbox.get(60.0) for _ in range(sent)]
     assert [arrival.payload for arrival in received if arrival] == [b"%d" % number for number in range(sent)]
 
