@@ -5,6 +5,7 @@ from functools import cache
 import gaps
 import numpy as np
 import pytest
+from optipmb_tools.run.rejoining import Rejoin, joins, tracklets
 
 from optipmb import generic_parameters
 
@@ -19,7 +20,9 @@ def judged() -> gaps.Judged:
         for seed in SEEDS:
             recording = gaps.record(name, seed)
             tracks = gaps.tracked(recording.frames, parameters)
-            found += gaps.judge(tracks, gaps.owners(tracks, recording.source), parameters)
+            rows = tracklets(tracks, parameters.labels)
+            joined = joins(rows, parameters, Rejoin.gap_s)
+            found += gaps.judge(rows, joined, gaps.owners(tracks, recording.source))
     return found
 
 
