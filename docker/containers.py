@@ -217,7 +217,7 @@ class Check:
             raise CheckError("the log of service-a has no command that sends detections")
         headers = {"authorization": found[2], "content-type": "application/json"}
         request = urllib.request.Request(found[1], found[3].encode(), headers)  # noqa: S310 - of the compose file
-        with urllib.request.urlopen(request, timeout=30) as answer:  # noqa: S310
+        with urllib.request.urlopen(request, timeout=30) as answer:  # noqa: S310 - likewise
             body = json.load(answer)
         if not body["accepted"] or not body["tracks"]:
             raise CheckError(f"service-a answers {body}")

@@ -143,7 +143,7 @@ def test_a_car_drives_through_a_zone_by_curl_and_mosquitto_pub_alone(tmp_path: P
                 assert events.stdout is not None
                 assert events.stdout.readline() == "1\n", "the retained topic says that it has subscribed"
                 senders = senders.replace("127.0.0.1:8080", address_of(service)).replace("_pub", f"_pub -p {port}")
-                subprocess.run(["bash", "-ec", senders], cwd=tmp_path, check=True, timeout=120)  # noqa: S607
+                subprocess.run(["bash", "-ec", senders], cwd=tmp_path, check=True, timeout=120)  # noqa: S607 - found by its name
                 found = [json.loads(line) for line in events.stdout]
             assert "internal_error" not in bridge.errors
     happened = {(one["stream"], one["kind"], one["how"], one["n"]) for one in found}
