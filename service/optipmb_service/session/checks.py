@@ -11,8 +11,6 @@ import optipmb
 from optipmb_service.session.values import MAX_SENSORS, SECOND
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     import optipmb_schemas as schemas
 
     from optipmb_service.session.timeline import FrameId
@@ -59,15 +57,18 @@ class SensorChecks:
         self._poses = PoseCheck()
         self._is_blind = False
 
-    def add(self, message: schemas.Detections, arrived_ns: int, policy: Policy) -> Iterator[Finding]:
-        """Yield problems of a frame that arrived (monotonic)."""
+    def add(self, message: schemas.Detections, arrived_ns: int, policy: Policy) -> list[Finding]:
+        """Return problems of a frame that arrived (monotonic)."""
+        findings = []
         if found := self._stamps.add(message.stamp_ns, arrived_ns):
-            yield Finding("clock", "stamp_ns", "stamps in nanoseconds that advance with time", found)
+            findings.append(Finding("clock", "stamp_ns", "stamps in nanoseconds that advance with time", found))
         if policy.jumps == "report" and (found := self._poses.add(message, policy)):
-            yield Finding("world_jump", "pose", "a pose where the motion of the sensor leads, or a `relocation`", found)
+            expected = "a pose where the motion of the sensor leads, or a `relocation`"
+            findings.append(Finding("world_jump", "pose", expected, found))
         if policy.needs_view and message.field_of_view is None and not self._is_blind:
             self._is_blind = True
-            yield Finding("no_view", "field_of_view", "where the sensor sees", "nothing")
+            findings.append(Finding("no_view", "field_of_view", "where the sensor sees", "nothing"))
+        return findings
 
 
 class ScoreChecks:
@@ -82,8 +83,8 @@ class ScoreChecks:
         self._checks: dict[str, ScoreCheck] = {}
         """By sensor; the check of the profile has an empty name."""
 
-    def add(self, frame_id: FrameId, frame: optipmb.Frame, parameters: optipmb.Parameters) -> Iterator[Finding]:
-        """Yield the classes that lose most of their detections, looking at one frame of some.
+    def add(self, frame_id: FrameId, frame: optipmb.Frame, parameters: optipmb.Parameters) -> list[Finding]:
+        """Return the classes that lose most of their detections, looking at one frame of some.
 
         Args:
             frame_id: identity of the frame.
@@ -91,13 +92,13 @@ class ScoreChecks:
             parameters: of its sensor.
         """
         if frame_id.seq % SCORED_EVERY or parameters.self_calibration:  # which filters the lower half of none
-            return
+            return []
         sensor = "" if parameters is self._parameters else frame_id.sensor
         if sensor not in self._checks:
             if len(self._checks) > MAX_SENSORS:
                 self._checks.clear()
             self._checks[sensor] = ScoreCheck(parameters)
-        yield from self._checks[sensor].add(frame)
+        return self._checks[sensor].add(frame)
 
 
 class ScoreCheck:
@@ -113,20 +114,22 @@ class ScoreCheck:
         self._given = np.zeros(len(self._filters), np.int64)
         self._removed = np.zeros(len(self._filters), np.int64)
 
-    def add(self, frame: optipmb.Frame) -> Iterator[Finding]:
-        """Count the detections below the filter; yield each class that loses most of them, once."""
+    def add(self, frame: optipmb.Frame) -> list[Finding]:
+        """Count the detections below the filter; return each class that loses most of them, once."""
         filters, size = self._filters, len(self._filters)
         self._given += np.bincount(frame.label, minlength=size)
         low = frame.score < filters[frame.label]
         if not low.any():
-            return
+            return []
         self._removed += np.bincount(frame.label[low], minlength=size)
+        findings = []
         for index in np.flatnonzero((self._given >= SCORED) & (2 * self._removed > self._given)).tolist():
             label = self._parameters.labels[index]
             received = f"{self._removed[index]} of {self._given[index]} below {filters[index]:g}"
             expected = f"most scores of {label} above the filter of the profile {self._parameters.name}"
-            yield Finding("score_filter", f"{label}.score", expected, received)
+            findings.append(Finding("score_filter", f"{label}.score", expected, received))
             filters[index] = 0.0  # reported
+        return findings
 
 
 class StampCheck:

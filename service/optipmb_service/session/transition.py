@@ -360,7 +360,7 @@ class Transition:
             starts=before.starts,
             generation=frame.place.generation,
             last=frame_id,
-            tracks=int(result.tracks.confirmed.sum()),
+            tracks=int(np.count_nonzero(result.tracks.confirmed)),
             counts=_counted(before, frame, frames=1, gaps=gap, clouds_used=used, **more),
             sensors=_sensors(before, frame_id.sensor, known),
             zones=zones,
