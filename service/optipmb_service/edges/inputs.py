@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import collections
 import contextlib
+import hashlib
 import secrets
 import time
 from dataclasses import dataclass, field
@@ -307,9 +308,12 @@ class Inputs:
             async with stream.lock:  # taken once: frames of a stream go out in the order in which they came
                 await self._prepare(name, stream)
                 parts = separate(frame) if rules.complete is False else [frame]
+                is_new = False
                 for at, one in enumerate(parts):
+                    if is_new:  # the frame has begun, and whoever sent it again would send its objects twice
+                        await stream.in_flight.below(WINDOW)
                     tracks = self._loop.create_future() if wait_s and one is parts[-1] else None
-                    mark = _mark(one, repeats, at)
+                    mark = _mark(one, repeats, at, rules)
                     sent, is_new = await self._handed(stream, one, mark, rules, traceparent, tracks)
             counts = self.frames if is_new else self.duplicates
             counts[self._edge] += 1
@@ -508,10 +512,12 @@ class Inputs:
         self._reporter.flush(time.monotonic_ns())
 
 
-def _mark(frame: JsonFrame, repeats: str, part: int) -> Hashable:
+def _mark(frame: JsonFrame, repeats: str, part: int, rules: InputSettings) -> Hashable:
     """Return the mark of a part of a frame by which a repeated one is recognised; None without key and stamp."""
     if frame.key or repeats:
         return ("key", frame.key, part) if frame.key else ("repeats", repeats, part)
+    if rules.complete is False and frame.is_stamped:  # several objects may be reported with one stamp
+        return hashlib.blake2b(schemas.encode(frame.message), digest_size=16).digest()
     return frame.message.stamp_ns if frame.is_stamped else None
 
 

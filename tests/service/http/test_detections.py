@@ -162,6 +162,16 @@ def test_incomplete_frames_say_nothing_of_other_objects(start: Any) -> None:
     assert len(last.id) == 1
 
 
+def test_objects_of_incomplete_frames_are_told_apart() -> None:
+    """Two objects of one stamp are two frames; a frame of more than 64 objects is sent whole, and once."""
+    with Edge(free_endpoint(), router=True, inputs={"site/*/*": {"complete": False}}) as edge:
+        objects = [{"class": "car", "position": [x, 5]} for x in (20, 40)]
+        answers = [edge.post(stamped(0, objects=[one]), STREAM).body["frames"][0] for one in (*objects, objects[0])]
+        assert [(one["seq"], one["duplicate"]) for one in answers] == [(0, False), (1, False), (0, True)]
+        answer = edge.post({"objects": objects * 50}, STREAM)
+        assert (answer.status, answer.body["frames"][0]["seq"]) == (HTTPStatus.ACCEPTED, 101)
+
+
 def test_keys_tell_frames_without_stamps(edge: Edge) -> None:
     """A key in the frame or the header `Idempotency-Key` with the place in an array; with neither all are new."""
     one = {"objects": [], "key": "a"}
