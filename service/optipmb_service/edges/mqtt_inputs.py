@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import re
+import weakref
 from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_schemas as schemas
@@ -67,6 +68,7 @@ class MqttInputs:
         self._inputs = inputs
         self._rows = [_Input(stream, one.topic, mapping_of(one)) for stream, one in settings.mqtt.inputs.items()]
         self._tasks: set[asyncio.Task[None]] = set()
+        self._turns: weakref.WeakValueDictionary[str, asyncio.Lock] = weakref.WeakValueDictionary()
 
     def take(self, message: Any, confirm: Callable[[], object]) -> None:
         """Take a message of paho's; `confirm` is called when it is done with."""
@@ -111,18 +113,20 @@ class MqttInputs:
             self._inputs.report(stream, error)
             raise
         correlation = getattr(message.properties, "CorrelationData", b"")
-        while True:
-            try:
-                await self._inputs.send(frame, self._frames.rules(stream), correlation.hex())
-            except TransportError:
-                pass
-            except RefusedError as error:
-                if error.code != "busy":
-                    self._inputs.refused["mqtt", error.code] += 1
+        turn = self._turns.setdefault(stream, asyncio.Lock())
+        async with turn:  # none passes a frame that is tried again
+            while True:
+                try:
+                    await self._inputs.send(frame, self._frames.rules(stream), correlation.hex())
+                except TransportError:
+                    pass
+                except RefusedError as error:
+                    if error.code != "busy":
+                        self._inputs.refused["mqtt", error.code] += 1
+                        return
+                else:
                     return
-            else:
-                return
-            await asyncio.sleep(PAUSE_S)
+                await asyncio.sleep(PAUSE_S)
 
 
 def tried(settings: Settings, name: str, payload: bytes) -> str:

@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 from broker import mosquitto
 from json_senders import damaged, document, exists
-from optipmb_schemas import MessageError
+from optipmb_schemas import Detections, Keys, MessageError, decode
 from optipmb_service.edges.json_frames import FrameReader
 from optipmb_service.edges.mapping import PayloadMapping, mapping_of
 from optipmb_service.settings import MappingSettings, MqttInput, Settings, SettingsInvalidError, load
 from optipmb_service.zenoh.client import Client
 from router import Node, Sensor, plain
+from routers import free_endpoint
 
 paho = pytest.importorskip("paho.mqtt.client")
 CallbackAPIVersion = pytest.importorskip("paho.mqtt.enums").CallbackAPIVersion
@@ -118,6 +119,21 @@ async def test_frames_over_mqtt_give_the_same_bytes(start: Any, tmp_path: Path) 
             assert [plain(one) for one in tracks[: len(messages)]] == expected
             assert sum(bridge.inputs.refused.values()) == 2
             assert bridge.inputs.frames["mqtt"] == 2 * len(messages) + 1, "the retained one is old"
+
+
+async def test_frames_keep_their_order_while_nothing_is_tracked(tmp_path: Path) -> None:
+    """Those that come while 64 are without tracks are tried again, and are sent in the order in which they came."""
+    endpoint, inputs, arrived, numbers = free_endpoint(), {SENSOR.stream: {"topic": "sensor"}}, [], range(76)
+    with mosquitto(tmp_path) as address, publisher(address) as client:
+        async with bridged(endpoint, address, inputs, connect=[], listen=[endpoint], router=True) as bridge:
+            take = bridge.inputs.client.listen(Keys().detections(SENSOR.stream), arrived.append)
+            for number in numbers:
+                send(client, "sensor", {"objects": [{"class": "car", "position": [number, 0]}]})
+                await asyncio.sleep(0.03 * (number > 64))  # each is tried again at another time
+            await until(lambda: len(arrived) == len(numbers))
+            take.close()
+    found = [decode(one.payload.to_bytes(), Detections).center[0, 0] for one in arrived]
+    assert found == list(numbers)
 
 
 async def test_damaged_payloads_end_nothing(start: Any, tmp_path: Path) -> None:
