@@ -1006,9 +1006,9 @@ def _check_fused(settings: Settings) -> None:
 
 
 def _overlap(one: str, other: str) -> bool:
-    """Return whether some stream matches two patterns."""
-    parts = zip(one.split("/"), other.split("/"), strict=True)
-    return all(_share(tuple(part), tuple(wanted)) for part, wanted in parts)
+    """Return whether something matches two patterns of streams or topics."""
+    parts, others = one.split("/"), other.split("/")
+    return len(parts) == len(others) and all(map(_share, map(tuple, parts), map(tuple, others)))
 
 
 @cache
@@ -1046,12 +1046,12 @@ def _check_zones(settings: Settings) -> None:
 
 
 def _check_mqtt(settings: Settings) -> None:
-    """Refuse input topics that are output topics or do not say their stream, and two for one stream.
+    """Refuse input topics that are output topics, do not say their stream, or have a stream or a topic in common.
 
     Raises:
         SettingsInvalidError: there are such.
     """
-    seen: list[str] = []
+    seen: dict[str, str] = {}
     for stream, one in settings.mqtt.inputs.items():
         path, pattern = f"setting mqtt.inputs.{stream}", re.sub(r"\{\d\}", "*", stream)
         try:
@@ -1060,7 +1060,10 @@ def _check_mqtt(settings: Settings) -> None:
             raise SettingsInvalidError(f"{path}: {error.expected}, received {stream!r}") from None
         if other := next((each for each in seen if _overlap(each, pattern)), None):
             raise SettingsInvalidError(f"{path}: one input for a stream, {other} has it, too")
-        seen.append(pattern)
+        topic = one.topic.replace("*", "?").replace("+", "*")
+        if other := next((each for each, theirs in seen.items() if _overlap(theirs, topic)), None):
+            raise SettingsInvalidError(f"{path}.topic: one input for a topic, {other} has some of {one.topic!r}, too")
+        seen[pattern] = topic
         parts = one.topic.split("/")
         if any("+" in part and part != "+" for part in parts):
             raise SettingsInvalidError(f"{path}.topic: + stands for a whole part, received {one.topic!r}")

@@ -268,6 +268,7 @@ def test_an_error_names_the_path_in_the_payload(payload: Any, path: str) -> None
         ({"a/b/c": {"topic": "x/+"}}, "mqtt.inputs.a/b/c.topic"),
         ({"a/{1}/c": {"topic": "x"}}, "mqtt.inputs.a/{1}/c.topic"),
         ({"a/{1}/c": {"topic": "x/+"}, "a/b/c": {"topic": "y"}}, "mqtt.inputs.a/b/c"),
+        ({"a/{1}/c": {"topic": "x/+"}, "a/b/d": {"topic": "x/y"}}, "mqtt.inputs.a/b/d.topic"),
         ({"a/b/c": {"topic": "optipmb/v1/a/b/c/tracks"}}, "mqtt.inputs.a/b/c.topic"),
         ({"a/b/c": {"topic": "x", "format": "yaml"}}, "mqtt.inputs.a/b/c.format"),
         ({"a/b/c": {"topic": "x", "format": "mapped"}}, "mqtt.inputs.a/b/c.mapping"),
