@@ -64,8 +64,8 @@ STEPS: Final = 4
 
 PROCESSES: Final = "OPTIPMB_COMPILE_PROCESSES"
 """Environment variable: how many processes compile; 0 compiles each kernel at its first call, in its own process."""
-REJOIN: Final = f"{__package__}.rejoin"
-"""Module whose kernels take as long to compile as all others, and few trackers need."""
+JOINING: Final = frozenset({f"{__package__}.rejoin", f"{__package__}.appearance"})
+"""Modules whose kernels take as long to compile as all others, and few trackers need."""
 MOST_PROCESSES: Final = 4
 """More are not faster: one kernel takes a third of the time."""
 
@@ -181,7 +181,7 @@ def _compiled(function: F, *, nogil: bool) -> F:
     options: Any = config  # it has names that are set at run time
     if options.DISABLE_JIT:
         return calls.recorded(function)
-    common = function.__module__ != REJOIN
+    common = function.__module__ not in JOINING
     (progress.kernels if common else progress.others).add(f"{function.__module__}.{function.__qualname__}")
     jit = partial(numba.njit, nogil=nogil, error_model="numpy", no_cfunc_wrapper=True)
     try:

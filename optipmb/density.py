@@ -14,6 +14,7 @@ It is stored as named arrays (`bernoulli.mean`, `poisson.weight`) or as bytes, a
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from math import prod
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
@@ -21,7 +22,7 @@ import numpy as np
 
 from optipmb.compiled import kernel
 from optipmb.errors import DensityError
-from optipmb.lost_objects import Beginnings, Lost, Places, Rejoining, Statistics, Tracklets
+from optipmb.lost_objects import EMBEDDING, Appearance, Beginnings, Lost, Places, Rejoining, Statistics, Tracklets
 from optipmb.rows import Column, Rows, arrays_of, record, shown, views_of
 
 if TYPE_CHECKING:
@@ -286,6 +287,9 @@ MOST_COUNTED: Final = 1e9
 JOINING: Final = (Tracklets, Places, Lost, Beginnings, Statistics)
 """Records of `Density.rejoining`, in the order of its fields."""
 
+APPEARANCE: Final = "rejoin.appearance"
+"""Part of the names of `Rejoining.appearance` among the columns."""
+
 ROUNDING: Final = 1e-6
 """By how much the sum of probabilities may differ from 1."""
 
@@ -342,7 +346,9 @@ def _others(density: Density) -> dict[str, NDArray[Any]]:
     """Return the arrays that are in no record, by name."""
     own = density.self_calibration
     counts = {} if own is None else {f"{COUNTED}.{name}": getattr(own, name) for name in _shapes(0, 0, 0)}
-    others = {CLASSES: density.class_probability, **counts, SENSOR: density.sensor}
+    look = None if density.rejoining is None else density.rejoining.appearance
+    looks = {} if look is None else {f"{APPEARANCE}.{name}": getattr(look, name) for name in look.shapes(0, 0, 0, 0)}
+    others = {CLASSES: density.class_probability, **counts, SENSOR: density.sensor, **looks}
     return {name: array for name, array in others.items() if array is not None}
 
 
@@ -399,6 +405,13 @@ def columns_in(parts: Mapping[str, bytes], classes: int) -> dict[str, NDArray[An
             width = prod(shape[1:]) * np.dtype(kind).itemsize // 8
             words = _words(parts, f"{COUNTED}.{name}", width)
             columns[f"{COUNTED}.{name}"] = words.view(kind).reshape(-1, *shape[1:])
+    if f"{APPEARANCE}.model" in parts:
+        numbers = int(_words(parts, f"{APPEARANCE}.model", 2).view(np.int64)[1:].sum())
+        if not EMBEDDING[0] <= numbers <= EMBEDDING[1]:
+            raise DensityError(f"{APPEARANCE}.model", f"{EMBEDDING[0]} to {EMBEDDING[1]} numbers", str(numbers))
+        for name, (shape, kind) in Appearance.shapes(numbers, 0, 0, 0).items():
+            words = _words(parts, f"{APPEARANCE}.{name}", prod(shape[1:]) * np.dtype(kind).itemsize // 8)
+            columns[f"{APPEARANCE}.{name}"] = words.view(kind).reshape(-1, *shape[1:])
     return columns
 
 
@@ -507,7 +520,26 @@ def _rejoining(columns: Mapping[str, Any], stamp_ns: int, next_id: int, classes:
     ):
         if column.size and not 0 <= column.min() <= column.max() <= most:
             raise DensityError(path, f"from 0 to {most}", f"{column.min()} to {column.max()}")
-    return found
+    if f"{APPEARANCE}.model" not in columns:
+        return found
+    return replace(found, appearance=_appearance(columns, stamp_ns, len(live), len(lost), classes))
+
+
+def _appearance(columns: Mapping[str, Any], stamp_ns: int, live: int, lost: int, classes: int) -> Appearance:
+    """Return the vectors and the counts of their distances."""
+    model: Any = columns[f"{APPEARANCE}.model"]
+    numbers = int(model[1]) if shown(model) == "(2,) int64" else 0
+    arrays: dict[str, Any] = {}
+    for name, (shape, kind) in Appearance.shapes(numbers, live, lost, classes).items():
+        path, column = f"{APPEARANCE}.{name}", columns.get(f"{APPEARANCE}.{name}")
+        if not isinstance(column, np.ndarray) or column.dtype != kind or column.shape != shape:
+            raise DensityError(path, f"{shape} {kind.__name__}", shown(column))
+        low = {"counts": 0, "stamp_ns": -1}.get(name, -MOST_COUNTED)
+        high = stamp_ns if name == "stamp_ns" else MOST_COUNTED
+        if name != "model" and column.size and not low <= column.min() <= column.max() <= high:
+            raise DensityError(path, f"numbers from {low:g} to {high:g}", f"{column.min():g} to {column.max():g}")
+        arrays[name] = np.array(column, order="C")
+    return Appearance(**arrays)
 
 
 def _self_calibration(columns: Mapping[str, Any], shapes: Mapping[str, tuple[tuple[int, ...], Any]]) -> SelfCalibration:

@@ -24,7 +24,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from optipmb.class_names import class_indices
 from optipmb.compiled import kernel
 from optipmb.errors import FrameError
 from optipmb.field_of_view import FieldOfView, check_view
+from optipmb.lost_objects import EMBEDDING
 from optipmb.rows import read_only
 
 if TYPE_CHECKING:
@@ -42,6 +43,10 @@ if TYPE_CHECKING:
     from optipmb.parameters import Parameters, ScoreCalibration
     from optipmb.rows import Array, Index
 
+SHORTEST: Final = 1e-6
+"""Least length of one."""
+LONGEST_MODEL: Final = 64
+"""Most characters of the name of a model."""
 UNIT_TOLERANCE = 1e-3
 """How far the norm of a quaternion may be from one; it is normalised afterwards."""
 
@@ -131,6 +136,18 @@ class PointCloud:
         object.__setattr__(self, "xyz", view)
 
 
+class Embedding(NamedTuple):
+    """Appearance of the detections of a frame.
+
+    Attributes:
+        model: name and version of the model.
+        vectors: (M, E) float32; a row of NaN where unknown.
+    """
+
+    model: str
+    vectors: NDArray[np.float32]
+
+
 @dataclass(frozen=True)
 class Frame:
     """Detections of one stamp in the world frame; made by `make_frame`, which checks and copies them.
@@ -149,6 +166,7 @@ class Frame:
         field_of_view: of the sensor, with its pose; None: it sees everything.
         position_covariance: (M, 3) R_xx, R_xy and R_yy of each position, m^2; NaN, or None: R of the class.
         pose: world from sensor; None: the sensor stands at the origin of the world.
+        embedding: appearance of the detections; None: unknown.
 
     The arrays cannot be written to, so that they stay as they were checked.
 
@@ -169,6 +187,7 @@ class Frame:
     field_of_view: FieldOfView | None = None
     position_covariance: Array | None = None
     pose: Pose | None = None
+    embedding: Embedding | None = None
 
     def __post_init__(self) -> None:
         count = np.shape(self.score)[0] if np.ndim(self.score) == 1 else 0
@@ -181,6 +200,9 @@ class Frame:
             column = _shaped("position_covariance", self.position_covariance, (count, 3))
             _all("position_covariance", semidefinite(column), "a covariance R_xx, R_xy, R_yy, or NaN alone", column)
             arrays["position_covariance"] = column
+        if self.embedding is not None:
+            checked = embedding_of(self.embedding.model, self.embedding.vectors, count)
+            self.__dict__["embedding"] = checked
         if not 0 <= self.stamp_ns < 2**63:
             raise FrameError("stamp_ns", "whole nanoseconds in [0, 2^63)", repr(self.stamp_ns))
         check_view(self.field_of_view)
@@ -215,6 +237,8 @@ def make_frame(
     cloud: PointCloud | None = None,
     field_of_view: FieldOfView | None = None,
     position_covariance: ArrayLike | None = None,
+    embedding: ArrayLike | None = None,
+    embedding_model: str | None = None,
 ) -> tuple[Frame, int]:
     """Check the detections of one stamp and bring them to the world frame and to the classes of the parameters.
 
@@ -238,6 +262,8 @@ def make_frame(
             objects are neither detected nor missed. None: it sees everything.
         position_covariance: (M, 3, 3) of the errors of the centres along the axes of the same frame, m^2, in place of R
             of the class; a matrix of NaN, or None, where the detector gives none.
+        embedding: (M, E) appearance of each detection, E from 2 to 512, of any length; a row of NaN where unknown.
+        embedding_model: model and version of these vectors; required with them.
 
     Returns:
         The frame, and how many objects were left out: their class is not in the parameters, or their score is 0.
@@ -261,7 +287,9 @@ def make_frame(
     spread = position_covariance
     spread = None if spread is None else _shaped("position_covariance", spread, (m, 3, 3))
     columns = which, center, size, yaw, score, velocity
-    return frame_of_checked(parameters, int(stamp_ns), tuple(labels), columns, pose, cloud, field_of_view, spread)
+    looks = None if embedding is None else embedding_of(embedding_model, embedding, m)
+    named = tuple(labels)
+    return frame_of_checked(parameters, int(stamp_ns), named, columns, pose, cloud, field_of_view, spread, looks)
 
 
 def frame_of_checked(
@@ -273,6 +301,7 @@ def frame_of_checked(
     cloud: PointCloud | None,
     field_of_view: FieldOfView | None,
     position_covariance: Array | None,
+    embedding: Embedding | None = None,
 ) -> tuple[Frame, int]:
     """Make a frame as `make_frame` does, of arrays that the caller has checked: only covariances are checked here.
 
@@ -307,11 +336,12 @@ def frame_of_checked(
         center, size, yaw, velocity = center[source], size[source], yaw[source], velocity[source]
         score, known = score[source], known[source]
         spread = None if spread is None else spread[source]
+        embedding = embedding and embedding._replace(vectors=read_only(embedding.vectors[source]))
     columns = center, size, yaw, velocity, score, known, source
     if field_of_view is not None and field_of_view.pose is None and pose is not None:
         field_of_view = field_of_view.at(pose)
     sensor = pose if pose is not None or field_of_view is None else field_of_view.pose
-    rest = names, cloud, field_of_view, spread, sensor
+    rest = names, cloud, field_of_view, spread, sensor, embedding
     for column in columns if spread is None else (*columns, spread):
         column.flags.writeable = False
     if rotation is not None and not allowed(known, len(names), center, size, yaw, score, velocity):
@@ -320,6 +350,28 @@ def frame_of_checked(
     frame = object.__new__(Frame)
     frame.__dict__.update(zip(Frame.__dataclass_fields__, (stamp_ns, *columns, *rest), strict=True))
     return frame, m - source.shape[0]
+
+
+def embedding_of(model: str | None, vectors: ArrayLike, count: int) -> Embedding:
+    """Check the vectors of so many detections.
+
+    Raises:
+        FrameError: there is no model, the shape is none, or a row is neither a vector of `SHORTEST` or more nor NaN.
+    """
+    if not model or len(model) > LONGEST_MODEL:
+        raise FrameError("embedding_model", f"the model of the vectors, 1 to {LONGEST_MODEL} characters", repr(model))
+    with np.errstate(over="ignore"):  # what overflows becomes infinite, and is refused
+        given = _array("embedding", vectors, np.float32)
+    least, most = EMBEDDING
+    if not count and not given.size:
+        given = given.reshape(0, least)
+    if given.ndim != 2 or len(given) != count or not least <= given.shape[1] <= most:  # noqa: PLR2004 - a row for each
+        raise FrameError("embedding", f"shape ({count}, {least} to {most})", str(given.shape))
+    unknown = np.isnan(given).all(axis=1, keepdims=True)
+    _all("embedding", np.isfinite(given) | unknown, "a finite number, or a whole row of NaN", given)
+    length = np.sqrt((given.astype(np.float64) ** 2).sum(axis=1))
+    _all("embedding", (length >= SHORTEST) | unknown[:, 0], f"a vector of length {SHORTEST:g} or more", length)
+    return Embedding(model, given)
 
 
 @lru_cache(64)
@@ -397,7 +449,7 @@ def _bounded(path: str, values: Array, bound: float) -> None:
     _all(path, np.abs(values) <= bound, f"a finite number of size at most {bound:g}", values)
 
 
-def _array(path: str, values: ArrayLike, dtype: type[np.float64] | None) -> NDArray[Any]:
+def _array(path: str, values: ArrayLike, dtype: type[np.floating[Any]] | None) -> NDArray[Any]:
     try:
         # A copy in one piece: a frame shares no memory with the caller.
         return read_only(np.array(values, dtype=dtype, order="C"))

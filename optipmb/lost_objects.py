@@ -9,10 +9,17 @@ import numpy as np
 from optipmb.rows import Column, Rows, record
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from optipmb.relocation import Relocation
+    from optipmb.rows import Index
 
 PLACES: Final = 13
 """Places of a live track that are kept."""
+EMBEDDING: Final = (2, 512)
+"""Least and most numbers of a vector of appearance."""
+DISTANCES: Final = 26
+"""Bins of the distances of vectors of appearance."""
 
 
 class Tracklets(Rows):
@@ -123,14 +130,61 @@ class Statistics(Rows):
 
 
 @record
+class Appearance:
+    """Vectors of tracks and lost objects, and distances of those of each class (`optipmb.appearance`).
+
+    A vector has E numbers and a zero behind an odd E, W together.
+
+    Attributes:
+        model: (2,) int64 hash of the name of the model, and E.
+        total: (N, W) float32 a(t) of each live track at its last vector; zero: it has none.
+        first: (N, W) float32 the same when it was decided.
+        stamp_ns: (N, 3) int64 of the last vector, of `first` and of the last distance that was counted; -1: none.
+        lost: (L, W) float32 `total` of each lost object.
+        counts: (C, 2, `DISTANCES`) distances of the same object and of different ones.
+    """
+
+    model: Index
+    total: NDArray[np.float32]
+    first: NDArray[np.float32]
+    stamp_ns: Index
+    lost: NDArray[np.float32]
+    counts: NDArray[np.float64]
+
+    @classmethod
+    def shapes(cls, numbers: int, live: int, lost: int, classes: int) -> dict[str, tuple[tuple[int, ...], Any]]:
+        """Return shape and type of each array for vectors of so many numbers."""
+        width = numbers + numbers % 2
+        return {
+            "model": ((2,), np.int64),
+            "total": ((live, width), np.float32),
+            "first": ((live, width), np.float32),
+            "stamp_ns": ((live, 3), np.int64),
+            "lost": ((lost, width), np.float32),
+            "counts": ((classes, 2, DISTANCES), np.float64),
+        }
+
+    @classmethod
+    def empty(cls, model: int, numbers: int, live: int, lost: int, classes: int) -> Appearance:
+        """Return the state before the first vector."""
+        made: dict[str, Any] = {
+            name: np.zeros(shape, kind) for name, (shape, kind) in cls.shapes(numbers, live, lost, classes).items()
+        }
+        made["stamp_ns"][:] = -1
+        made["model"][:] = model, numbers
+        return cls(**made)
+
+
+@record
 class Rejoining:
-    """State of the joining of tracks between two frames."""
+    """State of the joining of tracks between two frames; `appearance` is None without vectors."""
 
     live: Tracklets
     places: Places
     lost: Lost
     beginnings: Beginnings
     classes: Statistics
+    appearance: Appearance | None = None
 
     @classmethod
     def empty(cls, classes: int, stamp_ns: int) -> Rejoining:
@@ -155,4 +209,5 @@ class Rejoining:
             tracks(self.lost),
             self.beginnings.replaced(place=relocation.points(self.beginnings.place)),
             self.classes,
+            self.appearance,
         )

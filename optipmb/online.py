@@ -58,9 +58,10 @@ ALIASES: Final = MappingProxyType({
 WITHOUT: Final = MappingProxyType({"z": 0.0, "h": 1.5, "score": 1.0})
 """Values of the columns that may be missing, as in the tables of `optipmb track`."""
 BOXES: Final = ("center", "score", "label")
-OTHERS: Final = ("size", "yaw", "velocity", "position_covariance")
+OTHERS: Final = ("size", "yaw", "velocity", "position_covariance", "embedding")
 KNOWN: Final = (*BOXES, *OTHERS, *(part for _, parts in FLAT for part in parts), *ALIASES)
-KNOWN_PIXELS: Final = ("score", "label", *(part for name, parts in PIXELS for part in (name, *parts)), *ALIASES)
+OF_PIXELS: Final = ("box", "foot", "score", "label", "embedding")
+KNOWN_PIXELS: Final = (*OF_PIXELS, *(part for _, parts in PIXELS for part in parts), *ALIASES)
 SHOWN_ROWS: Final = 10
 """Tracks that the representation of `OnlineTracks` lists."""
 CLASS_COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#8C6D1F")
@@ -332,6 +333,7 @@ class OnlineTracker:
         if unknown_classes not in {"refuse", "leave out"}:
             raise FrameError("unknown_classes", "'refuse' or 'leave out'", repr(unknown_classes))
         self._tracker = Tracker(profile, modules, rejoin=rejoin)
+        self._rejoin = rejoin
         self.parameters = self._tracker.parameters
         self._names = np.asarray(self.parameters.labels, dtype=np.object_)
         self._leave_out = unknown_classes == "leave out"
@@ -356,6 +358,7 @@ class OnlineTracker:
         cloud: PointCloud | None = None,
         field_of_view: FieldOfView | None = None,
         camera: GroundCamera | None = None,
+        embedding_model: str | None = None,
         **arrays: ArrayLike,
     ) -> OnlineTracks:
         """Take the detections of the next frame and return the tracks.
@@ -366,9 +369,9 @@ class OnlineTracker:
                 `y`, `z`; `size` (M, 3) or `l`, `w`, `h` or `length`, `width`, `height`; `yaw` or `heading` (M,) rad;
                 `score` or `confidence` (M,) in (0, 1]; `class`, `label`, `name`, `category` or `type` (M,): class
                 names, or their places in the profile; `velocity` (M, 2) or `vx`, `vy`, m/s, NaN where unknown;
-                `position_covariance` (M, 3, 3), m^2, likewise. Sizes, headings and `z` may be NaN or absent, unknown;
-                but with a size a missing column `z` is 0 and `h` 1.5 m. Without `score` it is 1. None: nothing was
-                detected.
+                `position_covariance` (M, 3, 3), m^2, and `embedding` (M, E), appearance, likewise. Sizes, headings and
+                `z` may be NaN or absent, unknown; but with a size a missing column `z` is 0 and `h` 1.5 m. Without
+                `score` it is 1. None: nothing was detected.
             t: time of the frame: seconds, or a date (of pandas too; UTC where it has no zone); or
             stamp_ns: nanoseconds.
             pose: world from sensor, or None when the boxes are in the world frame; with a camera on a vehicle, of it.
@@ -376,7 +379,8 @@ class OnlineTracker:
             field_of_view: where the sensor detects objects; outside it they are neither detected nor missed. With a
                 camera the default is the field of view of its image.
             camera: of pixel boxes: `box` (M, 4) or `x1`, `y1`, `x2`, `y2`, or the points `foot` (M, 2) or `u`, `v` on
-                which objects stand, with classes and scores.
+                which objects stand, with classes and scores, and `embedding`.
+            embedding_model: model and version that `embedding` is of: that of `Rejoin`; required with it.
             arrays: the same columns as arguments.
 
         Raises:
@@ -397,9 +401,17 @@ class OnlineTracker:
         if camera is None:
             columns = _columns(boxes, arrays)
         else:
-            columns = self._on_ground(camera, pose, _pixels(boxes, arrays))
+            pixels = _pixels(boxes, arrays)
+            looks = pixels.pop("embedding", None)
+            columns = self._on_ground(camera, pose, pixels)
+            if looks is not None:
+                columns["embedding"] = np.asarray(looks)[columns["row"]]
             row, outside = columns.pop("row"), sum(columns.pop("left_out").values())
             field_of_view = field_of_view or camera.view_from(pose)
+        compared = None if self._rejoin is None else self._rejoin.embedding_model
+        if "embedding" in columns and embedding_model != compared:
+            expected = "that of Rejoin(embedding_model=…)" if compared is None else repr(compared)
+            raise FrameError("embedding_model", expected, repr(embedding_model))
         names, label, left_out = self._classes(columns.pop("label"))
         frame, missing = make_frame(
             self.parameters,
@@ -409,6 +421,7 @@ class OnlineTracker:
             pose=pose,
             cloud=cloud,
             field_of_view=field_of_view,
+            embedding_model=embedding_model,
             **columns,
         )
         if row is not None:
@@ -495,7 +508,9 @@ def _columns(boxes: Any, arrays: Mapping[str, ArrayLike]) -> dict[str, Any]:
             columns[name] = given[name]
         elif any(part in given for part in parts):
             columns[name] = _stacked(given, parts)
-    columns |= {name: given[name] for name in ("yaw", "score", "position_covariance", "label") if name in given}
+    columns |= {
+        name: given[name] for name in ("yaw", "score", "position_covariance", "embedding", "label") if name in given
+    }
     columns.setdefault("score", [WITHOUT["score"]] * len(columns.get("center", ())))
     if "size" not in columns and "center" not in given and "z" not in given and "center" in columns:
         columns["center"][:, 2] = np.nan
@@ -531,7 +546,7 @@ def _pixels(boxes: Any, arrays: Mapping[str, ArrayLike]) -> dict[str, Any]:
     for name, parts in PIXELS:
         if any(part in given for part in parts):
             given[name] = _stacked(given, parts)
-    return {name: _nested(values) for name, values in given.items() if name in {"box", "foot", "score", "label"}}
+    return {name: _nested(values) for name, values in given.items() if name in OF_PIXELS}
 
 
 def _nested(values: Any) -> Any:

@@ -28,11 +28,13 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from optipmb.appearance import NOTHING, Vectors, aligned, appearance_score, seen
 from optipmb.class_names import common_name
 from optipmb.compiled import kernel
 from optipmb.density import OMEGA, objects_in
 from optipmb.errors import ParameterError
 from optipmb.extract import Tracks, tracks_in
+from optipmb.frame import LONGEST_MODEL
 from optipmb.lost_objects import PLACES, Beginnings, Lost, Places, Rejoining, Statistics, Tracklets
 from optipmb.rows import arrays_of, views_of
 
@@ -40,6 +42,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from optipmb.density import Density
+    from optipmb.frame import Embedding
     from optipmb.parameters import Parameters
     from optipmb.rows import Array, Columns, Index, Rows
 
@@ -128,6 +131,7 @@ class Rejoin:
         min_probability: least probability of a join; below it a track is a new object.
         decide_s: time from the first detection of a track to its decision, s.
         most: lost objects that are kept; then the oldest are dropped.
+        embedding_model: model whose vectors are compared; None: none are.
 
     Raises:
         ParameterError: a value is out of its bounds.
@@ -137,12 +141,16 @@ class Rejoin:
     min_probability: float = 0.97
     decide_s: float = 0.3
     most: int = 1000
+    embedding_model: str | None = None
 
     def __post_init__(self) -> None:
         for name, (least, most, expected) in _BOUNDS.items():
             value = getattr(self, name)
             if not least <= value <= most:
                 raise ParameterError(f"rejoin.{name}", expected, f"{value:g}")
+        if self.embedding_model is not None and not 1 <= len(self.embedding_model) <= LONGEST_MODEL:
+            expected = f"1 to {LONGEST_MODEL} characters"
+            raise ParameterError("rejoin.embedding_model", expected, str(len(self.embedding_model)))
 
 
 TrackletArrays: Final = arrays_of(Tracklets, "TrackletArrays", __name__)
@@ -696,6 +704,7 @@ def decide(
     stamp_ns: int,
     kinds: Columns,
     limits: tuple[float, float],
+    vectors: Vectors,
 ) -> tuple[Array, Array, Index]:
     """Decide on new tracks: write their objects to the words of the live tracks, and sizes to the words of the classes.
 
@@ -706,6 +715,7 @@ def decide(
         stamp_ns: of the frame.
         kinds: the fields of `Kinds`.
         limits: `Rejoin.gap_s` and `min_probability`.
+        vectors: of the tracks and of the lost objects.
 
     Returns:
         The words of the lost objects and of the beginnings, and the rows of live tracks that were joined: they are not
@@ -744,6 +754,8 @@ def decide(
                 if value > -math.inf:
                     sizes = known.count[c], known.mean[c], known.square[c]
                     value += size_score(table.size[n], live.size[k], sizes[0], sizes[1], sizes[2], LEAST_SIZES)
+                    if vectors.total.shape[1] > 0:
+                        value += appearance_score(vectors, table.id[n], live.id[k], c)
                 if value > least_log:
                     if math.isnan(log_rate):
                         around = _around(begun, c, live.id[k], live.begin[k, 0], live.begin[k, 1])
@@ -817,6 +829,7 @@ def advance(
     moment: tuple[Array, Array, int],
     kinds: Columns,
     limits: tuple[float, float, float, int],
+    vectors: Columns,
 ) -> tuple[Array, Array, Array, Array, Array, Index, Array, Index, int, int]:
     """Return the words of `Rejoining` after a frame.
 
@@ -824,7 +837,8 @@ def advance(
         given: those before it.
         moment: words of the tracks of the frame and of the objects of the density, and the stamp.
         kinds: the fields of `Kinds`.
-        limits: the fields of `Rejoin`.
+        limits: the first fields of `Rejoin`.
+        vectors: the fields of `Vectors`.
 
     Returns:
         The words; object and probability (N,) of the tracks of the frame; ids of the objects that were joined while
@@ -867,6 +881,7 @@ def advance(
             stamp_ns,
             kinds,
             (gap_s, least),
+            Vectors(*vectors),
         )
         joined = np.sum((had < 0) & (live.object >= 0) & (live.object != live.id))
         if rows.shape[0]:
@@ -914,7 +929,15 @@ class Joined(NamedTuple):
     dropped: int
 
 
-def rejoin_tracks(before: Rejoining | None, density: Density, tracks: Tracks, settings: Rejoin, kinds: Kinds) -> Joined:
+def rejoin_tracks(
+    before: Rejoining | None,
+    density: Density,
+    tracks: Tracks,
+    settings: Rejoin,
+    kinds: Kinds,
+    embedding: Embedding | None,
+    detections: tuple[Index, Index],
+) -> Joined:
     """Return the tracks of a frame with their objects.
 
     Args:
@@ -923,16 +946,32 @@ def rejoin_tracks(before: Rejoining | None, density: Density, tracks: Tracks, se
         tracks: of the frame.
         settings: the limits.
         kinds: of the classes.
+        embedding: vectors of the detections.
+        detections: row of each measurement among them, and (K,) the measurement of each object of the density.
+
+    Raises:
+        FrameError: vectors of another length than before.
     """
     state = before or Rejoining.empty(len(kinds.kind), density.stamp_ns)
     given = tuple(one.words for one in (state.live, state.places, state.lost, state.beginnings, state.classes))
     gap_s = settings.gap_s if density.sensor_motion is None else 0.0
     limits = gap_s, settings.min_probability, settings.decide_s, settings.most
+    looks, vectors, (chosen, measurement) = None, NOTHING, detections
+    if (model := settings.embedding_model) is not None and (embedding is not None or state.appearance is not None):
+        rows = tracks.detection >= 0
+        identity = tracks.id[rows]
+        source = chosen[measurement[np.searchsorted(density.bernoulli.id, identity)]]
+        looks = seen(state, model, embedding, (identity, tracks.label[rows], source), kinds.kind, density.stamp_ns)
+    if looks is not None:
+        appearance, ids = looks
+        vectors = Vectors(ids, appearance.total, state.lost.id, appearance.lost, appearance.counts)
     *words, objects, probability, ended, joins, dropped = advance(
-        given, (tracks.words, density.bernoulli.words, density.stamp_ns), tuple(kinds), limits
+        given, (tracks.words, density.bernoulli.words, density.stamp_ns), tuple(kinds), limits, tuple(vectors)
     )
     live, places, lost, begun, known = words
     after = Rejoining(Tracklets.of(live), Places.of(places), Lost.of(lost), Beginnings.of(begun), Statistics.of(known))
+    if looks is not None:
+        after = replace(after, appearance=aligned(*looks, state.lost, after.live, after.lost))
     density = replace(density, rejoining=after)
     if len(ended):
         stays = ~np.isin(tracks.id, ended)

@@ -268,7 +268,7 @@ class Tracker:
 
         Raises:
             FrameError: the frame is older than the density, or the classes of the frame or of the density differ from
-                those in the parameters.
+                those in the parameters, or vectors have another length than those of the same model before.
             DensityError: the parts of the density do not fit together, or a label is of no class.
             EffortError: the frame needs more than `max_pairs` pairs looked at; nothing costly was done yet.
         """
@@ -319,7 +319,8 @@ class Tracker:
         shown = objects.words, posterior.missed_from_ns, after.measurement, tuple(z), tuple(moment)
         tracks, joined = Tracks.of(extract(*shown, modules.ote, table.classes)), None
         if self._rejoin is not None:
-            joined = rejoin_tracks(density.rejoining, posterior, tracks, self._rejoin, self._kinds)
+            before = density.rejoining, posterior, tracks, self._rejoin, self._kinds
+            joined = rejoin_tracks(*before, frame.embedding, (chosen, after.measurement))
             posterior, tracks = joined.density, joined.tracks
             objects, pi = posterior.bernoulli, posterior.class_probability
         paths = paths_of(tracks, self._horizons, table) if self._horizons.size else None

@@ -142,7 +142,8 @@ def _run_rejoining(parameters: Parameters) -> None:
     empty, kinds = np.zeros(0, np.int64), Kinds.of(parameters)
     pair_scores(np.zeros(0), empty, empty, kinds.kind, kinds.motion, 60.0)
     match(empty, empty, np.zeros(0), np.zeros(0, np.bool_), 0)
-    tracker = Tracker(parameters, rejoin=Rejoin())
+    tracker = Tracker(parameters, rejoin=Rejoin(embedding_model="any"))
     boxes: dict[str, Any] = {"label": [0], "center": [[0.0, 0.0, 0.0]], "score": [0.9]}
+    boxes |= {"embedding": [[1.0, 0.0]], "embedding_model": "any"}
     frame, _ = make_frame(parameters, stamp_ns=0, labels=("pedestrian",), **boxes)
     tracker.step(tracker.initial(), frame)

@@ -274,6 +274,25 @@ def record(name: str, seed: int, seconds: float = 120.0) -> Recording:
     return Recording(frames, sources, truths, dict(enumerate(label.tolist())))
 
 
+def with_vectors(recording: Recording, view: float, seed: int = 0, numbers: int = 32) -> list[dict[str, Any]]:
+    """Return the frames of a recording with simulated vectors of appearance.
+
+    Each object has a direction of its own. To it come a part of the length `view` that changes with a time constant of
+    3 s, as the side from which it is seen, and white noise. With 1.6, 1.25 and 0.85 distances of different objects are
+    1.5, 2 and 3 standard deviations above those of the same object after a long gap.
+    """
+    rng = np.random.Generator(np.random.PCG64([seed, numbers]))
+    count, keep = len(recording.labels), np.exp(-1.0 / (3.0 * RATE))
+    own, sides = rng.standard_normal((2, count + 1, numbers))
+    frames = []
+    for given, source in zip(recording.frames, recording.source, strict=True):
+        sides = keep * sides + np.sqrt(1.0 - keep**2) * rng.standard_normal(sides.shape)
+        own[-1] = rng.standard_normal(numbers)  # of a false detection
+        vectors = own[source] + view * sides[source] + 0.7 * rng.standard_normal((len(source), numbers))
+        frames.append(given | {"embedding": vectors.astype(np.float32), "embedding_model": "reid-7"})
+    return frames
+
+
 def cars(*paths: tuple[float, float, tuple[float, float], tuple[float, float]]) -> list[dict[str, Any]]:
     """Return frames over 10 s of cars, each given from and until a time, with its first place and its velocity."""
     frames = []
