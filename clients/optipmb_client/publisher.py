@@ -127,6 +127,8 @@ class Publisher:
         field_of_view: FieldOfView | None = None,
         position_covariance: ArrayLike | None = None,
         relocation: PoseLike | None = None,
+        embedding: ArrayLike | None = None,
+        embedding_model: str | None = None,
     ) -> int:
         """Publish the detections of one sensor frame, and its point cloud where there is one.
 
@@ -154,6 +156,8 @@ class Publisher:
             relocation: With the first frame after a loop closure or a change of map: the motion (translation (3,),
                 quaternion of a turn about z) from the world frame before to the frame of this and all later messages.
                 The service moves its tracks so, and they keep their ids.
+            embedding: (M, E), appearance of the objects, E from 2 to 512; a row of NaN where it is unknown.
+            embedding_model: Model and version that `embedding` is of, at most 64 characters; required with it.
 
         Returns:
             The sequence number of the frame.
@@ -189,6 +193,8 @@ class Publisher:
                 has_points=has_points,
                 field_of_view=field_of_view,
                 position_covariance=None if position_covariance is None else _array(position_covariance, 3, 3),
+                embedding=None if embedding is None else _array(embedding, 2),
+                embedding_model=embedding_model,
             )
             payload = self._detections.pack(message)
             attachment = attachment_of(current_traceparent())

@@ -122,9 +122,14 @@ class SessionState(Message):
     repaired: Count = Field(default=0, description="Covariances repaired after a loss of rank by rounding.")
     clouds_refused: Count = Field(default=0, description="Points messages not valid, or that could not be taken.")
     rejoined: Count | None = Field(
-        default=None, description="Tracks joined with an earlier one of the same object. Absent, as the next two: none."
+        default=None,
+        description="Tracks joined with an earlier one of the same object. Absent, as the next three: none.",
     )
     lost_dropped: Count | None = Field(default=None, description="Lost objects dropped because there were too many.")
+    embedding_ignored: Count | None = Field(
+        default=None,
+        description="Frames whose embeddings were ignored: not of the `embedding_model` of the setting `rejoin`.",
+    )
     lost_objects: Count | None = Field(default=None, description="Lost objects that may still be joined.")
     tracks: Count = Field(default=0, description="Confirmed tracks of the newest frame.")
     bernoullis: Count = Field(default=0, description="Bernoulli components now.")

@@ -181,6 +181,7 @@ class EdgeObject(Struct, frozen=True, rename={"name": "class"}):
     position_covariance: Annotated[tuple[Row, Row, Row], Meta(description="Of the errors of x, y, z; m^2.")] | None = (
         None
     )
+    embedding: Annotated[list[float], Meta(description="Appearance, of the frame's `embedding_model`.")] | None = None
 
 
 class EdgeDetections(Struct, frozen=True, forbid_unknown_fields=True):
@@ -196,6 +197,7 @@ class EdgeDetections(Struct, frozen=True, forbid_unknown_fields=True):
     pose: Annotated[dict[str, Any], Meta(description="As in Detections.")] | None = None
     field_of_view: Annotated[dict[str, Any], Meta(description="As in Detections.")] | None = None
     relocation: Annotated[dict[str, Any], Meta(description="As in Detections.")] | None = None
+    embedding_model: Annotated[str, Meta(description="As in Detections.")] | None = None
     epoch: Annotated[str, Meta(description="As in Detections, with `seq`. Absent: the edge numbers.")] | None = None
     seq: Annotated[int | str, Meta(description="As in Detections, also as text.")] | None = None
     key: Annotated[str, Meta(min_length=1, max_length=128, description="Frames of one key are one frame.")] | None = (

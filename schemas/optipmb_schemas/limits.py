@@ -43,8 +43,11 @@ class Limits:
     max_horizons: int = _limit(100, "horizons of predicted paths (H)")
 
     def rows(self, dimension: str) -> int:
-        """Return the limit of a dimension: M detections, N tracks or components, P points, H horizons, C classes."""
-        most: int = getattr(self, _DIMENSIONS[dimension])
+        """Return the limit of a dimension: M detections, N tracks or components, P points, H horizons, C classes.
+
+        Other dimensions are limited by their descriptions, and by the number of values.
+        """
+        most: int = getattr(self, _DIMENSIONS.get(dimension, "max_values"))
         return most
 
     @cached_property

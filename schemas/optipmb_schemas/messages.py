@@ -47,6 +47,10 @@ LEAST_VARIANCE = 1e-8
 """Least variance of a position along any axis, m^2."""
 ROUNDING = 8 * sys.float_info.epsilon
 """Share of the sum of variances by which one of them may be beyond its limit: errors of computation are smaller."""
+EMBEDDING: Final = (2, 512)
+"""Least and most numbers of a vector of appearance."""
+SHORTEST = 1e-6
+"""Least length of one."""
 SYMMETRY = 1e-6
 """Share of the largest variance by which opposite entries of a covariance may differ, as in float32."""
 
@@ -184,13 +188,25 @@ class Detections(SensorMessage):
         "symmetric, the variance along every axis from 1e-8 to 1e8. A matrix of NaN (JSON: null) is an object for "
         "which the profile's noise holds. Absent: it holds for all.",
     )
+    embedding: Annotated[Singles, Array("f4", ("M", "E"), -1e9, 1e9, unknown="row")] | None = Field(
+        default=None,
+        description="Appearance of each object as a vector of E numbers, from 2 to 512, of any length from 1e-6 on. A "
+        "row of NaN (JSON: null) is unknown. Absent: all are.",
+    )
+    embedding_model: Annotated[str, Field(strict=True, min_length=1, max_length=64)] | None = Field(
+        default=None,
+        description="Model and version that `embedding` is of, as `reid-7`; required with it. Only vectors of one "
+        "model are compared.",
+    )
 
     def check(self) -> None:
-        """Every label must be in the list, every covariance must be one."""
+        """Every label must be in the list, every covariance and every vector must be one."""
         super().check()
         _check_labels(self.label, self.labels)
         if self.position_covariance is not None:
             _check_covariances(self.position_covariance)
+        if self.embedding is not None:
+            self.__dict__["embedding"] = _check_embeddings(self.embedding, self.embedding_model)
 
 
 class Points(SensorMessage):
@@ -503,6 +519,22 @@ def _check_covariances(covariance: Reals) -> None:
         if not good and not all(map(math.isnan, chain.from_iterable(rows := covariance[at].tolist()))):
             expected = "a symmetric covariance with variances from 1e-8 to 1e8 along every axis, or NaN alone"
             raise invalid(f"position_covariance[{at}]", expected, rows)
+
+
+def _check_embeddings(embedding: Singles, model: str | None) -> Singles:
+    """Return the vectors; of no rows, whose length lists cannot say, those of the least length."""
+    least, most = EMBEDDING
+    if model is None:
+        raise invalid("embedding_model", "the model and version of `embedding`", None)
+    if not len(embedding):
+        return embedding.reshape((0, least))
+    if not least <= embedding.shape[1] <= most:
+        expected = f"{least} to {most} numbers for each object"
+        raise MessageError("invalid_value", "embedding", expected, f"shape {shape_text(embedding.shape)}")
+    for at, square in enumerate((embedding * embedding).sum(axis=1).tolist()):
+        if square < SHORTEST**2:
+            raise invalid(f"embedding[{at}]", f"a vector of length {SHORTEST:g} or more", math.sqrt(square))
+    return embedding
 
 
 def _are_covariances(matrices: Reals) -> Any:

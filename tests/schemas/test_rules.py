@@ -6,7 +6,7 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
-from message_rules import NAN, RULES, SPREAD, plain
+from message_rules import INF, NAN, RULES, SPREAD, plain
 from optipmb_schemas import (
     Detections,
     Limits,
@@ -22,6 +22,7 @@ from optipmb_schemas import (
     encode_json,
     messages,
 )
+from optipmb_schemas.protobuf.convert import from_proto, to_proto
 
 
 @pytest.mark.parametrize(("kind", "field", "value", "path"), RULES)
@@ -66,6 +67,51 @@ def test_covariances_of_some_objects_survive(detections: Detections) -> None:
     root = np.random.default_rng(0).normal(0, 1, (3, 3, 3))
     single = (root @ root.transpose(0, 2, 1) + 0.01 * np.eye(3)).astype("f4")
     Detections(**(dict(detections.present()) | {"position_covariance": single}))
+
+
+VECTORS = [[3, 4], [0, 1e-5], [NAN, NAN]]
+
+
+def test_vectors_of_some_objects_survive(detections: Detections) -> None:
+    """A row of NaN is an object without one, null in JSON; vectors of no objects have the least length."""
+    fields = dict(detections.present()) | {"embedding": VECTORS, "embedding_model": "reid-7"}
+    message = Detections(**fields)
+    columns = {name: value[:0] for name, value in message.present() if name in message.arrays}
+    none = Detections(**(fields | columns | {"embedding": np.empty((0, 600))}))
+    for one in (message, none, from_proto(to_proto(message), Detections)):
+        for payload in (encode(one), encode_json(one)):
+            assert decode(payload, Detections) == one
+    assert json.loads(encode_json(message))["embedding"] == [[3.0, 4.0], [0.0, float(np.float32(1e-5))], [None] * 2]
+    assert none.embedding is not None
+    assert none.embedding.shape == (0, 2)
+
+
+@pytest.mark.parametrize(
+    ("change", "path"),
+    [
+        ({"embedding": VECTORS[:2]}, "embedding"),
+        ({"embedding": [1, 2, 3]}, "embedding[0]"),
+        ({"embedding": np.ones((3, 1))}, "embedding"),
+        ({"embedding": np.ones((3, 513))}, "embedding"),
+        ({"embedding": [[1, 2], [1, INF], [1, 2]]}, "embedding[1][1]"),
+        ({"embedding": [[1, 2], [1, NAN], [1, 2]]}, "embedding[1][1]"),
+        ({"embedding": [[1, 2], [1, 2], [0, 9e-7]]}, "embedding[2]"),
+        ({"embedding_model": None}, "embedding_model"),
+        ({"embedding_model": ""}, "embedding_model"),
+        ({"embedding_model": "x" * 65}, "embedding_model"),
+    ],
+)
+def test_vectors_that_are_none_are_refused(change: dict[str, Any], path: str, detections: Detections) -> None:
+    """Of a message and of its msgpack, with the path."""
+    fields = dict(detections.present()) | {"embedding": VECTORS, "embedding_model": "reid-7"} | change
+    with pytest.raises(MessageError) as made:
+        Detections(**fields)
+    assert (made.value.code, made.value.path) == ("invalid_value", path)
+    sent = encode(Detections(**(fields | {"embedding": VECTORS, "embedding_model": "reid-7"})))
+    lists = {name: np.asarray(one).tolist() if name == "embedding" else one for name, one in change.items()}
+    with pytest.raises(MessageError) as read:
+        decode(msgpack.packb(msgpack.unpackb(sent) | lists), Detections)
+    assert read.value.path == path
 
 
 @pytest.mark.parametrize("spread", [(0.99e8, 0.1, 0.1), (1.0, 1.01e-8, 1.01e-8), (1e8, 1e8, 1e8), (1e-8, 1e-8, 1e-8)])

@@ -82,7 +82,7 @@ class FieldOfView(_message.Message):
     def __init__(self, azimuth: _Optional[_Iterable[float]] = ..., elevation: _Optional[_Iterable[float]] = ..., range: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Detections(_message.Message):
-    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "frame", "pose", "relocation", "labels", "label", "center", "size", "yaw", "score", "velocity", "has_points", "field_of_view", "position_covariance")
+    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "frame", "pose", "relocation", "labels", "label", "center", "size", "yaw", "score", "velocity", "has_points", "field_of_view", "position_covariance", "embedding", "embedding_model")
     STREAM_FIELD_NUMBER: _ClassVar[int]
     EPOCH_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
@@ -100,6 +100,8 @@ class Detections(_message.Message):
     HAS_POINTS_FIELD_NUMBER: _ClassVar[int]
     FIELD_OF_VIEW_FIELD_NUMBER: _ClassVar[int]
     POSITION_COVARIANCE_FIELD_NUMBER: _ClassVar[int]
+    EMBEDDING_FIELD_NUMBER: _ClassVar[int]
+    EMBEDDING_MODEL_FIELD_NUMBER: _ClassVar[int]
     stream: str
     epoch: bytes
     seq: int
@@ -117,7 +119,9 @@ class Detections(_message.Message):
     has_points: bool
     field_of_view: FieldOfView
     position_covariance: Array
-    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., frame: _Optional[_Union[Frame, str]] = ..., pose: _Optional[_Union[Pose, _Mapping]] = ..., relocation: _Optional[_Union[Relocation, _Mapping]] = ..., labels: _Optional[_Iterable[str]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., has_points: _Optional[bool] = ..., field_of_view: _Optional[_Union[FieldOfView, _Mapping]] = ..., position_covariance: _Optional[_Union[Array, _Mapping]] = ...) -> None: ...
+    embedding: Array
+    embedding_model: str
+    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., frame: _Optional[_Union[Frame, str]] = ..., pose: _Optional[_Union[Pose, _Mapping]] = ..., relocation: _Optional[_Union[Relocation, _Mapping]] = ..., labels: _Optional[_Iterable[str]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., has_points: _Optional[bool] = ..., field_of_view: _Optional[_Union[FieldOfView, _Mapping]] = ..., position_covariance: _Optional[_Union[Array, _Mapping]] = ..., embedding: _Optional[_Union[Array, _Mapping]] = ..., embedding_model: _Optional[str] = ...) -> None: ...
 
 class Points(_message.Message):
     __slots__ = ("stream", "epoch", "seq", "stamp_ns", "frame", "pose", "relocation", "xyz")
@@ -348,7 +352,7 @@ class Problem(_message.Message):
     def __init__(self, stream: _Optional[str] = ..., instance: _Optional[str] = ..., code: _Optional[str] = ..., path: _Optional[str] = ..., expected: _Optional[str] = ..., received: _Optional[str] = ..., message: _Optional[str] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., count: _Optional[int] = ..., reported_ns: _Optional[int] = ...) -> None: ...
 
 class SessionState(_message.Message):
-    __slots__ = ("stream", "session", "state", "profile", "epoch", "seq", "stamp_ns", "received", "frames", "duplicates", "late", "inserted", "corrected", "refused", "shed", "gaps", "new_epochs", "clouds_used", "clouds_missed", "repaired", "clouds_refused", "rejoined", "lost_dropped", "lost_objects", "tracks", "bernoullis", "poissons", "next_id", "queue", "digest")
+    __slots__ = ("stream", "session", "state", "profile", "epoch", "seq", "stamp_ns", "received", "frames", "duplicates", "late", "inserted", "corrected", "refused", "shed", "gaps", "new_epochs", "clouds_used", "clouds_missed", "repaired", "clouds_refused", "rejoined", "lost_dropped", "embedding_ignored", "lost_objects", "tracks", "bernoullis", "poissons", "next_id", "queue", "digest")
     STREAM_FIELD_NUMBER: _ClassVar[int]
     SESSION_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
@@ -372,6 +376,7 @@ class SessionState(_message.Message):
     CLOUDS_REFUSED_FIELD_NUMBER: _ClassVar[int]
     REJOINED_FIELD_NUMBER: _ClassVar[int]
     LOST_DROPPED_FIELD_NUMBER: _ClassVar[int]
+    EMBEDDING_IGNORED_FIELD_NUMBER: _ClassVar[int]
     LOST_OBJECTS_FIELD_NUMBER: _ClassVar[int]
     TRACKS_FIELD_NUMBER: _ClassVar[int]
     BERNOULLIS_FIELD_NUMBER: _ClassVar[int]
@@ -402,6 +407,7 @@ class SessionState(_message.Message):
     clouds_refused: int
     rejoined: int
     lost_dropped: int
+    embedding_ignored: int
     lost_objects: int
     tracks: int
     bernoullis: int
@@ -409,7 +415,7 @@ class SessionState(_message.Message):
     next_id: int
     queue: int
     digest: str
-    def __init__(self, stream: _Optional[str] = ..., session: _Optional[str] = ..., state: _Optional[str] = ..., profile: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., received: _Optional[int] = ..., frames: _Optional[int] = ..., duplicates: _Optional[int] = ..., late: _Optional[int] = ..., inserted: _Optional[int] = ..., corrected: _Optional[int] = ..., refused: _Optional[int] = ..., shed: _Optional[int] = ..., gaps: _Optional[int] = ..., new_epochs: _Optional[int] = ..., clouds_used: _Optional[int] = ..., clouds_missed: _Optional[int] = ..., repaired: _Optional[int] = ..., clouds_refused: _Optional[int] = ..., rejoined: _Optional[int] = ..., lost_dropped: _Optional[int] = ..., lost_objects: _Optional[int] = ..., tracks: _Optional[int] = ..., bernoullis: _Optional[int] = ..., poissons: _Optional[int] = ..., next_id: _Optional[int] = ..., queue: _Optional[int] = ..., digest: _Optional[str] = ...) -> None: ...
+    def __init__(self, stream: _Optional[str] = ..., session: _Optional[str] = ..., state: _Optional[str] = ..., profile: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., received: _Optional[int] = ..., frames: _Optional[int] = ..., duplicates: _Optional[int] = ..., late: _Optional[int] = ..., inserted: _Optional[int] = ..., corrected: _Optional[int] = ..., refused: _Optional[int] = ..., shed: _Optional[int] = ..., gaps: _Optional[int] = ..., new_epochs: _Optional[int] = ..., clouds_used: _Optional[int] = ..., clouds_missed: _Optional[int] = ..., repaired: _Optional[int] = ..., clouds_refused: _Optional[int] = ..., rejoined: _Optional[int] = ..., lost_dropped: _Optional[int] = ..., embedding_ignored: _Optional[int] = ..., lost_objects: _Optional[int] = ..., tracks: _Optional[int] = ..., bernoullis: _Optional[int] = ..., poissons: _Optional[int] = ..., next_id: _Optional[int] = ..., queue: _Optional[int] = ..., digest: _Optional[str] = ...) -> None: ...
 
 class SessionParameters(_message.Message):
     __slots__ = ("profile", "cloud_wait_s", "horizons", "restart", "values", "sensors", "session")

@@ -35,13 +35,13 @@ SECOND: Final = 1_000_000_000
 DIGITS: Final = 20
 UNKNOWN: Final = (nan, nan, nan)
 PLACES: Final = ("position", "lat and lon", "box", "foot")
-MODEL: Final = ("frame", "pose", "field_of_view", "relocation")
+MODEL: Final = ("frame", "pose", "field_of_view", "relocation", "embedding_model")
 """Fields of a frame with the names and values of `Detections`."""
 
 SEPARATE: Final = ("epoch", "field_of_view")
 """Fields of a frame that cannot hold for each of its objects alone."""
 
-COLUMNS: Final = ("label", "center", "size", "yaw", "score", "velocity", "position_covariance")
+COLUMNS: Final = ("label", "center", "size", "yaw", "score", "velocity", "position_covariance", "embedding")
 STEP_NS: Final = 1000
 """Distance of the frames of separate objects."""
 
@@ -268,6 +268,7 @@ class FrameReader:
             "size": _column([one.size and [nan if n is None else n for n in one.size] for one in objects], UNKNOWN),
             "velocity": _column([one.velocity for one in objects], UNKNOWN[:2]),
             "position_covariance": _column([one.position_covariance for one in objects], (UNKNOWN,) * 3),
+            "embedding": _embeddings(objects),
         }
         placed = [at for at, one in enumerate(objects) if one.lat is not None or one.heading is not None]
         if placed:
@@ -312,7 +313,7 @@ class FrameReader:
             path = f"objects[{match[1]}].{name}" if match else "objects"
             raise schemas.MessageError("invalid_value", path, error.expected, error.received) from None
         rows = found["row"]
-        for column in ("label", "score", "yaw", "size", "velocity"):
+        for column in ("label", "score", "yaw", "size", "velocity", "embedding"):
             if column in fields:
                 fields[column] = fields[column][rows]
         fields |= {column: found[column] for column in ("center", "position_covariance")}
@@ -444,6 +445,16 @@ def _column(values: list[Any], unknown: Any) -> Any:
     if all(value is None for value in values):
         return None
     return np.array([unknown if value is None else value for value in values], np.float64)
+
+
+def _embeddings(objects: Sequence[EdgeObject]) -> Any:
+    """Return the vectors of the objects, which are of one length; None when there is none."""
+    lengths = {at: len(one.embedding) for at, one in enumerate(objects) if one.embedding is not None}
+    length = next(iter(lengths.values()), 0)
+    for at, other in lengths.items():
+        if other != length:
+            raise invalid(f"objects[{at}].embedding", f"a list of {length}, as before it", objects[at].embedding)
+    return _column([one.embedding for one in objects], (nan,) * length)
 
 
 def _of_object(

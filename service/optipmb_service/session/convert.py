@@ -16,7 +16,7 @@ import numpy as np
 import optipmb_schemas as schemas
 
 import optipmb
-from optipmb.frame import frame_of_checked
+from optipmb.frame import Embedding, frame_of_checked
 from optipmb.rows import read_only
 from optipmb.table import ClassTable
 from optipmb_service.session.values import Tracked
@@ -108,8 +108,10 @@ def frame_of(
         optipmb.FrameError: a pose or covariance is none, or an object is too far in the world frame; `path` names it.
     """
     columns, pose, spread = _boxes(message), pose_of(message, ahead), message.position_covariance
-    view = view_of(message, ahead)
-    return frame_of_checked(parameters, message.stamp_ns, message.labels, columns, pose, None, view, spread)
+    view, looks = view_of(message, ahead), None
+    if message.embedding is not None and message.embedding_model is not None:
+        looks = Embedding(message.embedding_model, message.embedding)
+    return frame_of_checked(parameters, message.stamp_ns, message.labels, columns, pose, None, view, spread, looks)
 
 
 def unknown_labels(parameters: optipmb.Parameters, message: schemas.Detections) -> dict[str, int]:

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 MAX_COUNT: Final = 2**61
 """Where counters end, so that neither one more nor the sum of two leaves the 64 bits of a message."""
 
-JOINING: Final = frozenset({"rejoined", "lost_dropped"})
-"""Counts of sessions that join tracks."""
+JOINING: Final = frozenset({"rejoined", "lost_dropped", "embedding_ignored"})
+"""Counts of sessions that join tracks, or are sent what that needs."""
 
 Count = Annotated[int, Field(strict=True, ge=0, le=MAX_COUNT)]
 
@@ -65,12 +65,13 @@ class FrameCounts:
         new_epochs: how often the publisher restarted or its stamps jumped.
         clouds_used: tracked with their cloud.
         clouds_missed: that waited for a cloud in vain.
-        astray: refused because the sensor cannot have been there.
+        astray: refused because the sensor cannot have been there, or its vectors have another length.
         effort: refused because they need too much computing.
         unconfirmed: refused because their stamps jumped and no others agreed.
         repaired: covariances that had lost rank in rounding and were repaired.
         rejoined: tracks that were joined with an earlier one of the same object.
         lost_dropped: lost objects that were dropped because there were too many.
+        embedding_ignored: whose embeddings were not of the model that the session compares.
     """
 
     frames: Count = 0
@@ -84,6 +85,7 @@ class FrameCounts:
     repaired: Count = 0
     rejoined: Count = 0
     lost_dropped: Count = 0
+    embedding_ignored: Count = 0
 
 
 @dataclass

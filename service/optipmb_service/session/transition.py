@@ -64,7 +64,7 @@ class Outcome:
         begun: the session id that it starts, if any.
         unknown: the classes that the profile lacks, with the number of objects of each, when not reported before.
         effort: why the frame was refused, when it needs more computing than a frame may.
-        fault: of its relocation.
+        fault: of its relocation, or why its vectors are refused.
     """
 
     frame: ProcessedFrame
@@ -210,6 +210,10 @@ class Transition:
                 with suppress(optipmb.EffortError):
                     return self._track(before, frame, inputs, self._begin(before, frame, "effort"), pose_history)
             return _refused(before, frame, sensor.pose_history, "effort"), Outcome(frame, effort=error)
+        except optipmb.FrameError as error:
+            if error.path != "embedding":
+                raise
+            return _refused(before, frame, sensor.pose_history, "astray"), Outcome(frame, fault=error)
 
     def on_new_clock(
         self, before: FilterState, frame: ProcessedFrame, message: schemas.Detections | None = None
@@ -348,6 +352,9 @@ class Transition:
         more = {"repaired": int(result.diagnostics.repaired)}
         if result.joined is not None:
             more |= {"rejoined": result.joined.joins, "lost_dropped": result.joined.dropped}
+        if message.embedding is not None:
+            how = self._policy.rejoin
+            more["embedding_ignored"] = int(how is None or how.embedding_model != message.embedding_model)
         known = SensorState(
             cursor=sensor.cursor.after(frame_id, frame.place),
             tracked=(frame_id.epoch, max(highest, frame_id.seq)),

@@ -18,7 +18,7 @@ import pytest
 from json_senders import Edge, damaged, document, exists, post
 from optipmb_schemas import MessageError, encode_json
 from optipmb_service.edges.http import detections
-from optipmb_service.edges.json_frames import FrameReader
+from optipmb_service.edges.json_frames import FrameReader, separate
 from optipmb_service.settings import Settings, load
 from router import Node, Sensor, plain, until
 from routers import free_endpoint
@@ -29,6 +29,7 @@ from optipmb import Georeference
 
 SENSOR = Sensor()
 STREAM = f"stream={SENSOR.stream}"
+CAR = {"class": "car", "position": [0, 0]}
 PAGE = Path(__file__).parents[3] / "docs/json.md"
 SITE = (48.265, 11.67, 489.0)
 
@@ -226,6 +227,17 @@ def test_damaged_documents_get_a_path(edge: Edge, endpoint: str, way: str) -> No
             "objects[0].size[1]",
         ),
         ({"objects": [{"class": "\n", "position": [0, 0]}]}, "invalid_value", "objects[0].class"),
+        ({"objects": [CAR | {"embedding": [1, 2]}]}, "invalid_value", "embedding_model"),
+        (
+            {"objects": [CAR | {"embedding": [1, 2]}, CAR | {"embedding": [1]}], "embedding_model": "reid-7"},
+            "invalid_value",
+            "objects[1].embedding",
+        ),
+        (
+            {"objects": [CAR, CAR | {"embedding": [0, 0]}], "embedding_model": "reid-7"},
+            "invalid_value",
+            "objects[1].embedding",
+        ),
         ({"objects": [], "object": []}, "invalid_value", "object"),
         ({"objects": [], "frame": "sensor"}, "missing_field", "pose"),
         ({"objects": [], "frame": "map"}, "invalid_value", "frame"),
@@ -240,6 +252,16 @@ def test_an_error_names_the_path(fields: dict[str, Any], code: str, path: str) -
     with pytest.raises(MessageError) as raised:
         FrameReader(Settings()).read(json.dumps(fields).encode(), SENSOR.stream)
     assert (raised.value.code, raised.value.path) == (code, path)
+
+
+def test_vectors_of_objects_are_columns() -> None:
+    """An object without one is unknown, and a frame that says nothing of other objects has one frame for each."""
+    body = {"objects": [CAR | {"embedding": [3, 4]}, CAR], "embedding_model": "reid-7"}
+    found = FrameReader(Settings()).read(json.dumps(body).encode(), SENSOR.stream)
+    assert found.message.embedding is not None
+    np.testing.assert_array_equal(found.message.embedding, [[3, 4], [np.nan, np.nan]])
+    assert found.message.embedding_model == "reid-7"
+    assert [one.message.embedding.shape for one in separate(found)] == [(1, 2)] * 2  # type: ignore[union-attr]  # as above
 
 
 def test_latitude_and_heading_become_the_world(tmp_path: Path) -> None:

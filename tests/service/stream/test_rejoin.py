@@ -3,13 +3,14 @@
 import json
 import random
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gaps
 import msgpack
+import numpy as np
 import pytest
 from optipmb_schemas import Detections, Tracks, decode, encode
 from optipmb_schemas.json_form import tracks_json
@@ -18,15 +19,17 @@ from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpo
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Policy, Tracked
 from optipmb_service.settings import MOST_ZONES, RejoinSettings, SettingsInvalidError, load
-from sessions import Merged, plain, tracks
+from sessions import Merged, plain, problems, tracks
 
 from optipmb import OnlineTracker, Rejoin, generic_parameters, zones
+from optipmb.online import KNOWN
 from optipmb.zones import Event, Zone
 
 GENERIC = generic_parameters(gaps.CLASSES, 0.1)
 HOW = Rejoin(min_probability=0.6)
 POLICY = Policy(rejoin=HOW)
-FRAMES = gaps.record("street", 7, 25.0).frames
+RECORDING = gaps.record("street", 7, 25.0)
+FRAMES = RECORDING.frames
 STREAM = "site/node/camera"
 
 
@@ -149,6 +152,55 @@ def test_twenty_kills_change_no_object() -> None:
     assert state_bytes(session.snapshot()) == state_bytes(one.snapshot())
 
 
+MODEL = replace(HOW, embedding_model="reid-7")
+VECTORS = [message_of(seq, one) for seq, one in enumerate(gaps.with_vectors(RECORDING, 0.85))]
+
+
+def test_vectors_are_compared_as_in_the_library_through_kills_and_late_frames() -> None:
+    """Objects and states are those of `OnlineTracker`, whatever the order of frames and the restores between them."""
+    found, one = in_order(Policy(rejoin=MODEL), VECTORS)
+    tracker = OnlineTracker(GENERIC, rejoin=MODEL)
+    for output, given in zip(found, gaps.with_vectors(RECORDING, 0.85), strict=True):
+        model, stamp_ns = given["embedding_model"], given["stamp_ns"]
+        columns = {name: value for name, value in given.items() if name in KNOWN}
+        expected, message = tracker.update(columns, stamp_ns=stamp_ns, embedding_model=model), output.tracks
+        assert output.estimates.words.tobytes() == expected.tracks.words.tobytes()
+        assert message.object is not None
+        assert expected.object is not None
+        assert message.object.tobytes() == expected.object.tobytes()
+    appearance = tracker.density.rejoining.appearance if tracker.density.rejoining else None
+    assert appearance is not None
+    assert appearance.counts[0].sum(axis=1).min() >= 200
+    expected_tracks, merged, session = Merged(), Merged(), fresh(Policy(rejoin=MODEL))
+    expected_tracks.take(found)
+    for seq in [k ^ 1 for k in range(len(VECTORS))]:
+        if seq % 40 == 1:
+            session = Session.restore(decode_checkpoint(encode_checkpoint(session.snapshot())), 0, Policy(rejoin=MODEL))
+        merged.take(session.on_detections(VECTORS[seq], 0), session.run)
+    merged.take(session.recovered(0), session.run)
+    assert merged.plain() == expected_tracks.plain()
+    assert state_bytes(session.snapshot()) == state_bytes(one.snapshot())
+    assert session.state().embedding_ignored is None
+
+
+def test_vectors_of_other_models_are_counted_and_of_another_length_refused() -> None:
+    """A frame of another model, or without the setting, is tracked; another length is a problem with the path."""
+    _, plain_session = in_order(POLICY, VECTORS[:20])
+    assert plain_session.state().embedding_ignored == 20
+    _, session = in_order(Policy(rejoin=MODEL), VECTORS[:20])
+    other = VECTORS[20].model_copy(update={"embedding_model": "reid-8"})
+    assert tracks(session.on_detections(other, 0))
+    assert session.state().embedding_ignored == 1
+    vectors = VECTORS[21].embedding
+    assert vectors is not None
+    short = VECTORS[21].model_copy(update={"embedding": np.ascontiguousarray(vectors[:, :4])})
+    (problem,) = problems(session.on_detections(short, 0))
+    assert (problem.code, problem.path) == ("invalid_value", "embedding")
+    assert "32 numbers" in problem.expected
+    assert session.state().refused == 1
+    assert tracks(session.on_detections(VECTORS[22], 0))
+
+
 def test_a_reset_forgets_lost_objects() -> None:
     """No object of a session is of another one."""
     _, session = in_order(messages=MESSAGES[:200])
@@ -208,7 +260,9 @@ def test_zones_by_object_survive_late_frames_and_restores() -> None:
     assert state_bytes(session.snapshot()) == state_bytes(one.snapshot())
 
 
-@pytest.mark.parametrize("value", ["gap_s = 0", "min_probability = 1.0", "most = 0", "decide_s = 6", "other = 1"])
+@pytest.mark.parametrize(
+    "value", ["gap_s = 0", "min_probability = 1.0", "most = 0", "decide_s = 6", "other = 1", "embedding_model = ''"]
+)
 def test_settings_out_of_bounds_are_named(value: str, tmp_path: Path) -> None:
     """The path of the setting is in the error."""
     path = tmp_path / "settings.toml"
@@ -221,7 +275,12 @@ def test_settings_have_the_bounds_of_the_library() -> None:
     """The settings, which do not import the tracker, repeat its bounds and defaults without a difference."""
     assert RejoinSettings().model_dump() == asdict(Rejoin())
     limits = {"minimum", "exclusiveMinimum", "maximum", "exclusiveMaximum"}
-    for name, described in RejoinSettings.model_json_schema()["properties"].items():
+    for length in (0, 1, 64, 65):
+        accepted = [is_accepted(one, "embedding_model", "x" * length) for one in (RejoinSettings, Rejoin)]
+        assert accepted == [1 <= length <= 64] * 2
+    numbers = RejoinSettings.model_json_schema()["properties"]
+    del numbers["embedding_model"]
+    for name, described in numbers.items():
         ends = [described[one] for one in sorted(limits & described.keys())]
         assert len(ends) == 2
         step = 1 if described["type"] == "integer" else 1e-9
@@ -230,7 +289,7 @@ def test_settings_have_the_bounds_of_the_library() -> None:
     assert MOST_ZONES == zones.MOST
 
 
-def is_accepted(kind: Callable[..., object], name: str, value: float) -> bool:
+def is_accepted(kind: Callable[..., object], name: str, value: object) -> bool:
     try:
         kind(**{name: value})
     except ValueError:
