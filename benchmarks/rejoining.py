@@ -4,7 +4,7 @@ Prints the tables of docs/gaps.md as Markdown: four generated scenes (`tests/sup
 with lasting objects, and with `--root` KITTI and nuScenes. A join is right if the earlier track ended on the object on
 which the later one began, by the last and the first five detections. Profile `auto`. With `--online` tracks are joined
 while tracking: rows that are not decided have no identity, and joins below the least probability are those of a second
-run.
+run. With `--vectors` detections of the generated scenes bring simulated vectors of appearance (`gaps.with_vectors`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,20 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 
-from gaps import CLASSES, FALSE_OBJECT, SCENES, SIZES, Judged, decided, ends_of, followed, judge, owners, record
+from gaps import (
+    CLASSES,
+    FALSE_OBJECT,
+    SCENES,
+    SIZES,
+    Judged,
+    decided,
+    ends_of,
+    followed,
+    judge,
+    owners,
+    record,
+    with_vectors,
+)
 from generality import DETECTORS, identity_f1, sequences_of
 from optipmb_tools.datasets import Truth, open_dataset
 from optipmb_tools.evaluation.cases import default_rules, prepare
@@ -75,10 +88,12 @@ class How:
 
     least: float
     online: bool
+    view: float = 0.0  # of the simulated vectors of appearance; 0: there are none
 
     def tracked(self, frames: Sequence[Frame], parameters: Parameters, least: float = 0.0) -> dict[int, Tracks]:
         """Return the tracks of frames, joined while tracking if that is asked for."""
-        how = optipmb.Rejoin(min_probability=least or self.least)
+        model = "reid-7" if self.view else None
+        how = optipmb.Rejoin(min_probability=least or self.least, embedding_model=model)
         return followed(frames, parameters, how if self.online else None)
 
     def joins(self, tracks: dict[int, Tracks], parameters: Parameters) -> tuple[Tracklets, tuple[Ints, Ints, Floats]]:
@@ -136,15 +151,16 @@ def head(*cells: object) -> None:
     line(*["---"] * len(cells))
 
 
-def generated(seeds: Sequence[int], how: How) -> None:
-    """Print the tables of the four scenes."""
+def generated(seeds: Sequence[int], how: How, scenes: Sequence[str]) -> None:
+    """Print the tables of the generated scenes."""
     parameters, least = generic_parameters(CLASSES, 0.1), how.least
     every, unsure, rows = Judged(), Judged(), []
-    for name in SCENES:
+    for name in scenes:
         here, figures = Judged(), []
         for seed in seeds:
             recording = record(name, seed)
-            frames = [optipmb.make_frame(parameters, **one)[0] for one in recording.frames]
+            given = with_vectors(recording, how.view, seed) if how.view else recording.frames
+            frames = [optipmb.make_frame(parameters, **one)[0] for one in given]
             tracks = how.tracked(frames, parameters)
             here += judge(*how.joins(tracks, parameters), owners(tracks, recording.source))
             if how.online:
@@ -229,15 +245,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--root", type=Path, help="folder with kitti/, nuscenes/ and nuscenes-more/")
     parser.add_argument("--seeds", type=int, nargs="*", default=range(21, 27))
-    parser.add_argument("--frames", type=int, default=900, help="of the generated traffic")
+    parser.add_argument("--frames", type=int, default=900, help="of the generated traffic; 0: without it")
     parser.add_argument("--online", action="store_true", help="join while tracking")
+    parser.add_argument("--scenes", nargs="*", default=list(SCENES), choices=list(SCENES))
+    parser.add_argument("--vectors", type=float, default=0.0, help="length of what changes in them, as 1.25")
     parser.add_argument("--min-probability", type=float, help="default: that of the product")
     given = parser.parse_args()
     default = optipmb.Rejoin.min_probability if given.online else Rejoin.min_probability
-    how = How(given.min_probability or default, given.online)
+    how = How(given.min_probability or default, given.online, given.vectors)
     if given.seeds:
-        generated(given.seeds, how)
-    recorded(given.root, given.frames, how)
+        generated(given.seeds, how, given.scenes)
+    if given.frames:
+        recorded(given.root, given.frames, how)
 
 
 if __name__ == "__main__":
