@@ -16,10 +16,11 @@ from html import escape
 from io import StringIO
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
+from warnings import warn
 
 import numpy as np
 
-from optipmb.class_names import class_indices
+from optipmb.class_names import class_indices, common_name
 from optipmb.detectors import forms_of, from_detector
 from optipmb.errors import FrameError
 from optipmb.frame import make_frame
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from optipmb.density import Density
     from optipmb.extract import Tracks
     from optipmb.field_of_view import FieldOfView
-    from optipmb.frame import PointCloud, Pose
+    from optipmb.frame import Frame, PointCloud, Pose
     from optipmb.ground_camera import GroundCamera
     from optipmb.parameters import Parameters
     from optipmb.paths import PredictedPaths
@@ -69,6 +70,13 @@ HTML_COLUMNS: Final = ("id", "class", "x", "y", "z", "yaw", "vx", "vy", "existen
 """Columns of the table that notebooks show."""
 NEAR_M: Final = 0.1
 """Least distance from a camera at which a box is projected."""
+DOUBTED: Final = 20
+"""Frames in succession with odd times after which a warning follows."""
+STEPS_NS: Final = 10**6, 10**10
+"""Times between frames that are not odd: no object is followed from one frame to the next over ten seconds."""
+COMPARED: Final = 100
+"""Boxes of vehicles whose length is compared with their width."""
+LONG: Final = frozenset({"car", "truck", "bus", "trailer"})
 
 
 @dataclass(frozen=True)
@@ -339,6 +347,9 @@ class OnlineTracker:
         self._leave_out = unknown_classes == "leave out"
         self.density: Density = self._tracker.initial()
         self._latest = ""  # summary of the newest tracks
+        self._is_long = np.array([common_name(name) in LONG for name in self.parameters.labels])
+        self._odd_steps = self._boxes = self._wide = 0
+        self._has_warned_of_yaw = False
 
     def __repr__(self) -> str:
         return f"OnlineTracker: profile {self.parameters.name}, {self._latest or 'no frame yet'}"
@@ -368,10 +379,10 @@ class OnlineTracker:
                 for each box, a structured array, or a data frame of pandas, polars or pyarrow. `center` (M, 3) or `x`,
                 `y`, `z`; `size` (M, 3) or `l`, `w`, `h` or `length`, `width`, `height`; `yaw` or `heading` (M,) rad;
                 `score` or `confidence` (M,) in (0, 1]; `class`, `label`, `name`, `category` or `type` (M,): class
-                names, or their places in the profile; `velocity` (M, 2) or `vx`, `vy`, m/s, NaN where unknown;
-                `position_covariance` (M, 3, 3), m^2, and `embedding` (M, E), appearance, likewise. Sizes, headings and
-                `z` may be NaN or absent, unknown; but with a size a missing column `z` is 0 and `h` 1.5 m. Without
-                `score` it is 1. None: nothing was detected.
+                names, one name for all, or their places in the profile; `velocity` (M, 2) or `vx`, `vy`, m/s, NaN where
+                unknown; `position_covariance` (M, 3, 3), m^2, and `embedding` (M, E), appearance, likewise. Sizes,
+                headings and `z` may be NaN or absent, unknown; but with a size a missing column `z` is 0 and `h` 1.5 m.
+                Without `score` it is 1. None: nothing was detected.
             t: time of the frame: seconds, or a date (of pandas too; UTC where it has no zone); or
             stamp_ns: nanoseconds.
             pose: world from sensor, or None when the boxes are in the world frame; with a camera on a vehicle, of it.
@@ -386,6 +397,10 @@ class OnlineTracker:
         Raises:
             FrameError: a column is missing or unknown, or a shape, value or class is not allowed, or the stamp goes
                 back; names it. The density stays as it was.
+
+        Warns:
+            UserWarning: the times are not in seconds, the headings in degrees, or the widths before the lengths, by all
+                appearance; once each.
         """
         if (t is None) == (stamp_ns is None):
             raise FrameError("t", "t (s) or stamp_ns (ns)", "both" if t is not None else "neither")
@@ -426,6 +441,7 @@ class OnlineTracker:
         )
         if row is not None:
             frame = replace(frame, source=row[frame.source])
+        self._doubt(frame, columns.get("yaw"))
         result = self._tracker.step(self.density, frame)
         self.density = result.density
         tracks = result.tracks
@@ -446,6 +462,25 @@ class OnlineTracker:
         )
         self._latest = online.summary
         return online
+
+    def _doubt(self, frame: Frame, yaw: ArrayLike | None) -> None:
+        """Warn of a frame whose numbers have another meaning than they should, by all appearance."""
+        step_ns = frame.stamp_ns - self.density.stamp_ns
+        is_odd = self.density.stamp_ns >= 0 and not STEPS_NS[0] <= step_ns <= STEPS_NS[1]
+        self._odd_steps = self._odd_steps + 1 if is_odd else 0
+        if self._odd_steps == DOUBTED:
+            seconds = f"{DOUBTED} frames in succession, the last {step_ns / 1e9:g} s after the one before"
+            warn(f"t: expected seconds (stamp_ns: nanoseconds), received {seconds}", stacklevel=3)
+        largest = 0.0 if yaw is None or not len(frame.yaw) else float(np.nanmax(np.abs(yaw), initial=0.0))
+        if largest > 4.0 * np.pi and not self._has_warned_of_yaw:
+            self._has_warned_of_yaw = True
+            warn(f"yaw: expected radians, received {largest:g} (numpy.radians converts degrees)", stacklevel=3)
+        if self._boxes < COMPARED:
+            length, width = frame.size[self._is_long[frame.label], :2].T
+            self._boxes, self._wide = self._boxes + len(length), self._wide + int((length < width).sum())
+            if self._boxes >= COMPARED and 2 * self._wide > self._boxes:
+                found = f"{self._wide} of {self._boxes} vehicles wider than long"
+                warn(f"size: expected length, width, height, received {found}", stacklevel=3)
 
     def _on_ground(self, camera: GroundCamera, pose: Pose | None, columns: dict[str, Any]) -> dict[str, Any]:
         """Return the detections of pixel boxes, in the frame of the camera's position."""
@@ -516,6 +551,8 @@ def _columns(boxes: Any, arrays: Mapping[str, ArrayLike]) -> dict[str, Any]:
         columns["center"][:, 2] = np.nan
     if missing := [name for name in BOXES if name not in columns]:
         raise FrameError(missing[0], f"a column for each of {', '.join(BOXES)}", f"the columns {', '.join(given)}")
+    if isinstance(columns["label"], str):
+        columns["label"] = [columns["label"]] * len(columns["center"])
     columns = {name: _nested(values) for name, values in columns.items()}
     if isinstance(columns["label"], list):
         columns["label"] = [getattr(one, "value", one) for one in columns["label"]]  # of an enumeration
@@ -526,7 +563,7 @@ def _renamed(
     boxes: Any, arrays: Mapping[str, ArrayLike], known: Sequence[str], flat: Sequence[tuple[str, tuple[str, ...]]]
 ) -> dict[str, Any]:
     """Return the columns of boxes and arguments by their first names, each meaning once."""
-    given = {**_named(boxes), **arrays}
+    given = {name: values for name, values in {**_named(boxes), **arrays}.items() if values is not None}
     if unknown := [name for name in given if name not in known]:
         pixels = " (pixel boxes need camera=)" if unknown[0] in KNOWN_PIXELS else ""
         raise FrameError(unknown[0], f"columns among {', '.join(known)}{pixels}", f"the columns {', '.join(given)}")

@@ -181,6 +181,37 @@ def test_what_is_wrong_is_named_and_changes_nothing(boxes: Any, when: dict[str, 
     assert tracker.density is before
 
 
+@pytest.mark.parametrize(
+    ("unit", "change", "text"),
+    [
+        (1e3, {}, r"t: expected seconds .*, received 20 frames in succession, the last 100 s after the one before"),
+        (0.0, {}, r"t: expected seconds .*, received 20 frames in succession, the last 0 s after"),
+        (1.0, {"yaw": [180.0]}, r"yaw: expected radians, received 180 \(numpy.radians converts degrees\)"),
+        (1.0, {"l": [1.9], "w": [4.5]}, "size: expected length, width, height, received 100 of 100 vehicles wider"),
+    ],
+)
+def test_numbers_of_another_meaning_are_doubted_once(unit: float, change: dict[str, Any], text: str) -> None:
+    """Times that are not in seconds, degrees, and widths before lengths bring one warning."""
+    tracker = optipmb.OnlineTracker()
+    with pytest.warns(UserWarning, match=text) as warnings:
+        _ = [tracker.update({**flat(k), **change}, t=unit * 0.1 * k) for k in range(120)]
+    assert len(warnings) == 1
+
+
+def test_slow_frames_and_frames_in_parts_are_not_doubted() -> None:
+    """A frame every five seconds is none too few, and the classes of one time may come one after the other."""
+    slow, parts = optipmb.OnlineTracker(), optipmb.OnlineTracker()
+    for k in range(40):
+        slow.update(flat(0), t=5.0 * k)
+        parts.update(flat(k), t=0.1 * (k // 2))
+
+
+def test_one_class_is_of_all_boxes_and_none_is_no_column() -> None:
+    """A single name stands for each box; a column of None is absent."""
+    boxes = {"center": [[0.0] * 3, [20.0] * 3], "size": None, "label": "car", "score": [0.9, 0.8]}
+    assert optipmb.OnlineTracker().update(boxes, t=0.0).name.tolist() == ["car", "car"]
+
+
 def test_classes_that_are_left_out_are_counted() -> None:
     """On request, detections of classes that the profile lacks are left out and counted."""
     tracker = optipmb.OnlineTracker("kitti", unknown_classes="leave out")
