@@ -784,9 +784,18 @@ class Settings(BaseSettings):
         return one
 
     def missing_s(self, session: str) -> float | None:
-        """Return the time without a report after which objects count as missed; None: `unseen_time` of the profile."""
-        one = self.input_of(session)
-        return one.missing_s if one.complete is False else None
+        """Return the time without a report after which objects count as missed; None: `unseen_time` of the profile.
+
+        For a fused session it is the longest one of the inputs that may feed it.
+        """
+        node, _, sensor = session.rpartition("/")
+        feeding = list(self.fused_sessions[session].streams) if session in self.fused_sessions else []
+        if sensor == "fused":
+            feeding += [f"{node}/{one.split('/')[2]}" for one in self.fuse if fnmatchcase(node, one.rpartition("/")[0])]
+        known = (*self.inputs, *(re.sub(r"\{\d\}", "*", name) for name in self.mqtt.inputs)) if feeding else ()
+        names = [one for one in known if any(_overlap(one, each) for each in feeding)]
+        rules = map(self.input_of, names if feeding else [session])
+        return max((one.missing_s for one in rules if one.complete is False), default=None)
 
     @property
     def fused_sessions(self) -> dict[str, FusedSettings]:

@@ -132,6 +132,21 @@ def test_events_of_frigate(calibration: Path) -> None:
     assert found == [10.0, None, None]
 
 
+def test_fused_sessions_miss_objects_as_late_as_their_inputs() -> None:
+    """Of a node and of a site: after the longest `missing_s` of the incomplete streams that may feed them."""
+    incomplete = {"complete": False, "missing_s": 30}
+    given = {
+        "fuse": ["garage/a/*", "garage/b/lidar*"],
+        "fused": {"all": {"streams": ["yard/*/cam"]}, "lidars": {"streams": ["yard/*/lidar"]}},
+        "inputs": {"garage/*/cam*": incomplete, "yard/gate/*": {"complete": False, "missing_s": 20}},
+        "mqtt": {"inputs": {"yard/{1}/cam": {"topic": "+/events", "format": "frigate"}}},
+    }
+    settings = load(None, given).settings
+    garage = [settings.missing_s(f"garage/{one}") for one in ("a/fused", "b/fused", "c/fused", "c/cam")]
+    assert garage == [30.0, None, None, 30.0]
+    assert [settings.missing_s(f"yard/fused/{one}") for one in ("all", "lidars")] == [20.0, 20.0]
+
+
 def test_separate_objects_are_alone_in_view(calibration: Path) -> None:
     """Each frame of an incomplete one looks at its object, and at none that is more than a few metres away."""
     boxes = [[300, 700, 420, 760], [1135, 699, 1255, 763], [1700, 800, 1900, 900]]
