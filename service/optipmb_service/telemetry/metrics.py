@@ -71,7 +71,7 @@ class MetricFamily:
         values = value if isinstance(value, Mapping) else {} if value is None else {(): value}
         kind = CounterMetricFamily if self.kind == "counter" else GaugeMetricFamily
         family = kind(NAMESPACE + name, self.meaning, labels=self.labels)
-        for labels, number in values.items():
+        for labels, number in tuple(values.items()):  # others count meanwhile
             family.add_metric((labels,) if isinstance(labels, str) else labels, number)
         return family if values else None
 

@@ -1,6 +1,7 @@
 """What a process measures: as Prometheus' own client would count it, and the same for the parent of workers."""
 
 import re
+from collections.abc import Iterator
 from types import SimpleNamespace
 
 from optipmb_service.telemetry.metrics import METRICS, SECONDS, Metrics
@@ -51,6 +52,23 @@ def test_counts_are_there_from_the_start() -> None:
     lines = own(Metrics().text())
     for name in ('received_total{topic="points"}', "tracks_started_total", "step_seconds_count"):
         assert f"optipmb_{name} 0.0" in lines
+
+
+def test_what_is_counted_for_the_first_time_meanwhile_ends_no_answer() -> None:
+    """Another thread counts a reason that was not there while the metrics are made."""
+    counts: dict[object, int] = {}
+
+    class Reason(tuple[str, ...]):
+        __slots__ = ()
+
+        def __iter__(self) -> Iterator[str]:
+            counts["another",] = 1
+            return super().__iter__()
+
+    counts[Reason(("first",))] = 1
+    metrics = Metrics()
+    metrics.add({"mqtt_refused_total": METRICS["mqtt_refused_total"]}, lambda: SimpleNamespace(refused=counts))
+    assert 'optipmb_mqtt_refused_total{reason="first"} 1.0' in own(metrics.text())
 
 
 def test_the_parent_shows_what_its_workers_show() -> None:
