@@ -400,7 +400,7 @@ def _time(text: str) -> int:
     Raises:
         MessageError: it is none, or says no zone.
     """
-    expected = "ISO 8601 from 1970 on with Z or an offset, as 2026-11-27T08:00:00.100Z"
+    expected = "ISO 8601 from 1970 to 2261 with Z or an offset, as 2026-11-27T08:00:00.100Z"
     if (match := _TIME.fullmatch(text)) is None:
         raise invalid("time", expected, text)
     day, fraction, zone = match.groups()
@@ -408,7 +408,7 @@ def _time(text: str) -> int:
         seconds = int(datetime.fromisoformat(f"{day}{'+00:00' if zone == 'Z' else zone}").timestamp())
     except ValueError:
         seconds = -1
-    if seconds < 0:
+    if not 0 <= seconds < 2**63 // SECOND:
         raise invalid("time", expected, text)
     return seconds * SECOND + int((fraction or "0")[:9].ljust(9, "0"))
 

@@ -242,6 +242,7 @@ def test_damaged_documents_get_a_path(edge: Edge, endpoint: str, way: str) -> No
         ({"objects": [], "frame": "sensor"}, "missing_field", "pose"),
         ({"objects": [], "frame": "map"}, "invalid_value", "frame"),
         ({"objects": [], "time": "2026-11-27T08:00:00"}, "invalid_value", "time"),
+        ({"objects": [], "time": "2262-11-27T08:00:00Z"}, "invalid_value", "time"),
         ({"objects": [], "time": "2026-11-27T08:00:00Z", "stamp_ns": 1}, "invalid_value", "stamp_ns"),
         ({"objects": [], "seq": 1}, "missing_field", "epoch"),
         ({"objects": [], "stream": "a/b/c"}, "invalid_value", "stream"),
