@@ -12,6 +12,7 @@ from optipmb_schemas import Detections, MessageError
 from optipmb_service.edges.json_frames import FrameReader, separate
 from optipmb_service.edges.mapping import PayloadMapping, mapping_of
 from optipmb_service.settings import MappingSettings, MqttInput, load
+from router import Node
 from scipy.spatial.transform import Rotation
 
 from optipmb import GroundCamera
@@ -167,6 +168,19 @@ def test_separate_objects_are_alone_in_view(calibration: Path) -> None:
         angle, distance = np.arctan2(places[:, 1], places[:, 0]), np.linalg.norm(places, axis=1)
         seen = (low < angle) & (angle < high) & (near < distance) & (distance < far)
         assert seen.tolist() == [one == at for one in range(3)]
+
+
+def test_a_node_converts_its_boxes(calibration: Path, start: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The program of the page publishes what the service makes of the same boxes as JSON: the same tracks."""
+    code = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)[1]
+    monkeypatch.chdir(calibration.parent)
+    endpoint, stamps = start(profile="generic")[1], iter(range(10**18, 2 * 10**18, 10**8))
+    monkeypatch.setattr("time.time_ns", lambda: next(stamps))
+    with Node(endpoint) as node:
+        exec(compile(code.replace('"world"', f'"world", connect="{endpoint}"'), "cameras.md", "exec"), {})  # noqa: S102 - of this repository
+        tracks = node.tracks(STREAM, 6)[-1]
+    boxes = [{"class": "car", "box": [1135 - 107.5, 699, 1255 - 112.5, 763], "score": 0.9}]
+    np.testing.assert_allclose(tracks.center[0, :2], read(calibration, {"objects": boxes}).center[0, :2], atol=1.0)
 
 
 @pytest.mark.parametrize(
