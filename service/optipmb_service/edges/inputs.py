@@ -16,6 +16,7 @@ import time
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from weakref import WeakValueDictionary
 
 import msgspec
 import optipmb_schemas as schemas
@@ -25,12 +26,11 @@ from optipmb_client.trace_context import attachment_of
 
 from optipmb_service.edges.json_frames import separate
 from optipmb_service.telemetry.problem_reporter import ProblemReporter
-from optipmb_service.zenoh.client import IdlePool
+from optipmb_service.zenoh.client import IdlePool, TooManyStreamsError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Hashable
 
-    from optipmb_client.zenoh.handles import Declared
     from optipmb_client.zenoh.session import Sample
 
     from optipmb_service.edges.json_frames import JsonFrame
@@ -81,7 +81,7 @@ class RefusedError(Exception):
     """A frame that is valid, and was not sent.
 
     Attributes:
-        code: for programs: `late`, `duplicate_epoch`, `busy`.
+        code: for programs: `late`, `duplicate_epoch`, `busy`, `too_many_streams`, `unlinked`, `not_allowed`.
         expected, received: why.
         retry_s: when it may come again; 0: never.
     """
@@ -184,14 +184,14 @@ class _Clock:
         self._others: list[int] = []
         self._sender_ns = self._last_ns = 0
 
-    def arrival(self) -> int:
+    def arrival(self, arrived_ns: int) -> int:
         """Return the time of arrival, after the one before."""
-        self._last_ns = max(time.time_ns(), self._last_ns + STEP_NS)
+        self._last_ns = max(arrived_ns, self._last_ns + STEP_NS)
         return self._last_ns
 
-    def moved(self, sender_ns: int) -> int:
+    def moved(self, sender_ns: int, arrived_ns: int) -> int:
         """Return a sender's stamp on the clock of this machine, by the least offset of the last frames."""
-        offset = time.time_ns() - sender_ns
+        offset = arrived_ns - sender_ns
         if self._offsets and abs(offset - min(self._offsets)) > SECOND:
             self._others.append(offset)
             if len(self._others) >= NEW_CLOCK:
@@ -200,7 +200,7 @@ class _Clock:
             self._offsets.append(offset)
         if offset in self._offsets:
             self._others.clear()
-        stamp_ns = max(0, sender_ns + min(self._offsets))
+        stamp_ns = max(0, sender_ns + min(*self._offsets, offset))  # no frame arrives before it is stamped
         if sender_ns > self._sender_ns:
             stamp_ns = max(stamp_ns, self._last_ns + STEP_NS)
         self._sender_ns, self._last_ns = sender_ns, stamp_ns
@@ -221,27 +221,20 @@ class _Stream:
     clock: _Clock = field(default_factory=_Clock)
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     in_flight: InFlight = field(default_factory=InFlight)
-    waiting: dict[tuple[bytes, int], list[asyncio.Future[Answer]]] = field(default_factory=dict)
+    waiting: WeakValueDictionary[tuple[bytes, int], asyncio.Future[Answer]] = field(default_factory=WeakValueDictionary)
+    """Tracks that somebody waits for, by the numbers of their frames."""
     users: int = 0
     link: _Link | None = None
 
-    def leave(self, sent: Sent, tracks: asyncio.Future[Answer]) -> None:
-        """Wait for the tracks of a frame no more."""
-        if left := [one for one in self.waiting.pop(sent[:2], ()) if one is not tracks]:
-            self.waiting[sent[:2]] = left
 
+class _Link(NamedTuple):
+    """Publisher of a stream; with its subscriptions to close."""
 
-class _Link:
-    """Publisher and subscriptions of a stream."""
-
-    def __init__(self, outgoing: Outgoing, subscriptions: tuple[Declared, ...]) -> None:
-        self.outgoing = outgoing
-        self._subscriptions = subscriptions
+    outgoing: Outgoing
+    opened: contextlib.ExitStack
 
     def close(self) -> None:
-        for one in self._subscriptions:
-            one.close()
-        self.outgoing.close()
+        self.opened.close()
 
 
 class Inputs:
@@ -301,63 +294,44 @@ class Inputs:
 
         Raises:
             RefusedError: it is not sent now.
-            TransportError: the network cannot be used, or too many streams were opened.
         """
         name = frame.message.stream
         async with self._used(name) as stream:
             async with stream.lock:  # taken once: frames of a stream go out in the order in which they came
                 await self._prepare(name, stream)
                 parts = separate(frame) if rules.complete is False else [frame]
-                is_new = False
+                before: Sent | None = None
                 for at, one in enumerate(parts):
-                    if is_new:  # the frame has begun, and whoever sent it again would send its objects twice
+                    if at and before is None:  # the frame has begun: sent again, its objects would be sent twice
                         await stream.in_flight.below(WINDOW)
-                    tracks = self._loop.create_future() if wait_s and one is parts[-1] else None
                     mark = _mark(one, repeats, at, rules)
-                    sent, is_new = await self._handed(stream, one, mark, rules, traceparent, tracks)
-            counts = self.frames if is_new else self.duplicates
+                    before = None if one.is_numbered else self._before(stream, one, mark, rules)
+                    sent = before or self._numbered(stream, one, rules)
+                    tracks = stream.waiting.setdefault(sent[:2], self._loop.create_future())
+                    if before is None:
+                        await self._put(stream, one, sent, traceparent)
+                        self._remember(stream, mark, sent)
+            counts = self.frames if before is None else self.duplicates
             counts[self._edge] += 1
-            found = await self._tracks(stream, name, sent, tracks, wait_s, is_new=is_new) if tracks else None
-            return sent, not is_new, found
-
-    async def _handed(
-        self,
-        stream: _Stream,
-        frame: JsonFrame,
-        mark: Hashable,
-        rules: InputSettings,
-        traceparent: str,
-        tracks: asyncio.Future[Answer] | None,
-    ) -> tuple[Sent, bool]:
-        """Send a frame, unless it was sent before, and wait for its tracks; return its numbers, and whether it is new.
-
-        Raises:
-            RefusedError: it is not sent now.
-        """
-        sent = None if frame.is_numbered else self._before(stream, frame, mark, rules)
-        if is_new := sent is None:
-            sent = self._numbered(stream, frame, rules)
-        if tracks is not None:
-            stream.waiting.setdefault(sent[:2], []).append(tracks)
-        if is_new:
-            try:
-                await self._put(stream, frame, sent, traceparent)
-            except BaseException:
-                if tracks is not None:
-                    stream.leave(sent, tracks)
-                raise
-            self._remember(stream, mark, sent)
-        return sent, is_new
+            return sent, before is not None, await self._tracks(name, sent, tracks, wait_s, is_new=before is None)
 
     @contextlib.asynccontextmanager
     async def _used(self, name: str) -> AsyncIterator[_Stream]:
-        """Give a stream; the last user leaves its publisher to the next one."""
+        """Give a stream; the last user leaves its publisher to the next one.
+
+        Raises:
+            RefusedError: the network cannot be used meanwhile.
+        """
         stream = self._streams.get(name) or _Stream()
         self._streams[name] = stream
         self._streams.move_to_end(name)
         stream.users += 1
         try:
             yield stream
+        except TooManyStreamsError as error:
+            raise RefusedError("too_many_streams", "fewer new streams", "more", error.wait_s) from error
+        except TransportError as error:
+            raise RefusedError("unlinked", "a network", str(error)) from error
         finally:
             stream.users -= 1
             if not stream.users and stream.link is not None:
@@ -407,9 +381,11 @@ class Inputs:
         if not frame.is_numbered and (left_s := stream.replaced_until - time.monotonic()) > 0:
             raise RefusedError("duplicate_epoch", "one publisher of the stream", "another one that sends", left_s)
         if not frame.is_stamped or rules.clock == "arrival":
-            stamp_ns = stream.clock.arrival()
+            stamp_ns = stream.clock.arrival(frame.arrived_ns)
+        elif rules.clock == "sender":
+            stamp_ns = message.stamp_ns
         else:
-            stamp_ns = message.stamp_ns if rules.clock == "sender" else stream.clock.moved(message.stamp_ns)
+            stamp_ns = stream.clock.moved(message.stamp_ns, frame.arrived_ns)
         if frame.is_numbered:
             return Sent(message.epoch, message.seq, stamp_ns)
         return Sent(stream.epoch, stream.seq, stamp_ns)
@@ -437,42 +413,29 @@ class Inputs:
             self._remembered -= len(self._streams.pop(name).sent)
 
     async def _tracks(
-        self,
-        stream: _Stream,
-        name: str,
-        sent: Sent,
-        tracks: asyncio.Future[Answer],
-        wait_s: float,
-        *,
-        is_new: bool,
+        self, name: str, sent: Sent, tracks: asyncio.Future[Answer], wait_s: float, *, is_new: bool
     ) -> Answer | None:
         """Return the tracks of a frame, from the caches if it was sent before; None if they do not come in time."""
-        try:
-            if not is_new:
-                for head, answer in reversed(await asyncio.to_thread(self._cached, name)):
-                    if (head.epoch, head.seq) == sent[:2]:
-                        return answer
-            async with asyncio.timeout(wait_s):
-                return await tracks
-        except TimeoutError:
-            return None
-        finally:
-            stream.leave(sent, tracks)
+        if wait_s and not is_new:
+            for head, answer in reversed(await asyncio.to_thread(self._cached, name)):
+                if (head.epoch, head.seq) == sent[:2]:
+                    return answer
+        if wait_s:
+            await asyncio.wait((tracks,), timeout=wait_s)
+        return tracks.result() if tracks.done() else None
 
     def _open(self, name: str) -> _Link:
         """Subscribe to the tracks and problems of a stream, and open its publisher."""
         keys = self.client.keys
         with contextlib.ExitStack() as opened:
-            subscriptions = []
             for key, take in (
                 (keys.tracks(self._session_of(name)), self._take_tracks),
                 (keys.problems(name), self._take_problem),
             ):
-                subscriptions.append(self.client.listen(key, partial(take, name)))
-                opened.callback(subscriptions[-1].close)
-            link = _Link(self.client.publish(name, CACHE, 0, lambda: None), tuple(subscriptions))
-            opened.pop_all()
-        return link
+                opened.callback(self.client.listen(key, partial(take, name)).close)
+            outgoing = self.client.publish(name, CACHE, 0, lambda: None)
+            opened.callback(outgoing.close)
+            return _Link(outgoing, opened.pop_all())
 
     def _cached(self, name: str) -> list[tuple[_Head, Answer]]:
         """Return the tracks of a stream that the services keep; may wait."""
@@ -499,9 +462,8 @@ class Inputs:
     def _tracked(self, name: str, numbers: tuple[bytes, int], answer: Answer) -> None:
         if (stream := self._streams.get(name)) is not None:
             stream.in_flight.remove(*numbers)
-            for one in stream.waiting.pop(numbers, ()):
-                if not one.done():
-                    one.set_result(answer)
+            if (tracks := stream.waiting.get(numbers)) is not None and not tracks.done():
+                tracks.set_result(answer)
 
     def _replaced(self, name: str, epoch: str) -> None:
         if (stream := self._streams.get(name)) is not None and epoch == stream.epoch.hex():

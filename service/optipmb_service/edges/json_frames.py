@@ -7,6 +7,7 @@ stamps that it does not give are left to the edge.
 from __future__ import annotations
 
 import re
+import time
 from datetime import datetime
 from functools import cache
 from math import atan2, hypot, nan, pi, sqrt
@@ -37,6 +38,9 @@ UNKNOWN: Final = (nan, nan, nan)
 PLACES: Final = ("position", "lat and lon", "box", "foot")
 MODEL: Final = ("frame", "pose", "field_of_view", "relocation", "embedding_model")
 """Fields of a frame with the names and values of `Detections`."""
+
+HEADER: Final = ("stream", "time", "stamp_ns", "seq", "key")
+"""Fields of a frame that a document with columns has in the same form."""
 
 SEPARATE: Final = ("epoch", "field_of_view")
 """Fields of a frame that cannot hold for each of its objects alone."""
@@ -75,12 +79,14 @@ class JsonFrame(NamedTuple):
         is_numbered: whether the sender gives `epoch` and `seq`.
         is_stamped: whether it gives a stamp.
         key: by which it knows the frame again; empty: it gives none.
+        arrived_ns: when it was read, ns since 1970.
     """
 
     message: schemas.Detections
     is_numbered: bool
     is_stamped: bool
     key: str
+    arrived_ns: int
 
 
 def separate(frame: JsonFrame) -> list[JsonFrame]:
@@ -219,16 +225,10 @@ class FrameReader:
         """Return the frame of a document with columns."""
         if "objects" in fields:
             raise schemas.MessageError("invalid_value", "objects", "objects or columns", "both")
-        for name, kinds in (
-            ("stream", str),
-            ("time", str),
-            ("key", str),
-            ("stamp_ns", (int, str)),
-            ("seq", (int, str)),
-        ):
-            value = fields.get(name)
-            if value is not None and (not isinstance(value, kinds) or isinstance(value, bool)):
-                raise invalid(name, "a text" if kinds is str else "an integer", value)
+        try:
+            msgspec.convert({name: fields.get(name) for name in HEADER} | {"objects": []}, EdgeDetections)
+        except msgspec.ValidationError as error:
+            raise _invalid(error, fields) from None
         given = {name: value for name, value in fields.items() if value is not None}
         return self._framed(codec.build(fields | _header(given, stream), schemas.Detections, self._limits), given)
 
@@ -243,7 +243,7 @@ class FrameReader:
             numbers = np.array([labels.index(name) for name in names], np.int64)
             message = message.model_copy(update={"labels": labels, "label": numbers[message.label]})
         is_stamped = "time" in given or "stamp_ns" in given
-        return JsonFrame(message, "epoch" in given, is_stamped, given.get("key", ""))
+        return JsonFrame(message, "epoch" in given, is_stamped, given.get("key", ""), time.time_ns())
 
     def _objects(self, objects: Sequence[EdgeObject], stream: str, frame: str) -> dict[str, Any]:
         """Return the columns of objects."""

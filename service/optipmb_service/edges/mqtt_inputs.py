@@ -7,14 +7,12 @@ network, so the broker keeps messages while that is away.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import re
 import weakref
 from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_schemas as schemas
 import structlog
-from optipmb_client.errors import ConnectionFailed as TransportError
 
 from optipmb_service.edges.inputs import RefusedError
 from optipmb_service.edges.json_frames import FrameReader
@@ -36,22 +34,10 @@ WAITING: Final = 1024
 PAUSE_S: Final = 0.2
 """Time until a frame that could not be sent is tried again."""
 
+LATER: Final = frozenset({"busy", "too_many_streams", "unlinked"})
+"""Why a frame is tried again."""
+
 log = structlog.get_logger("optipmb_service")
-
-
-class _Input:
-    """A row of the settings: which topics feed which streams, and how their payloads are read."""
-
-    def __init__(self, stream: str, topic: str, mapping: PayloadMapping | None) -> None:
-        self._stream = stream
-        self._topic = re.compile(re.escape(topic).replace(r"\+", "([^/]*)"))
-        self.mapping = mapping
-
-    def stream_of(self, topic: str) -> str | None:
-        """Return the stream that a topic feeds; None: another input has it."""
-        if (match := self._topic.fullmatch(topic)) is None:
-            return None
-        return re.sub(r"\{(\d)\}", lambda part: match[int(part[1])], self._stream)
 
 
 class MqttInputs:
@@ -66,14 +52,18 @@ class MqttInputs:
         self.topics = [(one.topic, one.qos) for one in settings.mqtt.inputs.values()]
         self._frames = FrameReader(settings)
         self._inputs = inputs
-        self._rows = [_Input(stream, one.topic, mapping_of(one)) for stream, one in settings.mqtt.inputs.items()]
+        self._rows = [
+            (re.compile(re.escape(one.topic).replace(r"\+", "([^/]*)")), stream, mapping_of(one))
+            for stream, one in settings.mqtt.inputs.items()
+        ]
         self._tasks: set[asyncio.Task[None]] = set()
         self._turns: weakref.WeakValueDictionary[str, asyncio.Lock] = weakref.WeakValueDictionary()
 
     def take(self, message: Any, confirm: Callable[[], object]) -> None:
         """Take a message of paho's; `confirm` is called when it is done with."""
-        found = ((row, stream) for row in self._rows if (stream := row.stream_of(message.topic)) is not None)
-        if (target := next(found, None)) is None or message.retain:  # counts that the bridge publishes; an old message
+        rows = ((topic.fullmatch(message.topic), stream, mapping) for topic, stream, mapping in self._rows)
+        target = next(((stream.format("", *match.groups()), mapping) for match, stream, mapping in rows if match), None)
+        if target is None or message.retain:  # counts that the bridge publishes; an old message
             confirm()
             return
         if not message.qos and len(self._tasks) >= WAITING:
@@ -88,40 +78,32 @@ class MqttInputs:
         for task in self._tasks:
             task.cancel()
 
-    async def _taken(self, message: Any, confirm: Callable[[], object], row: _Input, stream: str) -> None:
+    async def _taken(
+        self, message: Any, confirm: Callable[[], object], stream: str, mapping: PayloadMapping | None
+    ) -> None:
         try:
-            with contextlib.suppress(schemas.MessageError):  # it is reported
-                await self._send(message, row, stream)
+            await self._send(message, stream, mapping)
         except Exception:
             log.exception("internal_error", topic=message.topic)  # one message must not end the others
         confirm()
 
-    async def _send(self, message: Any, row: _Input, stream: str) -> None:
-        """Send the frame of a message, as soon as that is possible.
-
-        Raises:
-            MessageError: it is not valid.
-        """
+    async def _send(self, message: Any, stream: str, mapping: PayloadMapping | None) -> None:
+        """Send the frame of a message, as soon as that is possible."""
+        valid = ""
         try:
             self._inputs.client.keys.detections(stream)
+            valid = stream
+            frame = self._frames.read(message.payload, stream, mapping)
         except schemas.MessageError as error:
-            self._inputs.report("", error)
-            raise
-        try:
-            frame = self._frames.read(message.payload, stream, row.mapping)
-        except schemas.MessageError as error:
-            self._inputs.report(stream, error)
-            raise
+            self._inputs.report(valid, error)
+            return
         correlation = getattr(message.properties, "CorrelationData", b"")
-        turn = self._turns.setdefault(stream, asyncio.Lock())
-        async with turn:  # none passes a frame that is tried again
+        async with self._turns.setdefault(stream, asyncio.Lock()):  # none passes a frame that is tried again
             while True:
                 try:
                     await self._inputs.send(frame, self._frames.rules(stream), correlation.hex())
-                except TransportError:
-                    pass
                 except RefusedError as error:
-                    if error.code != "busy":
+                    if error.code not in LATER:
                         self._inputs.refused["mqtt", error.code] += 1
                         return
                 else:

@@ -7,11 +7,12 @@ import re
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
+from socket import SHUT_WR, create_connection
 from typing import Any
 
 import numpy as np
 import pytest
-from broker import mosquitto
+from broker import CONNACK, CONNECT, PUBLISH, mosquitto
 from json_senders import damaged, document, exists
 from optipmb_schemas import Detections, Keys, MessageError, decode
 from optipmb_service.edges.json_frames import FrameReader
@@ -134,6 +135,36 @@ async def test_frames_keep_their_order_while_nothing_is_tracked(tmp_path: Path) 
             take.close()
     found = [decode(one.payload.to_bytes(), Detections).center[0, 0] for one in arrived]
     assert found == list(numbers)
+
+
+async def test_a_frame_that_is_published_again_counts_once(start: Any, tmp_path: Path) -> None:
+    """Each connection ends before the confirmation, and the frame comes twice more, over two bridges: ids go on."""
+    endpoint, inputs = start()[1], {SENSOR.stream: {"topic": "sensor"}}
+    with mosquitto(tmp_path) as address, Node(endpoint) as node, publisher(address) as client:
+        for first, last in ((0, 3), (3, 7)):  # the confirmation of frame 3 was lost with the first bridge
+            async with bridged(endpoint, address, inputs) as bridge:
+                for seq in range(first, last + 1):
+                    payload = json.dumps(document(SENSOR.detections(seq))).encode()
+                    await asyncio.to_thread(cut, address, "sensor", payload)
+                    for _ in range(2):
+                        send(client, "sensor", payload)
+                    frames = await asyncio.to_thread(node.tracks, SENSOR.stream, seq + 1)
+                count = 3 * (last + 1 - first)
+                await until(lambda: bridge.inputs.duplicates["mqtt"] == count - 4)  # noqa: B023 - at once
+                assert bridge.inputs.frames["mqtt"] == 4
+    assert [one.stamp_ns for one in frames] == list(map(SENSOR.stamp_ns, range(8)))
+    assert len({(one.session, *one.id.tolist()) for one in frames}) == 1
+
+
+def cut(address: str, topic: str, payload: bytes) -> None:
+    """Publish a message with QoS 1, and end the connection before the confirmation has come."""
+    body = len(topic).to_bytes(2) + topic.encode() + b"\0\1" + payload
+    length = bytes([len(body) & 0x7F | 0x80, len(body) >> 7])
+    with create_connection(("127.0.0.1", int(address.rpartition(":")[2])), 60) as connection:
+        connection.sendall(bytes([CONNECT, 15]) + b"\0\4MQTT\4\2\0\x3c\0\3cut")
+        assert connection.recv(4)[0] == CONNACK  # all of it: nothing is unread at the end
+        connection.sendall(bytes([PUBLISH | 2]) + length + body)
+        connection.shutdown(SHUT_WR)  # the broker reads up to here, and its answers are not read
 
 
 async def test_damaged_payloads_end_nothing(start: Any, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Detections by POST: the same tracks as over Zenoh, once for each frame, and clear answers to what is wrong."""
 
+import asyncio
 import contextlib
 import hashlib
 import json
@@ -18,8 +19,10 @@ import pytest
 from json_senders import Edge, damaged, document, exists, post
 from optipmb_schemas import MessageError, encode_json
 from optipmb_service.edges.http import detections
+from optipmb_service.edges.inputs import Inputs
 from optipmb_service.edges.json_frames import FrameReader, separate
-from optipmb_service.settings import Settings, load
+from optipmb_service.settings import InputSettings, Settings, load
+from optipmb_service.zenoh.client import Client
 from router import Node, Sensor, plain, until
 from routers import free_endpoint
 from watched import Watched, asked, served
@@ -63,13 +66,26 @@ def socket(address: str, query: str, **options: Any) -> Iterator[WebSocket]:
         connection.shutdown()
 
 
-def cut(edge: Edge, body: Any) -> bool:
-    """Send a request, and end the connection before the answer has come."""
+def cut(edge: Edge, body: Any, way: str) -> bool:
+    """Send a frame, and end the connection before the answer has come."""
     payload = json.dumps(body).encode()
+    if way == "socket":
+        with socket(edge.address, STREAM) as connection:
+            connection.send(payload.decode())
+        return True
     head = f"POST /api/v1/detections?{STREAM} HTTP/1.1\r\nhost: {edge.address}\r\ncontent-type: application/json\r\n"
     with open_connection((edge.address.rpartition(":")[0], int(edge.address.rpartition(":")[2]))) as connection:
         connection.sendall(f"{head}content-length: {len(payload)}\r\n\r\n".encode() + payload)
     return True
+
+
+def sent(edge: Edge, body: Any, way: str) -> dict[str, Any]:
+    """Send a frame over a connection of its own, and return the answer about it."""
+    if way == "post":
+        return dict(edge.post(body, STREAM).body["frames"][0])
+    with socket(edge.address, STREAM) as connection:
+        connection.send(json.dumps(body))
+        return dict(json.loads(connection.recv()))
 
 
 def error(body: Any) -> tuple[str, str]:
@@ -103,8 +119,9 @@ def test_the_same_frames_give_the_same_bytes(start: Any) -> None:
     assert found[0] == found[1] == found[2] == found[3]
 
 
-def test_a_frame_that_is_sent_again_counts_once(endpoint: str) -> None:
-    """Each request is cut before its answer and sent twice more, over two edges: tracks come once, ids go on."""
+@pytest.mark.parametrize("way", ["post", "socket"])
+def test_a_frame_that_is_sent_again_counts_once(endpoint: str, way: str) -> None:
+    """Each frame is cut before its answer and sent twice more, over two edges: tracks come once, ids go on."""
     with Node(endpoint) as node:
         for first in (0, 4):
             with Edge(endpoint) as edge:
@@ -114,13 +131,12 @@ def test_a_frame_that_is_sent_again_counts_once(endpoint: str) -> None:
                     assert again.body["tracks"]["seq"] == first
                     assert error(edge.post(frame(0) | {"stamp_ns": 5}, STREAM).body) == ("late", "")
                 for seq in range(first + (first > 0), first + 4):
-                    cut(edge, frame(seq))
-                    answers = [edge.post(frame(seq), f"{STREAM}&wait=5&confirmed=0").body for _ in range(2)]
-                    assert answers[1]["frames"][0]["duplicate"]
-                    assert answers[0]["tracks"]["objects"] == answers[1]["tracks"]["objects"]
-                    assert answers[0]["frames"][0]["seq"] == seq - first - (first > 0)
-                if not first:  # a server that sees the end of a connection first does not read the request
-                    until(lambda: cut(edge, frame(4)) and len(node.tracks_seen.items) == 5, "tracks of frame 4")
+                    cut(edge, frame(seq), way)
+                    answers = [sent(edge, frame(seq), way) for _ in range(2)]
+                    assert answers[1]["duplicate"]
+                    assert answers[0]["seq"] == answers[1]["seq"] == seq - first - (first > 0)
+                if not first:  # a server that sees the end of a connection first does not read the frame
+                    until(lambda: cut(edge, frame(4), way) and len(node.tracks_seen.items) == 5, "tracks of frame 4")
         tracks = node.tracks(SENSOR.stream, 8)
     assert [one.stamp_ns for one in tracks] == [SENSOR.stamp_ns(seq) for seq in range(8)]
     assert len({(one.session, *one.id.tolist()) for one in tracks}) == 1
@@ -181,6 +197,43 @@ def test_keys_tell_frames_without_stamps(edge: Edge) -> None:
     found = [edge.post(two, STREAM, idempotency_key="k").body["frames"] for _ in range(2)]
     assert [[frame["duplicate"] for frame in frames] for frames in found] == [[False] * 2, [True] * 2]
     assert [edge.post({"objects": []}, STREAM).body["frames"][0]["seq"] for _ in range(2)] == [3, 4]
+
+
+@pytest.mark.parametrize(
+    ("clock", "sent_ms", "arrived_ms", "stamps_ms"),
+    [
+        ("sender", (0, 100), (5000, 5000), (0, 100)),
+        ("arrival", (0, 100), (5000, 5070), (5000, 5070)),
+        ("arrival", (None, None), (5000, 5000), (5000, 5000.001)),
+        ("offset", (0, 100, 200, 300), (5050, 5120, 5280, 5310), (5050, 5120, 5220, 5310)),
+        (
+            "offset",
+            (0, 100, 9200, 9300, 9400, 9500),
+            (5000, 5100, 5200, 5300, 5420, 5500),
+            (5000, 5100, 5200, 5300, 5400, 5500),
+        ),
+        (
+            "offset",
+            (9000, 9100, 0, 100, 200, 300),
+            (5000, 5100, 5200, 5300, 5400, 5500),
+            (5000, 5100, -4000, -3900, 5400, 5500),
+        ),
+    ],
+)
+async def test_stamps_are_of_the_clock_of_the_settings(
+    endpoint: str, clock: Any, sent_ms: Any, arrived_ms: Any, stamps_ms: Any
+) -> None:
+    """The sender's; those of the arrival, however late a frame goes out; or the sender's by the least difference."""
+    settings = load(None, {"connect": [endpoint], "instance": "edge"}).settings
+    network = await asyncio.to_thread(Client, settings)
+    inputs, reader, found = Inputs(settings, network, "http", str), FrameReader(settings), []
+    for sent, arrived in zip(sent_ms, arrived_ms, strict=True):
+        body = {"objects": []} | ({} if sent is None else {"stamp_ns": 10**18 + sent * 10**6})
+        frame = reader.read(json.dumps(body).encode(), SENSOR.stream)
+        numbers, *_ = await inputs.send(frame._replace(arrived_ns=10**18 + arrived * 10**6), InputSettings(clock=clock))
+        found.append((numbers.stamp_ns - 10**18) / 10**6)
+    assert tuple(found) == stamps_ms
+    await asyncio.to_thread(network.close)
 
 
 @pytest.mark.parametrize("way", ["post", "socket"])
@@ -246,6 +299,9 @@ def test_damaged_documents_get_a_path(edge: Edge, endpoint: str, way: str) -> No
         ({"objects": [], "time": "2026-11-27T08:00:00Z", "stamp_ns": 1}, "invalid_value", "stamp_ns"),
         ({"objects": [], "seq": 1}, "missing_field", "epoch"),
         ({"objects": [], "stream": "a/b/c"}, "invalid_value", "stream"),
+        ({"objects": [], "key": "k" * 129}, "invalid_value", "key"),
+        ({"labels": [], "label": [], "key": "k" * 129}, "invalid_value", "key"),
+        ({"labels": [], "label": [], "seq": True}, "invalid_value", "seq"),
     ],
 )
 def test_an_error_names_the_path(fields: dict[str, Any], code: str, path: str) -> None:

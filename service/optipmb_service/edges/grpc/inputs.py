@@ -12,6 +12,7 @@ from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
 from optipmb_service.edges.grpc.network import Item, Listener
+from optipmb_service.edges.grpc.selection import check_bound
 from optipmb_service.edges.inputs import CACHE, WINDOW, InFlight, put
 from optipmb_service.edges.readers import Outbox
 
@@ -205,8 +206,8 @@ class _Inputs:
         try:
             self._call.gateway.client.keys.detections(message.stream)
             if name == "options":
-                _check_bound("cache", message.cache, MAX_CACHE)
-                _check_bound("cache_clouds", message.cache_clouds, MAX_CACHE_CLOUDS)
+                check_bound("cache", message.cache, MAX_CACHE)
+                check_bound("cache_clouds", message.cache_clouds, MAX_CACHE_CLOUDS)
                 self._options = message
         except schemas.MessageError as error:
             raise error.under(name) from None
@@ -285,8 +286,3 @@ class _Acknowledgements:
         if self._due is not None:
             self._due.cancel()
             self._due = None
-
-
-def _check_bound(name: str, value: int, most: int) -> None:
-    if value > most:
-        raise schemas.MessageError("too_large", name, f"at most {most}", str(value))

@@ -22,6 +22,12 @@ CORNERS: Final = 3
 KINDS: Final = get_args(schemas.ZoneEvent.model_fields["kind"].annotation)
 
 
+def check_bound(name: str, value: int, most: int) -> None:
+    """Raise MessageError if a value is above a bound."""
+    if value > most:
+        raise schemas.MessageError("too_large", name, f"at most {most}", str(value))
+
+
 class Filter:
     """A filter as it was asked for.
 
@@ -35,9 +41,8 @@ class Filter:
     def __init__(self, asked: pb.TrackFilter) -> None:
         self.key = asked.SerializeToString(deterministic=True)
         """Equal filters have equal keys; a filter of everything has an empty one."""
-        for name, values in (("classes", asked.classes), ("fields", asked.fields)):
-            if len(values) > MAX_NAMES:
-                raise schemas.MessageError("too_large", f"filter.{name}", f"at most {MAX_NAMES}", str(len(values)))
+        check_bound("filter.classes", len(asked.classes), MAX_NAMES)
+        check_bound("filter.fields", len(asked.fields), MAX_NAMES)
         for row, field in enumerate(asked.fields):
             if field not in schemas.Tracks.arrays:
                 expected = f"one of {', '.join(schemas.Tracks.arrays)}"
@@ -88,8 +93,7 @@ class EventSelection:
     def __init__(self, asked: pb.SubscribeEventsRequest) -> None:
         self._chosen = {name: frozenset(getattr(asked, name)) for name in ("zones", "kinds", "classes")}
         for name, values in self._chosen.items():
-            if len(values) > MAX_NAMES:
-                raise schemas.MessageError("too_large", name, f"at most {MAX_NAMES}", str(len(values)))
+            check_bound(name, len(values), MAX_NAMES)
         if unknown := self._chosen["kinds"] - set(KINDS):
             expected = f"some of {', '.join(KINDS)}"
             raise schemas.MessageError("invalid_value", "kinds", expected, ascii(min(unknown))[:80])

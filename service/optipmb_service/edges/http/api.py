@@ -26,8 +26,9 @@ from optipmb_service.edges.access import ANYBODY, Caller, NotAllowedError, name_
 from optipmb_service.edges.readers import Feeds, Reader, Wish, listed
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Iterable, Mapping, Sequence
+    from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
 
+    from optipmb_client.zenoh.session import Session
     from optipmb_schemas.json_form import Place
     from starlette.requests import HTTPConnection, Request
     from starlette.types import Receive, Scope, Send
@@ -61,7 +62,7 @@ class NoTokenError(Exception):
 
 
 class NoRoomError(Exception):
-    """There are as many readers as there may be."""
+    """There are as many connections of a kind as there may be."""
 
 
 class RequestError(Exception):
@@ -109,8 +110,40 @@ class Source(Protocol):
         """Return the next text, and its id if it is an event. Raises TimeoutError."""
 
 
+class Room:
+    """Connections of a kind that are open now: a bounded number.
+
+    Args:
+        most: their largest number.
+        who: they are, for the refusal.
+    """
+
+    def __init__(self, most: int, who: str) -> None:
+        self.count = 0
+        self._most = most
+        self._who = who
+
+    @contextlib.contextmanager
+    def entered(self) -> Iterator[None]:
+        """Count a connection meanwhile.
+
+        Raises:
+            NoRoomError: there are too many.
+        """
+        if self.count >= self._most:
+            raise NoRoomError(f"{self._most} {self._who} are here already")
+        self.count += 1  # before anything is awaited: those who come together are counted one by one
+        try:
+            yield
+        finally:
+            self.count -= 1
+
+
 class Readers:
-    """Those who read now, by any path: a bounded number, with rights by their tokens.
+    """Those who read now, by any path, with rights by their tokens.
+
+    Attributes:
+        room: for them.
 
     Args:
         health: of the process.
@@ -122,12 +155,21 @@ class Readers:
         self.keys = schemas.Keys(settings.prefix)
         self._health = health
         self._places = places
-        self._most = settings.http_clients
         self._names = token_names("http_tokens", settings.http_tokens) if settings.http_tokens else None
         self._reads = settings.readable_by
         self.stale_s = settings.stale_s
-        self.count = 0
+        self.room = Room(settings.http_clients, "readers")
         self._feeds: Feeds | None = None
+
+    def session(self) -> Session:
+        """Return the session of the process.
+
+        Raises:
+            TransportError: there is none yet.
+        """
+        if (session := self._health.session()) is None:
+            raise TransportError(f"the service is {self._health.state()}")
+        return session
 
     def feeds(self) -> Feeds:
         """Return the subscriptions.
@@ -135,9 +177,7 @@ class Readers:
         Raises:
             TransportError: there is no session yet.
         """
-        session = self._health.session()
-        if session is None:
-            raise TransportError(f"the service is {self._health.state()}")
+        session = self.session()
         if self._feeds is None or self._feeds.session is not session:
             self._feeds = Feeds(session, self._places)
         return self._feeds
@@ -157,21 +197,6 @@ class Readers:
         if not (name := await name_by(self._names, metadata)):
             raise NoTokenError("the token is missing or not valid")
         return Caller(name, self._reads(name))
-
-    def enter(self) -> Callable[[], None]:
-        """Count a reader until the result is called.
-
-        Raises:
-            NoRoomError: there are too many.
-        """
-        if self.count >= self._most:
-            raise NoRoomError(f"{self._most} readers are here already")
-        self.count += 1  # before anything is awaited: those who come together are counted one by one
-
-        def leave() -> None:
-            self.count -= 1
-
-        return leave
 
     @contextlib.asynccontextmanager
     async def joined(self, keys: Sequence[str], source: Source) -> AsyncIterator[str]:
@@ -210,7 +235,7 @@ class Readers:
         if request.method == "HEAD":
             return Response(headers=headers, media_type=EVENT_STREAM)
         async with contextlib.AsyncExitStack() as ended:
-            ended.callback(self.enter())
+            ended.enter_context(self.room.entered())
             reader = source()
             begins = await ended.enter_async_context(self.joined(keys, reader))
             return _Stream(self._lines(reader, begins, pause_s), ended.pop_all(), headers)
@@ -388,8 +413,7 @@ class Api:
     async def socket(self, websocket: WebSocket) -> None:
         """Serve a WebSocket."""
         caller, wish = await self._asked(websocket)
-        leave = self._readers.enter()
-        try:
+        with self._readers.room.entered():
             reader = Reader(wish, self._readers.stale_s)
             async with contextlib.AsyncExitStack() as joined:
                 await joined.enter_async_context(self._readers.joined(wish.keys(self._readers.keys), reader))
@@ -404,8 +428,6 @@ class Api:
                     await asyncio.wait(tasks)
                 for task in done:
                     task.result()
-        finally:
-            leave()
 
     async def _listen(
         self, websocket: WebSocket, caller: Caller, reader: Reader, joined: contextlib.AsyncExitStack

@@ -6,12 +6,12 @@ import asyncio
 import contextlib
 import itertools
 import math
+from dataclasses import dataclass
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import msgspec
 import optipmb_schemas as schemas
-from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_schemas.json_form import EXACT
 from starlette.requests import ClientDisconnect
 from starlette.responses import Response
@@ -23,8 +23,8 @@ from optipmb_service.edges.http.api import (
     HEADERS,
     MALFORMED,
     PROTOCOL,
-    NoRoomError,
     RequestError,
+    Room,
     parameters_of,
     wish_of,
 )
@@ -33,10 +33,9 @@ from optipmb_service.edges.json_frames import FrameReader
 from optipmb_service.edges.readers import Publication
 from optipmb_service.settings import is_loopback
 from optipmb_service.telemetry.metrics import INPUT_METRICS
-from optipmb_service.zenoh.client import TooManyStreamsError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Mapping
 
     from optipmb_schemas.json_form import Place, Selection
     from starlette.requests import HTTPConnection, Request
@@ -74,7 +73,10 @@ class _Stream(msgspec.Struct):
 
 
 class Senders:
-    """Programs that send now: a bounded number, counted apart from other requests.
+    """Programs that send now, counted apart from other requests.
+
+    Attributes:
+        room: for them.
 
     Args:
         health: of the process.
@@ -92,7 +94,7 @@ class Senders:
         places: Mapping[str, Place],
         sessions: Callable[[str], str],
     ) -> None:
-        self.count = 0
+        self.room = Room(settings.http_senders, "requests and sockets that send")
         self._health = health
         self._readers = readers
         self._settings = settings
@@ -113,7 +115,7 @@ class Senders:
         stream, wait_s = parameters.get("stream", ""), _wait(parameters)
         wish = wish_of({name: parameters[name] for name in SELECTION if name in parameters} | {"stream": "*/*/*"})
         inputs = self._opened()
-        with self._entered():
+        with self.room.entered():
             _check_type(request)
             frames, is_array = self._frames.split(await self._body(request))
             if is_array and wait_s:
@@ -125,16 +127,16 @@ class Senders:
             answers = []
             for at, payload in enumerate(frames):
                 path = f"frames[{at}]" if is_array else ""
-                answer, retry_s = await sender.send(payload, path, repeats and f"{at} {repeats}", wait_s)
-                answers.append(({"index": at} | answer, retry_s))
-            return self._answer(answers, wish.selection if wait_s else None)
+                answer = await sender.send(payload, path, repeats and f"{at} {repeats}", wait_s)
+                answers.append({"index": at} | answer)
+            return self._answer(answers, sender.retry_s, wish.selection if wait_s else None)
 
     async def socket(self, websocket: WebSocket) -> None:
         """Hand the frames of a WebSocket to the network, each with an answer before the next."""
         caller = await self._caller(websocket)
         stream = parameters_of(websocket, ("stream",)).get("stream", "")
         sender = _Sender(self._opened(), self._frames, caller, stream, websocket.headers.get("traceparent", ""))
-        with self._entered(), contextlib.suppress(WebSocketDisconnect):
+        with self.room.entered(), contextlib.suppress(WebSocketDisconnect):
             await websocket.accept(PROTOCOL if PROTOCOL in websocket.scope["subprotocols"] else None)
             for index in itertools.count():
                 if (message := await websocket.receive())["type"] == "websocket.disconnect":
@@ -142,23 +144,8 @@ class Senders:
                 if (text := message.get("text")) is None:
                     await websocket.close(MALFORMED, "texts are expected")
                     return
-                answer, _ = await sender.send(text.encode(), "", "", 0.0)
+                answer = await sender.send(text.encode())
                 await websocket.send_text(msgspec.json.encode({"index": index} | answer).decode())
-
-    @contextlib.contextmanager
-    def _entered(self) -> Iterator[None]:
-        """Count a sender meanwhile.
-
-        Raises:
-            NoRoomError: there are too many.
-        """
-        if self.count >= self._settings.http_senders:
-            raise NoRoomError(f"{self._settings.http_senders} requests and sockets that send are here already")
-        self.count += 1
-        try:
-            yield
-        finally:
-            self.count -= 1
 
     async def _caller(self, request: HTTPConnection) -> Caller:
         """Return who sends.
@@ -177,10 +164,7 @@ class Senders:
         Raises:
             TransportError: there is no session yet.
         """
-        session = self._health.session()
-        if session is None:
-            raise TransportError(f"the service is {self._health.state()}")
-        client = cast("Client", session)  # as in every process with edges
+        client = cast("Client", self._readers.session())  # as in every process with edges
         if self._inputs is None or self._inputs.client is not client:
             self._inputs = inputs = Inputs(self._settings, client, "http", self._sessions)
             self._health.metrics.add(INPUT_METRICS, lambda: inputs)
@@ -214,9 +198,8 @@ class Senders:
             raise too_large
         return bytes(body)
 
-    def _answer(self, answers: list[tuple[dict[str, Any], float]], selection: Selection | None) -> Response:
-        """Return the answer about frames, each with when it may come again if it was refused."""
-        frames = [one for one, _ in answers]
+    def _answer(self, frames: list[dict[str, Any]], retry_s: float, selection: Selection | None) -> Response:
+        """Return the answer about frames, and when refused ones may come again."""
         refused = [one["error"]["code"] for one in frames if "error" in one]
         body: dict[str, Any] = {"accepted": len(frames) - len(refused), "refused": len(refused), "frames": frames}
         statuses = {STATUS.get(code, HTTPStatus.BAD_REQUEST) for code in refused}
@@ -228,7 +211,7 @@ class Senders:
         else:
             status = statuses.pop() if len(statuses) == 1 else HTTPStatus.BAD_REQUEST
             if status in {HTTPStatus.TOO_MANY_REQUESTS, HTTPStatus.SERVICE_UNAVAILABLE}:
-                headers["retry-after"] = str(math.ceil(max(1.0, *(retry_s for _, retry_s in answers))))
+                headers["retry-after"] = str(math.ceil(retry_s))
         if selection is not None and not refused:
             tracks = frames[0].pop("tracks")
             body["tracks"] = None
@@ -238,32 +221,43 @@ class Senders:
         return Response(msgspec.json.encode(body), status, headers, JSON)
 
 
+@dataclass
 class _Sender:
     """A request or socket that sends frames.
 
-    Args:
+    Attributes:
         inputs: takes them.
         frames: reads them.
         caller: who sends.
         stream: that the address names; empty: none.
         traceparent: W3C trace context, unchecked.
+        retry_s: when refused frames may come again.
     """
 
-    def __init__(self, inputs: Inputs, frames: FrameReader, caller: Caller, stream: str, traceparent: str) -> None:
-        self._inputs = inputs
-        self._frames = frames
-        self._caller = caller
-        self._stream = stream
-        self._traceparent = traceparent
+    inputs: Inputs
+    frames: FrameReader
+    caller: Caller
+    stream: str
+    traceparent: str
+    retry_s: float = 1.0
 
-    async def send(self, payload: bytes, path: str, repeats: str, wait_s: float) -> tuple[dict[str, Any], float]:
-        """Send a frame; return the answer about it, and when it may come again if it was refused."""
-        retry_s = 0.0
+    async def send(self, payload: bytes, path: str = "", repeats: str = "", wait_s: float = 0.0) -> dict[str, Any]:
+        """Send a frame; return the answer about it."""
+        refused: schemas.MessageError | RefusedError
         try:
-            frame = self._frames.read(payload, self._stream)
+            frame = self.frames.read(payload, self.stream)
             name = frame.message.stream
-            self._caller.may_publish(name)
-            found = await self._inputs.send(frame, self._frames.rules(name), repeats, self._traceparent, wait_s)
+            self.caller.may_publish(name)
+            found = await self.inputs.send(frame, self.frames.rules(name), repeats, self.traceparent, wait_s)
+        except schemas.MessageError as error:
+            self.inputs.report(self._reported(payload), error)
+            refused = error.under(path) if path else error
+            path = refused.path
+        except NotAllowedError as error:
+            refused = RefusedError("not_allowed", "a stream of the token", str(error))
+        except RefusedError as error:
+            refused = error
+        else:
             sent, duplicate, tracks = found
             answer = {
                 "stream": name,
@@ -272,33 +266,20 @@ class _Sender:
                 "stamp_ns": str(sent.stamp_ns),
                 "duplicate": duplicate,
             }
-            return answer | ({"tracks": tracks} if wait_s else {}), retry_s
-        except schemas.MessageError as error:
-            self._inputs.report(self._reported(payload), error)
-            refused = error.under(path) if path else error
-            about = {"code": refused.code, "path": refused.path, "expected": refused.expected}
-            return {"error": about | {"received": refused.received, "message": str(refused)}}, retry_s
-        except RefusedError as error:
-            retry_s, code, expected, received = error.retry_s, error.code, error.expected, error.received
-            message = str(error)
-        except NotAllowedError as error:
-            code, expected, received, message = "not_allowed", "a stream of the token", "another one", str(error)
-        except TransportError as error:
-            code, expected, received = "unlinked", "a network", "none"
-            if isinstance(error, TooManyStreamsError):
-                code, expected, received, retry_s = "too_many_streams", "fewer new streams", "more", error.wait_s
-            message = str(error)
-        self._inputs.refused["http", code] += 1
-        about = {"code": code, "path": path, "expected": expected, "received": received, "message": message}
-        return {"error": about}, retry_s
+            return answer | ({"tracks": tracks} if wait_s else {})
+        if isinstance(refused, RefusedError):
+            self.inputs.refused["http", refused.code] += 1
+            self.retry_s = max(self.retry_s, refused.retry_s)
+        about = {"code": refused.code, "path": path, "expected": refused.expected, "received": refused.received}
+        return {"error": about | {"message": str(refused)}}
 
     def _reported(self, payload: bytes) -> str:
         """Return the stream on which a frame that is not valid is reported; empty: on none."""
-        name = self._stream
+        name = self.stream
         try:
             name = name or msgspec.json.decode(payload, type=_Stream).stream
-            self._inputs.client.keys.problems(name)
-            self._caller.may_publish(name)
+            self.inputs.client.keys.problems(name)
+            self.caller.may_publish(name)
         except (ValueError, msgspec.DecodeError, RecursionError, NotAllowedError):
             return ""
         return name

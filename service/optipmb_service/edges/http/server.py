@@ -34,13 +34,14 @@ from optipmb_service.edges.http.tls import ServerCertificate
 from optipmb_service.telemetry.metrics import CONTENT_TYPE
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from optipmb_schemas.json_form import Place
     from starlette.requests import Request
     from starlette.types import ASGIApp, Receive, Scope, Send
 
+    from optipmb_service.edges.http.api import Room
     from optipmb_service.settings import Settings
     from optipmb_service.telemetry.health import ProcessHealth
 
@@ -121,7 +122,7 @@ def application(
         allowed = ["authorization", "content-type", "idempotency-key"]
         origins = settings.http_origins
         answers = CORSMiddleware(answers, allow_origins=origins, allow_methods=["GET", "POST"], allow_headers=allowed)
-    return _Guarded(answers, settings, readers, senders)
+    return _Guarded(answers, settings, (readers.room, senders.room))
 
 
 def _answer(body: dict[str, object], *, well: bool) -> Response:
@@ -135,10 +136,9 @@ class _Guarded:
     `http_origins`: a browser asks for both for the page of a stranger.
     """
 
-    def __init__(self, application: ASGIApp, settings: Settings, readers: Readers, senders: Senders) -> None:
+    def __init__(self, application: ASGIApp, settings: Settings, rooms: Sequence[Room]) -> None:
         self._application = application
-        self._readers = readers
-        self._senders = senders
+        self._rooms = rooms
         self._names = {name.lower().rstrip(".") for name in settings.http_hosts}
         self._origins = settings.http_origins
         self._requests = 0
@@ -151,7 +151,7 @@ class _Guarded:
             await answer(scope, receive, send)
             return
         headers = Headers(scope=scope)
-        if self._requests - self._readers.count - self._senders.count >= REQUESTS:
+        if self._requests - sum(room.count for room in self._rooms) >= REQUESTS:
             answer = PlainTextResponse(f"{REQUESTS} requests are being answered; ask again", UNAVAILABLE)
         elif (path not in MONITORING or is_socket) and not self._knows(headers.get("host", "")):
             answer = PlainTextResponse("unknown host; see the setting http_hosts", MISDIRECTED)
