@@ -90,6 +90,7 @@ MISTAKES: list[tuple[str, Any, list[str], int, str]] = [
     ("no such file", None, [], 2, "expected a table (.csv), received no such file"),
     ("a wrong profile", boxes(), ["--profile", "kiti"], 2, "(is kitti meant?)"),
     ("a wrong option", boxes(), ["--option", "jaw=degrees"], 2, "--option jaw: expected one of time, rate, group, yaw"),
+    ("places in centimetres", boxes(x=100.0 * boxes()["x"]), [], 0, "hardly anything is tracked, 0 of"),
     ("no tracks", boxes(score=np.full(ROWS, 0.01)), ["--profile", "kitti"], 1, "no tracks came of 90 detections"),
 ]
 

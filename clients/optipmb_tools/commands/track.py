@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 
 _SHOWN = 20  # recordings that are named
+_MANY = 50  # detections of which some should make tracks
+_HARDLY = 0.05  # share of the rows of tracks that are confirmed, below which numbers may have another meaning
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,10 +247,17 @@ def _complain(results: "list[TrackedSequence]", profile: str) -> None:
         from optipmb_tools.results.nuscenes import NUSCENES_MAX_BOXES  # noqa: PLC0415  of one format
 
         warn(f"{cut} boxes in {samples} samples are not written: a sample of nuScenes has {NUSCENES_MAX_BOXES} at most")
-    if not any(one.rows for one in results):
+    rows = sum(one.rows for one in results)
+    confirmed = rows - sum(one.unconfirmed_rows for one in results)
+    if not rows:
         if detections:
             warn(f"no tracks came of {detections} detections: do their scores and rate fit profile {profile}?")
         raise typer.Exit(1)
+    if detections >= _MANY and confirmed < _HARDLY * rows:
+        warn(
+            f"hardly anything is tracked, {confirmed} of {rows} rows are confirmed: are places and times in the units "
+            "that `optipmb check` shows, and higher scores the surer ones?"
+        )
 
 
 def _replay_dump(file: Path, *, trace: bool, as_json: bool) -> None:
