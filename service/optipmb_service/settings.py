@@ -283,6 +283,9 @@ class MqttInput(BaseModel):
     """form of payloads: frames as over HTTP, a known maker's, or that which `mapping` describes"""
     mapping: MappingSettings | None = None
     """paths of a payload, for the format `mapped`"""
+    only: dict[PathText, bool | int | str] = Field(default_factory=dict)
+    """values by their paths in the payload; other payloads are left out, or are of another input of the topic; for the
+    format `frigate` the camera of the stream, as `{ "after.camera" = "gate" }`"""
 
 
 class MqttSettings(BaseModel):
@@ -1062,7 +1065,7 @@ def _check_mqtt(settings: Settings) -> None:
     Raises:
         SettingsInvalidError: there are such.
     """
-    seen: dict[str, str] = {}
+    seen: dict[str, MqttInput] = {}
     for stream, one in settings.mqtt.inputs.items():
         path, pattern = f"setting mqtt.inputs.{stream}", re.sub(r"\{\d\}", "*", stream)
         try:
@@ -1071,10 +1074,12 @@ def _check_mqtt(settings: Settings) -> None:
             raise SettingsInvalidError(f"{path}: {error.expected}, received {stream!r}") from None
         if other := next((each for each in seen if _overlap(each, pattern)), None):
             raise SettingsInvalidError(f"{path}: one input for a stream, {other} has it, too")
-        topic = one.topic.replace("*", "?").replace("+", "*")
-        if other := next((each for each, theirs in seen.items() if _overlap(theirs, topic)), None):
+        if other := next((each for each, theirs in seen.items() if _have_in_common(one, theirs)), None):
             raise SettingsInvalidError(f"{path}.topic: one input for a topic, {other} has some of {one.topic!r}, too")
-        seen[pattern] = topic
+        if one.format == "frigate" and "after.camera" not in one.only:
+            expected = 'the camera of the stream, as { "after.camera" = "gate" }'
+            raise SettingsInvalidError(f"{path}.only: {expected}: Frigate has one topic for all")
+        seen[pattern] = one
         parts = one.topic.split("/")
         if any("+" in part and part != "+" for part in parts):
             raise SettingsInvalidError(f"{path}.topic: + stands for a whole part, received {one.topic!r}")
@@ -1088,6 +1093,12 @@ def _check_mqtt(settings: Settings) -> None:
             raise SettingsInvalidError(f"{path}.topic: other topics than those that are published, {one.topic!r}")
         if (one.format == "mapped") is not (one.mapping is not None):
             raise SettingsInvalidError(f"{path}.mapping: with the format mapped, and only with it")
+
+
+def _have_in_common(one: MqttInput, other: MqttInput) -> bool:
+    """Return whether some message of a topic may be of two inputs."""
+    apart = any(one.only[path] != other.only[path] for path in one.only.keys() & other.only.keys())
+    return not apart and _overlap(*(each.topic.replace("*", "?").replace("+", "*") for each in (one, other)))
 
 
 def _read(file: Path) -> dict[str, Any]:

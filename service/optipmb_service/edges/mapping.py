@@ -11,13 +11,14 @@ import re
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final
 
+import msgspec
 import optipmb_schemas as schemas
 from optipmb_schemas.errors import invalid
 
 from optipmb_service.settings import MappingSettings
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from optipmb_service.settings import MqttInput
 
@@ -77,6 +78,15 @@ def mapping_of(one: MqttInput) -> PayloadMapping | None:
     if one.format in FORMATS:
         return PayloadMapping(MappingSettings(**FORMATS[one.format]))
     return None if one.mapping is None else PayloadMapping(one.mapping)
+
+
+def is_of(payload: bytes, only: Mapping[str, bool | int | str]) -> bool:
+    """Return whether a payload has these values at their paths; one that is no JSON may be of any input."""
+    try:
+        document = msgspec.json.decode(payload) if only else None
+    except (ValueError, msgspec.DecodeError, RecursionError):
+        return True
+    return all(_at(document, path) == value for path, value in only.items())
 
 
 class PayloadMapping:

@@ -9,17 +9,17 @@ from __future__ import annotations
 import asyncio
 import re
 import weakref
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import optipmb_schemas as schemas
 import structlog
 
 from optipmb_service.edges.inputs import RefusedError
 from optipmb_service.edges.json_frames import FrameReader
-from optipmb_service.edges.mapping import mapping_of
+from optipmb_service.edges.mapping import is_of, mapping_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from optipmb_service.edges.inputs import Inputs
     from optipmb_service.edges.mapping import PayloadMapping
@@ -40,6 +40,15 @@ LATER: Final = frozenset({"busy", "too_many_streams", "unlinked"})
 log = structlog.get_logger("optipmb_service")
 
 
+class _Row(NamedTuple):
+    """An input of the settings."""
+
+    topic: re.Pattern[str]
+    only: Mapping[str, bool | int | str]
+    stream: str
+    mapping: PayloadMapping | None
+
+
 class MqttInputs:
     """Takes the messages of input topics. Create and use it on one loop.
 
@@ -49,11 +58,12 @@ class MqttInputs:
     """
 
     def __init__(self, settings: Settings, inputs: Inputs) -> None:
-        self.topics = [(one.topic, one.qos) for one in settings.mqtt.inputs.values()]
+        self.topics = {one.topic: one.qos for one in settings.mqtt.inputs.values()}.items()
         self._frames = FrameReader(settings)
+        self._most_bytes = settings.limits.max_json_bytes
         self._inputs = inputs
         self._rows = [
-            (re.compile(re.escape(one.topic).replace(r"\+", "([^/]*)")), stream, mapping_of(one))
+            _Row(re.compile(re.escape(one.topic).replace(r"\+", "([^/]*)")), one.only, stream, mapping_of(one))
             for stream, one in settings.mqtt.inputs.items()
         ]
         self._tasks: set[asyncio.Task[None]] = set()
@@ -61,15 +71,22 @@ class MqttInputs:
 
     def take(self, message: Any, confirm: Callable[[], object]) -> None:
         """Take a message of paho's; `confirm` is called when it is done with."""
-        rows = ((topic.fullmatch(message.topic), stream, mapping) for topic, stream, mapping in self._rows)
-        target = next(((stream.format("", *match.groups()), mapping) for match, stream, mapping in rows if match), None)
-        if target is None or message.retain:  # counts that the bridge publishes; an old message
+        found = (
+            []
+            if message.retain
+            else [(match, row) for row in self._rows if (match := row.topic.fullmatch(message.topic))]
+        )
+        fits = len(message.payload) <= self._most_bytes  # a larger one is refused
+        target = next(((match, row) for match, row in found if not fits or is_of(message.payload, row.only)), None)
+        if target is None:  # an old message, counts that the bridge publishes, or the payload of another sensor
+            self._inputs.refused["mqtt", "other_sensor"] += bool(found)
             confirm()
             return
+        match, row = target
         if not message.qos and len(self._tasks) >= WAITING:
             self._inputs.refused["mqtt", "busy"] += 1
             return
-        task = asyncio.create_task(self._taken(message, confirm, *target))
+        task = asyncio.create_task(self._taken(message, confirm, row.stream.format("", *match.groups()), row.mapping))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
@@ -122,6 +139,8 @@ def tried(settings: Settings, name: str, payload: bytes) -> str:
         raise ValueError(
             f"option --input: one of {', '.join(settings.mqtt.inputs) or 'mqtt.inputs'}, received {name!r}"
         )
+    if not is_of(payload, one.only):
+        raise ValueError(f"a payload with {one.only}, as `only` of the input says")
     stream = re.sub(r"\{(\d)\}", r"\1", name)
     frame = FrameReader(settings).read(payload, stream, mapping_of(one))
     return schemas.encode_json(frame.message).decode()

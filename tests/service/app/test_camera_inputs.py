@@ -127,7 +127,7 @@ def test_events_of_frigate(calibration: Path) -> None:
     np.testing.assert_array_equal(found.center, expected.center)
     assert (found.stamp_ns, found.score.tolist()) == (5_250_000_000, [0.5])
     assert len(made("end").label) == len(made("new", false_positive=True).label) == 0
-    rows = {"garage/{1}/cam": {"topic": "+/events", "format": "frigate"}}
+    rows = {"garage/{1}/cam": {"topic": "+/events", "format": "frigate", "only": {"after.camera": "gate"}}}
     settings = load(None, {"mqtt": {"inputs": rows}, "inputs": {"garage/b/*": {"complete": True}}}).settings
     found = [settings.missing_s(stream) for stream in ("garage/a/cam", "garage/b/cam", "garage/a/lidar")]
     assert found == [10.0, None, None]
@@ -140,7 +140,7 @@ def test_fused_sessions_miss_objects_as_late_as_their_inputs() -> None:
         "fuse": ["garage/a/*", "garage/b/lidar*"],
         "fused": {"all": {"streams": ["yard/*/cam"]}, "lidars": {"streams": ["yard/*/lidar"]}},
         "inputs": {"garage/*/cam*": incomplete, "yard/gate/*": {"complete": False, "missing_s": 20}},
-        "mqtt": {"inputs": {"yard/{1}/cam": {"topic": "+/events", "format": "frigate"}}},
+        "mqtt": {"inputs": {"yard/gate/cam": {"topic": "e", "format": "frigate", "only": {"after.camera": "gate"}}}},
     }
     settings = load(None, given).settings
     garage = [settings.missing_s(f"garage/{one}") for one in ("a/fused", "b/fused", "c/fused", "c/cam")]

@@ -52,6 +52,7 @@ PAYLOADS = {
         "type": "update",
         "before": {"label": "car"},
         "after": {
+            "camera": "gate",
             "label": "car",
             "score": 0.8,
             "box": [1135, 699, 1255, 763],
@@ -167,13 +168,34 @@ def cut(address: str, topic: str, payload: bytes) -> None:
         connection.shutdown(SHUT_WR)  # the broker reads up to here, and its answers are not read
 
 
+async def test_cameras_of_a_topic_feed_streams_of_their_own(tmp_path: Path) -> None:
+    """Events of Frigate by `after.camera`; those of a camera that no input has are left out, and counted."""
+    endpoint, arrived = free_endpoint(), []
+    inputs = {
+        f"garage/{name}/cam": {"topic": "frigate/events", "format": "frigate", "only": {"after.camera": name}}
+        for name in ("gate", "yard")
+    }
+    given = {"garage/*/cam": {"camera": str(calibration(tmp_path))}}
+    with mosquitto(tmp_path) as address, publisher(address) as client:
+        router = {"connect": [], "listen": [endpoint], "router": True}
+        async with bridged(endpoint, address, inputs, inputs=given, **router) as bridge:
+            take = bridge.inputs.client.listen(Keys().all("detections"), arrived.append)
+            for name in ("gate", "street", "yard"):
+                event = PAYLOADS["frigate"] | {"after": PAYLOADS["frigate"]["after"] | {"camera": name}}
+                send(client, "frigate/events", event)
+            await until(lambda: len(arrived) == 2 and bridge.inputs.refused["mqtt", "other_sensor"] == 1)
+            take.close()
+    found = {decode(one.payload.to_bytes(), Detections).stream for one in arrived}
+    assert found == inputs.keys()
+
+
 async def test_damaged_payloads_end_nothing(start: Any, tmp_path: Path) -> None:
     """200 payloads of Frigate with a fault and 10 MB of spaces are frames or refused; another stream loses nothing."""
     endpoint = start()[1]
     inputs = {
         SENSOR.stream: {"topic": "sensor"},
         "yard/damaged/lidar": {"topic": "damaged"},
-        CAMERA: {"topic": "frigate", "format": "frigate"},
+        CAMERA: {"topic": "frigate", "format": "frigate", "only": {"after.camera": "gate"}},
     }
     given = {CAMERA: {"camera": str(calibration(tmp_path))}}
     with mosquitto(tmp_path) as address, Node(endpoint) as node, publisher(address) as client:
@@ -300,6 +322,8 @@ def test_an_error_names_the_path_in_the_payload(payload: Any, path: str) -> None
         ({"a/{1}/c": {"topic": "x"}}, "mqtt.inputs.a/{1}/c.topic"),
         ({"a/{1}/c": {"topic": "x/+"}, "a/b/c": {"topic": "y"}}, "mqtt.inputs.a/b/c"),
         ({"a/{1}/c": {"topic": "x/+"}, "a/b/d": {"topic": "x/y"}}, "mqtt.inputs.a/b/d.topic"),
+        ({"a/b/c": {"topic": "x", "only": {"n": 1}}, "a/b/d": {"topic": "x"}}, "mqtt.inputs.a/b/d.topic"),
+        ({"a/b/c": {"topic": "x", "format": "frigate"}}, "mqtt.inputs.a/b/c.only"),
         ({"a/b/c": {"topic": "optipmb/v1/a/b/c/tracks"}}, "mqtt.inputs.a/b/c.topic"),
         ({"a/b/c": {"topic": "x", "format": "yaml"}}, "mqtt.inputs.a/b/c.format"),
         ({"a/b/c": {"topic": "x", "format": "mapped"}}, "mqtt.inputs.a/b/c.mapping"),
