@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import hashlib
+import itertools
 import json
 import re
 import shutil
@@ -403,8 +404,8 @@ def test_a_second_edge_of_a_stream_is_told(endpoint: str) -> None:
         assert other.post(stamped(1), f"{STREAM}&wait=5").body["tracks"] is not None
         assert one.post(stamped(2), STREAM).status == HTTPStatus.ACCEPTED
         node.problem(SENSOR.stream, "duplicate_epoch")
-        ends = time.monotonic() + 60
-        while (answer := one.post(stamped(2 + 1), STREAM)).status != HTTPStatus.CONFLICT:
+        ends, stamps = time.monotonic() + 60, itertools.count(SENSOR.stamp_ns(3))  # a stamp that went is a duplicate
+        while (answer := one.post({"stamp_ns": next(stamps), "objects": []}, STREAM)).status != HTTPStatus.CONFLICT:
             assert time.monotonic() < ends
         assert error(answer.body)[0] == "duplicate_epoch"
 
