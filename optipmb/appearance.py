@@ -130,28 +130,48 @@ def appearance_score(vectors: Vectors, i: int, j: int, kind: int) -> float:
 
 @kernel
 def see(
-    seen: tuple[Index, Index, Index],
+    live: tuple[Index, NDArray[np.bool_]],
+    old: tuple[Singles, Singles, Index, Array],
+    detected: tuple[Index, Index, Index],
     vectors: Singles,
-    decided: NDArray[np.bool_],
-    look: tuple[Singles, Singles, Index, Array],
     stamp_ns: int,
-) -> None:
+) -> tuple[Index, Singles, Singles, Index, Array]:
     """Add the vectors of a frame to those of the tracks, and count distances.
 
     Args:
-        seen: (K,) rows of the tracks that are detected, their kinds, and the rows of their vectors.
-        vectors: (M, E) of the detections; of NaN where unknown.
-        decided: (U,) which tracks were decided before.
-        look: `total`, `first`, `stamp_ns` and `counts` of `Appearance`, which are written to.
+        live: (N,) ids of the live tracks, ascending, and which of them are decided.
+        old: `total`, `first`, `stamp_ns` and `counts` of `Appearance` before the frame.
+        detected: (K,) ids, ascending, of the tracks that are detected, their kinds, and the rows of their vectors.
+        vectors: (M, E) of the detections; of NaN where unknown. None (0, E): nothing is counted.
         stamp_ns: of the frame.
+
+    Returns:
+        The ids (U,) of both, and the same arrays after the frame with rows for these.
     """
-    row, kind, source = seen
-    total, first, stamps, counts = look
+    identity, kind, source = detected
+    before, width = live[0].shape[0], old[0].shape[1]
+    most = before + identity.shape[0]
+    ids, row, decided = np.empty(most, np.int64), np.empty(identity.shape[0], np.int64), np.zeros(most, np.bool_)
+    total, first = np.zeros((most, width), np.float32), np.zeros((most, width), np.float32)
+    stamps, counts = np.full((most, 3), -1), old[3].copy()
+    u = n = 0
+    for k in range(identity.shape[0] + 1):
+        while n < before and (k == identity.shape[0] or live[0][n] <= identity[k]):
+            ids[u], decided[u] = live[0][n], live[1][n]
+            for s in range(3):
+                stamps[u, s] = old[2][n, s]
+            for s in range(width):
+                total[u, s], first[u, s] = old[0][n, s], old[1][n, s]
+            u, n = u + 1, n + 1
+        if k < identity.shape[0]:
+            if u == 0 or ids[u - 1] != identity[k]:
+                ids[u], u = identity[k], u + 1
+            row[k] = u - 1
     known = np.empty(row.shape[0], np.int64)
     count = 0
     for k in range(row.shape[0]):
         n, m, square = row[k], source[k], 0.0
-        if math.isnan(vectors[m, 0]):
+        if vectors.shape[0] == 0 or math.isnan(vectors[m, 0]):
             continue
         if decided[n] and stamps[n, _FIRST] < 0 <= stamps[n, _SEEN]:
             for s in range(total.shape[1]):
@@ -186,6 +206,7 @@ def see(
             if counts[c, s].sum() >= MOST_COUNTS:
                 for at in range(DISTANCES):
                     counts[c, s, at] *= 0.5
+    return ids[:u], total[:u], first[:u], stamps[:u], counts
 
 
 def seen(
@@ -222,16 +243,9 @@ def seen(
         expected = f"{old.model[1]} numbers for each detection, as of the same model before"
         raise FrameError("embedding", expected, str(vectors.shape[1]))
     identity, label, source = detected
-    ids = np.union1d(before.live.id, identity)
-    rows = np.searchsorted(ids, before.live.id)
-    total, first = (np.zeros((len(ids), old.total.shape[1]), np.float32) for _ in range(2))
-    stamps, decided = np.full((len(ids), 3), -1), np.zeros(len(ids), np.bool_)
-    total[rows], first[rows], stamps[rows], decided[rows] = old.total, old.first, old.stamp_ns, before.live.object >= 0
-    counts = old.counts
-    if len(vectors):
-        counts = counts.copy()
-        rows_seen = np.searchsorted(ids, identity), kind[label], source
-        see(rows_seen, vectors, decided, (total, first, stamps, counts), stamp_ns)
+    live = before.live.id, before.live.object >= 0
+    given = old.total, old.first, old.stamp_ns, old.counts
+    ids, total, first, stamps, counts = see(live, given, (identity, kind[label], source), vectors, stamp_ns)
     return Appearance(old.model, total, first, stamps, old.lost, counts), ids
 
 
@@ -245,17 +259,13 @@ def aligned(appearance: Appearance, ids: Index, before: Tracklets, live: Trackle
         live: the live tracks after it.
         lost: the lost objects after it.
     """
-    rows, vectors = np.searchsorted(ids, live.id), appearance.lost
+    total, first, stamps, vectors = appearance.total, appearance.first, appearance.stamp_ns, appearance.lost
     if not np.array_equal(before.id, lost.id):
         identity = np.concatenate((before.id, ids))
         order = np.argsort(identity, kind="stable")
         chosen = order[np.searchsorted(identity, lost.id, sorter=order)]
-        vectors = np.concatenate((appearance.lost, appearance.total))[chosen]
-    return Appearance(
-        appearance.model,
-        appearance.total[rows],
-        appearance.first[rows],
-        appearance.stamp_ns[rows],
-        vectors,
-        appearance.counts,
-    )
+        vectors = np.concatenate((vectors, total))[chosen]
+    if len(live) < len(ids):
+        rows = np.searchsorted(ids, live.id)
+        total, first, stamps = total[rows], first[rows], stamps[rows]
+    return Appearance(appearance.model, total, first, stamps, vectors, appearance.counts)

@@ -41,7 +41,7 @@ from optipmb.rows import arrays_of, views_of
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from optipmb.density import Density
+    from optipmb.density import Bernoullis, Density
     from optipmb.frame import Embedding
     from optipmb.parameters import Parameters
     from optipmb.rows import Array, Columns, Index, Rows
@@ -572,31 +572,35 @@ def _selected(source: Array, rows: Index, layout: Index) -> Array:
 @kernel
 def _detect(
     rows: Tracklets,
-    k: int,
     seen: Places,
     tracks: Tracks,
-    n: int,
-    parts: tuple[bool, bool, bool],
+    objects: Bernoullis,
+    places: tuple[Index, Index, Index],
     stamp_ns: int,
-    noise: float,
+    motion: Array,
 ) -> None:
-    """Write a detection, of row `n` of the tracks, to row `k`; `parts`: are heading, size, height known?"""
-    x, y, count = tracks.center[n, 0], tracks.center[n, 1], seen.count[k]
-    if count == 0 or stamp_ns - seen.stamp_ns[k, (count - 1) % PLACES] >= SPACING_NS:
-        slot = count % PLACES
-        seen.stamp_ns[k, slot], seen.place[k, 2 * slot], seen.place[k, 2 * slot + 1] = stamp_ns, x, y
-        seen.count[k] = count + 1
-    rows.label[k], rows.last_ns[k], rows.detections[k] = tracks.label[n], stamp_ns, rows.detections[k] + 1
-    rows.end[k, 0], rows.end[k, 1] = x, y
-    if stamp_ns - rows.first_ns[k] <= FIT_NS:
-        _fit(rows, k, seen, k, noise)
-        rows.begin_velocity[k, 0], rows.begin_velocity[k, 1] = rows.end_velocity[k, 0], rows.end_velocity[k, 1]
-        rows.begin_variance[k] = rows.end_variance[k]
-    rows.yaw[k] = tracks.yaw[n] if parts[0] else math.nan
-    for s in range(3):
-        if parts[max(1, s)]:
-            size, known = math.log(tracks.size[n, s]), rows.size[k, s]
-            rows.size[k, s] = size if math.isnan(known) else known + (size - known) / rows.detections[k]
+    """Write the detections of a frame, of rows of the live tracks, of the tracks and of the objects (`places`)."""
+    for k, n, spot in zip(places[0], places[1], places[2]):  # noqa: B905 - numba has no `strict`
+        own, turns = objects.auxiliary[spot], objects.covariance[spot, OMEGA, OMEGA]
+        sized = not (math.isnan(own[0]) or math.isnan(own[1]) or math.isnan(own[2]))
+        parts = turns != 0.0, sized, not math.isnan(own[3])
+        noise = motion[tracks.label[n], 0]
+        x, y, count = tracks.center[n, 0], tracks.center[n, 1], seen.count[k]
+        if count == 0 or stamp_ns - seen.stamp_ns[k, (count - 1) % PLACES] >= SPACING_NS:
+            slot = count % PLACES
+            seen.stamp_ns[k, slot], seen.place[k, 2 * slot], seen.place[k, 2 * slot + 1] = stamp_ns, x, y
+            seen.count[k] = count + 1
+        rows.label[k], rows.last_ns[k], rows.detections[k] = tracks.label[n], stamp_ns, rows.detections[k] + 1
+        rows.end[k, 0], rows.end[k, 1] = x, y
+        if stamp_ns - rows.first_ns[k] <= FIT_NS:
+            _fit(rows, k, seen, k, noise)
+            rows.begin_velocity[k, 0], rows.begin_velocity[k, 1] = rows.end_velocity[k, 0], rows.end_velocity[k, 1]
+            rows.begin_variance[k] = rows.end_variance[k]
+        rows.yaw[k] = tracks.yaw[n] if parts[0] else math.nan
+        for s in range(3):
+            if parts[max(1, s)]:
+                size, known = math.log(tracks.size[n, s]), rows.size[k, s]
+                rows.size[k, s] = size if math.isnan(known) else known + (size - known) / rows.detections[k]
 
 
 @kernel
@@ -647,20 +651,20 @@ def follow(
         _copy(live_words, row[stays], words, stays, _TRACKLETS)
         _copy(place_words, row[stays], spots, stays, _PLACES)
     rows, seen = tracklets_in(words), places_in(spots)
+    hits, hit = np.empty(count, np.int64), 0
     for k in range(count):
         n = source[k]
         if row[k] < 0:
             rows.id[k], rows.object[k], rows.first_ns[k], rows.probability[k] = tracks.id[n], -1, stamp_ns, 1.0
             rows.begin[k], rows.size[k] = tracks.center[n, :2], math.nan
         if n >= 0 and tracks.detection[n] >= 0:
-            own, turns = objects.auxiliary[spot[k]], objects.covariance[spot[k], OMEGA, OMEGA]
-            sized = not (math.isnan(own[0]) or math.isnan(own[1]) or math.isnan(own[2]))
-            parts = turns != 0.0, sized, not math.isnan(own[3])
-            _detect(rows, k, seen, tracks, n, parts, stamp_ns, motion[tracks.label[n], 0])
+            hits[hit], hit = k, hit + 1
         elif row[k] >= 0 and live.last_ns[row[k]] == before_ns:
             _fit(rows, k, seen, k, motion[rows.label[k], 0])
         if n >= 0:
             rows.confirmed[k] |= tracks.confirmed[n]
+    hits = hits[:hit]
+    _detect(rows, seen, tracks, objects, (hits, source[hits], spot[hits]), stamp_ns, motion)
     leaves = ended[:gone][live.object[ended[:gone]] >= 0]
     if leaves.shape[0]:
         lost = tracklets_in(lost_words)
