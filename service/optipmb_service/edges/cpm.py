@@ -114,7 +114,8 @@ class Station:
     def messages(self, tracks: Tracks, left_out: Counter[str]) -> Iterator[dict[str, Any]]:
         """Yield the messages that are due after a frame, if any; count confirmed tracks without a place in them."""
         stamp_ns = tracks.stamp_ns if tracks.predicted_to_ns is None else tracks.predicted_to_ns
-        if tracks.revision or not self._pace.passes(self._stream, stamp_ns):
+        is_correction = tracks.revision > 0 and tracks.predicted_to_ns is None  # a prediction is of another time
+        if is_correction or not self._pace.passes(self._stream, stamp_ns):
             return
         now = stamp_ns / 1e9
         turn = self._turn
