@@ -93,6 +93,7 @@ class Station:
             "altitude": {"value": max(-100_000, min(800_000, round(alt * 100))), "confidence": 15},
         }
         self._pace = Pace(cpm.rate_hz, predict=True)
+        self._newest = "", 0  # session and time of the last message
         self._included: dict[int, tuple[float, ...]] = {}  # time, east, north, speed, heading, by id
         self._sensors_s = -math.inf
         self._regions: dict[str, dict[str, Any]] = {}
@@ -112,11 +113,16 @@ class Station:
         self._regions[detections.stream] = {} if shape is None else {"perception_region_shape": {"radial": shape}}
 
     def messages(self, tracks: Tracks, left_out: Counter[str]) -> Iterator[dict[str, Any]]:
-        """Yield the messages that are due after a frame, if any; count confirmed tracks without a place in them."""
+        """Yield the messages that are due after a frame, if any; count confirmed tracks without a place in them.
+
+        In a session their times ascend: the tracks of a late frame are in none.
+        """
         stamp_ns = tracks.stamp_ns if tracks.predicted_to_ns is None else tracks.predicted_to_ns
         is_correction = tracks.revision > 0 and tracks.predicted_to_ns is None  # a prediction is of another time
-        if is_correction or not self._pace.passes(self._stream, stamp_ns):
+        is_late = tracks.session == self._newest[0] and stamp_ns < self._newest[1]
+        if is_correction or is_late or not self._pace.passes(self._stream, stamp_ns):
             return
+        self._newest = tracks.session, stamp_ns
         now = stamp_ns / 1e9
         turn = self._turn
         places = np.column_stack([tracks.center[:, :2] @ _axes(turn).T, tracks.center[:, 2]])

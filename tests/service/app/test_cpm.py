@@ -267,9 +267,7 @@ def test_vulnerable_road_users_are_included_together() -> None:
 
 
 def test_the_rate_is_bounded_and_corrections_are_not_sent() -> None:
-    """Between two messages lies a period in sensor time; without objects none is sent. Predictions are no corrections,
-    also where a late frame has corrected their tracks.
-    """
+    """Between two messages lies a period in sensor time; without objects none is sent. Predictions correct nothing."""
     sender = station(rate_hz=2)
     kept = [bool(texts(sender, frame(seq, [1], label=1))) for seq in range(11)]
     assert [seq for seq, one in enumerate(kept) if one] == [0, 5, 10]
@@ -277,6 +275,15 @@ def test_the_rate_is_bounded_and_corrections_are_not_sent() -> None:
     assert not texts(sender, frame(20, []))
     assert not texts(sender, frame(25, [1], confirmed=0))
     assert ids(texts(sender, frame(29, [1], label=1, revision=1, predicted_to_ns=AT + 3 * SECOND))) == [1]
+
+
+def test_times_ascend_in_a_session() -> None:
+    """Tracks of a late frame of another sensor are not sent; those of a new session are, whatever its clock is."""
+    sender = station()
+    assert ids(texts(sender, frame(10, [1]))) == [1]
+    assert not texts(sender, frame(8, [2]))
+    assert ids(texts(sender, frame(11, [2]))) == [2]
+    assert ids(texts(sender, frame(5, [3], session="f" * 32))) == [3]
 
 
 def test_sensors_are_named_once_a_second() -> None:
