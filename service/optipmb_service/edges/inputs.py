@@ -398,8 +398,8 @@ class Inputs:
 
     def _remember(self, stream: _Stream, mark: Hashable, sent: Sent) -> None:
         if mark is not None:
+            self._remembered += mark not in stream.sent  # numbered frames may have one stamp
             stream.sent[mark] = sent
-            self._remembered += 1
             if len(stream.sent) > FRAMES:
                 stream.sent.popitem(last=False)
                 self._remembered -= 1

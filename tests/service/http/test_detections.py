@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from json_senders import Edge, damaged, document, exists, post
 from optipmb_schemas import MessageError, encode_json
+from optipmb_service.edges import inputs
 from optipmb_service.edges.http import detections
 from optipmb_service.edges.inputs import Inputs
 from optipmb_service.edges.json_frames import FrameReader, separate
@@ -118,6 +119,17 @@ def test_the_same_frames_give_the_same_bytes(start: Any) -> None:
             tracks = node.tracks(SENSOR.stream, len(messages))
             found.append([plain(one.model_copy(update={"session": "0" * 32})) for one in tracks])
     assert found[0] == found[1] == found[2] == found[3]
+
+
+def test_numbered_frames_sent_again_take_no_room(edge: Edge, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However often one comes, the epochs of other streams are kept."""
+    monkeypatch.setattr(inputs, "ALL_FRAMES", 4)
+    epochs = set()
+    for _ in range(6):
+        assert edge.post(frame(0, "epoch", "seq"), STREAM).status == HTTPStatus.ACCEPTED
+        (answer,) = edge.post({"objects": []}, "stream=site/node/other").body["frames"]
+        epochs.add(answer["epoch"])
+    assert len(epochs) == 1
 
 
 @pytest.mark.parametrize("way", ["post", "socket"])
