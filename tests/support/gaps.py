@@ -278,8 +278,8 @@ def with_vectors(recording: Recording, view: float, seed: int = 0, numbers: int 
     """Return the frames of a recording with simulated vectors of appearance.
 
     Each object has a direction of its own. To it come a part of the length `view` that changes with a time constant of
-    3 s, as the side from which it is seen, and white noise. With 1.6, 1.25 and 0.85 distances of different objects are
-    1.5, 2 and 3 standard deviations above those of the same object after a long gap.
+    3 s, as the side from which it is seen, and white noise. With 1.6, 1.25 and 0.85 the equal error rate of the vectors
+    of two tracks is 20, 12 and 3 % after a long gap.
     """
     rng = np.random.Generator(np.random.PCG64([seed, numbers]))
     count, keep = len(recording.labels), np.exp(-1.0 / (3.0 * RATE))
