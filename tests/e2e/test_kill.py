@@ -5,6 +5,7 @@ import os
 import random
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -13,10 +14,11 @@ import pytest
 from fleet import Fleet
 from optipmb_client import Connection
 from optipmb_client.incoming import Inbox
+from optipmb_schemas import Detections
 from optipmb_service.session.values import Policy
 from optipmb_service.settings import ZoneSettings
 from real_data import kitti_root
-from recorded import KEYS, Replay, kitti
+from recorded import KEYS, Recording, Replay, kitti
 from sessions import undisturbed
 
 import optipmb
@@ -36,12 +38,21 @@ ZONES: dict[str, dict[str, Any]] = {
     for y in (-12, 0)
 } | {f"line-{x}": {"streams": ["*/kitti/*"], "line": [[x, -20], [x, 20]]} for x in range(5, 85, 10)}
 """Eight zones and eight lines where the recorded vehicles start."""
-JOINS = optipmb.Rejoin(min_probability=0.6)
+JOINS = optipmb.Rejoin(min_probability=0.6, embedding_model="sizes")
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _compiled() -> None:
     optipmb.warm_up(rejoin=True)
+
+
+def with_vectors(recording: Recording) -> Recording:
+    """Return a recording whose detections have their sizes as vectors of appearance."""
+    frames = [
+        (Detections(**dict(one.present()) | {"embedding": one.size, "embedding_model": "sizes"}), points)
+        for one, points in recording.frames
+    ]
+    return replace(recording, frames=frames)
 
 
 def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -59,12 +70,13 @@ def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[
     zones = tuple(ZoneSettings(**one).zone(name) for name, one in sorted(ZONES.items()))
     final, number = 0, 0
     settings = {"zones": json.dumps(ZONES), "profile": "kitti", "queue_clouds": FRAMES, "stream_mb": 1024} | waits
-    settings["rejoin"] = json.dumps({"*/kitti/*": {"min_probability": JOINS.min_probability}})
+    joins = {"min_probability": JOINS.min_probability, "embedding_model": JOINS.embedding_model}
+    settings["rejoin"] = json.dumps({"*/kitti/*": joins})
     policy = Policy(zones=zones, rejoin=JOINS)
     with Fleet(tmp_path, **settings) as fleet, Connection(fleet.endpoint) as connection:
         service = fleet.service("one")
         for round_ in range(KILLS):
-            recordings = [kitti(root, name, f"round{round_}/kitti/{name}", FRAMES) for name in SEQUENCES]
+            recordings = [with_vectors(kitti(root, name, f"round{round_}/kitti/{name}", FRAMES)) for name in SEQUENCES]
             replay = Replay(connection, recordings, pace_s=0.004)
             inbox = Inbox(100_000)
             keys = [key(one.stream) for one in recordings for key in (KEYS.tracks, KEYS.events)]
