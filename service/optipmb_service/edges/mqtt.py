@@ -310,24 +310,25 @@ class Bridge(Component):
                 await asyncio.to_thread(self._feeds.join, [self._keys.detections(stream)], partial(self._see, stream))
         self._reader.read(self._feeds.logs(keys))
         pause_s = RETRY_S
-        while True:
-            link = self._link()
-            try:
-                await self._serve(link)
-            except LinkError as error:
-                why, pause_s = str(error), RETRY_S
-                if error.code == TAKEN_OVER:  # they would take it from each other again and again
-                    why, pause_s = f"duplicate_name: another client is {self._identifier}, too; {error}", TAKEN_OVER_S
-                if why != self._why:
-                    log.warning("mqtt_disconnected", broker=self._mqtt.broker, reason=why)
-                self._why = why
-                if error.code in OLD:
-                    self._version = MQTTProtocolVersion.MQTTv311
-            finally:
-                self.connected = False
-                self._sources.end()
-                await link.close()
-            await asyncio.sleep(pause_s)
+        with contextlib.closing(self._sources):
+            while True:
+                link = self._link()
+                try:
+                    await self._serve(link)
+                except LinkError as error:
+                    why, pause_s = str(error), RETRY_S
+                    if error.code == TAKEN_OVER:  # they would take it from each other again and again
+                        why = f"duplicate_name: another client is {self._identifier}, too; {error}"
+                        pause_s = TAKEN_OVER_S
+                    if why != self._why:
+                        log.warning("mqtt_disconnected", broker=self._mqtt.broker, reason=why)
+                    self._why = why
+                    if error.code in OLD:
+                        self._version = MQTTProtocolVersion.MQTTv311
+                finally:
+                    self.connected = False
+                    await link.close()
+                await asyncio.sleep(pause_s)
 
     async def _serve(self, link: Link) -> None:
         broker = urlsplit(self._mqtt.broker)

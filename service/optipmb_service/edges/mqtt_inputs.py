@@ -90,8 +90,8 @@ class MqttInputs:
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    def end(self) -> None:
-        """Take nothing more."""
+    def close(self) -> None:
+        """End the sending of messages that wait."""
         for task in self._tasks:
             task.cancel()
 

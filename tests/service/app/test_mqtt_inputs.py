@@ -69,8 +69,8 @@ CAMERA = "garage/gate/cam"
 
 
 @contextlib.contextmanager
-def publisher(address: str) -> Iterator[Any]:
-    client = paho.Client(CallbackAPIVersion.VERSION2, protocol=paho.MQTTv5)
+def publisher(address: str, name: str = "") -> Iterator[Any]:
+    client = paho.Client(CallbackAPIVersion.VERSION2, name, protocol=paho.MQTTv5)
     connected = threading.Event()
     client.on_connect = lambda *_: connected.set()
     client.connect_async("127.0.0.1", int(address.rpartition(":")[2]))
@@ -166,6 +166,26 @@ def cut(address: str, topic: str, payload: bytes) -> None:
         assert connection.recv(4)[0] == CONNACK  # all of it: nothing is unread at the end
         connection.sendall(bytes([PUBLISH | 2]) + length + body)
         connection.shutdown(SHUT_WR)  # the broker reads up to here, and its answers are not read
+
+
+async def test_what_has_come_outlasts_its_connection(tmp_path: Path) -> None:
+    """Frames that wait for room are sent when another client has taken the bridge's connection to the broker."""
+    endpoint, arrived, topics = free_endpoint(), [], [*["sensor"] * 64, "other"]
+    inputs = {SENSOR.stream: {"topic": "sensor"}, "site/node/other": {"topic": "other"}}
+    router = {"connect": [], "listen": [endpoint], "router": True}
+    with mosquitto(tmp_path) as address, publisher(address) as client:
+        async with bridged(endpoint, address, inputs, **router) as bridge:
+            take = bridge.inputs.client.listen(Keys().all("detections"), arrived.append)
+            for topic in topics:
+                send(client, topic, {"objects": []})
+            await until(lambda: len(arrived) == len(topics))
+            for topic in ("sensor", "sensor", "other"):
+                send(client, topic, {"objects": []})
+            await until(lambda: len(arrived) > len(topics))  # the last has come, so the others have, too
+            with publisher(address, "optipmb-bridge"):
+                await until(lambda: not bridge.connected)
+                await until(lambda: len(arrived) == len(topics) + 3)
+            take.close()
 
 
 async def test_cameras_of_a_topic_feed_streams_of_their_own(tmp_path: Path) -> None:
