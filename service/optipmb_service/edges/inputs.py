@@ -274,8 +274,7 @@ class Inputs:
             problem = schemas.Problem.of(error, stream=stream, instance=self._instance)
             self._reporter.report(problem, time.monotonic_ns())
         if not self._flushing:
-            self._flushing = True
-            self._loop.call_later(FLUSH_S, self._flush)
+            self._flush_later()
 
     async def send(
         self, frame: JsonFrame, rules: InputSettings, repeats: str = "", traceparent: str = "", wait_s: float = 0.0
@@ -469,9 +468,14 @@ class Inputs:
         if (stream := self._streams.get(name)) is not None and epoch == stream.epoch.hex():
             stream.replaced_until = time.monotonic() + self._gap_s
 
+    def _flush_later(self) -> None:
+        self._flushing = True
+        self._loop.call_later(FLUSH_S, self._flush)
+
     def _flush(self) -> None:
         self._flushing = False
-        self._reporter.flush(time.monotonic_ns())
+        if self._reporter.flush(time.monotonic_ns()):
+            self._flush_later()
 
 
 def _mark(frame: JsonFrame, repeats: str, part: int, rules: InputSettings) -> Hashable:

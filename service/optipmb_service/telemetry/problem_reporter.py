@@ -93,8 +93,8 @@ class ProblemReporter:
             due = self._due(kind, now_ns)
         self._send(*due)
 
-    def flush(self, now_ns: int) -> None:
-        """Send the summaries that are due; to be called about once a second."""
+    def flush(self, now_ns: int) -> bool:
+        """Send the summaries that are due; to be called about once a second while it returns that some are left."""
         due = []
         with self._lock:
             for key, kind in list(self._kinds.items()):
@@ -102,8 +102,10 @@ class ProblemReporter:
                     due.append(self._due(kind, now_ns))
                 elif now_ns - kind.logged_ns >= LOG_EVERY_NS:
                     del self._kinds[key]
+            is_left = any(kind.gathered or kind.unlogged for kind in self._kinds.values())
         for one in due:
             self._send(*one)
+        return is_left
 
     def newest(self) -> tuple[schemas.Problem, ...]:
         """Return the newest problems, the oldest first."""

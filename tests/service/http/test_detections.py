@@ -24,6 +24,7 @@ from optipmb_service.edges.http import detections
 from optipmb_service.edges.inputs import Inputs
 from optipmb_service.edges.json_frames import FrameReader, separate
 from optipmb_service.settings import InputSettings, Settings, load
+from optipmb_service.telemetry import problem_reporter
 from optipmb_service.zenoh.client import Client
 from router import Node, Sensor, plain, until
 from routers import free_endpoint
@@ -471,6 +472,18 @@ def test_a_parameter_that_is_wrong_is_named(edge: Edge, query: str, path: str) -
     """Before the body is read."""
     answer = edge.post(stamped(0), query)
     assert (answer.status, answer.body["path"]) == (HTTPStatus.BAD_REQUEST, path)
+
+
+def test_problems_beyond_the_rate_come_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of twelve streams with wrong frames, three a second, all have theirs, though nothing else comes."""
+    monkeypatch.setattr(problem_reporter, "PUBLISHED_PER_SECOND", 3)
+    frames = [{"stream": f"site/node/{number}", "objects": [{}]} for number in range(12)]
+    endpoint = free_endpoint()
+    with Edge(endpoint, router=True) as edge, Node(endpoint) as node:
+        until(lambda: edge.post(frames[:1]) and node.problems_seen.items, "a problem")  # it is known who watches
+        edge.post(frames)
+        for one in frames:
+            node.problem(one["stream"], "missing_field")
 
 
 def test_refused_frames_are_problems_of_the_stream(endpoint: str, edge: Edge) -> None:
