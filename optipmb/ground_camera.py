@@ -54,8 +54,7 @@ BORDER_PX: Final = 3.0
 HIDING_PX: Final = 2.0
 """Least distance of the lower edge of a box below a foot that it hides."""
 _HALVES: Final = np.array([[0.0, 0.0], [0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
-_TURNS: Final = np.linspace(-math.pi, math.pi, 1441)  # rad, where the sides of the field of view are sought
-_RANGES: Final = np.geomspace(0.1, 2000.0, 1000)  # m, where the ends of the field of view are sought
+_RANGES: Final = np.geomspace(0.1, 2000.0, 1000)  # m, where the end of the field of view is sought
 
 Pair = tuple[float, float]
 Triple = tuple[float, float, float]
@@ -456,51 +455,41 @@ class GroundCamera(ParameterTable):
 
     @cached_property
     def field_of_view(self) -> FieldOfView | None:
-        """Part of the ground where the image shows whole objects, with errors up to `error.largest`.
+        """Sector of the ground that holds all that the image shows, with errors up to `error.largest`.
 
-        Its pose is in the frame of the camera's position. None for a homography without a position.
+        Its pose is in the frame of the camera's position. None for a homography without a position. Places beside the
+        image that are in the sector count as looked at: an object there is missed a little early, while one that is
+        detected out of view cannot be matched with its track.
         """
         geometry, (width, height), base = self._geometry, self.image, self._geometry.base
         if base is None:
             return None
         size = max((self._size(name) for name in self.classes or ("car",)), key=lambda one: one[0])
-        left, right, low = BORDER_PX + 1.0, width - BORDER_PX - 1.0, height - BORDER_PX - 1.0
-
-        def borders(*sides: tuple[Any, Any]) -> Array:
-            """Return the places (S, 33, 2) from the base of lines in the image."""
-            pixels = np.stack([np.column_stack([np.broadcast_to(u, 33), np.broadcast_to(v, 33)]) for u, v in sides])
-            return geometry.on_ground(pixels) - base
-
-        columns, rows = np.linspace(left, right, 33), np.linspace(BORDER_PX + 1.0, low, 33)
-        bottom = borders((columns, low))[0]
+        columns, rows = np.linspace(0.0, width, 33), np.linspace(0.0, height, 33)
+        sides = (columns, height), (columns, 0.0), (0.0, rows), (width, rows)
+        pixels = np.stack([np.column_stack(np.broadcast_arrays(u, v)) for u, v in sides])
+        ends = geometry.on_ground(pixels) - base  # (4, 33, 2)
         u, v = geometry.project(geometry.lifted(base, 0.0))
-        down = bool(left <= u <= right and rows[0] <= v <= low)  # the base is in the image
-        ends = borders((columns, low), (columns, rows[0]), (left, rows), (right, rows))
-        around = float(np.fmin.reduce(np.linalg.norm(ends, axis=2), axis=None)) - 0.5 * size[0] if down else 0.0
-        ahead = geometry.on_ground(np.array([0.5 * width, 0.5 * height])) - base if down else bottom[16]
-        ahead /= max(float(np.linalg.norm(ahead)), 1e-9)
+        down = bool(0.0 <= u <= width and 0.0 <= v <= height)  # the base is in the image
+        ahead = geometry.on_ground(np.array([0.5 * width, 0.5 * height])) - base if down else ends[0, 16]
+        length = float(np.linalg.norm(ahead))
+        if not (down or length > 0.0):  # the middle of the lower border is no ground
+            return None
+        ahead = ahead / length if length > 1e-6 else np.array([1.0, 0.0])  # noqa: PLR2004 - not straight down
         points = base + _RANGES[:, None] * ahead
         foot = geometry.project(geometry.lifted(points, 0.0))
         tall = foot[:, 1] - geometry.project(geometry.lifted(points, size[2]))[:, 1]
         wide = tall * size[1] / size[2]
         edges = foot[:, [0, 1, 0, 1]] + np.column_stack([-0.5 * wide, -tall, 0.5 * wide, 0.0 * tall])
         spread = self._placed(_Boxes(edges, foot, wide, tall, np.tile(size, (len(foot), 1))))[2]
-        kept = np.flatnonzero((spread <= self.error.largest) & (foot[:, 1] >= 0.0) & (foot[:, 1] <= low))
-        sector, near, far = (-math.pi, math.pi), 0.0, around
-        if len(kept):
-            last = kept[np.append(np.diff(kept) != 1, True).argmax()]
-            ring = np.cos(_TURNS)[:, None] * ahead + np.sin(_TURNS)[:, None] * (ahead @ _QUARTER)
-            pixels = geometry.project(geometry.lifted(base + _RANGES[last] * ring, 0.0))
-            seen = np.all((pixels >= (left, 0.0)) & (pixels <= (right, low)), axis=1)
-            first, end = (int(np.argmin(part)) for part in (seen[len(ring) // 2 :: -1], seen[len(ring) // 2 :]))
-            narrow = (
-                -float(_TURNS[len(ring) // 2 + max(first - 1, 0)]),
-                float(_TURNS[len(ring) // 2 + max(end - 1, 0)]),
-            )
-            if (narrow[1] - narrow[0]) * _RANGES[last] ** 2 > 2.0 * math.pi * max(around, 0.0) ** 2:
-                sector, far = narrow, float(_RANGES[last])
-                nearest = 0.0 if down else float(np.fmax.reduce(np.linalg.norm(bottom, axis=1)))
-                near = nearest + 0.5 * size[0] if not down and nearest + 0.5 * size[0] < far else nearest
+        reach = np.linalg.norm(ends, axis=2)
+        far = float(_RANGES[spread <= self.error.largest].max(initial=0.0))
+        far = far if np.isnan(reach).any() else min(far, float(reach.max()))  # beyond the horizon, or all is ground
+        sector, near = (-math.pi, math.pi), 0.0
+        if not down:
+            angles = np.arctan2(ends @ (ahead @ _QUARTER), ends @ ahead)
+            sector = float(np.nanmin(angles)), float(np.nanmax(angles))
+            near = float(np.nanmin(reach))
         if not (near < far and sector[0] < sector[1]):
             return None
         half = 0.5 * math.atan2(ahead[1], ahead[0])

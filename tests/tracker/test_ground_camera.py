@@ -422,6 +422,35 @@ def test_the_tracker_takes_pixel_boxes() -> None:
     assert len(tracker.update(t=1.6, camera=camera)) == 1
 
 
+@pytest.mark.parametrize(
+    ("height", "down", "x", "y"),
+    [
+        (1.65, 0.0, 4.5, 0.0),  # nearer than the ground in the lower corners
+        (1.65, 0.0, 8.0, 6.0),  # at the side
+        (6.0, 0.7, 4.5, 3.0),  # at the side, where it is at a larger angle than far away
+        (6.0, 0.7, 25.0, 20.0),  # in an upper corner
+        (6.0, 0.5 * np.pi, 3.0, 4.5),  # in a corner of a camera that looks down
+        (6.0, 0.5 * np.pi, 0.0, 0.0),
+    ],
+)
+def test_objects_keep_their_ids_wherever_the_image_shows_them(height: float, down: float, x: float, y: float) -> None:
+    """A person is one track while it has boxes, and ends without, for the image shows its place."""
+    document = pinhole(down=down)
+    document["pinhole"]["position"] = [0.0, 0.0, height]
+    camera, tracker = optipmb.GroundCamera.parse(document), optipmb.OnlineTracker("generic")
+    ids: set[int] = set()
+    for k in range(60):
+        middle = np.array([x, y - 0.05 * min(k, 20), 0.0])
+        corners = np.array(np.meshgrid([-0.25, 0.25], [-0.25, 0.25], [0.0, 1.7])).reshape(3, 8).T + middle
+        pixels = np.clip(camera.project(corners), 0.0, (1920.0, 1080.0))
+        box = [[*pixels.min(axis=0), *pixels.max(axis=0)]] if k <= 20 else []
+        tracks = tracker.update({"box": box, "class": ["person"] * len(box)}, t=0.1 * k, camera=camera)
+        ids.update(tracks.id.tolist())
+        assert len(tracks) or k > 20
+    assert ids == {1}
+    assert len(tracks) == 0
+
+
 def test_a_camera_on_a_vehicle_moves_with_its_pose() -> None:
     """A vehicle that stands at a pose gives the density of a camera fixed there, its field of view included."""
     errors = {"tilt": 0.01, "height": 0.03, "range": "both"}
