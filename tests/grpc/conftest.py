@@ -10,13 +10,14 @@ from gateway import GatewayProcess
 from service_process import ServiceProcess
 
 NUMBERS = itertools.count()
+FUSED = {"OPTIPMB_FUSE": "fused-yard/*/*"}
 
 
 @pytest.fixture(scope="session")
 def service() -> Iterator[ServiceProcess]:
     yard = {"streams": ["zoned/*/*"], "polygon": [[10, -5], [30, -5], [30, 5], [10, 5]]}
     zones = {"yard": yard, "gate": {"streams": ["zoned/*/*"], "line": [[20, -5], [20, 5]]}}
-    with ServiceProcess(environment={"OPTIPMB_ZONES": json.dumps(zones)}) as process:
+    with ServiceProcess(environment={"OPTIPMB_ZONES": json.dumps(zones)} | FUSED) as process:
         process.wait_ready()
         yield process
 
@@ -24,7 +25,7 @@ def service() -> Iterator[ServiceProcess]:
 @pytest.fixture(scope="session")
 def gateway(service: ServiceProcess) -> Iterator[GatewayProcess]:
     """A gateway of that service; a new interpreter, for the memory that it takes is measured."""
-    with GatewayProcess(service.endpoint, fresh=True) as process:
+    with GatewayProcess(service.endpoint, environment=FUSED, fresh=True) as process:
         process.wait_ready()
         yield process
 

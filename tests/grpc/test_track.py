@@ -95,6 +95,24 @@ def test_tracks_are_those_on_zenoh(service: ServiceProcess, stub: Any, stream: s
     assert len(convert.from_proto(responses[-1].tracks, Tracks).id) == 2
 
 
+def test_sensors_of_a_fused_session_get_the_tracks_of_their_frames(stub: Any) -> None:
+    """Those of the session of their node, also when a call comes back."""
+    for number, name in enumerate(["lidar", "radar", "radar"]):
+        stream, first = f"fused-yard/robot/{name}", 20 * (name == "radar")
+        found, complete = [], threading.Event()
+
+        def requests(stream: str, first: int, complete: threading.Event) -> Iterator[pb.TrackRequest]:
+            yield from (detections(frame(seq, stream, bytes([first] * 16))) for seq in range(first, first + 20))
+            complete.wait(DEADLINE_S)  # first frames of a fused session wait for sensors that it does not know yet
+
+        for one in stub.Track(requests(stream, first, complete)):
+            found.append(one.tracks)
+            if len(found) == 20:
+                complete.set()
+        assert {(one.stream, one.sensor) for one in found} == {("fused-yard/robot/fused", stream)}, number
+        assert [one.seq for one in found] == list(range(first, first + 20))
+
+
 def test_what_is_published_is_what_the_client_library_publishes(
     service: ServiceProcess, stub: Any, stream: str
 ) -> None:

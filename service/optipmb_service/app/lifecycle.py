@@ -373,7 +373,7 @@ def grpc_edge(settings: Settings, client: Client, metrics: Metrics) -> Iterator[
         from optipmb_service.edges.grpc.server import serving  # noqa: PLC0415 - an extra that only this needs
     except ModuleNotFoundError as error:
         raise ClientError(f"gRPC needs {error.name}, which is not installed: {install_command('grpc')}") from error
-    with serving(settings, client) as server:
+    with serving(settings, client, sessions_of(settings)) as server:
         metrics.add(GATEWAY_METRICS, lambda: server.metrics)
         yield server.address
 

@@ -47,13 +47,19 @@ async def track(call: Call) -> None:
         return
     answers = _Answers(call, outbox)
     keys, network = call.gateway.client.keys, call.gateway.network
+    tracks = keys.tracks(call.gateway.session_of(inputs.stream))
+
+    def is_own(one: EncodedTracks) -> bool:
+        return (one.sensor or one.stream) == inputs.stream
+
+    answers.listener.passes = is_own
     async with (
-        network.subscribed(keys.tracks(inputs.stream), answers.listener),
+        network.subscribed(tracks, answers.listener),
         network.subscribed(keys.problems(inputs.stream), answers.listener),
         inputs.opened(),
         call.writing(outbox),
     ):
-        cached = await network.recent(keys.tracks(inputs.stream))
+        cached = [one for one in await network.recent(tracks) if is_own(one)]
         known = _already_tracked(cached, message, outbox)
         answers.listener.begin(cached)
         while message is not None:

@@ -104,14 +104,16 @@ class Server:
     Args:
         settings: address, certificates, access, limits.
         client: of the network.
+        sessions: returns the session that a stream feeds.
 
     Raises:
         ClientError: the address, the certificates or the access cannot be used.
     """
 
-    def __init__(self, settings: Settings, client: Client) -> None:
+    def __init__(self, settings: Settings, client: Client, sessions: Callable[[str], str]) -> None:
         self.metrics = CallMetrics()
         self.client = client
+        self.session_of = sessions
         self.instance = settings.instance
         self.limits = settings.limits.limits()
         self.network = Network(client, self._invalid)
@@ -261,8 +263,8 @@ class Server:
 
 
 @contextlib.contextmanager
-def serving(settings: Settings, client: Client) -> Iterator[Server]:
-    """Serve meanwhile, on a thread with a loop of its own: neither side waits for the other.
+def serving(settings: Settings, client: Client, sessions: Callable[[str], str]) -> Iterator[Server]:
+    """Serve meanwhile, on a thread with a loop of its own: neither side waits for the other. Arguments as of `Server`.
 
     Raises:
         ClientError: the address, the certificates or the access cannot be used.
@@ -272,7 +274,7 @@ def serving(settings: Settings, client: Client) -> Iterator[Server]:
     thread.start()
 
     async def begin() -> Server:
-        server = Server(settings, client)
+        server = Server(settings, client, sessions)
         await server.start()
         return server
 
