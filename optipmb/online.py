@@ -471,7 +471,8 @@ class OnlineTracker:
         if self._odd_steps == DOUBTED:
             seconds = f"{DOUBTED} frames in succession, the last {step_ns / 1e9:g} s after the one before"
             warn(f"t: expected seconds (stamp_ns: nanoseconds), received {seconds}", stacklevel=3)
-        largest = 0.0 if yaw is None or not len(frame.yaw) else float(np.nanmax(np.abs(yaw), initial=0.0))
+        given = np.empty(0) if yaw is None else np.asarray(yaw, np.float64)  # a table of text has texts
+        largest = float(np.nanmax(np.abs(given), initial=0.0)) if len(frame.yaw) else 0.0
         if largest > 4.0 * np.pi and not self._has_warned_of_yaw:
             self._has_warned_of_yaw = True
             warn(f"yaw: expected radians, received {largest:g} (numpy.radians converts degrees)", stacklevel=3)
