@@ -55,7 +55,8 @@ def test_suppression(benchmark: BenchmarkFixture, apart: float) -> None:
     boxes[:, :2] *= apart
     classes = np.zeros(1, CLASS)
     classes["nms_iou"] = 0.1
-    keep = benchmark(non_maximum_suppression, boxes, np.zeros(1000, np.int64), classes, UNLIMITED)
+    given = boxes, np.full(1000, 0.5), np.zeros(1000, np.int64), classes, UNLIMITED
+    keep = benchmark(non_maximum_suppression, *given)
     assert 0 < keep.sum() < 1000
 
 

@@ -72,6 +72,7 @@ def _of_class(kind: str, period: float) -> dict[str, Any]:
         "announce_score": 0.15,
         "birth_score": 0.4 if agile else 0.5,
         "nms_iou": 0.05,
+        **({"sure_nms_iou": 0.15} if agile else {}),
         "survival": 1.0,
         "gate": gate,
         "gate_deviations": GATE_DEVIATIONS,

@@ -204,6 +204,12 @@ class ClassParameters(ParameterTable):
 
     score_filter: Probability = Field(description="eta_sf: detections with a lower score are removed")
     nms_iou: Probability = Field(description="eta_iou: of two detections that overlap more, the better scored stays")
+    sure_nms_iou: Probability = Field(
+        default=0.0,
+        exclude_if=not_,
+        description="where it is larger, eta_iou of two detections whose scores have a product of 0.64 or more; the "
+        "paper: 0",
+    )
     survival: NonZeroProbability = Field(description="p_s: survival probability per nominal period")
     gate: Positive = Field(description="eta_dist: gating distance on the ground plane, m")
     detection: OpenProbability = Field(description="p_d0: baseline detection probability")
@@ -438,10 +444,10 @@ def checked(table: type[_T], document: Mapping[str, Any], name: str) -> _T:
 
 
 MEASUREMENT: Final = (
-    "score_filter", "nms_iou", "suppress_in_group", "class_confusion", "score_calibration", "gate", "detection",
-    "expected_points", "detection_floor", "ground_clearance", "measurement_noise", "reported_noise", "clutter_rate",
-    "area", "birth_score", "announce_score", "adaptive_birth_rate", "baseline_birth_rate", "undetected_birth_rate",
-    "birth_heading_speed", "birth",
+    "score_filter", "nms_iou", "sure_nms_iou", "suppress_in_group", "class_confusion", "score_calibration", "gate",
+    "detection", "expected_points", "detection_floor", "ground_clearance", "measurement_noise", "reported_noise",
+    "clutter_rate", "area", "birth_score", "announce_score", "adaptive_birth_rate", "baseline_birth_rate",
+    "undetected_birth_rate", "birth_heading_speed", "birth",
 )  # fmt: skip
 """What a sensor has of its own profile, of each class."""
 

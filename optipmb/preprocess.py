@@ -2,12 +2,17 @@
 
 Measurements are sorted (best score first, then by coordinates), so that no result depends on the order in which a
 detector lists its boxes.
+
+People walk side by side, and their boxes overlap as two boxes of one person do (not in the paper). A detector is seldom
+sure of a second box of the same object. Where `sure_nms_iou` is more than eta_iou, boxes that overlap a better one by
+more than `sure_nms_iou` go first. Of the others, those go that overlap a better one that stays by more than eta_iou,
+unless the scores of both are high, ``z_s z_s' >= SURE_OF_BOTH``.
 """
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -95,15 +100,15 @@ def select(detections: Columns, width: int, classes: Classes, most: int) -> tupl
             above += 1
     order = chosen[:above]
     sort_canonically(order, score, center, size, yaw, source)
-    boxes = np.empty((above, 5))
+    boxes, ordered_score = np.empty((above, 5)), np.empty(above)
     ordered_label = np.empty(above, np.int64)
     for k in range(above):
         m = order[k]
         boxes[k, 0], boxes[k, 1], boxes[k, 4] = center[m, 0], center[m, 1], yaw[m]
         for s in range(2):
             boxes[k, 2 + s] = known_length(size[m, s], s, classes[label[m]])
-        ordered_label[k] = label[m]
-    keep = non_maximum_suppression(boxes, ordered_label, classes, most)
+        ordered_score[k], ordered_label[k] = score[m], label[m]
+    keep = non_maximum_suppression(boxes, ordered_score, ordered_label, classes, most)
     if keep.shape[0] < above:
         above = -1
     kept = 0
@@ -177,11 +182,15 @@ def sort_canonically(order: Index, score: Array, center: Array, size: Array, yaw
         width *= 2
 
 
-@kernel
-def non_maximum_suppression(boxes: Array, label: Index, classes: Classes, most: int) -> NDArray[np.bool_]:
-    """Keep each box unless a kept box of its group before it overlaps it by more than the threshold of its class.
+SURE_OF_BOTH: Final = 0.64
+"""Product of two scores from which they are of two objects: 0.8 each."""
 
-    `boxes` (M, 5) are bird's-eye boxes, best first.
+
+@kernel
+def non_maximum_suppression(boxes: Array, score: Array, label: Index, classes: Classes, most: int) -> NDArray[np.bool_]:
+    """Keep each box unless a better one of its group overlaps it by more than the threshold of its class.
+
+    `boxes` (M, 5) are bird's-eye boxes, best first, with `score` (M,).
 
     Returns:
         (M,) whether the box is kept; empty where more than `most` overlaps had to be computed.
@@ -194,24 +203,30 @@ def non_maximum_suppression(boxes: Array, label: Index, classes: Classes, most: 
         radius[m] = 0.5 * math.hypot(boxes[m, 2], boxes[m, 3])
         g = classes[label[m]].suppressed_with
         widest[g] = max(widest[g], radius[m])
-    # Only kept boxes stand in the torus; the cells of a group are as wide as two of its boxes reach.
+    # The torus has the boxes that overlap none in it too much; the cells of a group are as wide as two of them reach.
     head, following, side = empty_torus(count)
     for m in range(count):
-        g, threshold = classes[label[m]].suppressed_with, classes[label[m]].nms_iou
+        own, stands = classes[label[m]], True
+        g, widest_overlap = own.suppressed_with, max(own.nms_iou, own.sure_nms_iou)
         cell_size = 2.0 * widest[g]
         first_x, last_x, first_y, last_y = block(boxes[m, 0], boxes[m, 1], radius[m] + widest[g], cell_size)
         for i in range(first_x, last_x + 1):
             for j in range(first_y, last_y + 1):
                 k = head[(i & (side - 1)) * side + (j & (side - 1))]
-                while k != END_OF_CHAIN and keep[m]:
+                while k != END_OF_CHAIN and stands:
                     if classes[label[k]].suppressed_with == g:
                         dx, dy, reach = boxes[k, 0] - boxes[m, 0], boxes[k, 1] - boxes[m, 1], radius[k] + radius[m]
                         if dx * dx + dy * dy < reach * reach:
                             left -= 1
                             if left < 0:
                                 return keep[:0]
-                            keep[m] = not boxes_overlap(boxes[k], boxes[m], threshold)
+                            stands = not boxes_overlap(boxes[k], boxes[m], widest_overlap)
+                            unsure = own.nms_iou < widest_overlap and score[k] * score[m] < SURE_OF_BOTH
+                            if unsure and stands and keep[k] and keep[m]:
+                                keep[m] = not boxes_overlap(boxes[k], boxes[m], own.nms_iou)
                     k = following[k]
-        if keep[m]:
+        if stands:
             insert(head, following, side, m, boxes[m, 0], boxes[m, 1], cell_size)
+        else:
+            keep[m] = False
     return keep

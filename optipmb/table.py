@@ -65,6 +65,7 @@ class ClassRow(Protocol):
 
     score_filter: float
     nms_iou: float
+    sure_nms_iou: float
     survival: float
     gate: float
     gate_deviations: float

@@ -165,31 +165,35 @@ class Oracle:
                 component.weight *= survival
 
     def _preprocess(self, frame: Any) -> list[Measurement]:
-        """Score filter (eta_sf) and non-maximum suppression per group of classes (eta_iou), in the canonical order."""
+        """Score filter (eta_sf) and suppression per group of classes (eta_iou, of pairs), in the canonical order."""
         rows = []
         for i in range(len(frame.score)):
             x, y, z = (float(value) for value in frame.center[i])
             length, width, height = (float(value) for value in frame.size[i])
             key = (-float(frame.score[i]), x, y, z, length, width, height, float(frame.yaw[i]), int(frame.source[i]))
             rows.append((key, i))
+        standing: list[tuple[Array, Measurement]] = []
         kept: list[Measurement] = []
-        boxes: list[Array] = []
         for (minus_score, x, y, z, length, width, height, yaw, source), i in sorted(rows):
             label = int(frame.label[i])
             box = np.array([x, y, length, width, yaw])
             if -minus_score < self.classes[label].score_filter:
                 continue
+            c = self.classes[label]
             rivals = [
-                other
-                for other, known in zip(boxes, kept, strict=True)
+                (iou(box, other), known)
+                for other, known in standing
                 if known.label == label or self._suppressed_together(known.label, label)
             ]
-            if any(iou(box, other) > self.classes[label].nms_iou for other in rivals):
+            if any(overlap > max(c.nms_iou, c.sure_nms_iou) for overlap, _ in rivals):
                 continue
             velocity = None if np.isnan(frame.velocity[i]).any() else np.array(frame.velocity[i])
             auxiliary = np.array([length, width, height, z])
-            kept.append(Measurement(np.array([x, y]), velocity, yaw, auxiliary, label, -minus_score, source))
-            boxes.append(box)
+            found = Measurement(np.array([x, y]), velocity, yaw, auxiliary, label, -minus_score, source)
+            standing.append((box, found))
+            doubtful = [known for overlap, known in rivals if overlap > c.nms_iou and known.score * found.score < 0.64]
+            if not any(known is one for known in doubtful for one in kept):
+                kept.append(found)
         return kept
 
     def _detection_probability(self, component: Bernoulli | Poisson, world: Array | None) -> float:

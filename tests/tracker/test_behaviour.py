@@ -211,6 +211,20 @@ def test_a_stopped_car_that_reports_its_old_velocity_keeps_its_track(stop: int) 
     assert np.abs(tracks.velocity - [[0.0, 0.0], [8.0, 0.0]]).max() < 0.3
 
 
+@pytest.mark.parametrize(("doubt", "count"), [(0.1, 2), (0.6, 1)])
+def test_people_side_by_side_are_two_where_both_are_sure(doubt: float, count: int) -> None:
+    """Boxes half a metre apart are of two people with `generic`, and of one where the detector doubts the second."""
+    tracker = optipmb.OnlineTracker("generic")
+    for k in range(20):
+        boxes = {
+            "center": [[0.1 * k, 0.0, 0.9], [0.1 * k, 0.52, 0.9]],
+            "size": [[0.7, 0.7, 1.75]] * 2,
+            "yaw": [0.0, 0.0],
+        }
+        tracks = tracker.update({**boxes, "score": [0.95, 1.0 - doubt]}, t=0.1 * k, label=["pedestrian"] * 2)
+    assert len(tracks) == count
+
+
 def test_an_irregular_stream_keeps_its_track() -> None:
     """Between 20 ms and 300 ms apart, the same object at constant speed keeps its id and its speed."""
     rng = np.random.default_rng(2)

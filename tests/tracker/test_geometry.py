@@ -67,20 +67,27 @@ def test_iou_is_symmetric_and_moves_with_the_world(
 @pytest.mark.parametrize("mixed", [False, True])
 @pytest.mark.parametrize("seed", range(3))
 def test_suppression_is_the_greedy_one_per_group(seed: int, *, mixed: bool, group: list[int]) -> None:
-    """A box goes when a better KEPT one of its group overlaps it by more than the threshold of its class."""
+    """A box goes when a better KEPT one of its group overlaps it by more than its class and both scores allow."""
     rng = np.random.default_rng(seed)
     boxes = rng.uniform([0, 0, 1, 1, -3], [12, 12, 5, 2, 3], (60, 5))
     if mixed:  # specks next to giants, many at the same x
         boxes[:, 0] = np.round(boxes[:, 0])
         boxes[:, 2:4] = 10 ** rng.uniform(-0.5, 1.2, (60, 2))
-    label = rng.integers(0, 3, 60)
-    thresholds = np.array([0.0, 0.1, 0.5])
+    label, score = rng.integers(0, 3, 60), np.sort(rng.uniform(0.5, 1.0, 60))[::-1].copy()
+    thresholds, sure = np.array([0.0, 0.1, 0.5]), np.array([0.2, 0.0, 0.6])
+    standing: list[int] = []
     wanted: list[int] = []
     for i in range(60):
-        rivals = [k for k in wanted if group[label[k]] == group[label[i]]]
-        if all(textbook.iou(boxes[i], boxes[k]) <= thresholds[label[i]] for k in rivals):
+        c = label[i]
+        rivals = [k for k in standing if group[label[k]] == group[c]]
+        overlap = {k: textbook.iou(boxes[i], boxes[k]) for k in rivals}
+        if any(overlap[k] > max(thresholds[c], sure[c]) for k in rivals):
+            continue
+        standing.append(i)
+        if all(overlap[k] <= thresholds[c] or score[i] * score[k] >= 0.64 for k in rivals if k in wanted):
             wanted.append(i)
-    found = non_maximum_suppression(boxes, label, class_rows(3, nms_iou=thresholds, suppressed_with=group), UNLIMITED)
+    classes = class_rows(3, nms_iou=thresholds, sure_nms_iou=sure, suppressed_with=group)
+    found = non_maximum_suppression(boxes, score, label, classes, UNLIMITED)
     np.testing.assert_array_equal(np.flatnonzero(found), wanted)
     assert 0 < len(wanted) < 60
 
