@@ -33,7 +33,11 @@ DETECTION_S: Final = 0.5
 SHOWN_S: Final = 0.3
 """How long a track is shown without a detection: in whole frames, rounded up."""
 EVIDENCE: Final = tuple(round(-3.0 + 0.5 * k, 1) for k in range(13))
-EXISTENCE: Final = tuple(round(1.0 / (1.0 + math.exp(0.56 - 1.82 * e)), 3) for e in EVIDENCE)
+EXISTENCE: Final = tuple(
+    tuple(round(min(max(1.0 / (1.0 + math.exp(-a - b * e)), 0.002), 0.998), 3) for e in EVIDENCE)
+    for a, b in ((-0.56, 1.82), (-1.9, 3.4))
+)
+"""Share of tracks that are objects, by evidence: of vehicles, and of pedestrians, of whom detectors imagine more."""
 
 
 def generic_parameters(labels: Iterable[str], period: float, *, name: str = "auto") -> Parameters:
@@ -96,13 +100,13 @@ def _of_class(kind: str, period: float) -> dict[str, Any]:
         "birth_overlap": 0.1,
         "motion": "cv" if agile else "ctra",
         "acceleration_time": None if agile else 1.0 if two_wheeled else 3.0,
-        "confirm_from": 0.55,
-        "confirm_until": 0.4,
+        "confirm_from": 0.4 if agile else 0.55,
+        "confirm_until": 0.25 if agile else 0.4,
         "calibration": {
             "memory": round(0.8 ** (10.0 * period), 4),  # 0.8 over a tenth of a second
             "missed": 1.0,
             "evidence": EVIDENCE,
-            "existence": EXISTENCE,
+            "existence": EXISTENCE[agile],
             "along": [0.15] * len(EVIDENCE),
             "across": [0.1] * len(EVIDENCE),
             "speed": 0.3 if agile else 0.5,
