@@ -241,6 +241,15 @@ def test_what_is_unknown_of_a_box_counts_nothing() -> None:
     assert len(set(objects.object.tolist())) < len(objects.id)
 
 
+def test_sizes_count_from_the_first_known_one() -> None:
+    """A track whose first boxes have no size has that of the others, as while tracking."""
+    frames = gaps.cars((0, 3, (0, 0), (8, 0)))
+    for one in frames[:10]:
+        del one["size"]
+    short = tracklets(gaps.tracked(frames, GENERIC), GENERIC.labels)
+    assert np.exp(short.size[0, :2]) == pytest.approx([4.5, 1.9], rel=0.1)
+
+
 def test_sizes_of_an_object_agree() -> None:
     """Equal sizes are evidence in a class of many sizes, another size is evidence against, and bounds hold."""
     rng = np.random.default_rng(4)

@@ -89,7 +89,8 @@ def tracklets(tracks: Mapping[int, Tracks], labels: Sequence[str]) -> Tracklets:
     for k, rows in enumerate(tracks_of):
         when = stamp[rows]
         found.label[k], found.detections[k] = np.bincount(label[rows]).argmax(), len(rows)
-        found.size[k] = np.log(size[rows].mean(axis=0))
+        known = np.count_nonzero(~np.isnan(size[rows]), axis=0)
+        found.size[k] = np.log(np.nansum(size[rows], axis=0) / np.where(known, known, np.nan))
         noise = motion_of(labels[found.label[k]]).noise
         early, late = rows[when <= when[0] + FIT_NS], rows[when >= when[-1] - FIT_NS]
         found.begin_velocity[k], found.begin_variance[k] = _slope(stamp[early], place[early], noise)
