@@ -3,7 +3,9 @@
 The detection probability of an object is ``p_d E[view]``: the share of the object that lies in the field of view, in
 the mean over its uncertain position. Outside it is zero, so the object keeps its existence probability (but for
 survival), its counters stand still for some seconds, and another sensor may find it again. Several sensors can so feed
-one density by turns. A frame without a field of view looks at everything.
+one density by turns. A frame without a field of view looks at everything. What a sensor detects it has looked at: an
+object within its gate of a detection that lies outside counts as in view, for a view that is stated too narrow would
+otherwise make a new object of each such detection.
 
 Azimuth is counter-clockwise from x in the xy plane of the sensor (x forward, y left, z up), elevation is from that
 plane upwards, range is the distance from the sensor.
@@ -20,7 +22,7 @@ import numpy as np
 
 from optipmb.calibration import log_odds
 from optipmb.compiled import kernel
-from optipmb.density import PHI, Misses, Moment, X, Y
+from optipmb.density import PHI, STATE, Misses, Moment, X, Y
 from optipmb.errors import FrameError
 from optipmb.rows import read_only, record
 
@@ -41,6 +43,9 @@ FARTHEST: Final = 1e9
 
 ROUNDING: Final = 1e-9
 """By how much an interval may be wider than the full turn, rad."""
+
+HALF: Final = 0.5
+"""Share of a detection below which it lies outside."""
 
 _NO_LIMIT: Final = 2.0
 """No sine and no cosine is larger."""
@@ -188,7 +193,9 @@ class Looks:
     misses: Misses
 
 
-def look(view: FieldOfView | None, prior: Density, moment: Moment, table: ClassTable) -> tuple[Looks | None, Density]:
+def look(
+    view: FieldOfView | None, prior: Density, measurements: Measurements, moment: Moment, table: ClassTable
+) -> tuple[Looks | None, Density]:
     """Compute which part of the predicted density is in view, and stop the counters of the rest.
 
     A look covers the time since the last frame that looked at the object, but where other frames came in between at
@@ -210,7 +217,7 @@ def look(view: FieldOfView | None, prior: Density, moment: Moment, table: ClassT
     before_ns, now_ns = moment.before_ns, moment.stamp_ns
     if view is None and misses is None and table.attention is None:
         return None, prior
-    view = view or FieldOfView()
+    given, view = view, view or FieldOfView()
     if misses is None:
         misses = Misses(missed_from_ns=bernoulli.seen_ns, looked_ns=np.full(len(bernoulli), before_ns, np.int64))
     axes: tuple[Array, Array] = _AXES_OF_WORLD if view.pose is None else (view.pose.rotation, view.pose.translation)
@@ -218,6 +225,10 @@ def look(view: FieldOfView | None, prior: Density, moment: Moment, table: ClassT
     in_view, poisson_in_view = np.empty(len(bernoulli)), np.empty(len(poisson))
     for rows, share in ((bernoulli, in_view), (poisson, poisson_in_view)):
         shares_in_view(rows.mean, rows.covariance, table.known_boxes(rows.label, rows.auxiliary), *where, share)
+    if given is not None:
+        places = _out_of_view(measurements, where, table)
+        for rows, share in ((bernoulli, in_view), (poisson, poisson_in_view)):
+            show(rows.mean, table["gate"][rows.label], places, share)
     looked_ns, counted = np.where(in_view > 0.0, now_ns, misses.looked_ns), in_view
     if table.attention is not None:
         attention = table.attention[bernoulli.label]
@@ -238,6 +249,16 @@ def look(view: FieldOfView | None, prior: Density, moment: Moment, table: ClassT
     return Looks(
         in_view, poisson_in_view, counted, time, Misses(missed_from_ns=missed_from_ns, looked_ns=looked_ns)
     ), prior
+
+
+def _out_of_view(measurements: Measurements, where: tuple[Array, Array, Array], table: ClassTable) -> Array:
+    """Return the places (D, 2) of the detections that lie in view by less than half."""
+    count = len(measurements.label)
+    mean, share = np.zeros((count, STATE)), np.empty(count)
+    mean[:, [X, Y]], mean[:, PHI] = measurements.position[:, :2], np.nan_to_num(measurements.yaw)
+    boxes = table.known_boxes(measurements.label, measurements.auxiliary)
+    shares_in_view(mean, np.zeros((count, STATE, STATE)), boxes, *where, share)
+    return np.ascontiguousarray(measurements.position[share < HALF][:, :2])
 
 
 def follow_looks(
@@ -306,6 +327,15 @@ def shares_in_view(
                     if in_view(dx, dy, dz, rotation, limits):
                         weight += (4 if i == 0 else 1) * (4 if j == 0 else 1) * (4 if k == 0 else 1)
         share[n] = weight / 216.0
+
+
+@kernel
+def show(mean: Array, gate: Array, places: Array, share: Array) -> None:
+    """Put objects (N, 6) in view that have one of the places (D, 2) in their gate (N,), m."""
+    for n in range(mean.shape[0]):
+        for d in range(places.shape[0]):
+            if math.hypot(places[d, 0] - mean[n, X], places[d, 1] - mean[n, Y]) <= gate[n]:
+                share[n] = 1.0
 
 
 @kernel

@@ -296,7 +296,7 @@ class Tracker:
         # Detection probabilities p_d(x_+), zero out of view
         announces = not modules.habm and self.parameters.starts_tracks
         prior = with_measurement_births(predicted, z, table) if announces else predicted
-        looks, prior = look(frame.field_of_view, prior, moment, table)
+        looks, prior = look(frame.field_of_view, prior, z, moment, table)
         p_d = detection_probability(prior, cloud, looks, moment, table)
 
         # PMB update: hypotheses, association, states, births

@@ -11,7 +11,7 @@ import pytest
 from scenes import boxes
 
 import optipmb
-from optipmb.field_of_view import count_looks, in_view, shares_in_view
+from optipmb.field_of_view import count_looks, in_view, shares_in_view, show
 from optipmb.hypotheses import close_gates
 
 KITTI, NUSCENES = optipmb.load_profile("kitti"), optipmb.load_profile("nuscenes")
@@ -306,12 +306,27 @@ def test_components_out_of_view_neither_age_nor_lose_weight() -> None:
     assert found.density.bernoulli.id.tolist() == [1]
 
 
-def test_a_box_outside_the_field_of_view_takes_no_object() -> None:
-    """An object there cannot be detected by that sensor: the box is another object's first."""
-    tracker = optipmb.Tracker(KITTI)
-    density = tracker.step(tracker.initial(), boxes(KITTI, 0.0, (20, 0))).density
-    after = tracker.step(density, boxes(KITTI, 0.1, (20, 0), field_of_view=BACKWARD)).density
-    assert after.bernoulli.id.tolist() == [1, 2]
+@pytest.mark.parametrize("half", [10, 30, 40, 50])
+def test_what_is_detected_outside_the_field_of_view_keeps_its_id(half: float) -> None:
+    """A view that is stated too narrow makes no new objects: a sensor sees what it detects."""
+    view = optipmb.FieldOfView(azimuth=(-math.radians(half), math.radians(half)))
+    tracker, density = optipmb.Tracker(KITTI), optipmb.Tracker(KITTI).initial()
+    for k in range(20):
+        place = 14.0 + 0.3 * k, 15.0
+        density = tracker.step(density, boxes(KITTI, 0.1 * k, place, field_of_view=view)).density
+    assert density.bernoulli.id.tolist() == [1]
+
+
+@SEEDS
+def test_places_out_of_view_show_what_is_in_their_gate(seed: int) -> None:
+    """As plain numpy says."""
+    rng = np.random.default_rng(seed)
+    mean, places, gate = rng.uniform(-9, 9, (30, 6)), rng.uniform(-9, 9, (6, 2)), rng.uniform(0.5, 4, 30)
+    share = rng.uniform(0, 1, 30)
+    near = (np.linalg.norm(mean[:, None, :2] - places, axis=2) <= gate[:, None]).any(axis=1)
+    wanted = np.where(near, 1.0, share)
+    show(mean, gate, places, share)
+    np.testing.assert_array_equal(share, wanted)
 
 
 def test_a_parked_car_at_the_border_is_missed_in_proportion() -> None:
