@@ -54,6 +54,7 @@ BORDER_PX: Final = 3.0
 HIDING_PX: Final = 2.0
 """Least distance of the lower edge of a box below a foot that it hides."""
 _HALVES: Final = np.array([[0.0, 0.0], [0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
+_STRAIGHT_DOWN: Final = 1e-6  # m from the base to the middle of the image, up to which no direction is ahead
 _RANGES: Final = np.geomspace(0.1, 2000.0, 1000)  # m, where the end of the field of view is sought
 
 Pair = tuple[float, float]
@@ -458,8 +459,7 @@ class GroundCamera(ParameterTable):
         """Sector of the ground that holds all that the image shows, with errors up to `error.largest`.
 
         Its pose is in the frame of the camera's position. None for a homography without a position. Places beside the
-        image that are in the sector count as looked at: an object there is missed a little early, while one that is
-        detected out of view cannot be matched with its track.
+        image that are in the sector count as looked at: an object there is missed a little early.
         """
         geometry, (width, height), base = self._geometry, self.image, self._geometry.base
         if base is None:
@@ -475,7 +475,7 @@ class GroundCamera(ParameterTable):
         length = float(np.linalg.norm(ahead))
         if not (down or length > 0.0):  # the middle of the lower border is no ground
             return None
-        ahead = ahead / length if length > 1e-6 else np.array([1.0, 0.0])  # noqa: PLR2004 - not straight down
+        ahead = ahead / length if length > _STRAIGHT_DOWN else np.array([1.0, 0.0])
         points = base + _RANGES[:, None] * ahead
         foot = geometry.project(geometry.lifted(points, 0.0))
         tall = foot[:, 1] - geometry.project(geometry.lifted(points, size[2]))[:, 1]
