@@ -1,15 +1,16 @@
-"""Appearance of tracks: vectors of a re-identification model, and how far apart those of one object are.
+"""Appearance of tracks: vectors of a re-identification model, and the distances between vectors of one object.
 
 A detection may bring a vector e. Where tracks are joined over gaps (`optipmb.rejoin`), the vector of a track is the
 direction of
 
     a(t) = sum_k exp(-(t - t_k) / `MEMORY_S`) e_k / |e_k|
 
-over its detections, and the distance of two vectors is that of their directions, in [0, 2]: the square root of twice
-the cosine distance. What a distance says depends on the model, so distances are counted while tracking. When a track
-is decided, its a(t_1) is kept. Later its distance from a(t) - exp(-(t - t_1) / `MEMORY_S`) a(t_1), the sum over the
-detections since, is one of the same object. Its distances from other tracks of the class that are detected in the same
-frame are those of different objects. With the histograms h of both, the log ratio of "j continues i" gets the term
+over its detections, and the distance of two vectors is the one between their directions, in [0, 2]: the square root of
+twice the cosine distance. What a distance says depends on the model, so distances are counted while tracking. When a
+track is decided, its a(t_1) is kept. Later its distance from a(t) - exp(-(t - t_1) / `MEMORY_S`) a(t_1), the sum over
+the detections since, is one of the same object. Its distances from other tracks of the class that are detected in the
+same frame are distances of different objects. With the histograms h of both, the log ratio of "j continues i" gets the
+term
 
     log [p_same(d) / p_different(d)],   p(d) = (h_(d-1) + 2 h_d + h_(d+1)) / (4 sum h) + 1 / (2 n)
 
@@ -58,7 +59,7 @@ class Vectors(NamedTuple):
     """Vectors of tracks and lost objects, as the kernels that join them read them.
 
     Attributes:
-        id: (U,) int64, ascending, of the tracks, those that have just ended among them.
+        id: (U,) int64, ascending, of the tracks, including tracks that have just ended.
         total: (U, W) `Appearance.total`.
         lost_id: (L,) int64, ascending, of the objects that were lost before the frame.
         lost: (L, W) `Appearance.lost`.
@@ -136,7 +137,7 @@ def see(
     vectors: Singles,
     stamp_ns: int,
 ) -> tuple[Index, Singles, Singles, Index, Array]:
-    """Add the vectors of a frame to those of the tracks, and count distances.
+    """Add the vectors of a frame to the vectors of the tracks, and count distances.
 
     Args:
         live: (N,) ids of the live tracks, ascending, and which of them are decided.

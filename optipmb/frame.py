@@ -365,7 +365,7 @@ def embedding_of(model: str | None, vectors: ArrayLike, count: int) -> Embedding
     least, most = EMBEDDING
     if not count and not given.size:
         given = given.reshape(0, least)
-    if given.ndim != 2 or len(given) != count or not least <= given.shape[1] <= most:  # noqa: PLR2004 - a row for each
+    if given.shape[:-1] != (count,) or not least <= given.shape[1] <= most:
         raise FrameError("embedding", f"shape ({count}, {least} to {most})", str(given.shape))
     unknown = np.isnan(given).all(axis=1, keepdims=True)
     _all("embedding", np.isfinite(given) | unknown, "a finite number, or a whole row of NaN", given)

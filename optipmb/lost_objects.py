@@ -131,7 +131,7 @@ class Statistics(Rows):
 
 @record
 class Appearance:
-    """Vectors of tracks and lost objects, and distances of those of each class (`optipmb.appearance`).
+    """Vectors of tracks and lost objects, and counts of their distances in each class (`optipmb.appearance`).
 
     A vector has E numbers and a zero behind an odd E, W together.
 

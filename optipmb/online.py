@@ -391,7 +391,7 @@ class OnlineTracker:
                 camera the default is the field of view of its image.
             camera: of pixel boxes: `box` (M, 4) or `x1`, `y1`, `x2`, `y2`, or the points `foot` (M, 2) or `u`, `v` on
                 which objects stand, with classes and scores, and `embedding`.
-            embedding_model: model and version that `embedding` is of: that of `Rejoin`; required with it.
+            embedding_model: model and version of `embedding`, the same as in `Rejoin`; required with it.
             arrays: the same columns as arguments.
 
         Raises:
@@ -425,7 +425,7 @@ class OnlineTracker:
             field_of_view = field_of_view or camera.view_from(pose)
         compared = None if self._rejoin is None else self._rejoin.embedding_model
         if "embedding" in columns and embedding_model != compared:
-            expected = "that of Rejoin(embedding_model=…)" if compared is None else repr(compared)
+            expected = "the model of Rejoin(embedding_model=…)" if compared is None else repr(compared)
             raise FrameError("embedding_model", expected, repr(embedding_model))
         names, label, left_out = self._classes(columns.pop("label"))
         frame, missing = make_frame(

@@ -580,7 +580,8 @@ def _detect(
     motion: Array,
 ) -> None:
     """Write the detections of a frame, of rows of the live tracks, of the tracks and of the objects (`places`)."""
-    for k, n, spot in zip(places[0], places[1], places[2]):  # noqa: B905 - numba has no `strict`
+    for i in range(places[0].shape[0]):
+        k, n, spot = places[0][i], places[1][i], places[2][i]
         own, turns = objects.auxiliary[spot], objects.covariance[spot, OMEGA, OMEGA]
         sized = not (math.isnan(own[0]) or math.isnan(own[1]) or math.isnan(own[2]))
         parts = turns != 0.0, sized, not math.isnan(own[3])

@@ -268,7 +268,7 @@ class Tracker:
 
         Raises:
             FrameError: the frame is older than the density, or the classes of the frame or of the density differ from
-                those in the parameters, or vectors have another length than those of the same model before.
+                those in the parameters, or vectors have another length than earlier ones of the same model.
             DensityError: the parts of the density do not fit together, or a label is of no class.
             EffortError: the frame needs more than `max_pairs` pairs looked at; nothing costly was done yet.
         """

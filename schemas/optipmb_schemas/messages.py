@@ -522,7 +522,7 @@ def _check_covariances(covariance: Reals) -> None:
 
 
 def _check_embeddings(embedding: Singles, model: str | None) -> Singles:
-    """Return the vectors; of no rows, whose length lists cannot say, those of the least length."""
+    """Return the vectors; an empty list does not tell their length, so it is taken for the least one."""
     least, most = EMBEDDING
     if model is None:
         raise invalid("embedding_model", "the model and version of `embedding`", None)

@@ -540,7 +540,7 @@ class RejoinSettings(BaseModel):
     most: int = Field(default=1000, ge=1, le=10_000)
     """lost objects that are kept; then the oldest are dropped"""
     embedding_model: str | None = Field(default=None, min_length=1, max_length=64)
-    """model whose vectors (`embedding` of Detections) are compared; those of others are ignored"""
+    """model whose vectors (`embedding` of Detections) are compared; vectors of other models are ignored"""
 
 
 def _default_instance() -> str:

@@ -67,7 +67,7 @@ EXCEPTIONS = {
     "compiled": {"fcntl", "logging", "os", "stat", "subprocess", "tempfile", "time"},
     "warm": {"gc", "os", "pickle"},  # the programs of those processes
     "parameters": {"fnmatch"},  # patterns of sensors
-    # dates, forms that users ask for, a page for notebooks, and doubts about what was given
+    # dates, forms that users ask for, a page for notebooks, and warnings
     "online": {"datetime", "html", "io", "matplotlib", "pandas", "pyarrow", "supervision", "warnings"},
 }
 EXECUTES = {"rows": {"exec"}}  # the views of the columns of a record, which come from their declaration

@@ -242,7 +242,7 @@ def test_what_is_unknown_of_a_box_counts_nothing() -> None:
 
 
 def test_sizes_count_from_the_first_known_one() -> None:
-    """A track whose first boxes have no size has that of the others, as while tracking."""
+    """A track whose first boxes have no size has the size of the others, as while tracking."""
     frames = gaps.cars((0, 3, (0, 0), (8, 0)))
     for one in frames[:10]:
         del one["size"]

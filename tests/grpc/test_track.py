@@ -96,7 +96,7 @@ def test_tracks_are_those_on_zenoh(service: ServiceProcess, stub: Any, stream: s
 
 
 def test_sensors_of_a_fused_session_get_the_tracks_of_their_frames(stub: Any) -> None:
-    """Those of the session of their node, also when a call comes back."""
+    """Tracks of the session of their node, also when a call comes back."""
     for number, name in enumerate(["lidar", "radar", "radar"]):
         stream, first = f"fused-yard/robot/{name}", 20 * (name == "radar")
         found, complete = [], threading.Event()

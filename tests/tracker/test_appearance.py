@@ -79,7 +79,7 @@ class Twin:
 
 
 def test_vectors_and_counts_are_those_of_plain_numpy() -> None:
-    """The vector of each track, and the histograms of each class, are those of a dictionary of tracks."""
+    """The vector of each track and the histograms of each class equal a plain dictionary of tracks."""
     tracker, twin = Tracker(GENERIC, rejoin=HOW), Twin()
     density = tracker.initial()
     for given in FRAMES[:120]:
@@ -192,7 +192,7 @@ def test_vectors_of_another_model_change_nothing() -> None:
 
 
 def test_another_model_in_the_setting_begins_anew(result: optipmb.StepResult) -> None:
-    """What was kept of the model before is dropped at the next frame, whatever the length of its vectors."""
+    """State of the model before is dropped at the next frame, for vectors of any length."""
     density = last(FRAMES[120:121], Rejoin(embedding_model="reid-8"), result.density).density
     assert density.rejoining is not None
     assert density.rejoining.appearance is None
@@ -211,7 +211,8 @@ def test_another_length_is_refused(result: optipmb.StepResult) -> None:
     without = last([RECORDING.frames[120]], density=result.density).density
     kept = appearance_of(without)
     assert kept.counts.tobytes() == appearance_of(result.density).counts.tobytes()
-    assert len(kept.total) == len(without.rejoining.live)  # type: ignore[union-attr]  # it has an appearance
+    assert without.rejoining is not None
+    assert len(kept.total) == len(without.rejoining.live)
 
 
 BOXES: dict[str, Any] = {"center": [[0, 0, 0], [9, 0, 0], [18, 0, 0]], "label": ["car"] * 3}
@@ -241,7 +242,7 @@ def test_vectors_that_are_none_are_refused(change: dict[str, Any], path: str) ->
     with pytest.raises(optipmb.FrameError, match=path):
         tracker.update(BOXES, t=0.1, **given)
     assert tracker.density is before
-    with pytest.raises(optipmb.FrameError, match="embedding_model: expected that of Rejoin"):
+    with pytest.raises(optipmb.FrameError, match="embedding_model: expected the model of Rejoin"):
         OnlineTracker(GENERIC).update(BOXES, t=0.0, embedding=LOOKS, embedding_model="reid-7")
     frame, _ = optipmb.make_frame(
         GENERIC, stamp_ns=0, labels=("car", "boat"), center=BOXES["center"], label=[0, 1, 0], score=[0.9] * 3,

@@ -308,7 +308,7 @@ def test_components_out_of_view_neither_age_nor_lose_weight() -> None:
 
 @pytest.mark.parametrize("half", [10, 30, 40, 50])
 def test_what_is_detected_outside_the_field_of_view_keeps_its_id(half: float) -> None:
-    """A view that is stated too narrow makes no new objects: a sensor sees what it detects."""
+    """A view stated too narrow makes no new objects: a detection shows what the sensor sees."""
     view = optipmb.FieldOfView(azimuth=(-math.radians(half), math.radians(half)))
     tracker, density = optipmb.Tracker(KITTI), optipmb.Tracker(KITTI).initial()
     for k in range(20):

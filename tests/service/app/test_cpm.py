@@ -278,7 +278,7 @@ def test_the_rate_is_bounded_and_corrections_are_not_sent() -> None:
 
 
 def test_times_ascend_in_a_session() -> None:
-    """Tracks of a late frame of another sensor are not sent; those of a new session are, whatever its clock is."""
+    """Tracks of a late frame of another sensor are not sent; tracks of a new session are, with any clock."""
     sender = station()
     assert ids(texts(sender, frame(10, [1]))) == [1]
     assert not texts(sender, frame(8, [2]))

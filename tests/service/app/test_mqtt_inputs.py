@@ -124,7 +124,7 @@ async def test_frames_over_mqtt_give_the_same_bytes(start: Any, tmp_path: Path) 
 
 
 async def test_frames_keep_their_order_while_nothing_is_tracked(tmp_path: Path) -> None:
-    """Those that come while 64 are without tracks are tried again, and are sent in the order in which they came."""
+    """Frames that come while 64 are without tracks are tried again, and are sent in the order in which they came."""
     endpoint, inputs, arrived, numbers = free_endpoint(), {SENSOR.stream: {"topic": "sensor"}}, [], range(76)
     with mosquitto(tmp_path) as address, publisher(address) as client:
         async with bridged(endpoint, address, inputs, connect=[], listen=[endpoint], router=True) as bridge:
@@ -151,7 +151,7 @@ async def test_a_frame_that_is_published_again_counts_once(start: Any, tmp_path:
                         send(client, "sensor", payload)
                     frames = await asyncio.to_thread(node.tracks, SENSOR.stream, seq + 1)
                 count = 3 * (last + 1 - first)
-                await until(lambda: bridge.inputs.duplicates["mqtt"] == count - 4)  # noqa: B023 - at once
+                await until(lambda: bridge.inputs.duplicates["mqtt"] == count - 4)  # noqa: B023 - awaited here
                 assert bridge.inputs.frames["mqtt"] == 4
     assert [one.stamp_ns for one in frames] == list(map(SENSOR.stamp_ns, range(8)))
     assert len({(one.session, *one.id.tolist()) for one in frames}) == 1
@@ -189,7 +189,7 @@ async def test_what_has_come_outlasts_its_connection(tmp_path: Path) -> None:
 
 
 async def test_cameras_of_a_topic_feed_streams_of_their_own(tmp_path: Path) -> None:
-    """Events of Frigate by `after.camera`; those of a camera that no input has are left out, and counted."""
+    """Events of Frigate by `after.camera`; events of a camera that no input has are left out, and counted."""
     endpoint, arrived = free_endpoint(), []
     inputs = {
         f"garage/{name}/cam": {"topic": "frigate/events", "format": "frigate", "only": {"after.camera": name}}

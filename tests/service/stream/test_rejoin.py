@@ -157,7 +157,7 @@ VECTORS = [message_of(seq, one) for seq, one in enumerate(gaps.with_vectors(RECO
 
 
 def test_vectors_are_compared_as_in_the_library_through_kills_and_late_frames() -> None:
-    """Objects and states are those of `OnlineTracker`, whatever the order of frames and the restores between them."""
+    """Objects and states equal the ones of `OnlineTracker`, for any order of frames and any restores."""
     found, one = in_order(Policy(rejoin=MODEL), VECTORS)
     tracker = OnlineTracker(GENERIC, rejoin=MODEL)
     for output, given in zip(found, gaps.with_vectors(RECORDING, 0.85), strict=True):
