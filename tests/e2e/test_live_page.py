@@ -2,6 +2,7 @@
 
 import contextlib
 import hashlib
+import itertools
 import json
 import math
 import threading
@@ -13,11 +14,15 @@ from pathlib import Path
 import pytest
 from browser import browser, console, requested, size, wait
 from optipmb_client import Publisher
+from optipmb_schemas import ServiceStatus, SessionSummary
+from optipmb_service.edges.http import api
 from processes import descendants, wait_until_ended
+from proxy import Proxy
 from readers import texts
 from routers import free_endpoint
 from selenium.webdriver import Chrome
 from service_process import ServiceProcess
+from watched import PROBLEM, STREAM, Watched, served, tracks
 
 ENDPOINT, HTTP = free_endpoint(), free_endpoint().removeprefix("tcp/")
 BASE = f"http://{HTTP}"
@@ -187,6 +192,86 @@ def test_the_page_takes_a_token_and_shows_zones(chrome: Chrome, tmp_path: Path) 
                 wait(chrome, f"(parseInt(ink.ground.trim().slice(1, 3), 16) < 64) === {str(is_dark).lower()}")
         wait(chrome, "at('caption').textContent.includes('no frame for')")
         wait(chrome, "at('streams').rows[0].cells[5].textContent.endsWith('s ago')")
+
+
+class Sessions(Watched):
+    """A service with so many sessions and one problem."""
+
+    def __init__(self, count: int) -> None:
+        super().__init__()
+        self.count = count
+
+    def status(self) -> ServiceStatus | None:
+        status = super().status()
+        about = {"session": "0" * 32, "state": "tracking", "profile": "kitti", "tracks": 1, "frames": 1, "age_s": 0.1}
+        figures = dict.fromkeys(("rate_hz", "latency_p50_ms", "latency_p99_ms", "late", "missing"), 0)
+        sessions = tuple(SessionSummary(stream=f"yard/gate/{n:04}", **about, **figures) for n in range(self.count))
+        problem = PROBLEM.model_copy(update={"reported_ns": time.time_ns()})
+        return status and status.model_copy(update={"sessions": sessions, "problems": (problem,)})
+
+
+def see(chrome: Chrome, address: str, name: str) -> None:
+    chrome.get("about:blank")
+    chrome.get(f"http://{address}/#{name}")
+    wait(chrome, "at('state').textContent === 'ready'")
+
+
+def publish(chrome: Chrome, watched: Watched, seq: int) -> None:
+    """Publish a frame when somebody looks, and wait until the page has taken it."""
+    assert watched.network is not None
+    watched.network.wait(2)
+    before = chrome.execute_script("return came")
+    watched.network.publish(tracks(seq))
+    wait(chrome, f"came !== {before}")
+
+
+@pytest.mark.parametrize("name", ["100%", "gate"])
+def test_a_stream_that_cannot_be_shown_is_refused_on_the_page(chrome: Chrome, name: str) -> None:
+    """An address with a name that is none: the page says why it has no tracks, and works."""
+    with served(Sessions(1)) as address:
+        see(chrome, address, name)
+        wait(chrome, "at('caption').textContent.includes('expected a stream as site/node/sensor')")
+        chrome.execute_script("at('streams').rows[0].cells[0].firstChild.click()")
+        wait(chrome, "at('caption').textContent === 'yard/gate/0000: waiting for tracks'")
+
+
+def test_tracks_of_a_service_that_has_gone_are_shown_as_old(chrome: Chrome) -> None:
+    """While the page tries to connect again, it says since when there is no frame."""
+    watched = Watched()
+    with served(watched) as address:
+        see(chrome, address, STREAM)
+        publish(chrome, watched, 1)
+    wait(chrome, "at('state').textContent === 'no answer'")
+    wait(chrome, "at('caption').textContent.includes('no frame for')")
+
+
+def test_the_page_leaves_a_connection_that_is_lost_without_an_end(
+    chrome: Chrome, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A cable that is pulled and a gateway that forgets: the page says that there is no answer, and connects again."""
+    monkeypatch.setattr(api, "KEEP_ALIVE_S", 0.05)
+    faster = (
+        "const now = performance.now.bind(performance), timeout = AbortSignal.timeout.bind(AbortSignal);"
+        "performance.now = () => 20 * now(); AbortSignal.timeout = (ms) => timeout(ms / 20)"
+    )
+    script = chrome.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": faster})
+    watched = Watched()
+    with served(watched) as address, Proxy(address) as proxy:
+        see(chrome, proxy.address, STREAM)
+        publish(chrome, watched, 1)
+        proxy.cut()
+        wait(chrome, "at('state').textContent === 'no answer'")
+        proxy.strand()
+        proxy.mend()
+        before = chrome.execute_script("return came")
+        for seq in itertools.count(2):
+            assert watched.network is not None
+            watched.network.publish(tracks(seq))
+            if chrome.execute_script(f"return came !== {before}"):
+                break
+        wait(chrome, "at('state').textContent.startsWith('ready')")
+        chrome.get("about:blank")
+    chrome.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", script)
 
 
 def test_streams_of_workers_are_shown_and_workers_end_with_their_parent() -> None:

@@ -7,7 +7,7 @@ const COLOURS = [ // of Okabe and Ito, as they are, darker and lighter
   "#00487A", "#93400A", "#006B4E", "#8A4F72", "#2F7FB5", "#A06E00", "#5E4914",
   "#5BA7D6", "#EE9157", "#4FC39F", "#E0A9C8", "#93D0F2", "#F2C14D", "#B99A4F"];
 const DARK = matchMedia("(prefers-color-scheme: dark)");
-const TRAIL_S = 5, ASK_MS = 2000, AGAIN_MS = 1000, SILENT_MS = 2000, EDGE = 44, SLOW = 0.3, KNOWN = 0.95, NAMED = 4; // NAMED: pixels per metre from which classes are written
+const TRAIL_S = 5, ASK_MS = 2000, AGAIN_MS = 1000, SILENT_MS = 2000, ANSWER_MS = 10000, LOST_MS = 15000, EDGE = 44, SLOW = 0.3, KNOWN = 0.95, NAMED = 4; // NAMED: pixels per metre from which classes are written
 const ID = 0, LABEL = 1, X = 2, Y = 3, LENGTH = 4, WIDTH = 5, YAW = 6, VX = 7, VY = 8, EXISTENCE = 9, SCORE = 10, AGE = 11, MISSED = 12, FACING = 13, OBJECT = 14;
 
 const ENDS = 5000; // objects whose last places are kept
@@ -18,16 +18,24 @@ const made = (tag, text) => Object.assign(document.createElement(tag), { textCon
 const canvas = at("canvas"), pen = canvas.getContext("2d");
 const view = { x: 0, y: 0, scale: 6, follow: true }; // centre in metres, pixels per metre
 const fingers = new Map(); // pointer id -> [x, y]
-let chosen = decodeURIComponent(location.hash.slice(1));
+let chosen = named();
 let asking = 0, token = sessionStorage.getItem("token") || "", ink = {};
-let frame = null, trails = new Map(), ends = new Map(), gaps = new Map(), names = [], selected = null, source = null, came = 0, dirty = true, moved = 0, fitted = false;
+let frame = null, trails = new Map(), ends = new Map(), gaps = new Map(), names = [], selected = null, source = null, heard = 0, came = 0, why = "", dirty = true, moved = 0, fitted = false;
+
+function named() { // the stream in the address
+  try {
+    return decodeURIComponent(location.hash.slice(1));
+  } catch { // no name was encoded so: as it is written
+    return location.hash.slice(1);
+  }
+}
 
 // What the service says
 
 async function ask() {
   let status = null, refusal = "no answer";
   try {
-    const answer = await get("status");
+    const answer = await get("status", { signal: AbortSignal.timeout(ANSWER_MS) });
     if (answer.ok) status = await answer.json();
     else if (answer.status === 401) refusal = "token needed";
     else if (answer.status === 403) refusal = "no right to see the status";
@@ -39,6 +47,7 @@ async function ask() {
   if (status === null) at("none").hidden = refusal !== "no answer";
   if (isStale()) dirty = true; // its age
   if (status !== null && status.sessions) list(status); // while it starts there are none
+  if (chosen && performance.now() - heard > LOST_MS) listen(); // a connection that is lost may never end
   clearTimeout(asking);
   asking = setTimeout(ask, document.hidden ? 5 * ASK_MS : ASK_MS);
 }
@@ -61,7 +70,7 @@ function list(status) {
   at("streams").replaceChildren(...status.sessions.map((one) => {
     const row = document.createElement("tr"), button = made("button", one.stream);
     button.onclick = () => choose(one.stream);
-    for (const content of [button, one.state, one.rate_hz.toFixed(1), one.latency_p50_ms.toFixed(1), one.tracks, heard(one.age_s)]) row.insertCell().append(content);
+    for (const content of [button, one.state, one.rate_hz.toFixed(1), one.latency_p50_ms.toFixed(1), one.tracks, since(one.age_s)]) row.insertCell().append(content);
     row.setAttribute("aria-selected", one.stream === chosen);
     const silent = one.silent || [];
     if (one.sensors && one.sensors.length > 0) button.title = one.sensors.map((name) => silent.includes(name) ? `${name}: silent` : name).join("\n");
@@ -78,7 +87,7 @@ function list(status) {
   if (!chosen && status.sessions.length > 0) choose(status.sessions[0].stream);
 }
 
-function heard(seconds) {
+function since(seconds) {
   return seconds === undefined || seconds === null ? "" : seconds * 1e3 < SILENT_MS ? "now" : ago(seconds);
 }
 
@@ -93,6 +102,7 @@ function ago(seconds) {
 function choose(stream) {
   if (stream !== chosen) history.replaceState(null, "", `#${encodeURIComponent(stream)}`);
   chosen = stream;
+  why = "";
   frame = selected = null;
   [trails, ends, gaps] = [new Map(), new Map(), new Map()];
   fitted = false;
@@ -104,15 +114,19 @@ function choose(stream) {
 async function listen() { // by fetch, because EventSource sends no token
   if (source !== null) source.abort();
   const mine = source = new AbortController();
-  came = performance.now();
+  heard = performance.now();
   dirty = true;
   try {
     const answer = await get(`live?stream=${encodeURIComponent(chosen)}`, { signal: mine.signal });
+    const refusal = answer.ok ? "" : await answer.text();
+    if (mine === source) why = refusal.startsWith("{") ? JSON.parse(refusal).error : refusal;
+    dirty = true;
     if (answer.ok) {
       const reader = answer.body.pipeThrough(new TextDecoderStream()).getReader();
       for (let text = ""; ;) {
         const { done, value } = await reader.read();
         if (done) break;
+        if (mine === source) heard = performance.now();
         const lines = (text + value).split("\n");
         text = lines.pop();
         for (const line of lines) if (line.startsWith("data: ") && mine === source) receive(JSON.parse(line.slice(6)));
@@ -353,7 +367,7 @@ function sensor(x, y, yaw) {
 }
 
 function tell() {
-  at("caption").textContent = frame === null ? (chosen ? `${chosen}: waiting for tracks` : "")
+  at("caption").textContent = frame === null ? (chosen ? `${chosen}: ${why || "waiting for tracks"}` : "")
     : `${chosen} · ${frame.profile} · ${frame.tracks.length} tracks${frame.unconfirmed ? ` and ${frame.unconfirmed} not confirmed` : ""}, ${frame.detections.length} detections${isStale() ? ` · no frame for ${ago((performance.now() - came) / 1e3).replace(" ago", "")}` : ""}`;
   const track = frame && frame.tracks.find((one) => one[ID] === selected);
   at("details").hidden = !track;
@@ -423,7 +437,7 @@ canvas.onwheel = (event) => { event.preventDefault(); zoom(Math.exp(-0.0015 * ev
 at("follow").onclick = () => setFollow(!view.follow);
 [at("closer").onclick, at("farther").onclick] = [() => zoom(1.4), () => zoom(1 / 1.4)];
 new ResizeObserver(() => { dirty = true; }).observe(canvas);
-window.onhashchange = () => choose(decodeURIComponent(location.hash.slice(1)));
+window.onhashchange = () => choose(named());
 if (chosen) listen();
 ask();
 draw();
