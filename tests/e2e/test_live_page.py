@@ -274,6 +274,19 @@ def test_the_page_leaves_a_connection_that_is_lost_without_an_end(
     chrome.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", script)
 
 
+def test_a_late_frame_does_not_end_the_paths(chrome: Chrome) -> None:
+    """Corrected tracks of earlier frames of the session are not drawn; another session begins anew."""
+    watched = Watched()
+    with served(watched) as address:
+        see(chrome, address, STREAM)
+        for seq in (5, 3, 6):
+            publish(chrome, watched, seq)
+        assert chrome.execute_script("return trails.get(0).map((point) => Math.round(10 * (point[2] - 1.8e9)))") == [
+            5,
+            6,
+        ]
+
+
 def test_streams_of_workers_are_shown_and_workers_end_with_their_parent() -> None:
     """With several processes the page of the whole gets the tracks of whichever worker has the stream.
 

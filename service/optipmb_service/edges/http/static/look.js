@@ -164,7 +164,8 @@ function showZones() {
 
 function receive(next) {
   came = performance.now();
-  if (frame !== null && (next.session !== frame.session || next.time < frame.time)) [trails, ends, gaps] = [new Map(), new Map(), new Map()];
+  if (frame !== null && next.session === frame.session && next.time < frame.time) return; // corrected by a late frame; the newest one follows
+  if (frame !== null && next.session !== frame.session) [trails, ends, gaps] = [new Map(), new Map(), new Map()];
   frame = next;
   for (const track of frame.tracks) {
     const trail = trails.get(track[ID]) || [];
