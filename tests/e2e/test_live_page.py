@@ -5,6 +5,7 @@ import hashlib
 import itertools
 import json
 import math
+import re
 import threading
 import time
 import urllib.request
@@ -285,6 +286,28 @@ def test_a_late_frame_does_not_end_the_paths(chrome: Chrome) -> None:
             5,
             6,
         ]
+
+
+def test_the_list_of_streams_stays_and_is_bounded(chrome: Chrome) -> None:
+    """Its buttons stay where they are, so that they can be pressed; of 1,001 streams 1,000 are there, and a hint.
+
+    The age of a problem goes by the clock of the service.
+    """
+    watched = Sessions(3)
+    with served(watched) as address:
+        see(chrome, address, "")
+        wait(chrome, "at('streams').rows.length === 3")
+        chrome.execute_script(
+            "window.row = at('streams').rows[1]; row.cells[0].firstChild.focus(); row.cells[2].textContent = 'before'"
+        )
+        wait(chrome, "row.cells[2].textContent === '0.0' && row.isConnected")
+        assert chrome.execute_script("return document.activeElement === row.cells[0].firstChild && at('more').hidden")
+        chrome.execute_script("Date.now = () => 0; row.remove()")
+        watched.count = 1001
+        wait(chrome, "at('streams').rows.length === 1000 && at('more').textContent.startsWith('and 1 more')")
+        assert re.fullmatch(
+            "just now|[0-9]+ s ago", chrome.execute_script("return at('problems').querySelector('time').textContent")
+        )
 
 
 def test_streams_of_workers_are_shown_and_workers_end_with_their_parent() -> None:

@@ -10,6 +10,7 @@ const DARK = matchMedia("(prefers-color-scheme: dark)");
 const TRAIL_S = 5, ASK_MS = 2000, AGAIN_MS = 1000, SILENT_MS = 2000, ANSWER_MS = 10000, LOST_MS = 15000, EDGE = 44, SLOW = 0.3, KNOWN = 0.95, NAMED = 4; // NAMED: pixels per metre from which classes are written
 const ID = 0, LABEL = 1, X = 2, Y = 3, LENGTH = 4, WIDTH = 5, YAW = 6, VX = 7, VY = 8, EXISTENCE = 9, SCORE = 10, AGE = 11, MISSED = 12, FACING = 13, OBJECT = 14;
 
+const ROWS = 1000; // streams in the list: a table of ten thousand takes a browser seconds, each time
 const ENDS = 5000; // objects whose last places are kept
 
 const object = (track) => (track[OBJECT] >= 0 ? track[OBJECT] : track[ID]);
@@ -33,9 +34,10 @@ function named() { // the stream in the address
 // What the service says
 
 async function ask() {
-  let status = null, refusal = "no answer";
+  let status = null, now = 0, refusal = "no answer";
   try {
     const answer = await get("status", { signal: AbortSignal.timeout(ANSWER_MS) });
+    now = Date.parse(answer.headers.get("date")) || Date.now(); // the clock of its reports
     if (answer.ok) status = await answer.json();
     else if (answer.status === 401) refusal = "token needed";
     else if (answer.status === 403) refusal = "no right to see the status";
@@ -46,7 +48,7 @@ async function ask() {
   at("token").hidden = refusal !== "token needed";
   if (status === null) at("none").hidden = refusal !== "no answer";
   if (isStale()) dirty = true; // its age
-  if (status !== null && status.sessions) list(status); // while it starts there are none
+  if (status !== null && status.sessions) list(status, now); // while it starts there are none
   if (chosen && performance.now() - heard > LOST_MS) listen(); // a connection that is lost may never end
   clearTimeout(asking);
   asking = setTimeout(ask, document.hidden ? 5 * ASK_MS : ASK_MS);
@@ -64,27 +66,38 @@ at("token").onsubmit = (event) => {
   ask();
 };
 
-function list(status) {
+function list(status, now) {
   at("instance").textContent = `${status.instance} ${status.version}`;
   at("none").hidden = status.sessions.length > 0;
-  at("streams").replaceChildren(...status.sessions.map((one) => {
-    const row = document.createElement("tr"), button = made("button", one.stream);
-    button.onclick = () => choose(one.stream);
-    for (const content of [button, one.state, one.rate_hz.toFixed(1), one.latency_p50_ms.toFixed(1), one.tracks, since(one.age_s)]) row.insertCell().append(content);
-    row.setAttribute("aria-selected", one.stream === chosen);
-    const silent = one.silent || [];
-    if (one.sensors && one.sensors.length > 0) button.title = one.sensors.map((name) => silent.includes(name) ? `${name}: silent` : name).join("\n");
+  const rows = new Map([...at("streams").rows].map((row) => [row.cells[0].textContent, row])); // they stay: one may have the focus, or be pressed
+  const shown = status.sessions.slice(0, ROWS).map((one) => {
+    const row = rows.get(one.stream) || newRow(one.stream), silent = one.silent || [];
+    const contents = [one.state, one.rate_hz.toFixed(1), one.latency_p50_ms.toFixed(1), one.tracks, since(one.age_s)];
+    contents.forEach((content, i) => { row.cells[i + 1].textContent = content; });
+    row.cells[0].firstChild.title = (one.sensors || []).map((name) => silent.includes(name) ? `${name}: silent` : name).join("\n");
     return row;
-  }));
+  });
+  at("more").hidden = shown.length === status.sessions.length;
+  at("more").textContent = `and ${status.sessions.length - shown.length} more: add #site/node/sensor to the address of this page to see one`;
+  if (shown.length !== rows.size || shown.some((row, i) => row !== at("streams").rows[i])) at("streams").replaceChildren(...shown);
   at("problems-title").hidden = !status.problems || status.problems.length === 0;
   at("problems").replaceChildren(...(status.problems || []).slice(-5).reverse().map((problem) => {
     const often = problem.count > 1 ? ` (${problem.count} times)` : "";
     const item = made("li", ` ${problem.stream} ${problem.message}${often}`);
-    if (problem.reported_ns) item.prepend(made("time", ago(Date.now() / 1e3 - problem.reported_ns / 1e9)), " ");
+    if (problem.reported_ns) item.prepend(made("time", ago(now / 1e3 - problem.reported_ns / 1e9)), " ");
     item.prepend(made("code", problem.code), " ");
     return item;
   }));
   if (!chosen && status.sessions.length > 0) choose(status.sessions[0].stream);
+}
+
+function newRow(stream) {
+  const row = document.createElement("tr"), button = made("button", stream);
+  button.onclick = () => choose(stream);
+  row.insertCell().append(button);
+  for (let i = 0; i < 5; i += 1) row.insertCell();
+  row.setAttribute("aria-selected", stream === chosen);
+  return row;
 }
 
 function since(seconds) {
