@@ -1,9 +1,8 @@
-"""AB3DMOT's protocol: known answers, the published evaluation's own figures, and a naive twin."""
+"""AB3DMOT's protocol: known answers, and the published evaluation's own figures."""
 
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 from evaluation_cases import TrackRow, TruthRow, followed, parked, shuffled, tracks_of, truth_of, write_kitti
 from optipmb_tools.datasets import open_dataset
@@ -13,9 +12,7 @@ from optipmb_tools.evaluation.ab3dmot import (
     evaluate_ab3dmot,
 )
 from optipmb_tools.evaluation.cases import Case, ab3dmot_rules, prepare
-from optipmb_tools.evaluation.clear import Counts
 from optipmb_tools.evaluation.evaluate import evaluate_figures, load_recordings
-from scipy.optimize import linear_sum_assignment
 
 AGREED = json.loads((Path(__file__).with_name("devkit") / "ab3dmot.json").read_text())
 
@@ -72,57 +69,6 @@ def test_ignored_truth_counts_neither_way_but_in_true_positives() -> None:
     assert (found.truth, found.true, found.false, found.missed, found.mota) == (20, 40, 0, 0, 1.0)
     lost = result_of(truth, [row for row in followed(truth) if row[1] == 0], second).best
     assert (lost.truth, lost.true, lost.missed, lost.mota) == (20, 20, 0, 1.0)
-
-
-def naive(case: Case, threshold: float) -> Counts:
-    """Count as the published evaluation does, box by box."""
-    means = {
-        one: round(sum(case.track_score[case.track_id == one]) / sum(case.track_id == one), 12)
-        for one in set(case.track_id.tolist())
-    }
-    overlap = dict(
-        zip(zip(case.truth_row.tolist(), case.track_row.tolist(), strict=True), case.similarity, strict=True)
-    )
-    match: dict[int, int] = {}
-    counts = dict.fromkeys(vars(Counts()), 0)
-    counts["similarity"] = 0.0
-    for frame in sorted({*case.truth_frame.tolist(), *case.track_frame.tolist()}):
-        truth = np.flatnonzero(case.truth_frame == frame).tolist()
-        tracks = [int(k) for k in np.flatnonzero(case.track_frame == frame) if means[case.track_id[k]] >= threshold]
-        cost = np.array([[1.0 - overlap.get((t, k), -1e9) for k in tracks] for t in truth]).reshape(
-            len(truth), len(tracks)
-        )
-        for row, column in zip(*linear_sum_assignment(cost), strict=True):
-            if (truth[row], tracks[column]) in overlap:
-                match[truth[row]] = tracks[column]
-        used = [match[t] for t in truth if t in match]
-        counts["false"] += sum(k not in used and not case.excused[k] for k in tracks)
-    counts["truth"] = int((~case.ignored).sum())
-    counts["true"] = len(match)
-    counts["missed"] = sum(row not in match and not case.ignored[row] for row in range(len(case.truth_frame)))
-    counts["similarity"] = sum(overlap[pair] for pair in match.items())
-    for one in sorted(set(case.truth_id.tolist())):
-        rows = sorted(np.flatnonzero(case.truth_id == one).tolist(), key=lambda row: case.truth_frame[row])
-        life = [int(case.track_id[match[row]]) if row in match else -1 for row in rows]
-        ignored = [bool(case.ignored[row]) for row in rows]
-        if all(ignored):
-            continue
-        counts["objects"] += 1
-        last, tracked = life[0], int(life[0] >= 0)
-        for f in range(1, len(life)):
-            if ignored[f]:
-                last = -1
-                continue
-            known = last != -1 and life[f] != -1
-            counts["switches"] += known and last != life[f] and life[f - 1] != -1
-            counts["fragments"] += known and f < len(life) - 1 and life[f - 1] != life[f] and life[f + 1] != -1
-            if life[f] != -1:
-                tracked, last = tracked + 1, life[f]
-        counts["fragments"] += len(life) > 1 and life[-2] != life[-1] != -1 != last and not ignored[-1]
-        share = tracked / (len(life) - sum(ignored))
-        counts["mostly_tracked"] += share > 0.8
-        counts["mostly_lost"] += share < 0.2
-    return Counts(**counts)
 
 
 @pytest.mark.parametrize("seed", AGREED)

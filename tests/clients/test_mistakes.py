@@ -12,7 +12,6 @@ from optipmb_tools.table_files import write_table
 from own_tables import FRAMES, boxes
 
 ROWS = 3 * FRAMES
-NOWHERE = "nowhere.csv"
 
 
 def camera_boxes() -> dict[str, np.ndarray]:

@@ -8,7 +8,6 @@ from optipmb_tools.cli import run
 
 import optipmb
 
-PAGE = Path(__file__).parents[2] / "docs" / "tuning.md"
 SCENE = ["--dataset", "scene", "--option", "frames=12", "--option", "clouds=0", "--sequences", "0000", "0001"]
 CARS = [*SCENE, "--profile", "kitti-paper", "--classes", "Car"]
 FEW = ["--trials", "3", "--folds", "2"]

@@ -1,6 +1,5 @@
 """What other people's programs do to the network must not reach the tracks of a stream."""
 
-import os
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 import pytest
 from commands import kill, result_of, run_here, start
-from optipmb_client import Connection, Publisher, Subscriber
+from optipmb_client import Connection, Subscriber
 from optipmb_client.sessions import find_services
 from optipmb_schemas import Detections, Keys, Points, Problem, SessionParameters, Tracks, encoding_of
 from optipmb_tools.cli import run
@@ -17,7 +16,6 @@ from routers import open_client
 from service_process import ServiceProcess
 
 SCENE = ("--dataset", "scene", "--option", "frames=40", "--option", "clouds=0")
-POSE = (np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
 
 @pytest.fixture(scope="module")
@@ -142,71 +140,3 @@ def test_garbage_on_every_key(
     (status,) = find_services(link, patience_s=60.0)
     assert status.refused > 100
     assert status.problems
-
-
-def test_classes_that_no_profile_has(
-    service: ServiceProcess, link: Connection, expected: bytes, replay: Callable[[], Any], tmp_path: Path
-) -> None:
-    """A stream full of unknown classes gets tracks of none of them, and disturbs no other stream."""
-    seen: list[Problem] = []
-    with (
-        Publisher("a/b/unknown", connection=link) as publisher,
-        Subscriber("a/b/unknown", connection=link, on_problem=seen.append, queue=100_000) as tracks,
-    ):
-
-        def disturb(number: int) -> None:
-            count = 200
-            publisher.publish(
-                stamp_ns=number * 1_000_000,
-                label=[f"thing-{number % 7}"] * count,
-                center=np.zeros((count, 3)),
-                size=np.ones((count, 3)),
-                yaw=np.zeros(count),
-                score=np.ones(count),
-                pose=POSE,
-            )
-
-        with Disturbance(disturb):
-            result = replay()
-        messages = []
-        while (received := tracks.receive(0.5)) is not None:
-            messages.append(received.tracks)
-    assert result["missing"] == 0
-    assert (tmp_path / "0000.txt").read_bytes() == expected
-    assert messages
-    assert all(len(message.id) == 0 and message.ignored == 200 for message in messages)
-    assert any(problem.code == "unknown_class" for problem in seen)
-
-
-def test_two_publishers_of_one_stream(
-    service: ServiceProcess, link: Connection, expected: bytes, replay: Callable[[], Any], tmp_path: Path
-) -> None:
-    """Two programs that fight for the name of a stream leave other streams alone."""
-    rng = np.random.default_rng(1)
-    with Publisher("a/b/twice", connection=link) as one, Publisher("a/b/twice", connection=link) as two:
-
-        def disturb(number: int) -> None:
-            (one, two)[number % 2].publish(
-                stamp_ns=int(rng.integers(0, 10**12)),
-                label=["car"],
-                center=rng.normal(size=(1, 3)),
-                size=np.ones((1, 3)),
-                yaw=[0.0],
-                score=[0.5],
-                pose=POSE,
-            )
-
-        with Disturbance(disturb):
-            result = replay()
-    assert result["missing"] == 0
-    assert (tmp_path / "0000.txt").read_bytes() == expected
-
-
-def test_the_service_has_survived(service: ServiceProcess, link: Connection) -> None:
-    """After all that the service runs, answers, and ends with status 0 when asked to."""
-    (status,) = find_services(link, patience_s=60.0)
-    assert status.instance == "garage"
-    assert status.state in {"ready", "running"}
-    link.close()
-    assert service.end()[0] == 0
-    assert not os.path.exists(f"/proc/{service.process.pid}")  # noqa: PTH110  a path of the kernel's, not of ours

@@ -15,7 +15,7 @@ from service_process import ServiceProcess
 @pytest.mark.parametrize("scenario", ["late", "jumps"])
 def test_final_tracks_are_those_that_were_recorded(scenario: str) -> None:
     """Frames published over Zenoh, late and with jumps of their stamps, give the recorded tracks."""
-    recorded = json.loads(FILE.read_text())[f"{scenario} core filter"]["final"]
+    recorded = json.loads(FILE.read_text())[f"{scenario} filter"]["final"]
     with ServiceProcess("--profile", str(PROFILE)) as service:
         service.wait_ready()
         with Node(service.endpoint) as node:

@@ -13,7 +13,6 @@ from optipmb_service.session.values import Tracked
 from optipmb_tools.datasets import open_dataset
 from optipmb_tools.recordings.files import RecordingWriter
 from optipmb_tools.run.tracking import track_whole
-from real_data import kitti_root
 from router import Sensor
 from service_process import ServiceProcess
 
@@ -59,15 +58,6 @@ def both(service: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFixture[
     return Both(service, tmp_path, capsys)
 
 
-def test_scene_at_full_speed(both: Both) -> None:
-    """A scene with clouds, as fast as tracks come back: the same file, no frame and no cloud missing."""
-    both.track(*SCENE)
-    (sequence,) = both.replay(*SCENE)["sequences"]
-    assert (sequence["sent"], sequence["returned"], sequence["missing"]) == (25, 25, 0)
-    assert (sequence["clouds"], sequence["clouds_missed"], sequence["problems"]) == (25, 0, 0)
-    assert 0.0 < sequence["latency"]["p50_ms"] <= sequence["latency"]["p99_ms"]
-
-
 def test_three_streams_at_once(both: Both) -> None:
     """Three scenes sent at the same time at full speed: each file equals its scene alone."""
     data = (*WITHOUT_CLOUDS, "--sequences", "0000", "0001", "0002")
@@ -102,14 +92,6 @@ def test_a_table_without_a_profile(service: ServiceProcess, tmp_path: Path, caps
     assert tracked.read_bytes() == replayed.read_bytes()
     rows = list(csv.DictReader(tracked.read_text().splitlines()))
     assert {row["confirmed"] for row in rows} == {"0", "1"}
-
-
-def test_kitti(both: Both) -> None:
-    """Recorded detections, with the few clouds that there are, give the same files, one by one and side by side."""
-    data = ("--dataset", "kitti", "--root", kitti_root(), "--detections", "pointrcnn", "--sequences", "0000", "0002")
-    both.track(*data)
-    for streams in (1, 2):
-        assert sum(entry["clouds"] for entry in both.replay(*data, "--streams", streams)["sequences"]) > 0
 
 
 @pytest.mark.parametrize("horizons", [(), (0.5, 1.0, 3.0)])

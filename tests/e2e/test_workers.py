@@ -16,8 +16,6 @@ KEYS = Keys()
 STREAMS = [f"yard/node-{number}/lidar" for number in range(6)]
 FRAMES = 12
 DEADLINE_S = 60.0
-LONGEST_SILENCE_S = 60.0
-"""The default of `stuck_s`, and the start of a process on a machine that is busy with other things."""
 OPTIONS = ("--workers", "2", "--instance", "pair")
 
 

@@ -1,6 +1,6 @@
-"""The service gives the bytes that it gave when they were recorded: packets in, bytes out, through public seams.
+"""The service gives the bytes that it gave when they were recorded: packets in, bytes out.
 
-`recordings.json` has, for each scenario, seam and tracker, how many outputs of each kind there were and the digest of
+`recordings.json` has, for each scenario and tracker, how many outputs of each kind there were and the digest of
 their bytes. With the `chained` tracker, which hashes the frames in their order, they depend on the service alone. With
 the `filter` they depend on the tracker too, whose numbers may differ on another kind of processor. After a change that
 is meant to change bytes, `OPTIPMB_TEST_RECORD=1 pytest tests/service/test_recordings.py` rewrites the file.
@@ -18,14 +18,12 @@ import pytest
 from fusing import FUSED
 from optipmb_service.cluster.leases import Change, partition_of
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint
-from optipmb_service.session.session import Session
-from optipmb_service.session.values import Output, Policy, Quarantined, RefusedError, Tracked
 from optipmb_service.streams.profiles import Profiles
 from optipmb_service.streams.queries import StreamQueries
 from optipmb_service.zenoh.inputs import Packet
 from registries import Around, packet_of, streams_of
 from router import SECOND
-from scenarios import FILE, PROFILE, SCENARIOS, SENSOR, STREAM, Raw, Recorded, Step, delivery
+from scenarios import FILE, PROFILE, SCENARIOS, SENSOR, STREAM, Raw, Recorded, Step
 from sessions import chained
 
 import optipmb
@@ -63,109 +61,7 @@ def told(counts: object, *names: str) -> bytes:
     return f"{type(counts).__name__}({', '.join(f'{name}={getattr(counts, name)}' for name in names)})".encode()
 
 
-class SessionSeam:
-    def __init__(self, stream: str, tracker: Callable[[optipmb.Parameters], Any], out: Recorded) -> None:
-        self._options: dict[str, Any] = {
-            "policy": Policy(late_clouds=True),
-            "instance": "test",
-            "tracker": lambda parameters: Failing(tracker(parameters)),
-        }
-        self._session = Session(stream, RECORDED, fused=stream == FUSED, **self._options)
-        self._out = out
-        self._now_ns = 1000 * SECOND
-        self._saved = self._session.snapshot()
-        self._waiting: list[Step] | None = None
-
-    def run(self, steps: Iterable[Step]) -> None:
-        for step in steps:
-            self._now_ns += BETWEEN_NS
-            self._step(step)
-        self._take(self._session.flush())
-        self._out.message(self._session.state())
-        self._out.add("counters", told(self._session.counters, *OF_SESSIONS))
-
-    def _step(self, step: Step) -> None:
-        if isinstance(step, tuple):
-            for one in step:
-                self._step(one)
-        elif isinstance(step, float):
-            self._now_ns += round(step * SECOND)
-        elif isinstance(step, str):
-            self._command(step)
-        elif self._waiting is not None:
-            self._waiting.append(step)
-        else:
-            self._message(step)
-        if self._session.deadline_ns is not None and self._session.deadline_ns <= self._now_ns:
-            self._take(self._session.on_tick(self._now_ns))
-
-    def _message(self, step: Step) -> None:
-        session = self._session
-        if isinstance(step, Raw):
-            self._raw(step.payload)
-        elif isinstance(step, schemas.Points):
-            self._take(session.on_points(step, self._now_ns))
-        elif isinstance(step, schemas.Detections):
-            self._take(session.on_detections(step, self._now_ns))
-        elif isinstance(step, schemas.ResetRequest):
-            self._take(session.reset())
-        elif isinstance(step, schemas.SessionParameters):
-            self._configure(step)
-
-    def _raw(self, payload: bytes) -> None:
-        try:
-            message = schemas.decode(payload, schemas.Detections)
-        except schemas.MessageError as error:
-            self._out.add(f"error {error.code}", str(error).encode())
-            self._session.refuse()
-        else:
-            self._take(self._session.on_detections(message, self._now_ns))
-
-    def _configure(self, asked: schemas.SessionParameters) -> None:
-        horizons = None if asked.horizons is None else asked.horizons.tolist()
-        profile = PROFILES.known.get(asked.profile or "")
-        try:
-            outputs = self._session.configure(profile, asked.cloud_wait_s, horizons, restart=asked.restart)
-        except RefusedError as error:
-            self._out.add("refused", str(error).encode())
-        else:
-            self._take(outputs)
-
-    def _command(self, command: str) -> None:
-        session = self._session
-        if command == "caches":
-            self._take(session.recovered(self._now_ns))
-        elif command == "take":
-            again, self._waiting = self._waiting or [], None
-            self._restore()
-            for step in again:
-                self._step(step)
-        else:
-            if command in {"keep", "leave"}:
-                self._saved = decode_checkpoint(encode_checkpoint(session.snapshot()))
-            if command == "leave":
-                self._waiting = [message for message, _ in session.unprocessed()]
-            if command == "kill":
-                self._restore()
-
-    def _restore(self) -> None:
-        self._session = Session.restore(self._saved, self._now_ns, **self._options)
-
-    def _take(self, outputs: Iterable[Output]) -> None:
-        for output in outputs:
-            if isinstance(output, Tracked):
-                self._out.message(output.tracks.model_copy(update={"delivery": delivery(output.run)}))
-            elif isinstance(output, schemas.Problem):
-                self._out.message(output)
-            elif isinstance(output, Quarantined):
-                self._out.add("quarantined", output.error.encode())
-            else:
-                self._out.add(
-                    f"begun {output.reason}", f"{self._out.session(output.session)} {output.jump_ns}".encode()
-                )
-
-
-class Process(Around):
+class Surroundings(Around):
     """The surroundings of a process that may hold the partitions; records published messages."""
 
     def __init__(self, out: Recorded, kept: dict[str, bytes]) -> None:
@@ -213,7 +109,7 @@ class Question:
         self.finished.set()
 
 
-class CoreSeam:
+class Process:
     """The streams of a process without a network: packets in, payloads out. The clock is the test's."""
 
     def __init__(self, stream: str, tracker: Callable[[optipmb.Parameters], Any], out: Recorded) -> None:
@@ -229,18 +125,18 @@ class CoreSeam:
             self.now_ns += BETWEEN_NS
             self._step(step)
             self._streams.resume()
-            self._process.run()
+            self._around.run()
         self._streams.finish()
-        self._process.run()
+        self._around.run()
         self._ask("state", None)
         self._out.add("totals", told(self._streams.totals(), *OF_SESSIONS, *OF_STREAMS))
 
     def _begin(self) -> None:
-        self._process = Process(self._out, self._kept)
+        self._around = Surroundings(self._out, self._kept)
         self._streams = streams_of(
-            self._process,
+            self._around,
             profiles=PROFILES,
-            reporter=self._process,
+            reporter=self._around,
             tracker=self._tracker,
             late_clouds=True,
             queue_frames=32,
@@ -274,42 +170,31 @@ class CoreSeam:
         elif command == "keep":
             self._streams.keep()
         elif command == "leave":
-            self._process.holding = False
+            self._around.holding = False
             self._streams.changed(partition_of(self._stream), Change.RECALLED)
         else:
             between = self._streams.recent([self._stream]) if command == "take" else []
             self._begin()
             self._streams.hold(self._stream)
             self._streams.take_up(self._stream, between)
-        self._process.run()
+        self._around.run()
 
     def _ask(self, name: str, message: schemas.Message | None) -> None:
         question = Question(KEYS.query(self._stream, name), message, self._out)  # type: ignore[arg-type]  # one of them
         self._queries.answer(question)  # type: ignore[arg-type]  # asked for no more
-        self._process.run()
+        self._around.run()
         assert question.finished.wait(60.0)
 
 
-SEAMS: Final = {"session": SessionSeam, "core": CoreSeam}
-
-
-def recorded(scenario: str, seam: str, tracker: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
-    out, stream = Recorded(), STREAM.get(scenario, SENSOR.stream)
-    one = SEAMS[seam](stream, TRACKERS[tracker], out)
-    if isinstance(one, CoreSeam):
-        monkeypatch.setattr(time, "monotonic_ns", lambda: one.now_ns)
-    one.run(SCENARIOS[scenario]())
-    return out.summary()
-
-
 @pytest.mark.parametrize("tracker", TRACKERS)
-@pytest.mark.parametrize("seam", SEAMS)
 @pytest.mark.parametrize("scenario", SCENARIOS)
-def test_outputs_are_those_that_were_recorded(
-    scenario: str, seam: str, tracker: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Every scenario gives, through every seam, the tracks, problems, replies and counters of the recording."""
-    found, name = recorded(scenario, seam, tracker, monkeypatch), f"{scenario} {seam} {tracker}"
+def test_outputs_are_those_that_were_recorded(scenario: str, tracker: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every scenario gives the tracks, problems, replies and counters of the recording."""
+    out, name = Recorded(), f"{scenario} {tracker}"
+    one = Process(STREAM.get(scenario, SENSOR.stream), TRACKERS[tracker], out)
+    monkeypatch.setattr(time, "monotonic_ns", lambda: one.now_ns)
+    one.run(SCENARIOS[scenario]())
+    found = out.summary()
     recordings = json.loads(FILE.read_text()) if FILE.exists() else {}
     if RECORD:
         FILE.write_text(json.dumps(recordings | {name: found}, indent=1, sort_keys=True) + "\n")

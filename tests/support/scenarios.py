@@ -30,7 +30,7 @@ from router import Sensor
 from sessions import Merged
 
 FILE: Final = Path(__file__).with_name("recordings.json")
-"""The outputs as they were recorded, by scenario, seam and tracker."""
+"""The outputs as they were recorded, by scenario and tracker."""
 PROFILE: Final = Path(__file__).with_name("recordings.toml")
 
 Command = Literal["keep", "kill", "leave", "take", "caches"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -135,20 +134,6 @@ def test_extraction_goes_on_for_longer_behind_an_occlusion() -> None:
     assert shown[0] > shown[1] > 10
 
 
-def test_a_flipped_heading_does_not_turn_the_track() -> None:
-    """Where the detector may turn a box by pi, the yaw stays and the id too, moving or standing."""
-    rng = np.random.default_rng(4)
-    for speed in (0.0, 6.0):
-        frames = []
-        for k in range(40):
-            yaw = 0.3 + rng.normal(0, 0.05) + math.pi * (k > 5 and rng.random() < 0.4)
-            xy = (speed * 0.1 * k * math.cos(0.3), speed * 0.1 * k * math.sin(0.3))
-            frames.append(boxes(KITTI, 0.1 * k, xy, yaw=yaw))
-        for result in steps(KITTI, frames):
-            np.testing.assert_array_equal(result.tracks.id, [1])
-            assert abs(math.remainder(result.tracks.yaw[0] - 0.3, 2 * math.pi)) < 0.5
-
-
 def test_a_track_born_backwards_drives_backwards() -> None:
     """A box that is always turned by pi: the velocity over ground is right, its sign along the yaw negative."""
     frames = [boxes(KITTI, 0.1 * k, (6.0 * 0.1 * k, 0.0), yaw=math.pi) for k in range(30)]
@@ -173,27 +158,6 @@ def test_a_thousand_detections() -> None:
     for result in steps(KITTI, frames):
         np.testing.assert_array_equal(result.tracks.id, np.arange(1, 1001))
         assert len(set(result.tracks.detection.tolist())) == 1000
-
-
-@pytest.mark.parametrize("label", KITTI.labels)
-def test_ten_seconds_of_silence_end_every_track(label: str) -> None:
-    """After a gap past the limit nothing old is left to be associated: the object gets a new id."""
-    first = boxes(KITTI, 0, (0, 0), label=label)
-    gap = steps(KITTI, [first, boxes(KITTI, 10, (0, 0), label=label)])
-    np.testing.assert_array_equal(gap[1].tracks.id, [2])
-
-
-def test_missed_frames_widen_and_weaken_a_track() -> None:
-    """While an object is missed its covariance grows, its existence falls, and in the end it is gone."""
-    frames = [boxes(NUSCENES, 0.5 * k, (0, 0) if k < 5 else (), label="car", velocity=(0, 0)) for k in range(30)]
-    results = steps(NUSCENES, frames)
-    alive = [result.density.bernoulli for result in results if len(result.density.bernoulli.id)]
-    missed = alive[4:]
-    assert 3 <= len(missed) < 25
-    for before, after in pairwise(missed):
-        assert np.linalg.eigvalsh(after.covariance[0, :2, :2] - before.covariance[0, :2, :2]).min() > 0
-        assert after.existence[0] < before.existence[0]
-    assert len(results[-1].density.bernoulli.id) == 0
 
 
 @pytest.mark.parametrize("stop", [30, 0])
@@ -223,16 +187,6 @@ def test_people_side_by_side_are_two_where_both_are_sure(doubt: float, count: in
         }
         tracks = tracker.update({**boxes, "score": [0.95, 1.0 - doubt]}, t=0.1 * k, label=["pedestrian"] * 2)
     assert len(tracks) == count
-
-
-def test_an_irregular_stream_keeps_its_track() -> None:
-    """Between 20 ms and 300 ms apart, the same object at constant speed keeps its id and its speed."""
-    rng = np.random.default_rng(2)
-    stamps = np.cumsum(rng.uniform(0.02, 0.3, 60))
-    frames = [boxes(KITTI, t, (7.0 * t, 0.0)) for t in stamps]
-    results = steps(KITTI, frames)
-    assert {result.tracks.id.tolist()[0] for result in results} == {1}
-    np.testing.assert_allclose(results[-1].tracks.velocity, [[7.0, 0.0]], atol=0.3)
 
 
 def test_a_stamp_that_goes_back_is_refused() -> None:

@@ -25,8 +25,6 @@ LENSES: Final = {
     "five": [-0.28, 0.07, 0.001, -0.0008, 0.01],
     "rational": [0.3, -0.05, 0.0004, 0.0002, 0.002, 0.4, 0.02, 0.001],
 }
-EXACT: Final = {"pixel": [1e-6, 0.0], "tilt": 0.0, "height": 0.0}
-"""A camera and boxes without errors."""
 
 
 def pinhole(*, down: float = 0.0, yaw: float = 0.0, lens: dict[str, Any] | None = None, **more: Any) -> dict[str, Any]:

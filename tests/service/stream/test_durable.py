@@ -403,22 +403,3 @@ def test_beyond_the_limit_a_stream_is_refused(start: Callable[..., Any]) -> None
 def _memory_kb() -> int:
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * (resource.getpagesize() // 1024)
-
-
-def test_fifty_sessions_are_restored(start: Callable[..., Any], tmp_path: Path) -> None:
-    """Fifty sessions of a hundred objects are all restored without a lost frame."""
-    sensors = [replace(SENSOR, stream=f"site/node/{number}", objects=100) for number in range(50)]
-    service, endpoint = start(store=str(tmp_path))
-    with Node(endpoint) as node:
-        for sensor in sensors:
-            node.send(*(sensor.detections(seq) for seq in range(5)))
-        for sensor in sensors:
-            node.tracks(sensor.stream, 5)
-    assert service.stop()
-    _, endpoint = start(store=str(tmp_path))
-    with Node(endpoint) as node:
-        for sensor in sensors:
-            node.send(sensor.detections(5))
-        for sensor in sensors:
-            node.tracks(sensor.stream, 1)
-        assert all(node.tracks(sensor.stream, 1)[0].gap == 0 for sensor in sensors)

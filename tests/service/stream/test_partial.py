@@ -7,7 +7,6 @@ import optipmb_schemas as schemas
 import pytest
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Tracked
 from router import Sensor
 from sessions import Merged, feed, tracks
 
@@ -37,18 +36,6 @@ def test_tracks_say_what_is_known(profile: str) -> None:
         payload = schemas.encode(message)
         assert schemas.decode(payload, schemas.Tracks) == message
         assert schemas.decode(schemas.encode_json(message), schemas.Tracks) == message
-
-
-@pytest.mark.parametrize("profile", PROFILES)
-def test_published_bytes_are_those_of_the_message(profile: str) -> None:
-    """Columns are written without a message between; both ways give the same bytes, also with `measured`."""
-    one = Session(SENSOR.stream, optipmb.load_profile(profile))
-    outputs = [one for one in feed(one, range(3), SENSOR, **POINTS) if isinstance(one, Tracked)]
-    times = dict.fromkeys(("queue_ms", "decode_ms", "step_ms"), 0.0)
-    delivery: dict[str, Any] = {"instance": "a", "received_ns": 1, "published_ns": 2, **times, "run": 1}
-    for output in outputs:
-        message = output.tracks.model_copy(update={"delivery": schemas.Delivery(**delivery)})
-        assert output.encoded(delivery) == schemas.encode(message)
 
 
 @pytest.mark.parametrize("profile", PROFILES)

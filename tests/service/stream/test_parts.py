@@ -1,7 +1,6 @@
-"""The small parts: turns, problems, figures, profiles, settings, and what imports what."""
+"""The small parts: problems, figures, profiles, settings, and what imports what."""
 
 import re
-import threading
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,6 @@ from optipmb_service.session.pending import CloudBuffer
 from optipmb_service.session.problems import problem_of
 from optipmb_service.settings import SettingsInvalidError, load
 from optipmb_service.streams.profiles import Profiles
-from optipmb_service.streams.streams import Scheduler
 from optipmb_service.telemetry.problem_reporter import LOGGED_PER_SECOND, PUBLISHED_PER_SECOND, ProblemReporter
 from optipmb_service.telemetry.stream_meter import StreamMeter
 from router import SECOND, Sensor
@@ -21,24 +19,6 @@ from structlog.testing import capture_logs
 import optipmb
 
 SENSOR = Sensor()
-
-
-# Turns
-
-
-def test_a_step_that_does_not_end_does_not_keep_the_scheduler() -> None:
-    """Closing gives up on a step that does not end, and says so."""
-    entered, gate = threading.Event(), threading.Event()
-
-    def stuck() -> bool:
-        entered.set()
-        return gate.wait(60) and False
-
-    scheduler = Scheduler()
-    scheduler.submit(stuck)
-    assert entered.wait(60)
-    assert not scheduler.close(0.05)
-    gate.set()
 
 
 # Problems

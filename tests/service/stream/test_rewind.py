@@ -1,5 +1,6 @@
 """Late, repeated and disordered messages: the session ends where it would have ended had all come once and in order."""
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -71,7 +72,9 @@ def test_later_than_the_window_is_late() -> None:
     one = session()
     feed(one, [*range(5), *range(6, 30)], SENSOR)
     before = state_bytes(one.snapshot())
-    assert [(p.code, p.seq) for p in problems(feed(one, [5], SENSOR))] == [("late", 5)]
+    (problem,) = problems(feed(one, [5], SENSOR))
+    assert (problem.code, problem.seq, problem.path) == ("late", 5, "stamp_ns")
+    assert re.fullmatch(r"Frame 5: it came too late, \d\.\d+ s before the newest one\.", problem.message)
     assert state_bytes(one.snapshot()) == before
     assert one.counters.late == 1
 

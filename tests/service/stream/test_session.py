@@ -31,22 +31,6 @@ def feed(one: Session, seqs: Any, sensor: Sensor = SENSOR, **changes: Any) -> li
     return sessions.feed(one, seqs, sensor, **changes)
 
 
-def test_the_same_messages_give_the_same_bytes() -> None:
-    """Two sessions fed alike publish equal bytes, with clouds, repeats, restarts and gaps."""
-
-    def run() -> list[bytes]:
-        one, outputs = session(), []
-        for seq in (0, 1, 2, 2, 5, 6, 90, 91, 92, 93):
-            outputs += one.on_points(SENSOR.points(seq), 0)
-            outputs += one.on_detections(SENSOR.detections(seq), 0)
-        outputs += one.on_detections(replace(SENSOR, epoch=b"f" * 16).detections(0), 0)
-        return [plain(message) for message in tracks(outputs)]
-
-    first = run()
-    assert len(first) == 8
-    assert first == run()
-
-
 def test_tracks_say_what_made_them() -> None:
     """Tracks carry the header of their frame, the profile, and indices into the sender's own arrays."""
     message = tracks(feed(session(), range(5)))[-1]
@@ -104,18 +88,6 @@ def test_gaps_are_counted_and_published() -> None:
     one = session()
     assert [message.gap for message in tracks(feed(one, [3, 4, 8, 9, 11]))] == [0, 0, 3, 0, 1]
     assert one.state().gaps == 4
-
-
-def test_late_frames_are_refused_with_a_problem() -> None:
-    """A frame later than the window changes nothing and is reported."""
-    one = session(policy=Policy(rewind_ns=0))
-    feed(one, [0, 1, 3])
-    density = one.density
-    found = problems(feed(one, [2]))
-    assert [(p.code, p.seq, p.path) for p in found] == [("late", 2, "stamp_ns")]
-    assert re.fullmatch(r"Frame 2: it came too late, \d\.\d+ s before the newest one\.", found[0].message)
-    assert one.density is density
-    assert one.counters.late == 1
 
 
 def test_a_restarted_publisher_continues() -> None:
@@ -451,15 +423,6 @@ def test_state_counts() -> None:
     assert (state.seq, state.stamp_ns, state.epoch) == (40, SENSOR.stamp_ns(40), SENSOR.epoch)
     assert (state.shed, state.queue) == (2, 3)
     assert state.next_id > 0
-
-
-def test_equal_stamps_are_tracked() -> None:
-    """Two frames of one stamp are two frames, in the order of their numbers."""
-    one = session()
-    outputs = feed(one, [0])
-    outputs += one.on_detections(SENSOR.detections(1, stamp_ns=SENSOR.stamp_ns(0)), 0)
-    assert [message.seq for message in tracks(outputs)] == [0, 1]
-    assert SENSOR.stamp_ns(1) - SENSOR.stamp_ns(0) == SECOND // 10
 
 
 def test_a_stamp_ahead_ends_no_track() -> None:

@@ -9,7 +9,6 @@ from prometheus_client import CollectorRegistry, Histogram, generate_latest
 from structlog.testing import capture_logs
 
 DURATIONS = (0.0, 1e-9, 0.0005, 0.00051, 0.001, 0.0999, 0.1, 1.0, 5.0, 5.1, 1e9)
-NAMES = ("latency", "queue", "decode", "step")
 
 
 def filled() -> Metrics:

@@ -159,27 +159,6 @@ def test_too_large_messages_are_refused_unread(start: Callable[..., Any]) -> Non
         assert node.problem(SENSOR.stream, "too_large").received == "3000 bytes"
 
 
-def test_garbage_on_every_key_costs_nothing(node: Node) -> None:
-    """Random bytes on every kind of key, and a stream that is tracked meanwhile comes out unchanged."""
-    random = np.random.default_rng(1)
-    for seq in range(30):
-        for topic in ("detections", "points", "tracks", "problems", "q/state", "other"):
-            for stream in (SENSOR.stream, f"x/{seq}/y", f"owner/{seq}/y", f"bad key/{seq}/ü"):
-                node.send_raw(f"optipmb/v1/{stream}/{topic}", random.bytes(int(random.integers(0, 200))))
-        node.send(SENSOR.detections(seq))
-    key = KEYS.tracks(SENSOR.stream)
-
-    def ours() -> list[bytes]:
-        good = encoding_of(Tracks)
-        return [payload for at, payload, encoding in node.tracks_seen.items if at == key and encoding == good]
-
-    node.tracks_seen.wait(lambda _: len(ours()) >= 30, "30 tracks")
-    assert [plain(decode(payload, Tracks)) for payload in ours()] == offline(SENSOR, range(30))
-    status = node.ask(KEYS.status("test"), ServiceStatus)
-    assert [summary.stream for summary in status.sessions] == [SENSOR.stream]
-    assert status.refused >= 60
-
-
 def test_a_flooding_stream_does_not_touch_another(start: Callable[..., Any]) -> None:
     """One stream sends garbage as fast as it can; the other's tracks are byte for byte the same."""
     _, endpoint = start()
@@ -386,25 +365,6 @@ def test_status(node: Node) -> None:
     assert [problem.code for problem in status.problems] == ["malformed"]
     assert [key for _, key, _ in node.query(KEYS.all_status())] == [KEYS.status("test")]
     assert node.alive(KEYS.all_alive()) == [KEYS.alive("test")]
-
-
-def test_sessions_are_limited_and_idle_ones_freed(start: Callable[..., Any]) -> None:
-    """Beyond the limit a stream is refused with a problem; when an idle one is closed there is room again."""
-    service, endpoint = start(max_sessions=1, idle_s=0.05)
-    other = replace(SENSOR, stream="site/node/other")
-    with Node(endpoint) as node:
-        node.send(SENSOR.detections(0))
-        node.tracks(SENSOR.stream, 1)
-        node.send(other.detections(0))
-        assert node.problem(other.stream, "refused").stream == other.stream
-
-        def freed() -> bool:
-            service.housekeeping()
-            return bool(service.status().sessions == ())
-
-        until(freed, "the idle session is closed")
-        node.send(other.detections(1))
-        assert node.tracks(other.stream, 1)[0].seq == 1
 
 
 def test_a_silent_stream_is_stale(start: Callable[..., Any]) -> None:
