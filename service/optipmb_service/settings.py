@@ -22,6 +22,7 @@ from fnmatch import fnmatchcase
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from urllib.parse import urlsplit
 
 from optipmb_schemas import DEFAULT, Keys, Limits, MessageError
 from pydantic import (
@@ -78,7 +79,21 @@ def address(value: str) -> str:
     """
     if value and not re.fullmatch(r"([A-Za-z0-9_.-]+|\[[0-9A-Fa-f:.%]+\]):\d{1,5}", value):
         raise ValueError(f"an address looks like 127.0.0.1:8080, received {value!r}")
+    _with_port(f"//{value}")
     return value
+
+
+def _with_port(url: str) -> str:
+    """Return an address of a server as it is, if its port is one.
+
+    Raises:
+        ValueError: it is none.
+    """
+    try:
+        urlsplit(url).port  # noqa: B018 - it is checked when it is read
+    except ValueError as error:
+        raise ValueError(f"a port is a number up to 65535: {error}") from error
+    return url
 
 
 def without_password(server: str) -> str:
@@ -103,7 +118,9 @@ Address = Annotated[str, AfterValidator(address)]
 Pattern = Annotated[
     str, _form(r"[A-Za-z0-9_.*-]+(/[A-Za-z0-9_.*-]+){2}", "a pattern of streams looks like site/*/lidar*")
 ]
-Server = Annotated[str, _form(r"(nats|tls)://\S+", "a NATS server looks like nats://127.0.0.1:4222")]
+Server = Annotated[
+    str, _form(r"(nats|tls)://\S+", "a NATS server looks like nats://127.0.0.1:4222"), AfterValidator(_with_port)
+]
 Endpoint = Annotated[
     str,
     _form(r"[a-z0-9]+/[^\s/#?]+:\d+([?#]\S*)?|[a-z0-9-]+/\S+", f"an endpoint looks like {DEFAULT_LISTEN}"),
@@ -293,7 +310,9 @@ class MqttSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    broker: Annotated[str, _form(r"mqtts?://[^\s/@]+", "a broker looks like mqtt://127.0.0.1:1883")] = DEFAULT_MQTT
+    broker: Annotated[
+        str, _form(r"mqtts?://[^\s/@]+", "a broker looks like mqtt://127.0.0.1:1883"), AfterValidator(_with_port)
+    ] = DEFAULT_MQTT
     """address of the broker; `mqtts://` with TLS"""
     credentials: Path | None = None
     """file with `user:password`"""
@@ -931,11 +950,12 @@ def load(
             message = f"unknown setting{_near(first['loc'])}"
         elif isinstance(first["input"], str | int | float):
             message = f"{message[:1].lower()}{message[1:]}; received {first['input']!r}"
-        raise SettingsInvalidError(f"setting {path}{where}: {message}") from error
+        raise SettingsInvalidError(f"setting {path}{where}: {without_password(message)}") from error
     if not settings.endpoints and not settings.connect:
         raise SettingsInvalidError("setting listen: neither an endpoint to listen on nor one to connect to")
     if settings.fuse and not settings.rewind_s:
         raise SettingsInvalidError("setting fuse: sensors do not come in order of their stamps: rewind_s must not be 0")
+    _check_patterns(settings)
     _check_fused(settings)
     _check_cluster(settings)
     _check_zones(settings)
@@ -995,6 +1015,20 @@ def _check_cluster(settings: Settings) -> None:
             raise SettingsInvalidError(f"setting cluster_tls: {folder}: cert.pem and key.pem belong together")
     if file is not None and not file.is_file():
         raise SettingsInvalidError(f"setting cluster_credentials: {file}: no such file")
+
+
+def _check_patterns(settings: Settings) -> None:
+    """Refuse patterns of which an earlier one matches all: the first match applies.
+
+    Raises:
+        SettingsInvalidError: there are such.
+    """
+    for name in ("profiles", "sensors", "outputs", "inputs", "rejoin", "cpm"):
+        patterns = list(getattr(settings, name))
+        for number, pattern in enumerate(patterns):
+            if before := next((one for one in patterns[:number] if fnmatchcase(pattern, one)), None):
+                reason = f"never applies, for {before} is before it and matches all of it: put the narrower one first"
+                raise SettingsInvalidError(f"setting {name}.{pattern}: {reason}")
 
 
 def _check_fused(settings: Settings) -> None:

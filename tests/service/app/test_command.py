@@ -270,12 +270,23 @@ def test_settings_have_an_order(
         ("limits.max_byte = 2000", "unknown setting; did you mean max_bytes?"),
         ('profiles = {"a/*/*" = "there-is-none.toml"}', "there-is-none.toml: no such file"),
         ('zenoh_config = "there-is-none.json5"', "there-is-none.json5: no such file"),
+        ('http = "127.0.0.1:99999"', "setting http (from the file): a port is a number up to 65535"),
+        ('grpc = "127.0.0.1:65536"', "setting grpc (from the file): a port is a number up to 65535"),
+        (
+            'mqtt.broker = "mqtt://127.0.0.1:mqtt"',
+            "setting mqtt.broker (from the file): a port is a number up to 65535",
+        ),
+        ('cluster = ["nats://user:secret@10.0.0.1:70000"]', "received 'nats://***@10.0.0.1:70000'"),
+        (
+            'outputs = {"*/*/*" = {rate_hz = 5}, "garage/*/*" = {rate_hz = 20}}',
+            "setting outputs.garage/*/*: never applies, for */*/* is before it and matches all of it",
+        ),
     ],
 )
 def test_config_names_what_is_wrong(
     content: str, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """An unknown setting with the one that it may be meant to be, and a file that is missing."""
+    """An unknown setting, a missing file, a port that is none, a pattern that never applies; no password is shown."""
     file = tmp_path / "settings.toml"
     file.write_text(content)
     with pytest.raises(SystemExit):
