@@ -10,6 +10,8 @@ from typing import TypeVar
 
 from optipmb_schemas import Message, decode
 
+from optipmb_client.merging import remember
+
 __all__ = ["Answer", "Arrival", "Inbox"]
 
 _Message = TypeVar("_Message", bound=Message)
@@ -61,7 +63,7 @@ class Inbox:
         self._capacity = capacity
         self._changed = threading.Condition()
         self._closed = False
-        self._dropped_keys: set[str] = set()
+        self._dropped_keys: collections.OrderedDict[str, None] = collections.OrderedDict()
         self.dropped = 0
 
     @property
@@ -75,7 +77,7 @@ class Inbox:
             if self._closed:
                 return
             if len(self._entries) >= self._capacity:
-                self._dropped_keys.add(self._entries.popleft().key)
+                remember(self._dropped_keys, self._entries.popleft().key, None)
                 self.dropped += 1
             self._entries.append(arrival)
             self._changed.notify()
@@ -88,7 +90,7 @@ class Inbox:
                 return None
             arrival = self._entries.popleft()
             if arrival.key in self._dropped_keys:
-                self._dropped_keys.discard(arrival.key)
+                del self._dropped_keys[arrival.key]
                 arrival = replace(arrival, after_loss=True)
             return arrival
 

@@ -9,7 +9,7 @@ are higher.
 import collections
 import enum
 import hashlib
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from optipmb_schemas import Events, Tracks
 
@@ -17,6 +17,20 @@ MOST_HELD = 4096
 """Messages held of a stream; beyond it the oldest are dropped, as when a service cannot write checkpoints."""
 MOST_SESSIONS = 1024
 """Sessions of a stream whose order is remembered."""
+MOST_STREAMS = 65_536
+"""Streams of which a reader remembers something: as many as a cluster knows."""
+
+K = TypeVar("K")
+V = TypeVar("V")
+
+
+def remember(entries: "collections.OrderedDict[K, V]", key: K, value: V) -> V:
+    """Set the value of a key as the newest of `MOST_STREAMS` entries, and return it."""
+    entries[key] = value
+    entries.move_to_end(key)
+    if len(entries) > MOST_STREAMS:
+        entries.popitem(last=False)
+    return value
 
 
 class Novelty(enum.Enum):
@@ -115,6 +129,18 @@ class FinalEvents:
 
     def _place(self, message: Events) -> tuple[int, int]:
         return self._sessions.get(message.session, 0), message.stamp_ns
+
+
+class FinalEventsOfStreams:
+    """Holds events of many streams until they are final, as `FinalEvents`; of those silent the longest none."""
+
+    def __init__(self) -> None:
+        self._streams: collections.OrderedDict[str, FinalEvents] = collections.OrderedDict()
+
+    def take(self, message: Events) -> list[Events]:
+        """Add a message; return the messages of its stream that are final now."""
+        of_stream = self._streams.get(message.stream) or FinalEvents()
+        return remember(self._streams, message.stream, of_stream).take(message)
 
 
 def _run(message: Events) -> int:

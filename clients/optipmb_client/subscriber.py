@@ -15,7 +15,7 @@ from optipmb_schemas import PREFIX, Events, Keys, Message, MessageError, Problem
 
 from optipmb_client.incoming import Arrival, Inbox
 from optipmb_client.links import Link, linked
-from optipmb_client.merging import FinalEvents, Merging, Novelty
+from optipmb_client.merging import FinalEventsOfStreams, Merging, Novelty, remember
 
 __all__ = ["EventSubscriber", "Missed", "Received", "Statistics", "Subscriber"]
 
@@ -167,7 +167,7 @@ class EventSubscriber(_Subscription):
     ) -> None:
         self.timeout = timeout
         self._final = final
-        self._streams: dict[str, FinalEvents] = collections.defaultdict(FinalEvents)
+        self._streams = FinalEventsOfStreams()
         opened = partial(linked, connect, config=config, timeout=connect_timeout)
         super().__init__(pattern, ("events",), queue, prefix, connection, opened, history=True)
 
@@ -175,7 +175,7 @@ class EventSubscriber(_Subscription):
         """Iterate over the messages until `timeout` or `close`."""
         while (arrival := self._inbox.get(self.timeout)) is not None:
             if (message := self._read(arrival, Events)) is not None:
-                for one in self._streams[message.stream].take(message) if self._final else (message,):
+                for one in self._streams.take(message) if self._final else (message,):
                     self._counts["delivered"] += 1
                     yield one
 
@@ -234,12 +234,13 @@ class Subscriber(_Subscription):
         self._on_problem = on_problem
         self._merging = Merging(REMEMBERED)
         self._corrections = corrections
-        self._newest: dict[tuple[str, str | None], tuple[bytes, int, int]] = {}
+        self._newest: collections.OrderedDict[tuple[str, str | None], tuple[bytes, int, int]]
+        self._newest = collections.OrderedDict()
         self._missed: collections.deque[Missed] = collections.deque(maxlen=MISSED)
         tracks: Topic = "now" if predict else "tracks"
         topics: tuple[Topic, ...] = (tracks,) if on_problem is None else (tracks, "problems")
         opened = partial(linked, connect, config=config, timeout=connect_timeout)
-        self._fastest_ns: dict[str, int] = {}
+        self._fastest_ns: collections.OrderedDict[str, int] = collections.OrderedDict()
         self._began_ns = time.time_ns() if history else 0
         super().__init__(pattern, topics, queue, prefix, connection, opened, history=history)
 
@@ -280,8 +281,8 @@ class Subscriber(_Subscription):
         took_ns = arrived_ns - published_ns  # two clocks: only differences are meaningful
         if published_ns < self._began_ns:
             return True
-        fastest_ns = self._fastest_ns[tracks.stream] = min(took_ns, self._fastest_ns.get(tracks.stream, took_ns))
-        return took_ns - fastest_ns > RECOVERED_NS
+        fastest_ns = min(took_ns, self._fastest_ns.get(tracks.stream, took_ns))
+        return took_ns - remember(self._fastest_ns, tracks.stream, fastest_ns) > RECOVERED_NS
 
     @property
     def missed(self) -> tuple[Missed, ...]:
@@ -293,7 +294,7 @@ class Subscriber(_Subscription):
         known = self._newest.get(sensor)
         if known is not None and known[0] == tracks.epoch and known[1] >= tracks.seq:
             return
-        self._newest[sensor] = tracks.epoch, tracks.seq, tracks.stamp_ns
+        remember(self._newest, sensor, (tracks.epoch, tracks.seq, tracks.stamp_ns))
         if known is None or not after_loss:
             return
         epoch, seq, stamp_ns = known

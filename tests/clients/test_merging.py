@@ -5,7 +5,9 @@ from dataclasses import dataclass
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from optipmb_client.merging import FinalEvents, Merging, Novelty
+from optipmb_client import merging
+from optipmb_client.incoming import Arrival, Inbox
+from optipmb_client.merging import FinalEvents, FinalEventsOfStreams, Merging, Novelty
 from optipmb_schemas import Delivery, Events, Tracks, ZoneEvent
 from tracks_message import tracks_message
 
@@ -22,38 +24,38 @@ def message(seq: int, *, content: int, revision: int = 0, run: int = 0, session:
 
 def test_a_repetition_brings_nothing() -> None:
     """The same tracks again, also in another run and under another revision, and older ones, are repetitions."""
-    merging = Merging(10)
-    assert merging.take(message(0, content=1)) is Novelty.NEW
-    assert merging.take(message(0, content=1)) is Novelty.REPEATED
-    assert merging.take(message(0, content=1, revision=2)) is Novelty.REPEATED
-    assert merging.take(message(0, content=2, revision=1)) is Novelty.REPEATED
-    assert merging.take(message(0, content=1, run=1)) is Novelty.REPEATED
+    merged = Merging(10)
+    assert merged.take(message(0, content=1)) is Novelty.NEW
+    assert merged.take(message(0, content=1)) is Novelty.REPEATED
+    assert merged.take(message(0, content=1, revision=2)) is Novelty.REPEATED
+    assert merged.take(message(0, content=2, revision=1)) is Novelty.REPEATED
+    assert merged.take(message(0, content=1, run=1)) is Novelty.REPEATED
 
 
 def test_what_is_later_holds() -> None:
     """A higher revision replaces, and a later run at any revision."""
-    merging = Merging(10)
-    merging.take(message(0, content=1, revision=3))
-    assert merging.take(message(0, content=2, revision=4)) is Novelty.CORRECTION
-    assert merging.take(message(0, content=3, run=1)) is Novelty.CORRECTION
-    assert merging.take(message(0, content=4, revision=9)) is Novelty.REPEATED
+    merged = Merging(10)
+    merged.take(message(0, content=1, revision=3))
+    assert merged.take(message(0, content=2, revision=4)) is Novelty.CORRECTION
+    assert merged.take(message(0, content=3, run=1)) is Novelty.CORRECTION
+    assert merged.take(message(0, content=4, revision=9)) is Novelty.REPEATED
 
 
 def test_a_session_begun_anew_is_heard() -> None:
     """A service without checkpoints counts from nothing; what the session before it sent does not come back."""
-    merging = Merging(10)
-    merging.take(message(0, content=1, revision=3))
-    assert merging.take(message(0, content=2, session="1" * 32)) is Novelty.CORRECTION
-    assert merging.take(message(0, content=1, revision=2)) is Novelty.REPEATED
+    merged = Merging(10)
+    merged.take(message(0, content=1, revision=3))
+    assert merged.take(message(0, content=2, session="1" * 32)) is Novelty.CORRECTION
+    assert merged.take(message(0, content=1, revision=2)) is Novelty.REPEATED
 
 
 def test_memory_is_bounded() -> None:
     """The oldest frames are forgotten."""
-    merging = Merging(4)
+    merged = Merging(4)
     for seq in range(10):
-        merging.take(message(seq, content=seq))
-    assert merging.take(message(9, content=9)) is Novelty.REPEATED
-    assert merging.take(message(0, content=0)) is Novelty.NEW
+        merged.take(message(seq, content=seq))
+    assert merged.take(message(9, content=9)) is Novelty.REPEATED
+    assert merged.take(message(0, content=0)) is Novelty.NEW
 
 
 @dataclass(frozen=True)
@@ -75,9 +77,9 @@ sent = st.builds(Sent, st.integers(0, 3), st.integers(0, 2), st.integers(0, 3))
 @given(st.lists(sent, max_size=40))
 def test_the_end_does_not_depend_on_the_way(messages: list[Sent]) -> None:
     """In any order and number of messages, the latest of each frame is given out last."""
-    merging, last = Merging(100), {}
+    merged, last = Merging(100), {}
     for one in messages:
-        if merging.take(one.tracks) is not Novelty.REPEATED:
+        if merged.take(one.tracks) is not Novelty.REPEATED:
             last[one.seq] = one
     assert last == {
         seq: max((one for one in messages if one.seq == seq), key=lambda one: (one.run, one.revision))
@@ -165,3 +167,27 @@ def test_events_come_once_when_they_are_final(messages: list[Events], released: 
     """In the order of the frames, as the last run and revision says."""
     merged = FinalEvents()
     assert [event.n for one in messages for final in merged.take(one) for event in final.events] == released
+
+
+def test_events_of_streams_that_are_silent_the_longest_are_not_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Readers of all streams hold those of a bounded number of streams: names are arbitrary."""
+    monkeypatch.setattr(merging, "MOST_STREAMS", 2)
+    streams = FinalEventsOfStreams()
+    for name in ("a/b/ended", "a/b/one", "a/b/other"):
+        assert streams.take(events(1, 1, final=(A, 0)).model_copy(update={"stream": name})) == []
+    settled = events(2, 2, final=(A, 2))
+    assert streams.take(settled.model_copy(update={"stream": "a/b/ended"})) == []
+    (released,) = streams.take(settled.model_copy(update={"stream": "a/b/other"}))
+    assert released.stream == "a/b/other"
+
+
+def test_keys_of_dropped_messages_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A full inbox marks the next message of a key after a loss, for the keys that lost last."""
+    monkeypatch.setattr(merging, "MOST_STREAMS", 1)
+    inbox = Inbox(1)
+    found = []
+    for keys in ("abc", "a", "b"):
+        for key in keys:
+            inbox.put(Arrival(key, b"", "", 0))
+        found.append(inbox.get())
+    assert [(one.key, one.after_loss) for one in found if one] == [("c", False), ("a", False), ("b", True)]

@@ -23,6 +23,7 @@ from urllib.parse import urlsplit
 import optipmb_schemas as schemas
 import structlog
 from optipmb_client.errors import ClientError, ConnectionFailed
+from optipmb_client.merging import remember
 from optipmb_schemas.certificates import context_of
 from optipmb_schemas.json_form import Selection
 from paho.mqtt import client as paho
@@ -249,7 +250,7 @@ class Bridge(Component):
         self.left_out: collections.Counter[str] = collections.Counter()
         """Objects without a place in the CPM, by reason."""
         self._settings = settings
-        self._stations: dict[str, Station | None] = {}
+        self._stations: collections.OrderedDict[str, Station | None] = collections.OrderedDict()
         self._seen: dict[str, float] = {}  # when the field of view of a sensor was taken, monotonic
         self._keys = client.keys
         self._why = "not connected yet"
@@ -275,9 +276,12 @@ class Bridge(Component):
         self._lost = 0
         self._unsent: list[Unsent] = []
         self._most = 0  # bytes of a packet that the broker takes; 0: it does not say
-        self._largest: dict[str, int] = {}  # confirmed on this connection, by topic
-        self._refusing: dict[str, str] = {}  # why the newest message was refused, by topic
-        self._impossible: dict[str, tuple[int, float]] = {}  # size that ended connections, and when, by topic
+        self._largest: collections.OrderedDict[str, int] = collections.OrderedDict()
+        """Bytes of the largest message that was confirmed on this connection, by topic."""
+        self._refusing: collections.OrderedDict[str, str] = collections.OrderedDict()
+        """Why the newest message was refused, by topic."""
+        self._impossible: collections.OrderedDict[str, tuple[int, float]] = collections.OrderedDict()
+        """Size that ended connections, and when, by topic."""
 
     @property
     def lost(self) -> int:
@@ -398,7 +402,7 @@ class Bridge(Component):
         """Queue the CPM that are due after a frame."""
         stream = tracks.stream
         if stream not in self._stations:
-            self._stations[stream] = station_of(self._settings, stream, OBJECTS)
+            remember(self._stations, stream, station_of(self._settings, stream, OBJECTS))
         station = self._stations[stream]
         if station is not None and station.predicted == predicted:
             for message in station.messages(tracks, self.left_out):
@@ -442,7 +446,7 @@ class Bridge(Component):
         elif size >= ended_at and time.monotonic() - at < FORGET_S:
             self._leave_out(one, topic, ENDED, f"less than {ended_at} bytes, with which it ended connections")
         elif one.strikes >= STRIKES:
-            self._impossible[topic] = size, time.monotonic()
+            remember(self._impossible, topic, (size, time.monotonic()))
             self._leave_out(one, topic, ENDED, f"a message that does not end the connection {STRIKES} times")
         else:
             is_known = size <= self._largest.get(topic, -1)
@@ -454,7 +458,7 @@ class Bridge(Component):
             self._note(topic, reason)
             if not reason:
                 self.published[kind] += 1
-                self._largest[topic] = max(size, self._largest.get(topic, 0))
+                remember(self._largest, topic, max(size, self._largest.get(topic, 0)))
 
     def _note(self, topic: str, reason: str) -> None:
         """Note why the broker refuses a message of a topic; empty if it takes it."""
@@ -465,7 +469,7 @@ class Bridge(Component):
         self._lost += topic.endswith("/events")
         if self._refusing.get(topic) != reason:
             log.warning("mqtt_refused", topic=topic, reason=reason)
-        self._refusing[topic] = reason
+        remember(self._refusing, topic, reason)
 
     def _leave_out(self, one: Unsent, topic: str, reason: str, expected: str) -> None:
         if self._refusing.get(topic) != reason:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
 
 import optipmb_schemas as schemas
 import structlog
-from optipmb_client.merging import FinalEvents
+from optipmb_client.merging import FinalEventsOfStreams, remember
 from optipmb_schemas import json_form
 from optipmb_schemas.json_form import EVERYTHING, Selection
 
@@ -198,13 +198,13 @@ class Pace:
         tolerance = PREDICTED_TOLERANCE if predict else TOLERANCE
         self._period_ns = tolerance * 1e9 / max_rate_hz if max_rate_hz else 0.0
         self._predict = predict
-        self._passed: dict[str, collections.deque[int]] = {}
+        self._passed: collections.OrderedDict[str, collections.deque[int]] = collections.OrderedDict()
 
     def passes(self, stream: str, stamp_ns: int) -> bool:
         """Tell whether the tracks of a frame are sent."""
         if not self._period_ns:
             return True
-        passed = self._passed.setdefault(stream, collections.deque(maxlen=REMEMBERED))
+        passed = remember(self._passed, stream, self._passed.get(stream) or collections.deque(maxlen=REMEMBERED))
         if stamp_ns in passed:
             return not self._predict
         if passed and abs(stamp_ns - passed[-1]) < self._period_ns:
@@ -315,7 +315,7 @@ class EventLog:
         self._is_final = final
         self._name = f"{time.time_ns():x}"
         self._lock = threading.Lock()
-        self._held: dict[str, FinalEvents] = collections.defaultdict(FinalEvents)
+        self._held = FinalEventsOfStreams()
         self._kept: dict[int, Event] = {}
         self._numbers: dict[str, collections.deque[int]] = {}
         self._size = 0
@@ -326,7 +326,7 @@ class EventLog:
         """Add the events of a message, or the events that it makes final."""
         message: schemas.Events = one.message
         with self._lock:
-            for each in self._held[message.stream].take(message) if self._is_final else [message]:
+            for each in self._held.take(message) if self._is_final else [message]:
                 for text in json_form.event_json(each, one.place):
                     self._last += 1
                     self._kept[self._last] = Event(self._last, time.monotonic(), message.stream, text)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from broker import Broker, mosquitto
+from optipmb_client import merging
 from optipmb_client.errors import ClientError
 from optipmb_schemas import Detections
 from optipmb_schemas.json_form import Selection, event_json, problem_json, tracks_json, zones_json
@@ -230,6 +231,16 @@ async def test_a_message_that_the_broker_cannot_take_blocks_no_other(
         await broker.wait(1, f"{STREAM}/tracks")
         await until(lambda: bridge.state == "ready")
         assert bridge.lost == 0
+
+
+async def test_refused_topics_are_bounded(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Names of streams are arbitrary: the bridge knows the last topics that were refused."""
+    monkeypatch.setattr(merging, "MOST_STREAMS", 2)
+    async with Broker(denied=("/tracks",)) as broker, bridging(session, broker, tracks_hz=0) as bridge:
+        await until(lambda: bridge.connected)
+        session.publish(*(tracks(1, f"garage/rig/{name}") for name in "abc"))
+        await until(lambda: bridge.refused.total() == 3)
+        assert bridge.failure.startswith("mqtt: 2 topics are refused")
 
 
 async def test_what_the_broker_refuses_is_not_published(session: Session) -> None:

@@ -3,7 +3,8 @@
 import asyncio
 
 import pytest
-from optipmb_service.edges.readers import Outbox
+from optipmb_client.merging import MOST_STREAMS
+from optipmb_service.edges.readers import Outbox, Pace
 
 
 async def test_a_reader_is_cancelled_also_as_an_item_comes() -> None:
@@ -23,3 +24,15 @@ async def test_a_reader_is_cancelled_also_as_an_item_comes() -> None:
     with pytest.raises(asyncio.CancelledError):
         async with asyncio.timeout(10.0):
             await reading
+
+
+def test_streams_that_are_silent_the_longest_have_no_pace() -> None:
+    """A reader of all streams remembers a bounded number of them: those that it heard last."""
+    pace = Pace(1.0)
+    assert pace.passes("a/b/ended", 0)
+    assert pace.passes("a/b/goes-on", 0)
+    for number in range(MOST_STREAMS - 1):
+        assert not pace.passes("a/b/goes-on", 1)
+        assert pace.passes(f"a/b/{number}", 0)
+    assert not pace.passes("a/b/goes-on", 1)
+    assert pace.passes("a/b/ended", 1)

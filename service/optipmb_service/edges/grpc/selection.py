@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import collections
 from typing import TYPE_CHECKING, Final, get_args
 
 import numpy as np
 import optipmb_schemas as schemas
-from optipmb_client.merging import FinalEvents
+from optipmb_client.merging import FinalEventsOfStreams
 from optipmb_schemas.json_form import Selection
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
@@ -98,13 +97,13 @@ class EventSelection:
             expected = f"some of {', '.join(KINDS)}"
             raise schemas.MessageError("invalid_value", "kinds", expected, ascii(min(unknown))[:80])
         self._final = asked.final or not asked.HasField("final")
-        self._streams: dict[str, FinalEvents] = collections.defaultdict(FinalEvents)
+        self._streams = FinalEventsOfStreams()
 
     def responses(self, message: schemas.Events | None) -> list[bytes]:
         """Return the responses that a message makes due."""
         if message is None:
             return []
-        due = self._streams[message.stream].take(message) if self._final else [message]
+        due = self._streams.take(message) if self._final else [message]
         return [
             pb.SubscribeEventsResponse(events=convert.to_proto(one)).SerializeToString()
             for one in map(self._of, due)
