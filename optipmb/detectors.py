@@ -81,12 +81,8 @@ def _value(one: Any, name: str) -> Any:
 
 def _array(name: str, values: Any, *shapes: tuple[int, ...]) -> Array:
     """Return an array of one of some shapes behind the number of boxes, as a copy."""
-    if hasattr(values, "detach"):
-        values = values.detach().cpu().numpy()
-    elif hasattr(values, "get") and not isinstance(values, Mapping):
-        values = values.get()
     try:
-        array = np.array(values, dtype=np.float64)
+        array = np.array(on_host(values), dtype=np.float64)
     except (TypeError, ValueError):
         raise FrameError(name, "numbers", f"{values!r:.60}") from None
     if array.size == 0:
@@ -95,6 +91,19 @@ def _array(name: str, values: Any, *shapes: tuple[int, ...]) -> Array:
         expected = " or ".join(str(("N", *shape)).replace("'", "") for shape in shapes)
         raise FrameError(name, expected, str(array.shape))
     return array
+
+
+def on_host(values: Any) -> Any:
+    """Return an array of torch or cupy as one of numpy, and masked numbers as NaN; others as they are."""
+    if hasattr(values, "detach"):
+        values = values.detach().cpu()
+        return (values.float() if "bfloat16" in str(getattr(values, "dtype", "")) else values).numpy()
+    if hasattr(values, "__cuda_array_interface__"):
+        return values.get()
+    if isinstance(values, np.ma.MaskedArray):
+        nothing: Any = np.nan if values.dtype.kind in "iuf" else None
+        return np.where(values.mask, nothing, values.data) if np.ma.is_masked(values) else values.data
+    return values
 
 
 def _columns(name: str, count: int, **columns: Any) -> dict[str, Any]:

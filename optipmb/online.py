@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from enum import Enum
 from html import escape
 from io import StringIO
 from types import MappingProxyType
@@ -21,9 +22,9 @@ from warnings import warn
 import numpy as np
 
 from optipmb.class_names import class_indices, common_name
-from optipmb.detectors import forms_of, from_detector
+from optipmb.detectors import forms_of, from_detector, on_host
 from optipmb.errors import FrameError
-from optipmb.frame import make_frame
+from optipmb.frame import Pose, make_frame
 from optipmb.tracker import Tracker
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
     from optipmb.density import Density
     from optipmb.extract import Tracks
     from optipmb.field_of_view import FieldOfView
-    from optipmb.frame import Frame, PointCloud, Pose
+    from optipmb.frame import Frame, PointCloud
     from optipmb.ground_camera import GroundCamera
     from optipmb.parameters import Parameters
     from optipmb.paths import PredictedPaths
@@ -402,12 +403,14 @@ class OnlineTracker:
             UserWarning: the times are not in seconds, the headings in degrees, or the widths before the lengths, by all
                 appearance; once each.
         """
+        if not isinstance(pose, Pose | None):
+            raise FrameError("pose", "an optipmb.Pose of a translation and a quaternion", type(pose).__name__)
         if (t is None) == (stamp_ns is None):
             raise FrameError("t", "t (s) or stamp_ns (ns)", "both" if t is not None else "neither")
         if stamp_ns is None:
             stamp_ns = _stamp(t)
-            if stamp_ns < max(self.density.stamp_ns, 0):
-                raise FrameError("t", f"a time from {max(self.density.stamp_ns, 0) / 1e9:g} s on", str(t))
+            if not max(self.density.stamp_ns, 0) <= stamp_ns < 2**63:
+                raise FrameError("t", f"a time from {max(self.density.stamp_ns, 0) / 1e9:g} s on, in seconds", str(t))
         if forms_of(boxes):
             arrays = {**from_detector(boxes, camera=camera), **arrays}
             boxes = None
@@ -496,6 +499,12 @@ class OnlineTracker:
         """Return the names of the classes of a frame, which of them each detection is of, and how many are unknown."""
         known = self.parameters.labels
         given = np.asarray(values)
+        if given.dtype.kind == "f":  # as networks give places
+            if (wrong := np.flatnonzero(given != np.round(given))).size:
+                raise FrameError(
+                    f"label[{wrong[0]}]", "a class, or its place in the profile", str(given.flat[wrong[0]])
+                )
+            given = given.astype(np.int64)
         if given.dtype.kind in "iu" or not given.size:
             return known, given.astype(np.int64), 0
         found, label = np.unique(given.astype(np.str_), return_inverse=True)
@@ -556,7 +565,7 @@ def _columns(boxes: Any, arrays: Mapping[str, ArrayLike]) -> dict[str, Any]:
         columns["label"] = [columns["label"]] * len(columns["center"])
     columns = {name: _nested(values) for name, values in columns.items()}
     if isinstance(columns["label"], list):
-        columns["label"] = [getattr(one, "value", one) for one in columns["label"]]  # of an enumeration
+        columns["label"] = [_class_name(one) for one in columns["label"]]
     return columns
 
 
@@ -564,7 +573,7 @@ def _renamed(
     boxes: Any, arrays: Mapping[str, ArrayLike], known: Sequence[str], flat: Sequence[tuple[str, tuple[str, ...]]]
 ) -> dict[str, Any]:
     """Return the columns of boxes and arguments by their first names, each meaning once."""
-    given = {name: values for name, values in {**_named(boxes), **arrays}.items() if values is not None}
+    given = {name: on_host(values) for name, values in {**_named(boxes), **arrays}.items() if values is not None}
     if unknown := [name for name in given if name not in known]:
         pixels = " (pixel boxes need camera=)" if unknown[0] in KNOWN_PIXELS else ""
         raise FrameError(unknown[0], f"columns among {', '.join(known)}{pixels}", f"the columns {', '.join(given)}")
@@ -587,6 +596,13 @@ def _pixels(boxes: Any, arrays: Mapping[str, ArrayLike]) -> dict[str, Any]:
     return {name: _nested(values) for name, values in given.items() if name in OF_PIXELS}
 
 
+def _class_name(value: Any) -> Any:
+    """Return the class that a member of an enumeration names, by its value where that is a text."""
+    if not isinstance(value, Enum):
+        return value
+    return value.value if isinstance(value.value, str) else value.name
+
+
 def _nested(values: Any) -> Any:
     """Return a column of objects, as data frames hold lists and members of an enumeration, as a list."""
     if isinstance(values, list):
@@ -602,7 +618,7 @@ def _named(boxes: Any) -> dict[str, Any]:
     if isinstance(boxes, list):
         names = boxes[0].keys() if isinstance(boxes[0], dict) else None
         if names is None or not all(isinstance(one, dict) and one.keys() == names for one in boxes):
-            raise FrameError("boxes", "a dictionary with the same keys for each box", f"a list of {len(boxes)}")
+            raise FrameError("boxes", "a dictionary with the same keys for each box", f"{boxes!r:.80}")
         return {str(name): [one[name] for one in boxes] for name in names}
     if isinstance(boxes, np.ndarray):
         if boxes.dtype.names is None:
@@ -614,7 +630,11 @@ def _named(boxes: Any) -> dict[str, Any]:
 
 def _stacked(given: Mapping[str, Any], parts: Sequence[str]) -> Array:
     """Return one array of the columns of its parts."""
-    count = len(next(given[part] for part in parts if part in given))
+    first = next(part for part in parts if part in given)
+    try:
+        count = len(given[first])
+    except TypeError:
+        raise FrameError(first, "numbers, one for each box", repr(given[first])) from None
     columns = []
     for part in parts:
         if part not in given and part not in WITHOUT:

@@ -7,6 +7,7 @@ intervals.
 
 from __future__ import annotations
 
+import re
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -26,6 +27,7 @@ T = TypeVar("T")
 _QUATERNION, _EULER, _PIXELS = 10, 9, 4  # numbers of a cuboid by its rotation, and of a box in an image
 _MATRIX: Final = 16
 _HEAD: Final = 4096
+_ZONE: Final = re.compile(r"(?:Z|([-+])(\d\d):?(\d\d))$")  # at the end of a time
 _SCORES: Final = ("score", "confidence")
 
 
@@ -170,11 +172,13 @@ def _time(path: Path, place: str, value: str | float | None) -> dict[str, Any]:
     except ValueError:
         pass
     try:
-        text = str(value).removesuffix("Z").removesuffix("+00:00")
-        return {"stamp_ns": int(np.datetime64(text, "ns").astype(np.int64))}
+        zone = _ZONE.search(str(value))
+        minutes = int(f"{zone[1]}1") * (60 * int(zone[2]) + int(zone[3])) if zone and zone[1] else 0
+        local = np.datetime64(_ZONE.sub("", str(value)), "ns") - np.timedelta64(minutes, "m")
+        return {"stamp_ns": int(local.astype(np.int64))}
     except ValueError as error:
         where = f"openlabel.{place}.frame_properties.timestamp"
-        raise DatasetError(path, f"seconds, or a time in UTC, at {where}", repr(value)) from error
+        raise DatasetError(path, f"seconds, or a time as 2026-01-31T08:00:00Z, at {where}", repr(value)) from error
 
 
 def _objects(

@@ -6,6 +6,7 @@ with a file for each frame, are read as records, one for each box; such a folder
 or has `.txt` files in the format of KITTI's object benchmark.
 """
 
+import ast
 import codecs
 import io
 import json
@@ -51,7 +52,9 @@ _READ_ONLY: Final = (".json", ".txt")
 _TEXT: Final = (".csv", ".tsv", ".txt")
 _PICKLES: Final = (".pkl", ".pickle")
 _COMPRESSED: Final = (".gz", ".bz2", ".zst")
-_SEPARATORS: Final = ",;\t"
+_SEPARATORS: Final = ",;\t|"
+_UNIT_WORDS: Final = {"", "-", "1", "m", "s", "ms", "us", "ns", "deg", "rad", "m/s", "rad/s", "deg/s", "%"}
+_COMMENT: Final = re.compile(r"(?m)^(?:#|%|//).*\n?")
 _MOST_PARTS: Final = 16
 _EXACT: Final = 2**53  # integers up to it are exact as 64-bit numbers with a point
 _INT64: Final = 2**63
@@ -272,8 +275,36 @@ def line_of(path: Path, row: int, options: Mapping[str, str] | None = None) -> i
     if path.is_dir() or _kind(path) not in _TEXT:
         return row + 1
     lines = _text(path, options or {}).split("\n")
-    filled = [number for number, line in enumerate(lines, start=1) if line.strip() and not line.startswith("#")]
-    return filled[row + _has_names(re.split(r"[,;\s]+", lines[filled[0] - 1].strip()))]
+    filled = [number for number, line in enumerate(lines, start=1) if line.strip() and not _COMMENT.match(line)]
+    first = _titles([lines[number - 1] for number in filled[:_MOST_PARTS]])
+    named = _has_names(re.split(r"[,;\s]+", lines[filled[first] - 1].strip()))
+    measured = filled[first + 1 :] and _are_units(re.split(r"[,;|\t]", lines[filled[first + 1] - 1]))
+    return filled[first + row + named + bool(measured)]
+
+
+def _titles(lines: Sequence[str]) -> int:
+    """Return how many of the first lines of a table stand before the one with the names of the columns."""
+    for place, line in enumerate(lines):
+        for mark in _SEPARATORS:
+            fields = line.split(mark)
+            if len(fields) > 2 and all(re.match(r"[\s\"']*([A-Za-z_]|$)", field) for field in fields):  # noqa: PLR2004  a title may have a comma
+                return 0 if any(one.count(mark) >= line.count(mark) for one in lines[:place]) else place
+    return 0
+
+
+def _with_units(head: str, rest: str, separator: str) -> tuple[str, str]:
+    """Return the names of columns with the units that a row below them has, and the text after that row."""
+    first, _, after = rest.partition("\n")
+    if '"' in head or not _are_units(units := first.split(separator)):
+        return head, rest
+    pairs = zip(head.split(separator), (unit.strip(" []()-") for unit in units), strict=False)
+    return separator.join(f"{name} [{unit}]" if unit else name for name, unit in pairs), after
+
+
+def _are_units(fields: Sequence[str]) -> bool:
+    """Tell whether a row below the names of columns has their units."""
+    units = {field.strip(' []()"') for field in fields}
+    return units <= _UNIT_WORDS and bool(units - {"", "-"})
 
 
 def _has_names(fields: list[str]) -> bool:
@@ -288,9 +319,9 @@ def _normal_text(path: Path, blocks: Iterator[str], kind: str) -> tuple[Iterator
         text = _without_comments(original).lstrip("\n")
         if text:
             break
-    text = re.sub(r"\Asep=.\n", "", text)
-    head, _, rest = text.lstrip("\n").partition("\n")
-    comments = [line.lstrip("# ") for line in original.split("\n", _MOST_PARTS) if line.startswith("#")]
+    lines = re.sub(r"\Asep=.\n", "", text).lstrip("\n").split("\n", _MOST_PARTS)
+    head, rest = (lines := lines[_titles(lines[:_MOST_PARTS]) :])[0], "\n".join(lines[1:])
+    comments = [line.lstrip("#%/ ") for line in original.split("\n", _MOST_PARTS) if _COMMENT.match(line)]
     separator = "\t" if kind == ".tsv" else max(_SEPARATORS, key=head.count)
     if separator not in head and len(head.split()) > 1:
         separator = " "
@@ -303,6 +334,7 @@ def _normal_text(path: Path, blocks: Iterator[str], kind: str) -> tuple[Iterator
         if not names:
             raise DatasetError(path, "a first line with the names of the columns", repr(head.strip()[:60]))
         head, rest = names[-1], f"{head}\n{rest}"
+    head, rest = _with_units(head, rest, separator)
     first = rest.split("\n", 1)[0].rstrip()
     more = first.count(separator) - head.count(separator)
     if more == 1 and first.endswith(separator):
@@ -316,7 +348,7 @@ def _normal_text(path: Path, blocks: Iterator[str], kind: str) -> tuple[Iterator
 
 
 def _without_comments(text: str) -> str:
-    return re.sub(r"(?m)^#.*\n?", "", text) if "#" in text else text
+    return _COMMENT.sub("", text) if any(mark in text for mark in ("#", "%", "//")) else text
 
 
 def _with_single_blanks(text: str) -> str:
@@ -465,7 +497,7 @@ def _parts(pa: Any, name: str, column: Any) -> Iterator[tuple[str, NDArray[Any]]
         rows = column.to_pylist()
         for place in range(max(lengths)):
             child = pa.array([None if row is None else row[place] for row in rows])
-            yield from _parts(pa, f"{name}.{place}", child)
+            yield from _parts(pa, name if max(lengths) == 1 else f"{name}.{place}", child)
     elif types.is_timestamp(kind):
         yield name, column.cast(pa.timestamp("ns")).to_numpy(zero_copy_only=False).astype("datetime64[ns]")
     elif types.is_integer(kind) or (types.is_decimal(kind) and not kind.scale):
@@ -475,7 +507,32 @@ def _parts(pa: Any, name: str, column: Any) -> Iterator[tuple[str, NDArray[Any]]
     elif types.is_binary(kind) or types.is_large_binary(kind):
         yield from _parts(pa, name, column.cast(pa.string()))
     else:
-        yield name, _texts(pa, column)
+        texts = _texts(pa, column)
+        lists = _written(pa, texts) if types.is_string(kind) or types.is_large_string(kind) else None
+        yield from [(name, texts)] if lists is None else _parts(pa, name, lists)
+
+
+def _written(pa: Any, texts: NDArray[np.str_]) -> Any:
+    """Return the lists or structures that all texts of a column are, as data frames write them; None for others."""
+    first = next((text for text in texts.tolist() if text), "").strip()
+    if not re.fullmatch(r"(?s)\[.*\]|\(.*\)|\{.*\}", first):
+        return None
+    try:
+        found = pa.array([_literal(text) if text else None for text in texts.tolist()])
+    except (ValueError, SyntaxError, RecursionError, MemoryError, OverflowError, pa.ArrowException):
+        return None
+    return found if pa.types.is_nested(found.type) else None
+
+
+def _literal(text: str) -> Any:
+    """Return what a text in the notation of JSON, Python or numpy stands for."""
+    inner = text.strip().strip("[]()").replace(",", " ").split()
+    if all(map(is_number, inner)):
+        return [float(one) for one in inner]
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return ast.literal_eval(text)
 
 
 def _texts(pa: Any, column: Any) -> NDArray[np.str_]:

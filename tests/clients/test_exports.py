@@ -111,8 +111,13 @@ def document(**changed: Any) -> dict[str, Any]:
     shape = {"name": "s", "val": lidar, "coordinate_system": "lidar", "attributes": velocity}
     mast = {"quaternion": [0.0, 0.0, 0.0, 1.0], "translation": [0.0, 0.0, 2.0]}
     frames: dict[str, Any] = {
-        str(k): {"frame_properties": {"timestamp": f"2026-11-27T08:00:00.{k}00000000Z", "transforms": transforms}}
-        for k in range(3)
+        str(k): {
+            "frame_properties": {
+                "timestamp": f"2026-11-27T{8 + k:02}:00:00.{k}00000000{zone}",
+                "transforms": transforms,
+            }
+        }
+        for k, zone in enumerate(("Z", "+01:00", "+0200"))
     }
     frames["0"]["objects"] = {"8c1f": {"object_data": {"type": "CAR", "cuboid": shape}}}
     frames["2"]["objects"] = {"8c1f": {"object_data": {"type": "CAR", "cuboid": [shape]}}}

@@ -58,7 +58,7 @@ AT_HOME = {
 IO = {"threading", "asyncio", "socket", "queue", "sqlite3", "os", "tempfile", "structlog"}
 
 COMPUTATION = {
-    "__future__", "collections", "contextlib", "dataclasses", "difflib", "functools", "hashlib", "importlib",
+    "__future__", "collections", "contextlib", "dataclasses", "enum", "difflib", "functools", "hashlib", "importlib",
     "itertools", "math", "numba", "numpy", "operator", "optipmb", "pathlib", "pydantic", "pydantic_core", "re", "sys",
     "tomllib", "types", "typing",
 }  # fmt: skip

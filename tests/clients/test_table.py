@@ -64,6 +64,7 @@ STAMPS = np.repeat(np.arange(FRAMES) * 100_000_000 + 1_700_000_000_000_000_000, 
         ({"yaw": None, "heading_deg": np.tile([0.0, 177.617, 5.72958], FRAMES)}, ""),
         ({"score": np.tile([2.197, 1.386, -0.8473], FRAMES)}, "scores look like logits"),
         ({"score": np.tile([90.0, 80.0, 70.0], FRAMES)}, "scores look like percent"),
+        ({"score": np.tile(["90%", "80 %", "70%"], FRAMES)}, "scores look like percent"),
     ],
 )
 def test_units_are_found_and_said(tmp_path: Path, changed: dict[str, Any], said: str) -> None:
@@ -124,6 +125,12 @@ def test_names_of_columns_are_many(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"a column x \(--option column.x=NAME\)"):
         notes_and_frames(tmp_path / "c.csv", east)
     same(notes_and_frames(tmp_path / "d.csv", east, **{"column.x": "east"})[1], sequence)
+    for before in ("det_", "bbox3d_", "object_"):
+        named = {"timeStamp": plain["t"], **{before + name: one for name, one in plain.items() if name != "t"}}
+        same(notes_and_frames(tmp_path / f"{before}.csv", named)[1], sequence)
+    nested = {"rotation.roll": 0.0 * plain["t"], "rotation.yaw": np.rad2deg(plain["yaw"])}
+    turned = {name: one for name, one in plain.items() if name != "yaw"} | nested
+    same(notes_and_frames(tmp_path / "e.csv", turned)[1], sequence)
 
 
 @pytest.mark.parametrize(

@@ -32,6 +32,9 @@ def same(one: Columns, other: Columns) -> None:
         ("said.csv", PLAIN.replace(",", ";").replace(".", ","), "utf-8", {"decimal": ","}),
         ("comments.csv", "# made by hand\n\n" + PLAIN.replace("0.1", "# half\n0.1"), "utf-8", {}),
         ("numpy.txt", "# " + PLAIN.replace(",", " "), "utf-8", {}),
+        ("percent.csv", "% units: metres, seconds\n// a run\n" + PLAIN, "utf-8", {}),
+        ("pipes.csv", PLAIN.replace(",", "|"), "utf-8", {}),
+        ("title.csv", "Detections of run 5, in the yard\n\nroom 2\n" + PLAIN, "utf-8", {}),
         ("excel.csv", "sep=;\n" + PLAIN.replace(",", ";"), "utf-8", {}),
         ("trailing.csv", PLAIN.replace("\n", ",\n"), "utf-8", {}),
         ("trailing_rows.csv", PLAIN.replace("\n", ",\n").replace("class,", "class"), "utf-8", {}),
@@ -51,6 +54,29 @@ def test_text_tables_of_other_countries(
     (tmp_path / "plain.csv").write_text(PLAIN, encoding="utf-8")
     (tmp_path / name).write_bytes(text.encode(encoding))
     same(read_table(tmp_path / name, options), read_table(tmp_path / "plain.csv"))
+
+
+def test_a_row_of_units_is_part_of_the_names(tmp_path: Path) -> None:
+    """Units below the names of the columns are read as in the names; lines are counted with them."""
+    (tmp_path / "a.csv").write_text("a, title\nt,x,yaw,class\n[s],[m],[deg],-\n0.0,1.5,90.0,car\n", encoding="utf-8")
+    assert list(read_table(tmp_path / "a.csv")) == ["t [s]", "x [m]", "yaw [deg]", "class"]
+    assert line_of(tmp_path / "a.csv", 0) == 4
+
+
+def test_texts_of_lists_are_lists(tmp_path: Path) -> None:
+    """Lists and structures are read as data frames and numpy write them into CSV; a list of one is its value."""
+    text = """t;center;size;kind;note
+0.0;[1.0, 2.0, nan];[4.5  1.9\t1.6];['car'];[a]
+0.1;[3, 4, 5];[4.5 1.9 1.6];['car'];(b
+"""
+    (tmp_path / "a.csv").write_text(text, encoding="utf-8")
+    columns = read_table(tmp_path / "a.csv")
+    assert list(columns) == ["t", *(f"{name}.{i}" for name in ("center", "size") for i in range(3)), "kind", "note"]
+    np.testing.assert_array_equal(columns["center.2"], [np.nan, 5.0])
+    assert columns["size.0"].tolist() == [4.5, 4.5]
+    assert columns["kind"].tolist() == ["car", "car"]
+    (tmp_path / "b.csv").write_text("t;center\n0.0;{'x': 1.0, 'y': 2.0}\n", encoding="utf-8")
+    assert list(read_table(tmp_path / "b.csv")) == ["t", "center.x", "center.y"]
 
 
 ISO = ("2024-05-01T10:00:00.100Z", "2024-05-01T10:00:00.200Z")

@@ -76,6 +76,15 @@ def test_names_places_lists_arrays_and_tables_are_one() -> None:
         assert other.center.tobytes() == first.center.tobytes()
 
 
+def test_masked_numbers_are_unknown() -> None:
+    """A masked heading, size or height is as NaN, and its number below the mask plays no part."""
+    hidden = {"yaw": np.ma.array([3.0], mask=True), "h": np.ma.array([99], mask=True)}
+    shown = {"yaw": [np.nan], "h": [np.nan]}
+    first, second = (run([flat(k) | change for k in range(4)])[-1] for change in (hidden, shown))
+    np.testing.assert_array_equal(first.tracks.size, second.tracks.size)
+    np.testing.assert_array_equal(first.yaw, second.yaw)
+
+
 def test_classes_have_the_names_that_the_detections_gave() -> None:
     """A class is called as its first detection called it; without one, as the profile does."""
     assert [run([flat(0, name)])[0].name.tolist() for name in ("car", "vehicle.car", 0)] == [
@@ -166,12 +175,21 @@ def test_nothing_detected_is_a_frame() -> None:
         ({**flat(0), "w": [0.0]}, {"t": 1.0}, r"size\[0\]\[1\]: expected a positive length"),
         ({**flat(0), "x": [float("nan")]}, {"t": 1.0}, r"center\[0\]\[0\]: expected a finite number"),
         ({**flat(0), "score": [3.0]}, {"t": 1.0}, r"score\[0\]"),
-        (flat(0), {"t": 0.1}, "t: expected a time from 0.5 s on, received 0.1"),
+        (flat(0), {"t": 0.1}, "t: expected a time from 0.5 s on, in seconds, received 0.1"),
         (flat(0), {"t": -1}, "t: expected a time from 0.5 s on"),
+        (flat(0), {"t": 1.7e18}, "t: expected a time from 0.5 s on, in seconds, received 1.7e.18"),
+        (flat(0), {"t": 1.0, "pose": np.eye(4)}, "pose: expected an optipmb.Pose .* received ndarray"),
+        ({**flat(0), "l": 4.5}, {"t": 1.0}, "l: expected numbers, one for each box, received 4.5"),
+        ({**flat(0), "x": np.ma.array([5.0], mask=True)}, {"t": 1.0}, r"center\[0\]\[0\]: .* received nan"),
+        (
+            {**flat(0), "class": np.ma.array([1], mask=True)},
+            {"t": 1.0},
+            r"label\[0\]: expected a class, .* received nan",
+        ),
         (flat(0), {"stamp_ns": 1}, "stamp_ns: expected a stamp from"),
     ],
 )
-def test_what_is_wrong_is_named_and_changes_nothing(boxes: Any, when: dict[str, float], text: str) -> None:
+def test_what_is_wrong_is_named_and_changes_nothing(boxes: Any, when: dict[str, Any], text: str) -> None:
     """An error names the column and the row, and the density stays as it was."""
     tracker = optipmb.OnlineTracker("kitti")
     tracker.update(flat(0), t=0.5)

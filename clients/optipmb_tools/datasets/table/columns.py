@@ -47,9 +47,13 @@ def _turn(bases: str, part: str, place: int) -> tuple[str, ...]:
 
 ALIASES: Final[Mapping[str, tuple[str, ...]]] = {
     "stamp": ("stamp", "t", "time", "timestamp", "ts", "sec", "secs", "seconds", "nanoseconds", "sim_time", "datetime",
-              "header_stamp", "header_timestamp"),
+              "header_stamp", "header_timestamp", "time_stamp", "frame_time", "frame_timestamp", "frame_stamp",
+              "date_time", "unix_time", "unix_timestamp", "epoch_time", "utc_time", "utc", "capture_time", "scan_time",
+              "lidar_timestamp", "lidar_time", "sensor_timestamp", "sensor_time", "measurement_time", "gps_time"),
     "nanosec": ("nanosec", "nanosecs", "nsec", "nsecs", "nanoseconds"),
-    "frame": ("frame", "frame_id", "frame_index", "frame_idx", "frame_number", "frame_no", "frame_nr"),
+    "frame": ("frame", "frame_id", "frame_index", "frame_idx", "frame_number", "frame_no", "frame_nr",
+              "frame_num", "frame_count", "frame_counter", "scan_id", "scan_index", "scan_idx", "scan_number",
+              "sweep_id", "timestep", "time_step", "sample_idx", "sample_index"),
     "x": ("x", "cx", "px", "x_center", "tx", *_vector(_CENTER, "x", 0)),
     "y": ("y", "cy", "py", "y_center", "ty", *_vector(_CENTER, "y", 1)),
     "z": ("z", "cz", "pz", "z_center", "tz", *_vector(_CENTER, "z", 2)),
@@ -60,7 +64,8 @@ ALIASES: Final[Mapping[str, tuple[str, ...]]] = {
     "w": ("w", "width", "box_width", "dy", *_extent("y", "w", "width", 1)),
     "h": ("h", "height", "box_height", "dz", *_extent("z", "h", "height", 2)),
     "yaw": ("yaw", "heading", "theta", "yaw_angle", "heading_angle", "rotation_z", "rot_z", "rz", "rotation_y", "ry",
-            "rot", "rotation", "orientation", "angle"),
+            "rot", "rotation", "orientation", "angle", "rotation_yaw", "rot_yaw", "orientation_yaw", "euler_yaw",
+            "rpy_yaw"),
     "qw": ("qw", *_vector(_BOX_TURN, "w", 0)),
     "qx": ("qx", *_vector(_BOX_TURN, "x", 1)),
     "qy": ("qy", *_vector(_BOX_TURN, "y", 2)),
@@ -103,7 +108,13 @@ _PART: Final = re.compile(
     r"(?:_(?:matrix|mat|angles?|vector|vec))?)_?(q?[wxyz]|\d(?:_?\d)?)"
 )
 """Base of a column that may be one of several numbers of an orientation."""
-_TURNED: Final = re.compile("(^|_)(rot|r?vec|orient|head|yaw|quat|euler|angle|axis|cog$|course)")
+_TURNED: Final = re.compile(
+    "(^|_)(rot|r?vec|orient|head|hdg$|yaw|quat|euler|angle|axis|cog$|course|bearing|azimuth|direction)"
+)
+_LEADING: Final = re.compile(
+    "^(det|detection|gt|pred|prediction|obj|object|(3d_)?b?box(_?3d)?|bounding_box(_3d)?|cuboid)_"
+)
+"""Word before the name of a column that only says what the column is of."""
 _OTHER: Final = re.compile("ego|pose|sensor|camera|lidar|vehicle|header")  # groups that describe no box
 _LENGTHS: Final = {"m", "meter", "meters", "metre", "metres", "mps"}
 
@@ -144,7 +155,7 @@ def find_columns(names: Iterable[str], chosen: Mapping[str, str], texts: Collect
             parts = [one for one in known if bases and _is_second_half(one)]
             fitting = [Column(one.name, "ns", aliases[0]) for one in parts if one.base in bases or one.base in aliases]
         if fitting:
-            best = min(fitting, key=lambda one: (aliases.index(one.base), _is_second_half(one)))
+            best = min(fitting, key=lambda one: (aliases.index(one.base), _is_second_half(one), len(one.name)))
             taken[role] = best
             used.add(best.name)
     return taken
@@ -154,6 +165,8 @@ def _is_shared(column: Column, known: Collection[Column]) -> bool:
     """Tell whether a column is one of several of an orientation, as `rotation.angle` with `rotation.axis`."""
     group = column.name.rpartition(".")[0]
     others = [one for one in known if one.name.startswith(f"{group}.") and one.name != column.name]
+    if _plain(column.name).endswith("_yaw"):  # of roll, pitch and yaw
+        return False
     return bool(group and others) and _plain(group.rpartition(".")[2]) in _BOX_TURN.split()
 
 
@@ -192,7 +205,8 @@ def normalised(name: str) -> Column:
         last, last_unit = _base(".".join(path[start:]))
         if _known(last):
             return Column(name, last_unit, last)
-    return Column(name, unit, base)
+    rest = _LEADING.sub("", base, count=1)
+    return Column(name, unit, base if _known(base) or not _known(rest) else rest)
 
 
 def _known(base: str) -> bool:
@@ -200,7 +214,7 @@ def _known(base: str) -> bool:
 
 
 def _base(name: str) -> tuple[str, str | None]:
-    base = _plain(name)
+    base = _plain(name).removesuffix("_m_s")
     head, _, tail = base.rpartition("_")
     if head and tail in _UNITS:
         return head, _UNITS[tail]

@@ -61,6 +61,7 @@ _TILTED: Final = 1 / 12  # of a turn: largest angle about x and y of a box that 
 _TWICE: Final = 0.25  # share of boxes at the place of another one from which objects are reported twice
 LEAST_VARIANCE: Final = 1e-8
 LARGEST_VARIANCE: Final = 1e8  # variances of a position along any axis, m^2, as `Detections` have them
+_SPARED: Final = ("z", "h", "score", "class")  # without a value in any row they are as without a column
 _POSE: Final = ("pose_x", "pose_y", "pose_z")
 _TURNS: Final = ("w", "x", "y", "z")
 _NUMBERED: Final = re.compile(r"(.*[^\W\d_])[\W_]*\d+|\d+[\W_]*([^\W\d_].*)")  # a class, a number of an object
@@ -196,7 +197,10 @@ def _columns_of(reading: Reading, columns: Columns) -> dict[str, Column]:
         chosen |= dict.fromkeys(METRES, NOTHING)
     taken = {role: name for role, name in chosen.items() if name in columns or name == NOTHING}
     words = {name for name, one in columns.items() if _has_no_number(one)}
-    found = find_columns(columns, taken, words)
+    empty = {name for name, one in columns.items() if one.dtype.kind == "f" and len(one) and np.isnan(one).all()}
+    found = find_columns([name for name in columns if name not in empty], taken, words)
+    if empty:
+        found = {role: one for role, one in find_columns(columns, taken, words).items() if role not in _SPARED} | found
     used = {one.name for one in found.values()}
     for role, one in find_columns(columns, taken).items():  # refused when it is read, as a number is expected
         if role not in found and one.name in words - used and _has_units(columns[one.name]):
@@ -237,6 +241,8 @@ class _Table:
         values = self._columns[name]
         if values.dtype.kind not in "iuf":
             texts = ["" if text.strip() in NO_VALUE else text for text in values.tolist()]
+            if role == "score":  # percent
+                texts = [text.strip().removesuffix("%") for text in texts]
             bad = np.array([text != "" and not is_number(text) for text in texts], dtype=np.bool_)
             remedy = f"column.{role}=none ignores it" if bad.all() else "invalid=skip leaves such rows out"
             expected = f"a number in column {name} (--option {remedy})"
@@ -636,6 +642,9 @@ class _Table:
             return None
         velocity = np.column_stack([self._numbers("vx"), self._numbers("vy")])[row]
         velocity[np.isnan(velocity).any(axis=1)] = np.nan
+        if len(motion.moves) and not np.nan_to_num(velocity).any():  # as detectors without velocities write
+            self._reading.note("velocity", "every velocity is 0 though boxes move: velocities are unknown")
+            return None
         posed = motion.pose is not None
         axes = read_velocity(self._reading, velocity, motion.moves, motion.carry, posed=posed)
         if axes == "world" and motion.pose is not None:
@@ -653,7 +662,7 @@ class _Table:
             if values.dtype.kind == "f":  # numbers with an empty cell
                 values = np.where(np.isnan(values), "", np.char.mod("%g", values))
             names, place = unique_texts(values.astype(np.str_, copy=False))
-            names = np.char.strip(names)
+            names = np.char.strip(names, " \t'\"")
             names = self._without_numbers(np.where(np.isin(names, NO_VALUE), "", names), place, stamp)
         renamed = {
             key.removeprefix("class."): name for key, name in self._reading.options.items() if key.startswith("class.")
