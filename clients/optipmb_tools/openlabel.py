@@ -129,10 +129,10 @@ def openlabel_records(path: Path, content: Any) -> list[dict[str, Any]]:
             about = time | {"id": name, "class": kind}
             for at, shape, values in _shapes(path, f"{where}.object_data.cuboid", data.cuboid, _QUATERNION, _EULER):
                 rotation, translation = carry(at, shape.coordinate_system)
-                records.append(about | _box(rotation, translation, values) | _others(shape, data, rotation))
-            for _, shape, (u, v, width, height) in _shapes(path, f"{where}.object_data.bbox", data.bbox, _PIXELS):
+                records.append(about | _box(rotation, translation, values) | _others(path, at, shape, data, rotation))
+            for at, shape, (u, v, width, height) in _shapes(path, f"{where}.object_data.bbox", data.bbox, _PIXELS):
                 corners = {"x1": u - width / 2, "y1": v - height / 2, "x2": u + width / 2, "y2": v + height / 2}
-                flat.append(about | corners | _others(shape, data, np.eye(3)))
+                flat.append(about | corners | _others(path, at, shape, data, np.eye(3)))
         if len(records) == count:
             records.append(time)
     found = flat if flat and not any("class" in one for one in records) else records
@@ -230,15 +230,19 @@ def _box(rotation: Floats, translation: Floats, values: list[float]) -> dict[str
     return dict(zip(names, carried.tolist(), strict=True))
 
 
-def _others(shape: _Shape, data: _Data, rotation: Floats) -> dict[str, Any]:
+def _others(path: Path, place: str, shape: _Shape, data: _Data, rotation: Floats) -> dict[str, Any]:
     """Return the score, 1 where there is none, and the velocity of a shape."""
     numbers = {one.name: one.val for one in (*data.num, *shape.attributes.num)}
-    score = next((numbers[name] for name in _SCORES if name in numbers), 1.0)
-    velocity = next((one.val for one in shape.attributes.vec if one.name == "velocity"), None)
-    if not isinstance(velocity, list) or len(velocity) not in {2, 3}:
-        return {"score": score}
-    vx, vy, _ = rotation @ np.array([*velocity, 0.0][:3], np.float64)
-    return {"score": score, "vx": float(vx), "vy": float(vy)}
+    others = {"score": next((numbers[name] for name in _SCORES if name in numbers), 1.0)}
+    for at, one in enumerate(shape.attributes.vec):
+        if one.name == "velocity" and one.val is not None:
+            where = f"{place}.attributes.vec[{at}].val"
+            velocity = _converted(path, where, one.val, list[float])
+            if len(velocity) not in {2, 3} or not np.isfinite(velocity).all():
+                raise DatasetError(path, f"2 or 3 finite numbers at openlabel.{where}", str(velocity)[:60])
+            vx, vy, _ = rotation @ np.array([*velocity, 0.0][:3])
+            return others | {"vx": float(vx), "vy": float(vy)}
+    return others
 
 
 def _to_root(

@@ -162,6 +162,9 @@ def test_openlabel_of_others_is_carried_to_the_world(tmp_path: Path) -> None:
     assert sorted(truth.id.tolist()) == [0, 0, 1, 1]
 
 
+VELOCITY = "frames.0.objects.8c1f.object_data.cuboid.attributes.vec[0]"
+
+
 @pytest.mark.parametrize(
     ("place", "value", "said"),
     [
@@ -172,19 +175,22 @@ def test_openlabel_of_others_is_carried_to_the_world(tmp_path: Path) -> None:
         ("frames.0.frame_properties.timestamp", "noon", "frames.0.frame_properties.timestamp"),
         ("coordinate_systems.map.parent", "lidar", "a coordinate system without parent|transform of map"),
         ("objects.post.frame_intervals", 3, "openlabel.objects.post.frame_intervals"),
+        (f"{VELOCITY}.val", "3 m/s", f"array.? at openlabel.{VELOCITY}.val.*received `?str"),
+        (f"{VELOCITY}.val", [3.0, "fast"], f"float.? at openlabel.{VELOCITY}.val.1..*received `?str"),
+        (f"{VELOCITY}.val", [3.0], f"2 or 3 finite numbers at openlabel.{VELOCITY}.val.*received .3.0."),
     ],
 )
 def test_a_fault_of_openlabel_is_named_by_its_place(tmp_path: Path, place: str, value: Any, said: str) -> None:
     """One error says where, what was expected and what was received."""
     content = document()
-    *parents, last = place.split(".")
+    *parents, last = place.replace("[", ".").replace("]", "").split(".")
     node = content["openlabel"]
     for name in parents:
-        node = node[name]
+        node = node[int(name) if name.isdecimal() and isinstance(node, list) else name]
     node[last] = value
     path = tmp_path / "a.json"
     path.write_text(json.dumps(content))
-    with pytest.raises(DatasetError, match=said):
+    with pytest.raises(DatasetError, match=said.replace("[", r"\[").replace("]", r"\]")):
         TableDataset(path)
 
 
