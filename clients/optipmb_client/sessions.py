@@ -1,5 +1,6 @@
 """Asking the service: parameters, reset, state and kept tracks of a stream's session, and the services themselves."""
 
+import contextlib
 import time
 from collections.abc import Callable, Iterator
 from typing import TypeVar
@@ -190,13 +191,13 @@ def find_services(
         connection: Where to ask.
         prefix: First part of all keys.
         patience_s: Time to wait for a first service, and for the answers of all.
-        on_silent: Is called with the instance of each service that is alive and has not answered.
+        on_silent: Is called with the instance of each service that is alive and has not answered, or with an error.
     """
     keys = Keys(prefix)
     deadline = time.monotonic() + patience_s
     while True:
         instances = [key.rsplit("/", 2)[1] for key in connection.alive(keys.all_alive())]
-        found = [_ask(connection, keys.status(instance), ServiceStatus) for instance in instances]
+        found = [_status(connection, keys.status(instance)) for instance in instances]
         if (found and None not in found) or time.monotonic() >= deadline:
             break
         time.sleep(RETRY_S)
@@ -206,6 +207,13 @@ def find_services(
     return [status for status in found if status is not None]
 
 
+def _status(connection: Connection, key: str) -> ServiceStatus | None:
+    """Return the answer of a service; None where it has none, or one that is no status: others may have theirs."""
+    with contextlib.suppress(ServiceRefused, MessageError):
+        return _ask(connection, key, ServiceStatus)
+    return None
+
+
 def only_service(connection: Connection, option: str, *, prefix: str = PREFIX) -> str:
     """Return the name of the one service that is alive.
 
@@ -213,11 +221,12 @@ def only_service(connection: Connection, option: str, *, prefix: str = PREFIX) -
         ServiceUnavailable: There is none.
         UsageError: There are several; says which, and the option that names one.
     """
-    names = [found.instance for found in find_services(connection, prefix=prefix)]
+    names: list[str] = []
+    names += [found.instance for found in find_services(connection, prefix=prefix, on_silent=names.append)]
     if not names:
         raise ServiceUnavailable(f"no tracking service is alive at {connection.where} (prefix {prefix})")
     if len(names) > 1:
-        raise UsageError(f"{option}: one of {', '.join(names)}")
+        raise UsageError(f"{option}: one of {', '.join(sorted(names))}")
     return names[0]
 
 

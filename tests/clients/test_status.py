@@ -3,12 +3,14 @@
 import contextlib
 import json
 import time
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 from fake_service import Behaviour, FakeService
 from optipmb_client import Connection
 from optipmb_client.sessions import find_services
-from optipmb_schemas import Keys, MemberSummary, Problem, ServiceStatus
+from optipmb_schemas import Keys, MemberSummary, Problem, ServiceStatus, encoding_of
 from optipmb_tools.cli import run
 from optipmb_tools.views.terminal import members_of, status_tables
 from rich.console import Console
@@ -70,9 +72,20 @@ def test_every_service_is_found(endpoint: str) -> None:
         assert [status.instance for status in found] == ["one"]
 
 
-def test_a_service_that_does_not_answer_is_named(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """It has a liveliness token and answers no question, as one that is overloaded."""
+@pytest.mark.parametrize(
+    "answer",
+    [
+        lambda _: None,
+        lambda query: query.reply_err(b"too many queries"),
+        lambda query: query.reply(query.key_expr, b"of another release", encoding=encoding_of(ServiceStatus)),
+    ],
+)
+def test_a_service_that_does_not_answer_is_named(
+    answer: Callable[[Any], None], endpoint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It has a liveliness token and no good answer, as one that is overloaded; others are shown all the same."""
     with contextlib.closing(open_client(endpoint)) as session, FakeService(endpoint):
+        session.declare_queryable(Keys().status("slow"), answer)
         token = session.liveliness().declare_token(Keys().alive("slow"))
         deadline = time.monotonic() + 60.0
         with Connection(endpoint) as connection:

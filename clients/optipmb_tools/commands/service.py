@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from optipmb_client.errors import ConnectionFailed, ServiceRefused, ServiceUnavailable, UsageError
+from optipmb_client.errors import ConnectionFailed, ServiceUnavailable, UsageError
 from optipmb_client.sessions import (
     drain_service,
     find_services,
@@ -74,7 +74,7 @@ def _watch(connection: Connection, prefix: str, interval_s: float) -> None:
             began = time.monotonic()
             try:
                 services = find_services(connection, prefix=prefix, patience_s=0.0)
-            except (ConnectionFailed, ServiceRefused):
+            except ConnectionFailed:
                 services = []
             view.take(services, time.monotonic())
             live.update(view.render(console.height, console.width), refresh=True)
