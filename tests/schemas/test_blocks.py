@@ -142,25 +142,6 @@ def test_arrays_are_aligned_whatever_the_payload(shift: int) -> None:
     assert not received.flags.writeable
 
 
-def test_two_large_blocks_are_not_exchanged() -> None:
-    """Several large blocks in one message keep their places, and all are views."""
-    rows = np.arange(1500.0)
-    message = Detections(
-        **HEADER,
-        labels=("car",),
-        label=np.zeros(1500, int),
-        center=np.stack([rows, rows + 1, rows + 2], axis=1),
-        size=np.full((1500, 3), 2.0),
-        yaw=rows,
-        score=np.full(1500, 0.5),
-    )
-    payload = encode(message)
-    received = decode(payload, Detections)
-    assert received == message
-    for name in ("label", "center", "size", "yaw", "score"):
-        assert np.shares_memory(getattr(received, name), np.frombuffer(payload, "u1")), name
-
-
 def test_the_constructor_views_arrays_that_fit() -> None:
     """An array of the described kind is held without a copy, its owner's rights untouched; others are converted."""
     xyz = np.ones((5, 3), "f4")

@@ -215,27 +215,6 @@ def written_with(example: Message, data: st.DataObject) -> bytes:
     return written(tree)
 
 
-@settings(max_examples=100)
-@given(data=st.data())
-def test_damaged_bytes(examples: dict[str, Message], data: st.DataObject) -> None:
-    """Bytes flipped, cut and put in: a message that is read equals the one by the models."""
-    payload = bytearray(encode(examples["Detections"]))
-    for _ in range(data.draw(st.integers(1, 3))):
-        at = data.draw(st.integers(0, len(payload) - 1))
-        match data.draw(st.sampled_from(["flip", "byte", "cut", "drop", "insert"])):
-            case "flip":
-                payload[at] ^= 1 << data.draw(st.integers(0, 7))
-            case "byte":
-                payload[at] = data.draw(st.sampled_from(b"\x00\x80\x90\xc0\xc1\xc3\xc4\xca\xd6\xd9\xdc\xde\xff"))
-            case "cut" if at:
-                del payload[at:]
-            case "drop" if len(payload) > 1:
-                del payload[at]
-            case _:
-                payload.insert(at, data.draw(st.sampled_from(b"\x00\x80\x90\xc0\xa1\xff")))
-    check(bytes(payload))
-
-
 @pytest.mark.parametrize("file", sorted(CORPUS.iterdir()), ids=lambda one: one.name)
 def test_files_that_a_search_found(file: Path) -> None:
     """Every file kept for the search, as any message."""

@@ -17,7 +17,7 @@ from json_senders import damaged, document, exists
 from optipmb_schemas import Detections, Keys, MessageError, decode
 from optipmb_service.edges.json_frames import FrameReader
 from optipmb_service.edges.mapping import PayloadMapping, mapping_of
-from optipmb_service.settings import MappingSettings, MqttInput, Settings, SettingsInvalidError, load
+from optipmb_service.settings import MappingSettings, MqttInput, Settings, load
 from optipmb_service.zenoh.client import Client
 from router import Node, Sensor, plain
 from routers import free_endpoint
@@ -332,31 +332,6 @@ def test_an_error_names_the_path_in_the_payload(payload: Any, path: str) -> None
         read(RADAR, payload)
     assert raised.value.path == path
     assert isinstance(payload, bytes) or exists(path, json.dumps(payload).encode())
-
-
-@pytest.mark.parametrize(
-    ("inputs", "path"),
-    [
-        ({"a/b": {"topic": "x"}}, "mqtt.inputs.a/b"),
-        ({"a/b/c": {"topic": "x/+"}}, "mqtt.inputs.a/b/c.topic"),
-        ({"a/{1}/c": {"topic": "x"}}, "mqtt.inputs.a/{1}/c.topic"),
-        ({"a/{1}/c": {"topic": "x/+"}, "a/b/c": {"topic": "y"}}, "mqtt.inputs.a/b/c"),
-        ({"a/{1}/c": {"topic": "x/+"}, "a/b/d": {"topic": "x/y"}}, "mqtt.inputs.a/b/d.topic"),
-        ({"a/b/c": {"topic": "x", "only": {"n": 1}}, "a/b/d": {"topic": "x"}}, "mqtt.inputs.a/b/d.topic"),
-        ({"a/b/c": {"topic": "x", "format": "frigate"}}, "mqtt.inputs.a/b/c.only"),
-        ({"a/b/c": {"topic": "optipmb/v1/a/b/c/tracks"}}, "mqtt.inputs.a/b/c.topic"),
-        ({"a/b/c": {"topic": "x", "format": "yaml"}}, "mqtt.inputs.a/b/c.format"),
-        ({"a/b/c": {"topic": "x", "format": "mapped"}}, "mqtt.inputs.a/b/c.mapping"),
-        (
-            {"a/b/c": {"topic": "x", "format": "mapped", "mapping": {"objects": "a b", "class": "c"}}},
-            "mqtt.inputs.a/b/c.mapping.objects",
-        ),
-    ],
-)
-def test_inputs_that_cannot_work_are_refused(inputs: Any, path: str) -> None:
-    """At the start, with the path in the settings."""
-    with pytest.raises(SettingsInvalidError, match=f"^setting {re.escape(path)}\\b"):
-        load(None, {"mqtt": {"inputs": inputs}})
 
 
 def test_the_settings_of_the_page(tmp_path: Path) -> None:

@@ -94,23 +94,6 @@ def test_a_closed_stream_that_moves_stays_closed(start: Callable[..., Any], tmp_
     assert not set(after.id) & set(before.id)
 
 
-def test_a_restart_goes_on(start: Callable[..., Any], tmp_path: Path) -> None:
-    """Fault 18: tracked state is there after the restart, to the byte, without the publisher's help."""
-    service, endpoint = start(store=str(tmp_path))
-    state = KEYS.query(SENSOR.stream, "state")
-    with Node(endpoint) as node:
-        node.send(*(SENSOR.detections(seq) for seq in range(20)))
-        node.tracks(SENSOR.stream, 20)
-        before = node.ask(state, SessionState)
-    assert service.stop()
-    _, endpoint = start(store=str(tmp_path))
-    with Node(endpoint) as node:
-        node.send(SENSOR.detections(19))  # a duplicate wakes the session and changes nothing
-        until(lambda: node.ask(state, SessionState).duplicates == 1, "the session is there")
-        after = node.ask(state, SessionState)
-    assert (after.digest, after.session, after.frames) == (before.digest, before.session, 20)
-
-
 def test_numbers_outlive_an_expired_checkpoint(start: Callable[..., Any], tmp_path: Path) -> None:
     """After longer than `keep_days` the session is a new one, its track ids and runs go on, and so once more."""
     ids: list[set[int]] = []

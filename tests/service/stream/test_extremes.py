@@ -187,18 +187,3 @@ def test_tracks_die_of_silence() -> None:
     assert (shortly.existence < before.existence[: len(shortly.id)]).all()
     after = tracks(feed(one, [50], SENSOR, objects=0))[-1]
     assert len(after.id) == 0
-
-
-def test_the_wall_clock_has_no_part_in_it() -> None:
-    """What the local clock says, also backwards, changes waiting at most, never tracks."""
-    outputs = []
-    for clock in ([0] * 8, [10**18, 5, 10**15, 0, 3, 2, 1, 10**18]):
-        one = Session(SENSOR.stream, NUSCENES, clock=lambda: 0)
-        outputs.append(
-            [
-                message.model_dump_json()
-                for seq, now_ns in enumerate(clock)
-                for message in tracks(one.on_detections(SENSOR.detections(seq), now_ns))
-            ]
-        )
-    assert outputs[0] == outputs[1]

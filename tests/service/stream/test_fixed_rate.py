@@ -11,7 +11,7 @@ import pytest
 from fusing import FRONT, FUSED, REAR
 from optipmb_schemas import Detections, Problem, Tracks, decode
 from optipmb_service.session.checkpoint import encode_checkpoint
-from optipmb_service.settings import SettingsInvalidError, load
+from optipmb_service.settings import load
 from optipmb_service.streams.profiles import Profiles
 from optipmb_service.streams.stream import Stream
 from registries import Around, packet_of, streams_of
@@ -354,23 +354,6 @@ def test_tracks_and_checkpoints_are_those_without_outputs(process: Callable[...,
         assert predicted.center[:, :2].tobytes() == tracks.path_position[:, 0].tobytes()
         assert predicted.yaw.astype("f4").tobytes() == tracks.path_yaw[:, 0].tobytes()
         assert predicted.horizons is None
-
-
-@pytest.mark.parametrize(
-    ("settings", "text"),
-    [
-        ({"a/b": {}}, "setting outputs.a/b.[key] (from the option): a pattern of streams looks like site/*/lidar*"),
-        ({"*/*/*": {"rate_hz": 51}}, "outputs.*/*/*.rate_hz"),
-        ({"*/*/*": {"clock": "gps"}}, "outputs.*/*/*.clock"),
-        ({"*/*/*": {"delay_s": -1}}, "outputs.*/*/*.delay_s"),
-        ({"*/*/*": {"rate": 5}}, "outputs.*/*/*.rate (from the option): unknown setting"),
-    ],
-)
-def test_wrong_settings_are_refused(settings: dict[str, Any], text: str) -> None:
-    """With the place of the fault."""
-    with pytest.raises(SettingsInvalidError) as raised:
-        load(None, {"outputs": settings})
-    assert text in str(raised.value)
 
 
 def test_the_first_pattern_that_matches_applies(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from optipmb_service.cluster.leases import partition_of
 from optipmb_service.session.checkpoint import digest_of
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import SECOND, Policy
-from optipmb_service.settings import SettingsInvalidError, load
+from optipmb_service.settings import load
 from optipmb_service.streams.profiles import Fusion
 from router import Node, Sensor, until
 from sessions import Merged, tracks
@@ -50,24 +50,6 @@ def published(node: Node, key: str, wanted: dict[tuple[bytes, int], bytes]) -> M
 
     node.tracks_seen.wait(complete, "the tracks of the frames in order")
     return found
-
-
-def test_a_car_keeps_its_id_through_the_service(start: Callable[..., Any]) -> None:
-    """Two sensors publish, each on its key; the tracks on the common key equal the frames in order."""
-    _, endpoint = start(fuse=["site/node/*"])
-    frames = drive()
-    wanted, _ = undisturbed(frames)
-    with Node(endpoint) as node:
-        node.send(*frames, OTHER.detections(0))
-        node.tracks(OTHER.stream, 1)
-        until(lambda: node.ask(KEYS.query(FUSED, "state"), SessionState).frames == len(frames), "all are tracked")
-        merged = published(node, KEYS.tracks(FUSED), wanted)
-        assert {key for key, _, _ in node.tracks_seen.items} == {KEYS.tracks(FUSED), KEYS.tracks(OTHER.stream)}
-        owners = node.alive(KEYS.all_owners())
-    found = [message for _, message in merged.newest.values()]
-    assert {int(one) for message in found for one in message.id} == {1}
-    assert {message.sensor for message in found if (message.detection >= 0).any()} == {FRONT.stream, REAR.stream}
-    assert {KEYS.stream_of(one) for one in owners} == {FUSED, OTHER.stream}
 
 
 @pytest.mark.parametrize("gone", [False, True])
@@ -239,31 +221,6 @@ def test_nodes_of_a_site_share_tracks(start: Callable[..., Any]) -> None:
         until(reported, "sensors without field of view, and the reserved name")
 
 
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        ({"fused": {"a": {"streams": ["*/n/*"]}}}, "patterns of one site, named without *, received *"),
-        ({"fused": {"a": {"streams": ["s/n/*", "t/n/*"]}}}, "patterns of one site, named without *, received s, t"),
-        ({"fused": {"a": {"streams": []}}}, "setting fused.a.streams"),
-        ({"fused": {"a": {"streams": ["s/n/*"] * 65}}}, "setting fused.a.streams"),
-        ({"fused": {"a/b": {"streams": ["s/n/*"]}}}, "setting fused.a/b"),
-        ({"fused": {"a": {"streams": ["s/fused/x"]}}}, "no node is named fused"),
-        ({"fused": {"a": {"streams": ["s/n/*"], "read": ["kiosk"]}}}, "a node looks like site/node, received 'kiosk'"),
-        ({"fused": {"a": {"streams": ["s/n/*"]}}, "rewind_s": 0}, "rewind_s must not be 0"),
-        (
-            {"fused": {"a": {"streams": ["s/n/x*"]}, "b": {"streams": ["s/*/*y"]}}},
-            "fused.b.streams: a stream feeds one session, s/*/*y and s/n/x* of fused.a.streams have some in common",
-        ),
-        ({"fused": {"a": {"streams": ["s/n/*"]}}, "fuse": ["*/*/lidar"]}, "and */*/lidar of fuse have some in common"),
-    ],
-)
-def test_a_wrong_session_of_nodes_is_named(options: dict[str, Any], text: str) -> None:
-    """The error names path and problem; a stream feeds one session."""
-    with pytest.raises(SettingsInvalidError) as caught:
-        load(None, options)
-    assert text in str(caught.value)
-
-
 def test_patterns_without_a_common_stream_are_allowed() -> None:
     """For any letters in common."""
     fused = {
@@ -276,20 +233,6 @@ def test_patterns_without_a_common_stream_are_allowed() -> None:
         "s/fused/b",
         "t/fused/c",
     }
-
-
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        ({"fuse": ["site/node"]}, "a pattern of streams looks like site/*/lidar*, received 'site/node'"),
-        ({"fuse": ["site/node/*"], "rewind_s": 0}, "rewind_s must not be 0"),
-    ],
-)
-def test_a_wrong_setting_is_named(options: dict[str, Any], text: str) -> None:
-    """A pattern has three parts, and sensors do not come in order."""
-    with pytest.raises(SettingsInvalidError) as caught:
-        load(None, options)
-    assert text in str(caught.value)
 
 
 def test_a_list_of_patterns_comes_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -305,28 +305,6 @@ def test_a_question_about_the_state_keeps_no_frame_waiting(
         assert decode(answer.result(60)[0][2], SessionState).frames == frames  # the state at the question
 
 
-def test_a_stream_that_opens_keeps_no_other_waiting(
-    start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """The store is slow: other streams are tracked meanwhile, and what the new one sent comes after."""
-    gate, load = threading.Event(), SqliteStore.load
-
-    def slow(store: SqliteStore, stream: str) -> bytes | None:
-        assert stream != CARELESS.stream or gate.wait(20)
-        return load(store, stream)
-
-    monkeypatch.setattr(SqliteStore, "load", slow)
-    _, endpoint = start(store=str(tmp_path))
-    with Node(endpoint) as node:
-        node.send(CAREFUL.detections(0))
-        node.tracks(CAREFUL.stream, 1)
-        node.send(*(CARELESS.detections(seq) for seq in range(3)))
-        node.send(CAREFUL.detections(1))
-        node.tracks(CAREFUL.stream, 2)
-        gate.set()
-        assert [one.seq for one in node.tracks(CARELESS.stream, 3)] == [0, 1, 2]
-
-
 def test_many_small_values_are_refused_by_their_number() -> None:
     """Half a megabyte of nils is refused where the list begins, not where it ends."""
     payload = b"\x81\xa6labels\xdd" + (500_000).to_bytes(4, "big") + 500_000 * b"\xc0"

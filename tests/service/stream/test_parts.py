@@ -160,15 +160,6 @@ def test_a_misspelt_variable_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None
     assert load().unknown == ("OPTIPMB_CLOUD_WAIT; did you mean OPTIPMB_CLOUD_WAIT_S?",)
 
 
-@pytest.mark.parametrize(
-    ("value", "says"), [("x", "a valid number.*received 'x'"), (-1, "greater than 0; received -1")]
-)
-def test_a_wrong_setting_is_named_with_what_was_received(value: object, says: str) -> None:
-    """The error has the setting, its source, the expected and the received value."""
-    with pytest.raises(SettingsInvalidError, match=rf"setting gap_limit_s \(from the option\): .*{says}"):
-        load(None, {"gap_limit_s": value})
-
-
 def test_a_variable_in_a_table_leaves_the_rest_of_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A variable inside a table replaces its one setting of the file; the table of profiles is replaced as a whole."""
     file = tmp_path / "service.toml"

@@ -16,7 +16,7 @@ from optipmb_service.streams.persistence import DUMPS, MAX_DUMPS, save_dump
 from optipmb_tools.cli import run
 from optipmb_tools.run import dumps as client
 from router import Sensor
-from sessions import Failing, Merged, begun, dumps, feed, problems, tracks
+from sessions import Failing, begun, dumps, feed, problems, tracks
 
 import optipmb
 
@@ -110,17 +110,6 @@ def test_a_late_cloud_that_fails_is_no_frame(epoch: bytes) -> None:
     outputs = feed(one, range(5, 8), SENSOR, has_points=False)
     assert ([m.seq for m in tracks(outputs)], problems(outputs)) == ([5, 6, 7], [])
     assert (one.counters.frames, one.counters.refused, one.counters.duplicates) == (7, 1, 0)
-
-
-def test_others_go_on() -> None:
-    """A session next to a failing one gives the same results as alone."""
-    other, expected = Session("site/node/other", NUSCENES, tracker=Failing), Merged()
-    alone, merged = Session("site/node/other", NUSCENES, tracker=Failing), Merged()
-    sensor = replace(SENSOR, stream="site/node/other")
-    expected.take(feed(alone, range(5), sensor))
-    failed()
-    merged.take(feed(other, range(5), sensor))
-    assert merged.plain() == expected.plain()
 
 
 # The dump

@@ -5,7 +5,6 @@ import random
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import gaps
@@ -18,7 +17,7 @@ from optipmb_schemas.protobuf.convert import from_proto, to_proto
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Policy, Tracked
-from optipmb_service.settings import MOST_ZONES, RejoinSettings, SettingsInvalidError, load
+from optipmb_service.settings import MOST_ZONES, RejoinSettings
 from sessions import Merged, plain, problems, tracks
 
 from optipmb import OnlineTracker, Rejoin, generic_parameters, zones
@@ -31,6 +30,14 @@ POLICY = Policy(rejoin=HOW)
 RECORDING = gaps.record("street", 7, 25.0)
 FRAMES = RECORDING.frames
 STREAM = "site/node/camera"
+
+
+MODEL = replace(HOW, embedding_model="reid-7")
+VECTORS = gaps.with_vectors(RECORDING, 0.85)
+YARD = Zone("yard", polygon=((-5, -5), (200, -5), (200, 5), (-5, 5)), dwell_s=(6.0,), lost_s=6.0)
+SHORT = Zone("short", polygon=((-5, -5), (200, -5), (200, 5), (-5, 5)))
+GATE = Zone("gate", line=((40.0, -9.0), (40.0, 9.0)), lost_s=6.0)
+LATE = Zone("late", line=((40.0, -9.0), (40.0, 9.0)))
 
 
 def message_of(seq: int, given: dict[str, Any]) -> Detections:
@@ -47,22 +54,49 @@ def in_order(policy: Policy = POLICY, messages: list[Detections] = MESSAGES) -> 
     return [one for one in outputs if isinstance(one, Tracked)], session
 
 
-def test_a_session_joins_as_the_library_does() -> None:
-    """Ids, objects, probabilities and states of each frame are those of `OnlineTracker`, byte for byte."""
-    found, _ = in_order()
-    tracker, joined = OnlineTracker(GENERIC, rejoin=HOW), 0
-    for one, given in zip(found, FRAMES, strict=True):
-        columns = {name: value for name, value in given.items() if name not in {"labels", "stamp_ns"}}
-        expected, message = tracker.update(columns, stamp_ns=given["stamp_ns"]), one.tracks
-        assert one.estimates.words.tobytes() == expected.tracks.words.tobytes()
+@pytest.mark.parametrize(
+    ("given", "policy"),
+    [(FRAMES, POLICY), (FRAMES, Policy(zones=(YARD, SHORT, GATE), rejoin=HOW)), (VECTORS, Policy(rejoin=MODEL))],
+    ids=["motion", "zones", "vectors"],
+)
+def test_a_session_joins_as_the_library_does(given: list[dict[str, Any]], policy: Policy) -> None:
+    """Tracks, objects and probabilities are those of `OnlineTracker`, for any order of frames and any restores."""
+    messages = [message_of(seq, one) for seq, one in enumerate(given)]
+    found, one = in_order(policy, messages)
+    tracker, joined = OnlineTracker(GENERIC, rejoin=policy.rejoin), 0
+    for output, frame in zip(found, given, strict=True):
+        model, message = frame.get("embedding_model"), output.tracks
+        columns = {name: value for name, value in frame.items() if name in KNOWN}
+        expected = tracker.update(columns, stamp_ns=frame["stamp_ns"], embedding_model=model)
+        assert output.estimates.words.tobytes() == expected.tracks.words.tobytes()
         assert message.object is not None
+        assert message.object_probability is not None
         assert expected.object is not None
         assert expected.object_probability is not None
         assert message.object.tobytes() == expected.object.tobytes()
-        assert message.object_probability is not None
         assert message.object_probability.tobytes() == expected.object_probability.astype("f4").tobytes()
         joined += ((message.object >= 0) & (message.object != message.id)).sum()
     assert joined
+    assert tracker.density.rejoining is not None
+    appearance = tracker.density.rejoining.appearance
+    assert (appearance is None) == (given is not VECTORS)
+    assert appearance is None or appearance.counts[0].sum(axis=1).min() >= 200
+    in_turn, merged, session = Merged(), Merged(), fresh(policy)
+    in_turn.take(found)
+    order, chance = list(range(len(messages))), random.Random(3)
+    for begin in range(0, len(order), 12):
+        stored = encode_checkpoint(session.snapshot())
+        part = order[begin : begin + 12]
+        chance.shuffle(part)
+        for seq in part[:4]:
+            merged.take(session.on_detections(messages[seq], 0), session.run)  # lost with the process
+        session = Session.restore(decode_checkpoint(stored), 0, policy)
+        for seq in part:
+            merged.take(session.on_detections(messages[seq], 0), session.run)
+        merged.take(session.recovered(0), session.run)
+    assert merged.plain() == in_turn.plain()
+    assert state_bytes(session.snapshot()) == state_bytes(one.snapshot())
+    assert session.state().embedding_ignored is None
 
 
 def test_messages_carry_objects() -> None:
@@ -119,86 +153,23 @@ def test_an_older_checkpoint_begins_with_an_empty_list() -> None:
     assert (found[-1].object == found[-1].id).sum() > 5
 
 
-def test_late_frames_give_the_objects_of_the_order() -> None:
-    """Frames that come in another order within the window end in the same messages and the same state."""
-    found, one = in_order()
-    expected, merged, session = Merged(), Merged(), fresh(POLICY)
-    expected.take(found)
-    order, chance = list(range(len(MESSAGES))), random.Random(3)
-    for k in range(0, len(order) - 6, 6):
-        part = order[k : k + 6]
-        chance.shuffle(part)
-        order[k : k + 6] = part
-    for seq in order:
-        merged.take(session.on_detections(MESSAGES[seq], 0))
-    assert merged.plain() == expected.plain()
-    assert state_bytes(session.snapshot()) == state_bytes(one.snapshot())
-
-
-def test_twenty_kills_change_no_object() -> None:
-    """A session that goes on from a checkpoint some frames old, again and again, has the same objects and state."""
-    found, one = in_order()
-    expected, merged, session = Merged(), Merged(), fresh(POLICY)
-    expected.take(found)
-    for begin in range(0, len(MESSAGES), 12):
-        stored = encode_checkpoint(session.snapshot())
-        for message in MESSAGES[begin : begin + 4]:
-            merged.take(session.on_detections(message, 0), session.run)  # lost with the process
-        session = Session.restore(decode_checkpoint(stored), 0, POLICY)
-        for message in MESSAGES[begin : begin + 12]:
-            merged.take(session.on_detections(message, 0), session.run)
-        merged.take(session.recovered(0), session.run)
-    assert merged.plain() == expected.plain()
-    assert state_bytes(session.snapshot()) == state_bytes(one.snapshot())
-
-
-MODEL = replace(HOW, embedding_model="reid-7")
-VECTORS = [message_of(seq, one) for seq, one in enumerate(gaps.with_vectors(RECORDING, 0.85))]
-
-
-def test_vectors_are_compared_as_in_the_library_through_kills_and_late_frames() -> None:
-    """Objects and states equal the ones of `OnlineTracker`, for any order of frames and any restores."""
-    found, one = in_order(Policy(rejoin=MODEL), VECTORS)
-    tracker = OnlineTracker(GENERIC, rejoin=MODEL)
-    for output, given in zip(found, gaps.with_vectors(RECORDING, 0.85), strict=True):
-        model, stamp_ns = given["embedding_model"], given["stamp_ns"]
-        columns = {name: value for name, value in given.items() if name in KNOWN}
-        expected, message = tracker.update(columns, stamp_ns=stamp_ns, embedding_model=model), output.tracks
-        assert output.estimates.words.tobytes() == expected.tracks.words.tobytes()
-        assert message.object is not None
-        assert expected.object is not None
-        assert message.object.tobytes() == expected.object.tobytes()
-    appearance = tracker.density.rejoining.appearance if tracker.density.rejoining else None
-    assert appearance is not None
-    assert appearance.counts[0].sum(axis=1).min() >= 200
-    expected_tracks, merged, session = Merged(), Merged(), fresh(Policy(rejoin=MODEL))
-    expected_tracks.take(found)
-    for seq in [k ^ 1 for k in range(len(VECTORS))]:
-        if seq % 40 == 1:
-            session = Session.restore(decode_checkpoint(encode_checkpoint(session.snapshot())), 0, Policy(rejoin=MODEL))
-        merged.take(session.on_detections(VECTORS[seq], 0), session.run)
-    merged.take(session.recovered(0), session.run)
-    assert merged.plain() == expected_tracks.plain()
-    assert state_bytes(session.snapshot()) == state_bytes(one.snapshot())
-    assert session.state().embedding_ignored is None
-
-
 def test_vectors_of_other_models_are_counted_and_of_another_length_refused() -> None:
     """A frame of another model, or without the setting, is tracked; another length is a problem with the path."""
-    _, plain_session = in_order(POLICY, VECTORS[:20])
+    messages = [message_of(seq, one) for seq, one in enumerate(VECTORS[:23])]
+    _, plain_session = in_order(POLICY, messages[:20])
     assert plain_session.state().embedding_ignored == 20
-    _, session = in_order(Policy(rejoin=MODEL), VECTORS[:20])
-    other = VECTORS[20].model_copy(update={"embedding_model": "reid-8"})
+    _, session = in_order(Policy(rejoin=MODEL), messages[:20])
+    other = messages[20].model_copy(update={"embedding_model": "reid-8"})
     assert tracks(session.on_detections(other, 0))
     assert session.state().embedding_ignored == 1
-    vectors = VECTORS[21].embedding
+    vectors = messages[21].embedding
     assert vectors is not None
-    short = VECTORS[21].model_copy(update={"embedding": np.ascontiguousarray(vectors[:, :4])})
+    short = messages[21].model_copy(update={"embedding": np.ascontiguousarray(vectors[:, :4])})
     (problem,) = problems(session.on_detections(short, 0))
     assert (problem.code, problem.path) == ("invalid_value", "embedding")
     assert "32 numbers" in problem.expected
     assert session.state().refused == 1
-    assert tracks(session.on_detections(VECTORS[22], 0))
+    assert tracks(session.on_detections(messages[22], 0))
 
 
 def test_a_reset_forgets_lost_objects() -> None:
@@ -212,12 +183,6 @@ def test_a_reset_forgets_lost_objects() -> None:
     for one in found:
         assert one.object is not None
         assert (one.object[one.object >= 0] >= found[0].id.min()).all()
-
-
-YARD = Zone("yard", polygon=((-5, -5), (200, -5), (200, 5), (-5, 5)), dwell_s=(6.0,), lost_s=6.0)
-SHORT = Zone("short", polygon=((-5, -5), (200, -5), (200, 5), (-5, 5)))
-GATE = Zone("gate", line=((40.0, -9.0), (40.0, 9.0)), lost_s=6.0)
-LATE = Zone("late", line=((40.0, -9.0), (40.0, 9.0)))
 
 
 def test_a_visit_over_a_gap_is_one() -> None:
@@ -245,30 +210,6 @@ def test_a_visit_over_a_gap_is_one() -> None:
     assert inside["short"] == {"entered": 2, "left": 1, "inside": 1}
     told = encode(found[-1].tracks)
     assert decode(told, Tracks).object is not None
-
-
-def test_zones_by_object_survive_late_frames_and_restores() -> None:
-    """Events and state are those of the order, with kills between."""
-    policy = Policy(zones=(YARD, SHORT, GATE), rejoin=HOW)
-    _, one = in_order(policy)
-    session = fresh(policy)
-    for seq in [k ^ 1 for k in range(len(MESSAGES))]:
-        if seq % 60 == 1:
-            session = Session.restore(decode_checkpoint(encode_checkpoint(session.snapshot())), 0, policy)
-        session.on_detections(MESSAGES[seq], 0)
-    session.recovered(0)
-    assert state_bytes(session.snapshot()) == state_bytes(one.snapshot())
-
-
-@pytest.mark.parametrize(
-    "value", ["gap_s = 0", "min_probability = 1.0", "most = 0", "decide_s = 6", "other = 1", "embedding_model = ''"]
-)
-def test_settings_out_of_bounds_are_named(value: str, tmp_path: Path) -> None:
-    """The path of the setting is in the error."""
-    path = tmp_path / "settings.toml"
-    path.write_text(f'[rejoin."site/*/*"]\n{value}\n')
-    with pytest.raises(SettingsInvalidError, match=rf"rejoin.site/\*/\*.{value.split(maxsplit=1)[0]}"):
-        load(path)
 
 
 def test_settings_have_the_bounds_of_the_library() -> None:

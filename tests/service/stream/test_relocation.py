@@ -105,16 +105,6 @@ def test_recorded_tracks_live_through_jumps(name: str) -> None:
     assert len(jumps) > 2
 
 
-def test_no_motion_changes_nothing() -> None:
-    """The tracks after an identity are byte for byte those without, but that they name the world."""
-    still = optipmb.Relocation(0.0, 0.0, 0.0, 0.0)
-    found = tracks(feed(session(), jumping(20, 10, still)))
-    assert [one.world for one in found] == [None] * 10 + [1] * 10
-    assert [one.seq for one in found if one.relocation] == [10]
-    bare = [one.model_copy(update={"world": None, "relocation": None}) for one in found]
-    assert [plain(one) for one in bare] == [plain(one) for one in tracks(feed(session(), jumping(20, 20)))]
-
-
 def test_two_motions_are_their_product() -> None:
     """Tracks after two jumps equal the run without, moved by both; the tracks give the positions of the jumps."""
     messages = [*jumping(10), *jumping(15, 0)[10:], *jumping(25, 0, JUMP, BACK)[15:]]
@@ -353,10 +343,3 @@ def test_a_world_outlives_a_reset() -> None:
     outputs = feed(one, jumping(15)[12:])
     assert begun(outputs) == []
     assert [message.world for message in tracks(outputs)] == [1, 1, 1]
-
-
-def test_the_state_without_relocations_is_as_before() -> None:
-    """A session in which nothing was announced has no worlds in its checkpoint."""
-    one = session()
-    feed(one, jumping(5, 5))
-    assert b"worlds" not in encode_checkpoint(one.snapshot())

@@ -11,7 +11,7 @@ from optipmb_schemas import Detections, Keys, SessionParameters, SessionState
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Policy
-from optipmb_service.settings import SettingsInvalidError, load, missing_files
+from optipmb_service.settings import load, missing_files
 from optipmb_service.streams.profiles import Profiles
 from optipmb_tools.run import dumps as client
 from router import Node, until
@@ -122,21 +122,6 @@ def test_the_service_uses_and_shows_the_setting(start: Callable[..., Any]) -> No
         shown = node.ask(KEYS.query(FUSED, "parameters"), SessionParameters)
         assert shown.sensors == {"site/*/rear": {"profile": "kitti", "trust_size": False}}
         assert node.ask(KEYS.query("other/node/lidar", "parameters"), SessionParameters).sensors is None
-
-
-@pytest.mark.parametrize(
-    ("sensors", "text"),
-    [
-        ({"site/rear": {}}, "a pattern of streams looks like site/*/lidar*"),
-        ({"site/*/rear": {"trusts_size": False}}, "setting sensors.site/*/rear.trusts_size"),
-        ({"site/*/rear": {"trust_size": "perhaps"}}, "setting sensors.site/*/rear.trust_size"),
-    ],
-)
-def test_a_wrong_setting_is_named(sensors: dict[str, Any], text: str) -> None:
-    """With its path."""
-    with pytest.raises(SettingsInvalidError) as caught:
-        load(None, {"sensors": sensors})
-    assert text in str(caught.value)
 
 
 def test_a_profile_that_is_not_there_is_named() -> None:

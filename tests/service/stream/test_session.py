@@ -49,31 +49,6 @@ def test_tracks_say_what_made_them() -> None:
     assert np.abs(message.center - found).max() < 0.5
 
 
-def test_a_sensor_frame_gives_the_same_tracks() -> None:
-    """Detections in the sensor frame with the sensor's pose give the tracks of the same detections in the world."""
-    angle = 0.7
-    pose = {
-        "translation": np.array([10.0, -4.0, 2.0]),
-        "quaternion": np.array([np.cos(angle / 2), 0, 0, np.sin(angle / 2)]),
-    }
-    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-    one, other = session(), session()
-    for seq in range(5):
-        world = SENSOR.detections(seq)
-        seen = world.model_copy(
-            update={
-                "frame": "sensor",
-                "pose": SENSOR.points(0).pose.model_copy(update=pose),  # type: ignore[union-attr]  # it has one
-                "center": (world.center - pose["translation"]) @ turn,
-                "yaw": world.yaw - angle,
-                "velocity": world.velocity @ turn[:2, :2],
-            }
-        )
-        ours, theirs = tracks(one.on_detections(world, 0))[0], tracks(other.on_detections(seen, 0))[0]
-    np.testing.assert_allclose(theirs.center, ours.center, atol=1e-9)
-    np.testing.assert_allclose(theirs.velocity, ours.velocity, atol=1e-9)
-
-
 def test_duplicates_change_nothing() -> None:
     """Frames that come again are counted and leave density and output as they were."""
     one, other = session(), session()

@@ -125,12 +125,6 @@ def test_numbers_go_on_when_all_zones_come_back() -> None:
         before = events
 
 
-def test_sessions_without_zones_have_none_in_their_checkpoints() -> None:
-    """Their bytes are unchanged."""
-    _, session = in_order(Policy())
-    assert b"zones" not in encode_checkpoint(session.snapshot())
-
-
 SETTINGS: dict[str, Any] = {
     "crossing": {"streams": ["site/*/*"], "polygon": [(5, -6), (12, -6), (12, 6), (5, 6)], "dwell_s": [1.0]},
     "elsewhere": {"streams": ["other/*/*"], "line": [(8.2, -30), (8.2, 30)]},
