@@ -64,6 +64,8 @@ class Inbox:
         self._changed = threading.Condition()
         self._closed = False
         self._dropped_keys: collections.OrderedDict[str, None] = collections.OrderedDict()
+        self._since_loss: collections.OrderedDict[str, None] | None = None
+        """Keys with an entry since messages of unknown keys were lost; None: none were."""
         self.dropped = 0
 
     @property
@@ -76,11 +78,20 @@ class Inbox:
         with self._changed:
             if self._closed:
                 return
+            if self._since_loss is not None and arrival.key not in self._since_loss:
+                remember(self._since_loss, arrival.key, None)
+                arrival = replace(arrival, after_loss=True)
             if len(self._entries) >= self._capacity:
                 remember(self._dropped_keys, self._entries.popleft().key, None)
                 self.dropped += 1
             self._entries.append(arrival)
             self._changed.notify()
+
+    def lose(self, count: int = 0) -> None:
+        """Note that messages are lost before the next entry, perhaps of all keys; `count`: of those that are known."""
+        with self._changed:
+            self.dropped += count
+            self._since_loss = collections.OrderedDict()
 
     def get(self, timeout: float | None = None) -> Arrival | None:
         """Take the oldest entry, waiting up to `timeout` seconds (None: for ever); None when there is none."""

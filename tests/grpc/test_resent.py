@@ -1,7 +1,8 @@
-"""What a publisher sends again to the next gateway, seen from a gateway."""
+"""What is sent again after a gateway has failed, and what is lost then, seen from a gateway."""
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -9,10 +10,12 @@ from typing import Any
 
 import grpc
 import numpy as np
-from optipmb_client import Publisher
+from optipmb_client import Publisher, Subscriber
+from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
 from routers import free_endpoint
+from tracks_message import tracks_message
 
 FRAMES = 4
 DEADLINE_S = 60.0
@@ -40,19 +43,48 @@ class Failing(rpc.TrackingServiceServicer):
                 self.complete.set()
 
 
-def test_what_was_kept_is_sent_again_in_its_order() -> None:
-    """Clouds among detections, as they were published, when a call fails."""
-    gateway, address = Failing(), free_endpoint().removeprefix("tcp/")
+@contextlib.contextmanager
+def served(gateway: rpc.TrackingServiceServicer) -> Iterator[str]:
+    address = free_endpoint().removeprefix("tcp/")
     server = grpc.server(ThreadPoolExecutor(4))
     rpc.add_TrackingServiceServicer_to_server(gateway, server)  # type: ignore[no-untyped-call]  # as it is generated
     server.add_insecure_port(address)
     server.start()
     try:
-        with Publisher("a/b/c", f"grpc://{address}", frame="world", cache_clouds=FRAMES) as publisher:
-            for k in range(FRAMES):
-                publisher.publish_points(stamp_ns=k, points=np.zeros((1, 3)), pose=POSE)
-                publisher.publish(stamp_ns=k, label=["car"], center=[[1, 2, 0]], score=[0.9], has_points=True)
-            assert gateway.complete.wait(DEADLINE_S), gateway.calls
+        yield f"grpc://{address}"
     finally:
         server.stop(None).wait(DEADLINE_S)
+
+
+def test_what_was_kept_is_sent_again_in_its_order() -> None:
+    """Clouds among detections, as they were published, when a call fails."""
+    gateway = Failing()
+    with served(gateway) as endpoint, Publisher("a/b/c", endpoint, frame="world", cache_clouds=FRAMES) as publisher:
+        for k in range(FRAMES):
+            publisher.publish_points(stamp_ns=k, points=np.zeros((1, 3)), pose=POSE)
+            publisher.publish(stamp_ns=k, label=["car"], center=[[1, 2, 0]], score=[0.9], has_points=True)
+        assert gateway.complete.wait(DEADLINE_S), gateway.calls
     assert gateway.calls == [[(kind, k) for k in range(FRAMES) for kind in ("points", "detections")]] * 2
+
+
+class Losing(rpc.TrackingServiceServicer):
+    """A gateway that skips frames, and fails; the next call has only the newest ones."""
+
+    def __init__(self) -> None:
+        self.calls = [[(0, 0), (1, 0), (5, 3)], [(9, 0), (10, 0)]]  # number of a frame, and skipped ones
+
+    def Subscribe(self, _request: Any, context: Any) -> Iterator[Any]:  # noqa: N802 - of gRPC
+        context.send_initial_metadata(())
+        for seq, skipped in self.calls.pop(0) if self.calls else ():
+            tracks = convert.to_proto(tracks_message("a/b/c", seq))
+            yield pb.SubscribeResponse(tracks=tracks, skipped=skipped)
+        context.abort(grpc.StatusCode.UNAVAILABLE, "goes")
+
+
+def test_frames_that_are_lost_at_a_gateway_are_named() -> None:
+    """Those that it skipped for a slow reader, and those that came between two calls and are kept no longer."""
+    with served(Losing()) as endpoint, Subscriber("a/b/c", endpoint) as tracks:
+        received = [tracks.receive(DEADLINE_S) for _ in range(5)]
+        assert [one.tracks.seq for one in received if one] == [0, 1, 5, 9, 10]
+        assert [(one.first, one.last) for one in tracks.missed] == [(2, 4), (6, 8)]
+        assert (tracks.statistics.missed, tracks.statistics.dropped) == (2, 3)

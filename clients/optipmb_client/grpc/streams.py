@@ -264,6 +264,8 @@ class GrpcSubscription(ResumedCall):
 
     def _began(self) -> None:
         self._call.initial_metadata()  # it is in force
+        if self._settled.is_set():
+            self._inbox.lose()  # what came since the call before, and is kept no longer
         if self._call.is_active():
             self._settled.set()
             self._request.history = True  # the next call recovers the losses in between
@@ -274,7 +276,8 @@ class GrpcSubscription(ResumedCall):
 
     def _take(self, response: bytes) -> None:
         said = (pb.SubscribeEventsResponse if self._events else pb.SubscribeResponse).FromString(response)
-        self._inbox.dropped += said.skipped
+        if said.skipped:
+            self._inbox.lose(said.skipped)
         (name,) = {field.name for field, _ in said.ListFields()} - {"skipped"}
         proto = getattr(said, name)
         key = getattr(self._keys, "problems" if name == "problem" else name)(proto.stream)
