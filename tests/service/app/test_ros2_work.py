@@ -8,10 +8,10 @@ import pytest
 from optipmb_client.incoming import Arrival
 from optipmb_schemas import encode, encoding_of
 from optipmb_schemas.ros2.cpm import CPM
-from optipmb_schemas.ros2.tracks import TRACKED
+from optipmb_schemas.ros2.tracks import TRACKED, header_of
 from optipmb_schemas.ros2.types import own_types
-from optipmb_service.edges.ros2.graph import Endpoint, Node
-from optipmb_service.edges.ros2.work import Work
+from optipmb_service.edges.ros2.graph import NO_HASH, Endpoint, Node, TopicKey
+from optipmb_service.edges.ros2.work import QUEUE, TF, Work
 from optipmb_service.settings import load
 from structlog.testing import capture_logs
 from tracks_message import tracks_message
@@ -45,8 +45,10 @@ class Bridging:
     def __init__(self, stream: str, **given: Any) -> None:
         self.stream = stream
         self.published: list[tuple[str, Any]] = []
+        self.sent: list[Any] = []
         self._receive: dict[str, Any] = {}
-        types = own_types(perception=True)
+        self._take: dict[str, Any] = {}
+        self.types = types = own_types(perception=True)
 
         def publish(topic: str, message: Any) -> None:
             types.write(message)
@@ -56,7 +58,9 @@ class Bridging:
             """Do nothing."""
 
         node: Any = SimpleNamespace(types=types, publish=publish, client=None, join=self._receive.__setitem__)
-        node.advertise = node.subscribe = node.watch = ignore
+        node.advertise = node.watch = ignore
+        node.subscribe = lambda endpoint, take, **_: self._take.update({endpoint.topic: take})
+        node.send = lambda _, message: self.sent.append(message)
         node.listened = lambda _: False
         node.endpoint = lambda kind, topic, type_, qos: Endpoint(Node(0, "", "", "", 0), 0, kind, topic, type_, "", qos)
         self._work = Work(load(None, {"store": "none", **given}).settings, node)
@@ -69,6 +73,10 @@ class Bridging:
             self._receive[self.stream](arrival)
         while self._work._queue:
             self._work.work(0.05)
+
+    def put(self, topic: str, kind: str, **fields: Any) -> None:
+        """Put a message of ROS into the queue."""
+        self._take[topic](TopicKey(0, topic, kind, NO_HASH), self.types.write(self.types.new(kind, **fields)))
 
     def of(self, kind: str) -> list[Any]:
         return [one for _, one in self.published if one.__msgtype__ == kind]
@@ -86,6 +94,20 @@ def test_tracks_that_ros_cannot_hold_keep_no_others_waiting() -> None:
     ((what, said),) = [(one["key"], one["message"]) for one in logs if one["event"] == "problem"]
     assert what == f"optipmb/v1/{stream}/tracks"
     assert "2147483647" in said
+
+
+def test_static_transforms_stay_where_more_comes_than_can_be_handled() -> None:
+    """They are said once: without them no later detections would have a pose."""
+    stream = "garage/robot-1/lidar"
+    bridging = Bridging(stream, ros2={"streams": {stream: {"detections": "/boxes"}}})
+    turn = {"rotation": {"w": 1.0}}
+    fixed = {"header": header_of(1, "map"), "child_frame_id": "lidar", "transform": turn}
+    bridging.put("/tf_static", TF, transforms=[fixed])
+    for stamp_ns in range(1, QUEUE + 1):
+        bridging.put("/boxes", "vision_msgs/msg/Detection3DArray", header=header_of(stamp_ns, "lidar"))
+    bridging.receive()
+    assert len(bridging.sent) == QUEUE - 1
+    assert bridging.sent[-1].stamp_ns == QUEUE
 
 
 @pytest.mark.parametrize("outputs", [{}, {"garage/*/*": {}}])

@@ -1,6 +1,7 @@
 """Work of the ROS 2 bridge: threads that receive put into one queue, and one thread does the work.
 
-The queue is bounded; when it is full the oldest message goes and is counted.
+The queue is bounded; when it is full the oldest message goes and is counted. What is said once stays the longest:
+static transforms, and which endpoints there are.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ class Work(Component):
         self._settings = settings
         self._node = node
         self._bridge = Bridge(settings, node)
-        self._queue: collections.deque[tuple[Callable[[], None], int]] = collections.deque()
+        self._queue: collections.deque[tuple[Callable[[], None], int, bool]] = collections.deque()
         self._waiting_bytes = 0
         self._lock = threading.Lock()
         self._filled = threading.Event()
@@ -78,7 +79,7 @@ class Work(Component):
                 self._node.advertise(endpoint)
             else:
                 self._node.subscribe(endpoint, partial(self._receive, endpoint), clouds=endpoint.type == CLOUD)
-        self._node.watch(lambda endpoint, came: self._put(lambda: self._changed(endpoint, came=came)))
+        self._node.watch(lambda endpoint, came: self._put(lambda: self._changed(endpoint, came=came), once=True))
         for stream in self._settings.ros2.streams:
             self._node.join(stream, lambda message: self._put(lambda: self._come_back(message)))
 
@@ -124,7 +125,7 @@ class Work(Component):
     def _receive(self, endpoint: graph.Endpoint, key: graph.TopicKey, payload: bytes) -> None:
         """Queue a message of the right type; the graph has reported any other."""
         if key.type == endpoint.type and key.hash in {endpoint.hash, graph.NO_HASH}:
-            self._put(lambda: self._read(endpoint, payload), len(payload))
+            self._put(lambda: self._read(endpoint, payload), len(payload), once=endpoint.qos.transient_local)
 
     def _read(self, endpoint: graph.Endpoint, payload: bytes) -> None:
         receive = self._endpoints[endpoint]
@@ -155,12 +156,14 @@ class Work(Component):
         for problem in self._matching.change(endpoint, came=came):
             log.warning("ros2_mismatch", message=problem)
 
-    def _put(self, work: Callable[[], None], size: int = 0) -> None:
+    def _put(self, work: Callable[[], None], size: int = 0, *, once: bool = False) -> None:
         with self._lock:
-            self._queue.append((work, size))
+            self._queue.append((work, size, once))
             self._waiting_bytes += size
             while len(self._queue) > QUEUE or self._waiting_bytes > QUEUE_BYTES:
-                self._waiting_bytes -= self._queue.popleft()[1]
+                oldest = next((at for at, (_, _, stays) in enumerate(self._queue) if not stays), 0)
+                self._waiting_bytes -= self._queue[oldest][1]
+                del self._queue[oldest]
                 self._shed += 1
         self._filled.set()
 
@@ -168,7 +171,7 @@ class Work(Component):
         with self._lock:
             if not self._queue:
                 return None
-            work, size = self._queue.popleft()
+            work, size, _ = self._queue.popleft()
             self._waiting_bytes -= size
             return work
 
