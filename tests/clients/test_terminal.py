@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 HEIGHT = 40
+SECOND = 1_000_000_000
 
 
 def session(stream: str, **changes: Any) -> SessionSummary:
@@ -41,8 +42,11 @@ def test_a_restart_is_no_negative_rate() -> None:
     """Counters that begin again after a restart are not compared with those before it."""
     view = StatusView("here")
     view.take([service("one", session("a/b/c"), frames=5000)], 10.0)
+    view.take([service("one", session("a/b/c", shed=9), frames=5000)], 10.5)
     view.take([service("one", session("a/b/c"), frames=3, started_ns=2)], 11.0)
     assert "0 frames/s, 0.0 lost/s" in text(view)
+    (line,) = [line for line in text(view).splitlines() if line.startswith("a/b/c")]
+    assert line.split()[8] == "0.0"
 
 
 def test_the_worst_come_first_and_the_rest_is_counted() -> None:
@@ -80,6 +84,21 @@ def test_problems_are_shown_once_with_their_age() -> None:
     assert len(lines) == 1
     assert lines[0].split()[:4] == ["4.0", "s", "ago", "a/b/c:"]
     assert "(3 times)" in lines[0]
+
+
+def test_problems_are_as_old_as_the_service_says() -> None:
+    """Also those from before the view began, and where a service has more of them than the view holds."""
+    reported = [
+        Problem(stream="a/b/c", instance="one", code="late", message=f"Frame {n}.", reported_ns=n * SECOND)
+        for n in range(100)
+    ]
+    view = StatusView("here")
+    for second in range(3):
+        status = service("one", session("a/b/c"), problems=tuple(reported), started_ns=0, uptime_s=7300.0 + second)
+        view.take([status], float(second))
+    lines = [line.split() for line in text(view).splitlines() if "Frame" in line]
+    assert [line[-1] for line in lines] == [f"{n}." for n in range(94, 100)]
+    assert {" ".join(line[:3]) for line in lines} == {"2 h ago"}
 
 
 @pytest.mark.parametrize("width", [80, 140])

@@ -122,7 +122,8 @@ class _Seen:
     status: ServiceStatus
     at_s: float
     frames_hz: float = 0.0
-    lost_hz: float = 0.0
+    lost_hz: dict[str, float] = field(default_factory=dict)
+    """By stream."""
     curve: deque[float] = field(default_factory=lambda: deque(maxlen=HISTORY))
 
 
@@ -137,7 +138,6 @@ class StatusView:
         self._where = where
         self._seen: dict[str, _Seen] = {}
         self._problems: dict[tuple[str, str, str, str], tuple[float, Problem]] = {}
-        self._lost: dict[tuple[str, str], float] = {}
         self._now_s = 0.0
 
     def take(self, services: Sequence[ServiceStatus], now_s: float) -> None:
@@ -149,13 +149,12 @@ class StatusView:
             if old is not None and old.status.started_ns == status.started_ns and now_s > old.at_s:
                 seconds = now_s - old.at_s
                 seen.frames_hz = max(0, status.frames - old.status.frames) / seconds
-                self._count_lost(status, old.status, seconds)
-                seen.lost_hz = sum(self._lost.get((status.instance, one.stream), 0.0) for one in status.sessions)
+                seen.lost_hz = _lost_hz(status, old.status, seconds)
                 seen.curve.append(seen.frames_hz)
             self._seen[status.instance] = seen
             for one in status.problems:
                 key = (one.instance, one.stream, one.code, f"{one.path} {one.message} {one.count}")
-                self._problems.setdefault(key, (now_s, one))
+                self._problems.setdefault(key, (now_s - _age_s(status, one), one))
                 if len(self._problems) > 10 * SHOWN_PROBLEMS:
                     del self._problems[next(iter(self._problems))]
         for instance in [name for name, seen in self._seen.items() if now_s - seen.at_s > GONE_S]:
@@ -177,18 +176,10 @@ class StatusView:
             shown += [Text(), *(self._problem(at_s, problem) for at_s, problem in problems)]
         return Group(*shown)
 
-    def _count_lost(self, status: ServiceStatus, before: ServiceStatus, seconds: float) -> None:
-        old = {session.stream: session for session in before.sessions}
-        for session in status.sessions:
-            past = old.get(session.stream, session)
-            names = ("refused", "shed", "gaps")
-            lost = sum(max(0, getattr(session, name) - getattr(past, name)) for name in names)
-            self._lost[status.instance, session.stream] = lost / seconds
-
     def _title(self, alive: Sequence[_Seen]) -> Text:
         streams = sum(len(seen.status.sessions) for seen in alive)
         frames = sum(seen.frames_hz for seen in alive)
-        lost = sum(seen.lost_hz for seen in alive)
+        lost = sum(sum(seen.lost_hz.values()) for seen in alive)
         text = Text.assemble(("OptiPMB", "bold"), f"  {self._where}   ")
         text.append(f"{_counted(len(alive), 'service')}, {_counted(streams, 'stream')}, ")
         text.append(f"{frames:.0f} frames/s", style="bold")
@@ -212,7 +203,7 @@ class StatusView:
                 str(len(sessions)),
                 str(seen.status.standby),
                 f"{seen.frames_hz:.1f}",
-                _lost(seen.lost_hz),
+                _lost(sum(seen.lost_hz.values())),
                 str(sum(session.queue for session in sessions)),
                 f"{median_high([session.latency_p50_ms for session in sessions] or [0.0]):.1f}",
                 _latency(max((session.latency_p99_ms for session in sessions), default=0.0)),
@@ -239,7 +230,7 @@ class StatusView:
                 _latency(session.latency_p99_ms),
                 str(session.tracks),
                 Text(str(session.queue), style=POOR if session.queue > session.rate_hz + 1 else ""),
-                _lost(self._lost.get((instance, session.stream), 0.0)),
+                _lost(seen.lost_hz.get(session.stream, 0.0)),
                 str(session.refused + session.shed + session.gaps),
                 "never" if session.age_s is None else duration(session.age_s),
             )
@@ -249,7 +240,7 @@ class StatusView:
 
     def _urgency(self, seen: _Seen, session: SessionSummary) -> float:
         """Return how urgent a stream is: losses first, then silence, then waiting and lateness."""
-        losing = 1e6 * (self._lost.get((seen.status.instance, session.stream), 0.0) > 0)
+        losing = 1e6 * (seen.lost_hz.get(session.stream, 0.0) > 0)
         silent = 1e5 * (session.state not in {"running", "new"})
         return losing + silent + 100 * (session.queue > session.rate_hz + 1) + (session.latency_p99_ms // LATE_MS)
 
@@ -259,6 +250,24 @@ class StatusView:
         style = POOR if age < RECENT_S else QUIET
         line = f"{duration(age):>8} ago  {text}"
         return Text(line, style=style, no_wrap=True, overflow="ellipsis")
+
+
+def _age_s(status: ServiceStatus, problem: Problem) -> float:
+    """Return how long ago a service reported a problem, by its clock; 0 where it does not say."""
+    if problem.reported_ns is None:
+        return 0.0
+    return max(0.0, status.uptime_s - (problem.reported_ns - status.started_ns) / 1e9)
+
+
+def _lost_hz(status: ServiceStatus, before: ServiceStatus, seconds: float) -> dict[str, float]:
+    """Return the frames per second that each stream has lost since a status before."""
+    lost_hz = {}
+    old = {session.stream: session for session in before.sessions}
+    for session in status.sessions:
+        past = old.get(session.stream, session)
+        lost = (max(0, getattr(session, name) - getattr(past, name)) for name in ("refused", "shed", "gaps"))
+        lost_hz[session.stream] = sum(lost) / seconds
+    return lost_hz
 
 
 def _table(names: Iterable[str], figures: Iterable[str]) -> Table:
