@@ -11,6 +11,7 @@ from typing import Any
 import grpc
 import numpy as np
 from optipmb_client import Publisher, Subscriber
+from optipmb_client.grpc.channels import SERVICE
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
@@ -44,10 +45,10 @@ class Failing(rpc.TrackingServiceServicer):
 
 
 @contextlib.contextmanager
-def served(gateway: rpc.TrackingServiceServicer) -> Iterator[str]:
+def served(gateway: Any, add: Any = rpc.add_TrackingServiceServicer_to_server) -> Iterator[str]:
     address = free_endpoint().removeprefix("tcp/")
     server = grpc.server(ThreadPoolExecutor(4))
-    rpc.add_TrackingServiceServicer_to_server(gateway, server)  # type: ignore[no-untyped-call]  # as it is generated
+    add(gateway, server)
     server.add_insecure_port(address)
     server.start()
     try:
@@ -88,3 +89,22 @@ def test_frames_that_are_lost_at_a_gateway_are_named() -> None:
         assert [one.tracks.seq for one in received if one] == [0, 1, 5, 9, 10]
         assert [(one.first, one.last) for one in tracks.missed] == [(2, 4), (6, 8)]
         assert (tracks.statistics.missed, tracks.statistics.dropped) == (2, 3)
+
+
+def test_responses_of_another_release_end_no_subscription_in_silence() -> None:
+    """A kind of response that is not known is left out; after one that cannot be read nobody waits for the next."""
+
+    def subscribe(_request: bytes, _context: Any) -> Iterator[bytes]:
+        yield bytes([15 << 3 | 2, 0])  # a field that there is not
+        yield pb.SubscribeResponse(tracks=convert.to_proto(tracks_message("a/b/c", 1))).SerializeToString()
+        yield bytes([1 << 3 | 2, 9])  # tracks that are cut
+
+    def add(handlers: Any, server: grpc.Server) -> None:
+        server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE, handlers),))
+
+    handlers = {"Subscribe": grpc.unary_stream_rpc_method_handler(subscribe)}
+    with served(handlers, add) as endpoint, Subscriber("a/b/c", endpoint) as tracks:
+        first = tracks.receive(DEADLINE_S)
+        assert first is not None
+        assert first.tracks.seq == 1
+        assert list(tracks) == []

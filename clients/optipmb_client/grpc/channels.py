@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import grpc
+from google.protobuf.message import DecodeError
 from optipmb_schemas.certificates import end_of, ended
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
@@ -196,6 +197,9 @@ class ResumedCall(ABC):
                 if lasting(error):
                     self._fail(ServiceRefused(f"the gateway refused: {error.details()}"))
                     return
+            except DecodeError as error:
+                self._fail(ServiceRefused(f"the gateway sent a response that cannot be read: {error}"))
+                return
             except (ConnectionFailed, ValueError) as error:  # the connection, or the channel, was closed
                 self._fail(ConnectionFailed(str(error)))
                 return

@@ -278,7 +278,8 @@ class GrpcSubscription(ResumedCall):
         said = (pb.SubscribeEventsResponse if self._events else pb.SubscribeResponse).FromString(response)
         if said.skipped:
             self._inbox.lose(said.skipped)
-        (name,) = {field.name for field, _ in said.ListFields()} - {"skipped"}
-        proto = getattr(said, name)
-        key = getattr(self._keys, "problems" if name == "problem" else name)(proto.stream)
-        self._inbox.put(_ProtoArrival(key, b"", "application/protobuf", time.monotonic_ns(), proto=proto))
+        kinds = {one.name for one, _ in said.ListFields()} - {"skipped"}
+        for name in kinds:  # none, where this release does not know it
+            proto = getattr(said, name)
+            key = getattr(self._keys, "problems" if name == "problem" else name)(proto.stream)
+            self._inbox.put(_ProtoArrival(key, b"", "application/protobuf", time.monotonic_ns(), proto=proto))
