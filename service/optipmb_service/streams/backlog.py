@@ -275,8 +275,13 @@ class Backlog:
             self.unasked |= asked_for
         self._lose(lost)
 
-    def bring(self, packets: Iterable[Packet]) -> None:
-        """Put messages that other members received before the held ones; none is held twice."""
+    def bring(self, packets: Iterable[Packet]) -> list[Packet]:
+        """Put messages that other members received before the held ones; none is held twice.
+
+        Returns:
+            Messages that were dropped because there is no room, for the caller to count.
+        """
+        lost: list[Packet] = []
         with self._lock:
             held = [(packet, True) for packet in packets]
             known = {(packet.key, packet.payload) for packet, _ in held}
@@ -286,8 +291,9 @@ class Backlog:
                     given -= packet.held
                 else:
                     held.append((packet, own))
-            self._bounds.held.add(given)
             self._held = deque(held)
+            self._make_room(lost, fits=self._bounds.held.add(given))
+        return lost
 
     def forget_missed(self) -> None:
         """Drop packets that were missed: they are in the log still."""
@@ -400,10 +406,12 @@ class Backlog:
         return first
 
     def _hold(self, packet: Packet, lost: list[Packet], *, own: bool) -> None:
-        """Hold a packet; when there is no room, the oldest clouds of the session go first, then its oldest frames."""
         self._held.append((packet, own))
         self.seen_ns = packet.now_ns
-        fits = self._bounds.held.add(packet.held)
+        self._make_room(lost, fits=self._bounds.held.add(packet.held))
+
+    def _make_room(self, lost: list[Packet], *, fits: bool) -> None:
+        """Drop held packets until all fit: the oldest clouds of the session go first, then its oldest frames."""
         while not fits and self._held:
             cloud = next((index for index, (one, _) in enumerate(self._held) if not one.frame), 0)
             fits = self._drop_held(cloud, lost)

@@ -341,6 +341,7 @@ class Streams:
 
     def take_up(self, session: str, packets: list[Packet]) -> None:
         """Open a session that has come here: first with messages that others received, then with the held ones."""
+        lost: list[Packet] = []
         with self._lock:
             self._newcomers.pop(session, None)
             self._coming.discard(session)
@@ -350,7 +351,9 @@ class Streams:
             if backlog is None:
                 return
             if holds := self.member.holds(session):
-                backlog.bring(packets)
+                lost = backlog.bring(packets)
+        if lost:
+            self._lose(session, lost)
         if holds:
             self._command(session, Stream.take_up, urgent=True, limited=False)
         else:

@@ -173,6 +173,18 @@ def test_what_others_received_goes_before_what_was_held_here() -> None:
     assert numbers(taken(backlog)) == [0, 1, 2]
 
 
+def test_brought_messages_take_no_more_room_than_there_is() -> None:
+    """The oldest go and are counted, so that other sessions keep what they hold."""
+    bounds = bounds_of(held=ByteBudget(5 * PACKET_BYTES))
+    other, backlog = (Backlog(name, bounds, 0) for name in ("a/b/other", "a/b/c"))
+    for number in range(2):
+        other.push(packet(number))
+    lost = backlog.bring([packet(number) for number in range(6)])
+    assert numbers(lost) == [0, 1, 2]
+    other.push(packet(2))
+    assert (numbers(backlog.recent()), numbers(other.recent())) == ([3, 4, 5], [1, 2])
+
+
 ACTIONS = st.sampled_from(["own", "cloud", "foreign", "take", "open", "live", "leave", "give", "recover", "trim"])
 
 
