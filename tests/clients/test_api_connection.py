@@ -14,7 +14,7 @@ import pytest
 import zenoh
 import zenoh.ext
 from optipmb_client import ConnectionFailed, Publisher, Subscriber
-from optipmb_client.incoming import Arrival, Inbox
+from optipmb_client.incoming import Inbox
 from optipmb_client.links import linked
 from optipmb_client.zenoh import DEFAULT_ENDPOINT, Connection
 from optipmb_client.zenoh import connection as connecting
@@ -112,22 +112,6 @@ def test_what_is_sent_just_before_closing_arrives(endpoint: str, monkeypatch: py
     }
 
 
-def test_a_late_subscriber_gets_the_history_of_the_cache(endpoint: str) -> None:
-    """A subscriber that comes after the messages gets the newest ones that the publisher keeps, in order."""
-    early, inbox = Inbox(100), Inbox(100)
-    with Connection(endpoint) as sender, Connection(endpoint) as witness, Connection(endpoint) as receiver:
-        witness.subscribe("a/*", early)
-        small = sender.cached_sender("a/small", "application/msgpack;optipmb.Detections.v1", cache=3)
-        for number in range(5):
-            small.put(b"%d" % number)
-        while (arrival := early.get(60.0)) and arrival.payload != b"4":  # none is under way when the late one comes
-            pass
-        receiver.subscribe("a/*", inbox)
-        arrivals = [inbox.get(60.0) for _ in range(3)]
-    assert [arrival.payload for arrival in arrivals if arrival] == [b"2", b"3", b"4"]
-    assert {arrival.encoding for arrival in arrivals if arrival} == {"application/msgpack;optipmb.Detections.v1"}
-
-
 def test_what_a_publisher_sent_before_its_first_sample_came_is_not_lost(
     endpoint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -203,30 +187,6 @@ def test_a_closed_connection_is_one_clear_error(endpoint: str) -> None:
             attempt()
         assert "\n" not in str(caught.value)
         assert ".rs" not in str(caught.value)
-
-
-def test_full_inbox_drops_the_oldest() -> None:
-    """Of n entries in an inbox of k, the newest k are read, in order."""
-    inbox = Inbox(3)
-    for number in range(7):
-        inbox.put(Arrival("k", b"%d" % number, "", number))
-    inbox.close()
-    read = []
-    while (arrival := inbox.get()) is not None:
-        read.append(arrival.monotonic_ns)
-    assert read == [4, 5, 6]
-    assert inbox.dropped == 4
-
-
-def test_closing_an_inbox_wakes_its_reader() -> None:
-    """A reader that waits without a timeout returns None when the inbox is closed."""
-    inbox = Inbox(1)
-    results: list[object] = []
-    reader = threading.Thread(target=lambda: results.append(inbox.get(None)), daemon=True)
-    reader.start()
-    inbox.close()
-    reader.join(10.0)
-    assert results == [None]
 
 
 def test_a_query_nobody_serves_has_no_answers(endpoint: str) -> None:

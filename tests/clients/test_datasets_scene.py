@@ -9,17 +9,12 @@ from typing import TypeAlias
 import numpy as np
 import pytest
 from boxes import points_in_box
-from evaluation_cases import evaluate_clear
-from optipmb_tools.datasets import DatasetError, Truth, open_dataset
+from optipmb_tools.datasets import DatasetError, open_dataset
 from optipmb_tools.datasets.scene.dataset import RADIUS, SceneSequence
-from optipmb_tools.datasets.scene.detector import CLASSES, FALSE, MIN_SCORE, Found
+from optipmb_tools.datasets.scene.detector import FALSE, MIN_SCORE, Found
 from optipmb_tools.datasets.scene.lidar import GROUND
 from optipmb_tools.datasets.scene.traffic import HALF_WIDTH, fixed_boxes
-from optipmb_tools.evaluation import Rules
 from optipmb_tools.geometry import rotation_of, wrap_angle
-from optipmb_tools.results import ResultTable
-
-import optipmb
 
 RATE = 10.0
 Observed: TypeAlias = list[list[tuple[np.ndarray, Found]]]
@@ -286,30 +281,3 @@ def test_errors_of_detections_are_those_of_a_detector(scenes: list[SceneSequence
     assert 0.03 < np.median(error[rich]) < 0.2
     assert 1.5 * np.median(error[rich]) < np.median(error[~rich]) < 0.7
     assert 0.0 < flip.mean() < 0.04
-
-
-def test_detections_are_where_the_truth_is(scenes: list[SceneSequence], observed: Observed) -> None:
-    """Most confident detections are at a true object, most visible objects are detected; truth as tracks is perfect."""
-    sequence = scenes[0]
-    truth = sequence.truth()
-    local: Truth = truth.to_sensor(sequence.poses)
-    _, found = observed[0][100]
-    now = local.take(local.frame == 100)
-    near = np.linalg.norm(found.center[:, None, :2] - now.center[None, :, :2], axis=2) < 2.0
-    sure = found.score > 0.7
-    assert near[sure].any(axis=1).mean() > 0.8
-    assert near[:, ~now.ignored].any(axis=0).mean() > 0.8
-    result = evaluate_clear(truth, visible(truth), "Car", Rules(measure="distance", limit=2.0))
-    assert result.mota > 0.99
-
-
-def visible(truth: Truth) -> ResultTable:
-    """Give the truth that is not ignored as tracks."""
-    rows = truth.take(~truth.ignored)
-    columns = (rows.frame, rows.id, rows.label, rows.center, rows.size, rows.yaw)
-    return ResultTable(rows.labels, *columns, np.ones(len(rows)), rows.box2d)
-
-
-def test_the_profile_of_scenes_knows_their_classes() -> None:
-    """The tracker has the profile that scenes name, and it has their classes."""
-    assert set(CLASSES) <= set(optipmb.load_profile(open_dataset("scene").profile).classes)

@@ -7,31 +7,24 @@ import pytest
 from optipmb_tools.files import DatasetError, numbers, read_rows, write_whole
 
 
-def test_a_number_that_is_none_is_named_with_its_line(tmp_path: Path) -> None:
-    """The error carries path, line, the expected form and the found text."""
+@pytest.mark.parametrize(
+    ("row", "text"),
+    [
+        ("3 four", "expected a number, received 'four'"),
+        ("3", "(two numbers), received 1 fields"),
+        ("3 nan", "received 'nan'"),
+        ("3 inf", "received 'inf'"),
+    ],
+)
+def test_a_row_that_is_none_is_named_with_its_line(tmp_path: Path, row: str, text: str) -> None:
+    """The error carries path, line, the expected form and the found text; a file without rows is no error."""
     path = tmp_path / "a.txt"
-    path.write_text("1 2\n\n3 four\n")
+    path.write_text(f"1 2\n\n{row}\n")
     with pytest.raises(DatasetError) as caught:
         numbers(path, read_rows(path, "numbers"), 2, "two numbers")
-    assert (caught.value.path, caught.value.line) == (str(path), 3)
-    assert (caught.value.expected, caught.value.received) == ("a number", "'four'")
-    assert str(caught.value) == f"{path}:3: expected a number, received 'four'"
-
-
-@pytest.mark.parametrize(("text", "received"), [("1\n", "1 fields"), ("1 nan\n", "'nan'"), ("1 inf\n", "'inf'")])
-def test_missing_fields_and_numbers_without_end_are_refused(tmp_path: Path, text: str, received: str) -> None:
-    """A row has all its fields, and they are finite."""
-    path = tmp_path / "a.txt"
-    path.write_text(text)
-    with pytest.raises(DatasetError) as caught:
-        numbers(path, read_rows(path, "numbers"), 2, "two numbers")
-    assert (caught.value.line, caught.value.received) == (1, received)
-
-
-def test_an_empty_file_is_a_table_without_rows(tmp_path: Path) -> None:
-    """No lines, no rows, but the columns."""
-    path = tmp_path / "a.txt"
-    path.touch()
+    assert str(caught.value).startswith(f"{path}:3: expected ")
+    assert str(caught.value).endswith(text)
+    path.write_text("")
     assert numbers(path, read_rows(path, "numbers"), 5, "five").shape == (0, 5)
 
 

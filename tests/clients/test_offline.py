@@ -20,16 +20,6 @@ def dataset() -> Dataset:
     return open_dataset("scene", frames=20, vehicles=6, pedestrians=3, cyclists=2)
 
 
-def test_the_same_data_give_the_same_bytes(dataset: Dataset, tmp_path: Path) -> None:
-    """Two runs write the same file, and it is not empty."""
-    files = []
-    for run in ("one", "two"):
-        (result,) = track(dataset, dataset.sequences(["0000"]), tmp_path / run, Tracking(read_profile("kitti")))
-        files.append(result.file.read_bytes())
-    assert files[0] == files[1]
-    assert len(files[0].splitlines()) > 40
-
-
 @pytest.mark.parametrize("smooth", [False, True])
 def test_predicted_paths_are_written_with_all_columns(dataset: Dataset, tmp_path: Path, *, smooth: bool) -> None:
     """With horizons in the profile the file of all columns has a path for each row; the result file is as without."""
@@ -82,19 +72,6 @@ def test_what_is_reported_is_what_was_written(dataset: Dataset, tmp_path: Path) 
     assert result.step is not None
     assert 0.0 < result.step.p50_ms <= result.step.p99_ms <= result.step.max_ms
     assert result.seconds > 0.0
-
-
-def test_clouds_change_the_tracks(dataset: Dataset) -> None:
-    """The clouds of the frames reach the tracker: without them existence probabilities differ."""
-    parameters = read_profile("kitti")
-    (sequence,) = dataset.sequences(["0000"])
-    bare = Preloaded(sequence)
-    bare._frames = [replace(frame, cloud=None) for frame in bare._frames]
-    with_clouds, without = (
-        np.concatenate([tracks.existence for tracks in track_whole(parameters, one).tracks.values()])
-        for one in (sequence, bare)
-    )
-    assert with_clouds.shape != without.shape or not np.array_equal(with_clouds, without)
 
 
 def test_chosen_classes_are_the_only_ones() -> None:

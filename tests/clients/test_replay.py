@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from fake_service import Behaviour, FakeService
-from optipmb_client import Connection, ServiceRefused, ServiceUnavailable, UsageError
+from optipmb_client import Connection, ServiceRefused
 from optipmb_schemas import Detections, Tracks
 from optipmb_tools.datasets import Dataset, open_dataset
 from optipmb_tools.run.replay import Pace, ReplayedSequence, Replaying, replay
@@ -172,36 +172,6 @@ def test_the_newest_revision_is_written(endpoint: str, link: Connection, dataset
     rows = [line.split() for line in result.file.read_text().splitlines()]
     assert {int(row[1]) >= 2000 for row in rows if row[0] == "7"} == {True}
     assert {int(row[1]) < 1000 for row in rows if row[0] != "7"} == {True}
-
-
-def test_sequences_at_once_do_not_mix(endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path) -> None:
-    """Three sequences at once give the same files as one after the other."""
-    names = ("0000", "0001", "0002")
-    with FakeService(endpoint) as service:
-        run(link, dataset, tmp_path / "one", *names)
-        together = run(link, dataset, tmp_path / "three", *names, streams=3)
-    assert [result.name for result in together] == list(names)
-    assert len(service.seen.closed) == 6
-    for name in names:
-        one, three = (tmp_path / folder / f"{name}.txt" for folder in ("one", "three"))
-        assert one.read_bytes() == three.read_bytes() != b""
-
-
-def test_classes_are_chosen(endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path) -> None:
-    """With classes given, only their objects are sent; a class that the data lack is refused by name."""
-    with FakeService(endpoint) as service:
-        run(link, dataset, tmp_path, classes=["Pedestrian"])
-        sent = {message.labels[index] for message in service.seen.detections for index in message.label}
-        assert sent == {"Pedestrian"}
-        with pytest.raises(UsageError, match="'Tram'"):
-            run(link, dataset, tmp_path, classes=["Tram"])
-
-
-def test_no_service_is_one_clear_error(link: Connection, dataset: Dataset, tmp_path: Path) -> None:
-    """A network without a service gives ServiceUnavailable within the time given, and no file."""
-    with pytest.raises(ServiceUnavailable, match="optipmb-service"):
-        run(link, dataset, tmp_path, pace=Pace(service_s=0.5))
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_service_that_comes_late_is_waited_for(

@@ -19,7 +19,7 @@ from optipmb_tools.cli import run
 from optipmb_tools.datasets import Dataset, DatasetError, open_dataset
 from optipmb_tools.recordings.files import RecordingFile
 from optipmb_tools.run.replay import Pace, Replaying, replay
-from real_data import REPOSITORY, kitti_root
+from real_data import REPOSITORY
 from service_process import ServiceProcess
 
 FRAMES = 15
@@ -243,12 +243,6 @@ def test_a_killed_recording_still_plays(
     assert "was cut off" in done.stderr
     assert "equal to the recorded tracks" in done.stdout
     assert done.returncode == 0, done.stderr
-
-
-def test_kitti(service: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Real detections, with the clouds that there are."""
-    path = recorded_replay(service, tmp_path, open_dataset("kitti", kitti_root(), "pointrcnn"), "0002")
-    play_into_another(path, tmp_path, capsys)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """`Subscribe` and `QueryTracks`: the selected tracks, in order; a slow reader delays no other."""
 
 import asyncio
-import threading
 from collections.abc import Iterable
 from typing import Any
 
@@ -188,31 +187,6 @@ def test_a_queue_above_the_bound_is_refused(stub: Any) -> None:
     with pytest.raises(grpc.RpcError) as raised:
         list(stub.Subscribe(pb.SubscribeRequest(pattern="a/b/c", queue=100_000)))
     assert raised.value.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
-
-
-def test_a_slow_reader_gets_the_newest_and_is_told_what_it_missed(gateway: GatewayProcess, stream: str) -> None:
-    """Frames delivered and frames said to be skipped add up; the last frame is there; others get everything."""
-    stub = gateway.stub()
-    many = {"label": np.zeros(300, dtype=int), "center": np.random.default_rng(1).uniform(-90, 90, (300, 3))}
-    many |= {"size": np.tile([4.5, 1.9, 1.6], (300, 1)), "yaw": np.zeros(300), "score": np.full(300, 0.9)}
-    asleep = subscribed(gateway.stub(), pattern=stream, queue=4)
-    awake = subscribed(gateway.stub(), pattern=stream, queue=1024)
-    received: list[Any] = []
-    reader = threading.Thread(target=lambda: received.extend(taken(awake, 200)), daemon=True)
-    reader.start()
-    list(stub.Track(detections(frame(seq, stream, **many)) for seq in range(200)))
-    reader.join(60)
-    assert [one.tracks.seq for one in received] == list(range(200))
-    assert sum(one.skipped for one in received) == 0
-    late, skipped = [], 0
-    while not late or late[-1] < 199:
-        response = next(asleep)
-        late.append(response.tracks.seq)
-        skipped += response.skipped
-    asleep.cancel()
-    assert skipped > 0
-    assert len(late) + skipped == 200
-    assert late == sorted(late)
 
 
 def test_what_is_left_of_a_frame_is_a_message(stub: Any, stream: str) -> None:

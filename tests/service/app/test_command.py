@@ -129,18 +129,6 @@ def test_a_profile_that_there_is_not_starts_nothing(
     assert says in shown.err
 
 
-def test_a_profile_of_some_streams_that_there_is_not_is_one_clear_line(tmp_path: Path) -> None:
-    """The process ends with status 2 and one line on stderr that names the profile; nothing is on stdout."""
-    own = tmp_path / "settings.toml"
-    own.write_text("[profiles]\n'a/*' = 'unheard-of'")
-    with ServiceProcess("--settings", str(own), listen=False) as service:
-        assert service.wait_end(120) == 2
-        assert service.errors.count("\n") == 1
-        assert service.errors.startswith("optipmb-service: ")
-        assert "unheard-of" in service.errors
-        assert service.output == []
-
-
 def refused(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *options: str, says: str) -> None:
     """Run the command in this process, which must refuse its options before anything is started."""
     monkeypatch.setattr(worker, "run", lambda _: pytest.fail("it was started"))

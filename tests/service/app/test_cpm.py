@@ -419,13 +419,3 @@ def test_settings_without_a_place_or_a_number_are_refused(tmp_path: Path, text: 
     with pytest.raises(SettingsInvalidError) as caught:
         load(path)
     assert error in str(caught.value)
-
-
-def test_the_settings_of_the_page_are_settings(tmp_path: Path) -> None:
-    """As they stand in docs/standards.md."""
-    page = (Path(__file__).parents[3] / "docs" / "standards.md").read_text()
-    path = tmp_path / "cpm.toml"
-    path.write_text(page.partition("```toml\n")[2].partition("```")[0])
-    settings = load(path).settings
-    assert station_of(settings, "garage/gate/fused", 128) is not None
-    assert settings.mqtt.topics == ("cpm",)

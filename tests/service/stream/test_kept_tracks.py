@@ -42,15 +42,6 @@ def seqs(messages: Iterable[Any]) -> list[int]:
     return [one.seq for one in messages]
 
 
-def test_what_is_wanted_is_taken_by_stamp() -> None:
-    """Stamps from the first to the last, both included, in their order, for any order of publication."""
-    found = TracksRange(2 * 10**9, 5 * 10**9)
-    assert found.add(at(1, 2, 4, 3))
-    assert found.add(at(5, 6))
-    assert seqs(found.messages()) == [2, 3, 4, 5]
-    assert found.cut_ns is None
-
-
 def test_of_a_frame_the_tracks_that_hold_are_taken() -> None:
     """The latest run, in it the latest revision, for any order of arrival; another sensor's frame is another one."""
     found = TracksRange(0, None)

@@ -100,21 +100,14 @@ def test_session_ids_depend_on_where_a_session_began() -> None:
     )
 
 
-def test_a_cloud_before_its_frame_is_used_at_once() -> None:
-    """A frame whose cloud is there does not wait."""
-    one = session()
+@pytest.mark.parametrize("wait_ns", [WAIT_NS, 0])
+def test_a_cloud_before_its_frame_is_used_at_once(wait_ns: int) -> None:
+    """A frame whose cloud is there does not wait, and has the cloud where none is waited for."""
+    one = session(policy=Policy(cloud_wait_ns=wait_ns))
     one.on_points(SENSOR.points(0), 0)
-    message = tracks(one.on_detections(SENSOR.detections(0, has_points=True), 0))[0]
+    message = tracks(one.on_detections(SENSOR.detections(0, has_points=True if wait_ns else None), 0))[0]
     assert message.cloud_used
     assert (one.counters.clouds_used, one.deadline_ns) == (1, None)
-
-
-def test_a_cloud_before_its_frame_is_used_where_no_cloud_is_waited_for() -> None:
-    """With no wait for clouds, a frame still gets the one that came before it."""
-    one = session(policy=Policy(cloud_wait_ns=0))
-    one.on_points(SENSOR.points(0), 0)
-    message = tracks(one.on_detections(SENSOR.detections(0), 0))[0]
-    assert message.cloud_used
 
 
 def test_a_frame_waits_for_its_cloud() -> None:
