@@ -110,6 +110,21 @@ def test_static_transforms_stay_where_more_comes_than_can_be_handled() -> None:
     assert bridging.sent[-1].stamp_ns == QUEUE
 
 
+def test_a_wrong_transform_takes_no_other_along() -> None:
+    """One message has those of many frames: the wrong one is logged with its place, and the others hold."""
+    stream = "garage/robot-1/lidar"
+    bridging = Bridging(stream, ros2={"streams": {stream: {"detections": "/boxes"}}})
+    fixed = {"header": header_of(1, "map"), "child_frame_id": "lidar", "transform": {"rotation": {"w": 1.0}}}
+    with capture_logs() as logs:
+        bridging.put("/tf", TF, transforms=[fixed | {"child_frame_id": "arm", "transform": {}}, fixed])
+        bridging.put("/boxes", "vision_msgs/msg/Detection3DArray", header=header_of(1, "lidar"))
+        bridging.receive()
+    ((topic, said),) = [(one["topic"], one["message"]) for one in logs if one["event"] == "problem"]
+    assert topic == "/tf"
+    assert said.startswith("transforms[0]")
+    assert len(bridging.sent) == 1
+
+
 @pytest.mark.parametrize("outputs", [{}, {"garage/*/*": {}}])
 def test_collective_perception_messages_have_a_topic_below_the_tracks(outputs: dict[str, Any]) -> None:
     """Of twenty objects each, of the states that `outputs` predicts where the stream has them."""

@@ -120,12 +120,18 @@ class Bridge:
         """Apply a `TFMessage`; messages that waited for it go out.
 
         Raises:
-            MessageError: one of them is no transform; those before it are taken.
+            MessageError: one of them is no transform, the first such one; the others are taken.
         """
+        wrong: list[schemas.MessageError] = []
         for row, one in enumerate(message.transforms):
             place, turn = one.transform.translation, one.transform.rotation
-            self._add(f"transforms[{row}]", one.header, one.child_frame_id, place, turn, static=static)
+            try:
+                self._add(f"transforms[{row}]", one.header, one.child_frame_id, place, turn, static=static)
+            except schemas.MessageError as error:
+                wrong.append(error)
         self.go_on()
+        if wrong:
+            raise wrong[0]
 
     def take_odometry(self, message: Any) -> None:
         """Apply an `Odometry` as the transform of its child frame.
