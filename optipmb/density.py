@@ -162,7 +162,7 @@ def misses_counted_from(objects: Bernoullis, missed_from_ns: Index) -> Index:
 
 
 BINS: Final = 26
-COUNTS: Final = 5
+COUNTS: Final = 6
 SLOTS: Final = 3
 SLOT: Final = BINS + 2
 SCATTER: Final = 3

@@ -19,6 +19,15 @@ The curve of a class is the isotonic regression of the shares over the log odds 
 in each bin whose scores are right. Its largest value is `MOST`. It depends on frames of the past alone, and
 the state is part of the density. Counts fade from `MASS` detections on.
 
+Clutter that stands lasts too. Of a class whose motion is "cv", such as pedestrians, a bin below the best fifth of the
+scores counts no more lasting detections than the moving ones among them tell:
+
+    n = min(lasting, (moving + `FREE`) / mu)
+
+mu is the share of the lasting detections of the best fifth that move, faster than `WALK` a slot later. Where it is at
+most `LEAST_MOVERS`, or a class parks, standing tells nothing. The score filter and the suppression of overlapping boxes
+use the curve without it, as standing boxes are of something.
+
 Noise is learned in the same way. Of a confirmed track of at least `SURE_S` that was detected in the frame before, the
 innovation nu and the residual epsilon of a detection, z less the predicted and the updated position, give its scatter
 along and across the heading:
@@ -42,7 +51,7 @@ import numpy as np
 
 from optipmb.calibration import log_odds
 from optipmb.compiled import kernel
-from optipmb.density import BINS, COUNTS, NO_BIN, PHI, SLOT, SLOTS, SelfCalibration, X, Y, objects_in
+from optipmb.density import BINS, COUNTS, NO_BIN, PHI, SLOT, SLOTS, SelfCalibration, V, X, Y, objects_in
 from optipmb.frame import PLAIN
 from optipmb.predict import rows_within
 from optipmb.rows import read_only
@@ -64,9 +73,9 @@ BIN: Final = 0.4
 LOWEST: Final = -0.5 * BIN * BINS
 """Width of a bin of log odds, and the lower edge of the first."""
 
-DETECTIONS, LASTING, GIVEN, HITS, LOOKS = range(5)
-"""Counts of a class by bin: evaluated detections, lasting ones, all scores of the detector, and hits and looks of inner
-slots by the mean bin of the slot."""
+DETECTIONS, LASTING, MOVING, GIVEN, HITS, LOOKS = range(6)
+"""Counts of a class by bin: evaluated detections, lasting ones, those of them whose object moves, all scores of the
+detector, and hits and looks of inner slots by the mean bin of the slot."""
 SLOT_TICKS: Final = 9900
 """Shortest time of a slot: a second, less the jitter of stamps, in ticks of 0.1 ms."""
 OF_LOOKS, TICKS = BINS, BINS + 1
@@ -87,6 +96,12 @@ FULL_SLOT: Final = 10.0
 LEAST_SHARE, MOST_SHARE, PRIOR_RECALL = 0.4, 0.87, 0.95
 BEST: Final = 0.2
 """Share of the detections of a class whose scores are the best."""
+WALK: Final = 0.5
+"""Speed from which an object moves, m/s."""
+LEAST_MOVERS: Final = 0.5
+"""Least of mu."""
+FREE: Final = 10.0
+"""Moving detections that a bin is given, so that a few standing people of one score are not clutter."""
 
 PAIRS, ALONG, ACROSS = range(3)
 """Columns of the scatter of a class."""
@@ -109,29 +124,62 @@ def bin_of(score: float) -> int:
 
 
 @kernel
-def curves(classes: Array) -> Array:
-    """Return the curve of each class at the middles of the bins, (C, `BINS`): isotonic, by pooling neighbours."""
-    out = np.empty((classes.shape[0], BINS))
+def best_from(counts: Array) -> int:
+    """Return the lowest bin of the best fifth of the detections of a class."""
+    mass, taken, b = counts[DETECTIONS].sum(), 0.0, BINS
+    while b > 0 and taken < BEST * mass:
+        b -= 1
+        taken += counts[DETECTIONS, b]
+    return b
+
+
+@kernel
+def of_objects(counts: Array) -> Array:
+    """Return the lasting detections n of a class of walkers by bin, (`BINS`,), less standing clutter."""
+    best = best_from(counts)
+    out: Array = counts[LASTING].copy()
+    of_best, moving = out[best:].sum(), counts[MOVING, best:].sum()
+    if moving > LEAST_MOVERS * of_best:
+        for b in range(best):
+            out[b] = min(out[b], (counts[MOVING, b] + FREE) * of_best / moving)
+    return out
+
+
+@kernel
+def isotonic(detections: Array, objects: Array, out: Array) -> None:
+    """Write the curve of a class at the middles of the bins, (`BINS`,), by pooling neighbours."""
     share, weight, size = np.empty(BINS), np.empty(BINS), np.empty(BINS, np.int64)
+    blocks = 0
+    for b in range(BINS):
+        meant = 1.0 / (1.0 + math.exp(-(LOWEST + (b + 0.5) * BIN)))
+        weight[blocks] = detections[b] + PRIOR
+        share[blocks] = (objects[b] + PRIOR * meant) / weight[blocks]
+        size[blocks] = 1
+        blocks += 1
+        while blocks > 1 and share[blocks - 2] >= share[blocks - 1]:
+            blocks -= 1
+            total = weight[blocks - 1] + weight[blocks]
+            share[blocks - 1] += (share[blocks] - share[blocks - 1]) * weight[blocks] / total
+            weight[blocks - 1] = total
+            size[blocks - 1] += size[blocks]
+    b = 0
+    for k in range(blocks):
+        for _ in range(size[k]):
+            out[b] = min(max(share[k] * MOST / share[blocks - 1], LEAST), MOST)
+            b += 1
+
+
+@kernel
+def curves(classes: Array, table: Classes) -> Array:
+    """Return the curves of lasting detections and of those of objects, (2, C, `BINS`)."""
+    out = np.empty((2, classes.shape[0], BINS))
     for c in range(classes.shape[0]):
-        blocks = 0
-        for b in range(BINS):
-            meant = 1.0 / (1.0 + math.exp(-(LOWEST + (b + 0.5) * BIN)))
-            weight[blocks] = classes[c, DETECTIONS, b] + PRIOR
-            share[blocks] = (classes[c, LASTING, b] + PRIOR * meant) / weight[blocks]
-            size[blocks] = 1
-            blocks += 1
-            while blocks > 1 and share[blocks - 2] >= share[blocks - 1]:
-                blocks -= 1
-                total = weight[blocks - 1] + weight[blocks]
-                share[blocks - 1] += (share[blocks] - share[blocks - 1]) * weight[blocks] / total
-                weight[blocks - 1] = total
-                size[blocks - 1] += size[blocks]
-        b = 0
-        for k in range(blocks):
-            for _ in range(size[k]):
-                out[c, b] = min(max(share[k] * MOST / share[blocks - 1], LEAST), MOST)
-                b += 1
+        isotonic(classes[c, DETECTIONS], classes[c, LASTING], out[0, c])
+        if table[c].constant_velocity:
+            isotonic(classes[c, DETECTIONS], of_objects(classes[c]), out[1, c])
+        else:
+            for b in range(BINS):
+                out[1, c, b] = out[0, c, b]
     return out
 
 
@@ -146,13 +194,15 @@ def on_curve(odds: float, curve: Array) -> float:
 
 @kernel
 def calibrate(classes: Array, score: Array, label: Index, table: Classes) -> Array:
-    """Return calibrated scores (M,), and bound the thresholds in `table` by the lower edge of the median of the scores.
+    """Return scores (2, M) by the curves, and bound the thresholds in `table` by the lower edge of the median score.
 
     `classes` are the counts, (C, `COUNTS`, `BINS`).
     """
-    curve, out = curves(classes), np.empty(score.shape[0])
+    curve, out = curves(classes, table), np.empty((2, score.shape[0]))
     for m in range(score.shape[0]):
-        out[m] = on_curve(log_odds(score[m]), curve[label[m]])
+        odds = log_odds(score[m])
+        for k in range(2):
+            out[k, m] = on_curve(odds, curve[k, label[m]])
     for c in range(classes.shape[0]):
         given = classes[c, GIVEN]
         half, below, median = 0.5 * given.sum(), 0.0, 0
@@ -160,11 +210,13 @@ def calibrate(classes: Array, score: Array, label: Index, table: Classes) -> Arr
             below += given[median]
             median += 1
         if half > 0.0:
-            edge = on_curve(LOWEST + median * BIN, curve[c]) if median > 0 else 0.0
-            own = table[c]
-            own.score_filter = min(own.score_filter, edge)
-            own.announce_score = min(own.announce_score, edge)
-            own.birth_score = min(own.birth_score, edge)
+            odds, own = LOWEST + median * BIN, table[c]
+            lasting, objects = on_curve(odds, curve[0, c]), on_curve(odds, curve[1, c])
+            if median == 0:
+                lasting = objects = 0.0
+            own.score_filter = min(own.score_filter, lasting)
+            own.announce_score = min(own.announce_score, objects)
+            own.birth_score = min(own.birth_score, objects)
     return out
 
 
@@ -173,12 +225,9 @@ def needed_shares(classes: Array) -> Array:
     """Return the share s of looks, for each class, in which a lasting object is detected."""
     needed = np.empty(classes.shape[0])
     for c in range(classes.shape[0]):
-        mass = classes[c, DETECTIONS].sum()
-        taken, hits, looks, b = 0.0, PRIOR_RECALL * PRIOR, PRIOR, BINS - 1
-        while b >= 0 and taken < BEST * mass:
-            taken += classes[c, DETECTIONS, b]
-            hits, looks = hits + classes[c, HITS, b], looks + classes[c, LOOKS, b]
-            b -= 1
+        best = best_from(classes[c])
+        hits = PRIOR_RECALL * PRIOR + classes[c, HITS, best:].sum()
+        looks = PRIOR + classes[c, LOOKS, best:].sum()
         needed[c] = min(max(1.0 - 3.0 * (1.0 - hits / looks), LEAST_SHARE), MOST_SHARE)
     return needed
 
@@ -192,10 +241,10 @@ def copy_rows(slots: Slots, first: int, out: Slots) -> None:
 
 
 @kernel
-def next_slot(slots: Slots, counts: Array, needed: float) -> None:
+def next_slot(slots: Slots, counts: Array, needed: float, speed: float) -> None:
     """Evaluate the middle of the slots of an object in the counts of its class, and begin a new slot.
 
-    A lasting object is detected in the share `needed` of looks.
+    A lasting object is detected in the share `needed` of looks; `speed` is that of the object now, m/s.
     """
     hits, looks = np.zeros(SLOTS), np.empty(SLOTS)
     for s in range(SLOTS):
@@ -206,10 +255,11 @@ def next_slot(slots: Slots, counts: Array, needed: float) -> None:
     for other in (0, 2):
         lasting |= hits[1] + hits[other] >= max(LEAST_HITS, needed * (looks[1] + looks[other]))
     if hits[1] > 0.0:
-        share, mean = min(FULL_SLOT / looks[1], 1.0), 0.0
+        share, mean, moves = min(FULL_SLOT / looks[1], 1.0), 0.0, lasting and abs(speed) > WALK
         for b in range(BINS):
             counts[DETECTIONS, b] += share * slots[1, b]
             counts[LASTING, b] += share * slots[1, b] * lasting
+            counts[MOVING, b] += share * slots[1, b] * moves
             mean += slots[1, b] * b
         if hits[0] > 0.0 and hits[2] > 0.0:
             middle = min(max(int(mean / hits[1] + 0.5), 0), BINS - 1)
@@ -222,58 +272,62 @@ def next_slot(slots: Slots, counts: Array, needed: float) -> None:
 @kernel
 def learn(
     counts: tuple[Array, Slots, Index],
-    before: tuple[Index, Index],
-    after: tuple[Index, Index, Index, NDArray[np.bool_]],
+    before_words: Array,
+    after: tuple[Array, Index, NDArray[np.bool_]],
     components_label: Index,
     fate: Index,
-    detections: tuple[Array, Index, Index],
+    detections: tuple[Array, Array, Index, Index],
     dt: float,
 ) -> tuple[Array, Slots, Index]:
-    """Return the counts after a frame.
+    """Return the counts after a frame, and write the scores of the detector to the objects of the posterior.
 
     Arguments of its own:
         counts: of classes, objects and components, as in `SelfCalibration`; the classes' are written.
-        before: ids, ascending, and classes of the objects of the frame before, (N,).
-        after: ids, ascending, and classes of the objects of the posterior, the measurement of each, negative where
-            missed, and whether it was in view, (K,).
+        before_words: array of the `Bernoullis` of the frame before.
+        after: that of the posterior, the measurement of each object, negative where missed, and whether it was in view,
+            (K,).
         components_label: (J,) classes of the predicted components.
         fate: (J + M,) of `update_undetected`.
-        detections: scores and classes of the detections, (D,), and the detection of each measurement, (M,).
+        detections: scores, calibrated scores and classes of the detections, (D,), and the detection of each
+            measurement, (M,).
     """
     classes, slots, bins = counts
-    before_id, before_label = before
-    objects_id, objects_label, hit, looked = after
-    score, label, rows = detections
+    words, hit, looked = after
+    before, objects = objects_in(before_words), objects_in(words)
+    score, meant, label, rows = detections
     for d in range(score.shape[0]):
         classes[label[d], GIVEN, bin_of(score[d])] += 1.0
     used, share = np.zeros(rows.shape[0], np.bool_), min(FULL_SLOT * dt, 1.0)
     lasting = needed_shares(classes)
 
     # Objects; their slots are evaluated at once when they end
-    kept_slots = np.zeros((objects_id.shape[0], SLOTS, SLOT), np.uint16)
+    kept_slots = np.zeros((objects.id.shape[0], SLOTS, SLOT), np.uint16)
     n = 0
-    for k in range(objects_id.shape[0] + 1):
-        last = k == objects_id.shape[0]
-        while n < before_id.shape[0] and (last or before_id[n] < objects_id[k]):
+    for k in range(objects.id.shape[0] + 1):
+        last = k == objects.id.shape[0]
+        while n < before.id.shape[0] and (last or before.id[n] < objects.id[k]):
             own = np.empty((SLOTS, SLOT), np.uint16)
             copy_rows(slots[n], 0, own)
             for _ in range(SLOTS - 1):
-                next_slot(own, classes[before_label[n]], lasting[before_label[n]])
+                c = before.label[n]
+                next_slot(own, classes[c], lasting[c], before.mean[n, V])
             n += 1
         if last:
             break
         own = kept_slots[k]
-        if n < before_id.shape[0] and before_id[n] == objects_id[k]:
+        if n < before.id.shape[0] and before.id[n] == objects.id[k]:
             copy_rows(slots[n], 0, own)
             own[SLOTS - 1, TICKS] = min(own[SLOTS - 1, TICKS] + 1e4 * dt + 0.5, MOST_TICKS)
             n += 1
         if own[SLOTS - 1, TICKS] >= SLOT_TICKS and own[SLOTS - 1, OF_LOOKS] > 1:
-            next_slot(own, classes[objects_label[k]], lasting[objects_label[k]])
+            c = objects.label[k]
+            next_slot(own, classes[c], lasting[c], objects.mean[k, V])
         counted = own[SLOTS - 1, OF_LOOKS] < MOST_LOOKS
         own[SLOTS - 1, OF_LOOKS] += looked[k] and counted
         if hit[k] >= 0:
-            used[hit[k]] = True
-            own[SLOTS - 1, bin_of(score[rows[hit[k]]])] += counted
+            d, used[hit[k]] = rows[hit[k]], True
+            own[SLOTS - 1, bin_of(score[d])] += counted
+            objects.score[k] *= score[d] / meant[d]
 
     # Components, and detections that no object uses
     kept = 0
@@ -389,12 +443,14 @@ class Scores(NamedTuple):
     Attributes:
         before: the density that they are calibrated by.
         given: (D,) of the detector.
-        meant: (D,) calibrated.
+        lasting: (D,) shares of the detections with such scores that last.
+        meant: (D,) calibrated: shares of those that are of objects.
         label: (D,) classes of the detections.
     """
 
     before: Density
     given: Array
+    lasting: Array
     meant: Array
     label: Index
 
@@ -402,9 +458,9 @@ class Scores(NamedTuple):
 def calibrated(density: Density, frame: Frame, table: ClassTable) -> tuple[Scores, ClassTable]:
     """Return the calibrated scores of a frame, and parameters whose thresholds they may be compared with."""
     own, table = SelfCalibration.of(density), table.copy()
-    meant = read_only(calibrate(own.classes, frame.score, frame.label, table.classes))
+    lasting, meant = read_only(calibrate(own.classes, frame.score, frame.label, table.classes))
     use_scatter(own.scatter, table.classes)
-    return Scores(density, frame.score, meant, frame.label), table
+    return Scores(density, frame.score, lasting, meant, frame.label), table
 
 
 def followed(
@@ -422,8 +478,7 @@ def followed(
     `rows` (M,) is the detection of each measurement.
     """
     density, objects, hit = scores.before, posterior.bernoulli, update.measurement
-    own, old, poisson, fate = SelfCalibration.of(density), density.bernoulli, density.poisson, update.fate
-    objects.score[hit >= 0] *= (scores.given / scores.meant)[rows[hit[hit >= 0]]]
+    own, poisson, fate = SelfCalibration.of(density), density.poisson, update.fate
     bins = own.components
     if len(prior.poisson) < len(bins):
         bins = bins[rows_within(poisson.label, poisson.born_ns, density.stamp_ns, True, moment, table.classes)]
@@ -432,10 +487,10 @@ def followed(
     looked = (
         np.ones(len(objects), np.bool_) if posterior.misses is None else posterior.misses.looked_ns == moment.stamp_ns
     )
-    after = objects.id, objects.label, hit, looked
     counts = own.classes.copy(), own.objects, bins
-    detections = scores.given, scores.label, rows
-    found = learn(counts, (old.id, old.label), after, prior.poisson.label, fate, detections, moment.dt)
+    detections = scores.given, scores.meant, scores.label, rows
+    after = objects.words, hit, looked
+    found = learn(counts, density.bernoulli.words, after, prior.poisson.label, fate, detections, moment.dt)
     words, stamps = (prior.bernoulli.words, objects.words), (moment.stamp_ns, moment.before_ns)
     scatter = learn_scatter(own.scatter, *words, (update.row, hit), measurements.position, stamps, table.classes)
     return SelfCalibration(*found, scatter)

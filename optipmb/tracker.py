@@ -285,8 +285,10 @@ class Tracker:
         if self.parameters.self_calibration:
             scores, table = calibrated(density, frame, table)
             table.restrict(self.parameters)
-            score = scores.meant
+            score = scores.lasting
         z, chosen, below_score, suppressed = preprocess(frame, table, self._max_pairs, score)
+        if scores is not None:
+            scores.meant.take(chosen, out=z.score)
         if not self.parameters.trust_size:
             z.auxiliary[:] = np.nan
         if not self.parameters.trust_heading:

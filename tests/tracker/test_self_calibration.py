@@ -10,27 +10,31 @@ import pytest
 from class_rows import class_rows
 
 import optipmb
-from optipmb.density import BINS, COUNTS, NO_BIN, PHI, SCATTER, SLOT, SLOTS, Bernoullis
+from optipmb.density import BINS, COUNTS, NO_BIN, PHI, SCATTER, SLOT, SLOTS, STATE, Bernoullis, V
 from optipmb.self_calibration import (
     ALONG,
     BIN,
     DETECTIONS,
+    FREE,
     GIVEN,
     HITS,
     LASTING,
     LASTING_RATIO,
+    LEAST_MOVERS,
     LEAST_NOISE,
     LEAST_PART,
     LOOKS,
     LOWEST,
     MASS,
     MOST_NOISE,
+    MOVING,
     OF_LOOKS,
     OUTLYING,
     PRIOR,
     PRIOR_PAIRS,
     RISE,
     TICKS,
+    WALK,
     bin_of,
     calibrate,
     lasting,
@@ -72,38 +76,57 @@ def test_a_bin_is_that_of_the_log_odds() -> None:
 
 
 def counts(rng: np.random.Generator, classes: int = 2) -> Array:
-    """Counts of classes: about half of the detections lasted, more of those with good scores."""
+    """Counts of classes: about half of the detections lasted and moved, more of those with good scores."""
     out = np.zeros((classes, COUNTS, BINS))
     out[:, [DETECTIONS, GIVEN, LOOKS]] = rng.integers(0, 40, (classes, 3, BINS))
     out[:, LASTING] = out[:, DETECTIONS] * np.clip(rng.normal(np.linspace(0, 1, BINS), 0.2), 0, 1)
+    out[:, MOVING] = out[:, LASTING] * np.clip(rng.normal(np.linspace(0, 1, BINS), 0.2), 0, 1)
     out[:, HITS] = out[:, LOOKS] * rng.uniform(0.8, 1, (classes, BINS))
     return out
 
 
+def isotonic(detections: Array, objects: Array) -> Array:
+    """The largest of the least weighted means, scaled to its bounds."""
+    weight = detections + PRIOR
+    share = (objects + PRIOR / (1 + np.exp(-MIDDLES))) / weight
+    means = [
+        [np.average(share[i : j + 1], weights=weight[i : j + 1]) if j >= i else np.inf for j in range(BINS)]
+        for i in range(BINS)
+    ]
+    curve = np.array([max(min(means[i][b:]) for i in range(b + 1)) for b in range(BINS)])
+    return np.clip(curve * 0.985 / curve[-1], 0.001, 0.985)
+
+
+def walkers(state: Array) -> Array:
+    """Lasting detections, of which few move beside the best fifth, where most of those do."""
+    best = np.cumsum(state[DETECTIONS][::-1])[::-1] - state[DETECTIONS] < 0.2 * state[DETECTIONS].sum()
+    share = state[MOVING, best].sum() / state[LASTING, best].sum()
+    most = np.where(best | (share <= LEAST_MOVERS), np.inf, (state[MOVING] + FREE) / share)
+    return np.minimum(state[LASTING], most)
+
+
 @SEEDS
-def test_scores_go_through_the_isotonic_curve(seed: int) -> None:
-    """The curve is the largest of the least weighted means; thresholds do not pass the median of all scores."""
+@pytest.mark.parametrize("movers", [1.0, 0.5])
+def test_scores_go_through_the_isotonic_curves(seed: int, movers: float) -> None:
+    """Of lasting detections and of objects, the same for vehicles; thresholds do not pass the median of all scores."""
     rng = np.random.default_rng(seed)
-    state, label, score = counts(rng), rng.integers(0, 2, 50), rng.uniform(0.001, 0.999, 50)
-    rows = class_rows(2, score_filter=0.1, announce_score=0.3, birth_score=0.9)
+    state, label, score = 4.0 * counts(rng), rng.integers(0, 2, 50), rng.uniform(0.001, 0.999, 50)
+    state[:, MOVING] *= movers
+    rows = class_rows(2, score_filter=0.1, announce_score=0.3, birth_score=0.9, constant_velocity=[False, True])
     found = calibrate(state, score, label, rows)
+    assert (walkers(state[1]) < state[1, LASTING]).any() == (movers == 1.0)
     for c in range(2):
-        weight = state[c, DETECTIONS] + PRIOR
-        share = (state[c, LASTING] + PRIOR / (1 + np.exp(-MIDDLES))) / weight
-        means = [
-            [np.average(share[i : j + 1], weights=weight[i : j + 1]) if j >= i else np.inf for j in range(BINS)]
-            for i in range(BINS)
-        ]
-        curve = np.array([max(min(means[i][b:]) for i in range(b + 1)) for b in range(BINS)])
-        curve = np.clip(curve * 0.985 / curve[-1], 0.001, 0.985)
+        objects = walkers(state[c]) if c else state[c, LASTING]
+        curves = [isotonic(state[c, DETECTIONS], one) for one in (state[c, LASTING], objects)]
         odds = logit(score[label == c])
-        np.testing.assert_allclose(found[label == c], np.interp(odds, MIDDLES, curve) + RISE * odds, rtol=1e-12)
+        wanted = [np.interp(odds, MIDDLES, curve) + RISE * odds for curve in curves]
+        np.testing.assert_allclose(found[:, label == c], wanted, rtol=1e-12)
         median = int(np.searchsorted(np.cumsum(state[c, GIVEN]), 0.5 * state[c, GIVEN].sum()))
         edge = LOWEST + median * BIN
-        bound = np.interp(edge, MIDDLES, curve) + RISE * edge
+        bound = [np.interp(edge, MIDDLES, curve) + RISE * edge for curve in (curves[0], curves[1], curves[1])]
         np.testing.assert_allclose([rows[name][c] for name in THRESHOLDS], np.minimum([0.1, 0.3, 0.9], bound))
     order = np.argsort(score[label == 0])
-    assert (np.diff(found[label == 0][order]) > 0).all()
+    assert (np.diff(found[:, label == 0][:, order]) > 0).all()
 
 
 @pytest.mark.parametrize("recall", [0.7, 0.85, 0.99])
@@ -125,7 +148,7 @@ class Counting:
         self.slots: dict[int, list[list[Any]]] = {}
         self.seconds: dict[int, float] = {}
 
-    def end_slot(self, one: int, c: int, needed: float) -> None:
+    def end_slot(self, one: int, c: int, needed: float, speed: float) -> None:
         """Evaluate the middle slot of an object."""
         before, own, after = self.slots[one]
         sums = [(len(own[0] + other[0]), own[1] + other[1]) for other in (before, after)]
@@ -134,6 +157,7 @@ class Counting:
         for b in own[0]:
             self.state[c, DETECTIONS, b] += share
             self.state[c, LASTING, b] += share * lasting
+            self.state[c, MOVING, b] += share * (lasting and abs(speed) > WALK)
         if own[0] and before[0] and after[0]:
             mean = int(np.floor(np.mean(own[0]) + 0.5))
             self.state[c, HITS, mean] += share * len(own[0])
@@ -141,18 +165,24 @@ class Counting:
         self.slots[one] = [own, after, [[], 0]]
         self.seconds[one] = 0.0
 
-    def follow(self, before: dict[int, int], objects: dict[int, tuple[int, int | None, bool]], dt: float) -> None:
+    def follow(
+        self,
+        before: dict[int, int],
+        objects: dict[int, tuple[int, int | None, bool]],
+        speeds: tuple[dict[int, float], dict[int, float]],
+        dt: float,
+    ) -> None:
         """Count objects by id: their class, the bin of their detection, and whether they were in view."""
         needed = needed_shares(self.state)
         for one in before.keys() - objects.keys():
             for _ in range(2):
-                self.end_slot(one, before[one], needed[before[one]])
+                self.end_slot(one, before[one], needed[before[one]], speeds[0][one])
             del self.slots[one]
         for one, (c, b, looked) in objects.items():
             self.seconds[one] = self.seconds[one] + dt if one in self.slots else 0.0
             slots = self.slots.setdefault(one, [[[], 0], [[], 0], [[], 0]])
             if self.seconds[one] >= 0.99 and slots[2][1] > 1:
-                self.end_slot(one, c, needed[c])
+                self.end_slot(one, c, needed[c], speeds[1][one])
             self.slots[one][2][1] += looked
             self.slots[one][2][0] += [] if b is None else [b]
 
@@ -163,19 +193,26 @@ class Counting:
                 self.state[c, first:end] *= min(1.0, MASS / self.state[c, first].sum())
 
 
+def objects_of(labels: dict[int, int], mean: Array) -> Bernoullis:
+    """Objects with these ids, classes and states, of a score of one."""
+    columns = {"id": np.array([*labels], np.int64), "label": np.array([*labels.values()], np.int64), "mean": mean}
+    return Bernoullis.of(np.zeros(len(labels) * Bernoullis.width)).replaced(**columns, score=np.ones(len(labels)))
+
+
 @SEEDS
 def test_frames_are_counted_as_plain_python_counts(seed: int) -> None:
     """Slots of objects that stay, come and go; components that age; detections without use; forgetting."""
     rng = np.random.default_rng(seed)
     state = 2.0 * counts(rng)
     plain = Counting(state.copy())
-    before, known = np.zeros((0, SLOTS, SLOT), np.uint16), dict[int, int]()
+    before, known, mean = np.zeros((0, SLOTS, SLOT), np.uint16), dict[int, int](), np.zeros((0, STATE))
     announced, announced_label = np.zeros(0, np.int64), np.zeros(0, np.int64)
     for k in range(60):
         dt, count = float(rng.choice([0.1, 0.3])), int(rng.integers(4, 12))
         score, label = rng.uniform(0.01, 0.99, count + 3), rng.integers(0, 2, count + 3)
         rows, own_bin = rng.permutation(count + 3)[:count], bins(score)
         now = {one: c for one, c in known.items() if rng.random() < 0.97} | {3 * k: 0, 3 * k + 1: 1}
+        mean_before, mean = mean, rng.normal(0.0, WALK, (len(now), STATE))
         hit = np.r_[rng.permutation(count), np.full(len(now), -1)][: len(now)]
         looked = (rng.random(len(now)) < 0.9) | (hit >= 0)
         free = ~np.isin(np.arange(count), hit)
@@ -185,17 +222,19 @@ def test_frames_are_counted_as_plain_python_counts(seed: int) -> None:
 
         np.add.at(plain.state, (label, GIVEN, own_bin), 1.0)
         found = [None if m < 0 else int(own_bin[rows[m]]) for m in hit]
-        plain.follow(known, dict(zip(now, zip(now.values(), found, looked, strict=True), strict=True)), dt)
+        speeds = dict(zip(known, mean_before[:, V], strict=True)), dict(zip(now, mean[:, V], strict=True))
+        plain.follow(known, dict(zip(now, zip(now.values(), found, looked, strict=True), strict=True)), speeds, dt)
         gone = (of_old == AGED) & (announced != NO_BIN)
         np.add.at(plain.state, (announced_label[gone], DETECTIONS, announced[gone]), min(1, 10 * dt))
         gone = rows[free & (of_new == AGED)]
         np.add.at(plain.state, (label[gone], DETECTIONS, own_bin[gone]), min(1, 10 * dt))
         plain.forget()
 
-        identity = np.array([*known], np.int64), np.array([*known.values()], np.int64)
-        after = np.array([*now], np.int64), np.array([*now.values()], np.int64), hit, looked
-        given = state, before, announced
-        state, before, kept = learn(given, identity, after, announced_label, fate, (score, label, rows), dt)
+        meant, given = rng.uniform(0.1, 1.0, len(score)), (state, before, announced)
+        old, new = objects_of(known, mean_before), objects_of(now, mean)
+        after, detections = (new.words, hit, looked), (score, meant, label, rows)
+        state, before, kept = learn(given, old.words, after, announced_label, fate, detections, dt)
+        np.testing.assert_allclose(new.score, np.where(hit < 0, 1.0, (score / meant)[rows[hit]]), rtol=1e-15)
         announced = np.r_[announced[of_old >= 0], own_bin[rows[of_new >= 0]]]
         announced_label = np.r_[announced_label[of_old >= 0], label[rows[of_new >= 0]]]
         known = now
@@ -340,6 +379,25 @@ def test_confirmed_tracks_are_the_objects_whatever_the_scale_of_the_scores(scale
     assert (last.center[last.confirmed, 1] < 5.0).all()
     assert (last.existence[last.confirmed] > 0.7).all()
     assert last.score.max() <= 0.9 * scale
+
+
+@pytest.mark.parametrize("speed", [1.0, 0.0])
+@pytest.mark.parametrize("label", range(2))
+def test_what_stands_is_no_person_where_people_walk(label: int, speed: float) -> None:
+    """Boxes that stand and score less than six walkers are clutter; not of cars, and not where all stand."""
+    rng, velocity = np.random.default_rng(0), np.r_[np.full(6, speed), np.zeros(4)]
+
+    def frames() -> Iterator[dict[str, Any]]:
+        for k in range(100):
+            score = np.r_[rng.uniform(0.7, 0.9, 6), rng.uniform(0.3, 0.45, 4)]
+            center = np.column_stack((0.1 * k * velocity, 20.0 * np.arange(10), np.ones(10)))
+            center[:, :2] += rng.normal(0.0, 0.05, (10, 2))
+            boxes = {"label": [label] * 10, "center": center, "size": [[0.7, 0.7, 1.75]] * 10, "yaw": [0.0] * 10}
+            yield {"stamp_ns": k * 100_000_000, "labels": CLASSES, "score": score, **boxes}
+
+    last = run(PARAMETERS, frames())[-1].tracks
+    confirmed = np.sort(np.rint(last.center[last.confirmed, 1] / 20.0))
+    np.testing.assert_array_equal(confirmed, np.arange(6 if label and speed else 10))
 
 
 def test_a_profile_that_does_not_calibrate_counts_nothing() -> None:
