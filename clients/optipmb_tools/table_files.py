@@ -66,6 +66,7 @@ _OWN_COMPRESSED: Final = (b"\x1f\x8b", b"\x28\xb5\x2f\xfd")
 _DATE: Final = re.compile(
     r"(\d{4}([-/])\d\d?\2\d\d?|\d\d?([-/.])\d\d?\3\d{4})[T ]+\d\d?:\d\d[:.,\d]*( ?UTC|(Z|[-+]\d\d(:?\d\d)?))?"
 )
+_BASIC: Final = re.compile(r"^(\d{4})(\d\d)(\d\d)T(\d\d)(\d\d)(\d\d)(?=\D|$)")  # of ISO 8601
 _DAY_OR_MONTH: Final = re.compile(r"^(\d{1,2})([-/.])(\d{1,2})\2(\d{4})")
 _ONE_DIGIT: Final = re.compile(r"(?<=[-T ])(\d)(?=[-T :])")
 _MONTHS: Final = 12
@@ -424,6 +425,8 @@ def _has_commas(pa: Any, path: Path, table: Any) -> bool:
 
 def _dates(pa: Any, path: Path, name: str, texts: NDArray[Any], options: Mapping[str, str]) -> NDArray[Any]:
     """Return a column of dates with a time of day as such, and other texts as they are."""
+    if _BASIC.match(next((text for text in texts.tolist() if text), "")):
+        texts = np.array([_BASIC.sub(r"\1-\2-\3T\4:\5:\6", text) for text in texts.tolist()], dtype=np.str_)
     first = next((text for text in unique_texts(texts)[0].tolist() if text), "").strip()
     date = _DATE.fullmatch(first)
     if date is None:
@@ -705,8 +708,8 @@ def read_json(path: Path) -> list[_Record]:
         raise DatasetError(path, "a table", f"results of nuScenes, which are read by {how}")
     if isinstance(content, dict) and any(name in content for name in LISTS):
         content = [content]
-    elif isinstance(content, dict) and len(content) == 1:
-        (content,) = content.values()
+    elif isinstance(content, dict):
+        content = _frames(content)
     if not isinstance(content, list) or not all(isinstance(one, dict) for one in content):
         expected = f"an array of objects, or an object with a list {', '.join(LISTS)}"
         raise DatasetError(path, expected, repr(str(content)[:60]))
@@ -714,6 +717,25 @@ def read_json(path: Path) -> list[_Record]:
         if "box_type_3d" in one:
             _centre(path, one)
     return content
+
+
+def _frames(content: dict[str, Any]) -> Any:
+    """Return the one list of records of an object, or a record for each frame where its names are those of frames."""
+    lists = [one for one in content.values() if isinstance(one, list) and one and isinstance(one[0], dict)]
+    named = all(re.search(r"\d", name) and isinstance(value, (list, dict)) for name, value in content.items())
+    if not named:
+        inner = content.get("frames", next(iter(content.values())) if len(content) == 1 else None)
+        return _frames(inner) if isinstance(inner, dict) else lists[0] if len(lists) == 1 else content
+    stamped = all(is_number(name) and float(name) >= _STAMPS for name in content)
+    frames = []
+    for name, value in content.items():
+        number = int(name) if name.isdigit() else name
+        if isinstance(value, dict) and value and all(isinstance(one, dict) for one in value.values()):
+            value = [{"id": key} | one for key, one in value.items()]  # noqa: PLW2901  objects by their ids
+        boxes = isinstance(value, list) and any(isinstance(one, list) for one in value)
+        record = value if isinstance(value, dict) else {"boxes" if boxes else "objects": value}
+        frames.append({"timestamp" if stamped else "frame": number} | record)
+    return frames
 
 
 def _centre(path: Path, frame: _Record) -> None:

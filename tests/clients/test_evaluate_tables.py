@@ -94,6 +94,16 @@ def test_the_tracks_that_are_shown_are_the_confirmed_ones(bench: Bench) -> None:
         assert [line.split()[at] for at, line in zip((1, 0, 0), lines[: len(rows)], strict=False)] == rows
 
 
+def test_tracks_may_be_a_table_of_text(bench: Bench) -> None:
+    """A `.txt` with names of columns is a table of tracks; a format of a benchmark in its place is named."""
+    bench.evaluate(cars(), cars())
+    tables = [bench.folder / "d.csv", "--truth", bench.folder / "truth.csv", "--tracks", bench.folder / "tracks.txt"]
+    (bench.folder / "tracks.txt").write_bytes((bench.folder / "truth.csv").read_bytes())
+    assert counts(bench.run("evaluate", *tables, "--json")) == RIGHT
+    (bench.folder / "tracks.txt").write_text("1,1,5.0,6.0,4.5,1.9,1,-1,-1,-1\n")
+    assert "image boxes as of MOTChallenge" in bench.run("evaluate", *tables).stderr
+
+
 def test_trackers_are_compared_by_mota_and_identity_switches(bench: Bench) -> None:
     """A row for each tracker begins with MOTA, switches and IDF1 of the tracks it shows; bars are drawn of them."""
     late = np.where(cars()["t"] < 2.0, cars()["id"], cars()["id"] + 2)

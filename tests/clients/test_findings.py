@@ -257,6 +257,30 @@ def test_digits_of_a_calendar_are_stamps(tmp_path: Path, digits: str) -> None:
     assert any("hhmmss, as their digits say" in one.text for one in findings)
 
 
+def test_times_of_a_day_are_stamps(tmp_path: Path) -> None:
+    """Texts as 23:59:58.100 go on after midnight, and tables of tracks have them as they are."""
+    columns = street(9.0)
+    stamps = np.datetime64("2026-03-01T23:59:55.000") + index(columns) * np.timedelta64(100, "ms")
+    columns["t"] = np.array([one.strftime("%H:%M:%S.%f")[:-3] for one in stamps.astype(object).tolist()])
+    dataset, findings = looked(tmp_path / "d.csv", columns)
+    assert np.diff(dataset.sequences(["all"])[0].stamps) == pytest.approx(1e8, abs=300)
+    assert any("times of a day in column t" in one.text for one in findings)
+
+
+def test_whole_numbers_that_may_be_seconds_are_not_milliseconds(tmp_path: Path) -> None:
+    """Steps of 12 with boxes that would go too fast in milliseconds are refused, and so are frames years apart."""
+    columns = {**street(9.0), "t": index(street(9.0)) * 12}
+    (found,) = troubles(tmp_path / "a.csv", columns)
+    assert "expected a unit of time" in found
+    assert "--option time=s, or time=ms" in found
+    assert troubles(tmp_path / "b.csv", columns, time="s") == troubles(tmp_path / "b.csv", columns, time="ms") == []
+    near = {**columns, "x": columns["x"] / 50, "y": columns["y"] / 50}
+    assert not [one for one in troubles(tmp_path / "c.csv", near) if "unit of time" in one]
+    write_table(tmp_path / "d.csv", {**street(4.0), "t": index(street(4.0)) * 10**11})
+    with pytest.raises(DatasetError, match=r"frames at a plausible rate .* which are 1e.08 s in milliseconds"):
+        TableDataset(tmp_path / "d.csv", {})
+
+
 @pytest.mark.parametrize("rows", [slice(400, 401), slice(480, None)])
 def test_a_stamp_far_from_all_others_is_refused(tmp_path: Path, rows: slice) -> None:
     """One frame that is a year ahead, and stamps half of which have another unit, are refused with the row."""
@@ -300,6 +324,103 @@ def test_marks_for_no_value_are_refused_or_left_out(tmp_path: Path, column: str,
         dataset, _ = looked(tmp_path / "d.csv", columns, missing=str(mark))
         yaw = np.concatenate([frame.yaw for frame in dataset.sequences(["all"])[0].frames()])
         assert np.isnan(yaw).sum() == 1
+
+
+def test_marks_among_positions_are_doubted(tmp_path: Path) -> None:
+    """A number that often stands for no value is named where no other position is near it."""
+    columns = street(4.0)
+    marked = columns["x"].copy()
+    marked[[10, 50]] = -999
+    (found,) = troubles(tmp_path / "d.csv", {**columns, "x": marked})
+    assert found == "column x has -999 in 2 rows, as a mark for no value --option missing=-999"
+    assert troubles(tmp_path / "d.csv", {**columns, "x": marked}, missing="-999", invalid="skip") == []
+    many = np.linspace(-1020, -980, len(marked)).round()
+    assert not [one for one in troubles(tmp_path / "e.csv", {**columns, "x": many}) if "mark" in one]
+
+
+def test_headings_that_are_all_turned_round_are_doubted(tmp_path: Path) -> None:
+    """Boxes that all drive backwards have headings from -x; the option turns them."""
+    columns = street()
+    turned = {**columns, "yaw": columns["yaw"] + np.pi}
+    (found,) = troubles(tmp_path / "d.csv", turned)
+    assert "many boxes drive backwards: 0% of" in found
+    assert "--option heading=-x" in found
+    assert troubles(tmp_path / "d.csv", turned, heading="-x") == []
+
+
+def cornered(columns: Table) -> np.ndarray:
+    """Return the corners (R, 8, 3) of boxes, from the left front at the bottom round to the left, then at the top."""
+    half = 0.5 * np.column_stack([columns[name] for name in "lwh"])
+    signs = np.array([[a, b, c] for c in (-1, 1) for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))])
+    local = signs * half[:, None]
+    cos, sin = np.cos(columns["yaw"])[:, None], np.sin(columns["yaw"])[:, None]
+    flat = (cos * local[:, :, 0] - sin * local[:, :, 1], sin * local[:, :, 0] + cos * local[:, :, 1], local[:, :, 2])
+    return np.stack(flat, axis=2) + np.column_stack([columns[name] for name in "xyz"])[:, None]
+
+
+@pytest.mark.parametrize("form", ["corners", "corner_3d", "corners.dict", "plan"])
+def test_corners_are_boxes(tmp_path: Path, form: str) -> None:
+    """Corners in any order give the box, whose heading gets the sense of its motion."""
+    columns = street(parked=0)
+    points = cornered(columns)[:, [4, 5, 6, 7, 0, 1, 2, 3]]
+    rest = {name: columns[name] for name in ("t", "score", "class")}
+    name = {"corners": "corners.{}.{}", "corner_3d": "corner_3d_{}_{}", "corners.dict": "corners.{}.{}"}.get(form)
+    axes = "xyz" if form == "corners.dict" else range(3)
+    count, axes = (4, range(2)) if form == "plan" else (8, axes)
+    corners = {
+        (name or "corner{}_{}").format(i, axis): points[:, i, k] for i in range(count) for k, axis in enumerate(axes)
+    }
+    dataset, findings = looked(tmp_path / "d.csv", rest | corners)
+    assert not [one for one in findings if one.wrong or one.doubt]
+    assert any(f"those of {count} corners" in one.text for one in findings)
+    frames = list(dataset.sequences(["all"])[0].frames())
+    wanted = list(looked(tmp_path / "e.csv", columns)[0].sequences(["all"])[0].frames())
+    for found, one in zip(frames, wanted, strict=True):
+        np.testing.assert_allclose(found.center[:, :2], one.center[:, :2], atol=1e-3)
+        np.testing.assert_allclose(found.size[:, :2], one.size[:, :2], atol=1e-3)
+        np.testing.assert_allclose(np.cos(found.yaw - one.yaw), 1.0, atol=1e-3)
+
+
+def test_bounds_and_sines_are_boxes(tmp_path: Path) -> None:
+    """Bounds along the axes give centres; sine and cosine, or q0 to q3, give headings."""
+    columns = street(4.0)
+    points = cornered(columns)
+    bounds = {
+        f"{axis}_{end}": getattr(points[:, :, i], end)(axis=1) for i, axis in enumerate("xyz") for end in ("min", "max")
+    }
+    rest = {name: columns[name] for name in ("t", "score", "class")}
+    bare, said = looked(tmp_path / "a.csv", rest | bounds)
+    centres = np.concatenate([frame.center for frame in bare.sequences(["all"])[0].frames()])
+    np.testing.assert_allclose(centres, np.column_stack([columns[name] for name in "xyz"]), atol=1e-3)
+    assert any("centres are those of bounds" in one.text for one in said)
+    yaw = columns.pop("yaw")
+    zero = np.zeros(len(yaw))
+    for turned in (
+        {"sin_yaw": np.sin(yaw), "cos_yaw": np.cos(yaw)},
+        {"q0": np.cos(yaw / 2), "q1": zero, "q2": zero, "q3": np.sin(yaw / 2)},
+    ):
+        found = yaw_of_frames(looked(tmp_path / "b.csv", columns | turned)[0])
+        np.testing.assert_allclose(np.cos(found - yaw), 1.0, atol=1e-3)
+
+
+def yaw_of_frames(dataset: TableDataset) -> np.ndarray:
+    return np.concatenate([frame.yaw for frame in dataset.sequences(["all"])[0].frames()])
+
+
+def test_units_of_length_are_in_names_or_options(tmp_path: Path) -> None:
+    """Names as x_cm and vx_kmh, and the option length_factor, give metres of positions, sizes and speeds."""
+    columns = street(4.0) | {"vx": np.full(320, 1.0), "vy": np.full(320, 0.5)}
+    lengths = [*"xyzlwh"]
+    named = {name: one for name, one in columns.items() if name not in {*lengths, "vx", "vy"}}
+    named |= {f"{name}_cm": 100.0 * columns[name] for name in lengths}
+    named |= {"vx (km/h)": 3.6 * columns["vx"], "vy (km/h)": 3.6 * columns["vy"]}
+    scaled = columns | {name: 1000.0 * columns[name] for name in (*lengths, "vx", "vy")}
+    wanted = next(looked(tmp_path / "a.csv", columns)[0].sequences(["all"])[0].frames())
+    for path, one, options in (("b.csv", named, {}), ("c.csv", scaled, {"length_factor": "0.001"})):
+        found = next(looked(tmp_path / path, one, **options)[0].sequences(["all"])[0].frames())
+        for name in ("center", "size", "velocity"):
+            np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), atol=1e-3)
+    assert any("length_factor for all lengths" in one for one in troubles(tmp_path / "d.csv", scaled))
 
 
 @pytest.mark.parametrize("mark", ["NULL", "none", "na", "N.A.", "\\N", "#VALUE!", "1.#QNAN"])
@@ -388,7 +509,7 @@ def test_a_heading_that_may_be_in_unread_columns_is_doubted(tmp_path: Path) -> N
     columns = street(4.0)
     yaw = columns.pop("yaw")
     axis = {f"rotation.axis.{place}": np.full(len(yaw), float(place == 2)) for place in range(3)}
-    for others in ({**axis, "rotation.angle": yaw}, {"yaw_sin": np.sin(yaw), "yaw_cos": np.cos(yaw)}):
+    for others in ({**axis, "rotation.angle": yaw}, {"course": yaw, "bearing": yaw}):
         (found,) = troubles(tmp_path / "d.parquet", {**columns, **others})
         assert all(name in found for name in others)
     assert troubles(tmp_path / "d.parquet", columns) == []

@@ -407,6 +407,16 @@ def test_a_recording_is_a_dataset(tmp_path: Path) -> None:
     assert frames[0].labels == ("Car",)
     assert np.array_equal(frames[1].center, detections(1).center)
     assert len(sequence.poses) == len(sequence) == 2
+    assert not sequence.notes
+
+
+def test_embeddings_of_a_recording_are_said_to_be_unused(tmp_path: Path) -> None:
+    """Detections that have vectors of appearance are joined by motion alone, and a note says so."""
+    vectors = {"embedding": np.ones((2, 2)), "embedding_model": "reid-7"}
+    with RecordingWriter(tmp_path / "a.mcap") as writer:
+        put(writer, Detections(**{**dict(detections(0)), **vectors}), 1)
+    (sequence,) = open_dataset("mcap", tmp_path / "a.mcap").sequences(["all"])
+    assert sequence.notes == ("garage.robot-1.lidar: embeddings are not used: objects are followed by motion alone",)
 
 
 def test_boxes_of_the_world_are_carried_to_a_sensor_with_a_field_of_view(tmp_path: Path) -> None:

@@ -82,6 +82,17 @@ def test_texts_of_lists_are_lists(tmp_path: Path) -> None:
 ISO = ("2024-05-01T10:00:00.100Z", "2024-05-01T10:00:00.200Z")
 
 
+def test_dates_of_iso_8601_may_be_without_separators(tmp_path: Path) -> None:
+    """20240501T100000.100Z is a date, also with a zone."""
+    for name, texts in {
+        "basic": ("20240501T100000.1Z", "20240501T100000.2Z"),
+        "zone": ("20240501T113000.1+0130",),
+    }.items():
+        (tmp_path / f"{name}.csv").write_text("\n".join(("t", *texts)), encoding="utf-8")
+        found = read_table(tmp_path / f"{name}.csv")["t"]
+        np.testing.assert_array_equal(found, np.array([one[:-1] for one in ISO], dtype="datetime64[ns]")[: len(texts)])
+
+
 @pytest.mark.parametrize("suffix", [".csv", ".tsv", ".jsonl", ".json", ".parquet", ".feather"])
 @pytest.mark.parametrize(
     ("texts", "options"),
@@ -233,6 +244,25 @@ def test_a_row_may_hold_the_boxes_of_a_frame(suffix: str, tmp_path: Path) -> Non
     found = frames_of(tmp_path / f"d{suffix}")
     assert found[7][0] == []
     assert found[:7] + found[8:] == flat(tmp_path)
+
+
+@pytest.mark.parametrize("form", ["frames", "numbers", "names", "stamps", "ids", "lists"])
+def test_frames_of_a_file_are_found_by_their_names(form: str, tmp_path: Path) -> None:
+    """A file of JSON may have the list of frames beside other values, or frames by their numbers, names or stamps."""
+    columns = boxes(**{"class": None, "score": None})
+    rows = [{name: values[i].item() for name, values in columns.items() if name != "t"} for i in range(3 * FRAMES)]
+    frames = [rows[i : i + 3] for i in range(0, len(rows), 3)]
+    content: Any = {
+        "frames": {"version": 1, "frames": [{"t": i / 10, "objects": one} for i, one in enumerate(frames)]},
+        "numbers": {f"{i}": one for i, one in enumerate(frames)},
+        "names": {f"scan_{i:04}.bin": {"objects": one} for i, one in enumerate(frames)},
+        "stamps": {f"{1_700_000_000_000_000_000 + 10**8 * i}": one for i, one in enumerate(frames)},
+        "ids": {"frames": {f"{i}": {f"{k}": box for k, box in enumerate(one)} for i, one in enumerate(frames)}},
+        "lists": {f"{i}": [[box[name] for name in (*"xyzlwh", "yaw")] for box in one] for i, one in enumerate(frames)},
+    }[form]
+    (tmp_path / "d.json").write_text(json.dumps(content), encoding="utf-8")
+    write_table(tmp_path / "flat.parquet", columns)
+    assert frames_of(tmp_path / "d.json") == frames_of(tmp_path / "flat.parquet")
 
 
 def test_lists_of_different_lengths_are_told_as_not_used(tmp_path: Path) -> None:

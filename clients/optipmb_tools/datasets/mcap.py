@@ -33,6 +33,8 @@ class RecordedSequence(DataSequence):
         self.recording = f"{name.removesuffix(plan_.stream.rpartition('/')[2])}fused"
         self.has_clouds: bool = bool(plan_.with_cloud)
         self._recording = recording
+        if plan_.has_embeddings:
+            self.notes = (f"{name}: embeddings are not used: objects are followed by motion alone",)
         self._plan = replace(plan_, tracks={})  # they are large, and not needed for tracking
         stamps = list(plan_.frames.values())
         for number, (before, after) in enumerate(itertools.pairwise(stamps), start=1):

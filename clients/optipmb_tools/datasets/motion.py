@@ -106,6 +106,25 @@ def find_moves(key: Ints, seconds: Floats, xy: Floats, kind: Ints) -> Moves:
     return Moves(start, end, xy[end] - xy[start], seconds[end] - seconds[start], chain[start], common)
 
 
+def typical_speed(key: Ints, seconds: Floats, xy: Floats, kind: Ints) -> float:
+    """Return the upper quartile of the speeds in m/s from boxes to the nearest of their class in the next frame, or 0.
+
+    The arguments are as for `find_moves`, without its limits on how far a box may go.
+    """
+    order = np.lexsort((seconds, key))[: LEAST_FRAMES * MOST_BOXES]
+    starts = np.flatnonzero(np.r_[True, (np.diff(key[order]) != 0) | (np.diff(seconds[order]) > 0.0)])
+    speeds: list[float] = []
+    for before, after in itertools.pairwise(np.split(order, starts[1:])[:LEAST_FRAMES] if len(order) else []):
+        first, second = before[:MOST_BOXES], after[:MOST_BOXES]
+        if key[first[0]] == key[second[0]]:
+            away = np.linalg.norm(xy[first][:, None] - xy[second][None], axis=2)
+            away[kind[first][:, None] != kind[second][None]] = np.inf
+            nearest = away.min(axis=1)
+            passed = seconds[second[0]] - seconds[first[0]]
+            speeds += (nearest[np.isfinite(nearest)] / passed).tolist()
+    return float(np.quantile(speeds, 0.75)) if speeds else 0.0  # others may stand
+
+
 def _scatter(following: Ints, chain: Ints, seconds: Floats, xy: Floats) -> Floats:
     """Return the scatter (B,) of each object's boxes about its path in metres; the median where it is not known."""
     first = np.flatnonzero(following >= 0)

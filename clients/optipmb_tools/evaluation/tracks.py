@@ -136,7 +136,7 @@ def read_tracks(results: Path, sequence: DataSequence, by: By = "id") -> ResultT
         _refuse_objects(results, by)
         return scene.to_sensor(sequence.poses)
     path = result_file(results, sequence.name)
-    if is_table(path):
+    if is_table(path) or (path == results and (path.suffix != ".txt" or hasattr(sequence, "tables"))):
         return _with_image(path, _from_table(path, sequence, by).to_sensor(sequence.poses), sequence)
     _refuse_objects(path, by)
     table = read_kitti_results(path)
@@ -158,7 +158,7 @@ def read_full_tracks(result: Path) -> FullTable | None:
 
 def result_file(results: Path, name: str) -> Path:
     """Return the file of a sequence in a folder of results, or the table of tracks that they are."""
-    if is_table(results) and not results.is_dir():
+    if results.is_file():
         return results
     tables = (results / f"{name}{suffix}" for suffix in SUFFIXES)
     return next((path for path in tables if path.is_file()), results / f"{name}.txt")

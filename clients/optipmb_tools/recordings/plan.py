@@ -31,6 +31,7 @@ class StreamPlan:
     clouds: collections.Counter[int] = field(default_factory=collections.Counter)  # by stamp
     with_cloud: set[FrameId] = field(default_factory=set)  # frames that are played with their cloud
     tracks: dict[FrameId, Tracks] = field(default_factory=dict)  # newest
+    has_embeddings: bool = False
     parameters: SessionParameters | None = None  # when the session began; None when they were not recorded
 
     @property
@@ -81,6 +82,7 @@ def plan(messages: Iterable[Recorded]) -> dict[str, StreamPlan]:
             one.clouds[recorded.stamp_ns] += 1
         elif recorded.topic == "detections" and (detections := _read(recorded, Detections)) is not None:
             one.frames.setdefault(_id(detections), detections.stamp_ns)
+            one.has_embeddings |= detections.embedding is not None
         elif recorded.topic == "tracks" and (tracks := _read(recorded, Tracks)) is not None:
             known = one.tracks.get(_id(tracks))
             if known is None or tracks.revision > known.revision:

@@ -39,7 +39,7 @@ from optipmb_tools.table_files import SUFFIXES, Columns, line_of, read_table, ta
 # Options, besides `column.MEANING=NAME` and `class.NAME=NAME`; `tracks` are tables that are yet to be read by them
 OPTIONS: Final = (
     *("time", "rate", "group", "yaw", "heading", "quaternion", "sizes", "axes", "velocity", "score", "invalid"),
-    *("missing", "size_factor"),
+    *("missing", "size_factor", "length_factor"),
     *("poses", "truth", "tracks", "decimal", "encoding", "date", "origin"),
     *pixels.OPTIONS,
 )

@@ -65,11 +65,11 @@ ALIASES: Final[Mapping[str, tuple[str, ...]]] = {
     "h": ("h", "height", "box_height", "dz", *_extent("z", "h", "height", 2)),
     "yaw": ("yaw", "heading", "theta", "yaw_angle", "heading_angle", "rotation_z", "rot_z", "rz", "rotation_y", "ry",
             "rot", "rotation", "orientation", "angle", "rotation_yaw", "rot_yaw", "orientation_yaw", "euler_yaw",
-            "rpy_yaw"),
-    "qw": ("qw", *_vector(_BOX_TURN, "w", 0)),
-    "qx": ("qx", *_vector(_BOX_TURN, "x", 1)),
-    "qy": ("qy", *_vector(_BOX_TURN, "y", 2)),
-    "qz": ("qz", *_vector(_BOX_TURN, "z", 3)),
+            "rpy_yaw", "yaw_of_corners"),
+    "qw": ("qw", "q0", *_vector(_BOX_TURN, "w", 0)),
+    "qx": ("qx", "q1", *_vector(_BOX_TURN, "x", 1)),
+    "qy": ("qy", "q2", *_vector(_BOX_TURN, "y", 2)),
+    "qz": ("qz", "q3", *_vector(_BOX_TURN, "z", 3)),
     "score": ("score", "confidence", "conf", "prob", "probability", "detection_score", "det_score", "tracking_score",
               "score_3d", "scores_3d", "pred_score", "pred_scores", "scores"),
     "class": ("class", "class_name", "cls", "label", "label_name", "category", "category_name", "type", "object_type",
@@ -117,6 +117,11 @@ _LEADING: Final = re.compile(
 """Word before the name of a column that only says what the column is of."""
 _OTHER: Final = re.compile("ego|pose|sensor|camera|lidar|vehicle|header")  # groups that describe no box
 _LENGTHS: Final = {"m", "meter", "meters", "metre", "metres", "mps"}
+FACTORS: Final[Mapping[str, float]] = {
+    "cm": 0.01, "mm": 0.001, "km": 1000.0, "ft": 0.3048, "feet": 0.3048, "kmh": 1.0 / 3.6, "kph": 1.0 / 3.6,
+    "mph": 0.44704,
+}  # fmt: skip
+"""Metres, or metres per second, of other units in the names of columns."""
 
 
 def find_columns(names: Iterable[str], chosen: Mapping[str, str], texts: Collection[str] = ()) -> dict[str, Column]:
@@ -214,8 +219,10 @@ def _known(base: str) -> bool:
 
 
 def _base(name: str) -> tuple[str, str | None]:
-    base = _plain(name).removesuffix("_m_s")
+    base = re.sub("_km_h$", "_kmh", _plain(name)).removesuffix("_m_s")
     head, _, tail = base.rpartition("_")
+    if head and tail in FACTORS:
+        return head, tail
     if head and tail in _UNITS:
         return head, _UNITS[tail]
     if base in _UNITS and base not in {"s", "ms", "us", "ns"}:

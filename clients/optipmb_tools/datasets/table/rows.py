@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optipmb_tools.datasets.interface import Reports, georeference_of
-from optipmb_tools.datasets.motion import Moves, find_moves, find_reports, overlapping
-from optipmb_tools.datasets.table.columns import ALIASES, NOTHING, Column, find_columns, normalised, turn_of
+from optipmb_tools.datasets.motion import SPEEDS, Moves, find_moves, find_reports, overlapping, typical_speed
+from optipmb_tools.datasets.table.columns import ALIASES, FACTORS, NOTHING, Column, find_columns, normalised, turn_of
 from optipmb_tools.datasets.table.columns import turned as turned_names
+from optipmb_tools.datasets.table.corners import CORNERED, with_boxes
 from optipmb_tools.datasets.table.findings import Reading
 from optipmb_tools.datasets.table.pixels import METRES, Placed, place
 from optipmb_tools.datasets.table.times import (
@@ -22,8 +23,10 @@ from optipmb_tools.datasets.table.times import (
     SECONDS,
     Stamps,
     may_be_merged,
+    may_be_seconds,
     median_step,
     nanoseconds,
+    read_clock,
     read_frames,
     read_stamps,
     refuse_gap,
@@ -61,6 +64,8 @@ _TILTED: Final = 1 / 12  # of a turn: largest angle about x and y of a box that 
 _TWICE: Final = 0.25  # share of boxes at the place of another one from which objects are reported twice
 LEAST_VARIANCE: Final = 1e-8
 LARGEST_VARIANCE: Final = 1e8  # variances of a position along any axis, m^2, as `Detections` have them
+_LENGTHS: Final = ("x", "y", "z", "alt", "l", "w", "h", "vx", "vy", "pose_x", "pose_y", "pose_z")
+_MARKS: Final = (-999, -9999, -99999, 999, 9999, 99999, -32768, 32767, 65535)  # numbers that often stand for no value
 _SPARED: Final = ("z", "h", "score", "class")  # without a value in any row they are as without a column
 _POSE: Final = ("pose_x", "pose_y", "pose_z")
 _TURNS: Final = ("w", "x", "y", "z")
@@ -220,7 +225,9 @@ class _Table:
         if wrong := [text for text in marks if not is_number(text)]:
             raise DatasetError("--option missing", "numbers, with commas between them", repr(wrong[0]))
         self._marks = [float(text) for text in marks]
+        self._columns = columns = with_boxes(reading, columns, _columns_of(reading, columns))
         self._found = _columns_of(reading, columns)
+        self._factor = reading.positive("length_factor", "metres of a unit of length") or 1.0
         turn = None if "yaw" in self._found else turn_of(map(normalised, columns))
         self._turn_of, self._turn_columns = turn or ("", [])
         self._placed: Placed | None = None
@@ -235,7 +242,10 @@ class _Table:
                 have = f"the columns {', '.join(self._columns)}"
                 raise DatasetError(self._reading.path, f"a column {role} (--option column.{role}=NAME)", have)
             return np.full(self._rows, otherwise)
-        return self._read_numbers(role, column.name)
+        numbers = self._read_numbers(role, column.name)
+        if role in _LENGTHS:
+            numbers = numbers * (FACTORS.get(column.unit or "") or self._factor)
+        return numbers
 
     def _read_numbers(self, role: str, name: str) -> Floats:
         values = self._columns[name]
@@ -251,6 +261,11 @@ class _Table:
             values = np.array([float(text) if is_number(text) else np.nan for text in texts])
             values[bad] = np.inf
         numbers = values.astype(np.float64)
+        for mark in _MARKS if role in _LENGTHS and not self._marks else ():
+            near = np.abs(numbers - mark) < 0.1 * abs(mark)
+            if 1 < near.sum() < len(near) and (numbers[near] == mark).all():
+                text = f"column {name} has {mark} in {near.sum()} rows, as a mark for no value"
+                self._reading.doubt("rows", text, f"--option missing={mark}")
         return np.where(np.isin(numbers, self._marks), np.nan, numbers) if self._marks else numbers
 
     def _unit(self, role: str) -> str | None:
@@ -295,8 +310,8 @@ class _Table:
             yaw_unit = "rad"
         read_digits(reading, center)
         stamps = self._framed(stamps, series, row, center, size, kind, score, scored=scored)
-        refuse_gap(reading, stamp := stamps.ns, series)
-        pose = self._checked_poses(stamp)
+        self._check_times(stamps, series, row, center, kind)
+        pose = self._checked_poses(stamp := stamps.ns)
         world = _world(center, row, pose)[:, :2]
         motion = _Motion(row, pose, find_moves(series[row], stamp[row] / 1e9, world, kind))
         yaw = self._heading(motion, size, yaw, yaw_unit if turned else "none", centres=centres, strict=scored)
@@ -456,6 +471,10 @@ class _Table:
         if values.dtype.kind == "M":
             reading.note("time", f"stamps are dates in column {column.name}")
             return Stamps(values.astype("datetime64[ns]").astype(np.int64), values, column.name, skipped)
+        shown = values
+        if values.dtype.kind == "U" and (clock := read_clock(values)) is not None:
+            reading.note("time", f"stamps are times of a day in column {column.name}")
+            values = clock
         if values.dtype.kind not in "iuf":
             bad = np.array([not is_number(text) for text in values.tolist()], dtype=np.bool_)
             expected = f"stamps in column {column.name}: numbers, or dates as YYYY-MM-DD HH:MM:SS.ffffff"
@@ -479,8 +498,9 @@ class _Table:
             reading.note("time", f"stamps are {column.name} + {found['nanosec'].name}")
             stamp = values.astype(np.int64) * 1_000_000_000 + part.astype(np.int64)
             return Stamps(stamp, stamp, "stamp_ns", skipped)
-        stamp = read_stamps(reading, values, series, column.unit, self._frame_numbers())
-        return Stamps(stamp, values, column.name, skipped)
+        unit = "s" if shown is not values else column.unit
+        stamp = read_stamps(reading, values, series, unit, self._frame_numbers())
+        return Stamps(stamp, shown if shown.dtype.kind == "U" and unit == "s" else values, column.name, skipped)
 
     def _frame_numbers(self) -> NDArray[Any] | None:
         """Return the numbers of the frames, if the table has several."""
@@ -556,6 +576,18 @@ class _Table:
             reading.doubt("rows", received, option)
         return stamps
 
+    def _check_times(self, stamps: Stamps, series: Ints, row: Ints, center: Floats, kind: Ints) -> None:
+        """Refuse stamps far from all others, and whole milliseconds that may be seconds by the speeds of the boxes."""
+        reading = self._reading
+        refuse_gap(reading, stamps.ns, series)
+        counted = "stamp" not in self._found or {"time", "rate"} & reading.options.keys()
+        if counted or not may_be_seconds(stamps, series, self._unit("stamp")):
+            return
+        speed = typical_speed(series[row], stamps.ns[row] / 1e9, center[:, :2], kind)
+        if speed > SPEEDS[0]:
+            received = f"whole numbers that may be seconds; in milliseconds, boxes go at {speed:.3g} m/s"
+            reading.refuse("time", "a unit of time", received, "--option time=s, or time=ms")
+
     def _is_name_of_few(self, column: str) -> bool:
         """Tell whether a column may have the names of a few sensors."""
         values = self._columns[column]
@@ -626,7 +658,8 @@ class _Table:
             unknown = int(np.isnan(yaw).sum())
             if unknown < len(yaw):
                 moving = unposed and is_moving(yaw, long)
-                found = read_heading(reading, yaw, unit, long, motion.carry, strict=strict, moving=moving)
+                free = "yaw" in self._found and self._found["yaw"].name == CORNERED
+                found = read_heading(reading, yaw, unit, long, motion.carry, strict=strict, moving=moving, free=free)
             if unknown:
                 reading.note("yaw", f"{unknown} of {len(yaw)} boxes have no heading: it is unknown")
         if unposed and self._placed is None:
@@ -808,7 +841,7 @@ class _Table:
             ("finite x, y and z", center, (np.abs(center) <= LARGEST).all(axis=1)),
             ("positive length, width and height", size, (np.isfinite(size) & (size > 0.0)).all(axis=1)),
             (
-                f"sizes up to {LARGEST_SIZE:g} m, or --option size_factor=0.01 or 0.001",
+                f"sizes up to {LARGEST_SIZE:g} m, or --option size_factor=0.01 or 0.001, length_factor for all lengths",
                 size,
                 ~(size > LARGEST_SIZE).any(axis=1),
             ),

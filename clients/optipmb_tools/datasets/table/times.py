@@ -1,5 +1,6 @@
 """Stamps of a table: unit, origin, and grouping into frames."""
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -14,6 +15,7 @@ SECONDS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _WORDS: Final = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 DATED: Final = (1e8, 4.2e9)  # seconds since 1970 that are taken for a date: 1973 to 2103
 PERIODS: Final = (0.005, 10.0)  # shortest and longest time between frames that is plausible, s
+SLOWEST: Final = 3600.0  # s between frames that no option confirms
 COUNTED_HZ: Final = 10.0  # default rate of frames that are counted and not stamped
 APART: Final = 3.0  # ratio of the shortest step between frames to the longest step inside of one
 CROWDED: Final = 0.5  # share of boxes that share their place with another one from which their stamps cannot be right
@@ -30,6 +32,7 @@ _WRAPS: Final = (
 _TURN: Final = 40.0  # what hhmmss counts too much at the turn of a minute
 _YEARS: Final = (1970, 2100)
 _CLOCK: Final = (24, 60, 60)
+_CLOCK_TEXT: Final = re.compile(r"([01]?\d|2[0-3]):([0-5]\d):([0-5]\d(?:\.\d*)?)")
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,24 @@ def may_be_merged(stamp: Ints, key: Ints, boxes: float) -> bool:
     step = median_step(stamp, key) / 1e9
     rounded = not step or step > PERIODS[1] or abs(np.log10(step) - round(np.log10(step))) < ROUNDED
     return bool(rounded and (not step or boxes <= FASTEST * step))
+
+
+def may_be_seconds(stamps: Stamps, key: Ints, unit: str | None) -> bool:
+    """Tell whether stamps that were taken for milliseconds are whole numbers of a step that may be seconds."""
+    numbers = stamps.time
+    if unit is not None or numbers.dtype.kind not in "if" or not np.all(numbers == np.round(numbers)):
+        return False
+    step = median_step(numbers, key)
+    return bool(PERIODS[1] < step <= LONGEST_GAP and float(numbers.max(initial=0)) < DATED[0])
+
+
+def read_clock(texts: NDArray[np.str_]) -> np.ndarray | None:
+    """Return the seconds (R,) of times of a day, as `12:59:58.250`; None where one of them is something else."""
+    found = [_CLOCK_TEXT.fullmatch(text.strip()) for text in texts.tolist()]
+    parts = [match.groups() for match in found if match is not None]
+    if len(parts) < len(found):
+        return None
+    return np.array([3600 * int(hour) + 60 * int(minute) + float(second) for hour, minute, second in parts])
 
 
 def frame_starts(stamp: Ints, key: Ints) -> Ints | None:
@@ -154,6 +175,9 @@ def read_stamps(reading: Reading, numbers: np.ndarray, key: Ints, unit: str | No
             what = "whole numbers in steps of 1, which may count frames" if counts else f"steps of {period:g}"
             reading.refuse("time", "a unit of time", what, "--option time=s, ms, us or ns, or rate=HZ")
         stated = found[0] if found else "s"
+        if period * SECONDS[stated] > SLOWEST:
+            what = f"steps of {period:g}, which are {period * SECONDS[stated]:.3g} s in {_WORDS[stated]}"
+            reading.refuse("time", "frames at a plausible rate", what, "--option time=UNIT")
     elif asked is None and period and not (0.2 * PERIODS[0] <= period * SECONDS[stated] <= 6.0 * PERIODS[1]):
         for other in fitting[:1]:
             expected = f"frames at a plausible rate: in {_WORDS[stated]}, as the column's name says, {period:g} apart"

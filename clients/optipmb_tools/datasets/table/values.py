@@ -5,7 +5,6 @@ ranges. `Reading.decide` compares the counts. Results: metres, radians, z up.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -110,6 +109,7 @@ def read_heading(
     *,
     strict: bool,
     moving: bool,
+    free: bool,
 ) -> Floats:
     """Return headings (B,) in radians, counter-clockwise from x; NaN where unknown.
 
@@ -121,6 +121,7 @@ def read_heading(
         carry: Returns headings in the world from headings (K,) and the rows (K,) of their boxes.
         strict: Whether headings that disagree with the motion are refused, and not only noted.
         moving: Whether the sensor moves and has no poses: then motion says little about headings.
+        free: Whether headings have no sense of their own: they get that of the motion.
     """
     asked = reading.chosen("yaw", ("degrees", "radians"))
     zero = reading.chosen("heading", HEADINGS)
@@ -166,11 +167,19 @@ def read_heading(
         least=LEAST_ALONG if sure else 0.0,
     )
     if claims[0].evidence.share > HALF and not moving:  # along a grid of streets only the sense differs
-        other = axis.removesuffix("-clockwise") if axis.endswith("-clockwise") else f"{axis}-clockwise"
-        option = f"--option heading={other}, or heading={axis} to keep it"
-        claims = [Claim(one, along(found, one)[1], f"if it is {one}", option, "doubt") for one in (axis, other)]
-        claims[0] = replace(claims[0], text="")
-        reading.decide("yaw", claims, "moves are forward", clash="many boxes drive backwards", asked=zero)
+        turned = axis.removesuffix("-clockwise") if axis.endswith("-clockwise") else f"{axis}-clockwise"
+        ways = (axis, axis.removeprefix("-") if axis.startswith("-") else f"-{axis}", *(() if free else (turned,)))
+        claims = [
+            Claim(
+                one,
+                along(found, one)[1],
+                f"if it is {one}" if one != axis and not free else "",
+                f"--option heading={one}, or heading={axis} to keep it",
+                "taken" if free else "doubt",
+            )
+            for one in ways
+        ]
+        axis = reading.decide("yaw", claims, "moves are forward", clash="many boxes drive backwards", asked=zero)
     return _radians(values, found, axis)
 
 
@@ -247,7 +256,7 @@ def read_sizes(reading: Reading, sizes: Floats, names: np.ndarray, *, stated: bo
         claims.append(Claim(order, evidence, shown, option, "doubt" if stated else "taken"))
     order = reading.decide("sizes", claims, asked=asked)
     found = sizes[:, [order.index(letter) for letter in "lwh"]]
-    if "size_factor" not in reading.options:
+    if not {"size_factor", "length_factor"} & reading.options.keys():
         _check_sizes(reading, found[some], names[some], kinds)
     return found
 
@@ -262,7 +271,8 @@ def _check_sizes(reading: Reading, sizes: Floats, names: np.ndarray, kinds: Mapp
     for factor, unit in FACTORS.items():
         size = sizes[rows] * float(factor)
         fits = ((size >= bounds[:, :, 0]) & (size <= bounds[:, :, 1])).all(axis=1)
-        option = f"--option size_factor={factor}"
+        both = f", or length_factor={factor} of all lengths" if unit not in {"", "halves", "doubled"} else ""
+        option = f"--option size_factor={factor}{both}"
         claims.append(
             Claim(factor, Evidence(float(fits.sum()), len(size)), f"as {unit}" if unit else "", option, "doubt")
         )
