@@ -163,25 +163,6 @@ def test_a_score_of_zero_is_valid(detections: Detections) -> None:
         assert decode(payload, Detections).score.tolist() == [0.5, 0.0, 0.5]
 
 
-def test_no_detections_are_a_message(detections: Detections) -> None:
-    """A frame without objects is valid, with empty lists or with empty blocks, and keeps its shapes."""
-    empty = {"label": [], "center": [], "size": [], "yaw": [], "score": [], "velocity": []}
-    message = decode(json.dumps({**plain(detections), **empty}).encode(), Detections)
-    assert message.center.shape == (0, 3)
-    assert message.velocity is not None
-    assert message.velocity.shape == (0, 2)
-    made = Detections(
-        **{name: getattr(detections, name) for name in ("stream", "epoch", "seq", "stamp_ns", "frame", "pose")},
-        labels=(),
-        label=np.empty(0, int),
-        center=np.empty((0, 3)),
-        size=np.empty((0, 3)),
-        yaw=np.empty(0),
-        score=np.empty(0),
-    )
-    assert made.center.shape == (0, 3)
-
-
 def test_a_sensor_frame_needs_a_pose(detections: Detections) -> None:
     """Without a pose, a message in the sensor frame is incomplete; in the world frame it is not."""
     fields = {name: value for name, value in plain(detections).items() if name != "pose"}

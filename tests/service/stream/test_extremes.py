@@ -156,26 +156,6 @@ def test_repairs_are_counted_and_shown() -> None:
     assert three.state().repaired == two.state().repaired
 
 
-def test_classes_of_a_group_survive_a_checkpoint() -> None:
-    """Tracks carry the probabilities of their classes, the same bytes whether or not a checkpoint lies between."""
-    document = NUSCENES.model_dump()
-    for name in ("car", "truck", "bus"):
-        document["classes"][name]["group"] = "motor vehicle"
-    parameters = optipmb.parse_parameters(document)
-    one, other = Session(SENSOR.stream, parameters), Session(SENSOR.stream, parameters)
-    for session in (one, other):
-        feed(session, range(4), SENSOR)
-    restored = Session.restore(decode_checkpoint(encode_checkpoint(one.snapshot())), 0)
-    again, wanted = (tracks(feed(session, [4], SENSOR))[-1] for session in (restored, other))
-    assert wanted.class_probability is not None
-    assert wanted.class_probability.shape == (len(wanted.id), len(parameters.classes))
-    np.testing.assert_allclose(wanted.class_probability.sum(axis=1), 1.0, atol=1e-6)
-    np.testing.assert_array_equal(again.class_probability, wanted.class_probability)
-    assert schemas.decode(schemas.encode(wanted), schemas.Tracks) == wanted
-    plain_one = Session(SENSOR.stream, NUSCENES)
-    assert tracks(feed(plain_one, range(4), SENSOR))[-1].class_probability is None
-
-
 def test_tracks_die_of_silence() -> None:
     """Four seconds without a frame: tracks of before are gone by time, not by frames, and covariance has grown."""
     one = Session(SENSOR.stream, NUSCENES)

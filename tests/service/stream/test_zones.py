@@ -59,18 +59,6 @@ def test_objects_enter_cross_and_leave() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    "order", [[0, 2, 1, *range(3, 40)], [*range(9), 12, 11, 10, 9, *range(13, 20), *range(21, 26), 20, *range(26, 40)]]
-)
-def test_late_frames_give_the_events_of_the_order(order: list[int]) -> None:
-    """State and final events are equal, byte for byte."""
-    expected, one = in_order()
-    session = Session(SENSOR.stream, PROFILE, POLICY)
-    events = final(feed(session, order, SENSOR))
-    assert repr(events) == repr(expected)
-    assert state_bytes(session.snapshot()) == state_bytes(one.snapshot())
-
-
 @pytest.mark.parametrize("seq", range(1, 40, 3))
 def test_a_restore_continues_events_and_numbers(seq: int) -> None:
     """A session that goes on from a checkpoint some frames old gives the events of one that never stopped."""
