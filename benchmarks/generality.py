@@ -288,7 +288,7 @@ def _delays(identity: Ints, stamp_ns: Ints, confirmed: Bools) -> Iterator[float]
 
 
 def _shown(value: float | None) -> str:
-    if value is None:
+    if value is None or math.isnan(value):
         return "-"
     return str(int(value)) if value == int(value) and abs(value) > 1 else f"{value:.4f}"
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from optipmb.class_posterior import weigh_by_class
 from optipmb.compiled import kernel
-from optipmb.density import PHI, V, X, Y
+from optipmb.density import OMEGA, PHI, A, V, X, Y
 from optipmb.errors import EffortError
 from optipmb.frame import PLAIN
 from optipmb.geometry import END_OF_CHAIN, block, empty_torus, insert
@@ -23,7 +23,7 @@ from optipmb.predict import heading_unknown, wrap
 
 if TYPE_CHECKING:
     from optipmb.class_posterior import Groups
-    from optipmb.density import Bernoullis, Density, Poissons
+    from optipmb.density import Bernoullis, Density, Moment, Poissons
     from optipmb.preprocess import Measurements
     from optipmb.rows import Array, Index
     from optipmb.table import Classes, ClassTable
@@ -143,6 +143,49 @@ def exclude_turned(
         variance = objects.covariance[n, PHI, PHI] + own.noise_heading**2
         if squared > own.gate**2 + widening[m] and turn**2 > TURNED**2 * variance:
             log_likelihood[k] = -math.inf
+
+
+HEADWAY: Final = 0.75
+"""Time, s, by which hardly any vehicle follows another one, from centre to centre."""
+
+SLOW: Final = 0.5
+"""Standard deviation of the speed of an object that stands or hardly moves, m/s."""
+
+
+@kernel
+def halt(objects: Bernoullis, measurements: Measurements, moment: Moment, classes: Classes) -> None:
+    """Predict in place that an object stands whose speed is new and that is detected again where it was last.
+
+    This is not in the paper. Where a parked car is missed and the next of its row is detected, one detection each, the
+    gate of the unknown speed takes them for one fast car, which then goes along the row. Another car does not follow
+    within `HEADWAY`: a parallel box at the place that the object would have left is the object. Detections with
+    velocities need no such guess.
+    """
+    for n in range(objects.label.shape[0]):
+        own, mean, covariance = classes[objects.label[n]], objects.mean[n], objects.covariance[n]
+        known, passed = objects.seen_ns[n] - objects.born_ns[n], (moment.stamp_ns - objects.seen_ns[n]) * 1e-9
+        way = mean[V] * passed
+        if known > HEADWAY * 1e9 or passed > HEADWAY or abs(way) <= own.gate or heading_unknown(covariance):
+            continue
+        phi = mean[PHI] - 0.5 * mean[OMEGA] * passed
+        cos_phi, sin_phi = math.cos(phi), math.sin(phi)
+        x, y = mean[X] - way * cos_phi, mean[Y] - way * sin_phi
+        across_2 = 2.0 * own.noise_position**2
+        along_2 = across_2 + (SLOW * passed) ** 2
+        for m in range(measurements.label.shape[0]):
+            dx, dy = measurements.position[m, 0] - x, measurements.position[m, 1] - y
+            along, across = cos_phi * dx + sin_phi * dy, cos_phi * dy - sin_phi * dx
+            turn = 0.5 * wrap(2.0 * (measurements.yaw[m] - phi))
+            if (
+                math.isnan(measurements.velocity[m, 0])
+                and classes[measurements.label[m]].group == own.group
+                and along**2 / along_2 + across**2 / across_2 <= DEVIATIONS_2
+                and turn**2 <= (TURNED * own.noise_heading) ** 2
+            ):
+                mean[X], mean[Y], mean[PHI], mean[V], mean[OMEGA], mean[A] = x, y, phi, 0.0, 0.0, 0.0
+                covariance[:] = np.diag(own.birth_unknown**2)
+                covariance[V, V] = SLOW**2
+                break
 
 
 @kernel

@@ -25,7 +25,7 @@ from optipmb.detection_probability import detection_probability
 from optipmb.errors import FrameError, ParameterError
 from optipmb.extract import Tracks, extract
 from optipmb.field_of_view import follow_looks, look
-from optipmb.hypotheses import UNLIMITED, check_effort, local_hypotheses
+from optipmb.hypotheses import UNLIMITED, check_effort, halt, local_hypotheses
 from optipmb.lightweight import light_weight_filter
 from optipmb.parameters import Parameters, load_profile
 from optipmb.paths import paths_of
@@ -98,11 +98,12 @@ class Update(NamedTuple):
 
 @kernel
 def update(
-    prior: Columns, p_d: Array, measurements: Columns, moment: Columns, confusion: Array, classes: Classes
+    prior: Columns, p_d: Array, measurements: Columns, moment: Columns, confusion: Array, classes: Classes, still: bool
 ) -> Columns:
     """Update the prediction with the measurements: from the fields of the named tuples to the fields of `Update`.
 
-    `p_d` (N + J,) is of the objects and, behind them, of the components; `confusion` as in `optipmb.table.ClassTable`.
+    `p_d` (N + J,) is of the objects and, behind them, of the components; `confusion` as in `optipmb.table.ClassTable`;
+    `still` says whether the sensor stands, or its poses are known.
     """
     given, z, now = Prior(*prior), Measurements(*measurements), Moment(*moment)
     objects, components = objects_in(given.objects), components_in(given.components)
@@ -110,6 +111,8 @@ def update(
     groups = Groups(given.class_probability, confusion)
 
     # Local hypotheses: missed, detected, first-time detected; HABM
+    if still:
+        halt(objects, z, now, classes)
     hypotheses = local_hypotheses(objects, components, p_d, z, groups, now.dt, classes)
 
     # Data association: the best global hypothesis, and the objects that outlive the pruning of the MB
@@ -305,7 +308,8 @@ class Tracker:
         since_ns = prior.missed_from_ns if looks is None else looks.misses.missed_from_ns
         likely = UNGROUPED if prior.class_probability is None else prior.class_probability
         given = prior.bernoulli.words, since_ns, likely, prior.poisson.words, len(predicted.poisson), prior.next_id
-        after = Update(*update(given, p_d, tuple(z), tuple(moment), table.confusion, table.classes))
+        still = density.sensor is None  # poses are known, or not needed
+        after = Update(*update(given, p_d, tuple(z), tuple(moment), table.confusion, table.classes, still))
         objects = Bernoullis.of(after.objects)
         poisson = Poissons.of(after.components) if modules.rpp else Poissons.empty()
         misses = None if looks is None else follow_looks(looks, after, prior.bernoulli, objects, z, moment, table)

@@ -119,6 +119,8 @@ class Oracle:
                 self.poisson.append(Poisson(mean, covariance, weight, z.label, z.auxiliary.copy(), now, newborn=True))
         p_d = [self._detection_probability(b, world) for b in self.bernoulli]
         p_du = [self._detection_probability(u, world) for u in self.poisson]
+        for b in self.bernoulli:
+            self._halt(b, measurements, now)
         gates = [[j for j, u in enumerate(self.poisson) if self._in_gate(u, z)] for z in measurements]  # J^m
         p_a = [self._association_probability(z) for z in measurements]
         new = [self._first_detection(z, gates[m], p_du, p_a[m]) for m, z in enumerate(measurements)]
@@ -209,6 +211,24 @@ class Oracle:
             p_d *= min(1.0, scale)
         share = self.dt / self.detection_time if self.detection_time else 1.0
         return float(1 - (1 - p_d) ** max(share, 0.02)) if share < 1 else p_d
+
+    def _halt(self, b: Bernoulli, zs: list[Measurement], now: int) -> None:
+        """A new speed is given up where a parallel box without velocity is at the last place, within 0.75 s."""
+        c, passed = self.classes[b.label], (now - b.seen_ns) * 1e-9
+        if b.seen_ns - b.born_ns > 0.75e9 or passed > 0.75 or abs(b.mean[2] * passed) <= c.gate:
+            return
+        phi, noise = b.mean[3] - b.mean[4] * passed / 2, c.measurement_noise
+        axes = np.array([[math.cos(phi), math.sin(phi)], [-math.sin(phi), math.cos(phi)]])
+        place = b.mean[:2] - b.mean[2] * passed * axes[0]
+        variance = 2 * noise.position**2 + np.array([(0.5 * passed) ** 2, 0.0])
+        for z in zs:
+            turn = (z.yaw - phi + math.pi / 2) % math.pi - math.pi / 2
+            near = np.sum((axes @ (z.xy - place)) ** 2 / variance) <= 9.21
+            if z.velocity is None and z.label in self._group(b.label) and near and abs(turn) <= 1.5 * noise.heading:
+                p = c.birth
+                b.mean = np.array([*place, 0.0, phi, 0.0, 0.0])
+                b.covariance = np.diag([p.position, p.position, 0.5, p.heading, p.turn_rate, p.acceleration]) ** 2
+                return
 
     def _in_gate(self, component: Bernoulli | Poisson, z: Measurement) -> bool:
         """Class gate, open to the group of a detected object, and distance gate."""

@@ -99,6 +99,36 @@ def test_oncoming_objects_keep_their_ids() -> None:
         assert last.velocity[i, 0] == pytest.approx(-8 * np.sign(first.center[i, 0]), abs=0.5)
 
 
+def cars_at(x: list[float], t: float, tracker: optipmb.OnlineTracker) -> optipmb.OnlineTracks:
+    """Detect cars along a road and give them to the tracker."""
+    n = len(x)
+    boxes = {"center": [[one, 5.0, 0.8] for one in x], "size": [[4.4, 1.8, 1.5]] * n, "yaw": [0.0] * n}
+    return tracker.update({**boxes, "score": [0.9] * n}, t=t, label=["car"] * n)
+
+
+def test_no_track_goes_along_a_row_of_parked_cars() -> None:
+    """At 2 Hz a car is missed where the next of its row is first detected: from then on each place keeps its id."""
+    tracker, owner = optipmb.OnlineTracker(optipmb.generic_parameters(["car"], 0.5)), {}
+    cars_at([0.0], 0.0, tracker)
+    cars_at([6.5], 0.5, tracker)
+    for k in range(2, 12):
+        tracks = cars_at([6.5 * n for n in range(k + 1)], 0.5 * k, tracker)
+        for track, x in zip(tracks.id.tolist(), tracks.center[:, 0].round(1).tolist(), strict=True):
+            assert owner.setdefault(x, track) == track
+    assert sorted(owner) == [6.5 * n for n in range(12)]
+    assert np.nanmax(np.abs(tracks.velocity)) < 0.1
+
+
+@pytest.mark.parametrize("headway", [0.8, 1.5])
+def test_cars_that_follow_one_another_keep_their_ids(headway: float) -> None:
+    """At 2 Hz and 15 m/s."""
+    tracker = optipmb.OnlineTracker(optipmb.generic_parameters(["car"], 0.5))
+    for k in range(10):
+        tracks = cars_at([15.0 * (0.5 * k - headway * n) for n in range(4)], 0.5 * k, tracker)
+    assert tracks.id.tolist() == [1, 2, 3, 4]
+    assert np.abs(tracks.velocity - [15.0, 0.0]).max() < 0.5
+
+
 def occlusion(*, hidden: bool, parameters: optipmb.Parameters) -> list[optipmb.StepResult]:
     """A standing car, seen for a second, then missed; its box is empty of points (`hidden`) or full of them."""
     rng = np.random.default_rng(0)
