@@ -26,6 +26,7 @@ from optipmb.detectors import forms_of, from_detector, on_host
 from optipmb.errors import FrameError
 from optipmb.frame import Pose, make_frame
 from optipmb.tracker import Tracker
+from optipmb.velocity_check import EXPECTED, VelocityCheck
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -351,6 +352,7 @@ class OnlineTracker:
         self._is_long = np.array([common_name(name) in LONG for name in self.parameters.labels])
         self._odd_steps = self._boxes = self._wide = 0
         self._has_warned_of_yaw = False
+        self._velocities = VelocityCheck()
 
     def __repr__(self) -> str:
         return f"OnlineTracker: profile {self.parameters.name}, {self._latest or 'no frame yet'}"
@@ -400,8 +402,8 @@ class OnlineTracker:
                 back; names it. The density stays as it was.
 
         Warns:
-            UserWarning: the times are not in seconds, the headings in degrees, or the widths before the lengths, by all
-                appearance; once each.
+            UserWarning: the times are not in seconds, the headings in degrees, the widths before the lengths, or the
+                velocities not those of the boxes, by all appearance; once each.
         """
         if not isinstance(pose, Pose | None):
             raise FrameError("pose", "an optipmb.Pose of a translation and a quaternion", type(pose).__name__)
@@ -485,6 +487,8 @@ class OnlineTracker:
             if self._boxes >= COMPARED and 2 * self._wide > self._boxes:
                 found = f"{self._wide} of {self._boxes} vehicles wider than long"
                 warn(f"size: expected length, width, height, received {found}", stacklevel=3)
+        if self._velocities.add(frame, estimated=self.density.sensor_motion is not None):
+            warn(f"velocity: expected {EXPECTED}, received {self._velocities.contradiction}", stacklevel=3)
 
     def _on_ground(self, camera: GroundCamera, pose: Pose | None, columns: dict[str, Any]) -> dict[str, Any]:
         """Return the detections of pixel boxes, in the frame of the camera's position."""

@@ -90,6 +90,13 @@ MISTAKES: list[tuple[str, Any, list[str], int, str]] = [
     ("a wrong profile", boxes(), ["--profile", "kiti"], 2, "(is kitti meant?)"),
     ("a wrong option", boxes(), ["--option", "jaw=degrees"], 2, "--option jaw: expected one of time, rate, group, yaw"),
     ("places in centimetres", boxes(x=100.0 * boxes()["x"]), [], 0, "hardly anything is tracked, 0 of"),
+    (
+        "velocities of another sign",
+        boxes(t=np.repeat(np.arange(FRAMES), 3) * 1.0, vx=np.tile([-9.0, 8.0, -7.0], FRAMES), vy=np.zeros(ROWS)),
+        ["--option", "time=s"],
+        0,
+        "velocity: expected metres per second over ground",
+    ),
     ("no tracks", boxes(score=np.full(ROWS, 0.01)), ["--profile", "kitti"], 1, "no tracks came of 90 detections"),
 ]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from datetime import UTC, datetime
 from enum import Enum
 from importlib.metadata import version
@@ -214,6 +215,24 @@ def test_numbers_of_another_meaning_are_doubted_once(unit: float, change: dict[s
     with pytest.warns(UserWarning, match=text) as warnings:
         _ = [tracker.update({**flat(k), **change}, t=unit * 0.1 * k) for k in range(120)]
     assert len(warnings) == 1
+
+
+@pytest.mark.parametrize("wrong", ["nothing", "unit", "axes", "relative"])
+def test_velocities_that_contradict_the_boxes_are_doubted_once(wrong: str) -> None:
+    """Velocities in km/h, along other axes or relative to the sensor bring one warning; true ones with noise none."""
+    tracker, rng = optipmb.OnlineTracker(), np.random.default_rng(1)
+    speed = np.array([7.0, -8.0, 9.0, -10.0, 11.0, 0.0, 0.0, 0.0])
+    boxes = {"y": 8.0 * np.arange(8), "l": [4.5] * 8, "w": [1.9] * 8, "yaw": [0.0] * 8, "label": "car"}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for k in range(120):
+            vx, vy = speed + rng.normal(0.0, 1.0, 8), rng.normal(0.0, 1.0, 8)
+            given = {"unit": (3.6 * vx, 3.6 * vy), "axes": (-vy, -vx), "relative": (vx - 15.0, vy)}.get(wrong, (vx, vy))
+            x = speed * 0.1 * k + rng.normal(0.0, 0.2, 8)
+            tracker.update({"x": x, "vx": given[0], "vy": given[1], **boxes}, t=0.1 * k)
+    texts = [str(one.message) for one in caught]
+    assert len(texts) == (wrong != "nothing")
+    assert all(text.startswith("velocity: expected metres per second over ground") for text in texts)
 
 
 def test_slow_frames_and_frames_in_parts_are_not_doubted() -> None:

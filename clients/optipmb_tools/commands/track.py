@@ -242,6 +242,8 @@ def _complain(results: "list[TrackedSequence]", profile: str) -> None:
     if estimated := sum(one.estimated for one in results):
         frames = sum(one.frames for one in results)
         warn(f"the motion of the sensor is estimated in {estimated} of {frames} frames: boxes have no poses")
+    for doubt in [f"{one.name}: {doubt}" for one in results for doubt in one.doubts]:
+        warn(doubt)
     cut, samples = map(sum, zip(*(one.cut for one in results), strict=True))
     if cut:
         from optipmb_tools.results.nuscenes import NUSCENES_MAX_BOXES  # noqa: PLC0415  of one format

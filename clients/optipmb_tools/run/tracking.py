@@ -6,7 +6,7 @@ A replay through the service (`optipmb_tools.run.replay`) gives the same bytes.
 import functools
 import itertools
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -38,6 +38,7 @@ from optipmb import (
 from optipmb.hindsight import with_hindsight
 from optipmb.parameters import ALIKE
 from optipmb.self_calibration import learned_noise
+from optipmb.velocity_check import EXPECTED, VelocityCheck
 from optipmb_tools.datasets import DataSequence, Dataset, DatasetArguments, DetectionFrame, selected_frames
 from optipmb_tools.files import remove_unfinished
 from optipmb_tools.results.output import Latency, Results, TrackCounts, horizons_for, latency
@@ -64,6 +65,7 @@ class Tracked:
     left_out: dict[str, int]  # detections of each class that the profile lacks, or that are below its score filter
     estimated: int  # frames in which the motion of the sensor was estimated
     learned: tuple[str, ...]  # noise of the detections of each class, in words
+    doubts: tuple[str, ...]  # velocities that contradict the motion of their boxes, by sensor, in words
     steps_ns: tuple[int, ...]
     seconds: float
 
@@ -131,6 +133,7 @@ def track_whole(
     found: dict[int, Tracks] = {}
     extracted: dict[int, optipmb.Tracks] = {}
     steps: list[int] = []
+    checks: defaultdict[str, VelocityCheck] = defaultdict(VelocityCheck)  # by sensor
     clouds = detections = estimated = 0
     left_out: Counter[str] = Counter()
     size = len(parameters.classes)
@@ -155,6 +158,7 @@ def track_whole(
         extracted[frame.index] = result.tracks
         if smoother is not None:
             smoother.add(frame.index, density, result.tracks)
+        checks[frame.sensor].add(taken, estimated=density.sensor_motion is not None)
         clouds += frame.cloud is not None
         estimated += density.sensor_motion is not None
         detections += len(frame)
@@ -174,7 +178,8 @@ def track_whole(
             found[index] = found[index].model_copy(update=fields_of(one, paths))
     _use_hindsight(found, extracted, hindsight_s, parameters, same_axes=not (smooth or estimated))
     counts = clouds, detections, dict(left_out), estimated
-    return Tracked(found, *counts, learned_noise(density), tuple(steps), time.monotonic() - begun)
+    doubts = tuple(one.contradiction for one in checks.values() if one.contradiction)
+    return Tracked(found, *counts, learned_noise(density), doubts, tuple(steps), time.monotonic() - begun)
 
 
 def _use_hindsight(
@@ -243,6 +248,7 @@ class TrackedSequence:
     rows: int  # a track in a frame
     unconfirmed_rows: int
     learned: tuple[str, ...]  # noise of the detections of each class, in words
+    doubts: tuple[str, ...]  # velocities that contradict the motion of their boxes, in words
     seconds: float
     step: Latency | None  # durations of the tracker's steps
 
@@ -326,6 +332,7 @@ def _track_one(job: _Job, name: str) -> tuple[TrackedSequence, Path | Columns]:
         (sum(beyond), len(beyond)),
         *TrackCounts.of(found.tracks.values()),
         found.learned,
+        tuple(f"velocity: expected {EXPECTED}, received {one}" for one in found.doubts),
         found.seconds,
         latency(found.steps_ns),
     ), written

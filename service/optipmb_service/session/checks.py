@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 import optipmb
+from optipmb.velocity_check import EXPECTED, VelocityCheck
 from optipmb_service.session.values import MAX_SENSORS, SECOND
 
 if TYPE_CHECKING:
@@ -56,9 +57,20 @@ class SensorChecks:
         self._stamps = StampCheck()
         self._poses = PoseCheck()
         self._is_blind = False
+        self._velocities = VelocityCheck()
 
-    def add(self, message: schemas.Detections, arrived_ns: int, policy: Policy) -> list[Finding]:
-        """Return problems of a frame that arrived (monotonic)."""
+    def add(
+        self, message: schemas.Detections, frame: optipmb.Frame, arrived_ns: int, policy: Policy, *, estimated: bool
+    ) -> list[Finding]:
+        """Return problems of a frame that arrived (monotonic).
+
+        Args:
+            message: the frame.
+            frame: its detections.
+            arrived_ns: when it arrived.
+            policy: what the session follows.
+            estimated: whether the motion of the sensor is.
+        """
         findings = []
         if found := self._stamps.add(message.stamp_ns, arrived_ns):
             findings.append(Finding("clock", "stamp_ns", "stamps in nanoseconds that advance with time", found))
@@ -68,6 +80,8 @@ class SensorChecks:
         if policy.needs_view and message.field_of_view is None and not self._is_blind:
             self._is_blind = True
             findings.append(Finding("no_view", "field_of_view", "where the sensor sees", "nothing"))
+        if message.velocity is not None and self._velocities.add(frame, estimated=estimated):
+            findings.append(Finding("velocity", "velocity", EXPECTED, self._velocities.contradiction))
         return findings
 
 

@@ -21,6 +21,10 @@ CODES: Final = {
         "Most detections of a class have scores below the profile's `score_filter`; reported once per session.",
         "Choose the profile `generic`, or lower the filter of the class.",
     ),
+    "velocity": (
+        "Most velocities contradict the motion of their boxes; reported once per session and sensor.",
+        "Send velocities over ground, in m/s, along the axes of the boxes; or none.",
+    ),
     "no_pose": (
         "The sensor moves, and its frames have no pose: the motion is estimated; reported once per session.",
         "Send poses where they are known: tracks are in the axes of the sensor without them.",

@@ -507,7 +507,9 @@ class Session:
             queue.timeline = judged[0].note(frame_id)
             self._follow(self._timeline.note(frame_id))
             return self._refuse(self._problems.invalid(frame_id, error))
-        findings = queue.checks.add(message, since_ns, self._policy) + self._scores.add(frame_id, frame, parameters)
+        estimated = self.density.sensor_motion is not None
+        findings = queue.checks.add(message, frame, since_ns, self._policy, estimated=estimated)
+        findings += self._scores.add(frame_id, frame, parameters)
         outputs: list[Output] = [self._problems.of(one.code, frame_id, *one[1:]) for one in findings]
         deadline_ns, inputs = queue.cloud_deadline_ns(message, since_ns), (message, frame, ignored)
         pending = PendingFrame(frame_id, detections, inputs, deadline_ns, ticket, judged, since_ns)

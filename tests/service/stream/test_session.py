@@ -275,6 +275,23 @@ def test_an_estimated_motion_of_the_sensor_is_reported_once() -> None:
     assert reported(0.0) == []
 
 
+def test_velocities_that_contradict_the_boxes_are_reported_once() -> None:
+    """Ten cars whose velocities have the other sign are reported; with velocities over ground they are not."""
+    places, speeds = np.column_stack((np.zeros(10), 8.0 * np.arange(10), np.zeros(10))), np.arange(6.0, 16.0)
+
+    def reported(factor: float) -> list[tuple[str, str]]:
+        one, outputs = session(), []
+        for seq in range(150):
+            center = places + np.outer(0.1 * seq * speeds, [1.0, 0.0, 0.0])
+            velocity = np.column_stack((factor * speeds, np.zeros(10)))
+            given = {"objects": 10, "center": center, "velocity": velocity, "label": np.zeros(10, int)}
+            outputs += feed(one, [seq], stamp_ns=SECOND + seq * SECOND // 10, labels=("car",), **given)
+        return [(problem.code, problem.path) for problem in problems(outputs)]
+
+    assert reported(-1.0) == [("velocity", "velocity")]
+    assert reported(1.0) == []
+
+
 def test_other_names_of_a_class_are_tracked() -> None:
     """A stream that says `vehicle.car` has the tracks of one that says `car`, and no problem."""
     said, alike = (
