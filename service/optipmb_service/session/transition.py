@@ -3,10 +3,11 @@
 It is a pure function of state, frame and parameters, so frames can be processed again when one is inserted before them.
 When a step raises, nothing has changed.
 
-A session id names one incarnation of the density. It is derived from the stream, the first frame of the incarnation and
-the parameters: a repeated run gives it again, and a service that was restarted without its checkpoints and went on with
-another frame does not. When a late frame turns out to be the first one, the incarnation gets the id that it would have
-had in order; tracks that were published under the other id are corrected like all others behind that frame.
+A session id names one incarnation of the density. It is derived from the stream, the first frame of the incarnation,
+the parameters, and the settings `sensors` and `rejoin`: a repeated run gives it again, and a service that was restarted
+without its checkpoints and went on with another frame does not. When a late frame turns out to be the first one, the
+incarnation gets the id that it would have had in order; tracks that were published under the other id are corrected
+like all others behind that frame.
 """
 
 from __future__ import annotations
@@ -105,6 +106,8 @@ class Transition:
         values = json.dumps(parameters.model_dump(mode="json", exclude={"horizons"}))  # no track depends on them
         if policy.sensors.shown():
             values += repr(policy.sensors)
+        if policy.rejoin is not None:
+            values += repr(policy.rejoin)
         self._digest = hashlib.blake2b(values.encode(), digest_size=16).digest()
 
     def name(self, frame_id: FrameId | None, starts: int) -> str:

@@ -100,6 +100,14 @@ def test_session_ids_depend_on_where_a_session_began() -> None:
     )
 
 
+def test_session_ids_depend_on_how_tracks_are_joined() -> None:
+    """Sessions of one stream have the same id only where they have the same settings of joining."""
+    ways = [None, optipmb.Rejoin(), optipmb.Rejoin(gap_s=5.0), optipmb.Rejoin(embedding_model="reid-7")]
+    ids = [tracks(feed(session(policy=Policy(rejoin=how)), [0]))[0].session for how in [*ways, *ways]]
+    assert ids[:4] == ids[4:]
+    assert len(set(ids)) == 4
+
+
 @pytest.mark.parametrize("wait_ns", [WAIT_NS, 0])
 def test_a_cloud_before_its_frame_is_used_at_once(wait_ns: int) -> None:
     """A frame whose cloud is there does not wait, and has the cloud where none is waited for."""
