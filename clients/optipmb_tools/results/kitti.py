@@ -8,13 +8,12 @@ does boxes that are for more than half in unannotated regions. Numbers have six 
 the same bytes.
 
 A submission leaves rows out: the server of the benchmark sweeps no scores, so every false track counts. It has the
-tracks that were confirmed in some frame and whose mean score is at least the threshold of their class, and of these the
-rows with an image box.
+tracks that were confirmed in some frame and whose rank (`optipmb_tools.results.ranks`) is at least the threshold of
+their class, and of these the rows with an image box.
 """
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from statistics import fmean
 
 import numpy as np
 from optipmb_schemas import Tracks
@@ -23,7 +22,7 @@ from optipmb_tools.camera import Camera, alpha_of, kitti_from_sensor, sensor_fro
 from optipmb_tools.datasets.interface import class_like
 from optipmb_tools.files import DatasetError, numbers, read_rows, write_whole
 from optipmb_tools.geometry import PoseLike, rotation_of, to_sensor
-from optipmb_tools.results import ResultTable
+from optipmb_tools.results import ResultTable, ranks
 
 LEAST_SHOWN = 0.5  # part of a projected box that must lie in the image for its line to have an image box
 
@@ -70,15 +69,11 @@ def write_kitti_results(
             lines.append((identity, names[label], float(row[-1]), bool(shown), line))
         if known and one.confirmed is not None:
             confirmed.update(one.id[np.asarray(one.confirmed, dtype=np.bool_)].tolist())
-    scores: dict[int, list[float]] = {}
-    for identity, _, score, shown, _ in lines:
-        if shown and identity in confirmed:
-            scores.setdefault(identity, []).append(score)
-    mean = {identity: fmean(values) for identity, values in scores.items()}
+    ids, scores = np.array([line[0] for line in lines], np.int64), np.array([line[2] for line in lines])
     kept = (
         line
-        for identity, name, _, shown, line in lines
-        if least is None or (shown and mean.get(identity, -1.0) >= least[name])
+        for rank, (identity, name, _, shown, line) in zip(ranks(ids, scores).tolist(), lines, strict=True)
+        if least is None or (shown and identity in confirmed and rank >= least[name])
     )
     write_whole(path, kept)
     return path
