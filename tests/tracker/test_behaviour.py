@@ -227,3 +227,35 @@ def test_a_stamp_that_goes_back_is_refused() -> None:
         tracker.step(density, boxes(KITTI, 0.999999999, (0, 0)))
     assert caught.value.path == "stamp_ns"
     tracker.step(density, boxes(KITTI, 1.0, (0, 0)))
+
+
+def test_a_flipped_heading_does_not_turn_the_track() -> None:
+    """Where the detector may turn a box by pi, the yaw stays and the id too, moving or standing."""
+    rng = np.random.default_rng(4)
+    for speed in (0.0, 6.0):
+        frames = []
+        for k in range(40):
+            yaw = 0.3 + rng.normal(0, 0.05) + math.pi * (k > 5 and rng.random() < 0.4)
+            xy = (speed * 0.1 * k * math.cos(0.3), speed * 0.1 * k * math.sin(0.3))
+            frames.append(boxes(KITTI, 0.1 * k, xy, yaw=yaw))
+        for result in steps(KITTI, frames):
+            np.testing.assert_array_equal(result.tracks.id, [1])
+            assert abs(math.remainder(result.tracks.yaw[0] - 0.3, 2 * math.pi)) < 0.5
+
+
+@pytest.mark.parametrize("label", KITTI.labels)
+def test_ten_seconds_of_silence_end_every_track(label: str) -> None:
+    """After a gap past the limit nothing old is left to be associated: the object gets a new id."""
+    first = boxes(KITTI, 0, (0, 0), label=label)
+    gap = steps(KITTI, [first, boxes(KITTI, 10, (0, 0), label=label)])
+    np.testing.assert_array_equal(gap[1].tracks.id, [2])
+
+
+def test_an_irregular_stream_keeps_its_track() -> None:
+    """Between 20 ms and 300 ms apart, the same object at constant speed keeps its id and its speed."""
+    rng = np.random.default_rng(2)
+    stamps = np.cumsum(rng.uniform(0.02, 0.3, 60))
+    frames = [boxes(KITTI, t, (7.0 * t, 0.0)) for t in stamps]
+    results = steps(KITTI, frames)
+    assert {result.tracks.id.tolist()[0] for result in results} == {1}
+    np.testing.assert_allclose(results[-1].tracks.velocity, [[7.0, 0.0]], atol=0.3)

@@ -413,3 +413,25 @@ def test_the_first_frames_of_many_new_streams_wait_for_room(
     until(lambda: service.status().frames == 1 + 3 * most, "all are tracked")
     status = service.status()
     assert (status.refused, status.shed, len(streams.tracking())) == (0, 0, 1 + 3 * most)
+
+
+def test_a_stream_that_opens_keeps_no_other_waiting(
+    start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The store is slow: other streams are tracked meanwhile, and what the new one sent comes after."""
+    gate, load = threading.Event(), SqliteStore.load
+
+    def slow(store: SqliteStore, stream: str) -> bytes | None:
+        assert stream != CARELESS.stream or gate.wait(20)
+        return load(store, stream)
+
+    monkeypatch.setattr(SqliteStore, "load", slow)
+    _, endpoint = start(store=str(tmp_path))
+    with Node(endpoint) as node:
+        node.send(CAREFUL.detections(0))
+        node.tracks(CAREFUL.stream, 1)
+        node.send(*(CARELESS.detections(seq) for seq in range(3)))
+        node.send(CAREFUL.detections(1))
+        node.tracks(CAREFUL.stream, 2)
+        gate.set()
+        assert [one.seq for one in node.tracks(CARELESS.stream, 3)] == [0, 1, 2]

@@ -467,3 +467,24 @@ def test_a_client_with_an_id_of_its_own_does_not_start(tmp_path: Path) -> None:
     settings = load(None, {"connect": [free_endpoint()], "zenoh_config": str(file), "instance": "test"}).settings
     with pytest.raises(TransportError, match='id: expected none, received "ab12"'):
         Transport(settings)
+
+
+def test_garbage_on_every_key_costs_nothing(node: Node) -> None:
+    """Random bytes on every kind of key, and a stream that is tracked meanwhile comes out unchanged."""
+    random = np.random.default_rng(1)
+    for seq in range(30):
+        for topic in ("detections", "points", "tracks", "problems", "q/state", "other"):
+            for stream in (SENSOR.stream, f"x/{seq}/y", f"owner/{seq}/y", f"bad key/{seq}/ü"):
+                node.send_raw(f"optipmb/v1/{stream}/{topic}", random.bytes(int(random.integers(0, 200))))
+        node.send(SENSOR.detections(seq))
+    key = KEYS.tracks(SENSOR.stream)
+
+    def ours() -> list[bytes]:
+        good = encoding_of(Tracks)
+        return [payload for at, payload, encoding in node.tracks_seen.items if at == key and encoding == good]
+
+    node.tracks_seen.wait(lambda _: len(ours()) >= 30, "30 tracks")
+    assert [plain(decode(payload, Tracks)) for payload in ours()] == offline(SENSOR, range(30))
+    status = node.ask(KEYS.status("test"), ServiceStatus)
+    assert [summary.stream for summary in status.sessions] == [SENSOR.stream]
+    assert status.refused >= 60
