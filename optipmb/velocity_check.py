@@ -28,7 +28,7 @@ COMPARED: Final = 30
 """Velocities after which they are judged, if they are of `FRAMES`."""
 FRAMES: Final = 5
 MOST: Final = 0.5
-"""Share of contradictions that is reported: true velocities with errors of 1 m/s along each axis stay below .3."""
+"""Share of contradictions that is reported: true velocities with errors of 1 m/s along each axis stay below .4."""
 
 
 class VelocityCheck:
