@@ -158,8 +158,8 @@ def halt(objects: Bernoullis, measurements: Measurements, moment: Moment, classe
 
     This is not in the paper. Where a parked car is missed and the next of its row is detected, one detection each, the
     gate of the unknown speed takes them for one fast car, which then goes along the row. Another car does not follow
-    within `HEADWAY`: a parallel box at the place that the object would have left is the object. Detections with
-    velocities need no such guess.
+    within `HEADWAY`: a parallel box at the place that the object would have left, sure enough to start a track, is the
+    object. Weaker ones may be echoes of what moves on, and detections with velocities need no such guess.
     """
     for n in range(objects.label.shape[0]):
         own, mean, covariance = classes[objects.label[n]], objects.mean[n], objects.covariance[n]
@@ -177,7 +177,8 @@ def halt(objects: Bernoullis, measurements: Measurements, moment: Moment, classe
             along, across = cos_phi * dx + sin_phi * dy, cos_phi * dy - sin_phi * dx
             turn = 0.5 * wrap(2.0 * (measurements.yaw[m] - phi))
             if (
-                math.isnan(measurements.velocity[m, 0])
+                measurements.score[m] >= own.birth_score
+                and math.isnan(measurements.velocity[m, 0])
                 and classes[measurements.label[m]].group == own.group
                 and along**2 / along_2 + across**2 / across_2 <= DEVIATIONS_2
                 and turn**2 <= (TURNED * own.noise_heading) ** 2

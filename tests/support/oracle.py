@@ -213,7 +213,7 @@ class Oracle:
         return float(1 - (1 - p_d) ** max(share, 0.02)) if share < 1 else p_d
 
     def _halt(self, b: Bernoulli, zs: list[Measurement], now: int) -> None:
-        """A new speed is given up where a parallel box without velocity is at the last place, within 0.75 s."""
+        """A new speed is given up where a sure parallel box without velocity is at the last place, within 0.75 s."""
         c, passed = self.classes[b.label], (now - b.seen_ns) * 1e-9
         if b.seen_ns - b.born_ns > 0.75e9 or passed > 0.75 or abs(b.mean[2] * passed) <= c.gate:
             return
@@ -224,7 +224,8 @@ class Oracle:
         for z in zs:
             turn = (z.yaw - phi + math.pi / 2) % math.pi - math.pi / 2
             near = np.sum((axes @ (z.xy - place)) ** 2 / variance) <= 9.21
-            if z.velocity is None and z.label in self._group(b.label) and near and abs(turn) <= 1.5 * noise.heading:
+            sure = z.score >= c.birth_score and z.velocity is None
+            if sure and z.label in self._group(b.label) and near and abs(turn) <= 1.5 * noise.heading:
                 p = c.birth
                 b.mean = np.array([*place, 0.0, phi, 0.0, 0.0])
                 b.covariance = np.diag([p.position, p.position, 0.5, p.heading, p.turn_rate, p.acceleration]) ** 2
