@@ -403,7 +403,7 @@ class OnlineTracker:
 
         Warns:
             UserWarning: the times are not in seconds, the headings in degrees, the widths before the lengths, or the
-                velocities not those of the boxes, by all appearance; once each.
+                velocities in contradiction to the boxes, by all appearance; once each.
         """
         if not isinstance(pose, Pose | None):
             raise FrameError("pose", "an optipmb.Pose of a translation and a quaternion", type(pose).__name__)

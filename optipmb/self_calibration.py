@@ -74,7 +74,7 @@ LOWEST: Final = -0.5 * BIN * BINS
 """Width of a bin of log odds, and the lower edge of the first."""
 
 DETECTIONS, LASTING, MOVING, GIVEN, HITS, LOOKS = range(6)
-"""Counts of a class by bin: evaluated detections, lasting ones, those of them whose object moves, all scores of the
+"""Counts of a class by bin: evaluated detections, lasting ones, lasting ones whose object moves, all scores of the
 detector, and hits and looks of inner slots by the mean bin of the slot."""
 SLOT_TICKS: Final = 9900
 """Shortest time of a slot: a second, less the jitter of stamps, in ticks of 0.1 ms."""
@@ -171,7 +171,7 @@ def isotonic(detections: Array, objects: Array, out: Array) -> None:
 
 @kernel
 def curves(classes: Array, table: Classes) -> Array:
-    """Return the curves of lasting detections and of those of objects, (2, C, `BINS`)."""
+    """Return the curves of the shares that last, and of the shares of objects, (2, C, `BINS`)."""
     out = np.empty((2, classes.shape[0], BINS))
     for c in range(classes.shape[0]):
         isotonic(classes[c, DETECTIONS], classes[c, LASTING], out[0, c])
@@ -244,7 +244,7 @@ def copy_rows(slots: Slots, first: int, out: Slots) -> None:
 def next_slot(slots: Slots, counts: Array, needed: float, speed: float) -> None:
     """Evaluate the middle of the slots of an object in the counts of its class, and begin a new slot.
 
-    A lasting object is detected in the share `needed` of looks; `speed` is that of the object now, m/s.
+    A lasting object is detected in the share `needed` of looks; `speed`: of the object now, m/s.
     """
     hits, looks = np.zeros(SLOTS), np.empty(SLOTS)
     for s in range(SLOTS):
@@ -284,8 +284,8 @@ def learn(
     Arguments of its own:
         counts: of classes, objects and components, as in `SelfCalibration`; the classes' are written.
         before_words: array of the `Bernoullis` of the frame before.
-        after: that of the posterior, the measurement of each object, negative where missed, and whether it was in view,
-            (K,).
+        after: array of the posterior, and for each object its measurement, negative where missed, and whether it was in
+            view, (K,).
         components_label: (J,) classes of the predicted components.
         fate: (J + M,) of `update_undetected`.
         detections: scores, calibrated scores and classes of the detections, (D,), and the detection of each
@@ -444,7 +444,7 @@ class Scores(NamedTuple):
         before: the density that they are calibrated by.
         given: (D,) of the detector.
         lasting: (D,) shares of the detections with such scores that last.
-        meant: (D,) calibrated: shares of those that are of objects.
+        meant: (D,) calibrated: shares that are of objects.
         label: (D,) classes of the detections.
     """
 

@@ -44,7 +44,7 @@ class VelocityCheck:
         self._then: tuple[Array, Array] = np.empty((0, 2)), np.empty((0, 2))
         """Places and velocities (K, 2) of the detections of the frame with this stamp that move."""
         self._sums = np.zeros(4)
-        """Frames and velocities that were compared, those that contradict, and their speeds, m/s."""
+        """Compared frames, compared velocities, contradicting velocities, and the sum of their speeds, m/s."""
 
     def add(self, frame: Frame, *, estimated: bool) -> bool:
         """Compare the velocities of a frame, about once a second; return whether a contradiction has been found now.
@@ -77,7 +77,7 @@ class VelocityCheck:
         return bool(self._sums[0] >= FRAMES and self._sums[1] >= COMPARED) and self._judged()
 
     def _judged(self) -> bool:
-        """Judge the velocities so far, and begin anew, after a rest where they are right."""
+        """Judge the velocities so far, and restart the counts, after a rest where they are right."""
         _, compared, against, speeds = self._sums.tolist()
         self._sums[:] = 0.0
         if against < MOST * compared:

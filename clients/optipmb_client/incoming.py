@@ -88,7 +88,7 @@ class Inbox:
             self._changed.notify()
 
     def lose(self, count: int = 0) -> None:
-        """Note that messages are lost before the next entry, perhaps of all keys; `count`: of those that are known."""
+        """Note that messages are lost before the next entry, of any keys; `count`: how many are known to be."""
         with self._changed:
             self.dropped += count
             self._since_loss = collections.OrderedDict()

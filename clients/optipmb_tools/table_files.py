@@ -720,7 +720,7 @@ def read_json(path: Path) -> list[_Record]:
 
 
 def _frames(content: dict[str, Any]) -> Any:
-    """Return the one list of records of an object, or a record for each frame where its names are those of frames."""
+    """Return the one list of records of an object, or a record for each frame where its names name frames."""
     lists = [one for one in content.values() if isinstance(one, list) and one and isinstance(one[0], dict)]
     named = all(re.search(r"\d", name) and isinstance(value, (list, dict)) for name, value in content.items())
     if not named:

@@ -1,4 +1,4 @@
-"""The exact overlap of boxes beside that of the tracker."""
+"""The exact overlap of boxes equals the tracker's."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def draw(rng: np.random.Generator, count: int) -> Boxes:
 
 @given(st.integers(0, 2**32), st.sampled_from([0.0, 0.5 * np.pi, np.pi]))
 def test_the_overlap_in_the_plane_is_that_of_the_tracker(seed: int, turn: float) -> None:
-    """Of boxes at random places, and of those that share their sides, one of which lies in the other or is turned."""
+    """Boxes at random places, with common sides, one inside the other, and turned."""
     rng = np.random.default_rng(seed)
     first, second = draw(rng, 50), draw(rng, 50)
     center, size, yaw = (one.copy() for one in second)

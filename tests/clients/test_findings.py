@@ -372,7 +372,7 @@ def test_corners_are_boxes(tmp_path: Path, form: str) -> None:
     }
     dataset, findings = looked(tmp_path / "d.csv", rest | corners)
     assert not [one for one in findings if one.wrong or one.doubt]
-    assert any(f"those of {count} corners" in one.text for one in findings)
+    assert any(f"have {count} corners" in one.text for one in findings)
     frames = list(dataset.sequences(["all"])[0].frames())
     wanted = list(looked(tmp_path / "e.csv", columns)[0].sequences(["all"])[0].frames())
     for found, one in zip(frames, wanted, strict=True):
@@ -392,7 +392,7 @@ def test_bounds_and_sines_are_boxes(tmp_path: Path) -> None:
     bare, said = looked(tmp_path / "a.csv", rest | bounds)
     centres = np.concatenate([frame.center for frame in bare.sequences(["all"])[0].frames()])
     np.testing.assert_allclose(centres, np.column_stack([columns[name] for name in "xyz"]), atol=1e-3)
-    assert any("centres are those of bounds" in one.text for one in said)
+    assert any("centres are the middles of bounds" in one.text for one in said)
     yaw = columns.pop("yaw")
     zero = np.zeros(len(yaw))
     for turned in (

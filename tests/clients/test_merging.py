@@ -170,7 +170,7 @@ def test_events_come_once_when_they_are_final(messages: list[Events], released: 
 
 
 def test_events_of_streams_that_are_silent_the_longest_are_not_held(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Readers of all streams hold those of a bounded number of streams: names are arbitrary."""
+    """Readers of all streams hold events of a bounded number of streams: names are arbitrary."""
     monkeypatch.setattr(merging, "MOST_STREAMS", 2)
     streams = FinalEventsOfStreams()
     for name in ("a/b/ended", "a/b/one", "a/b/other"):

@@ -248,7 +248,7 @@ def test_a_row_may_hold_the_boxes_of_a_frame(suffix: str, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("form", ["frames", "numbers", "names", "stamps", "ids", "lists"])
 def test_frames_of_a_file_are_found_by_their_names(form: str, tmp_path: Path) -> None:
-    """A file of JSON may have the list of frames beside other values, or frames by their numbers, names or stamps."""
+    """A file of JSON may have the list of frames among other values, or frames by their numbers, names or stamps."""
     columns = boxes(**{"class": None, "score": None})
     rows = [{name: values[i].item() for name, values in columns.items() if name != "t"} for i in range(3 * FRAMES)]
     frames = [rows[i : i + 3] for i in range(0, len(rows), 3)]

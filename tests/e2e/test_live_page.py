@@ -276,7 +276,7 @@ def test_the_page_leaves_a_connection_that_is_lost_without_an_end(
 
 
 def test_a_late_frame_does_not_end_the_paths(chrome: Chrome) -> None:
-    """Corrected tracks of earlier frames of the session are not drawn; another session begins anew."""
+    """Corrected tracks of earlier frames of the session are not drawn; another session starts with empty paths."""
     watched = Watched()
     with served(watched) as address:
         see(chrome, address, STREAM)

@@ -1,4 +1,4 @@
-"""What is sent again after a gateway has failed, and what is lost then, seen from a gateway."""
+"""Frames that are sent again after a gateway has failed, and frames that are lost then, as a gateway sees them."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class Losing(rpc.TrackingServiceServicer):
 
 
 def test_frames_that_are_lost_at_a_gateway_are_named() -> None:
-    """Those that it skipped for a slow reader, and those that came between two calls and are kept no longer."""
+    """Frames that it skipped for a slow reader, and frames between two calls that are kept no longer."""
     with served(Losing()) as endpoint, Subscriber("a/b/c", endpoint) as tracks:
         received = [tracks.receive(DEADLINE_S) for _ in range(5)]
         assert [one.tracks.seq for one in received if one] == [0, 1, 5, 9, 10]
@@ -92,7 +92,7 @@ def test_frames_that_are_lost_at_a_gateway_are_named() -> None:
 
 
 def test_responses_of_another_release_end_no_subscription_in_silence() -> None:
-    """A kind of response that is not known is left out; after one that cannot be read nobody waits for the next."""
+    """A kind of response that is not known is left out; after one that cannot be read the subscription ends."""
 
     def subscribe(_request: bytes, _context: Any) -> Iterator[bytes]:
         yield bytes([15 << 3 | 2, 0])  # a field that there is not

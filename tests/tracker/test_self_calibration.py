@@ -98,7 +98,7 @@ def isotonic(detections: Array, objects: Array) -> Array:
 
 
 def walkers(state: Array) -> Array:
-    """Lasting detections, of which few move beside the best fifth, where most of those do."""
+    """Lasting detections of which few move, where most of the best fifth do."""
     best = np.cumsum(state[DETECTIONS][::-1])[::-1] - state[DETECTIONS] < 0.2 * state[DETECTIONS].sum()
     share = state[MOVING, best].sum() / state[LASTING, best].sum()
     most = np.where(best | (share <= LEAST_MOVERS), np.inf, (state[MOVING] + FREE) / share)

@@ -265,7 +265,7 @@ class GrpcSubscription(ResumedCall):
     def _began(self) -> None:
         self._call.initial_metadata()  # it is in force
         if self._settled.is_set():
-            self._inbox.lose()  # what came since the call before, and is kept no longer
+            self._inbox.lose()  # messages since the call before that are kept no longer
         if self._call.is_active():
             self._settled.set()
             self._request.history = True  # the next call recovers the losses in between

@@ -111,7 +111,7 @@ def test_static_transforms_stay_where_more_comes_than_can_be_handled() -> None:
 
 
 def test_a_wrong_transform_takes_no_other_along() -> None:
-    """One message has those of many frames: the wrong one is logged with its place, and the others hold."""
+    """One message has transforms of many frames: the wrong one is logged with its place, and the others hold."""
     stream = "garage/robot-1/lidar"
     bridging = Bridging(stream, ros2={"streams": {stream: {"detections": "/boxes"}}})
     fixed = {"header": header_of(1, "map"), "child_frame_id": "lidar", "transform": {"rotation": {"w": 1.0}}}

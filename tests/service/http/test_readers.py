@@ -27,7 +27,7 @@ async def test_a_reader_is_cancelled_also_as_an_item_comes() -> None:
 
 
 def test_streams_that_are_silent_the_longest_have_no_pace() -> None:
-    """A reader of all streams remembers a bounded number of them: those that it heard last."""
+    """A reader of all streams remembers a bounded number of them, the last that it heard."""
     pace = Pace(1.0)
     assert pace.passes("a/b/ended", 0)
     assert pace.passes("a/b/goes-on", 0)

@@ -174,7 +174,7 @@ def test_what_others_received_goes_before_what_was_held_here() -> None:
 
 
 def test_brought_messages_take_no_more_room_than_there_is() -> None:
-    """The oldest go and are counted, so that other sessions keep what they hold."""
+    """The oldest go and are counted, so that other sessions keep their messages."""
     bounds = bounds_of(held=ByteBudget(5 * PACKET_BYTES))
     other, backlog = (Backlog(name, bounds, 0) for name in ("a/b/other", "a/b/c"))
     for number in range(2):

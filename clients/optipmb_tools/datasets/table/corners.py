@@ -24,7 +24,7 @@ CORNERED: Final = "yaw of corners"
 
 
 def with_boxes(reading: Reading, columns: Columns, found: Collection[str]) -> Columns:
-    """Return columns with those of centres, sizes and headings in place of others that say the same.
+    """Return columns of centres, sizes and headings in place of equivalent ones.
 
     Args:
         reading: Gets the findings.
@@ -68,7 +68,7 @@ def _of_corners(reading: Reading, columns: Columns) -> Columns:
     }
     if axes > 2:  # noqa: PLR2004  the axes of the plane
         boxes |= {"z": points[:, :, 2].mean(axis=1), "h": np.ptp(points[:, :, 2], axis=1)}
-    reading.note("sizes", f"boxes are those of {count} corners: their length is the longer side, the heading along it")
+    reading.note("sizes", f"boxes have {count} corners: their length is the longer side, the heading along it")
     return {name: one for name, one in columns.items() if name not in names.values()} | boxes
 
 
@@ -83,7 +83,7 @@ def _of_bounds(reading: Reading, columns: Columns) -> Columns:
     centres: dict[str, Floats] = {
         axis: 0.5 * (columns[names[axis, "min"]] + columns[names[axis, "max"]]) for axis in "xyz"
     }
-    reading.note("sizes", "centres are those of bounds along the axes, which tell neither sizes nor headings")
+    reading.note("sizes", "centres are the middles of bounds along the axes, which tell neither sizes nor headings")
     return {name: one for name, one in columns.items() if name not in names.values()} | centres
 
 
@@ -94,7 +94,7 @@ def _of_sines(reading: Reading, columns: Columns) -> Columns:
         for pair in ((f"sin_{base}", f"cos_{base}"), (f"{base}_sin", f"{base}_cos")):
             names = [known[one] for one in pair if one in known]
             if len(names) == len(pair) and all(columns[name].dtype.kind in "if" for name in names):
-                reading.note("yaw", f"headings are those of {names[0]} and {names[1]}")
+                reading.note("yaw", f"headings are computed from {names[0]} and {names[1]}")
                 yaw = np.arctan2(columns[names[0]], columns[names[1]])
                 return {name: one for name, one in columns.items() if name not in names} | {"yaw": yaw}
     return columns

@@ -121,7 +121,7 @@ def read_heading(
         carry: Returns headings in the world from headings (K,) and the rows (K,) of their boxes.
         strict: Whether headings that disagree with the motion are refused, and not only noted.
         moving: Whether the sensor moves and has no poses: then motion says little about headings.
-        free: Whether headings have no sense of their own: they get that of the motion.
+        free: Whether the motion gives the sense of the headings.
     """
     asked = reading.chosen("yaw", ("degrees", "radians"))
     zero = reading.chosen("heading", HEADINGS)

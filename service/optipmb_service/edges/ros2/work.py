@@ -1,7 +1,7 @@
 """Work of the ROS 2 bridge: threads that receive put into one queue, and one thread does the work.
 
-The queue is bounded; when it is full the oldest message goes and is counted. What is said once stays the longest:
-static transforms, and which endpoints there are.
+The queue is bounded; when it is full the oldest message goes and is counted. Messages that are sent once stay the
+longest: static transforms and changes of endpoints.
 """
 
 from __future__ import annotations
