@@ -248,7 +248,16 @@ def test_acknowledgements_are_few(stub: Any, stream: str) -> None:
 def test_a_clock_that_stands_still_is_told_to_the_caller(stub: Any, stream: str) -> None:
     """Frames with one stamp are tracked, and the call that sent them gets the problem `clock`."""
     sent = [frame(seq, stream).model_copy(update={"stamp_ns": 10**18}) for seq in range(25)]
-    responses = list(stub.Track(detections(one) for one in sent))
+    answered, responses = threading.Event(), []
+
+    def requests() -> Iterator[Any]:
+        yield from map(detections, sent)
+        answered.wait(DEADLINE_S)  # a call that is closed ends after a second without tracks
+
+    for one in stub.Track(requests()):
+        responses.append(one)
+        if len(responses) > len(sent):
+            answered.set()
     problems = [one.problem for one in responses if one.WhichOneof("response") == "problem"]
     assert [one.code for one in problems] == ["clock"]
     assert problems[0].received == f"20 frames with the stamp {10**18}: the clock does not advance"
