@@ -288,7 +288,8 @@ def _titles(lines: Sequence[str]) -> int:
     for place, line in enumerate(lines):
         for mark in _SEPARATORS:
             fields = line.split(mark)
-            if len(fields) > 2 and all(re.match(r"[\s\"']*([A-Za-z_]|$)", field) for field in fields):  # noqa: PLR2004  a title may have a comma
+            named = all(re.match(r"[\s\"']*([A-Za-z_]|$)", field) for field in fields)
+            if line.count(mark) > 1 and named:  # a title may have a comma
                 return 0 if any(one.count(mark) >= line.count(mark) for one in lines[:place]) else place
     return 0
 
@@ -730,10 +731,12 @@ def _frames(content: dict[str, Any]) -> Any:
     frames = []
     for name, value in content.items():
         number = int(name) if name.isdigit() else name
-        if isinstance(value, dict) and value and all(isinstance(one, dict) for one in value.values()):
-            value = [{"id": key} | one for key, one in value.items()]  # noqa: PLW2901  objects by their ids
-        boxes = isinstance(value, list) and any(isinstance(one, list) for one in value)
-        record = value if isinstance(value, dict) else {"boxes" if boxes else "objects": value}
+        if isinstance(value, list):
+            record = {"boxes" if any(isinstance(one, list) for one in value) else "objects": value}
+        elif value and all(isinstance(one, dict) for one in value.values()):  # objects by their ids
+            record = {"objects": [{"id": key} | one for key, one in value.items()]}
+        else:
+            record = value
         frames.append({"timestamp" if stamped else "frame": number} | record)
     return frames
 

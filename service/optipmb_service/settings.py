@@ -90,7 +90,7 @@ def _with_port(url: str) -> str:
         ValueError: it is none.
     """
     try:
-        urlsplit(url).port  # noqa: B018 - it is checked when it is read
+        _ = urlsplit(url).port  # is checked when it is read
     except ValueError as error:
         raise ValueError(f"a port is a number up to 65535: {error}") from error
     return url

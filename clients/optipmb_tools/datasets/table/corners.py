@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 _CORNER: Final = re.compile(r"(?:.*_)?corners?(?:_3d)?_?(\d)_?([012xyz])")
 _BOUND: Final = re.compile(r"(?:.*_)?(?:([xyz])_?(min|max)|(min|max)_?([xyz]))")
 _FACE: Final = 4  # corners of a box from above
+_AXES: Final = "xyz"
 CORNERED: Final = "yaw of corners"
 """Column of headings whose sense the corners do not tell."""
 
@@ -45,7 +46,7 @@ def _of_corners(reading: Reading, columns: Columns) -> Columns:
     names: dict[tuple[int, int], str] = {}
     for name in columns:
         if match := _CORNER.fullmatch(re.sub(r"[^a-z0-9]+", "_", name.lower())):
-            names[int(match[1]), "012".find(match[2]) if match[2].isdigit() else "xyz".find(match[2])] = name
+            names[int(match[1]), "012".find(match[2]) if match[2].isdigit() else _AXES.find(match[2])] = name
     axes = 1 + max((axis for _, axis in names), default=0)
     count = len(names) // axes
     numeric = all(columns[name].dtype.kind in "if" for name in names.values())
@@ -66,7 +67,7 @@ def _of_corners(reading: Reading, columns: Columns) -> Columns:
         "w": length[rows, short],
         CORNERED: np.arctan2(along[:, 1], along[:, 0]),
     }
-    if axes > 2:  # noqa: PLR2004  the axes of the plane
+    if axes == len(_AXES):
         boxes |= {"z": points[:, :, 2].mean(axis=1), "h": np.ptp(points[:, :, 2], axis=1)}
     reading.note("sizes", f"boxes have {count} corners: their length is the longer side, the heading along it")
     return {name: one for name, one in columns.items() if name not in names.values()} | boxes
@@ -78,10 +79,10 @@ def _of_bounds(reading: Reading, columns: Columns) -> Columns:
     for name in columns:
         if match := _BOUND.fullmatch(normalised(name).base):
             names[match[1] or match[4], match[2] or match[3]] = name
-    if len(names) != 6 or any(columns[name].dtype.kind not in "if" for name in names.values()):  # noqa: PLR2004
+    if len(names) != 2 * len(_AXES) or any(columns[name].dtype.kind not in "if" for name in names.values()):
         return columns
     centres: dict[str, Floats] = {
-        axis: 0.5 * (columns[names[axis, "min"]] + columns[names[axis, "max"]]) for axis in "xyz"
+        axis: 0.5 * (columns[names[axis, "min"]] + columns[names[axis, "max"]]) for axis in _AXES
     }
     reading.note("sizes", "centres are the middles of bounds along the axes, which tell neither sizes nor headings")
     return {name: one for name, one in columns.items() if name not in names.values()} | centres
