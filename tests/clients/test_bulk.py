@@ -6,6 +6,7 @@ import os
 import signal
 import time
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -32,14 +33,14 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def workers(of: int) -> set[int]:
-    found = set()
+    children, found = [], set()
     for task in Path(f"/proc/{of}/task").iterdir():
-        for child in (task / "children").read_text().split():
-            try:
-                if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
-                    found.add(int(child))
-            except OSError:  # it has ended
-                continue
+        with suppress(OSError):  # the thread has ended
+            children += (task / "children").read_text().split()
+    for child in children:
+        with suppress(OSError):  # it has ended
+            if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
+                found.add(int(child))
     return found
 
 
