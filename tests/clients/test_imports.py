@@ -1,6 +1,8 @@
 """Rules of the repository: directions of imports, pure computation, and names in the documentation."""
 
 import ast
+import dataclasses
+import inspect
 import re
 import subprocess
 import sys
@@ -12,6 +14,8 @@ import optipmb_schemas
 import optipmb_service
 import optipmb_tools
 import pytest
+from optipmb_tools.datasets.table.draft import Draft
+from optipmb_tools.datasets.table.read import STEPS
 
 import optipmb
 
@@ -169,3 +173,24 @@ def test_each_fault_of_reliability_has_tests_that_exist() -> None:
     for file, name in re.findall(r"`(tests/\S+?\.py)::(test_\w+)`", page):
         functions = {part.name for part in ast.walk(tree(DOCS.parent / file)) if isinstance(part, ast.FunctionDef)}
         assert name in functions, f"{file}::{name}"
+
+
+def test_steps_of_the_reading_of_tables_read_fields_that_earlier_steps_set() -> None:
+    """Each function in STEPS, with those of its module that it calls, reads of the draft only what is set by then."""
+    known = {"columns", "rows", "scored", "framed", "roles"}
+    for step in STEPS:
+        functions = {
+            one.name: one for one in tree(Path(inspect.getfile(step))).body if isinstance(one, ast.FunctionDef)
+        }
+        called, names = [functions[step.__name__]], {step.__name__}
+        for function in called:
+            parts = {part.id for part in ast.walk(function) if isinstance(part, ast.Name)} & functions.keys()
+            called += [functions[name] for name in sorted(parts - names)]
+            names |= parts
+        parts = [part for function in called for part in ast.walk(function)]
+        read = {part.attr for part in parts if isinstance(part, ast.Attribute) and ast.unparse(part.value) == "draft"}
+        calls = [part for part in parts if isinstance(part, ast.Call) and ast.unparse(part.func) == "replace"]
+        fields = {one.name for one in dataclasses.fields(Draft)}
+        assert read & fields <= known, f"{step.__module__}.{step.__name__}: {sorted(read & fields - known)}"
+        known |= {word.arg for call in calls for word in call.keywords if word.arg} & fields
+    assert fields <= known

@@ -9,7 +9,7 @@ import pytest
 from commands import result_of, run_here
 from optipmb_tools.datasets import DataSequence, DatasetError, open_dataset
 from optipmb_tools.datasets.table import TableDataset, TableSequence, match_stamps
-from optipmb_tools.datasets.table.rows import find_columns
+from optipmb_tools.datasets.table.columns import find_columns
 from optipmb_tools.run.tracking import track_whole
 from optipmb_tools.table_files import read_table, write_table
 from own_tables import FRAMES, boxes

@@ -29,8 +29,10 @@ from optipmb_tools.datasets.interface import (
 )
 from optipmb_tools.datasets.table import pixels
 from optipmb_tools.datasets.table.columns import ALIASES
+from optipmb_tools.datasets.table.draft import Boxes
 from optipmb_tools.datasets.table.findings import Finding, Reading
-from optipmb_tools.datasets.table.rows import NO_ID, Boxes, read_tables
+from optipmb_tools.datasets.table.names import NO_ID
+from optipmb_tools.datasets.table.read import read_tables
 from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Bools, Floats, Ints, Pose, stack_poses, to_world
 from optipmb_tools.results.output import track_columns, write_tracks

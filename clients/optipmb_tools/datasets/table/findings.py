@@ -16,6 +16,7 @@ from optipmb_tools.datasets.interface import Assumption
 from optipmb_tools.files import DatasetError
 from optipmb_tools.table_files import is_number, line_of
 
+NOISE: Final = 0.1  # difference of two shares that tells nothing
 HALF: Final = 0.5  # share of its rival's evidence up to which a reading is refused
 
 
@@ -66,6 +67,18 @@ class Reading:
     def skips(self) -> bool:
         """Whether the user leaves out rows that cannot be used."""
         return self.chosen("invalid", ("skip", "refuse")) == "skip"
+
+    @property
+    def marks(self) -> list[float]:
+        """Numbers by which the user says that a cell has no value.
+
+        Raises:
+            DatasetError: One of them is no number.
+        """
+        texts = [text.strip() for text in self.options.get("missing", "").split(",") if text.strip()]
+        if wrong := [text for text in texts if not is_number(text)]:
+            raise DatasetError("--option missing", "numbers, with commas between them", repr(wrong[0]))
+        return [float(text) for text in texts]
 
     @property
     def notes(self) -> list[str]:

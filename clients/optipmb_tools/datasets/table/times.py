@@ -1,15 +1,17 @@
-"""Stamps of a table: unit, origin, and grouping into frames."""
+"""Stamps of a table: unit, origin, and the steps between them."""
 
 import re
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from optipmb_tools.datasets.table.draft import Draft, Stamps, numbers
 from optipmb_tools.datasets.table.findings import HALF, Reading
+from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Bools, Ints
+from optipmb_tools.table_files import NO_VALUE, is_number
 
 SECONDS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _WORDS: Final = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
@@ -18,12 +20,8 @@ PERIODS: Final = (0.005, 10.0)  # shortest and longest time between frames that 
 SLOWEST: Final = 3600.0  # s between frames that no option confirms
 COUNTED_HZ: Final = 10.0  # default rate of frames that are counted and not stamped
 APART: Final = 3.0  # ratio of the shortest step between frames to the longest step inside of one
-CROWDED: Final = 0.5  # share of boxes that share their place with another one from which their stamps cannot be right
-ROUNDED: Final = 1e-3  # relative difference of a step from a power of ten
-FASTEST: Final = 30.0  # frames a second of a detector
 NEAR: Final = 5.0  # steps of a counter from its end to its beginning, where it wraps
 LONGEST_GAP: Final = 60.0  # s; a longer one than this and than all other steps together is a fault of a stamp
-UNITS_APART: Final = 100.0  # ratio of steps, many of either length, from which stamps have two units
 _WRAPS: Final = (
     *(2.0**bits for bits in (16, 24, 31, 32)),
     *(size * 10.0**power for size in (1, 60, 3600, 86400, 604800) for power in (0, 3, 6, 9)),
@@ -35,16 +33,6 @@ _CLOCK: Final = (24, 60, 60)
 _CLOCK_TEXT: Final = re.compile(r"([01]?\d|2[0-3]):([0-5]\d):([0-5]\d(?:\.\d*)?)")
 
 
-@dataclass(frozen=True)
-class Stamps:
-    """Times of the rows of a table."""
-
-    ns: Ints  # (R,)
-    time: NDArray[Any]  # (R,) as the table has it
-    column: str  # its name
-    skipped: Bools  # (R,) rows without a stamp, which are left out
-
-
 def median_step(numbers: np.ndarray, key: Ints) -> float:
     """Return the median time between the frames of a recording (R,), 0 where it has no two.
 
@@ -53,25 +41,6 @@ def median_step(numbers: np.ndarray, key: Ints) -> float:
     steps = _steps(numbers, key)
     longest = _longest_inside(steps)
     return float(np.median(steps[steps > longest])) if len(steps) else 0.0
-
-
-def may_be_merged(stamp: Ints, key: Ints, boxes: float) -> bool:
-    """Tell whether each of the stamps (R,) may hold several frames, given the number of `boxes` at one place.
-
-    Then they are a power of ten apart, or further than frames are, and no detector is faster than the merged frames.
-    """
-    step = median_step(stamp, key) / 1e9
-    rounded = not step or step > PERIODS[1] or abs(np.log10(step) - round(np.log10(step))) < ROUNDED
-    return bool(rounded and (not step or boxes <= FASTEST * step))
-
-
-def may_be_seconds(stamps: Stamps, key: Ints, unit: str | None) -> bool:
-    """Tell whether stamps that were taken for milliseconds are whole numbers of a step that may be seconds."""
-    numbers = stamps.time
-    if unit is not None or numbers.dtype.kind not in "if" or not np.all(numbers == np.round(numbers)):
-        return False
-    step = median_step(numbers, key)
-    return bool(PERIODS[1] < step <= LONGEST_GAP and float(numbers.max(initial=0)) < DATED[0])
 
 
 def read_clock(texts: NDArray[np.str_]) -> np.ndarray | None:
@@ -272,74 +241,79 @@ def unwrapped(reading: Reading, numbers: np.ndarray, key: Ints) -> np.ndarray:
 MOST_BACK: Final = 3  # steps back of a table whose rows are in the order of time
 
 
-def refuse_gap(reading: Reading, stamp: Ints, key: Ints) -> None:
-    """Refuse a stamp that is further from the others of its recording than these are from each other."""
-    for one in np.unique(key).tolist():
-        rows = np.flatnonzero(key == one)
-        ordered = np.unique(stamp[rows])
-        steps = np.diff(ordered)
-        if len(steps) < 2:  # noqa: PLR2004  of two stamps none is the odd one
-            continue
-        low, high = np.quantile(steps, (0.2, 0.8)).tolist()
-        place = int(np.argmax(steps))
-        gap = int(steps[place])
-        rest = int(steps.sum()) - gap
-        if high <= UNITS_APART * low and (gap <= LONGEST_GAP * 1e9 or gap <= rest):
-            continue
-        before = stamp[rows] <= ordered[place]
-        few = rows[before if before.sum() < 0.5 * len(rows) else ~before]
-        count = f"{len(few)} of {len(rows)} rows are {gap / 1e9:.6g} s from the others, which span {rest / 1e9:.6g} s"
-        if "time" in reading.options:
-            reading.doubt("time", count)
-        else:
-            option = "--option time=UNIT, if the stamps are right"
-            reading.refuse("time", "stamps of one recording in one unit", count, option, int(few[0]))
+def step(reading: Reading, draft: Draft) -> Draft:
+    """Read the stamps of all rows, or the numbers of frames."""
+    return replace(draft, stamps=_stamps(reading, draft))
 
 
-def read_frames(
-    reading: Reading,
-    stamps: Stamps,
-    series: Ints,
-    number: NDArray[Any] | None,
-    crowd: Callable[[Ints], float],
-    name: str,
-) -> Stamps:
-    """Return the stamps of frames: equal for boxes of a frame that have stamps of their own.
+def _stamps(reading: Reading, draft: Draft) -> Stamps:
+    found = draft.roles
+    rate = reading.positive("rate", "frames per second")
+    column = found.get("stamp")
+    skipped = np.zeros(draft.rows, dtype=np.bool_)
+    if column is None or (rate is not None and "frame" in found):
+        return _counted(reading, draft, rate)
+    values = draft.columns[column.name]
+    missing = np.isnat(values) if values.dtype.kind == "M" else values != values  # noqa: PLR0124  NaN differs from itself
+    if values.dtype.kind == "U":
+        missing = np.isin(np.char.strip(values), NO_VALUE)
+    if missing.any() and not missing.all() and reading.skips:
+        skipped = missing
+        near = np.maximum.accumulate(np.where(missing, 0, np.arange(draft.rows)))
+        values = values[np.where(missing[near], np.flatnonzero(~missing)[0], near)]
+    else:
+        expected = f"a stamp in column {column.name} (--option invalid=skip leaves such rows out)"
+        reading.strict().first("time", missing, expected, values)
+    if values.dtype.kind == "M":
+        reading.note("time", f"stamps are dates in column {column.name}")
+        return Stamps(values.astype("datetime64[ns]").astype(np.int64), values, column.name, skipped)
+    shown = values
+    if values.dtype.kind == "U" and (clock := read_clock(values)) is not None:
+        reading.note("time", f"stamps are times of a day in column {column.name}")
+        values = clock
+    if values.dtype.kind not in "iuf":
+        bad = np.array([not is_number(text) for text in values.tolist()], dtype=np.bool_)
+        expected = f"stamps in column {column.name}: numbers, or dates as YYYY-MM-DD HH:MM:SS.ffffff"
+        reading.strict().first("time", bad, expected, values)
+        texts = [text.strip() for text in values.tolist()]
+        integers = all(text.lstrip("+-").isdigit() for text in texts)  # as nanoseconds with an empty cell
+        values = np.array(
+            [int(text) for text in texts] if integers else texts, dtype=np.int64 if integers else np.float64
+        )
+    if rate is not None:
+        counted = "nanosec" not in found and bool(np.all((values == np.round(values)) & (values < DATED[0])))
+        if counted:
+            reading.note("time", f"column {column.name} counts frames, {rate:g} a second")
+            return Stamps(nanoseconds(reading, values, 1e9 / rate), values, column.name, skipped)
+        reading.doubt("time", f"rate is not used: column {column.name} has times, not numbers of frames")
+    if "nanosec" in found:
+        whole = np.asarray(values == np.floor(values))
+        reading.strict().first("time", ~whole, f"whole seconds in column {column.name}", values)
+        part = numbers(reading, draft, "nanosec")
+        reading.strict().first("time", ~np.isfinite(part), f"nanoseconds in column {found['nanosec'].name}", part)
+        reading.note("time", f"stamps are {column.name} + {found['nanosec'].name}")
+        stamp = values.astype(np.int64) * 1_000_000_000 + part.astype(np.int64)
+        return Stamps(stamp, stamp, "stamp_ns", skipped)
+    unit = "s" if shown is not values else column.unit
+    stamp = read_stamps(reading, values, draft.series, unit, draft.frame_numbers)
+    return Stamps(stamp, shown if shown.dtype.kind == "U" and unit == "s" else values, column.name, skipped)
 
-    Args:
-        reading: Gets the findings.
-        stamps: Of the rows (R,).
-        series: (R,) recording of each row.
-        number: (R,) of frames; None without such a column.
-        crowd: Returns the share of boxes that share their place under stamps (R,).
-        name: Of the column of `number`.
-    """
 
-    def of(first: Ints) -> Stamps:
-        return Stamps(stamps.ns[first], stamps.time[first], stamps.column, stamps.skipped)
-
-    asked = reading.positive("group", "seconds", zero=True)
-    if asked is not None:
-        return of(group_stamps(stamps.ns, series, asked * 1e9, whole=True)) if asked else stamps
-    alone = crowd(stamps.ns)
-    by_number = None if number is None else rows_of_frames(stamps.ns, number, series)
-    for first, how in ((by_number, "number"), (frame_starts(stamps.ns, series), "step")):
-        if first is None:
-            continue
-        grouped = stamps.ns[first]
-        if crowd(grouped) > max(0.5 * CROWDED, alone):
-            if how == "number":
-                reading.doubt(
-                    "time",
-                    f"column {name} is not used: its frames hold boxes at one place",
-                    f"--option column.frame={name}",
-                )
-            continue
-        if how == "number":
-            reading.note("time", f"stamps differ within a frame: each has the first one of its {name}")
-        else:
-            apart, frames = (stamps.ns - grouped).max() / 1e9, len(np.unique(grouped))
-            text = f"stamps differ by up to {apart:.3g} s within a frame: grouped into {frames} frames"
-            reading.note("time", text, "--option group=SECONDS, 0 for none")
-        return of(first)
-    return stamps
+def _counted(reading: Reading, draft: Draft, rate: float | None) -> Stamps:
+    """Return stamps from the numbers of frames."""
+    column = draft.roles.get("frame")
+    if column is None:
+        expected = "a column of stamps (t, stamp_ns …; --option column.stamp=NAME) or of frames"
+        raise DatasetError(reading.path, expected, f"the columns {', '.join(draft.columns)}")
+    frame = numbers(reading, draft, "frame")
+    reading.strict().first("time", ~np.isfinite(frame), f"the number of a frame in column {column.name}", frame)
+    if rate is None:
+        step = median_step(frame, draft.series) or 1.0
+        rate = COUNTED_HZ * step
+        steps = "" if step == 1.0 else f" (numbers in steps of {step:g})"
+        text = f"no column of stamps: frames of column {column.name} are taken to come at {COUNTED_HZ:g} Hz{steps}"
+        reading.note("time", text, "--option rate=HZ")
+    else:
+        reading.note("time", f"column {column.name} counts frames, {rate:g} a second")
+    stamp = nanoseconds(reading, frame, 1e9 / rate)
+    return Stamps(stamp, draft.columns[column.name], column.name, np.zeros(draft.rows, dtype=np.bool_))

@@ -1,0 +1,199 @@
+"""Frames of a table: rows grouped by their stamps, and doubts about these."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optipmb_tools.datasets.motion import SPEEDS, find_reports, overlapping, typical_speed
+from optipmb_tools.datasets.table.draft import Draft, Stamps
+from optipmb_tools.datasets.table.findings import NOISE, Reading
+from optipmb_tools.datasets.table.times import (
+    DATED,
+    LONGEST_GAP,
+    PERIODS,
+    frame_starts,
+    group_stamps,
+    median_step,
+    rows_of_frames,
+)
+from optipmb_tools.geometry import Ints
+
+CROWDED: Final = 0.5  # share of boxes that share their place with another one from which their stamps cannot be right
+ROUNDED: Final = 1e-3  # relative difference of a step from a power of ten
+FASTEST: Final = 30.0  # frames a second of a detector
+UNITS_APART: Final = 100.0  # ratio of steps, many of either length, from which stamps have two units
+_TWICE: Final = 0.25  # share of boxes at the place of another one from which objects are reported twice
+_MOST_SENSORS: Final = 16
+
+
+def step(reading: Reading, draft: Draft) -> Draft:
+    """Group the rows into frames, and doubt their stamps by the places of the boxes."""
+    framed = replace(draft, stamps=_framed(reading, draft))
+    _check_times(reading, framed)
+    return framed
+
+
+def reports(reading: Reading, draft: Draft) -> Draft:
+    """Tell whether objects report one by one."""
+    row = draft.row
+    if not draft.scored or draft.pose is not None or "sensor" in draft.roles or draft.placed is not None:
+        return draft
+    found = find_reports(draft.series[row], draft.stamps.ns[row] / 1e9, draft.center[:, :2], draft.kind)
+    if found is not None:
+        text = f"objects report one by one: a frame is a look at {found.distance:.3g} m around its box"
+        reading.doubt("time", text, "--option group=SECONDS joins them")
+    return replace(draft, reports=found)
+
+
+def _framed(reading: Reading, draft: Draft) -> Stamps:
+    """Return the stamps of frames; refuse frames most of whose boxes stand at the places of others."""
+    stamps, series, row = draft.stamps, draft.series, draft.row
+
+    def at_places(stamp: Ints, part: NDArray[Any]) -> Ints:
+        frame = series[row]
+        for one in (stamp, part):
+            place = np.unique(one[row], return_inverse=True)[1]
+            frame = np.unique(frame * len(stamp) + place, return_inverse=True)[1].astype(np.int64)
+        return overlapping(frame, draft.center[:, :2], draft.size, draft.kind, draft.score)
+
+    def crowd(stamp: Ints, part: NDArray[Any] = series) -> float:
+        return float(np.mean(at_places(stamp, part) > 1)) if len(row) else 0.0
+
+    column = draft.roles.get("frame")
+    numbers = None if column is None or column.name == stamps.column else draft.frame_numbers
+    name = "" if column is None else column.name
+    stamps = read_frames(reading, stamps, series, numbers, crowd, name)
+    share = crowd(stamps.ns) if draft.scored else 0.0
+    if share <= _TWICE:
+        return stamps
+    used = {one.name for one in draft.roles.values()}
+    parts = (name for name in draft.columns if name not in used and _is_name_of_few(draft, name))
+    divider = next((name for name in parts if crowd(stamps.ns, draft.columns[name]) < NOISE), None)
+    counts = at_places(stamps.ns, series)
+    received, option = f"{share:.0%} of the boxes at the place of another one of their stamp and class", ""
+    if divider is not None:
+        received, option = f"{received}, which differs in column {divider}", f"--option column.sensor={divider}"
+    elif share > CROWDED and may_be_merged(stamps.ns, series, float(np.median(counts[counts > 1]))):
+        received += ": stamps have lost digits, frames were merged, or two detectors see each object"
+        option = "--option time=UNIT, if the stamps are right"
+    else:
+        received += ": objects are reported twice, by two detectors or before suppression"
+    if option and share > CROWDED and "time" not in reading.options:
+        reading.refuse("time", "boxes apart from each other under one stamp", received, option)
+    else:
+        reading.doubt("rows", received, option)
+    return stamps
+
+
+def _check_times(reading: Reading, draft: Draft) -> None:
+    """Refuse stamps far from all others, and whole milliseconds that may be seconds by the speeds of the boxes."""
+    stamps, series, row = draft.stamps, draft.series, draft.row
+    refuse_gap(reading, stamps.ns, series)
+    counted = "stamp" not in draft.roles or {"time", "rate"} & reading.options.keys()
+    if counted or not may_be_seconds(stamps, series, draft.unit("stamp")):
+        return
+    speed = typical_speed(series[row], stamps.ns[row] / 1e9, draft.center[:, :2], draft.kind)
+    if speed > SPEEDS[0]:
+        received = f"whole numbers that may be seconds; in milliseconds, boxes go at {speed:.3g} m/s"
+        reading.refuse("time", "a unit of time", received, "--option time=s, or time=ms")
+
+
+def _is_name_of_few(draft: Draft, column: str) -> bool:
+    """Tell whether a column may have the names of a few sensors."""
+    values = draft.columns[column]
+    return values.dtype.kind in "iU" and 1 < len(np.unique(values)) <= _MOST_SENSORS
+
+
+def may_be_merged(stamp: Ints, key: Ints, boxes: float) -> bool:
+    """Tell whether each of the stamps (R,) may hold several frames, given the number of `boxes` at one place.
+
+    Then they are a power of ten apart, or further than frames are, and no detector is faster than the merged frames.
+    """
+    step = median_step(stamp, key) / 1e9
+    rounded = not step or step > PERIODS[1] or abs(np.log10(step) - round(np.log10(step))) < ROUNDED
+    return bool(rounded and (not step or boxes <= FASTEST * step))
+
+
+def may_be_seconds(stamps: Stamps, key: Ints, unit: str | None) -> bool:
+    """Tell whether stamps that were taken for milliseconds are whole numbers of a step that may be seconds."""
+    numbers = stamps.time
+    if unit is not None or numbers.dtype.kind not in "if" or not np.all(numbers == np.round(numbers)):
+        return False
+    step = median_step(numbers, key)
+    return bool(PERIODS[1] < step <= LONGEST_GAP and float(numbers.max(initial=0)) < DATED[0])
+
+
+def refuse_gap(reading: Reading, stamp: Ints, key: Ints) -> None:
+    """Refuse a stamp that is further from the others of its recording than these are from each other."""
+    for one in np.unique(key).tolist():
+        rows = np.flatnonzero(key == one)
+        ordered = np.unique(stamp[rows])
+        steps = np.diff(ordered)
+        if len(steps) < 2:  # noqa: PLR2004  of two stamps none is the odd one
+            continue
+        low, high = np.quantile(steps, (0.2, 0.8)).tolist()
+        place = int(np.argmax(steps))
+        gap = int(steps[place])
+        rest = int(steps.sum()) - gap
+        if high <= UNITS_APART * low and (gap <= LONGEST_GAP * 1e9 or gap <= rest):
+            continue
+        before = stamp[rows] <= ordered[place]
+        few = rows[before if before.sum() < 0.5 * len(rows) else ~before]
+        count = f"{len(few)} of {len(rows)} rows are {gap / 1e9:.6g} s from the others, which span {rest / 1e9:.6g} s"
+        if "time" in reading.options:
+            reading.doubt("time", count)
+        else:
+            option = "--option time=UNIT, if the stamps are right"
+            reading.refuse("time", "stamps of one recording in one unit", count, option, int(few[0]))
+
+
+def read_frames(
+    reading: Reading,
+    stamps: Stamps,
+    series: Ints,
+    number: NDArray[Any] | None,
+    crowd: Callable[[Ints], float],
+    name: str,
+) -> Stamps:
+    """Return the stamps of frames: equal for boxes of a frame that have stamps of their own.
+
+    Args:
+        reading: Gets the findings.
+        stamps: Of the rows (R,).
+        series: (R,) recording of each row.
+        number: (R,) of frames; None without such a column.
+        crowd: Returns the share of boxes that share their place under stamps (R,).
+        name: Of the column of `number`.
+    """
+
+    def of(first: Ints) -> Stamps:
+        return Stamps(stamps.ns[first], stamps.time[first], stamps.column, stamps.skipped)
+
+    asked = reading.positive("group", "seconds", zero=True)
+    if asked is not None:
+        return of(group_stamps(stamps.ns, series, asked * 1e9, whole=True)) if asked else stamps
+    alone = crowd(stamps.ns)
+    by_number = None if number is None else rows_of_frames(stamps.ns, number, series)
+    for first, how in ((by_number, "number"), (frame_starts(stamps.ns, series), "step")):
+        if first is None:
+            continue
+        grouped = stamps.ns[first]
+        if crowd(grouped) > max(0.5 * CROWDED, alone):
+            if how == "number":
+                reading.doubt(
+                    "time",
+                    f"column {name} is not used: its frames hold boxes at one place",
+                    f"--option column.frame={name}",
+                )
+            continue
+        if how == "number":
+            reading.note("time", f"stamps differ within a frame: each has the first one of its {name}")
+        else:
+            apart, frames = (stamps.ns - grouped).max() / 1e9, len(np.unique(grouped))
+            text = f"stamps differ by up to {apart:.3g} s within a frame: grouped into {frames} frames"
+            reading.note("time", text, "--option group=SECONDS, 0 for none")
+        return of(first)
+    return stamps

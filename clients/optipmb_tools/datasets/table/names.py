@@ -1,0 +1,109 @@
+"""Names in a table: of recordings and sensors, of classes, and ids of objects."""
+
+import re
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optipmb_tools.datasets.table.draft import Draft
+from optipmb_tools.datasets.table.findings import Reading
+from optipmb_tools.geometry import Ints
+from optipmb_tools.table_files import NO_VALUE, unique_texts
+
+NO_CLASS: Final = "object"  # class of all boxes of a table without classes
+NO_ID: Final = -1  # id of a box that has none
+_NUMBERED: Final = re.compile(r"(.*[^\W\d_])[\W_]*\d+|\d+[\W_]*([^\W\d_].*)")  # a class, a number of an object
+
+
+def keys(reading: Reading, draft: Draft) -> Draft:
+    """Read the recordings and sensors."""
+    names = tuple(draft.roles[role].name for role in ("recording", "sensor") if role in draft.roles)
+    key, named = np.full(draft.rows, ""), {"": ("",) * len(names)}
+    if names and draft.rows:
+        key, named = _joined(draft, names)
+    file = np.searchsorted([first for _, first in reading.files], np.arange(draft.rows), side="right")
+    series = unique_texts(key)[1] * (len(reading.files) + 1) + file * (not draft.framed)
+    return replace(draft, key=key, key_columns=names, keys=named, series=series)
+
+
+def step(reading: Reading, draft: Draft) -> Draft:
+    """Read the classes and ids."""
+    names, objects = _classes(reading, draft)
+    return replace(draft, name=names, id=_ids(draft, objects))
+
+
+def _joined(draft: Draft, names: tuple[str, ...]) -> tuple[NDArray[np.str_], dict[str, tuple[str, ...]]]:
+    parts = [draft.columns[name].astype(np.str_, copy=False) for name in names]
+    place = np.zeros(draft.rows, dtype=np.int64)
+    for part in parts:
+        values, own = unique_texts(part)
+        place = place * len(values) + own
+    _, first, place = np.unique(place, return_index=True, return_inverse=True)
+    rows = list(zip(*(part[first].tolist() for part in parts), strict=True))
+    joined = [".".join(row) for row in rows]
+    found = {joined[one]: rows[one] for one in np.argsort(first).tolist()}  # in the order of the table
+    return np.array(joined, dtype=np.str_)[place], found
+
+
+def _classes(reading: Reading, draft: Draft) -> tuple[NDArray[np.str_], NDArray[np.str_] | None]:
+    """Return the classes (R,), and the names (R,) of objects where the column has these too."""
+    column, objects = draft.roles.get("class"), None
+    if column is None:
+        names, place = np.array([NO_CLASS]), np.zeros(draft.rows, dtype=np.int64)
+        reading.note("class", f"no column for class: every box is of class {NO_CLASS}")
+    else:
+        values = draft.columns[column.name]
+        if values.dtype.kind == "f":  # numbers with an empty cell
+            values = np.where(np.isnan(values), "", np.char.mod("%g", values))
+        names, place = unique_texts(values.astype(np.str_, copy=False))
+        names = np.char.strip(names, " \t'\"")
+        named = np.where(np.isin(names, NO_VALUE), "", names)
+        names = _without_numbers(reading, draft, named, place)
+        objects = None if names is named else named[place]
+    renamed = {key.removeprefix("class."): name for key, name in reading.options.items() if key.startswith("class.")}
+    have = sorted(set(names.tolist()))
+    folded = {name.lower(): name for name in renamed}
+    for name in renamed if draft.rows else ():
+        if not name.isdigit():  # classes are counted: a recording need not have all of them
+            reading.name(f"class.{name}", have, "a class of the table", name)
+        elif name not in have:
+            reading.note("class", f"no box is of class {name}")
+    new = {one: renamed[folded[one.lower()]] if one.lower() in folded else one for one in have}
+    return np.array([new[name] for name in names.tolist()], dtype=np.str_)[place], objects
+
+
+def _without_numbers(reading: Reading, draft: Draft, names: NDArray[np.str_], place: Ints) -> NDArray[np.str_]:
+    """Return the classes of different names that are a class and the number of an object, as `car:12`; else the names.
+
+    `place` (R,) has each row's name.
+    """
+    split = {name: _NUMBERED.fullmatch(name) for name in names.tolist() if name}
+    classes = {name: match[1] or match[2] for name, match in split.items() if match}
+    if len(classes) < len(split) or len(set(classes.values())) == len(classes):
+        return names
+    found = np.array([classes.get(name, name) for name in names.tolist()])
+
+    def most(values: NDArray[np.str_]) -> int:
+        kind = np.unique(values, return_inverse=True)[1][place]
+        frame = np.unique(draft.stamps.ns, return_inverse=True)[1]
+        return int(np.unique(frame * len(values) + kind, return_counts=True)[1].max())
+
+    if most(names) > 1 or most(found) == 1:  # a class may have several boxes in a frame, an object has one
+        return names
+    column = draft.roles["class"].name
+    reading.note("class", f"column {column} has classes and numbers of objects: {names[0]} is of class {found[0]}")
+    return found
+
+
+def _ids(draft: Draft, objects: NDArray[np.str_] | None) -> Ints | None:
+    column = draft.roles.get("id")
+    values = objects if column is None else draft.columns[column.name]
+    if values is None:
+        return None
+    if values.dtype.kind == "i":
+        return values.astype(np.int64)
+    texts = np.char.strip(values.astype(np.str_))
+    numbers = np.unique(texts, return_inverse=True)[1].astype(np.int64)
+    return np.where(np.isin(texts, (*NO_VALUE, "-1", "-1.0")), NO_ID, numbers)

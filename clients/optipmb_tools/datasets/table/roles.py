@@ -1,0 +1,104 @@
+"""Meanings of the columns of a table: by names and values, by corners, and numbers in names."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optipmb_tools.datasets.table.columns import ALIASES, NOTHING, Column, find_columns, normalised, turn_of
+from optipmb_tools.datasets.table.corners import with_boxes
+from optipmb_tools.datasets.table.draft import Draft
+from optipmb_tools.datasets.table.findings import Reading
+from optipmb_tools.datasets.table.pixels import METRES
+from optipmb_tools.table_files import NO_VALUE, Columns, frame_numbers, is_number
+
+_MOST_SHOWN: Final = 6
+_LONGEST: Final = 30.0  # boxes that are longer, in metres, are suspicious
+_LOOKED_AT: Final = 200  # texts of a column that tell whether it has numbers
+_SPARED: Final = ("z", "h", "score", "class")  # without a value in any row they are as without a column
+
+
+def step(reading: Reading, draft: Draft) -> Draft:
+    """Find the column of each meaning."""
+    columns = _with_frame_numbers(reading, draft.columns, draft.roles)
+    roles = draft.roles if columns is draft.columns else find(reading, columns)
+    boxes = with_boxes(reading, columns, roles)
+    if boxes is not columns:
+        roles = find(reading, boxes)
+    kind, members = (None if "yaw" in roles else turn_of(map(normalised, boxes))) or ("", [])
+    return replace(draft, columns=boxes, roles=roles, turn_of=kind, turn_columns=tuple(members))
+
+
+def find(reading: Reading, columns: Columns) -> dict[str, Column]:
+    """Return the column of each meaning, as the user says or by names and values."""
+    chosen = {key.removeprefix("column."): name for key, name in reading.options.items() if key.startswith("column.")}
+    for role, name in chosen.items():
+        reading.name(f"column.{role}", [*columns, NOTHING], "a column", name)
+    if "camera" in reading.options:
+        chosen |= dict.fromkeys(METRES, NOTHING)
+    taken = {role: name for role, name in chosen.items() if name in columns or name == NOTHING}
+    words = {name for name, one in columns.items() if _has_no_number(one)}
+    empty = {name for name, one in columns.items() if one.dtype.kind == "f" and len(one) and np.isnan(one).all()}
+    found = find_columns([name for name in columns if name not in empty], taken, words)
+    if empty:
+        found = {role: one for role, one in find_columns(columns, taken, words).items() if role not in _SPARED} | found
+    used = {one.name for one in found.values()}
+    for role, one in find_columns(columns, taken).items():  # refused when it is read, as a number is expected
+        if role not in found and one.name in words - used and _has_units(columns[one.name]):
+            found[role] = one
+    return found
+
+
+def note(reading: Reading, draft: Draft) -> Draft:
+    if reading.lenient:
+        long = int((draft.size[:, :2] > _LONGEST).any(axis=1).sum())
+        if long:
+            reading.note("rows", f"{long} boxes are longer than {_LONGEST:g} m")
+        pairs = (role if role == one.name else f"{role} from {one.name}" for role, one in draft.roles.items())
+        reading.note("columns", f"columns found: {', '.join(pairs)}")
+    used = {one.name for one in draft.roles.values()} | set(draft.turn_columns)
+    used |= set(draft.placed.columns if draft.placed else ())
+    unused = [name for name in draft.columns if name not in used]
+    stems = {name.rpartition(".")[0] for name in used} - {""}
+    unused.sort(key=lambda name: name.rpartition(".")[0] not in stems)  # the rest of a group that is used in part
+    if unused:
+        more = f" and {len(unused) - _MOST_SHOWN} more" if len(unused) > _MOST_SHOWN else ""
+        reading.note("columns", f"columns not used: {', '.join(unused[:_MOST_SHOWN])}{more}")
+    return draft
+
+
+def _with_frame_numbers(reading: Reading, columns: Columns, found: Mapping[str, Column]) -> Columns:
+    """Return columns with the numbers of frames, or stamps, that their names hold: `frame_12.bin`.
+
+    Raises:
+        DatasetError: The names differ in several numbers.
+    """
+    if "stamp" in found:
+        return columns
+    named = (
+        [found["frame"].name]
+        if "frame" in found
+        else [one for one in columns if normalised(one).base in ALIASES["frame"]]
+    )
+    for name in (one for one in named if _has_no_number(columns[one])):
+        texts, place = np.unique(columns[name], return_inverse=True)
+        if len(texts) > 1 and all(map(re.compile(r"\d").search, texts.tolist())):
+            kind, numbers = frame_numbers([reading.path / text for text in texts.tolist()])
+            return columns | {name if kind == "frame" else kind: np.array(numbers)[place]}
+    return columns
+
+
+def _has_units(texts: NDArray[np.str_]) -> bool:
+    """Tell whether each text of a column begins with a number, as `87%` and `4.5 m`."""
+    return all(re.match(r"[-+]?\.?\d", text.strip()) for text in texts.tolist() if text.strip() not in NO_VALUE)
+
+
+def _has_no_number(values: NDArray[Any]) -> bool:
+    """Tell whether a column has texts, none of which is a number."""
+    if values.dtype.kind != "U":
+        return False
+    texts = [text for text in values[:_LOOKED_AT].tolist() if text.strip() not in NO_VALUE]
+    return bool(texts) and not any(map(is_number, texts))
