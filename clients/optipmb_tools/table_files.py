@@ -81,6 +81,13 @@ LISTS: Final = (
     "predictions",
     "annotations",
 )  # names of lists of all boxes of a frame
+_PLACE: Final = re.compile(r"(?i)[xyz]|c[xyz]|[xyz]c|[xyz]_?(center|centre|world|m)|lat|lon|lng|latitude|longitude|alt")
+_PLACES: Final = re.compile(
+    r"(?i)cent(er|re|roid)|pos(ition|e)?$|loc(ation)?|translation|xyz|b?box(?!.*2d)|psr|coordinates"
+)
+"""Names of coordinates, and of structures and lists of them."""
+_LEAST_NUMBERS: Final = 7  # of a box in a list without a name
+_LOOKED_AT: Final = 200  # records that tell which lists have boxes
 _FIRST: Final = 8  # field of a line of KITTI's object benchmark where the 3D box begins
 _STAMPS: Final = 1_000_000_000  # from here on, the number in the name of a file is a stamp, not a frame
 _COMMA: Final = r"^\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*$"
@@ -166,15 +173,15 @@ def read_table(path: Path, options: Mapping[str, str] | None = None) -> Columns:
 
 def _read(pa: Any, path: Path, kind: str, options: Mapping[str, str]) -> Any:
     if path.is_dir():
-        return _rows(pa, read_frames(path))
+        return _rows(pa, read_frames(path, options))
     if kind in _TEXT:
         return _read_text(pa, path, kind, options)
     if kind == ".json":
-        return _rows(pa, split_boxes(read_json(path)))
+        return _rows(pa, split_boxes(path, read_json(path), options))
     if kind in _PICKLES:
         from optipmb_tools.pickles import read_pickle  # noqa: PLC0415  of one format
 
-        return _rows(pa, split_boxes(read_pickle(path)))
+        return _rows(pa, split_boxes(path, read_pickle(path), options))
     if kind in {".jsonl", ".ndjson"}:
         table = _read_lines(pa, path, options)
     elif kind == ".parquet":
@@ -185,9 +192,8 @@ def _read(pa: Any, path: Path, kind: str, options: Mapping[str, str]) -> Any:
         from pyarrow import feather  # noqa: PLC0415  as above
 
         table = feather.read_table(path)
-    lists = [table.schema.field(name).type for name in table.column_names if name in LISTS]
-    if any(_is_list(pa, one) and pa.types.is_nested(one.value_type) for one in lists):
-        return _rows(pa, split_boxes(table.to_pylist()))
+    if any(_has_lists(pa, one.type) for one in table.schema):
+        return _rows(pa, split_boxes(path, table.to_pylist(), options))
     return table
 
 
@@ -213,7 +219,7 @@ def _read_lines(pa: Any, path: Path, options: Mapping[str, str]) -> Any:
             if not isinstance(record, dict):
                 raise DatasetError(path, "an object of JSON in every line", repr(line[:60]), line=number)
             records.append(record)
-    return _rows(pa, split_boxes(records))
+    return _rows(pa, split_boxes(path, records, options))
 
 
 def _rounded(pa: Any, table: Any) -> list[str]:
@@ -484,6 +490,13 @@ def _is_list(pa: Any, kind: Any) -> bool:
     return bool(pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind))
 
 
+def _has_lists(pa: Any, kind: Any) -> bool:
+    """Tell whether values hold lists of structures or of lists."""
+    if _is_list(pa, kind):
+        return bool(pa.types.is_nested(kind.value_type))
+    return bool(pa.types.is_struct(kind)) and any(_has_lists(pa, one.type) for one in kind)
+
+
 def _parts(pa: Any, name: str, column: Any) -> Iterator[tuple[str, NDArray[Any]]]:
     """Give a column as arrays of numpy, one for each number of a list and each field of a structure."""
     kind = column.type
@@ -645,7 +658,7 @@ def is_kitti_object(text: str) -> bool:
     return re.match(r"[A-Za-z]\w*([ \t]+-?\d[-+.e\d]*){14,15}[ \t]*(\n|$)", text) is not None
 
 
-def read_frames(folder: Path) -> list[_Record]:
+def read_frames(folder: Path, options: Mapping[str, str]) -> list[_Record]:
     """Return a record for each box of a folder with a file for each frame, whose name has its number or stamp.
 
     Raises:
@@ -654,7 +667,8 @@ def read_frames(folder: Path) -> list[_Record]:
     files = frame_files(folder)
     name, number = frame_numbers(files)
     read = _kitti_frame if files[0].suffix == ".txt" else read_json
-    return split_boxes([{name: n} | one for n, file in sorted(zip(number, files, strict=True)) for one in read(file)])
+    frames = [{name: n} | one for n, file in sorted(zip(number, files, strict=True)) for one in read(file)]
+    return split_boxes(folder, frames, options)
 
 
 def frame_numbers(files: Sequence[Path]) -> tuple[str, list[float]]:
@@ -707,10 +721,9 @@ def read_json(path: Path) -> list[_Record]:
     if isinstance(content, dict) and isinstance(content.get("results"), dict):
         how = f"--dataset nuscenes --root ROOT --detections {path}"
         raise DatasetError(path, "a table", f"results of nuScenes, which are read by {how}")
-    if isinstance(content, dict) and any(name in content for name in LISTS):
-        content = [content]
-    elif isinstance(content, dict):
-        content = _frames(content)
+    if isinstance(content, dict):
+        known = any(isinstance(content.get(name), list) for name in LISTS)
+        content = [content] if known else _of_columns(content) or _frames(content)
     if not isinstance(content, list) or not all(isinstance(one, dict) for one in content):
         expected = f"an array of objects, or an object with a list {', '.join(LISTS)}"
         raise DatasetError(path, expected, repr(str(content)[:60]))
@@ -720,13 +733,34 @@ def read_json(path: Path) -> list[_Record]:
     return content
 
 
-def _frames(content: dict[str, Any]) -> Any:
+def _of_columns(content: _Record) -> list[_Record]:
+    """Return the records of an object of columns: lists, or values by the numbers of rows, as data frames write."""
+    if isinstance(content.get("columns"), list) and isinstance(content.get("data"), list):
+        return [dict(zip(content["columns"], row, strict=False)) for row in content["data"] if isinstance(row, list)]
+    values = list(content.values())
+    if len(values) < 2 or any(map(is_number, content)):  # noqa: PLR2004  one column tells nothing
+        return []
+    if all(isinstance(one, dict) and one and one.keys() == values[0].keys() for one in values):
+        counted = all(key.isdigit() for key in values[0])
+        values = [list(one.values()) for one in values] if counted else []
+    plain = all(isinstance(one, list) and not any(isinstance(part, dict) for part in one) for one in values)
+    if not values or not plain or len(set(map(len, values))) > 1:
+        return []
+    return [dict(zip(content, row, strict=True)) for row in zip(*values, strict=True)]
+
+
+def _frames(content: _Record) -> Any:
     """Return the one list of records of an object, or a record for each frame where its names name frames."""
-    lists = [one for one in content.values() if isinstance(one, list) and one and isinstance(one[0], dict)]
     named = all(re.search(r"\d", name) and isinstance(value, (list, dict)) for name, value in content.items())
     if not named:
         inner = content.get("frames", next(iter(content.values())) if len(content) == 1 else None)
-        return _frames(inner) if isinstance(inner, dict) else lists[0] if len(lists) == 1 else content
+        if isinstance(inner, dict):
+            return _frames(inner)
+        lists = {name: one for name, one in _lists(content) if one and isinstance(one[0], dict)}
+        fitting = [one for one in lists.values() if _groups(one) or any(map(_has_place, one))]
+        if len(fitting) == 1:
+            return fitting[0]
+        return [content] if fitting else next(iter(lists.values())) if len(lists) == 1 else content
     stamped = all(is_number(name) and float(name) >= _STAMPS for name in content)
     frames = []
     for name, value in content.items():
@@ -751,24 +785,108 @@ def _centre(path: Path, frame: _Record) -> None:
     frame["labels_3d"] = [str(label) for label in frame["labels_3d"]]
 
 
-def split_boxes(records: Sequence[_Record]) -> list[_Record]:
-    """Return a record for each box: of a list of boxes in a record, and of the other lists that are as long."""
+def split_boxes(path: Path, records: Sequence[_Record], options: Mapping[str, str]) -> list[_Record]:
+    """Return a record for each box: of a list of boxes in a record, and of the other lists that are as long.
+
+    The list has one of the names `LISTS`, or it is the only one whose elements may be boxes, at any depth.
+
+    Raises:
+        DatasetError: Several lists may be meant, and `--option boxes=NAME` does not say which.
+    """
+    names = dict.fromkeys(name for one in records for name in one)
+    asked = [name for name in options.get("boxes", "").split(",") if name]
+
+    def has_boxes(value: object) -> bool:
+        return isinstance(value, list) and all(isinstance(box, (list, dict)) for box in value)
+
+    named = (name for name in LISTS if name in names)
+    key = next((str(name) for name in named if all(has_boxes(one.get(name) or []) for one in records)), "")
+    if asked or not key:
+        found = asked or _groups(records)
+        if len(found) > 1 and not asked:
+            expected = f"one list of boxes (--option boxes={found[0]}, or boxes={','.join(found)} for all)"
+            raise DatasetError(path, expected, f"the lists {', '.join(found)}")
+        if not found:
+            return list(records)
+        if len(found) > 1:
+            return [box | {"kind": name} for name in found for box in _split(_lifted(records, name), _last(name))]
+        records, key = _lifted(records, found[0]), _last(found[0])
+    return _split(records, key)
+
+
+def _split(records: Sequence[_Record], key: str) -> list[_Record]:
     names = dict.fromkeys(name for one in records for name in one)
 
     def lists(name: str) -> list[Any]:
         return [[] if one.get(name) is None else one[name] for one in records]
 
-    def has_boxes(value: object) -> bool:
-        return isinstance(value, list) and all(isinstance(box, (list, dict)) for box in value)
-
-    key = next((name for name in LISTS if name in names and all(map(has_boxes, lists(name)))), None)
-    if key is None:
-        return list(records)
     counts = [len(boxes) for boxes in lists(key)]
     split = [name for name in names if [len(one) if isinstance(one, list) else -1 for one in lists(name)] == counts]
     rows: list[_Record] = []
     for one, count in zip(records, counts, strict=True):
         frame = {name: value for name, value in one.items() if name not in split}
-        boxes = [frame | {name: one[name][place] for name in split} for place in range(count)]
+        boxes = [frame | {name: one[name][place] for name in split if one.get(name)} for place in range(count)]
         rows += [box | box.pop(key) if isinstance(box[key], dict) else box for box in boxes] or [frame]
     return rows
+
+
+def _last(name: str) -> str:
+    return name.rpartition(".")[2]
+
+
+def _lifted(records: Sequence[_Record], name: str) -> list[_Record]:
+    """Return records with the fields of the structures around a list beside it: `annos.names` becomes `names`."""
+    *outer, key = name.split(".")
+    for place in outer:
+        records = [
+            {other: value for other, value in one.items() if other != place} | inner
+            if isinstance(inner := one.get(place), dict)
+            else one
+            for one in records
+        ]
+    if key not in LISTS and any(isinstance(box, list) for one in records for box in one.get(key) or []):
+        return [one | {key: [{"boxes": box} for box in one.get(key) or []]} for one in records]
+    return list(records)
+
+
+def _groups(records: Sequence[_Record]) -> list[str]:
+    """Return the names of the lists whose elements may be boxes, with the names of the structures around them."""
+    found: dict[str, bool] = {}
+    for record in records[:_LOOKED_AT]:
+        alone = _has_place(record)
+        for name, value in _lists(record):
+            if value and all(isinstance(one, (list, dict)) for one in value):
+                fits = all(_may_be_box(one, _last(name), alone=alone) for one in value)
+                found[name] = found.get(name, True) and fits
+    return [name for name, fits in found.items() if fits]
+
+
+def _lists(record: _Record, before: str = "") -> Iterator[tuple[str, list[Any]]]:
+    for name, value in record.items():
+        if isinstance(value, list):
+            yield f"{before}{name}", value
+        elif isinstance(value, dict):
+            yield from _lists(value, f"{before}{name}.")
+
+
+def _has_place(record: _Record) -> bool:
+    """Tell whether a record has the coordinates of one thing itself."""
+    for name, value in record.items():
+        numbers = isinstance(value, dict) or (
+            isinstance(value, list) and all(isinstance(one, (int, float)) for one in value)
+        )
+        if _PLACE.fullmatch(name) and not isinstance(value, (list, dict)):
+            return True
+        if numbers and value and _PLACES.search(name):
+            return True
+    return False
+
+
+def _may_be_box(one: list[Any] | _Record, name: str, *, alone: bool) -> bool:
+    """Tell whether an element of a list may be a box; of a thing with a place of its own, a bare point is none."""
+    if isinstance(one, list):
+        numeric = all(isinstance(part, (int, float)) for part in one)
+        return numeric and (name in BOX_LISTS or (len(one) >= _LEAST_NUMBERS and not alone))
+    inner = next((part for part in one.values() if isinstance(part, dict) and _has_place(part)), {})
+    more = one.keys() - {place for place in one if _PLACE.fullmatch(place)}
+    return (_has_place(one) or bool(inner)) and (bool(more) or not alone)

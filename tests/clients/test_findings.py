@@ -509,7 +509,7 @@ def test_a_heading_that_may_be_in_unread_columns_is_doubted(tmp_path: Path) -> N
     columns = street(4.0)
     yaw = columns.pop("yaw")
     axis = {f"rotation.axis.{place}": np.full(len(yaw), float(place == 2)) for place in range(3)}
-    for others in ({**axis, "rotation.angle": yaw}, {"course": yaw, "bearing": yaw}):
+    for others in ({**axis, "rotation.angle": yaw}, {"direction": yaw, "bearing": yaw}):
         (found,) = troubles(tmp_path / "d.parquet", {**columns, **others})
         assert all(name in found for name in others)
     assert troubles(tmp_path / "d.parquet", columns) == []

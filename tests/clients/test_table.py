@@ -122,7 +122,7 @@ def test_names_of_columns_are_many(tmp_path: Path) -> None:
     assert "columns not used: weather" in notes
     same(sequence, only(TableDataset(table(tmp_path / "b.csv", plain))))
     east = {name: values for name, values in {**plain, "east": plain["x"]}.items() if name != "x"}
-    with pytest.raises(DatasetError, match=r"a column x \(--option column.x=NAME\)"):
+    with pytest.raises(DatasetError, match=r"a column x \(--option column.x=east\)"):
         notes_and_frames(tmp_path / "c.csv", east)
     same(notes_and_frames(tmp_path / "d.csv", east, **{"column.x": "east"})[1], sequence)
     for before in ("det_", "bbox3d_", "object_"):

@@ -42,7 +42,7 @@ from optipmb_tools.table_files import SUFFIXES, Columns, line_of, read_table, ta
 OPTIONS: Final = (
     *("time", "rate", "group", "yaw", "heading", "quaternion", "sizes", "axes", "velocity", "score", "invalid"),
     *("missing", "size_factor", "length_factor"),
-    *("poses", "truth", "tracks", "decimal", "encoding", "date", "origin"),
+    *("poses", "truth", "tracks", "decimal", "encoding", "date", "origin", "boxes"),
     *pixels.OPTIONS,
 )
 GAP: Final = 1.5

@@ -57,7 +57,7 @@ def read_turn(reading: Reading, topic: str, parts: Floats, *, named: bool) -> Fl
     return parts[:, [3, 0, 1, 2]] if order == "xyzw" else parts
 
 
-def quaternion_of(reading: Reading, draft: Draft, prefix: str, topic: str) -> Floats | None:
+def read_quaternion(reading: Reading, draft: Draft, prefix: str, topic: str) -> Floats | None:
     """Return quaternions w x y z (R, 4); None where the table has none."""
     roles = [f"{prefix}{part}" for part in "wxyz"]
     if not {roles[0], roles[3]} <= draft.roles.keys():

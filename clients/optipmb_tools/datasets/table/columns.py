@@ -45,18 +45,21 @@ def _turn(bases: str, part: str, place: int) -> tuple[str, ...]:
     return (*(f"{base}_q{part}" for base in bases.split()), *_vector(bases, part, place))
 
 
+BEARINGS: Final = ("angle", "hdg", "course", "cog", "course_over_ground", "true_track")
+"""Names of headings that are often clockwise from north."""
 ALIASES: Final[Mapping[str, tuple[str, ...]]] = {
     "stamp": ("stamp", "t", "time", "timestamp", "ts", "sec", "secs", "seconds", "nanoseconds", "sim_time", "datetime",
               "header_stamp", "header_timestamp", "time_stamp", "frame_time", "frame_timestamp", "frame_stamp",
               "date_time", "unix_time", "unix_timestamp", "epoch_time", "utc_time", "utc", "capture_time", "scan_time",
-              "lidar_timestamp", "lidar_time", "sensor_timestamp", "sensor_time", "measurement_time", "gps_time"),
+              "lidar_timestamp", "lidar_time", "sensor_timestamp", "sensor_time", "measurement_time", "gps_time",
+              "base_date_time", "global_time", "timestep_time", "time_of_day", "posix_time", "position_time"),
     "nanosec": ("nanosec", "nanosecs", "nsec", "nsecs", "nanoseconds"),
     "frame": ("frame", "frame_id", "frame_index", "frame_idx", "frame_number", "frame_no", "frame_nr",
               "frame_num", "frame_count", "frame_counter", "scan_id", "scan_index", "scan_idx", "scan_number",
-              "sweep_id", "timestep", "time_step", "sample_idx", "sample_index"),
-    "x": ("x", "cx", "px", "x_center", "tx", *_vector(_CENTER, "x", 0)),
-    "y": ("y", "cy", "py", "y_center", "ty", *_vector(_CENTER, "y", 1)),
-    "z": ("z", "cz", "pz", "z_center", "tz", *_vector(_CENTER, "z", 2)),
+              "sweep_id", "timestep", "time_step", "sample_idx", "sample_index", "image_id", "img_id"),
+    "x": ("x", "cx", "xc", "px", "x_center", "x_centre", "tx", "easting", "local_x", *_vector(_CENTER, "x", 0)),
+    "y": ("y", "cy", "yc", "py", "y_center", "y_centre", "ty", "northing", "local_y", *_vector(_CENTER, "y", 1)),
+    "z": ("z", "cz", "zc", "pz", "z_center", "z_centre", "tz", *_vector(_CENTER, "z", 2)),
     "lat": ("lat", "latitude"),
     "lon": ("lon", "lng", "longitude"),
     "alt": ("alt", "altitude"),
@@ -64,8 +67,8 @@ ALIASES: Final[Mapping[str, tuple[str, ...]]] = {
     "w": ("w", "width", "box_width", "dy", *_extent("y", "w", "width", 1)),
     "h": ("h", "height", "box_height", "dz", *_extent("z", "h", "height", 2)),
     "yaw": ("yaw", "heading", "theta", "yaw_angle", "heading_angle", "rotation_z", "rot_z", "rz", "rotation_y", "ry",
-            "rot", "rotation", "orientation", "angle", "rotation_yaw", "rot_yaw", "orientation_yaw", "euler_yaw",
-            "rpy_yaw", "yaw_of_corners"),
+            "rot", "rotation", "orientation", "rotation_yaw", "rot_yaw", "orientation_yaw", "euler_yaw",
+            "rpy_yaw", "yaw_of_corners", "psi", *BEARINGS),
     "qw": ("qw", "q0", *_vector(_BOX_TURN, "w", 0)),
     "qx": ("qx", "q1", *_vector(_BOX_TURN, "x", 1)),
     "qy": ("qy", "q2", *_vector(_BOX_TURN, "y", 2)),
@@ -74,14 +77,16 @@ ALIASES: Final[Mapping[str, tuple[str, ...]]] = {
               "score_3d", "scores_3d", "pred_score", "pred_scores", "scores"),
     "class": ("class", "class_name", "cls", "label", "label_name", "category", "category_name", "type", "object_type",
               "obj_type", "class_id", "label_id", "classification", "object_class", "name", "tracking_name",
-              "detection_name", "label_3d", "labels_3d", "pred_label", "pred_labels", "names", "labels"),
+              "detection_name", "label_3d", "labels_3d", "pred_label", "pred_labels", "names", "labels", "label_class",
+              "class_label", "agent_type", "agent_class", "agent_category", "kind", "species", "semantic_class"),
     "vx": _vector(_SPEED, "x", 0),
     "vy": _vector(_SPEED, "y", 1),
     "cov_xx": ("cov_xx", "cov_x_x", "covariance_xx", "covariance_x_x", "var_x", "variance_x", "x_var", "x_variance"),
     "cov_xy": ("cov_xy", "cov_x_y", "covariance_xy", "covariance_x_y"),
     "cov_yy": ("cov_yy", "cov_y_y", "covariance_yy", "covariance_y_y", "var_y", "variance_y", "y_var", "y_variance"),
     "id": ("id", "track_id", "object_id", "obj_id", "tracking_id", "instance_id", "instance",
-           "instance_token", "track", "track_uuid", "object_uuid", "instance_uuid", "uuid", "track_label"),
+           "instance_token", "track", "track_uuid", "object_uuid", "instance_uuid", "uuid", "track_label", "agent_id",
+           "actor_id", "person_id", "player_id", "target_id", "mmsi", "icao24"),
     "recording": ("recording", "recording_id", "sequence", "sequence_id", "sequence_name", "scene", "scene_name",
                   "scene_id", "session", "log", "log_id", "run", "run_id", "drive", "segment", "bag", "stream"),
     "sensor": ("sensor", "sensor_id", "sensor_name", "node", "lidar", "device"),
@@ -100,21 +105,35 @@ _LISTED: Final = ("x", "y", "z", "l", "w", "h", "yaw", "vx", "vy")  # meanings o
 _UNITS: Final[Mapping[str, str]] = {
     "deg": "deg", "degree": "deg", "degrees": "deg", "rad": "rad", "radian": "rad", "radians": "rad",
     "s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "us": "us", "usec": "us",
+    "millis": "ms", "micros": "us", "nanos": "ns",
     "ns": "ns", "nsec": "ns", "nsecs": "ns", "nanosec": "ns", "nanosecs": "ns", "nanoseconds": "ns",
 }  # fmt: skip
 _WORDS: Final = {"stamp", "class", "id", "recording", "sensor"}  # meanings whose values may be words
+_WORDS_OF: Final = {
+    "stamp": "time|stamp|timestamp|datetime|date|clock|epoch|nanos|micros|millis|nsec|usec|msec",
+    "frame": "frame|scan|sweep|step|image|index",
+    "x": "x|xc|x0|lon|longitude|east|easting|utm_x|utm_e", "y": "y|yc|y0|lat|latitude|north|northing|utm_y|utm_n",
+    "l": "l|len|length|long|size|dims?|dimensions?|extents?", "w": "w|width|wide|beam|size|dims?|dimensions?|extents?",
+    "class": "class|classes|type|category|categories|label|labels|kind|species|subtype|classification",
+    "id": "id|uid|uuid|guid|token|mmsi|imo|icao|callsign|track",
+}  # fmt: skip
+"""Words of the names of columns that may have a meaning."""
 _PART: Final = re.compile(
     rf"((?:{'|'.join((*_BOX_TURN.split(), 'r', 'euler', 'rpy', 'ypr', 'matrix', 'rotvec', 'rvec'))})"
     r"(?:_(?:matrix|mat|angles?|vector|vec))?)_?(q?[wxyz]|\d(?:_?\d)?)"
 )
 """Base of a column that may be one of several numbers of an orientation."""
 _TURNED: Final = re.compile(
-    "(^|_)(rot|r?vec|orient|head|hdg$|yaw|quat|euler|angle|axis|cog$|course|bearing|azimuth|direction)"
+    "(^|_)(rot|r?vec|orient|head|hdg$|yaw|quat|euler|angle|axis|cog$|course|bearing|azimuth|direction|psi|facing)"
 )
 _LEADING: Final = re.compile(
-    "^(det|detection|gt|pred|prediction|obj|object|(3d_)?b?box(_?3d)?|bounding_box(_3d)?|cuboid)_"
+    "^(det|detection|gt|pred|prediction|obj|object|(3d_)?b?box(_?3d)?|bounding_box(_3d)?|cuboid|agent|actor|target|"
+    "veh|vehicle|v(?=_(length|width|height|class|type|id)))_"
 )
 """Word before the name of a column that only says what the column is of."""
+_GROUP_OF: Final = (("size", "size|dims?|dimensions?|extents?"), ("velocity", "vel|velocity|twist|speed"))
+_NO_PLACE: Final = "acc|accel|acceleration|force|jerk|angular|std|sigma|var|cov|covariance|error|offset|gyro|imu"
+"""Words of groups whose members x, y, z are no places."""
 _OTHER: Final = re.compile("ego|pose|sensor|camera|lidar|vehicle|header")  # groups that describe no box
 _LENGTHS: Final = {"m", "meter", "meters", "metre", "metres", "mps"}
 FACTORS: Final[Mapping[str, float]] = {
@@ -180,6 +199,12 @@ def turned(names: Iterable[str]) -> list[str]:
     return [name for name in names if _TURNED.search(_plain(name))]
 
 
+def candidates(names: Iterable[str], role: str) -> list[str]:
+    """Return the names whose words say that they may have a meaning, whatever else they say."""
+    words = re.compile(f"(^|_)({_WORDS_OF.get(role, role)})(_|$)")
+    return [name for name in names if words.search(_plain(name)) and not _known(normalised(name).base)]
+
+
 def _names_of(role: str) -> tuple[str, ...]:
     """Return the names of a meaning, the most telling first; those in lists of boxes come before flat columns."""
     if role not in _LISTED:
@@ -208,8 +233,11 @@ def normalised(name: str) -> Column:
     path = name.split(".")
     for start in range(1, 1 if _known(base) or _OTHER.match(base) else len(path)):
         last, last_unit = _base(".".join(path[start:]))
-        if _known(last):
-            return Column(name, last_unit, last)
+        group = f"_{_plain('.'.join(path[:start]))}_"
+        if _known(last) and not re.search(f"_({_NO_PLACE})(_?[23]d)?_", group):
+            of = (kind for kind, words in _GROUP_OF if re.search(f"_({words})(_?[23]d)?_", group))
+            named = f"{next(of, '')}_{last}".strip("_")
+            return Column(name, last_unit, named if _known(named) else last)
     rest = _LEADING.sub("", base, count=1)
     return Column(name, unit, base if _known(base) or not _known(rest) else rest)
 

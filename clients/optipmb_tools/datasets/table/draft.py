@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from optipmb_tools.datasets.interface import Reports
 from optipmb_tools.datasets.motion import Moves
-from optipmb_tools.datasets.table.columns import FACTORS, Column
+from optipmb_tools.datasets.table.columns import FACTORS, Column, candidates
 from optipmb_tools.datasets.table.findings import Reading
 from optipmb_tools.datasets.table.pixels import Placed
 from optipmb_tools.files import DatasetError
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from optipmb import GroundCamera
 
 _LENGTHS: Final = ("x", "y", "z", "alt", "l", "w", "h", "vx", "vy", "pose_x", "pose_y", "pose_z")
+_MOST_NAMED: Final = 24  # columns in an error
 _OF_ROWS: Final = ("frame_stamp", "frame_key", "frame_pose", "frame_time", "frame_number")
 _MARKS: Final = (-999, -9999, -99999, 999, 9999, 99999, -32768, 32767, 65535)  # numbers that often stand for no value
 
@@ -135,16 +136,36 @@ def numbers(reading: Reading, draft: Draft, role: str, otherwise: float | None =
     column = draft.roles.get(role)
     if column is None:
         if otherwise is None:
-            if error := reading.named.get(f"column.{role}"):
-                raise error
-            have = f"the columns {', '.join(draft.columns)}"
-            raise DatasetError(reading.path, f"a column {role} (--option column.{role}=NAME)", have)
+            raise missing(reading, draft, role)
         return np.full(draft.rows, otherwise)
     found = column_numbers(reading, draft, role, column.name)
     if role in _LENGTHS:
         asked = reading.positive("length_factor", "metres of a unit of length")
         found = found * (FACTORS.get(column.unit or "") or asked or 1.0)
     return found
+
+
+def missing(reading: Reading, draft: Draft, role: str) -> DatasetError:
+    """Return the error for a column that a table must have; it names all such columns, and those that may be meant."""
+    if error := reading.named.get(f"column.{role}"):
+        return error
+    roles = draft.roles.keys()
+    lacks = [] if {"stamp", "frame"} & roles else ["stamp"]
+    lacks += [one for one in ("x", "y") if one not in roles and not {"lat", "lon"} <= roles]
+    lacks += [one for one in ("l", "w") if one not in roles and {"l", "w"} & roles]
+    if role not in lacks or "camera" in reading.options:
+        lacks = [role]
+    unused = draft.columns.keys() - {one.name for one in draft.roles.values()}
+    likely = {one: [name for name in candidates(draft.columns, one) if name in unused] for one in lacks}
+    option = " ".join(f"--option column.{one}={'NAME' if not names else names[0]}" for one, names in likely.items())
+    expected = f"{'a column' if len(lacks) == 1 else 'columns'} {', '.join(lacks)} ({option})"
+    if "stamp" in lacks:
+        option = option.replace("--option column.stamp=NAME", "t, stamp_ns …; --option column.stamp=NAME")
+        others = f", and columns {', '.join(lacks[1:])}" if len(lacks) > 1 else ""
+        expected = f"a column of stamps ({option}) or of frames{others}"
+    have = [*draft.columns]
+    more = f" and {len(have) - _MOST_NAMED} more" if len(have) > _MOST_NAMED else ""
+    return DatasetError(reading.path, expected, f"the columns {', '.join(have[:_MOST_NAMED])}{more}")
 
 
 def column_numbers(reading: Reading, draft: Draft, role: str, name: str) -> Floats:

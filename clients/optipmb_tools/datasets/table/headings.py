@@ -1,16 +1,16 @@
 """Headings and velocities of boxes, against their motion."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 
 from optipmb_tools.datasets.evidence import Evidence
 from optipmb_tools.datasets.motion import LEAST_ALONG, MOST, SAME_DIRECTION, Moves
-from optipmb_tools.datasets.table.angles import ANGLE_UNITS, FULL_TURN, quaternion_of
-from optipmb_tools.datasets.table.columns import normalised, turned
+from optipmb_tools.datasets.table.angles import ANGLE_UNITS, FULL_TURN, read_quaternion
+from optipmb_tools.datasets.table.columns import BEARINGS, Column, normalised, turned
 from optipmb_tools.datasets.table.corners import CORNERED
 from optipmb_tools.datasets.table.draft import Draft, column_numbers, numbers
 from optipmb_tools.datasets.table.findings import HALF, NOISE, Claim, Reading
@@ -36,6 +36,17 @@ HEADINGS: Final[Mapping[str, tuple[float, float]]] = {
     "-x-clockwise": (-1.0, np.pi),
     "-y-clockwise": (-1.0, -0.5 * np.pi),
 }
+
+
+@dataclass(frozen=True)
+class _Way:
+    """Circumstances in which headings are read."""
+
+    strict: bool  # headings that disagree with the motion are refused, and not only noted
+    moving: bool  # the sensor moves and has no poses: then motion says little about headings
+    free: bool  # the motion gives the sense of the headings
+    compass: bool  # they stand beside latitudes
+    bearing: bool  # their name is that of a bearing
 
 
 def step(reading: Reading, draft: Draft) -> Draft:
@@ -65,7 +76,7 @@ def _yaw(reading: Reading, draft: Draft) -> tuple[Floats, str | None]:
     """Return headings as the table has them, and the unit that is stated for them; `none` where there are none."""
     if "yaw" in draft.roles:
         return numbers(reading, draft, "yaw"), draft.unit("yaw")
-    quaternion = None if draft.turn_of in {"angles", "matrix"} else quaternion_of(reading, draft, "q", "yaw")
+    quaternion = None if draft.turn_of in {"angles", "matrix"} else read_quaternion(reading, draft, "q", "yaw")
     if quaternion is not None:
         w, x, y, z = quaternion.T
         return np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z), "quaternion"
@@ -106,8 +117,15 @@ def _heading(reading: Reading, draft: Draft) -> Floats:
         unknown = int(np.isnan(yaw).sum())
         if unknown < len(yaw):
             moving = unposed and is_moving(yaw, long)
-            free = "yaw" in draft.roles and draft.roles["yaw"].name == CORNERED
-            found = read_heading(reading, yaw, unit, long, carry, strict=draft.scored, moving=moving, free=free)
+            column = draft.roles.get("yaw", Column("", None, ""))
+            way = _Way(
+                strict=draft.scored,
+                moving=moving,
+                free=column.name == CORNERED,
+                compass="x" not in draft.roles and column.base in {"heading", *BEARINGS},
+                bearing=column.base in BEARINGS,
+            )
+            found = read_heading(reading, yaw, unit, long, carry, way)
         if unknown:
             reading.note("yaw", f"{unknown} of {len(yaw)} boxes have no heading: it is unknown")
     if unposed and draft.placed is None:
@@ -124,10 +142,7 @@ def read_heading(
     unit: str | None,
     moves: Moves,
     carry: Callable[[Floats, Ints], Floats],
-    *,
-    strict: bool,
-    moving: bool,
-    free: bool,
+    way: _Way,
 ) -> Floats:
     """Return headings (B,) in radians, counter-clockwise from x; NaN where unknown.
 
@@ -137,12 +152,11 @@ def read_heading(
         unit: Unit in the name of the column; `quaternion` where the values come from one.
         moves: Moves of the boxes, in the world.
         carry: Returns headings in the world from headings (K,) and the rows (K,) of their boxes.
-        strict: Whether headings that disagree with the motion are refused, and not only noted.
-        moving: Whether the sensor moves and has no poses: then motion says little about headings.
-        free: Whether the motion gives the sense of the headings.
+        way: What is known of them besides.
     """
     asked = reading.chosen("yaw", ("degrees", "radians"))
     zero = reading.chosen("heading", HEADINGS)
+    usual = "y-clockwise" if way.compass else "x"
     stated = asked or ("radians" if unit == "quaternion" else ANGLE_UNITS.get(unit or ""))
     size = np.abs(values[np.isfinite(values)])
     if stated is None and len(size) and np.mean(size > FULL_TURN) > FEW:
@@ -158,11 +172,12 @@ def read_heading(
         both = near | (off > np.pi - SAME_DIRECTION)
         return Evidence(float(both.sum()) * bool(count), count), Evidence(float(near.sum()) * bool(count), count)
 
-    axis = zero or "x"
+    axis = zero or usual
     claims = [Claim("radians", share("radians", axis)[0]), Claim("degrees", share("degrees", axis)[1])]
     claims += [Claim("radians", share("radians", one)[0]) for one in HEADINGS]
     found = stated or reading.decide("yaw", claims)  # small degrees: all objects go forward in one direction
     text = "yaw is that of quaternions" if unit == "quaternion" else f"yaw is in {found}"
+    text += ", clockwise from north as beside latitudes" if way.compass and zero is None else ""
     if not count:
         most = float(size.max(initial=0.0))
         text += f" (up to {most:.4g}); too few boxes move to compare headings with motion"
@@ -170,12 +185,17 @@ def read_heading(
     near = max(both for both, _ in shares.values()) - NOISE
     other = max((one for one in shares if shares[one][0] >= near), key=lambda one: shares[one][1])
     what = f"if it is measured from {other.replace('-clockwise', ' clockwise')}"
-    option = f"--option heading={other}, or heading=x to keep it"
+    option = f"--option heading={other}, or heading={usual} to keep it"
+    wins: Literal["taken", "doubt", "refused"] = "refused" if way.strict and not way.moving else "doubt"
+    if way.bearing and other == "y-clockwise":
+        wins, what = "taken", f"yaw is in {found}, clockwise from y"
     claims = [
         Claim(axis, share(found, axis)[0], text, "" if asked or unit else "--option yaw=degrees, radians"),
-        Claim(other, share(found, other)[0], what, option, "refused" if strict and not moving else "doubt", sure),
+        Claim(other, share(found, other)[0], what, option, wins, sure),
     ]
-    reading.decide(
+    if way.bearing and not (count or way.compass or zero):
+        reading.doubt("yaw", f"{text}; it may be clockwise from north", "--option heading=y-clockwise, or heading=x")
+    axis = reading.decide(
         "yaw",
         claims,
         "moves are along it",
@@ -184,16 +204,16 @@ def read_heading(
         asked=zero,
         least=LEAST_ALONG if sure else 0.0,
     )
-    if claims[0].evidence.share > HALF and not moving:  # along a grid of streets only the sense differs
+    if claims[axis == other].evidence.share > HALF and not way.moving:  # along a grid of streets only the sense differs
         turned = axis.removesuffix("-clockwise") if axis.endswith("-clockwise") else f"{axis}-clockwise"
-        ways = (axis, axis.removeprefix("-") if axis.startswith("-") else f"-{axis}", *(() if free else (turned,)))
+        ways = (axis, axis.removeprefix("-") if axis.startswith("-") else f"-{axis}", *(() if way.free else (turned,)))
         claims = [
             Claim(
                 one,
                 share(found, one)[1],
-                f"if it is {one}" if one != axis and not free else "",
+                f"if it is {one}" if one != axis and not way.free else "",
                 f"--option heading={one}, or heading={axis} to keep it",
-                "taken" if free else "doubt",
+                "taken" if way.free else "doubt",
             )
             for one in ways
         ]

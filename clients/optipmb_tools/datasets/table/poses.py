@@ -1,23 +1,27 @@
 """Poses of the sensor, of the table or of another one, and the moves of boxes in the world."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
+from optipmb_tools.datasets.evidence import Evidence
 from optipmb_tools.datasets.motion import find_moves
 from optipmb_tools.datasets.table import roles, times
-from optipmb_tools.datasets.table.angles import quaternion_of, read_angle
+from optipmb_tools.datasets.table.angles import read_angle, read_quaternion, read_turn
 from optipmb_tools.datasets.table.columns import Column, find_columns
-from optipmb_tools.datasets.table.draft import Draft, numbers
-from optipmb_tools.datasets.table.findings import Reading
+from optipmb_tools.datasets.table.draft import Draft, column_numbers, numbers
+from optipmb_tools.datasets.table.findings import Claim, Reading
 from optipmb_tools.files import DatasetError
-from optipmb_tools.geometry import Floats, Ints
+from optipmb_tools.geometry import Floats, Ints, quaternion_of
 from optipmb_tools.table_files import Columns, read_table
 
 _UNIT: Final = 1e-3
 _LEAST_TURN: Final = 1e-6
+_SEVEN: Final = 7  # numbers of a place and a quaternion
+_MATRIX: Final = 16
 
 
 def step(reading: Reading, draft: Draft) -> Draft:
@@ -33,7 +37,30 @@ def _poses(reading: Reading, draft: Draft) -> Floats | None:
     """Return the poses (R, 7) of the table, or of another one at its stamps."""
     if "poses" in reading.options:
         return _poses_at(reading, Path(reading.options["poses"]), draft.stamps.ns)
-    return _of_columns(reading, draft, "pose_") if {"pose_x", "pose_y"} <= draft.roles.keys() else None
+    if not {"pose_x", "pose_y"} <= draft.roles.keys():
+        return None
+    stem = draft.roles["pose_x"].name.removesuffix("0")
+    listed = [name for name in draft.columns if re.fullmatch(rf"{re.escape(stem)}\d(\d|\.\d)?", name)]
+    if len(listed) in {_SEVEN, _MATRIX - 4, _MATRIX}:
+        return _of_list(reading, np.column_stack([column_numbers(reading, draft, "pose", name) for name in listed]))
+    return _of_columns(reading, draft, "pose_")
+
+
+def _of_list(reading: Reading, values: Floats) -> Floats:
+    """Return the poses (R, 7) of lists: a place and a quaternion in either order, or a matrix by rows."""
+    if values.shape[1] >= _MATRIX - 4:
+        rows = values[:, : _MATRIX - 4].reshape(-1, 3, 4)
+        turn = np.array([quaternion_of(one) for one in rows[:, :, :3]]).reshape(-1, 4)
+        return np.column_stack([rows[:, :, 3], turn])
+    claims = []
+    for order, part in (("the place", values[:, 3:]), ("the quaternion", values[:, :4])):
+        unit = abs(np.linalg.norm(part, axis=1) - 1.0) < _UNIT
+        claims.append(Claim(order, Evidence(float(unit.sum()), len(unit)), f"poses are lists, {order} first"))
+    first = reading.decide("pose", claims)
+    place, turn = (values[:, :3], values[:, 3:]) if first == "the place" else (values[:, 4:], values[:, :4])
+    turn = read_turn(reading, "pose", turn, named=False)
+    reading.first("pose", ~(abs(np.linalg.norm(turn, axis=1) - 1.0) < _UNIT), "a pose with a unit quaternion", turn)
+    return np.column_stack([place, turn])
 
 
 def _of_columns(reading: Reading, draft: Draft, prefix: str) -> Floats:
@@ -57,7 +84,7 @@ def _checked(reading: Reading, draft: Draft) -> Floats | None:
 
 def _turn(reading: Reading, draft: Draft, prefix: str) -> Floats:
     """Return the unit quaternions (R, 4) of poses, which the table has as such or as yaws."""
-    quaternion = quaternion_of(reading, draft, f"{prefix}q", "pose")
+    quaternion = read_quaternion(reading, draft, f"{prefix}q", "pose")
     if quaternion is None:
         role = f"{prefix}yaw"
         turn = read_angle(reading, role, numbers(reading, draft, role), draft.unit(role))

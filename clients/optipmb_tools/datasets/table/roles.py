@@ -8,14 +8,16 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from optipmb_tools.datasets.table.columns import ALIASES, NOTHING, Column, find_columns, normalised, turn_of
+from optipmb_tools.datasets.table.columns import ALIASES, NOTHING, Column, candidates, find_columns, normalised, turn_of
 from optipmb_tools.datasets.table.corners import with_boxes
 from optipmb_tools.datasets.table.draft import Draft
 from optipmb_tools.datasets.table.findings import Reading
 from optipmb_tools.datasets.table.pixels import METRES
-from optipmb_tools.table_files import NO_VALUE, Columns, frame_numbers, is_number
+from optipmb_tools.table_files import NO_VALUE, Columns, frame_numbers, is_number, unique_texts
 
 _MOST_SHOWN: Final = 6
+_NEEDED: Final = ("x", "y")  # with texts they are refused where a text stands
+_FEW_CLASSES: Final = 64
 _LONGEST: Final = 30.0  # boxes that are longer, in metres, are suspicious
 _LOOKED_AT: Final = 200  # texts of a column that tell whether it has numbers
 _SPARED: Final = ("z", "h", "score", "class")  # without a value in any row they are as without a column
@@ -47,8 +49,17 @@ def find(reading: Reading, columns: Columns) -> dict[str, Column]:
         found = {role: one for role, one in find_columns(columns, taken, words).items() if role not in _SPARED} | found
     used = {one.name for one in found.values()}
     for role, one in find_columns(columns, taken).items():  # refused when it is read, as a number is expected
-        if role not in found and one.name in words - used and _has_units(columns[one.name]):
+        if role not in found and one.name in words - used and (role in _NEEDED or _has_units(columns[one.name])):
             found[role] = one
+    track = found.get("id")
+    over_ground = track is not None and track.base == "track" and columns[track.name].dtype.kind == "f"
+    if track is not None and over_ground and {"lat", "lon"} <= found.keys() and "yaw" not in found:
+        found["yaw"] = replace(found.pop("id"), base="true_track")
+    if "class" not in found and chosen.get("class") != NOTHING:
+        named = [name for name in candidates(columns, "class") if name in words - used]
+        few = [name for name in named if len(unique_texts(columns[name])[0]) <= _FEW_CLASSES]
+        if len(few) == 1:
+            found["class"] = Column(few[0], None, "")
     return found
 
 
@@ -64,6 +75,12 @@ def note(reading: Reading, draft: Draft) -> Draft:
     unused = [name for name in draft.columns if name not in used]
     stems = {name.rpartition(".")[0] for name in used} - {""}
     unused.sort(key=lambda name: name.rpartition(".")[0] not in stems)  # the rest of a group that is used in part
+    for role in ("class", "id", *(("l", "w") if draft.centres else ())):
+        likely = candidates(unused, role)[:_MOST_SHOWN]
+        if likely and role not in draft.roles and f"column.{role}" not in reading.options:
+            text = f"no column for {role} is found, though {', '.join(likely)} may have it"
+            how = f"--option column.{role}=NAME, or none"
+            (reading.note if role == "id" else reading.doubt)("columns", text, how)
     if unused:
         more = f" and {len(unused) - _MOST_SHOWN} more" if len(unused) > _MOST_SHOWN else ""
         reading.note("columns", f"columns not used: {', '.join(unused[:_MOST_SHOWN])}{more}")

@@ -7,9 +7,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from optipmb_tools.datasets.table.draft import Draft, Stamps, numbers
+from optipmb_tools.datasets.table.draft import Draft, Stamps, missing, numbers
 from optipmb_tools.datasets.table.findings import HALF, Reading
-from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Bools, Ints
 from optipmb_tools.table_files import NO_VALUE, is_number
 
@@ -303,8 +302,7 @@ def _counted(reading: Reading, draft: Draft, rate: float | None) -> Stamps:
     """Return stamps from the numbers of frames."""
     column = draft.roles.get("frame")
     if column is None:
-        expected = "a column of stamps (t, stamp_ns …; --option column.stamp=NAME) or of frames"
-        raise DatasetError(reading.path, expected, f"the columns {', '.join(draft.columns)}")
+        raise missing(reading, draft, "stamp")
     frame = numbers(reading, draft, "frame")
     reading.strict().first("time", ~np.isfinite(frame), f"the number of a frame in column {column.name}", frame)
     if rate is None:
