@@ -11,7 +11,8 @@ import codecs
 import io
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
@@ -343,16 +344,21 @@ def _normal_text(path: Path, blocks: Iterator[str], kind: str) -> tuple[Iterator
             raise DatasetError(path, "a first line with the names of the columns", repr(head.strip()[:60]))
         head, rest = names[-1], f"{head}\n{rest}"
     head, rest = _with_units(head, rest, separator)
-    first = rest.split("\n", 1)[0].rstrip()
-    more = first.count(separator) - head.count(separator)
-    if more == 1 and first.endswith(separator):
-        head += separator
-    elif more == -1 and head.endswith(separator):
-        head = head.removesuffix(separator)
+    head = _with_all_names(head, rest.split("\n", 1)[0].rstrip(), separator)
     more_blocks = map(_without_comments, blocks)
     if separator == " ":
         more_blocks = map(_with_single_blanks, more_blocks)
     return chain([f"{head}\n{rest}"], more_blocks), separator
+
+
+def _with_all_names(head: str, first: str, separator: str) -> str:
+    """Return the names of columns, as many as the first row has fields."""
+    more = first.count(separator) - head.count(separator)
+    if more == 1 and first.endswith(separator):
+        return head + separator
+    if more == 1:  # R writes the names of the rows without a title
+        return f"row{separator}{head}"
+    return head.removesuffix(separator) if more == -1 else head
 
 
 def _without_comments(text: str) -> str:
@@ -383,6 +389,12 @@ def _benchmark(line: str) -> str | None:
 def _read_text(pa: Any, path: Path, kind: str, options: Mapping[str, str]) -> Any:
     from pyarrow import csv  # noqa: PLC0415  packages of an extra
 
+    ragged: list[Any] = []
+
+    def keep(row: Any) -> str:
+        ragged.append(row)
+        return "error"
+
     def parsed(decimal: str, *texts: str, threads: bool = True) -> Any:
         blocks, separator = _normal_text(path, _blocks(path, options), kind)
         null = list(NO_VALUE)
@@ -391,6 +403,8 @@ def _read_text(pa: Any, path: Path, kind: str, options: Mapping[str, str]) -> An
             null_values=null, strings_can_be_null=True, decimal_point=decimal, column_types=types
         )
         parse, read = csv.ParseOptions(delimiter=separator), csv.ReadOptions(use_threads=threads)
+        if not threads:
+            parse.invalid_row_handler = keep
         data = io.BufferedReader(_Blocks(blocks), _BLOCK)
         return csv.read_csv(data, parse_options=parse, convert_options=convert, read_options=read)
 
@@ -400,21 +414,39 @@ def _read_text(pa: Any, path: Path, kind: str, options: Mapping[str, str]) -> An
     try:
         table = parsed(decimal or ".")
     except pa.ArrowInvalid:
-        table = parsed(decimal or ".", threads=False)  # raises with the number of the row
+        table = _again(path, partial(parsed, decimal or ".", threads=False), ragged, options)
     names = [name for name in table.column_names if name]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise DatasetError(path, "every column once", f"{twice[0]!r} twice")
     if decimal is None and _has_commas(pa, path, table):
         table = parsed(",")
     if rounded := _rounded(pa, table):
-        import pyarrow.compute as pc  # noqa: PLC0415  packages of an extra
-
-        texts = parsed(".", *rounded)
-        for name in rounded:
-            if pc.all(pc.match_substring_regex(texts[name], r"^\s*-?\d+\s*$")).as_py():
-                table = table.set_column(table.column_names.index(name), name, texts[name])
+        table = _with_digits(table, parsed(".", *rounded), rounded)
     places = enumerate(table.column_names)  # a separator at the end of the lines gives one without name and values
     return table.select([place for place, name in places if name or table.column(place).null_count < len(table)])
+
+
+def _again(path: Path, read: Callable[[], Any], ragged: Sequence[Any], options: Mapping[str, str]) -> Any:
+    """Read a table again on one thread, which tells the number of the row that cannot be read."""
+    try:
+        return read()
+    except ValueError as error:  # of pyarrow
+        if not ragged:
+            raise
+        row = ragged[0]
+        expected = f"{row.expected_columns} fields in each row, as many as names"
+        line = line_of(path, row.number - 2, options)  # counted from 1, with the line of names
+        raise DatasetError(path, expected, f"{row.actual_columns}: {row.text.strip()[:60]!r}", line=line) from error
+
+
+def _with_digits(table: Any, texts: Any, names: Sequence[str]) -> Any:
+    """Return a table with texts in place of integers that have lost digits."""
+    import pyarrow.compute as pc  # noqa: PLC0415  packages of an extra
+
+    for name in names:
+        if pc.all(pc.match_substring_regex(texts[name], r"^\s*-?\d+\s*$")).as_py():
+            table = table.set_column(table.column_names.index(name), name, texts[name])
+    return table
 
 
 def _has_commas(pa: Any, path: Path, table: Any) -> bool:

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 _SHOWN = 20  # recordings that are named
 _MANY = 50  # detections of which some should make tracks
 _HARDLY = 0.05  # share of the rows of tracks that are confirmed, below which numbers may have another meaning
+_SHORT = 2.0  # rows of a track up to which nothing was followed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -255,6 +256,12 @@ def _complain(results: "list[TrackedSequence]", profile: str) -> None:
         if detections:
             warn(f"no tracks came of {detections} detections: do their scores and rate fit profile {profile}?")
         raise typer.Exit(1)
+    tracks = sum(one.tracks for one in results)
+    if tracks >= _MANY and confirmed < _SHORT * tracks:
+        warn(
+            f"hardly any track outlives a frame, {tracks} tracks have {confirmed} rows: are the rate, the units of "
+            "time and length, and the grouping of frames right?"
+        )
     if detections >= _MANY and confirmed < _HARDLY * rows:
         warn(
             f"hardly anything is tracked, {confirmed} of {rows} rows are confirmed: are places and times in the units "

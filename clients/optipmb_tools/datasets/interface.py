@@ -168,6 +168,7 @@ class DataSequence(ABC):
     numbers: NDArray[Any] | None = None  # (F,) numbers of the frames as the table has them
     areas: Sequence[Area] = ()  # later ones lie above earlier ones
     reports: Reports | None = None  # where objects report one by one
+    apart: Sequence[str] = ()  # classes whose boxes are things of their own, however close
 
     if TYPE_CHECKING:
 

@@ -45,6 +45,14 @@ SPEEDS: Final = (40.0, 350.0)  # m/s that such objects reach: on the ground and 
 LONGEST_ALONE_S: Final = 30.0  # to the next report of an object,
 LONGEST_WAY_S: Final = 1.5  # in which it goes no further than at its highest speed for so long
 LEAST_LOOK: Final = 10.0  # least range in metres of a look at one object
+SMALL: Final = 1.5  # longest side in metres of things that may stand side by side at less than `LARGEST_OVERLAP`
+BODY: Final = 0.6  # width in metres of a person
+ASIDE: Final = 0.5  # of their width from which the centres of two things are two
+MANY_FRAMES: Final = 10
+RUNNING: Final = 4.0  # m/s, faster than people go
+ELBOWS: Final = 1.5  # m between people that is too little for vehicles
+PERSON: Final = ((0.2, 1.4), (0.2, 1.3), (1.0, 2.3))
+"""Least and largest length, width and height of people, m."""
 LARGEST_OVERLAP: Final = 2.5  # distance in metres from which the centres of two boxes of a class are two places
 
 
@@ -58,6 +66,7 @@ class Moves:
     duration: Floats  # (K,) s
     object: Ints  # (K,) number of the object, which has one for each unbroken chain of links
     common: Evidence  # pairs of frames most of whose boxes make one rigid motion
+    chain: Ints  # (B,) number of the object of each box, in the frames that were looked at; -1 in others
 
     def __len__(self) -> int:
         return len(self.start)
@@ -73,7 +82,7 @@ class Moves:
 
     def take(self, rows: Bools) -> "Moves":
         floats, numbers = (self.step[rows], self.duration[rows]), self.object[rows]
-        return Moves(self.start[rows], self.end[rows], *floats, numbers, self.common)
+        return Moves(self.start[rows], self.end[rows], *floats, numbers, self.common, self.chain)
 
 
 def find_moves(key: Ints, seconds: Floats, xy: Floats, kind: Ints) -> Moves:
@@ -103,26 +112,30 @@ def find_moves(key: Ints, seconds: Floats, xy: Floats, kind: Ints) -> Moves:
     least = np.maximum(LEAST_MOVE, STEADY * _scatter(following, chain, seconds, xy))
     start, end = _chains(following, xy, least)
     common = _common(frames, key, seconds, xy, chain)
-    return Moves(start, end, xy[end] - xy[start], seconds[end] - seconds[start], chain[start], common)
+    looked = np.full(len(key), -1, dtype=np.int64)
+    if frames:
+        rows = np.concatenate(frames)
+        looked[rows] = chain[rows]
+    return Moves(start, end, xy[end] - xy[start], seconds[end] - seconds[start], chain[start], common, looked)
 
 
-def typical_speed(key: Ints, seconds: Floats, xy: Floats, kind: Ints) -> float:
-    """Return the upper quartile of the speeds in m/s from boxes to the nearest of their class in the next frame, or 0.
+def next_steps(key: Ints, seconds: Floats, xy: Floats, kind: Ints) -> tuple[Floats, Floats]:
+    """Return the distances (S,) in metres from boxes to the nearest of their class in the next frame, and the times.
 
     The arguments are as for `find_moves`, without its limits on how far a box may go.
     """
     order = np.lexsort((seconds, key))[: LEAST_FRAMES * MOST_BOXES]
     starts = np.flatnonzero(np.r_[True, (np.diff(key[order]) != 0) | (np.diff(seconds[order]) > 0.0)])
-    speeds: list[float] = []
+    steps, times = [np.empty(0)], [np.empty(0)]
     for before, after in itertools.pairwise(np.split(order, starts[1:])[:LEAST_FRAMES] if len(order) else []):
         first, second = before[:MOST_BOXES], after[:MOST_BOXES]
         if key[first[0]] == key[second[0]]:
             away = np.linalg.norm(xy[first][:, None] - xy[second][None], axis=2)
             away[kind[first][:, None] != kind[second][None]] = np.inf
             nearest = away.min(axis=1)
-            passed = seconds[second[0]] - seconds[first[0]]
-            speeds += (nearest[np.isfinite(nearest)] / passed).tolist()
-    return float(np.quantile(speeds, 0.75)) if speeds else 0.0  # others may stand
+            steps.append(nearest[np.isfinite(nearest)])
+            times.append(np.full(len(steps[-1]), seconds[second[0]] - seconds[first[0]]))
+    return np.concatenate(steps), np.concatenate(times)
 
 
 def _scatter(following: Ints, chain: Ints, seconds: Floats, xy: Floats) -> Floats:
@@ -228,20 +241,71 @@ def overlapping(frame: Ints, xy: Floats, size: Floats, kind: Ints, score: Floats
     """Return how many boxes of its frame and class are at the place of each box (B,), itself among them.
 
     A detector without suppression gives many boxes of an object, of scores from high to low: these count as one.
+    Things that keep apart (`kinds_apart`) have places of their own.
     Of frames with more than `MOST_BOXES` boxes a part is looked at, and no more than `MOST_FRAMES` frames.
     """
     found = np.ones(len(frame), dtype=np.int64)
+    near = np.minimum(0.7 * size[:, :2].max(axis=1, initial=0.0), LARGEST_OVERLAP)
+    near[np.isin(kind, kinds_apart(frame, xy, size, kind))] = 0.0
+    for rows in _some(frame):
+        away = np.linalg.norm(xy[rows][:, None] - xy[rows][None], axis=2)
+        close = (away < near[rows][:, None]) & (kind[rows][:, None] == kind[rows][None])
+        least = np.where(close, score[rows][None], np.inf).min(axis=1, initial=np.inf)
+        most = np.where(close, score[rows][None], 0.0).max(axis=1, initial=0.0)
+        found[rows] = np.where(least > LIKE * most, np.maximum(close.sum(axis=1), 1), 1)
+    return found
+
+
+def kinds_apart(frame: Ints, xy: Floats, size: Floats, kind: Ints) -> Ints:
+    """Return the classes (K,) of small things that stand close together in many frames, and at one place in none.
+
+    These are people side by side. Boxes of one person by two detectors come as near to each other as they scatter.
+    """
+    small = size[:, :2].max(axis=1, initial=0.0) <= SMALL
+    parts: list[tuple[Floats, Ints, Ints]] = []
+    for rows in _some(frame):
+        some = rows[small[rows]]
+        away = np.linalg.norm(xy[some][:, None] - xy[some][None], axis=2)
+        away[kind[some][:, None] != kind[some][None]] = np.inf
+        np.fill_diagonal(away, np.inf)
+        nearest = away.min(axis=1, initial=np.inf) / np.minimum(size[some, :2].min(axis=1, initial=SMALL), BODY)
+        close = nearest < 1.0 / BODY
+        parts.append((nearest[close], kind[some][close], frame[some][close]))
+    if not parts:
+        return np.empty(0, dtype=np.int64)
+    away, kinds, frames = (np.concatenate(one) for one in zip(*parts, strict=True))
+    found = []
+    for one in np.unique(kinds).tolist():
+        mine = away[kinds == one]
+        low, usual = np.quantile(mine, (0.05, 0.5)).tolist()
+        if len(np.unique(frames[kinds == one])) >= MANY_FRAMES and low > max(0.5 * usual, ASIDE):
+            found.append(one)
+    return np.array(found, dtype=np.int64)
+
+
+def _some(frame: Ints) -> "Iterable[Ints]":
+    """Yield rows of each frame, `MOST_BOXES` at most."""
     order = np.argsort(frame, kind="stable")
     starts = np.flatnonzero(np.r_[True, np.diff(frame[order]) != 0])
-    near = np.minimum(0.7 * size[:, :2].max(axis=1, initial=0.0), LARGEST_OVERLAP)
     for rows in np.split(order, starts[1:])[:MOST_FRAMES] if len(order) else []:
-        some = rows[: MOST_BOXES * (1 + len(rows) // MOST_BOXES) : 1 + len(rows) // MOST_BOXES]
-        away = np.linalg.norm(xy[some][:, None] - xy[some][None], axis=2)
-        close = (away < near[some][:, None]) & (kind[some][:, None] == kind[some][None])
-        least = np.where(close, score[some][None], np.inf).min(axis=1)
-        most = np.where(close, score[some][None], 0.0).max(axis=1)
-        found[some] = np.where(least > LIKE * most, close.sum(axis=1), 1)
-    return found
+        yield rows[: MOST_BOXES * (1 + len(rows) // MOST_BOXES) : 1 + len(rows) // MOST_BOXES]
+
+
+def are_people(frame: Ints, xy: Floats, size: Floats | None, moves: Moves) -> bool:
+    """Tell whether boxes (B,) are of people: by sizes (B, 3), or by speeds and distances where these are unknown."""
+    speed = np.hypot(*moves.velocity.T)
+    if len(moves) >= SURE_MOVES and float(np.quantile(speed, 0.95)) > RUNNING:
+        return False
+    if size is not None:
+        low, high = (np.array(one) for one in zip(*PERSON, strict=True))
+        return len(size) > 0 and float(np.mean(((size >= low) & (size <= high)).all(axis=1))) > MOST_ALONE
+    distances = []
+    for rows in _some(frame):
+        away = np.linalg.norm(xy[rows][:, None] - xy[rows][None], axis=2)
+        np.fill_diagonal(away, np.inf)
+        distances.append(away.min(axis=1, initial=np.inf))
+    nearest = np.concatenate(distances) if distances else np.empty(0)
+    return len(moves) >= SURE_MOVES and int((nearest < ELBOWS).sum()) >= SURE_MOVES
 
 
 def find_reports(key: Ints, seconds: Floats, xy: Floats, kind: Ints) -> Reports | None:

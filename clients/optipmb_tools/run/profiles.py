@@ -35,6 +35,7 @@ __all__ = [
     "warm_up",
 ]
 
+SIDE_BY_SIDE: Final = 0.5  # overlap up to which boxes of people that keep apart are of two
 AUTO: Final = "auto"  # name of the profile that is made for the data: rate and classes as they come
 USUAL_PERIOD: Final = 0.1
 SLOWEST: Final = 4.0  # s, the longest period that such a profile is for
@@ -154,6 +155,9 @@ def _made_for(sequences: Sequence[DataSequence]) -> Parameters:
         parameters = generic_parameters(labels or ("object",), min(period, SLOWEST))
     except OptipmbError as error:
         raise UsageError(f"--profile {AUTO}: {error}") from error
+    for name in {name for one in sequences for name in one.apart} & parameters.classes.keys():
+        side_by_side = {"nms_iou": SIDE_BY_SIDE, "sure_nms_iou": SIDE_BY_SIDE}
+        parameters.classes[name] = parameters.classes[name].model_copy(update=side_by_side)
     for name, own in parameters.classes.items() if reports else ():
         # The gate grows with the time since the last frame, and not since the last report of the object.
         gate = max(own.gate, *(one.distance for one in reports))

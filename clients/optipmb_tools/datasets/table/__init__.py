@@ -247,6 +247,7 @@ class TableSequence(DataSequence):
         self._truth = truth
         self._origin = origin
         self.reports = boxes.reports
+        self.apart = boxes.apart
         rows = np.flatnonzero(boxes.frame_key == key)
         self._stamps, first, frame = np.unique(boxes.frame_stamp[rows], return_index=True, return_inverse=True)
         self.times: NDArray[Any] = boxes.frame_time[rows[first]]

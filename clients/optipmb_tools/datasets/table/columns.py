@@ -102,7 +102,7 @@ ALIASES: Final[Mapping[str, tuple[str, ...]]] = {
 """Names of each column, the most telling first."""
 
 _LISTED: Final = ("x", "y", "z", "l", "w", "h", "yaw", "vx", "vy")  # meanings of the numbers of a list of `BOX_LISTS`
-_UNITS: Final[Mapping[str, str]] = {
+UNITS: Final[Mapping[str, str]] = {
     "deg": "deg", "degree": "deg", "degrees": "deg", "rad": "rad", "radian": "rad", "radians": "rad",
     "s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "us": "us", "usec": "us",
     "millis": "ms", "micros": "us", "nanos": "ns",
@@ -251,10 +251,10 @@ def _base(name: str) -> tuple[str, str | None]:
     head, _, tail = base.rpartition("_")
     if head and tail in FACTORS:
         return head, tail
-    if head and tail in _UNITS:
-        return head, _UNITS[tail]
-    if base in _UNITS and base not in {"s", "ms", "us", "ns"}:
-        return base, _UNITS[base]
+    if head and tail in UNITS:
+        return head, UNITS[tail]
+    if base in UNITS and base not in {"s", "ms", "us", "ns"}:
+        return base, UNITS[base]
     return head if head and tail in _LENGTHS else base, None
 
 

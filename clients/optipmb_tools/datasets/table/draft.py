@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 _LENGTHS: Final = ("x", "y", "z", "alt", "l", "w", "h", "vx", "vy", "pose_x", "pose_y", "pose_z")
 _MOST_NAMED: Final = 24  # columns in an error
+_COUNTS: Final = ("stamp", "nanosec", "frame")  # in which a mark for no value is a number
 _OF_ROWS: Final = ("frame_stamp", "frame_key", "frame_pose", "frame_time", "frame_number")
 _MARKS: Final = (-999, -9999, -99999, 999, 9999, 99999, -32768, 32767, 65535)  # numbers that often stand for no value
 
@@ -64,6 +65,7 @@ class Draft:
     center: Floats = field(default_factory=_unset)  # (R, 3), then (B, 3)
     size: Floats = field(default_factory=_unset)
     centres: bool = False  # whether boxes have no size
+    unsized: Bools = field(default_factory=_unset)  # (R,) rows of unknown size
     yaw: Floats = field(default_factory=_unset)
     yaw_unit: str | None = None  # in the name of the column; `quaternion`, or `none` where there are no headings
     score: Floats = field(default_factory=_unset)
@@ -71,6 +73,7 @@ class Draft:
     covariance: Floats | None = None  # (R, 3, 3), then (B, 3, 3)
     row: Ints = field(default_factory=_unset)  # (B,)
     kind: Ints = field(default_factory=_unset)  # (B,) number of the class
+    apart: tuple[str, ...] = ()  # classes whose boxes are things of their own, however close
     pose: Floats | None = None  # (R, 7)
     moves: Moves = field(default_factory=_unset)  # of the boxes, in the world
     velocity: Floats | None = None  # (B, 2)
@@ -117,6 +120,7 @@ class Boxes:
     key_columns: tuple[str, ...]
     sensor_column: str  # one of `key_columns`, with the sensor; empty: none
     keys: Mapping[str, tuple[str, ...]]  # key -> values of the columns that it stands for
+    apart: tuple[str, ...] = ()  # classes whose boxes are things of their own, however close
     camera: "GroundCamera | None" = None  # that placed the boxes
 
     def rows(self, first: int, last: int) -> "Boxes":
@@ -188,7 +192,7 @@ def column_numbers(reading: Reading, draft: Draft, role: str, name: str) -> Floa
         if 1 < near.sum() < len(near) and (found[near] == mark).all():
             text = f"column {name} has {mark} in {near.sum()} rows, as a mark for no value"
             reading.doubt("rows", text, f"--option missing={mark}")
-    return np.where(np.isin(found, reading.marks), np.nan, found) if reading.marks else found
+    return np.where(np.isin(found, reading.marks), np.nan, found) if reading.marks and role not in _COUNTS else found
 
 
 def leave_out(reading: Reading, kept: Bools, bad: Bools, what: str) -> Bools:

@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from optipmb_tools.datasets.motion import SPEEDS, find_reports, overlapping, typical_speed
+from optipmb_tools.datasets.motion import MOST_ALONE, REACH, SPEEDS, find_reports, kinds_apart, next_steps, overlapping
 from optipmb_tools.datasets.table.draft import Draft, Stamps
 from optipmb_tools.datasets.table.findings import NOISE, Reading
 from optipmb_tools.datasets.table.times import (
@@ -27,13 +27,21 @@ FASTEST: Final = 30.0  # frames a second of a detector
 UNITS_APART: Final = 100.0  # ratio of steps, many of either length, from which stamps have two units
 _TWICE: Final = 0.25  # share of boxes at the place of another one from which objects are reported twice
 _MOST_SENSORS: Final = 16
+_MANY: Final = 30  # boxes that tell whether any can be followed
 
 
 def step(reading: Reading, draft: Draft) -> Draft:
     """Group the rows into frames, and doubt their stamps by the places of the boxes."""
     framed = replace(draft, stamps=_framed(reading, draft))
     _check_times(reading, framed)
-    return framed
+    frame = np.unique(np.column_stack([draft.series, framed.stamps.ns])[draft.row], axis=0, return_inverse=True)[1]
+    apart = kinds_apart(frame.reshape(-1), draft.center[:, :2], draft.size, draft.kind)
+    names = sorted(set(draft.name[np.isin(draft.kind, apart)].tolist()))
+    if names:
+        reading.note(
+            "rows", f"boxes of class {', '.join(names)} stand close together and keep apart: each is one thing"
+        )
+    return replace(framed, apart=tuple(names))
 
 
 def reports(reading: Reading, draft: Draft) -> Draft:
@@ -45,7 +53,15 @@ def reports(reading: Reading, draft: Draft) -> Draft:
     if found is not None:
         text = f"objects report one by one: a frame is a look at {found.distance:.3g} m around its box"
         reading.doubt("time", text, "--option group=SECONDS joins them")
-    return replace(draft, reports=found)
+        return replace(draft, reports=found)
+    steps, times = next_steps(draft.series[row], draft.stamps.ns[row] / 1e9, draft.center[:, :2], draft.kind)
+    far = steps > REACH[0] + SPEEDS[0] * times
+    if len(steps) >= _MANY and far.mean() > MOST_ALONE and not {"time", "rate", "group"} & reading.options.keys():
+        received = f"{far.mean():.0%} of {len(steps)} boxes without one of their class within {SPEEDS[0]:g} m/s"
+        received += f": the nearest are {np.median(steps):.3g} m away after {np.median(times):.3g} s"
+        how = "--option time=UNIT, rate=HZ, length_factor=FACTOR; time=s keeps seconds"
+        reading.refuse("time", "boxes that can be followed from frame to frame", received, how)
+    return draft
 
 
 def _framed(reading: Reading, draft: Draft) -> Stamps:
@@ -95,7 +111,8 @@ def _check_times(reading: Reading, draft: Draft) -> None:
     counted = "stamp" not in draft.roles or {"time", "rate"} & reading.options.keys()
     if counted or not may_be_seconds(stamps, series, draft.unit("stamp")):
         return
-    speed = typical_speed(series[row], stamps.ns[row] / 1e9, draft.center[:, :2], draft.kind)
+    steps, times = next_steps(series[row], stamps.ns[row] / 1e9, draft.center[:, :2], draft.kind)
+    speed = float(np.quantile(steps / times, 0.75)) if len(steps) else 0.0  # others may stand
     if speed > SPEEDS[0]:
         received = f"whole numbers that may be seconds; in milliseconds, boxes go at {speed:.3g} m/s"
         reading.refuse("time", "a unit of time", received, "--option time=s, or time=ms")

@@ -17,7 +17,7 @@ from optipmb_tools.datasets.table.findings import HALF, NOISE, Claim, Reading
 from optipmb_tools.datasets.table.poses import rotated
 from optipmb_tools.datasets.table.scores import FEW
 from optipmb_tools.files import DatasetError
-from optipmb_tools.geometry import Floats, Ints, wrap_angle
+from optipmb_tools.geometry import Bools, Floats, Ints, wrap_angle
 
 ENOUGH_MOVES: Final = 5  # moves from which headings are compared with motion
 REFUSED_MOVES: Final = 80  # moves of several objects from which headings are refused
@@ -243,28 +243,28 @@ def _velocity(reading: Reading, draft: Draft) -> Floats | None:
     if len(draft.moves) and not np.nan_to_num(velocity).any():  # as detectors without velocities write
         reading.note("velocity", "every velocity is 0 though boxes move: velocities are unknown")
         return None
-    posed = draft.pose is not None
-    axes = read_velocity(reading, velocity, draft.moves, partial(_carry, draft), posed=posed)
+    axes, wrong = read_velocity(reading, velocity, draft.moves, draft, posed=draft.pose is not None)
     if axes == "world" and draft.pose is not None:
         flat = np.column_stack([velocity, np.zeros(len(velocity))])
         velocity = rotated(draft.pose[draft.row, 3:] * _INVERSE, flat)[:, :2]
+    chain = draft.moves.chain
+    velocity[np.isin(chain, wrong) | ((chain < 0) & bool(len(wrong)))] = np.nan  # of later ones nothing is known
     return velocity
 
 
-def read_velocity(
-    reading: Reading, velocity: Floats, moves: Moves, carry: Callable[[Floats, Ints], Floats], *, posed: bool
-) -> str:
-    """Return the axes of velocities (B, 2), m/s, NaN where unknown: `sensor`, or `world` where boxes are `posed`.
+def read_velocity(reading: Reading, velocity: Floats, moves: Moves, draft: Draft, *, posed: bool) -> tuple[str, Ints]:
+    """Return the axes of velocities (B, 2), m/s, NaN where unknown, and the objects whose velocities contradict motion.
 
-    The other arguments are as for `read_heading`.
+    The axes are `sensor`, or `world` where boxes are `posed`.
     """
     asked = reading.chosen("velocity", ("sensor", "world"))
     known = moves.take(np.asarray(np.isfinite(velocity[moves.start]).all(axis=1)))
+    none = np.empty(0, dtype=np.int64)
     if len(known) < ENOUGH_MOVES:
-        return asked or "sensor"
+        return asked or "sensor", none
     given = velocity[known.start]
     speed = np.hypot(*given.T)
-    course = carry(np.arctan2(given[:, 1], given[:, 0]), known.start)
+    course = _carry(draft, np.arctan2(given[:, 1], given[:, 0]), known.start)
     along = {"sensor": speed[:, None] * np.column_stack([np.cos(course), np.sin(course)]), "world": given}
     real = np.hypot(*known.velocity.T)
     off = {axes: np.linalg.norm(one - known.velocity, axis=1) for axes, one in along.items()}
@@ -278,8 +278,31 @@ def read_velocity(
         for axes, other in (("sensor", "world"), ("world", "sensor"))
     ]
     axes = reading.decide("velocity", claims, asked=asked)
-    fits = off[axes] < np.maximum(2.0 * SLOW, 0.5 * real)
+    most = np.maximum(2.0 * SLOW, 0.5 * real)
+    fits = off[axes] < most
+    if fits.mean() >= HALF:
+        objects, place = np.unique(known.object, return_inverse=True)
+        count = np.bincount(place)
+        wrong = objects[(np.bincount(place, fits) < HALF * count) & (count >= ENOUGH_MOVES)]
+        if len(wrong) and asked is None:
+            mine = np.isin(known.object, wrong)
+            text = f"velocities of {len(wrong)} of {len(objects)} objects contradict their motion and are left out"
+            heading = _carry(draft, draft.yaw[known.start], known.start) if draft.yaw_unit != "none" else course
+            turn = heading + np.arctan2(given[:, 1], given[:, 0])
+            own = speed[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
+            ways = (
+                ("are along the heading of the box", own),
+                ("point backwards", -along[axes]),
+                ("are of another unit or relative to the sensor", known.velocity),
+            )
+            how = next(word for word, one in ways if _near(one, known.velocity, most)[mine].mean() >= HALF)
+            reading.note("velocity", f"{text}: they {how}", "--option velocity=sensor keeps them")
+            return axes, wrong
     clash = f"velocities and motion disagree: {np.median(speed):.3g} m/s on average, boxes move at"
     clash += f" {np.median(real):.3g} m/s; another unit, or relative to the sensor?"
     claims = [Claim(axes, Evidence(float(fits.sum()), len(known)))]
-    return reading.decide("velocity", claims, "moves have the velocity of their box", clash=clash, least=HALF)
+    return reading.decide("velocity", claims, "moves have the velocity of their box", clash=clash, least=HALF), none
+
+
+def _near(one: Floats, other: Floats, most: Floats) -> Bools:
+    return np.asarray(np.linalg.norm(one - other, axis=1) < most, dtype=np.bool_)

@@ -11,7 +11,6 @@ from optipmb_tools.datasets.table.findings import Reading
 from optipmb_tools.datasets.table.sizes import LARGEST_SIZE
 from optipmb_tools.files import LARGEST
 from optipmb_tools.geometry import Bools
-from optipmb_tools.table_files import unique_texts
 
 _READ: Final = ("x", "y", "z", "l", "w", "h", "yaw", "score", "class")
 
@@ -39,7 +38,7 @@ def boxes(reading: Reading, draft: Draft) -> Draft:
     arrays = {name: getattr(draft, name) for name in ("center", "size", "yaw", "score", "name", "id", "covariance")}
     if len(row) < draft.rows:
         arrays = {name: None if one is None else one[row] for name, one in arrays.items()}
-    return replace(draft, row=row, **arrays, kind=unique_texts(arrays["name"])[1])
+    return replace(draft, row=row, **arrays)
 
 
 def _doubled(draft: Draft) -> Bools:
@@ -66,7 +65,7 @@ def _valid(reading: Reading, draft: Draft, kept: Bools) -> Bools:
     option = f"--option invalid=skip leaves such rows out{marks}"
     for what, values, fine in (
         ("finite x, y and z", center, (np.abs(center) <= LARGEST).all(axis=1)),
-        ("positive length, width and height", size, (np.isfinite(size) & (size > 0.0)).all(axis=1)),
+        ("positive length, width and height", size, (np.isfinite(size) & (size > 0.0)).all(axis=1) | draft.unsized),
         (
             f"sizes up to {LARGEST_SIZE:g} m, or --option size_factor=0.01 or 0.001, length_factor for all lengths",
             size,

@@ -7,12 +7,15 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from optipmb_tools.datasets.motion import are_people, find_moves
 from optipmb_tools.datasets.table.draft import Draft
-from optipmb_tools.datasets.table.findings import Reading
+from optipmb_tools.datasets.table.findings import HALF, Reading
 from optipmb_tools.geometry import Ints
 from optipmb_tools.table_files import NO_VALUE, unique_texts
 
 NO_CLASS: Final = "object"  # class of all boxes of a table without classes
+_ENOUGH: Final = 5  # changes of name from which two names may be of one class
+_WALKING: Final = "pedestrian"
 NO_ID: Final = -1  # id of a box that has none
 _NUMBERED: Final = re.compile(r"(.*[^\W\d_])[\W_]*\d+|\d+[\W_]*([^\W\d_].*)")  # a class, a number of an object
 
@@ -32,6 +35,73 @@ def step(reading: Reading, draft: Draft) -> Draft:
     """Read the classes and ids."""
     names, objects = _classes(reading, draft)
     return replace(draft, name=names, id=_ids(draft, objects))
+
+
+def spellings(reading: Reading, draft: Draft) -> Draft:
+    """Make one class of the spellings of one, and of names of one kind between which objects change.
+
+    `Car`, `car` and `vehicle.car` are spellings. `person` and `pedestrian` may be two classes, or of two schemes: in
+    one scheme an object keeps its name.
+    """
+    names, place = unique_texts(draft.name)
+    asked = {one for name, one in reading.options.items() if name.startswith("class.")}
+    free = [name for name in names.tolist() if name and name not in asked]
+    if len(free) < 2:  # noqa: PLR2004  one name has no other spelling
+        return replace(draft, kind=place)
+    from optipmb.class_names import common_name  # noqa: PLC0415  loads the tracker, which few tables need
+
+    kind = {name: common_name(name) or _plain(name) for name in free}
+    if len(set(kind.values())) == len(kind):
+        return replace(draft, kind=place)
+    share = dict(zip(names.tolist(), np.bincount(place, minlength=len(names)).tolist(), strict=True))
+    first: dict[str, str] = {}
+    for name in sorted(free, key=lambda one: -share[one]):
+        same = (one for one in first if kind[one] == kind[name])
+        alike = [one for one in same if _plain(one) == _plain(name) or _change(draft, names, place, one, name)]
+        first[name] = first[alike[0]] if alike else name
+    merged = {name: one for name, one in first.items() if name != one}
+    if not merged:
+        return replace(draft, kind=place)
+    for one in dict.fromkeys(merged.values()):
+        others = ", ".join(name for name in sorted(merged) if merged[name] == one)
+        text = f"{others} and {one} are read as one class, {one}"
+        reading.note("class", text, f"--option class.{others.split(', ')[0]}=NAME keeps it")
+    name = np.array([merged.get(name, name) for name in names.tolist()], dtype=np.str_)[place]
+    return replace(draft, name=name, kind=unique_texts(name)[1])
+
+
+def people(reading: Reading, draft: Draft) -> Draft:
+    """Give a table without classes that of people where its boxes are theirs."""
+    if not draft.scored or "class" in draft.roles or set(draft.name.tolist()) != {NO_CLASS}:
+        return draft
+    size = None if draft.centres or not {"l", "w", "h"} <= draft.roles.keys() else draft.size
+    stamps = np.unique(draft.stamps.ns[draft.row], return_inverse=True)[1]
+    if not are_people(stamps + draft.series[draft.row] * len(draft.row), draft.center[:, :2], size, draft.moves):
+        return draft
+    what = "speeds and distances" if size is None else "sizes"
+    reading.note(
+        "class", f"boxes have the {what} of people: they are of class {_WALKING}", "--option class.object=NAME"
+    )
+    name = np.full(len(draft.name), _WALKING)
+    return replace(draft, name=name, apart=(_WALKING,) if draft.apart else ())
+
+
+def _plain(name: str) -> str:
+    """Return the last part of the name of a class in small letters: `vehicle.car` is `car`."""
+    return re.sub(r"[\W_]+", "_", re.split(r"[./:]", re.sub(r"([a-z])([A-Z])", r"\1_\2", name))[-1].lower()).strip("_")
+
+
+def _change(draft: Draft, names: NDArray[np.str_], place: Ints, one: str, other: str) -> bool:
+    """Tell whether objects change between two names: where a box of either has a box of the other next."""
+    own = np.flatnonzero(np.isin(place, [np.flatnonzero(names == name)[0] for name in (one, other)]))
+    row = draft.row[own]
+    moves = find_moves(
+        draft.series[row], draft.stamps.ns[row] / 1e9, draft.center[own, :2], np.zeros(len(own), dtype=np.int64)
+    )
+    names_of = place[own]
+    changed = names_of[moves.start] != names_of[moves.end]
+    part = float(np.mean(names_of[moves.start] == names_of[0])) if len(changed) else 0.0
+    return int(changed.sum()) >= _ENOUGH and float(changed.mean()) > HALF * 2.0 * part * (1.0 - part)
 
 
 def _joined(draft: Draft, names: tuple[str, ...]) -> tuple[NDArray[np.str_], dict[str, tuple[str, ...]]]:

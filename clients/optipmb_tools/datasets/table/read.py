@@ -16,7 +16,17 @@ from optipmb_tools.table_files import Columns, frame_numbers, read_table
 
 STEPS: Final = (
     *(roles.step, names.keys, times.step, names.step, places.step, sizes.step, headings.step, scores.step, kept.step),
-    *(scores.probabilities, places.covariances, kept.boxes, sizes.order, places.axes, frames.step, poses.step),
+    *(
+        scores.probabilities,
+        places.covariances,
+        kept.boxes,
+        names.spellings,
+        sizes.order,
+        places.axes,
+        frames.step,
+        poses.step,
+        names.people,
+    ),
     *(headings.along, headings.velocities, frames.reports, roles.note),
 )
 """Steps of the reading, in this order; each reads fields of the draft that earlier ones set."""
@@ -127,5 +137,6 @@ def _boxes(reading: Reading, draft: Draft) -> Boxes:
         key_columns=draft.key_columns,
         sensor_column="" if sensor is None else sensor.name,
         keys=draft.keys,
+        apart=draft.apart,
         camera=draft.placed.camera if draft.placed else None,
     )

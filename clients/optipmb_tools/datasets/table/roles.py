@@ -16,7 +16,7 @@ from optipmb_tools.datasets.table.pixels import METRES
 from optipmb_tools.table_files import NO_VALUE, Columns, frame_numbers, is_number, unique_texts
 
 _MOST_SHOWN: Final = 6
-_NEEDED: Final = ("x", "y")  # with texts they are refused where a text stands
+_NEEDED: Final = ("x", "y", "lat", "lon", "l", "w")  # with texts they are refused where a text stands
 _FEW_CLASSES: Final = 64
 _LONGEST: Final = 30.0  # boxes that are longer, in metres, are suspicious
 _LOOKED_AT: Final = 200  # texts of a column that tell whether it has numbers

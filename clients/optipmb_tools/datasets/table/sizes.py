@@ -34,7 +34,11 @@ def step(reading: Reading, draft: Draft) -> Draft:
     ends = (("l", 1.0 if centres else None), ("w", 1.0 if centres else None), ("h", 1.5))
     factor = reading.positive("size_factor", "a factor of sizes") or 1.0
     size = factor * np.column_stack([numbers(reading, draft, role, without) for role, without in ends])
-    return replace(draft, size=size, centres=centres)
+    unsized = np.asarray((size[:, :2] == 0.0).all(axis=1))
+    if unsized.any():
+        reading.note("sizes", f"{int(unsized.sum())} rows have a size of 0: it is unknown")
+        size[unsized] = np.nan
+    return replace(draft, size=size, centres=centres, unsized=unsized)
 
 
 def order(reading: Reading, draft: Draft) -> Draft:

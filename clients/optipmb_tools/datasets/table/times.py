@@ -7,6 +7,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from optipmb_tools.datasets.table.columns import UNITS, Column
 from optipmb_tools.datasets.table.draft import Draft, Stamps, missing, numbers
 from optipmb_tools.datasets.table.findings import HALF, Reading
 from optipmb_tools.geometry import Bools, Ints
@@ -26,6 +27,11 @@ _WRAPS: Final = (
     *(size * 10.0**power for size in (1, 60, 3600, 86400, 604800) for power in (0, 3, 6, 9)),
 )
 """Ends of counters: of bits, a second, a minute, an hour, a day and a week, in any unit."""
+_MEASURED: Final = re.compile(r"([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*([a-zA-Z]+)")
+_DIGITS: Final = 18
+DAY: Final = 86400.0
+_DAYS: Final = {"a spreadsheet": (25569.0, (30_000.0, 80_000.0)), "MATLAB": (719529.0, (700_000.0, 800_000.0))}
+"""Days of 1970-01-01 in the serial dates of programs, and the days of dates from 1982 to 2119."""
 _TURN: Final = 40.0  # what hhmmss counts too much at the turn of a minute
 _YEARS: Final = (1970, 2100)
 _CLOCK: Final = (24, 60, 60)
@@ -128,6 +134,8 @@ def read_stamps(reading: Reading, numbers: np.ndarray, key: Ints, unit: str | No
     asked = reading.chosen("time", SECONDS)
     if asked is None and len(numbers) and (read := _calendar(reading, numbers, unit)) is not None:
         return unwrapped(reading, read, key)
+    if asked is None and unit is None and (days := _serial_days(reading, numbers, key)) is not None:
+        return days
     numbers = unwrapped(reading, numbers, key)
     first = None if frame is None else rows_of_frames(numbers, frame, key)
     period = median_step(numbers if first is None else numbers[first], key)
@@ -168,6 +176,22 @@ def nanoseconds(reading: Reading, numbers: NDArray[Any], unit: float) -> Ints:
     if numbers.dtype.kind in "iu" and unit.is_integer():
         return numbers.astype(np.int64) * int(unit)
     return np.round(numbers * unit).astype(np.int64)
+
+
+def _serial_days(reading: Reading, numbers: np.ndarray, key: Ints) -> Ints | None:
+    """Return stamps in nanoseconds of days with decimals, as spreadsheets and MATLAB count them; None of others."""
+    if numbers.dtype.kind != "f" or not len(numbers):
+        return None
+    step = median_step(np.round(numbers * DAY, 4), key)  # such numbers have the digits of microseconds
+    for program, (epoch, (low, high)) in _DAYS.items():
+        if (
+            low <= numbers.min()
+            and numbers.max() <= min(high, numbers.min() + 1.0)
+            and PERIODS[0] <= step <= PERIODS[1]
+        ):
+            reading.note("time", f"stamps are days of {program}", "--option time=UNIT")
+            return np.round((numbers - epoch) * DAY * 1e4).astype(np.int64) * 100_000
+    return None
 
 
 def _calendar(reading: Reading, numbers: np.ndarray, unit: str | None) -> Ints | None:
@@ -267,18 +291,7 @@ def _stamps(reading: Reading, draft: Draft) -> Stamps:
         reading.note("time", f"stamps are dates in column {column.name}")
         return Stamps(values.astype("datetime64[ns]").astype(np.int64), values, column.name, skipped)
     shown = values
-    if values.dtype.kind == "U" and (clock := read_clock(values)) is not None:
-        reading.note("time", f"stamps are times of a day in column {column.name}")
-        values = clock
-    if values.dtype.kind not in "iuf":
-        bad = np.array([not is_number(text) for text in values.tolist()], dtype=np.bool_)
-        expected = f"stamps in column {column.name}: numbers, or dates as YYYY-MM-DD HH:MM:SS.ffffff"
-        reading.strict().first("time", bad, expected, values)
-        texts = [text.strip() for text in values.tolist()]
-        integers = all(text.lstrip("+-").isdigit() for text in texts)  # as nanoseconds with an empty cell
-        values = np.array(
-            [int(text) for text in texts] if integers else texts, dtype=np.int64 if integers else np.float64
-        )
+    values, unit = _of_texts(reading, values, column) if values.dtype.kind not in "iuf" else (values, column.unit)
     if rate is not None:
         counted = "nanosec" not in found and bool(np.all((values == np.round(values)) & (values < DATED[0])))
         if counted:
@@ -293,9 +306,34 @@ def _stamps(reading: Reading, draft: Draft) -> Stamps:
         reading.note("time", f"stamps are {column.name} + {found['nanosec'].name}")
         stamp = values.astype(np.int64) * 1_000_000_000 + part.astype(np.int64)
         return Stamps(stamp, stamp, "stamp_ns", skipped)
-    unit = "s" if shown is not values else column.unit
     stamp = read_stamps(reading, values, draft.series, unit, draft.frame_numbers)
     return Stamps(stamp, shown if shown.dtype.kind == "U" and unit == "s" else values, column.name, skipped)
+
+
+def _of_texts(reading: Reading, values: NDArray[Any], column: Column) -> tuple[np.ndarray, str | None]:
+    """Return the numbers (R,) of stamps that are texts, and their unit."""
+    if values.dtype.kind == "U" and (clock := read_clock(values)) is not None:
+        reading.note("time", f"stamps are times of a day in column {column.name}")
+        return clock, "s"
+    if values.dtype.kind == "U" and (measured := _measured(values)) is not None:
+        return measured
+    bad = np.array([not is_number(text) for text in values.tolist()], dtype=np.bool_)
+    expected = f"stamps in column {column.name}: numbers, or dates as YYYY-MM-DD HH:MM:SS.ffffff"
+    reading.strict().first("time", bad, expected, values)
+    texts = [text.strip() for text in values.tolist()]
+    # Nanoseconds with an empty cell are texts; what is beyond 64 bits fits no unit.
+    if all(text.lstrip("+-").isdigit() and len(text) <= _DIGITS for text in texts):
+        return np.array([int(text) for text in texts], dtype=np.int64), column.unit
+    return np.array(texts, dtype=np.float64), column.unit
+
+
+def _measured(texts: NDArray[np.str_]) -> tuple[np.ndarray, str] | None:
+    """Return the numbers of texts as `0.1 sec`, and their unit; None where they have none, or several."""
+    found = [_MEASURED.fullmatch(text.strip()) for text in texts.tolist()]
+    units = {match[2].lower() for match in found if match is not None}
+    if None in found or len(units) != 1 or (unit := UNITS.get(units.pop())) not in SECONDS:
+        return None
+    return np.array([float(match[1]) for match in found if match is not None]), str(unit)
 
 
 def _counted(reading: Reading, draft: Draft, rate: float | None) -> Stamps:
