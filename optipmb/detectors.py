@@ -27,19 +27,23 @@ if TYPE_CHECKING:
     from optipmb.ground_camera import GroundCamera
     from optipmb.rows import Array
 
-    Classes = Sequence[str] | None
+    Classes = Sequence[str] | Mapping[int, str] | None
 
 _BOX: Final = ("detection_name", "translation", "size", "rotation")
 
 
 def from_detector(
-    result: Any, *, classes: Sequence[str] | None = None, camera: GroundCamera | None = None, form: str | None = None
+    result: Any,
+    *,
+    classes: Sequence[str] | Mapping[int, str] | None = None,
+    camera: GroundCamera | None = None,
+    form: str | None = None,
 ) -> dict[str, Any]:
     """Return the columns of a detector's result for one frame.
 
     Args:
         result: of one of the forms of this module; a list of one result is that result.
-        classes: names of the classes that the labels are the places of; some forms have them.
+        classes: names of the classes that the labels are the places of, or by label; some forms have them.
         camera: that pixel boxes need; it becomes a column, for `update`.
         form: of the result, where it could be several.
 
@@ -49,7 +53,9 @@ def from_detector(
     found = forms_of(result) if form is None else (form,)
     if len(found) != 1 or found[0] not in _FORMS:
         received = f"{type(result).__name__}, {' and '.join(found) or 'none of them'}"
-        raise FrameError("boxes", f"a result of {', '.join(_FORMS)}, or form=", received)
+        way = "give others as columns: update({'center', 'size', 'yaw', 'score', 'class'}), or boxes of an image as "
+        way += "update({'box', 'class', 'score'}, camera=…)"
+        raise FrameError("boxes", f"a result of {', '.join(_FORMS)}, or form=; {way}", received)
     one = result if found[0] == "nuscenes" else _one(result)
     return _FORMS[found[0]](one, classes, camera)
 
@@ -117,6 +123,12 @@ def _names(name: str, labels: Array, classes: Classes, first: int = 0) -> list[s
     """Return the names of labels, which count from `first`."""
     if len(labels) and not classes:
         raise FrameError("classes", f"the names of the classes that {name} counts", "none")
+    if isinstance(classes, Mapping):
+        known = {int(label): str(name) for label, name in classes.items()}
+        for place, label in enumerate(labels.tolist()):
+            if label not in known:
+                raise FrameError(f"{name}[{place}]", f"one of {', '.join(map(str, known))}", f"{label:g}")
+        return [known[int(label)] for label in labels]
     names = tuple(classes or ())
     for place, label in enumerate(labels.tolist()):
         if label != int(label) or not first <= label < first + len(names):
@@ -196,8 +208,7 @@ def _ultralytics(result: Any, classes: Classes, camera: GroundCamera | None) -> 
     boxes = _array("boxes.xyxy", result.boxes.xyxy, (4,))
     score, labels = (_array(f"boxes.{name}", getattr(result.boxes, name), ()) for name in ("conf", "cls"))
     _columns("boxes.xyxy", len(boxes), conf=score, cls=labels)
-    names = classes or [str(result.names.get(place, "")) for place in range(max(result.names, default=-1) + 1)]
-    return _of_pixels(boxes, score, _names("boxes.cls", labels, names), camera)
+    return _of_pixels(boxes, score, _names("boxes.cls", labels, classes or result.names), camera)
 
 
 def _of_pixels(boxes: Array, score: Array, names: list[str], camera: GroundCamera | None) -> dict[str, Any]:

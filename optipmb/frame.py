@@ -50,6 +50,8 @@ LONGEST_MODEL: Final = 64
 UNIT_TOLERANCE = 1e-3
 """How far the norm of a quaternion may be from one; it is normalised afterwards."""
 
+MAX_YAW: Final = 6.4
+"""Largest yaw, rad: a turn, and what rounding adds."""
 MAX_COORDINATE = 1e8
 """Coordinates beyond this (metres) are not positions on Earth; the limit keeps squares far from overflow."""
 
@@ -402,7 +404,7 @@ def allowed(label: Index, n_labels: int, center: Array, size: Array, yaw: Array,
     good = True
     for m in range(label.shape[0]):  # NaN compares as not good
         good &= 0 <= label[m] < n_labels
-        good &= abs(yaw[m]) <= MAX_COORDINATE or np.isnan(yaw[m])
+        good &= abs(yaw[m]) <= MAX_YAW or np.isnan(yaw[m])
         good &= 0.0 < score[m] <= 1.0
         for s in range(3):
             good &= abs(center[m, s]) <= MAX_COORDINATE or (s == 2 and np.isnan(center[m, s]))  # noqa: PLR2004 - z
@@ -418,8 +420,10 @@ def _refuse(label: Index, n_labels: int, center: Array, size: Array, yaw: Array,
     z_known = np.where(np.isnan(center) & (np.arange(3) == 2), 0.0, center)  # noqa: PLR2004 - z may be unknown
     size_known, yaw_known = np.where(np.isnan(size), 1.0, size), np.where(np.isnan(yaw), 0.0, yaw)
     bounds = (("center", z_known, MAX_COORDINATE), ("size", size_known, MAX_COORDINATE))
-    for path, values, bound in (*bounds, ("yaw", yaw_known, MAX_COORDINATE), ("score", score, 1.0)):
+    for path, values, bound in (*bounds, ("score", score, 1.0)):
         _bounded(path, values, bound)
+    expected = f"radians from -{MAX_YAW:g} to {MAX_YAW:g} (numpy.radians converts degrees)"
+    _all("yaw", np.abs(yaw_known) <= MAX_YAW, expected, yaw)
     _all("size", size_known > 0, "a positive length", size)
     _all("score", score > 0, "a score in (0, 1]", score)
     unknown = np.isnan(velocity).all(axis=1, keepdims=True)

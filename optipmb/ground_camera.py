@@ -161,26 +161,41 @@ class Homography(Lens):
     @model_validator(mode="after")
     def _invertible(self) -> Self:
         matrix = np.array(self.matrix)
-        if np.linalg.matrix_rank(matrix / max(np.abs(matrix).max(), 1e-300), tol=1e-15) < 3:  # noqa: PLR2004 - 3 x 3
+        rows = matrix / np.maximum(np.abs(matrix).max(axis=1, keepdims=True), 1e-300)
+        if np.linalg.matrix_rank(rows, tol=1e-15) < 3:  # noqa: PLR2004 - 3 x 3
             raise ParameterError("matrix", "a matrix that has an inverse", "a singular one")
-        if not np.isfinite(self.on_ground(np.array(self.reference))).all():
+        if not np.isfinite(self._place).all():
             raise ParameterError("reference", "a pixel on the ground", f"{self.reference}, on the horizon")
+        if np.linalg.det(self._near) > 0.0:
+            expected = "a map as a camera above the ground sees it: x, y and z up are right-handed, v points down"
+            raise ParameterError("matrix", expected, "a mirrored one; is y down in the map, or are u and v exchanged?")
         return self
+
+    @cached_property
+    def _place(self) -> Array:
+        """Place (2,) of the reference, from which all are measured: coordinates of maps have millions of metres."""
+        matrix, at = np.array(self.matrix), np.append(self.flat(np.array(self.reference)), 1.0)
+        mapped = matrix @ at
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(
+                np.where(abs(mapped[2]) > 1e-12 * np.abs(matrix[2] * at).max(), mapped[:2] / mapped[2], np.nan)
+            )
+
+    @cached_property
+    def _near(self) -> Array:
+        """The matrix (3, 3) to places from `_place`, with the sign that makes the third coordinate positive there."""
+        matrix = np.array(self.matrix)
+        matrix = matrix * np.sign(matrix[2] @ np.append(self.flat(np.array(self.reference)), 1.0))
+        return np.asarray(np.vstack([matrix[:2] - self._place[:, None] * matrix[2], matrix[2]]))
 
     @cached_property
     def base(self) -> Array | None:
         """Place (2,) on the ground below the camera, None where it is unknown."""
         return None if self.position is None else np.array(self.position)
 
-    @cached_property
-    def mapping(self) -> Array:
-        """The matrix (3, 3) with the sign that makes the third coordinate positive on the ground."""
-        matrix = np.array(self.matrix)
-        return np.asarray(matrix * np.sign(matrix[2] @ np.append(self.flat(np.array(self.reference)), 1.0)))
-
     def on_ground(self, pixels: Array) -> Array:
         """Return the places (..., 2) that pixels (..., 2) show; NaN beyond the horizon."""
-        return _mapped(self.mapping, self.flat(pixels))
+        return np.asarray(_mapped(self._near, self.flat(pixels)) + self._place)
 
     @staticmethod
     def lifted(places: Array, height: float) -> Array:
@@ -189,8 +204,8 @@ class Homography(Lens):
 
     def project(self, points: Array) -> Array:
         """Return the pixels (..., 2) of points (..., 3) on the ground, whose z is not read."""
-        inverse = np.linalg.inv(self.mapping)
-        return self.curved(_mapped(np.asarray(inverse, np.float64), points[..., :2]))
+        inverse = np.linalg.inv(self._near)
+        return self.curved(_mapped(np.asarray(inverse, np.float64), points[..., :2] - self._place))
 
 
 def _mapped(matrix: Array, points: Array) -> Array:

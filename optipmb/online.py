@@ -21,8 +21,10 @@ from warnings import warn
 
 import numpy as np
 
-from optipmb.class_names import class_indices, common_name
+from optipmb.class_names import class_indices
 from optipmb.detectors import forms_of, from_detector, on_host
+from optipmb.doubts import EXPECTED as SIZES
+from optipmb.doubts import SizeCheck
 from optipmb.errors import FrameError
 from optipmb.frame import Pose, make_frame
 from optipmb.tracker import Tracker
@@ -76,9 +78,6 @@ DOUBTED: Final = 20
 """Frames in succession with odd times after which a warning follows."""
 STEPS_NS: Final = 10**6, 10**10
 """Times between frames that are not odd: no object is followed from one frame to the next over ten seconds."""
-COMPARED: Final = 100
-"""Boxes of vehicles whose length is compared with their width."""
-LONG: Final = frozenset({"car", "truck", "bus", "trailer"})
 
 
 @dataclass(frozen=True)
@@ -349,9 +348,8 @@ class OnlineTracker:
         self._leave_out = unknown_classes == "leave out"
         self.density: Density = self._tracker.initial()
         self._latest = ""  # summary of the newest tracks
-        self._is_long = np.array([common_name(name) in LONG for name in self.parameters.labels])
-        self._odd_steps = self._boxes = self._wide = 0
-        self._has_warned_of_yaw = False
+        self._odd_steps = 0
+        self._sizes = SizeCheck()
         self._velocities = VelocityCheck()
 
     def __repr__(self) -> str:
@@ -402,8 +400,8 @@ class OnlineTracker:
                 back; names it. The density stays as it was.
 
         Warns:
-            UserWarning: the times are not in seconds, the headings in degrees, the widths before the lengths, or the
-                velocities in contradiction to the boxes, by all appearance; once each.
+            UserWarning: the times are not in seconds, the sizes in another unit or the widths before the lengths, or
+                the velocities in contradiction to the boxes, by all appearance; once each.
         """
         if not isinstance(pose, Pose | None):
             raise FrameError("pose", "an optipmb.Pose of a translation and a quaternion", type(pose).__name__)
@@ -446,7 +444,7 @@ class OnlineTracker:
         )
         if row is not None:
             frame = replace(frame, source=row[frame.source])
-        self._doubt(frame, columns.get("yaw"))
+        self._doubt(frame)
         result = self._tracker.step(self.density, frame)
         self.density = result.density
         tracks = result.tracks
@@ -468,7 +466,7 @@ class OnlineTracker:
         self._latest = online.summary
         return online
 
-    def _doubt(self, frame: Frame, yaw: ArrayLike | None) -> None:
+    def _doubt(self, frame: Frame) -> None:
         """Warn of a frame whose numbers have another meaning than they should, by all appearance."""
         step_ns = frame.stamp_ns - self.density.stamp_ns
         is_odd = self.density.stamp_ns >= 0 and not STEPS_NS[0] <= step_ns <= STEPS_NS[1]
@@ -476,17 +474,8 @@ class OnlineTracker:
         if self._odd_steps == DOUBTED:
             seconds = f"{DOUBTED} frames in succession, the last {step_ns / 1e9:g} s after the one before"
             warn(f"t: expected seconds (stamp_ns: nanoseconds), received {seconds}", stacklevel=3)
-        given = np.empty(0) if yaw is None else np.asarray(yaw, np.float64)  # a table of text has texts
-        largest = float(np.nanmax(np.abs(given), initial=0.0)) if len(frame.yaw) else 0.0
-        if largest > 4.0 * np.pi and not self._has_warned_of_yaw:
-            self._has_warned_of_yaw = True
-            warn(f"yaw: expected radians, received {largest:g} (numpy.radians converts degrees)", stacklevel=3)
-        if self._boxes < COMPARED:
-            length, width = frame.size[self._is_long[frame.label], :2].T
-            self._boxes, self._wide = self._boxes + len(length), self._wide + int((length < width).sum())
-            if self._boxes >= COMPARED and 2 * self._wide > self._boxes:
-                found = f"{self._wide} of {self._boxes} vehicles wider than long"
-                warn(f"size: expected length, width, height, received {found}", stacklevel=3)
+        if self._sizes.add(frame):
+            warn(f"size: expected {SIZES}, received {self._sizes.contradiction}", stacklevel=3)
         if self._velocities.add(frame, estimated=self.density.sensor_motion is not None):
             warn(f"velocity: expected {EXPECTED}, received {self._velocities.contradiction}", stacklevel=3)
 
@@ -494,7 +483,13 @@ class OnlineTracker:
         """Return the detections of pixel boxes, in the frame of the camera's position."""
         if camera.mount == "fixed" and pose is not None:
             raise FrameError("pose", "none, for the camera is fixed in the world (mount)", "a pose")
-        names, label, _ = self._classes(columns.pop("label"))
+        given = columns.pop("label")
+        if np.asarray(given).dtype.kind in "iuf" and np.size(given):
+            expected = (
+                "names of classes, as detectors count theirs in other orders (names=['person', …] of the detector)"
+            )
+            raise FrameError("label", expected, f"numbers: {np.asarray(given).tolist()!s:.40}")
+        names, label, _ = self._classes(given)
         if not ((label >= 0) & (label < len(names))).all():
             raise FrameError("label", f"integers in [0, {len(names)})", str(label.tolist())[:80])
         return camera.detections(label=np.asarray(names, np.object_)[label], pose=pose, **columns)

@@ -64,19 +64,26 @@ def fit(path: Path, pixels: Floats, points: Floats, image: tuple[int, int], lens
         raise DatasetError(path, f"at least {least} points", str(len(points)))
     if len(points) == IN_PLANE and (_on_line(points[:, :2]) or _on_line(pixels)):
         raise DatasetError(path, "four points of which no three are on one line", "three on a line")
+    if (outside := (pixels < -1.0).any(axis=1) | (pixels > np.array(image) + 1.0).any(axis=1)).any():
+        row = int(np.argmax(outside))
+        how = f"pixels u, v of the image of {image[0]} x {image[1]}"
+        raise DatasetError(path, how, f"{pixels[row].tolist()} of point {row + 1}: are u and v exchanged?")
     document: dict[str, Any] = {"image": list(image), "error": {"largest": 1e4}}
+    middle = np.append(points[:, :2].mean(axis=0), 0.0)  # coordinates of maps have millions of metres
+    near = points - middle
     if lens is None:
         if not flat:
             raise DatasetError(
                 path, "points on the ground, of one z, or --intrinsics", f"z differs by {np.ptp(points[:, 2]):g}"
             )
-        matrix = _homography(pixels, points[:, :2])
+        matrix = _homography(pixels, near[:, :2])
         side = np.insert(pixels, 2, 1.0, axis=1) @ matrix[2]
+        matrix[:2] += middle[:2, None] * matrix[2]
         document["homography"] = {"matrix": matrix.tolist(), "reference": pixels.mean(axis=0).tolist()}
         seen = bool((side > 0.0).all() or (side < 0.0).all())
     else:
-        rotation, position, seen = _pose(pixels, points, lens, flat=flat)
-        place = {"position": position.tolist(), "quaternion": quaternion_of(rotation).tolist()}
+        rotation, position, seen = _pose(pixels, near, lens, flat=flat)
+        place = {"position": (position + middle).tolist(), "quaternion": quaternion_of(rotation).tolist()}
         document["pinhole"] = {**lens, **place, "ground": float(points[0, 2]) if flat else 0.0}
     if not seen:
         raise DatasetError(path, "points on one side of the horizon, in front of the camera", "points on both sides")

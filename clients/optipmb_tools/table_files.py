@@ -379,6 +379,9 @@ def _benchmark(line: str) -> str | None:
         return "labels or results of KITTI's tracking benchmark: --dataset kitti reads a folder of it"
     if len(fields) == 15 and all(numeric):  # noqa: PLR2004  fields of a detection
         return "detections for KITTI's tracking benchmark: --dataset kitti reads a folder of it"
+    if len(fields) in {5, 6} and all(numeric) and all(0.0 <= float(one) <= 1.0 for one in fields[1:]):
+        way = "join them to a table frame,class,xc,yc,w,h,score, which --camera and --option box=cxcywh read"
+        return f"boxes of YOLO, as shares of the image: {way}"
     counted = all(one.isdigit() for one in fields[:2]) or fields[7:] == ["-1"] * 3
     if len(fields) in {9, 10} and counted and fields[0].isdigit() and all(numeric):
         way = "a first line frame,id,x,y,w,h,score,class and --camera place them on the ground"

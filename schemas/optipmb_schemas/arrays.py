@@ -65,6 +65,7 @@ class Array:
         unknown: what may be NaN (null in JSON), not known for this object: a whole `row`, any `number`, or the `last`
             one of a row; empty: nothing.
         wider: the last dimension may be larger than described; further columns are dropped.
+        hint: added to the range in errors.
     """
 
     dtype: str
@@ -74,6 +75,7 @@ class Array:
     above: bool = False
     unknown: Literal["", "row", "number", "last"] = ""
     wider: bool = False
+    hint: str = ""
 
     @cached_property
     def rows(self) -> str | None:
@@ -119,7 +121,7 @@ class Array:
 
     def refused(self, at: int, array: Any) -> MessageError:
         """Return the error of an array whose number `at`, counted row by row, is out of the range."""
-        return invalid(_element(at, array.shape), self.range_described, array.flat[at])
+        return invalid(_element(at, array.shape), f"{self.range_described}{self.hint}", array.flat[at])
 
     def validate(self, value: object) -> Numeric:
         """Return `value` as the array that the description asks for.
@@ -153,7 +155,7 @@ class Array:
             return numeric.of_leaves(leaves, "i8" if whole else "f8", shape)
         except OverflowError:  # an integer beyond what the array can hold: say which
             at = next(i for i, leaf in enumerate(leaves) if not self.low <= leaf <= self.high)
-            raise invalid(_element(at, shape), self.range_described, leaves[at]) from None
+            raise invalid(_element(at, shape), f"{self.range_described}{self.hint}", leaves[at]) from None
 
     def _flatten(self, value: object) -> tuple[list[Any], tuple[int, ...]]:
         """Return the numbers and the shape of nested lists. Every level is checked before the next is opened."""

@@ -140,6 +140,10 @@ class SensorMessage(Header):
             raise MessageError("missing_field", "pose", "a pose, because frame is sensor", "nothing")
 
 
+RADIANS: Final = ", radians (in JSON, `heading` takes degrees clockwise from north)"
+"""Added to the range of headings."""
+
+
 class Detections(SensorMessage):
     """The detected objects of one frame, M of them (M may be 0). One row of every array is one object."""
 
@@ -157,7 +161,7 @@ class Detections(SensorMessage):
         description="Length (along the heading), width, height in metres. A number of NaN (JSON: null) is unknown. "
         "Absent: all are.",
     )
-    yaw: Annotated[Reals, Array("f8", ("M",), -1e4, 1e4, unknown="number")] | None = Field(
+    yaw: Annotated[Reals, Array("f8", ("M",), -6.4, 6.4, unknown="number", hint=RADIANS)] | None = Field(
         default=None,
         description="Heading in radians, counter-clockwise about z from the x axis of `frame`. NaN (JSON: null): "
         "unknown for this object. Absent: for all.",

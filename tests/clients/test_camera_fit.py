@@ -143,7 +143,11 @@ def test_points_on_both_sides_of_the_horizon_are_refused(tmp_path: Path, capsys:
     given = camera(bent=False)
     places = np.array([[12.0, 3.0, 0.0], [13.0, -6.0, 0.0], [30.0, -8.0, 0.0], [-40.0, 16.0, 0.0]])
     homogeneous = given.project(places[:3])
-    behind = np.array([[600.0, -900.0]])
+    behind = np.array([[600.0, 40.0]])
+    lens = given.pinhole
+    assert lens is not None
+    ray = lens.rays(behind[0]) @ lens.pose.rotation.T
+    places[3] = lens.pose.translation - lens.height / ray[2] * ray
     write(tmp_path / "p.csv", np.vstack([homogeneous, behind]), places)
     done = run_here(capsys, "camera", "fit", tmp_path / "p.csv", "--image", "1920x1080")
     assert done.returncode == 2

@@ -69,6 +69,7 @@ COMPUTATION = {
 EXCEPTIONS = {
     # to show why a first frame takes a while; a folder; processes that compile
     "compiled": {"fcntl", "logging", "os", "stat", "subprocess", "tempfile", "time"},
+    "camera_files": {"json"},  # a format of calibrations
     "warm": {"gc", "os", "pickle"},  # the programs of those processes
     "parameters": {"fnmatch"},  # patterns of sensors
     # dates, forms that users ask for, a page for notebooks, and warnings

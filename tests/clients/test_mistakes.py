@@ -89,7 +89,7 @@ MISTAKES: list[tuple[str, Any, list[str], int, str]] = [
     ("no such file", None, [], 2, "expected a table (.csv), received no such file"),
     ("a wrong profile", boxes(), ["--profile", "kiti"], 2, "(is kitti meant?)"),
     ("a wrong option", boxes(), ["--option", "jaw=degrees"], 2, "--option jaw: expected one of time, rate, group, yaw"),
-    ("places in centimetres", boxes(x=100.0 * boxes()["x"]), [], 0, "hardly anything is tracked, 0 of"),
+    ("places in centimetres", boxes(x=100.0 * boxes()["x"]), [], 2, "expected boxes that can be followed from frame"),
     (
         "velocities of another sign",
         boxes(t=np.repeat(np.arange(FRAMES), 3) * 1.0, vx=np.tile([-9.0, 8.0, -7.0], FRAMES), vy=np.zeros(ROWS)),

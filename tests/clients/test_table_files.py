@@ -153,7 +153,7 @@ def test_the_day_is_found_where_a_number_exceeds_twelve(tmp_path: Path) -> None:
             {"date": "ymd"},
             "--option date=dmy (day first) or date=mdy, received 'ymd' for column t",
         ),
-        ("d.csv", "t,x\n1,2\n3\n", {}, "Row #3: Expected 2 columns, got 1"),
+        ("d.csv", "t,x\n1,2\n3\n", {}, "d.csv:3: expected 2 fields in each row"),
         (
             "d.txt",
             "0 1 Car 0 0 -1.5 1 2 3 4 1.5 1.6 4.2 1 1.6 20 1.57\n",

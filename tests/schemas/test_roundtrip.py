@@ -115,7 +115,7 @@ def detections(draw: st.DrawFn) -> Detections:
     center, size, yaw = (
         draw(rows((m, 3), -FAR, FAR)),
         draw(rows((m, 3), 0, 1e4, above=True)),
-        draw(rows((m,), -1e4, 1e4)),
+        draw(rows((m,), -6.4, 6.4)),
     )
     if draw(st.booleans()):
         center[draw(arrays(np.bool_, m)), 2] = np.nan

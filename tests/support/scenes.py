@@ -166,6 +166,7 @@ def _detect(rng: np.random.Generator, options: Options, bodies: list[_Body]) -> 
             size = body.size * rng.uniform(0.9, 1.1, 3)
             score = float(np.clip(body.confidence + rng.normal(0, 0.15), 0.01, 1.0))
             position = np.array([x, y]) + rng.normal(0, 0.15, 2)
+            yaw = yaw if abs(yaw) < math.tau else math.remainder(yaw, math.tau)
             rows.append([body.label, *position, body.z + rng.normal(0, 0.1), *size, yaw, *velocity, score, body.number])
     for _ in range(rng.poisson(options.clutter)):
         label = int(rng.integers(len(options.labels)))

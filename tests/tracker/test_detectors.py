@@ -240,7 +240,7 @@ WRONG: Final[list[tuple[Any, dict[str, Any], str, str]]] = [
     ),
     (detectors.supervision(PIXELS, None, [0, 0], None), {"classes": ("car",)}, "camera", "the GroundCamera"),
     (detectors.supervision(PIXELS, None, None, None), {"camera": CAMERA}, "class_id", "2 values"),
-    (detectors.ultralytics(PIXELS, [1.0, 1.0], [7, 0]), {"camera": CAMERA}, "boxes.cls[0]", "0 to 2, received 7"),
+    (detectors.ultralytics(PIXELS, [1.0, 1.0], [7, 0]), {"camera": CAMERA}, "boxes.cls[0]", "one of 0, 2, received 7"),
     (detectors.ultralytics(PIXELS, [1.0, 1.0], [0, 0], (540, 960)), {"camera": CAMERA}, "orig_shape", "(1080, 1920)"),
     (SimpleNamespace(boxes=None, obb=1, names={}), {"camera": CAMERA}, "boxes", "oriented boxes (obb)"),
 ]

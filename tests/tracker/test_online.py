@@ -172,7 +172,7 @@ def test_nothing_detected_is_a_frame() -> None:
         ({**flat(0), "center": [[0.0, 0.0, 0.8]]}, {"t": 1.0}, "center: expected one column for each meaning, .* x, y"),
         (flat(0), {}, "t: expected t .s. or stamp_ns .ns., received neither"),
         (flat(0), {"t": float("nan")}, "t: expected finite seconds"),
-        ({**flat(0), "yaw": [float("inf")]}, {"t": 1.0}, r"yaw\[0\]: expected a finite number"),
+        ({**flat(0), "yaw": [float("inf")]}, {"t": 1.0}, r"yaw\[0\]: expected radians from -6.4 to 6.4"),
         ({**flat(0), "w": [0.0]}, {"t": 1.0}, r"size\[0\]\[1\]: expected a positive length"),
         ({**flat(0), "x": [float("nan")]}, {"t": 1.0}, r"center\[0\]\[0\]: expected a finite number"),
         ({**flat(0), "score": [3.0]}, {"t": 1.0}, r"score\[0\]"),
@@ -205,12 +205,12 @@ def test_what_is_wrong_is_named_and_changes_nothing(boxes: Any, when: dict[str, 
     [
         (1e3, {}, r"t: expected seconds .*, received 20 frames in succession, the last 100 s after the one before"),
         (0.0, {}, r"t: expected seconds .*, received 20 frames in succession, the last 0 s after"),
-        (1.0, {"yaw": [180.0]}, r"yaw: expected radians, received 180 \(numpy.radians converts degrees\)"),
-        (1.0, {"l": [1.9], "w": [4.5]}, "size: expected length, width, height, received 100 of 100 vehicles wider"),
+        (1.0, {"l": [1.9], "w": [4.5]}, "size: expected length, width, height.*, received 100 of 100 vehicles wider"),
+        (1.0, {"l": [4500.0], "w": [1900.0]}, "size: .* in metres, received 100 of 100 boxes of sizes as 4500"),
     ],
 )
 def test_numbers_of_another_meaning_are_doubted_once(unit: float, change: dict[str, Any], text: str) -> None:
-    """Times that are not in seconds, degrees, and widths before lengths bring one warning."""
+    """Times that are not in seconds, millimetres, and widths before lengths bring one warning."""
     tracker = optipmb.OnlineTracker()
     with pytest.warns(UserWarning, match=text) as warnings:
         _ = [tracker.update({**flat(k), **change}, t=unit * 0.1 * k) for k in range(120)]

@@ -28,6 +28,7 @@ class Action(StrEnum):
 
     fit = "fit"
     ground = "ground"
+    convert = "convert"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +63,7 @@ class FitOptions:
 
 
 def camera(
-    action: Annotated[Action, typer.Argument(help="fit: make a calibration; ground: print places of pixels.")],
+    action: Annotated[Action, typer.Argument(help="fit, convert: make a calibration; ground: print places of pixels.")],
     file: Annotated[Path, typer.Argument(help="Table of points (fit), or calibration (ground).")],
     pixels: Annotated[
         list[str] | None, typer.Argument(metavar="[U,V]...", help="Pixels, for ground.", show_default=False)
@@ -75,9 +76,14 @@ def camera(
     fit reads a table with u, v, x, y and, if it differs, z; or u, v, lat, lon, alt with --origin. It prints the
     residual of each point, and names one that does not fit. Without --intrinsics at least 4 points on the ground give a
     homography; with them 4 in a plane or 6 in space give the pose.
+
+    convert reads a file with the matrix of the lens and its distortion (or --intrinsics FILE), and R and t, rvec and
+    tvec, or a matrix of them, from the world to the camera.
     """
     if action is Action.ground:
         _print_places(file, pixels or [])
+    elif action is Action.convert:
+        _convert(file, how)
     else:
         _fit(file, how)
 
@@ -102,6 +108,25 @@ def _fit(file: Path, how: FitOptions) -> None:
         error = {"pixel": [round(max(1.0, found.rms), 3), 0.04]}
         write_whole(how.out, camera_fit.toml({**found.document, "error": error}).encode())
         say(f"calibration in {how.out}")
+
+
+def _convert(file: Path, how: FitOptions) -> None:
+    from optipmb import GroundCamera, ParameterError  # noqa: PLC0415  loads the tracker
+    from optipmb.camera_files import read_pose  # noqa: PLC0415  as above
+    from optipmb_tools.camera_fit import toml  # noqa: PLC0415  as above
+
+    size = how.size()
+    try:
+        document = {"image": list(size), "pinhole": {**_lens(how.intrinsics or file, list(size)), **read_pose(file)}}
+        GroundCamera.parse(document)
+    except ParameterError as error:
+        raise DatasetError(f"{file}: {error.path}", error.expected, error.received) from error
+    text = toml(document)
+    if how.out is None:
+        say(text.rstrip())
+        return
+    write_whole(how.out, text.encode())
+    say(f"calibration in {how.out}")
 
 
 def _print_places(file: Path, pixels: list[str]) -> None:
@@ -137,7 +162,10 @@ def _points(file: Path, origin: str | None) -> "tuple[Floats, Floats]":
             raise DatasetError(file, f"finite numbers in column {name}", "others")
     pixels = np.column_stack([given["u"], given["v"]]).astype(np.float64)
     if origin is not None:
-        return pixels, georeference_of(origin).to_world(given["lat"], given["lon"], given.get("alt"))
+        place = georeference_of(origin)
+        points = place.to_world(given["lat"], given["lon"], given.get("alt"))
+        points[:, 2] = given["alt"] - place.origin[2] if "alt" in given else 0.0  # above the curved earth
+        return pixels, points
     zero = np.zeros(len(pixels))
     return pixels, np.column_stack([given["x"], given["y"], given.get("z", zero)]).astype(np.float64)
 

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 import optipmb
+from optipmb.doubts import EXPECTED as SIZES
+from optipmb.doubts import SizeCheck
 from optipmb.velocity_check import EXPECTED, VelocityCheck
 from optipmb_service.session.values import MAX_SENSORS, SECOND
 
@@ -58,6 +60,7 @@ class SensorChecks:
         self._poses = PoseCheck()
         self._is_blind = False
         self._velocities = VelocityCheck()
+        self._sizes = SizeCheck()
 
     def add(
         self, message: schemas.Detections, frame: optipmb.Frame, arrived_ns: int, policy: Policy, *, estimated: bool
@@ -80,6 +83,8 @@ class SensorChecks:
         if policy.needs_view and message.field_of_view is None and not self._is_blind:
             self._is_blind = True
             findings.append(Finding("no_view", "field_of_view", "where the sensor sees", "nothing"))
+        if message.size is not None and self._sizes.add(frame):
+            findings.append(Finding("size", "size", SIZES, self._sizes.contradiction))
         if message.velocity is not None and self._velocities.add(frame, estimated=estimated):
             findings.append(Finding("velocity", "velocity", EXPECTED, self._velocities.contradiction))
         return findings

@@ -25,6 +25,10 @@ CODES: Final = {
         "Most velocities contradict the motion of their boxes; reported once per session and sensor.",
         "Send velocities over ground, in m/s, along the axes of the boxes; or none.",
     ),
+    "size": (
+        "Most sizes are wider than long, or far from those of their classes; reported once per session and sensor.",
+        "Send length, width, height in metres.",
+    ),
     "no_pose": (
         "The sensor moves, and its frames have no pose: the motion is estimated; reported once per session.",
         "Send poses where they are known: tracks are in the axes of the sensor without them.",

@@ -27,9 +27,14 @@ METRES: Final = (
 """Meanings that no column has in a table of pixel boxes."""
 _LOW: Final = (("x1", "xmin", "x_min", "left", "x"), ("y1", "ymin", "y_min", "top", "y"))
 _HIGH: Final = (("x2", "xmax", "x_max", "right"), ("y2", "ymax", "y_max", "bottom"))
-_FORMS: Final = {"xyxy": (*_LOW, *_HIGH), "xywh": (*_LOW, ("w", "width"), ("h", "height")), "uv": (("u",), ("v",))}
+_SIDES: Final = (("w", "width"), ("h", "height"))
+_MIDDLE: Final = tuple((f"{one}_center", f"{one}_centre", f"center_{one}", f"{one}c", f"c{one}") for one in "xy")
+_FORMS: Final = {
+    "xyxy": (*_LOW, *_HIGH), "cxcywh": (*_MIDDLE, *_SIDES), "xywh": (*_LOW, *_SIDES), "uv": (("u",), ("v",)),
+}  # fmt: skip
 """Names of the columns of each form, the first form that has all of them first."""
 _PREFIX: Final = re.compile(r"^(bbox|box|bb|bounding_box|xyxy|xywh|rect|foot)_(?=.)|_(px|pixels?)$")
+_SHARES: Final = 1.05  # largest share of the image, with boxes that its border cuts
 _MANY: Final = 0.1  # share of boxes outside the image from which they may be of another one
 
 
@@ -63,7 +68,8 @@ def find_boxes(names: Iterable[str], asked: str | None) -> tuple[str, tuple[str,
     for form, parts in _FORMS.items():
         if asked in {None, form}:
             listed = () if form == "uv" else tuple(plain.get(str(place), "") for place in range(4))
-            found = tuple(next((plain[one] for one in part if one in plain), "") for part in parts)
+            names_of = [(*part, part[0][0]) if form == asked == "cxcywh" else part for part in parts]
+            found = tuple(next((plain[one] for one in part if one in plain), "") for part in names_of)
             if "" in found and listed:
                 found = listed
             if "" not in found:
@@ -89,14 +95,23 @@ def place(
     from optipmb import Pose as PoseOfVehicle  # noqa: PLC0415  as above
 
     camera = camera_of(reading.options["camera"])
-    asked = reading.chosen("box", ("xyxy", "xywh"))
+    asked = reading.chosen("box", ("xyxy", "xywh", "cxcywh"))
     found = find_boxes(names, asked)
     if found is None:
-        expected = "pixel boxes: columns x1 y1 x2 y2, x y w h (--option box=xywh), or u v"
+        expected = "pixel boxes: columns x1 y1 x2 y2, x y w h (--option box=xywh, or cxcywh of centres), or u v"
         raise DatasetError(reading.path, expected, f"the columns {', '.join(names)}")
     form, columns = found
     pixels = np.column_stack([numbers(name, name) for name in columns]) * (reading.positive("scale", "a factor") or 1.0)
-    if form == "xywh":
+    if len(pixels) and not (pixels > _SHARES).any() and (pixels > 0.0).any():
+        reading.note("camera", "pixels are shares of the image, as all are up to 1", "--option scale=1")
+        pixels *= np.resize(camera.image, pixels.shape[1]) if "scale" not in reading.options else 1.0
+    if form == "xywh" and asked is None and [normalised(name).base for name in columns[:2]] == ["x", "y"]:
+        reading.doubt(
+            "camera", f"{columns[0]}, {columns[1]} are taken for the left upper corner", "--option box=xywh, cxcywh"
+        )
+    if form == "cxcywh":
+        pixels[:, :2] -= 0.5 * pixels[:, 2:]
+    if form in {"xywh", "cxcywh"}:
         pixels[:, 2:] += pixels[:, :2]
     given = ~np.isnan(pixels).all(axis=1)
     bad = np.asarray(given & ~np.isfinite(pixels).all(axis=1))
@@ -105,7 +120,7 @@ def place(
         with np.errstate(invalid="ignore"):
             bad |= (pixels[:, 2:] < pixels[:, :2]).any(axis=1)
         expected = f"pixel boxes {', '.join(columns)} ({form}) with x1 <= x2 and y1 <= y2"
-    reading.first("camera", bad, expected, pixels, "" if form == "uv" else "--option box=xyxy or box=xywh")
+    reading.first("camera", bad, expected, pixels, "" if form == "uv" else "--option box=xyxy, box=xywh or box=cxcywh")
     given &= ~bad
     _note_outside(reading, form, columns, pixels[given], camera.image)
     center, covariance = np.full((len(pixels), 3), np.nan), np.full((len(pixels), 3, 3), np.nan)
@@ -134,7 +149,7 @@ def _note_outside(reading: Reading, form: str, columns: Sequence[str], pixels: F
         f"pixels are {form} in columns {', '.join(columns)}, {share:.0%} outside the image of {image[0]} x {image[1]}"
     )
     doubtful = share > _MANY
-    option = "--option box=xyxy or box=xywh, scale=FACTOR" if form != "uv" else "--option scale=FACTOR"
+    option = "--option box=xyxy, box=xywh or box=cxcywh, scale=FACTOR" if form != "uv" else "--option scale=FACTOR"
     (reading.doubt if doubtful else reading.note)("camera", text, option)
 
 
