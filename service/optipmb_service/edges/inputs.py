@@ -23,13 +23,14 @@ import optipmb_schemas as schemas
 from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_client.incoming import Answer
 from optipmb_client.trace_context import attachment_of
+from optipmb_schemas.errors import show
 
 from optipmb_service.edges.json_frames import separate
 from optipmb_service.telemetry.problem_reporter import ProblemReporter
 from optipmb_service.zenoh.client import IdlePool, TooManyStreamsError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Hashable
+    from collections.abc import AsyncIterator, Callable
 
     from optipmb_client.zenoh.session import Sample
 
@@ -75,13 +76,17 @@ NEW_CLOCK: Final = 3
 """Frames after which another offset is that of a new clock."""
 
 SECOND: Final = 1_000_000_000
+OTHER_CONTENT: Final = 'a key or stamp of its own: finer stamps, `epoch` and `seq`, or `clock = "arrival"` in `inputs`'
+LATER: Final = frozenset({"busy", "too_many_streams", "unlinked"})
+"""Why a frame may be sent again."""
 
 
 class RefusedError(Exception):
     """A frame that is valid, and was not sent.
 
     Attributes:
-        code: for programs: `late`, `duplicate_epoch`, `busy`, `too_many_streams`, `unlinked`, `not_allowed`.
+        code: for programs: `late`, `duplicate_epoch`, `duplicate_key`, `busy`, `too_many_streams`, `unlinked`,
+            `not_allowed`.
         expected, received: why.
         retry_s: when it may come again; 0: never.
     """
@@ -100,6 +105,30 @@ class Sent(NamedTuple):
     epoch: bytes
     seq: int
     stamp_ns: int
+
+
+class _Mark(NamedTuple):
+    """Key by which a frame is recognised, and its content.
+
+    Attributes:
+        key: digest of the key.
+        name: of the key, for people.
+        content: digest of the content.
+        size: bytes of the content.
+    """
+
+    key: bytes
+    name: str
+    content: bytes
+    size: int
+
+
+class _Known(NamedTuple):
+    """A frame that was sent, and its content as in `_Mark`."""
+
+    sent: Sent
+    content: bytes
+    size: int
 
 
 class _Head(msgspec.Struct):
@@ -213,7 +242,8 @@ class _Stream:
 
     epoch: bytes = field(default_factory=lambda: secrets.token_bytes(16))
     seq: int = 0
-    sent: collections.OrderedDict[Hashable, Sent] = field(default_factory=collections.OrderedDict)
+    sent: collections.OrderedDict[bytes, _Known] = field(default_factory=collections.OrderedDict)
+    """Newest frames by the keys of their marks."""
     tracked: dict[int, Sent] | None = None
     """Frames in the caches of tracks when the stream was opened, by stamp; None: they were not asked yet."""
     replaced_until: float = 0.0
@@ -267,11 +297,15 @@ class Inputs:
         self._reporter = ProblemReporter(client.publish_problem)
         self._flushing = False
 
-    def report(self, stream: str, error: schemas.MessageError) -> None:
-        """Count a frame that is not valid, and report it on its stream; nowhere without a stream."""
+    def report(self, stream: str, error: schemas.MessageError | RefusedError) -> None:
+        """Count a refused frame; report it on its stream, if it has one, unless the frame may be sent again."""
         self.refused[self._edge, error.code] += 1
-        if stream:
-            problem = schemas.Problem.of(error, stream=stream, instance=self._instance)
+        if stream and error.code not in LATER:
+            about = error
+            if isinstance(about, RefusedError):
+                about = schemas.MessageError("invalid_value", "", about.expected, about.received)
+            problem = schemas.Problem.of(about, stream=stream, instance=self._instance)
+            problem = problem.model_copy(update={"code": error.code, "message": str(error)})
             self._reporter.report(problem, time.monotonic_ns())
         if not self._flushing:
             self._flush_later()
@@ -284,7 +318,7 @@ class Inputs:
         Args:
             frame: the frame.
             rules: settings of its stream.
-            repeats: by which it is known again if it has no key.
+            repeats: name of the key by which it is recognised if it has none of its own.
             traceparent: W3C trace context, unchecked.
             wait_s: how long to wait for its tracks.
 
@@ -303,7 +337,7 @@ class Inputs:
                 for at, one in enumerate(parts):
                     if at and before is None:  # the frame has begun: sent again, its objects would be sent twice
                         await stream.in_flight.below(WINDOW)
-                    mark = _mark(one, repeats, at, rules)
+                    mark = None if one.is_numbered else _mark(one, repeats, at, rules)
                     before = None if one.is_numbered else self._before(stream, one, mark, rules)
                     sent = before or self._numbered(stream, one, rules)
                     tracks = stream.waiting.setdefault(sent[:2], self._loop.create_future())
@@ -352,15 +386,21 @@ class Inputs:
             found = [one for one, _ in await asyncio.to_thread(self._cached, name)]
             stream.tracked = {one.stamp_ns: Sent(one.epoch, one.seq, one.stamp_ns) for one in found}
 
-    def _before(self, stream: _Stream, frame: JsonFrame, mark: Hashable, rules: InputSettings) -> Sent | None:
+    def _before(self, stream: _Stream, frame: JsonFrame, mark: _Mark | None, rules: InputSettings) -> Sent | None:
         """Return with which numbers a frame was sent; None of a new one.
 
         Raises:
-            RefusedError: it is earlier than a frame that was tracked before this edge began.
+            RefusedError: other content was sent with its key, or it is earlier than a frame that was tracked before
+                this edge began.
         """
         stamp_ns, tracked = frame.message.stamp_ns, stream.tracked or {}
-        if (sent := stream.sent.get(mark)) is not None or not frame.is_stamped or rules.clock != "sender":
-            return sent
+        if mark is not None and (known := stream.sent.get(mark.key)) is not None:
+            if known.content != mark.content:
+                expected = f"the {known.size} bytes that were sent with {mark.name}; other content with {OTHER_CONTENT}"
+                raise RefusedError("duplicate_key", expected, f"{mark.size} bytes of other content")
+            return known.sent
+        if not frame.is_stamped or rules.clock != "sender":
+            return None
         if (sent := tracked.get(stamp_ns)) is not None:
             return sent
         if tracked and not stream.seq and stamp_ns < max(tracked):
@@ -395,10 +435,10 @@ class Inputs:
         stream.in_flight.add(sent.epoch, sent.seq)
         stream.seq += not frame.is_numbered
 
-    def _remember(self, stream: _Stream, mark: Hashable, sent: Sent) -> None:
+    def _remember(self, stream: _Stream, mark: _Mark | None, sent: Sent) -> None:
         if mark is not None:
-            self._remembered += mark not in stream.sent  # numbered frames may have one stamp
-            stream.sent[mark] = sent
+            self._remembered += 1
+            stream.sent[mark.key] = _Known(sent, mark.content, mark.size)
             if len(stream.sent) > FRAMES:
                 stream.sent.popitem(last=False)
                 self._remembered -= 1
@@ -478,13 +518,22 @@ class Inputs:
             self._flush_later()
 
 
-def _mark(frame: JsonFrame, repeats: str, part: int, rules: InputSettings) -> Hashable:
-    """Return the mark of a part of a frame by which a repeated one is recognised; None without key and stamp."""
-    if frame.key or repeats:
-        return ("key", frame.key, part) if frame.key else ("repeats", repeats, part)
-    if rules.complete is False and frame.is_stamped:  # several objects may be reported with one stamp
-        return hashlib.blake2b(schemas.encode(frame.message), digest_size=16).digest()
-    return frame.message.stamp_ns if frame.is_stamped else None
+def _mark(frame: JsonFrame, repeats: str, part: int, rules: InputSettings) -> _Mark | None:
+    """Return the mark of a part of a frame; None without key and stamp."""
+    name = f"key {frame.key}" if frame.key else repeats
+    content = schemas.encode(frame.message)
+    key = b"%d %b" % (part, name.encode())
+    if not name:
+        if not frame.is_stamped:
+            return None
+        name = f"stamp_ns {frame.message.stamp_ns}"
+        # Several objects may be reported with one stamp; and stamps that are not used need not differ.
+        key = content if rules.complete is False or rules.clock == "arrival" else name.encode()
+    return _Mark(_digest(key), show(name)[1:-1], _digest(content), len(content))
+
+
+def _digest(content: bytes) -> bytes:
+    return hashlib.blake2b(content, digest_size=16).digest()
 
 
 def _head_of(payload: bytes, stream: str) -> _Head | None:

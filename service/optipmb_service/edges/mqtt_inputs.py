@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import optipmb_schemas as schemas
 import structlog
 
-from optipmb_service.edges.inputs import RefusedError
+from optipmb_service.edges.inputs import LATER, RefusedError
 from optipmb_service.edges.json_frames import FrameReader
 from optipmb_service.edges.mapping import is_of, mapping_of
 
@@ -33,9 +33,6 @@ WAITING: Final = 1024
 
 PAUSE_S: Final = 0.2
 """Time until a frame that could not be sent is tried again."""
-
-LATER: Final = frozenset({"busy", "too_many_streams", "unlinked"})
-"""Why a frame is tried again."""
 
 log = structlog.get_logger("optipmb_service")
 
@@ -114,14 +111,15 @@ class MqttInputs:
         except schemas.MessageError as error:
             self._inputs.report(valid, error)
             return
-        correlation = getattr(message.properties, "CorrelationData", b"")
+        correlation = getattr(message.properties, "CorrelationData", b"").hex()
+        repeats = correlation and f"correlation data {correlation}"
         async with self._turns.setdefault(stream, asyncio.Lock()):  # none passes a frame that is tried again
             while True:
                 try:
-                    await self._inputs.send(frame, self._frames.rules(stream), correlation.hex())
+                    await self._inputs.send(frame, self._frames.rules(stream), repeats)
                 except RefusedError as error:
                     if error.code not in LATER:
-                        self._inputs.refused["mqtt", error.code] += 1
+                        self._inputs.report(stream, error)
                         return
                 else:
                     return

@@ -53,6 +53,10 @@ CODES: Final = {
         "A frame has the epoch and the number of another one, as of a publisher that began again; it is refused.",
         "Give the publisher a new random epoch at every start, and number its frames upwards.",
     ),
+    "duplicate_key": (
+        "A JSON frame has the key or the stamp of an earlier one and other content; it is refused.",
+        'Send finer stamps, `epoch` and `seq`, or a key for each frame; or set `clock = "arrival"` in `inputs`.',
+    ),
     "shed": ("The queue was full and the oldest frames were dropped.", "Lower the rate, or add processors."),
     "refused": (
         "No room for another session, or a change that needs a restart.",

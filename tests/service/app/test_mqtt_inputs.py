@@ -23,6 +23,8 @@ from router import Node, Sensor, plain
 from routers import free_endpoint
 
 paho = pytest.importorskip("paho.mqtt.client")
+PacketTypes = pytest.importorskip("paho.mqtt.packettypes").PacketTypes
+Properties = pytest.importorskip("paho.mqtt.properties").Properties
 CallbackAPIVersion = pytest.importorskip("paho.mqtt.enums").CallbackAPIVersion
 mqtt = pytest.importorskip("optipmb_service.edges.mqtt")
 mqtt_inputs = pytest.importorskip("optipmb_service.edges.mqtt_inputs")
@@ -155,6 +157,21 @@ async def test_a_frame_that_is_published_again_counts_once(start: Any, tmp_path:
                 assert bridge.inputs.frames["mqtt"] == 4
     assert [one.stamp_ns for one in frames] == list(map(SENSOR.stamp_ns, range(8)))
     assert len({(one.session, *one.id.tolist()) for one in frames}) == 1
+
+
+async def test_constant_correlation_data_is_a_problem(start: Any, tmp_path: Path) -> None:
+    """Other content under the key of an earlier message is refused, counted, and told on the stream."""
+    endpoint, inputs = start()[1], {SENSOR.stream: {"topic": "sensor"}}
+    properties = Properties(PacketTypes.PUBLISH)
+    properties.CorrelationData = b"constant"
+    with mosquitto(tmp_path) as address, Node(endpoint) as node, publisher(address) as client:
+        async with bridged(endpoint, address, inputs) as bridge:
+            for at in (0, 0, 1, 2):
+                send(client, "sensor", {"objects": [{"class": "car", "position": [at, 0]}]}, properties=properties)
+            problem = await asyncio.to_thread(node.problem, SENSOR.stream, "duplicate_key")
+            assert f"correlation data {b'constant'.hex()}" in problem.expected
+            await until(lambda: bridge.inputs.refused["mqtt", "duplicate_key"] == 2)
+            assert (bridge.inputs.frames["mqtt"], bridge.inputs.duplicates["mqtt"]) == (1, 1)
 
 
 def cut(address: str, topic: str, payload: bytes) -> None:

@@ -213,6 +213,37 @@ def test_keys_tell_frames_without_stamps(edge: Edge) -> None:
     assert [edge.post({"objects": []}, STREAM).body["frames"][0]["seq"] for _ in range(2)] == [3, 4]
 
 
+@pytest.mark.parametrize("known_by", ["stamp_ns", "key", "Idempotency-Key"])
+def test_other_content_under_a_known_stamp_or_key_is_told(endpoint: str, known_by: str) -> None:
+    """To its sender and on the stream, with the key and both sizes; the same content again is a duplicate."""
+    headers = {"idempotency_key": "k"} if known_by == "Idempotency-Key" else {}
+    named = {"stamp_ns": SENSOR.stamp_ns(0), "key": "a", "Idempotency-Key": SENSOR.stamp_ns(0)}[known_by]
+    bodies = [{"objects": [CAR | {"position": [at, 0]}] * at} for at in (1, 2)]
+    if known_by != "Idempotency-Key":
+        bodies = [body | {known_by: named} for body in bodies]
+    with Node(endpoint) as node, Edge(endpoint) as edge:
+        for _ in range(2):
+            (answer,) = edge.post(bodies[0], STREAM, **headers).body["frames"]
+        assert answer["duplicate"]
+        refused = [edge.post(bodies[1], STREAM, **headers) for _ in range(4)][-1]
+        assert (refused.status, error(refused.body)) == (HTTPStatus.CONFLICT, ("duplicate_key", ""))
+        problem = node.problem(SENSOR.stream, "duplicate_key")
+        for about in (refused.body["frames"][0]["error"], problem.model_dump()):
+            assert known_by in about["expected"]
+            assert "`seq`" in about["expected"]
+            sizes = [int(re.findall(r"(\d+) bytes", about[name])[0]) for name in ("expected", "received")]
+            assert sizes[0] < sizes[1]
+        edge.post(bodies[0], STREAM, **headers)
+
+
+def test_stamps_that_are_not_used_need_not_differ() -> None:
+    """With the clock of the arrival, frames of one stamp are told apart by their content."""
+    with Edge(free_endpoint(), router=True, inputs={"site/*/*": {"clock": "arrival"}}) as edge:
+        bodies = [stamped(0, objects=[CAR | {"position": [at, 0]}]) for at in (0, 1, 1)]
+        answers = [edge.post(body, STREAM).body["frames"][0] for body in bodies]
+        assert [(one["seq"], one["duplicate"]) for one in answers] == [(0, False), (1, False), (1, True)]
+
+
 @pytest.mark.parametrize(
     ("clock", "sent_ms", "arrived_ms", "stamps_ms"),
     [

@@ -59,6 +59,7 @@ LENGTH_DIGITS: Final = 12
 STATUS: Final = {
     "busy": HTTPStatus.TOO_MANY_REQUESTS,
     "duplicate_epoch": HTTPStatus.CONFLICT,
+    "duplicate_key": HTTPStatus.CONFLICT,
     "not_allowed": HTTPStatus.FORBIDDEN,
     "too_many_streams": HTTPStatus.TOO_MANY_REQUESTS,
     "unlinked": HTTPStatus.SERVICE_UNAVAILABLE,
@@ -127,7 +128,7 @@ class Senders:
             answers = []
             for at, payload in enumerate(frames):
                 path = f"frames[{at}]" if is_array else ""
-                answer = await sender.send(payload, path, repeats and f"{at} {repeats}", wait_s)
+                answer = await sender.send(payload, path, repeats and f"Idempotency-Key {at} {repeats}", wait_s)
                 answers.append({"index": at} | answer)
             return self._answer(answers, sender.retry_s, wish.selection if wait_s else None)
 
@@ -244,6 +245,7 @@ class _Sender:
     async def send(self, payload: bytes, path: str = "", repeats: str = "", wait_s: float = 0.0) -> dict[str, Any]:
         """Send a frame; return the answer about it."""
         refused: schemas.MessageError | RefusedError
+        name = ""
         try:
             frame = self.frames.read(payload, self.stream)
             name = frame.message.stream
@@ -254,7 +256,7 @@ class _Sender:
             refused = error.under(path) if path else error
             path = refused.path
         except NotAllowedError as error:
-            refused = RefusedError("not_allowed", "a stream of the token", str(error))
+            refused, name = RefusedError("not_allowed", "a stream of the token", str(error)), ""
         except RefusedError as error:
             refused = error
         else:
@@ -268,7 +270,7 @@ class _Sender:
             }
             return answer | ({"tracks": tracks} if wait_s else {})
         if isinstance(refused, RefusedError):
-            self.inputs.refused["http", refused.code] += 1
+            self.inputs.report(name, refused)
             self.retry_s = max(self.retry_s, refused.retry_s)
         about = {"code": refused.code, "path": path, "expected": refused.expected, "received": refused.received}
         return {"error": about | {"message": str(refused)}}
