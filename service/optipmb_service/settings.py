@@ -293,7 +293,7 @@ class MqttInput(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     topic: str = Field(pattern=r"^[^#]+$", max_length=1024)
-    """topic; `+` stands for any part, which `{1}`, `{2}` … name in the stream"""
+    """topic; `+` stands for any part, which `{1}`, `{2}` … name in the stream; `$share/GROUP/TOPIC` is shared"""
     qos: Literal[0, 1, 2] = 1
     """quality of service that the broker is asked for"""
     format: Literal["optipmb", "axis", "frigate", "scenescape", "mapped"] = "optipmb"
@@ -303,6 +303,11 @@ class MqttInput(BaseModel):
     only: dict[PathText, bool | int | str] = Field(default_factory=dict)
     """values by their paths in the payload; other payloads are left out, or are of another input of the topic; for the
     format `frigate` the camera of the stream, as `{ "after.camera" = "gate" }`"""
+
+    @property
+    def pattern(self) -> str:
+        """Topics of its messages."""
+        return re.sub(r"^\$share/[^/+]+/(?=.)", "", self.topic)
 
 
 class MqttSettings(BaseModel):
@@ -1114,16 +1119,16 @@ def _check_mqtt(settings: Settings) -> None:
             expected = 'the camera of the stream, as { "after.camera" = "gate" }'
             raise SettingsInvalidError(f"{path}.only: {expected}: Frigate has one topic for all")
         seen[pattern] = one
-        parts = one.topic.split("/")
+        parts = one.pattern.split("/")
         if any("+" in part and part != "+" for part in parts):
             raise SettingsInvalidError(f"{path}.topic: + stands for a whole part, received {one.topic!r}")
         wanted = {str(number) for number in range(1, parts.count("+") + 1)}
         if set(re.findall(r"\{(\d)\}", stream)) != wanted:
             numbers = ", ".join(f"{{{number}}}" for number in sorted(wanted)) or "no number in braces"
             raise SettingsInvalidError(f"{path}.topic: a stream with {numbers} for {one.topic!r}")
-        output = re.escape(one.topic).replace(r"\+", "[^/]*")
+        output = re.escape(one.pattern).replace(r"\+", "[^/]*")
         kinds = (f"{settings.prefix}/x/x/x/{kind}" for kind in settings.mqtt.topics)
-        if one.topic.startswith(f"{settings.prefix}/") or any(re.fullmatch(output, kind) for kind in kinds):
+        if one.pattern.startswith(f"{settings.prefix}/") or any(re.fullmatch(output, kind) for kind in kinds):
             raise SettingsInvalidError(f"{path}.topic: other topics than those that are published, {one.topic!r}")
         if (one.format == "mapped") is not (one.mapping is not None):
             raise SettingsInvalidError(f"{path}.mapping: with the format mapped, and only with it")
@@ -1132,7 +1137,7 @@ def _check_mqtt(settings: Settings) -> None:
 def _have_in_common(one: MqttInput, other: MqttInput) -> bool:
     """Return whether some message of a topic may be of two inputs."""
     apart = any(one.only[path] != other.only[path] for path in one.only.keys() & other.only.keys())
-    return not apart and _overlap(*(each.topic.replace("*", "?").replace("+", "*") for each in (one, other)))
+    return not apart and _overlap(*(each.pattern.replace("*", "?").replace("+", "*") for each in (one, other)))
 
 
 def _read(file: Path) -> dict[str, Any]:

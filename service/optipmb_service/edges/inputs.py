@@ -298,9 +298,9 @@ class Inputs:
         self._flushing = False
 
     def report(self, stream: str, error: schemas.MessageError | RefusedError) -> None:
-        """Count a refused frame; report it on its stream, if it has one, unless the frame may be sent again."""
+        """Count a refused frame, and report it, on its stream if it has one, unless the frame may be sent again."""
         self.refused[self._edge, error.code] += 1
-        if stream and error.code not in LATER:
+        if error.code not in LATER:
             about = error
             if isinstance(about, RefusedError):
                 about = schemas.MessageError("invalid_value", "", about.expected, about.received)

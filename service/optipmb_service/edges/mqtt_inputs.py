@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import optipmb_schemas as schemas
 import structlog
+from optipmb_schemas.errors import show
 
 from optipmb_service.edges.inputs import LATER, RefusedError
 from optipmb_service.edges.json_frames import FrameReader
@@ -59,8 +60,9 @@ class MqttInputs:
         self._frames = FrameReader(settings)
         self._most_bytes = settings.limits.max_json_bytes
         self._inputs = inputs
+        self._own = f"{settings.prefix}/"
         self._rows = [
-            _Row(re.compile(re.escape(one.topic).replace(r"\+", "([^/]*)")), one.only, stream, mapping_of(one))
+            _Row(re.compile(re.escape(one.pattern).replace(r"\+", "([^/]*)")), one.only, stream, mapping_of(one))
             for stream, one in settings.mqtt.inputs.items()
         ]
         self._tasks: set[asyncio.Task[None]] = set()
@@ -77,6 +79,8 @@ class MqttInputs:
         target = next(((match, row) for match, row in found if not fits or is_of(message.payload, row.only)), None)
         if target is None:  # an old message, counts that the bridge publishes, or the payload of another sensor
             self._inputs.refused["mqtt", "other_sensor"] += bool(found)
+            if not (found or message.retain or message.topic.startswith(self._own)):
+                self._report_topic(message.topic, "a topic of `mqtt.inputs`", "another one")
             confirm()
             return
         match, row = target
@@ -101,15 +105,20 @@ class MqttInputs:
             log.exception("internal_error", topic=message.topic)  # one message must not end the others
         confirm()
 
+    def _report_topic(self, topic: str, expected: str, received: str) -> None:
+        self._inputs.report("", schemas.MessageError("invalid_value", show(topic)[1:-1], expected, received))
+
     async def _send(self, message: Any, stream: str, mapping: PayloadMapping | None) -> None:
         """Send the frame of a message, as soon as that is possible."""
-        valid = ""
         try:
             self._inputs.client.keys.detections(stream)
-            valid = stream
+        except schemas.MessageError as error:
+            self._report_topic(message.topic, f"levels that are names in {error.expected}", show(stream))
+            return
+        try:
             frame = self._frames.read(message.payload, stream, mapping)
         except schemas.MessageError as error:
-            self._inputs.report(valid, error)
+            self._inputs.report(stream, error)
             return
         correlation = getattr(message.properties, "CorrelationData", b"").hex()
         repeats = correlation and f"correlation data {correlation}"

@@ -8,6 +8,7 @@ import threading
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from socket import SHUT_WR, create_connection
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from optipmb_service.settings import MappingSettings, MqttInput, Settings, load
 from optipmb_service.zenoh.client import Client
 from router import Node, Sensor, plain
 from routers import free_endpoint
+from structlog.testing import capture_logs
 
 paho = pytest.importorskip("paho.mqtt.client")
 PacketTypes = pytest.importorskip("paho.mqtt.packettypes").PacketTypes
@@ -172,6 +174,39 @@ async def test_constant_correlation_data_is_a_problem(start: Any, tmp_path: Path
             assert f"correlation data {b'constant'.hex()}" in problem.expected
             await until(lambda: bridge.inputs.refused["mqtt", "duplicate_key"] == 2)
             assert (bridge.inputs.frames["mqtt"], bridge.inputs.duplicates["mqtt"]) == (1, 1)
+
+
+async def test_two_bridges_share_a_subscription(start: Any, tmp_path: Path) -> None:
+    """Each message of `$share/GROUP/TOPIC` goes to one of them, and all frames are tracked."""
+    endpoint, inputs = start()[1], {"site/{1}/lidar": {"topic": "$share/g/sensors/+/det"}}
+    with mosquitto(tmp_path) as address, Node(endpoint) as node, publisher(address) as client:
+        async with (
+            bridged(endpoint, address, inputs) as one,
+            bridged(endpoint, address, inputs, instance="second") as other,
+        ):
+            for seq in range(20):
+                send(client, "sensors/node/det", document(SENSOR.detections(seq), "epoch", "seq"))
+            await asyncio.to_thread(node.tracks, SENSOR.stream, 20)
+            counts = [each.inputs.frames["mqtt"] for each in (one, other)]
+    assert sum(counts) == 20
+    assert min(counts) > 0
+
+
+async def test_a_message_that_feeds_no_stream_is_a_problem(tmp_path: Path) -> None:
+    """Of a topic that no input has, or whose levels are no names: the log names the topic; both are counted."""
+    endpoint, given = free_endpoint(), {"site/{1}/lidar": {"topic": "sensors/+/det"}}
+    router = {"connect": [], "listen": [endpoint], "router": True}
+    with mosquitto(tmp_path) as address, capture_logs() as lines:
+        async with bridged(endpoint, address, given, **router) as bridge:
+            settings = load(None, {"mqtt": {"inputs": given}}).settings
+            sources, confirmed = mqtt_inputs.MqttInputs(settings, bridge.inputs), []
+            for topic in ("other", "sensors/no de/det"):
+                message = {"payload": b'{"objects": []}', "retain": False, "qos": 1, "properties": None}
+                sources.take(SimpleNamespace(topic=topic, **message), lambda: confirmed.append(1))
+            await until(lambda: len(confirmed) == 2)
+            assert bridge.inputs.refused == {("mqtt", "other_sensor"): 0, ("mqtt", "invalid_value"): 2}
+    problems = {(one["code"], one["path"]) for one in lines if one["event"] == "problem"}
+    assert problems == {("invalid_value", "other"), ("invalid_value", "sensors/no de/det")}
 
 
 def cut(address: str, topic: str, payload: bytes) -> None:
