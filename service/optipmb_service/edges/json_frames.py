@@ -302,6 +302,7 @@ class FrameReader:
         pixels = np.array([getattr(one, name) for one in objects], np.float64)
         if box_unit == "image":
             pixels *= np.resize(np.array(camera.image, np.float64), pixels.shape[1])
+        _check_pixels(pixels, camera.image, name)
         renamed = self.rules(stream).classes
         labels = [renamed.get(one.name, one.name) for one in objects]
         pose: Any = fields.get("pose")  # that there is one is all that it looks at
@@ -427,6 +428,25 @@ def _check(one: EdgeObject, path: str) -> str:
         if getattr(one, name) is not None and getattr(one, other) is not None:
             raise schemas.MessageError("invalid_value", f"{path}.{other}", f"{name} or {other}", "both")
     return said[0]
+
+
+def _check_pixels(pixels: Any, image: tuple[int, int], name: str) -> None:
+    """Refuse boxes and feet of another image: those with their middle outside of it, and shares of the image.
+
+    Raises:
+        MessageError: there are such.
+    """
+    expected = f"pixels in the image of {image[0]} x {image[1]}, as `image` of the calibration says"
+    ends = pixels.reshape(len(pixels), -1, 2)
+    middle = ends.mean(axis=1)
+    outside = ((middle < 0.0) | (middle > image)).any(axis=1)
+    if ((pixels >= 0.0) & (pixels <= 1.0)).all():
+        expected += ', or `box_unit = "image"` in the mapping for shares of it'
+        outside[:] = True
+    if outside.any():
+        row = int(np.argmax(outside))
+        x, y = ends[row].max(axis=0)
+        raise schemas.MessageError("invalid_value", f"objects[{row}].{name}", expected, f"up to {x:.6g} x {y:.6g}")
 
 
 def _score(one: EdgeObject) -> float:

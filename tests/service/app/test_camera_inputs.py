@@ -170,6 +170,31 @@ def test_separate_objects_are_alone_in_view(calibration: Path) -> None:
         assert seen.tolist() == [one == at for one in range(3)]
 
 
+@pytest.mark.parametrize(
+    ("place", "path", "received"),
+    [
+        ({"box": [2270, 1398, 2510, 1526]}, "objects[1].box", "2510 x 1526"),
+        ({"box": [-400, 700, -10, 760]}, "objects[1].box", "-10 x 760"),
+        ({"foot": [2390, 1526]}, "objects[0].foot", "2390 x 1526"),
+        ({"foot": [0.62, 0.71]}, "objects[0].foot", "0.62 x 0.71"),
+    ],
+)
+def test_boxes_of_another_image_are_refused(calibration: Path, place: dict[str, Any], path: str, received: str) -> None:
+    """Those outside the image, or all as shares of it: the error says the size, and how far they reach."""
+    other = {"class": "car", "box": BOXES[0]}
+    given = [other, other | place] if "box" in place else [{"class": "car"} | place]
+    with pytest.raises(MessageError, match=r"1920 x 1080") as raised:
+        read(calibration, {"objects": given})
+    assert (raised.value.path, received in raised.value.received) == (path, True)
+    shares = [{"class": "car", "box": [0.5, 0.6, 0.6, 0.7]}] * 2
+    with pytest.raises(MessageError, match=r"box_unit"):
+        read(calibration, {"objects": shares})
+    mapping = {"objects": "objects[]", "class": "class", "box": "box", "box_unit": "image"}
+    assert len(read(calibration, {"objects": shares}, mapping).label) == 2
+    with pytest.raises(MessageError, match=r"1920 x 1080"):
+        read(calibration, {"objects": [other]}, mapping)
+
+
 def test_a_node_converts_its_boxes(calibration: Path, start: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """The program of the page publishes what the service makes of the same boxes as JSON: the same tracks."""
     code = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)[1]
