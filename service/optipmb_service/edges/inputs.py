@@ -73,7 +73,10 @@ OFFSETS: Final = 100
 """Frames by which the offset of a sender's clock is known."""
 
 NEW_CLOCK: Final = 3
-"""Frames after which another offset is that of a new clock."""
+"""Least number of frames whose offset is that of a new clock."""
+
+PACE: Final = 0.25
+"""Largest difference of their intervals of arrival from those of their stamps, as a share."""
 
 SECOND: Final = 1_000_000_000
 OTHER_CONTENT: Final = 'a key or stamp of its own: finer stamps, `epoch` and `seq`, or `clock = "arrival"` in `inputs`'
@@ -210,7 +213,8 @@ class _Clock:
 
     def __init__(self) -> None:
         self._offsets: collections.deque[int] = collections.deque(maxlen=OFFSETS)
-        self._others: list[int] = []
+        self._others: collections.deque[tuple[int, int]] = collections.deque(maxlen=OFFSETS)
+        """Newest frames of another offset, by the sender and by the arrival."""
         self._sender_ns = self._last_ns = 0
 
     def arrival(self, arrived_ns: int) -> int:
@@ -218,22 +222,33 @@ class _Clock:
         self._last_ns = max(arrived_ns, self._last_ns + STEP_NS)
         return self._last_ns
 
-    def moved(self, sender_ns: int, arrived_ns: int) -> int:
-        """Return a sender's stamp on the clock of this machine, by the least offset of the last frames."""
+    def moved(self, sender_ns: int, arrived_ns: int) -> tuple[int, int]:
+        """Return a sender's stamp on the clock of this machine, by the least offset of the last frames.
+
+        Another offset is that of a new clock when frames with it come at the pace of their stamps: those that were held
+        come faster. Until then the old one holds.
+
+        Returns:
+            The stamp, and by how much the offset is exceeded, ns; 0 where that may be the way here.
+        """
         offset = arrived_ns - sender_ns
-        if self._offsets and abs(offset - min(self._offsets)) > SECOND:
-            self._others.append(offset)
-            if len(self._others) >= NEW_CLOCK:
-                self._offsets = collections.deque(self._others, OFFSETS)
-        else:
+        exceeded_ns = offset - min(self._offsets, default=offset)
+        if abs(exceeded_ns) <= SECOND:
             self._offsets.append(offset)
-        if offset in self._offsets:
             self._others.clear()
+        else:
+            if self._others and abs(offset - self._others[-1][1] + self._others[-1][0]) > SECOND:
+                self._others.clear()
+            self._others.append((sender_ns, arrived_ns))
+            sent_ns, came_ns = (last - first for first, last in zip(self._others[0], self._others[-1], strict=True))
+            if len(self._others) >= NEW_CLOCK and abs(came_ns - sent_ns) <= PACE * sent_ns:
+                self._offsets = collections.deque((came - sent for sent, came in self._others), OFFSETS)
+                self._others.clear()
         stamp_ns = max(0, sender_ns + min(*self._offsets, offset))  # no frame arrives before it is stamped
         if sender_ns > self._sender_ns:
             stamp_ns = max(stamp_ns, self._last_ns + STEP_NS)
         self._sender_ns, self._last_ns = sender_ns, stamp_ns
-        return stamp_ns
+        return stamp_ns, exceeded_ns if self._others and exceeded_ns > 0 else 0
 
 
 @dataclass
@@ -300,13 +315,16 @@ class Inputs:
     def report(self, stream: str, error: schemas.MessageError | RefusedError) -> None:
         """Count a refused frame, and report it, on its stream if it has one, unless the frame may be sent again."""
         self.refused[self._edge, error.code] += 1
-        if error.code not in LATER:
-            about = error
-            if isinstance(about, RefusedError):
-                about = schemas.MessageError("invalid_value", "", about.expected, about.received)
-            problem = schemas.Problem.of(about, stream=stream, instance=self._instance)
-            problem = problem.model_copy(update={"code": error.code, "message": str(error)})
-            self._reporter.report(problem, time.monotonic_ns())
+        if isinstance(error, schemas.MessageError):
+            self._report(stream, error.code, error)
+        elif error.code not in LATER:
+            about = schemas.MessageError("invalid_value", "", error.expected, error.received)
+            self._report(stream, error.code, about)
+
+    def _report(self, stream: str, code: str, error: schemas.MessageError) -> None:
+        problem = schemas.Problem.of(error, stream=stream, instance=self._instance)
+        message = problem.message.replace(f"[{error.code}]", f"[{code}]")
+        self._reporter.report(problem.model_copy(update={"code": code, "message": message}), time.monotonic_ns())
         if not self._flushing:
             self._flush_later()
 
@@ -424,7 +442,11 @@ class Inputs:
         elif rules.clock == "sender":
             stamp_ns = message.stamp_ns
         else:
-            stamp_ns = stream.clock.moved(message.stamp_ns, frame.arrived_ns)
+            stamp_ns, exceeded_ns = stream.clock.moved(message.stamp_ns, frame.arrived_ns)
+            if exceeded_ns:
+                expected = "at most 1 s more than before from the stamp to the arrival; the offset of the clock stays"
+                late = schemas.MessageError("invalid_value", "stamp_ns", expected, f"{exceeded_ns / SECOND:.3f} s more")
+                self._report(message.stream, "clock", late)
         if frame.is_numbered:
             return Sent(message.epoch, message.seq, stamp_ns)
         return Sent(stream.epoch, stream.seq, stamp_ns)

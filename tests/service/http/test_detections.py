@@ -37,6 +37,9 @@ SENSOR = Sensor()
 STREAM = f"stream={SENSOR.stream}"
 CAR = {"class": "car", "position": [0, 0]}
 PAGE = Path(__file__).parents[3] / "docs/json.md"
+HELD = (0, 100, *range(200, 5200, 100), 5200, 5300)  # ms: 50 frames of an outage, and live ones before and after
+BURST = (HELD, (5000, 5100, *range(10_150, 10_200), 10_200, 10_300), [5000 + one for one in HELD])
+DRAINED = (HELD, (5000, 5100, *range(8200, 10_200, 40), 10_200, 10_300), [5000 + one for one in HELD])
 SITE = (48.265, 11.67, 489.0)
 
 
@@ -263,6 +266,8 @@ def test_stamps_that_are_not_used_need_not_differ() -> None:
             (5000, 5100, 5200, 5300, 5400, 5500),
             (5000, 5100, -4000, -3900, 5400, 5500),
         ),
+        ("offset", *BURST),
+        ("offset", *DRAINED),
     ],
 )
 async def test_stamps_are_of_the_clock_of_the_settings(
@@ -277,8 +282,21 @@ async def test_stamps_are_of_the_clock_of_the_settings(
         frame = reader.read(json.dumps(body).encode(), SENSOR.stream)
         numbers, *_ = await inputs.send(frame._replace(arrived_ns=10**18 + arrived * 10**6), InputSettings(clock=clock))
         found.append((numbers.stamp_ns - 10**18) / 10**6)
-    assert tuple(found) == stamps_ms
+    assert found == list(stamps_ms)
     await asyncio.to_thread(network.close)
+
+
+def test_a_late_frame_is_a_problem_until_the_clock_is_new() -> None:
+    """Frames that are held for more than a second keep the offset of the clock; the stream tells of it."""
+    clock = {"site/*/*": {"clock": "offset"}}
+    with Edge(free_endpoint(), router=True, inputs=clock) as edge, Node(edge.settings.listen[0]) as node:
+        now = time.time_ns()
+        found = []
+        for late_s in (0, 30):
+            (one,) = edge.post({"stamp_ns": now - late_s * 10**9, "objects": []}, STREAM).body["frames"]
+            found.append(int(one["stamp_ns"]))
+        assert found[0] - found[1] == 30 * 10**9
+        assert "30." in node.problem(SENSOR.stream, "clock").received
 
 
 @pytest.mark.parametrize("way", ["post", "socket"])
