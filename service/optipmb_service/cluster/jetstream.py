@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import re
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -26,6 +27,7 @@ _T = TypeVar("_T")
 BATCH: Final = 1024  # records read at once
 SAVED_AT_ONCE: Final = 8
 SAVED_IN_A_CALL: Final = 32
+PARTS: Final = 16  # messages of one checkpoint
 MEMBER_TTL_S: Final = 3600  # age at which the server forgets the record of a member that has ended
 NOT_THE_NEWEST: Final = 10071
 UNDECIDED: Final = 10164  # several servers have not agreed yet on a write that was asked for before
@@ -34,6 +36,8 @@ AGAIN_S: Final = 0.05
 MOST_NUMBERS: Final = 4096  # streams whose written numbers are remembered
 
 EXPECTED: Final = "Nats-Expected-Last-Subject-Sequence"
+IN_PARTS: Final = "Optipmb-Parts"
+"""Sequences of the messages with the first parts of a checkpoint; its own message has the last one."""
 
 
 class JetStream:
@@ -57,8 +61,13 @@ class JetStream:
         self._there = False
         self._numbers: dict[str, bytes] = {}
         """Numbers that were written last, by stream."""
-        self.max_bytes = 2**19
-        """Bytes that a checkpoint may have; the server's own limit, once that is known."""
+        self._part_bytes = 2**19
+        """Bytes of a message; by the server's own limit, once that is known."""
+
+    @property
+    def max_bytes(self) -> int:
+        """Bytes that a checkpoint may have."""
+        return PARTS * self._part_bytes
 
     def follow(self, after: int) -> list[Record]:
         """Return the newest record of each key that changed after a revision, by revision; a thousand at most."""
@@ -86,12 +95,13 @@ class JetStream:
         refused: frozenset[str] = frozenset()
         left = iter(checkpoints.items())
         while some := dict(islice(left, SAVED_IN_A_CALL)):  # a server that is stuck is waited for once
-            refused |= self._call(self._save(some), len(some))
+            messages = sum(1 + len(one.data) // self._part_bytes for one in some.values())
+            refused |= self._call(self._save(some), messages)
         return refused
 
     def load(self, stream: str) -> bytes | None:
         """Return the newest checkpoint of a stream, None without one."""
-        found = self._call(self._last(self._subject("checkpoint", stream)))
+        found = self._call(self._load(stream), PARTS)
         return None if found is None else found[1]
 
     def numbers(self, stream: str) -> bytes | None:
@@ -124,7 +134,7 @@ class JetStream:
         """Create the JetStream stream, unless it is there."""
         client = self._connection.client()
         if not self._there:
-            self.max_bytes = client.max_payload * 3 // 4 - 4096  # it is read as base64
+            self._part_bytes = client.max_payload * 3 // 4 - 4096  # it is read as base64
             await self._connection.create(self._name, {"max_msgs_per_subject": KEPT, "allow_msg_ttl": True})
             self._there = True
 
@@ -139,16 +149,32 @@ class JetStream:
         return sorted(records.values(), key=lambda record: record.revision)
 
     async def _last(self, subject: str) -> tuple[int, bytes] | None:
-        """Return sequence and bytes of the newest message on a subject, from the server that decides on writes."""
+        """Return sequence and bytes of the newest message on a subject; None without one."""
+        message = await self._message({"last_by_subj": subject})
+        return None if message is None else (int(message["seq"]), base64.b64decode(message.get("data", "")))
+
+    async def _message(self, which: dict[str, Any]) -> dict[str, Any] | None:
+        """Return a message from the server that decides on writes; None without one."""
         await self._ready()
         try:
-            answer = await self._connection.ask(f"STREAM.MSG.GET.{self._name}", {"last_by_subj": subject})
+            answer = await self._connection.ask(f"STREAM.MSG.GET.{self._name}", which)
         except RefusedError as refused:
             if refused.code == NOTHING_THERE:
                 return None
             raise
-        message = answer["message"]
-        return int(message["seq"]), base64.b64decode(message.get("data", ""))
+        message: dict[str, Any] = answer["message"]
+        return message
+
+    async def _load(self, stream: str) -> tuple[int, bytes] | None:
+        """Return sequence and bytes of the newest checkpoint; without the parts that are not there any more."""
+        message = await self._message({"last_by_subj": self._subject("checkpoint", stream)})
+        if message is None:
+            return None
+        headers = base64.b64decode(message.get("hdrs", "")).decode()
+        sequences = re.findall(rf"^{IN_PARTS}: *(.*?)\r?$", headers, re.MULTILINE)
+        parts = [await self._message({"seq": int(one)}) for text in sequences for one in text.split(",")]
+        whole = b"".join(base64.b64decode(one.get("data", "")) for one in (*parts, message) if one is not None)
+        return int(message["seq"]), whole
 
     async def _publish(self, subject: str, data: bytes, headers: dict[str, str]) -> int | None:
         """Return the sequence of a message that was kept; None when another one than expected is the newest."""
@@ -173,7 +199,7 @@ class JetStream:
             if self._keep_s:
                 headers["Nats-TTL"] = f"{self._keep_s}s"
             async with turn:
-                kept = await self._publish(self._subject("checkpoint", stream), one.data, headers)
+                kept = await self._save_one(stream, one.data, headers)
                 if kept is not None and one.numbers and self._numbers.get(stream) != one.numbers:
                     headers.pop("Nats-TTL", None)
                     await self._publish(self._subject("numbers", stream), one.numbers, headers)
@@ -184,6 +210,18 @@ class JetStream:
 
         refused = await asyncio.gather(*(save(*one) for one in checkpoints.items()))
         return frozenset(stream for stream in refused if stream is not None)
+
+    async def _save_one(self, stream: str, data: bytes, headers: dict[str, str]) -> int | None:
+        """Write a checkpoint, the first parts of a large one before it; return as `_publish` does."""
+        sequences: list[str] = []
+        while len(data) > self._part_bytes:
+            part, data = data[: self._part_bytes], data[self._part_bytes :]
+            sequence = await self._publish(self._subject(f"part.{len(sequences)}", stream), part, headers)
+            if sequence is None:
+                return None
+            sequences.append(str(sequence))
+        whole = headers | {IN_PARTS: ",".join(sequences)} if sequences else headers
+        return await self._publish(self._subject("checkpoint", stream), data, whole)
 
     async def _set_aside(self, stream: str, reason: str) -> None:
         await self._ready()

@@ -70,7 +70,8 @@ _SOFTWARE: Final = version("optipmb")
 class CheckpointError(ValueError):
     """The bytes are no checkpoint that this service can read; the text says why.
 
-    `incarnation` has the numbers that the session used, where the checkpoint is whole and of another format; else None.
+    `incarnation` has the numbers that the session used, where the checkpoint is whole, and of another format or without
+    a state; else None.
     """
 
     def __init__(self, text: str, incarnation: Incarnation | None = None) -> None:
@@ -188,6 +189,8 @@ def _open(data: bytes) -> bytes:
     version, incarnation, body = _opened(data)
     if version != VERSION:
         raise CheckpointError(_other_format(version), incarnation)
+    if not body:
+        raise CheckpointError("numbers alone: the state was larger than the store takes", incarnation)
     return body
 
 

@@ -325,17 +325,24 @@ class CheckpointWriter:
                 then()
 
     def _save(self, checkpoints: Mapping[str, tuple[Checkpoint, int | None]]) -> None:
-        """Encode and save checkpoints with their fences, and note what the store has taken."""
+        """Encode and save checkpoints with their fences, and note what the store has taken.
+
+        Of a state that is too large the numbers are saved in its place: ids do not come again.
+        """
         encoded = self._encoded({stream: one for stream, (one, _) in checkpoints.items()}) if checkpoints else {}
-        fenced = {
-            stream: Fenced(partition_key(partition_of(stream)), fence, data, seal(b"", checkpoint.incarnation))
-            for stream, data in encoded.items()
-            for checkpoint, fence in [checkpoints[stream]]
-            if fence is not None
-        }
+        most, fenced = self._store.max_bytes, {}
+        for stream, data in encoded.items():
+            checkpoint, fence = checkpoints[stream]
+            if fence is not None:
+                numbers = seal(b"", checkpoint.incarnation)
+                kept = data if len(data) <= most else numbers
+                fenced[stream] = Fenced(partition_key(partition_of(stream)), fence, kept, numbers)
         lost = self._store.save(fenced) if fenced else ()
         self.written += len(encoded) - len(lost)
-        for stream in encoded:
+        for stream, data in encoded.items():
+            if len(data) > most:
+                self._fail(stream, f"{len(data)} bytes, and the store takes {most}: the next ids alone are kept")
+                continue
             self._failed_streams.pop(stream, None)
             if stream in lost:
                 log.warning("checkpoint_refused", stream=stream)
@@ -355,14 +362,9 @@ class CheckpointWriter:
         encoded = {}
         for stream, one in checkpoints.items():
             try:
-                data = encode_checkpoint(one)
+                encoded[stream] = encode_checkpoint(one)
             except Exception as error:  # noqa: BLE001 - an error of one stream must not keep the others
                 self._fail(stream, f"{type(error).__name__}: {error}")
-            else:
-                if len(data) > (most := self._store.max_bytes):
-                    self._fail(stream, f"{len(data)} bytes, and the store takes {most} at once")
-                else:
-                    encoded[stream] = data
             if pause_s:
                 self._ended.wait(pause_s)
         return encoded

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from lease_log import LEASE_S, SECOND, Alone, HandMember, MemoryLeases, Shared
 from nats_process import NatsProcess, NatsTrio
+from optipmb_service.cluster import jetstream, nats_connection
 from optipmb_service.cluster import member as members_module
-from optipmb_service.cluster import nats_connection
 from optipmb_service.cluster.jetstream import JetStream
 from optipmb_service.cluster.leases import LEFT_AT_ONCE, PARTITIONS, Change, partition_key, partition_of
 from optipmb_service.cluster.member import Member
@@ -602,3 +602,26 @@ def test_a_slow_store_holds_new_streams_up_for_two_leases_at_most(monkeypatch: p
     store.took_ns = lease_ns // 10
     assert strained(1) == {False}
     assert told == ["leases_slow", "leases_in_time"]
+
+
+def test_a_checkpoint_above_the_largest_message_is_cut(nats: NatsProcess) -> None:
+    """It comes back whole; a part of a frozen writer is refused; without all parts the one before is found."""
+    store = JetStream([nats.url], "test/parts")
+    connected(store)
+    key, part = partition_key(partition_of("a/b/c")), store.max_bytes // jetstream.PARTS
+    fence = store.put(Write(key, "one", 0)) or 0
+    small, large = b"small", bytes(range(256)) * (part // 100)
+    for data in (small, large):
+        assert store.save({"a/b/c": Fenced(key, fence, data, b"n")}) == frozenset()
+        assert store.load("a/b/c") == data
+    later = store.put(Write(key, "two", fence)) or 0
+    assert store.save({"a/b/c": Fenced(key, fence, large + b"x", b"n")}) == {"a/b/c"}
+    assert store.load("a/b/c") == large
+    for number in range(2):  # of two others whose writers ended before the last part
+        store._call(store._publish(store._subject("part.0", "a/b/c"), b"%d" % number, {}))
+    assert store.load("a/b/c") not in {large, None}
+    store.set_aside("a/b/c", "torn")
+    assert store.load("a/b/c") == small
+    assert store.save({"a/b/c": Fenced(key, later, large, b"n")}) == frozenset()
+    assert store.load("a/b/c") == large
+    store.close(5.0)

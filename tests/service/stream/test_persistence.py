@@ -7,8 +7,9 @@ from dataclasses import replace
 from lease_log import Alone
 from optipmb_service.cluster.sqlite import SqliteStore
 from optipmb_service.cluster.store import Fenced, StoreError
-from optipmb_service.session.checkpoint import Checkpoint
+from optipmb_service.session.checkpoint import Checkpoint, CheckpointError, encode_checkpoint
 from optipmb_service.session.session import Session
+from optipmb_service.session.values import Incarnation
 from optipmb_service.streams.persistence import CheckpointWriter
 from router import Sensor, until
 
@@ -138,6 +139,34 @@ def test_the_end_says_whether_all_is_written() -> None:
     assert end(SqliteStore(None)) is True
     assert end(full) is False
     assert end(SqliteStore(None), lapsed=True) is False
+
+
+def test_the_numbers_of_a_state_that_does_not_fit_are_kept() -> None:
+    """Its ids never come again: the successor reads the next ones, and no older state; the failure is told."""
+    store, told, unread, found = SqliteStore(None), list[str](), list[Incarnation](), list[Checkpoint | None]()
+    leases = Alone(store)
+    state = snapshot(FIRST)
+    for most, next_id in ((10**9, 5), (len(encode_checkpoint(state)) - 1, 9)):
+        store.max_bytes = most  # type: ignore[misc]  # as if it were another server
+        writer = CheckpointWriter(store, 60.0, leases, lambda _, why: told.append(why))
+        writer.start(lambda: None)
+        head = replace(state.head, density=replace(state.head.density, next_id=next_id))
+        writer.put(replace(state, base=head, head=head), leases.fence(FIRST.stream))
+        assert writer.close(60.0) is (next_id == 5)
+    assert len(told) == 1
+    reader = CheckpointWriter(store, 60.0, leases)
+
+    def restore(one: Checkpoint) -> Checkpoint:
+        if unread:
+            raise CheckpointError("older")
+        return one
+
+    reader.start(lambda: None)
+    reader.recall(FIRST.stream, restore, found.append, unread.append)
+    until(lambda: found, "it is read")
+    assert (found, {one.next_id for one in unread}) == ([None], {9})
+    reader.close(60.0)
+    store.close()
 
 
 def test_the_end_says_when_a_state_cannot_be_written() -> None:
