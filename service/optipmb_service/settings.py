@@ -1056,6 +1056,17 @@ def _check_fused(settings: Settings) -> None:
             if both is not None:
                 streams = f"a stream feeds one session, {both[0]} and {both[1]} of {other} have some in common"
                 raise SettingsInvalidError(f"setting {path}: {streams}")
+    named = {"fuse": settings.fuse, "inputs": settings.inputs, "ros2.streams": settings.ros2.streams}
+    named["mqtt.inputs"] = [re.sub(r"\{\d\}", "*", one) for one in settings.mqtt.inputs]
+    for path, patterns in named.items():
+        for pattern in patterns:
+            node, _, sensor = pattern.rpartition("/")
+            fuses = any(_overlap(node, one.rpartition("/")[0]) for one in settings.fuse)
+            if (sensor == "fused" and fuses) or (node.endswith("/fused") and settings.fused):
+                part = "sensor" if sensor == "fused" else "node"
+                raise SettingsInvalidError(
+                    f"setting {path}: no {part} is named fused, as its tracks, received {pattern}"
+                )
 
 
 def _overlap(one: str, other: str) -> bool:

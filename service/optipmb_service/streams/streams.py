@@ -6,6 +6,7 @@ guards the table of backlogs; nothing slow is done under it.
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
 import time
@@ -178,7 +179,10 @@ class Streams:
             stream, session = self.parsed(packet.key)
         except schemas.MessageError as error:
             # Only members that receive the detections of all streams receive it.
-            self._refuse("invalid_value", packet, "", error.expected, error.received)
+            named = ""
+            with contextlib.suppress(schemas.MessageError):  # the key of a stream, with the name of a session
+                named = self.keys.stream_of(packet.key)
+            self._refuse("invalid_value", packet, named, error.expected, error.received)
             return
         topic: Literal["detections", "points"] = "detections" if packet.frame else "points"
         if not self.member.holds(session):

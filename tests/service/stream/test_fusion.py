@@ -17,7 +17,7 @@ from optipmb_service.cluster.leases import partition_of
 from optipmb_service.session.checkpoint import digest_of
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import SECOND, Policy
-from optipmb_service.settings import load
+from optipmb_service.settings import SettingsInvalidError, load
 from optipmb_service.streams.profiles import Fusion
 from router import Node, Sensor, until
 from sessions import Merged, tracks
@@ -219,6 +219,24 @@ def test_nodes_of_a_site_share_tracks(start: Callable[..., Any]) -> None:
             return named and {one.stream for one in found if one.code == "no_view"} == blind
 
         until(reported, "sensors without field of view, and the reserved name")
+        assert node.problem("site/fused/lidar", "invalid_value").path == "key"
+
+
+@pytest.mark.parametrize(
+    ("given", "setting"),
+    [
+        ({"fuse": ["site/car/fused"]}, "fuse"),
+        ({"fuse": ["site/*/lidar*"], "inputs": {"site/car/fused": {}}}, "inputs"),
+        ({"fuse": ["site/*/lidar*"], "mqtt": {"inputs": {"site/{1}/fused": {"topic": "a/+"}}}}, "mqtt.inputs"),
+        ({"fuse": ["*/*/*"], "ros2": {"streams": {"site/car/fused": {"detections": "/a"}}}}, "ros2.streams"),
+        ({"fused": {"a": {"streams": ["site/car/x"]}}, "inputs": {"site/fused/cam": {}}}, "inputs"),
+    ],
+)
+def test_a_sensor_with_the_name_of_a_fused_session_is_refused(given: dict[str, Any], setting: str) -> None:
+    """At the start, where a setting names it."""
+    with pytest.raises(SettingsInvalidError, match=rf"setting {setting}: no (sensor|node) is named fused"):
+        load(None, given)
+    load(None, {name: one for name, one in given.items() if not name.startswith("fuse")})
 
 
 def test_patterns_without_a_common_stream_are_allowed() -> None:
