@@ -4,6 +4,8 @@ import os
 import signal
 import sys
 
+from optipmb_service.app import ENDING
+
 
 def main() -> None:
     """Run the command line; `health` without loading anything of the tracker: containers ask every few seconds."""
@@ -12,8 +14,9 @@ def main() -> None:
 
         sys.exit(health_command.main(sys.argv[2:]))
     # Before all imports, which take a second: process 1 of a container gets no signal that it does not handle.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: os._exit(0))  # nothing has begun
+    for number in ENDING:
+        if signal.getsignal(number) != signal.SIG_IGN:  # as under `nohup`
+            signal.signal(number, lambda *_: os._exit(0))  # nothing has begun
     try:
         from optipmb_service.app import cli  # noqa: PLC0415 - a second that `health` can do without
     except ModuleNotFoundError as error:

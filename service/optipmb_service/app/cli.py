@@ -24,7 +24,7 @@ from optipmb_schemas.installation import install_command
 from typer.main import get_command
 
 from optipmb_service import __version__
-from optipmb_service.app import health_command
+from optipmb_service.app import ENDING, health_command
 from optipmb_service.app.lifecycle import leave_or_restart
 from optipmb_service.app.processes import run_gateway, run_log, run_mqtt, run_ros2, run_router
 from optipmb_service.cluster.store import StoreError
@@ -321,7 +321,7 @@ def copy_command(
     settings: Annotated[Path | None, typer.Option(metavar="FILE", help="Settings, a TOML file.")] = None,
 ) -> None:
     """Copy the sessions of this machine's folder into a cluster, before its members start; their ids go on there."""
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in ENDING:
         signal.signal(number, signal.SIG_DFL)  # an interrupted copy is no success
     given: dict[str, Any] = {"settings": settings, "cluster": cluster, "store": store and str(store)}
     loaded = _begin(_load(given))

@@ -34,6 +34,7 @@ from optipmb_client.errors import ClientError
 from optipmb_schemas.installation import install_command
 
 from optipmb_service import __version__
+from optipmb_service.app import ENDING
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.telemetry import logs
 from optipmb_service.telemetry.certificates import Certificates
@@ -209,7 +210,7 @@ def _calls(frame: FrameType) -> str:
 
 
 class StopRequest:
-    """Request to end this process, by SIGINT, SIGTERM or a caller; begins the bound. To be made inside the loop."""
+    """Request to end this process, by a signal or a caller; begins the bound. To be made inside the loop."""
 
     def __init__(self, bound: EndBound) -> None:
         self.bound = bound
@@ -217,7 +218,9 @@ class StopRequest:
         """Whether the process is to begin again after the end."""
         self._loop = asyncio.get_running_loop()
         self._event = asyncio.Event()
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in ENDING:
+            if signal.getsignal(number) == signal.SIG_IGN:  # as under `nohup`
+                continue
             self._loop.add_signal_handler(number, self.ask, number.name)
             # The loop hears of it over a descriptor, which stays; in place of a handler that does nothing, the bound
             # begins, also where the loop hangs. Nothing else may be done there: the interrupted code may hold locks.
@@ -233,7 +236,8 @@ class StopRequest:
         self.restarts = False
         if not self.bound.begin():  # before anything that may block, as a log without a reader
             log.warning("end_unbounded")
-        log.info("stop_asked" if not self.is_set() else "stop_asked_again", signal=reason)
+        about = {"hint": "settings hold from the start: start it again"} if reason == signal.SIGHUP.name else {}
+        log.info("stop_asked" if not self.is_set() else "stop_asked_again", signal=reason, **about)
         self._event.set()
 
     def ask_threadsafe(self, reason: str) -> None:
@@ -386,7 +390,7 @@ async def run(
     more_s: float = 0.0,
     **about: Any,
 ) -> int:
-    """Work until SIGINT or SIGTERM.
+    """Work until a signal of `ENDING`.
 
     Args:
         settings: of the process.

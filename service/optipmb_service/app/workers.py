@@ -17,7 +17,6 @@ import json
 import math
 import os
 import shutil
-import signal
 import sys
 import tempfile
 import time
@@ -30,7 +29,7 @@ import optipmb_schemas as schemas
 import structlog
 
 from optipmb_service import __version__
-from optipmb_service.app import lifecycle
+from optipmb_service.app import ENDING, lifecycle
 from optipmb_service.app.lifecycle import LATE_S, RESTART, SLICE_S, grpc_edge, say_ready, unless
 from optipmb_service.cluster.leases import ALIVE, instance_of
 from optipmb_service.streams.profiles import Fusion
@@ -58,7 +57,7 @@ STEADY_S: Final = 10.0  # a worker that has lived for so long is started again a
 START_S: Final = 900.0  # longest start of a worker: one compiles the kernels, and the others wait
 WORKERS_S: Final = 2.0  # time of a parent's end beyond the end of its workers
 OWN_END_S: Final = 0.5  # time of a parent's end after its workers; those still running before are killed
-ORDERLY: Final = frozenset({0, RESTART, -signal.SIGINT, -signal.SIGTERM})
+ORDERLY: Final = frozenset({0, RESTART, *(-number for number in ENDING)})
 """Statuses of a worker that has ended as it was asked to; by these signals before it could listen to them."""
 
 LINE_BYTES: Final = 1 << 20  # longest line between worker and parent

@@ -112,8 +112,8 @@ EVENTS: Final = {
     "worker_killed": "A worker did not end or respond in time and was killed.",
     "metrics_unreadable": "The metrics of a worker cannot be read and are left out.",
     "parent_gone": "The parent has died; its worker ends.",
-    "stop_asked": "SIGINT or SIGTERM, or the parent ends its worker; it stops within 8 s + `grace_s`, a parent of"
-    " workers within 10 s + `grace_s`.",
+    "stop_asked": "SIGINT, SIGTERM, SIGHUP, SIGUSR1 or SIGUSR2, or the parent ends its worker;"
+    " it stops within 8 s + `grace_s`, a parent of workers within 10 s + `grace_s`.",
     "stop_asked_again": "Another signal, which has no effect.",
     "step_hangs": "`steps` of the end do not return, as in Zenoh; checkpoints are written all the same, unless"
     " `store_failed` says otherwise. The exit status is 1.",

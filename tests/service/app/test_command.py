@@ -51,6 +51,18 @@ def test_a_signal_during_the_start_ends_it() -> None:
         assert status == 0
 
 
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2])
+def test_other_signals_end_it_in_order(number: signal.Signals) -> None:
+    """As SIGTERM does; the log says that settings hold from the start."""
+    with ServiceProcess() as service:
+        service.wait_ready()
+        assert service.end(number, deadline_s=END_S)[0] == 0
+        (asked,) = [line for line in service.errors.splitlines() if "stop_asked" in line]
+        assert number.name in asked
+        assert ("start it again" in asked) is (number is signal.SIGHUP)
+        assert "stopped" in service.errors
+
+
 def test_the_last_frames_are_tracked() -> None:
     """Frames received before a SIGTERM still become tracks, and it ends in order; more signals change nothing."""
     with ServiceProcess() as service:

@@ -165,6 +165,17 @@ async def test_where_no_thread_can_be_started_the_end_is_asked_for(monkeypatch: 
     assert [one["event"] for one in logs] == ["end_unbounded", "stop_asked", "step_hangs"]
 
 
+async def test_hangups_that_are_ignored_stay_ignored() -> None:
+    """As under `nohup`."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        StopRequest(EndBound(60.0))
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+        assert signal.getsignal(signal.SIGUSR1) != signal.SIG_DFL
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
 def caught(pid: int) -> bool:
     """Whether a process has a handler of its own for SIGTERM."""
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()

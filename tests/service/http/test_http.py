@@ -20,7 +20,7 @@ import pytest
 from optipmb_client.errors import ClientError
 from optipmb_schemas import Keys, ServiceStatus
 from optipmb_service.app.health_command import ask
-from optipmb_service.edges.http import Server, application
+from optipmb_service.edges.http import Server, application, server
 from optipmb_service.edges.http.server import CONNECTIONS, REQUESTS
 from optipmb_service.edges.readers import BURST
 from optipmb_service.settings import Settings
@@ -29,7 +29,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from router import Node, Sensor, until
 from routers import free_endpoint, open_router
 from service_process import ServiceProcess
-from watched import Watched, served
+from watched import STREAM, Watched, served
+from websocket import WebSocketException, create_connection
 
 KEYS = Keys()
 SENSOR = Sensor()
@@ -109,6 +110,20 @@ def test_connections_without_a_request_keep_no_probe_out(sent: bytes) -> None:
             one.settimeout(END_S)
             with contextlib.suppress(ConnectionResetError):
                 assert one.recv(1) == b""
+
+
+def test_websockets_keep_no_probe_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They count among the connections: where all places are theirs, the one that is open for longest makes room."""
+    monkeypatch.setattr(server, "CONNECTIONS", 8)
+    with served(Watched(), http_clients=64) as address, contextlib.ExitStack() as stack:
+        url = f"ws://{address}/api/v1/ws?stream={STREAM}"
+        sockets = [create_connection(url, timeout=60, suppress_origin=True) for _ in range(20)]
+        for one in sockets:
+            stack.callback(one.shutdown)
+        assert get(address, "/healthz")[0] == 200
+        sockets[-1].ping()
+        with pytest.raises((WebSocketException, OSError)):
+            sockets[0].recv()
 
 
 def test_slow_requests_keep_no_probe_out() -> None:

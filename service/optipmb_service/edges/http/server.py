@@ -247,11 +247,30 @@ class _Loop(asyncio.SelectorEventLoop):
 
 
 class _Bounded(asyncio.Protocol):
-    """A connection that is aborted when its peer takes nothing for `SEND_S`."""
+    """A connection that is aborted when its peer takes nothing for `SEND_S`, or when others need its place.
+
+    Where all places are taken, the connection that has been idle for the longest time is closed; where all are busy,
+    the one that has been busy for the longest time. So probes are always answered.
+    """
 
     loop: asyncio.AbstractEventLoop
     transport: asyncio.Transport
+    connections: set[Any]
     _limit: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as the base classes have it
+        super().connection_made(transport)
+        self.since = time.monotonic()
+        if len(self.connections) > CONNECTIONS:
+            others = [one for one in self.connections if one is not self]
+            victim = min(others, key=lambda one: (one.is_busy, one.since))
+            self.connections.discard(victim)  # it is lost with the loop's next turn: others may come before
+            victim.transport.abort()
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether it is in use."""
+        return True
 
     def pause_writing(self) -> None:
         super().pause_writing()
@@ -275,28 +294,18 @@ class _Socket(_Bounded, WSProtocol):
 
 
 class _Connection(_Bounded, H11Protocol):
-    """A connection that ends when its first request does not come, or when others need its place.
-
-    Where all places are taken, the connection that has been idle for the longest time is closed; where all are busy,
-    the one that has been busy for the longest time. So probes are always answered.
-    """
+    """A connection that ends when its first request does not come."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as the base class has it
         super().connection_made(transport)
-        self._since = time.monotonic()
         self._head = self.loop.call_later(HEAD_S, self._end_without_request)
-        if len(self.connections) > CONNECTIONS:
-            others = [one for one in self.connections if one is not self and isinstance(one, _Connection)]
-            victim = min(others, key=lambda one: (one.is_busy, one._since))  # noqa: SLF001 - of the same class
-            self.connections.discard(victim)  # it is lost with the loop's next turn: others may come before
-            victim.transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._head.cancel()
         super().connection_lost(exc)
 
     def on_response_complete(self) -> None:
-        self._since = time.monotonic()
+        self.since = time.monotonic()
         super().on_response_complete()
 
     @property
