@@ -10,6 +10,7 @@ from typing import TypeVar
 
 from optipmb_schemas import Message, decode
 
+from optipmb_client.errors import ClientError
 from optipmb_client.merging import remember
 
 __all__ = ["Answer", "Arrival", "Inbox"]
@@ -63,6 +64,7 @@ class Inbox:
         self._capacity = capacity
         self._changed = threading.Condition()
         self._closed = False
+        self._error: ClientError | None = None
         self._dropped_keys: collections.OrderedDict[str, None] = collections.OrderedDict()
         self._since_loss: collections.OrderedDict[str, None] | None = None
         """Keys with an entry since messages of unknown keys were lost; None: none were."""
@@ -94,10 +96,17 @@ class Inbox:
             self._since_loss = collections.OrderedDict()
 
     def get(self, timeout: float | None = None) -> Arrival | None:
-        """Take the oldest entry, waiting up to `timeout` seconds (None: for ever); None when there is none."""
+        """Take the oldest entry, waiting up to `timeout` seconds (None: for ever); None when there is none.
+
+        Raises:
+            ClientError: with which it was closed; once, after the last entry.
+        """
         with self._changed:
             self._changed.wait_for(lambda: self._entries or self._closed, timeout)
             if not self._entries:
+                error, self._error = self._error, None
+                if error is not None:
+                    raise error
                 return None
             arrival = self._entries.popleft()
             if arrival.key in self._dropped_keys:
@@ -110,8 +119,10 @@ class Inbox:
         """Whether no further entries will come; waiting ones can still be read."""
         return self._closed
 
-    def close(self) -> None:
-        """Wake the reader for good."""
+    def close(self, error: ClientError | None = None) -> None:
+        """Wake the reader for good, to whom the error is raised that has ended it."""
         with self._changed:
+            if not self._closed:
+                self._error = error
             self._closed = True
             self._changed.notify_all()

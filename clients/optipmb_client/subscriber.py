@@ -172,7 +172,11 @@ class EventSubscriber(_Subscription):
         super().__init__(pattern, ("events",), queue, prefix, connection, opened, history=True)
 
     def __iter__(self) -> Iterator[Events]:
-        """Iterate over the messages until `timeout` or `close`."""
+        """Iterate over the messages until `timeout` or `close`.
+
+        Raises:
+            ServiceRefused: the gateway has ended the subscription for good.
+        """
         while (arrival := self._inbox.get(self.timeout)) is not None:
             if (message := self._read(arrival, Events)) is not None:
                 for one in self._streams.take(message) if self._final else (message,):
@@ -245,12 +249,20 @@ class Subscriber(_Subscription):
         super().__init__(pattern, topics, queue, prefix, connection, opened, history=history)
 
     def __iter__(self) -> Iterator[Tracks]:
-        """Iterate over the messages until `timeout` or `close`."""
+        """Iterate over the messages until `timeout` or `close`.
+
+        Raises:
+            ServiceRefused: the gateway has ended the subscription for good.
+        """
         while (received := self.receive(self.timeout)) is not None:
             yield received.tracks
 
     def receive(self, timeout: float | None = None) -> Received | None:
-        """Return the next tracks, waiting up to `timeout` seconds (None: for ever); None when none came."""
+        """Return the next tracks, waiting up to `timeout` seconds (None: for ever); None when none came.
+
+        Raises:
+            ServiceRefused: the gateway has ended the subscription for good; raised once.
+        """
         deadline = None if timeout is None else time.monotonic() + timeout
         while True:
             left = None if deadline is None else max(0.0, deadline - time.monotonic())

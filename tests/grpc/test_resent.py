@@ -6,12 +6,17 @@ import contextlib
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 from typing import Any
 
 import grpc
 import numpy as np
+import pytest
 from optipmb_client import Publisher, Subscriber
+from optipmb_client.errors import ClientError, ServiceRefused
+from optipmb_client.grpc import channels
 from optipmb_client.grpc.channels import SERVICE
+from optipmb_client.grpc.streams import GrpcSubscription
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
@@ -57,6 +62,10 @@ def served(gateway: Any, add: Any = rpc.add_TrackingServiceServicer_to_server) -
         server.stop(None).wait(DEADLINE_S)
 
 
+def add_generic(handlers: Any, server: grpc.Server) -> None:
+    server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE, handlers),))
+
+
 def test_what_was_kept_is_sent_again_in_its_order() -> None:
     """Clouds among detections, as they were published, when a call fails."""
     gateway = Failing()
@@ -91,20 +100,48 @@ def test_frames_that_are_lost_at_a_gateway_are_named() -> None:
         assert (tracks.statistics.missed, tracks.statistics.dropped) == (2, 3)
 
 
-def test_responses_of_another_release_end_no_subscription_in_silence() -> None:
-    """A kind of response that is not known is left out; after one that cannot be read the subscription ends."""
+@pytest.mark.parametrize("at_once", [True, False])
+def test_responses_of_another_release_end_no_subscription_in_silence(*, at_once: bool) -> None:
+    """A kind of response that is not known is left out; one that cannot be read is raised once, to who iterates."""
+    received = threading.Event()
+    if at_once:
+        received.set()
 
     def subscribe(_request: bytes, _context: Any) -> Iterator[bytes]:
         yield bytes([15 << 3 | 2, 0])  # a field that there is not
         yield pb.SubscribeResponse(tracks=convert.to_proto(tracks_message("a/b/c", 1))).SerializeToString()
+        received.wait(DEADLINE_S)
         yield bytes([1 << 3 | 2, 9])  # tracks that are cut
 
-    def add(handlers: Any, server: grpc.Server) -> None:
-        server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE, handlers),))
-
     handlers = {"Subscribe": grpc.unary_stream_rpc_method_handler(subscribe)}
-    with served(handlers, add) as endpoint, Subscriber("a/b/c", endpoint) as tracks:
+    with served(handlers, add_generic) as endpoint, Subscriber("a/b/c", endpoint) as tracks:
         first = tracks.receive(DEADLINE_S)
         assert first is not None
         assert first.tracks.seq == 1
+        received.set()
+        with pytest.raises(ServiceRefused, match="cannot be read"):
+            tracks.receive(DEADLINE_S)
         assert list(tracks) == []
+
+
+def test_a_response_that_cannot_be_read_opens_a_subscription_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However soon it comes, and however late the program looks: the error is raised where it iterates."""
+    ended = threading.Event()
+    fail = GrpcSubscription._fail
+
+    def failed(self: GrpcSubscription, error: ClientError) -> None:
+        fail(self, error)
+        ended.set()
+
+    class Late(threading.Event):
+        def wait(self, timeout: float | None = None) -> bool:
+            return super().wait(timeout) and ended.wait(DEADLINE_S)
+
+    monkeypatch.setattr(GrpcSubscription, "_fail", failed)
+    names = {"Event": Late, "Lock": threading.Lock, "Thread": threading.Thread}
+    monkeypatch.setattr(channels, "threading", SimpleNamespace(**names))
+    handlers = {"Subscribe": grpc.unary_stream_rpc_method_handler(lambda *_: iter([bytes([1 << 3 | 2, 9])]))}
+    with served(handlers, add_generic) as endpoint, Subscriber("a/b/c", endpoint) as tracks:
+        with pytest.raises(ServiceRefused, match="cannot be read"):
+            tracks.receive(DEADLINE_S)
+        assert tracks.receive(DEADLINE_S) is None

@@ -134,6 +134,7 @@ class ResumedCall(ABC):
         self._method = method
         self._call: Any = None
         self._settled = threading.Event()  # the first call is in force, or there will be none
+        self._in_force = False  # whether a call was
         self._is_last = False  # whether a call that ends without an error is the last one
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -164,8 +165,10 @@ class ResumedCall(ABC):
         self._thread.start()
         if not self._settled.wait(timeout):
             self.error = ConnectionFailed(f"no gRPC gateway took the {what} within {timeout:g} s")
+        elif self._in_force:
+            return
+        self._end()
         if self.error is not None:
-            self._end()
             raise self.error
 
     def _end(self) -> None:
@@ -175,6 +178,11 @@ class ResumedCall(ABC):
             self._call.cancel()
         self._ended()
         self._thread.join(CLOSE_S)
+
+    def _settle(self) -> None:
+        """Note that a call is in force."""
+        self._in_force = True
+        self._settled.set()
 
     def _fail(self, error: ClientError) -> None:
         self.error = error

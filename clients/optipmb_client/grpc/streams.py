@@ -94,7 +94,7 @@ class Publishing(ResumedCall):
         said = pb.PublishResponse.FromString(response)
         if said.WhichOneof("response") == "acknowledgement":
             self.points_wanted = self._keeps_clouds or said.acknowledgement.points_wanted
-            self._settled.set()
+            self._settle()
 
     def _began(self) -> None:
         """Wait for the first acknowledgement."""
@@ -267,14 +267,19 @@ class GrpcSubscription(ResumedCall):
         if self._settled.is_set():
             self._inbox.lose()  # messages since the call before that are kept no longer
         if self._call.is_active():
-            self._settled.set()
-            self._request.history = True  # the next call recovers the losses in between
+            self._settle()
+
+    def _settle(self) -> None:
+        super()._settle()
+        self._request.history = True  # the next call recovers the losses in between
 
     def _ended(self) -> None:
-        if not self._over.is_set():
-            self._inbox.close()  # nothing will come any more
+        if not self._over.is_set():  # nothing will come any more; who reads learns why, unless it closed the connection
+            self._inbox.close(None if isinstance(self.error, ConnectionFailed) else self.error)
 
     def _take(self, response: bytes) -> None:
+        if not self._in_force:  # the call has ended since
+            self._settle()
         said = (pb.SubscribeEventsResponse if self._events else pb.SubscribeResponse).FromString(response)
         if said.skipped:
             self._inbox.lose(said.skipped)
