@@ -95,7 +95,7 @@ CODES: Final = {
         "Nothing. If it happens often, raise `lease_s`, or look for what stops the process.",
     ),
     "certificate": (
-        "A certificate of the service has ended; `received` names it.",
+        "A certificate of the service has ended, or does not fit its key; `received` names it.",
         "Renew it; see `security.md`. A process that listens with it needs a restart.",
     ),
     "contested": (

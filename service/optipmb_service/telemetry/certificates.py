@@ -7,6 +7,7 @@ again, so that one that is renewed holds without a restart.
 from __future__ import annotations
 
 import asyncio
+import ssl
 import time
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
@@ -37,18 +38,20 @@ class Certificates:
         self._files = files
         self._fixed = fixed
         self._ends: dict[str, datetime] = {}
+        self._unusable: dict[str, str] = {}
+        """Why files cannot be used, by use; the certificates before are served."""
         self._looked = -LOOK_S
         self._look()
 
     def days(self) -> dict[str, float]:
-        """Return how many days each certificate still holds, by its use."""
+        """Return how many days each certificate that is served still holds, by its use."""
         now = datetime.now(UTC)
         return {use: (end - now).total_seconds() / DAY_S for use, end in self._look().items()}
 
     @property
     def failure(self) -> str:
-        """Which certificates have ended; empty while all hold."""
-        return "; ".join(self._ended())
+        """Which certificates have ended, or cannot be used; empty while all hold."""
+        return "; ".join([*self._ended(), *self._unusable.values()])
 
     @property
     def cut_off(self) -> bool:
@@ -60,10 +63,12 @@ class Certificates:
         warned = -DAY_S
         told: set[str] = set()
         while True:
-            now_ended = self._ended().keys()
-            for why in now_ended - told:
+            now_ended, unusable = self._ended(), set(self._unusable.values())
+            for why in now_ended.keys() - told:
                 log.error("certificate_ended", error=why)
-            told = set(now_ended)
+            for why in unusable - told:
+                log.error("certificate_unusable", error=why)
+            told = now_ended.keys() | unusable
             soon = {use: round(days, 1) for use, days in self.days().items() if 0 < days < WARN_DAYS}
             if soon and time.monotonic() - warned >= DAY_S:
                 warned = time.monotonic()
@@ -77,6 +82,19 @@ class Certificates:
     def _look(self) -> dict[str, datetime]:
         if (now := time.monotonic()) - self._looked >= LOOK_S:
             found = {use: end for use, file in self._files.items() if (end := end_of(file)) is not None}
-            kept = {use: end for use, end in self._ends.items() if use == self._fixed}
+            self._unusable = {use: why for use, file in self._files.items() if (why := _unusable(file))}
+            kept = {use: end for use, end in self._ends.items() if use == self._fixed or use in self._unusable}
             self._ends, self._looked = found | kept, now
         return self._ends
+
+
+def _unusable(file: Path) -> str:
+    """Return why a certificate does not fit the key beside it; empty where it does, or where there is none."""
+    key = file.with_name("key.pem")
+    if file.name != "cert.pem" or not key.exists():
+        return ""
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(file, key, password="")
+    except OSError as error:  # `ssl.SSLError` is one
+        return f"TLS: {file} does not fit {key.name}, so the one before is served: {error.strerror or error}"
+    return ""

@@ -37,6 +37,8 @@ EVENTS: Final = {
     "http_certificates": "Changed files of `http_tls` cannot be used; the certificate before holds.",
     "grpc_certificates": "Renewed certificates cannot be read; the previous ones stay in use.",
     "certificate_ends": "Certificates that end within a week, and the `days` that they hold: renew them.",
+    "certificate_unusable": "A certificate, renewed perhaps, does not fit its key: the one before is served until both"
+    " files fit. The state is `degraded`.",
     "certificate_ended": "A certificate has ended: no link with it can be opened. Renew it, and restart what listens"
     " with it.",
     "unprotected": "Everybody who reaches these `addresses` may publish, read and command: there is neither TLS nor"
