@@ -82,7 +82,10 @@ TASKS: Final = (
         "browser, web page, JSON, WebSocket, readers",
         "`http`, `http_hosts`, `http_origins`, `http_clients`; see [JSON](json.md)",
     ),
-    ("curl, POST, sensors without a client", "`http_senders`, `inputs`; see [JSON](json.md#send-detections)"),
+    (
+        "curl, POST, sensors without a client",
+        "`http_senders`, `sender_idle_s`, `inputs`; see [JSON](json.md#send-detections)",
+    ),
     ("gRPC clients", "`grpc`, `grpc_calls`, `grpc_connections`; see [gRPC](grpc.md)"),
     ("MQTT broker", "`mqtt`; see [MQTT](json.md#mqtt)"),
     ("C-ITS, V2X, CPM", "`cpm`; see [Standards](standards.md#collective-perception-messages)"),

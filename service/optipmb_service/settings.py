@@ -727,6 +727,8 @@ class Settings(BaseSettings):
     """readers of streams over HTTP at once, viewers of the page among them; further ones are refused"""
     http_senders: int = Field(default=64, ge=1, le=256)
     """requests and WebSockets that send detections over HTTP at once; further ones are refused"""
+    sender_idle_s: float = Field(default=30.0, ge=0, le=86_400)
+    """time without a frame after which a WebSocket of `http_senders` gives its place to another one"""
     http_streams: int = Field(default=100, ge=0, le=10_000)
     """streams with series of their own in the metrics, by name"""
     grpc: Address = ""
@@ -862,7 +864,7 @@ class Settings(BaseSettings):
         addresses = [(one, one.partition("/")[2].partition("?")[0].partition("#")[0]) for one in endpoints]
         if self.grpc_tls is None and not self.grpc_tokens and self.grpc:
             addresses.append((f"grpc {self.grpc}", self.grpc))
-        if self.http_tls is None and self.http_tokens:
+        if self.http and (self.http_tls is None or not self.http_tokens):
             addresses.append((f"http {self.http}", self.http))
         return tuple(said for said, address in addresses if address.rpartition(":")[0] and not is_loopback(address))
 
@@ -960,6 +962,7 @@ def load(
         raise SettingsInvalidError("setting listen: neither an endpoint to listen on nor one to connect to")
     if settings.fuse and not settings.rewind_s:
         raise SettingsInvalidError("setting fuse: sensors do not come in order of their stamps: rewind_s must not be 0")
+    _check_tokens(settings)
     _check_patterns(settings)
     _check_fused(settings)
     _check_cluster(settings)
@@ -1020,6 +1023,17 @@ def _check_cluster(settings: Settings) -> None:
             raise SettingsInvalidError(f"setting cluster_tls: {folder}: cert.pem and key.pem belong together")
     if file is not None and not file.is_file():
         raise SettingsInvalidError(f"setting cluster_credentials: {file}: no such file")
+
+
+def _check_tokens(settings: Settings) -> None:
+    """Refuse settings of tokens that are there and empty, as of a variable of a shell that is not set.
+
+    Raises:
+        SettingsInvalidError: there is one.
+    """
+    for name in ("http_tokens", "grpc_tokens"):
+        if name in settings.model_fields_set and not getattr(settings, name):
+            raise SettingsInvalidError(f"setting {name}: expected tokens, received nothing; leave it out to have none")
 
 
 def _check_patterns(settings: Settings) -> None:

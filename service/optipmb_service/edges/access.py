@@ -16,12 +16,16 @@ import hashlib
 import importlib
 import inspect
 import json
+import re
+import time
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+import structlog
 from optipmb_client.errors import ClientError
+from optipmb_schemas.errors import show
 
 Tokens = Callable[[Mapping[str, str], str], str | Awaitable[str | None] | None]
 """Returns the name that holds, by the metadata of a call and the name in its certificate; None to refuse."""
@@ -29,8 +33,14 @@ Tokens = Callable[[Mapping[str, str], str], str | Awaitable[str | None] | None]
 ANYBODY: Final = ""
 """Name of a caller where callers have none."""
 
-NODE_CHUNKS: Final = 2
 BEARER: Final = "bearer "
+NAME: Final = re.compile(r"[A-Za-z0-9_.-]+/[A-Za-z0-9_.-]+")
+"""Names that have rights."""
+
+LOOK_S: Final = 5.0
+"""Period in which files of tokens, and the tokens of open connections, are looked at again."""
+
+log = structlog.get_logger("optipmb_service")
 
 
 class NotAllowedError(Exception):
@@ -73,7 +83,7 @@ class Caller:
         return head if head in {"viewer", "service"} else ""
 
     def _owns(self, stream: str) -> bool:
-        return not self._role and self.name.count("/") == NODE_CHUNKS - 1 and stream.startswith(f"{self.name}/")
+        return not self._role and NAME.fullmatch(self.name) is not None and stream.startswith(f"{self.name}/")
 
     def _check(self, allowed: bool, what: str) -> None:  # noqa: FBT001 - the one thing that it is given
         if not allowed:
@@ -88,7 +98,7 @@ def token_names(setting: str, value: str) -> Tokens:
     """
     module, separator, name = value.partition(":")
     if not separator:
-        return _file(setting, Path(value))
+        return TokenFile(setting, Path(value))
     try:
         function: Tokens = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError, ValueError) as error:
@@ -114,15 +124,64 @@ def json_file(setting: str, file: Path) -> Any:
         raise ClientError(f"setting {setting}: {file}: {error}") from error
 
 
-def _file(setting: str, file: Path) -> Tokens:
-    names = json_file(setting, file)
-    if not isinstance(names, dict) or not all(isinstance(name, str) and name for name in names.values()):
-        raise ClientError(f"setting {setting}: {file}: expected a JSON object of names by the SHA-256 of their tokens")
+class TokenFile:
+    """Names by the SHA-256 of tokens, in a JSON file that is read again when it has changed.
 
-    def name_of(metadata: Mapping[str, str], _certificate: str) -> str | None:
+    Args:
+        setting: that names the file.
+        file: its path.
+
+    Raises:
+        ClientError: it cannot be used.
+    """
+
+    def __init__(self, setting: str, file: Path) -> None:
+        self._setting = setting
+        self._file = file
+        self._changed, self._looked = self._time(), time.monotonic()
+        self._names = self._read()
+        if not self._names:
+            raise ClientError(f"setting {setting}: {file}: expected names by the SHA-256 of tokens, received none")
+
+    def __call__(self, metadata: Mapping[str, str], _certificate: str) -> str | None:
+        """Return the name of a token; None without one that is valid."""
+        self._renew()
         value = metadata.get("authorization", "")
         token = value[len(BEARER) :] if value.lower().startswith(BEARER) else ""
-        found: str | None = names.get(hashlib.sha256(token.encode()).hexdigest())
-        return found
+        return self._names.get(hashlib.sha256(token.encode()).hexdigest())
 
-    return name_of
+    def _renew(self) -> None:
+        if time.monotonic() - self._looked < LOOK_S:
+            return
+        self._looked = time.monotonic()
+        if (now := self._time()) != self._changed:
+            try:
+                self._names = self._read()
+            except ClientError as error:
+                log.warning("tokens_unusable", error=str(error))  # the ones before hold
+            self._changed = now
+
+    def _time(self) -> int:
+        try:
+            return self._file.stat().st_mtime_ns
+        except OSError:
+            return 0
+
+    def _read(self) -> dict[str, str]:
+        names = json_file(self._setting, self._file)
+        where = f"setting {self._setting}: {self._file}"
+        if not isinstance(names, dict):
+            raise ClientError(f"{where}: expected a JSON object of names by the SHA-256 of their tokens")
+        for digest, name in names.items():
+            if not re.fullmatch("[0-9A-Fa-f]{64}", digest):
+                received = show(digest)
+                raise ClientError(
+                    f"{where}: expected 64 hexadecimal digits, the SHA-256 of a token, received {received}"
+                )
+            if digest.lower() == hashlib.sha256(b"").hexdigest():
+                raise ClientError(f"{where}: expected the SHA-256 of a token, received that of the empty token")
+            if not isinstance(name, str) or not NAME.fullmatch(name):
+                hint = ", which reads all as viewer/NAME: name it so" if name == "*/*" else ""
+                expected = "a node as site/node, viewer/NAME or service/NAME"
+                raise ClientError(f"{where}: expected {expected}, received {show(name)}{hint}")
+        return {digest.lower(): name for digest, name in names.items()}

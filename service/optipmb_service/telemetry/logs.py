@@ -41,8 +41,10 @@ EVENTS: Final = {
     " files fit. The state is `degraded`.",
     "certificate_ended": "A certificate has ended: no link with it can be opened. Renew it, and restart what listens"
     " with it.",
+    "tokens_unusable": "The file of tokens has changed and cannot be used: the tokens before hold.",
     "unprotected": "Everybody who reaches these `addresses` may publish, read and command: there is neither TLS nor"
-    " access control. Of `http`: tokens cross the network readable, without `http_tls`. See `security.md`.",
+    " access control. Of `http`: all may read without `http_tokens`, and tokens are readable without `http_tls`. See"
+    " `security.md`.",
     "unknown_environment": "Variables `OPTIPMB_…` that are not settings, usually misspelt.",
     "peer_connected": "A node, router or service has connected.",
     "tracker_message": "A `text` of the tracker: it compiles, for up to a minute.",

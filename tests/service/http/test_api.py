@@ -21,9 +21,11 @@ from optipmb_schemas import (
     SessionSummary,
 )
 from optipmb_schemas.json_form import event_json, problem_json, tracks_json, zones_json
+from optipmb_service.edges import access
+from optipmb_service.edges.access import Caller, NotAllowedError
 from optipmb_service.edges.http import application, server
 from optipmb_service.edges.readers import BURST, Bounds, Feeds, Publication, Reader, Wish
-from optipmb_service.settings import Settings
+from optipmb_service.settings import Settings, SettingsInvalidError, load
 from readers import received, texts
 from router import until
 from watched import (
@@ -272,15 +274,77 @@ def test_tokens_decide_who_reads_what(guarded: str, session: Session) -> None:
         assert response.status == OK
 
 
-@pytest.mark.parametrize("content", [None, "[]", '{"00": ""}', "garbage"])
-def test_a_file_of_tokens_that_cannot_be_used_ends_the_start(tmp_path: Path, content: str | None) -> None:
-    """One line with the setting and the file."""
+def test_a_token_that_is_taken_out_of_the_file_ends(
+    watched: Watched, session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also one with other rights: its open streams and sockets end, later requests are refused, and others go on."""
+    monkeypatch.setattr(access, "LOOK_S", 0.05)
+    file = tmp_path / "tokens.json"
+    names = {hashlib.sha256(token.encode()).hexdigest(): name for token, name in TOKENS.items()}
+    file.write_text(json.dumps(names))
+    query = "stream=garage/rig/*"
+    with (
+        served(watched, http_tokens=str(file)) as address,
+        socket(address, query, subprotocols=["optipmb.v1", "bearer.rig"]) as ended,
+        socket(address, query, subprotocols=["optipmb.v1", "bearer.secret"]) as changed,
+        asked(address, f"/api/v1/stream?{query}", authorization="Bearer rig") as stream,
+    ):
+        file.write_text("cut sh")  # as it is while it is written
+        assert get(address, f"tracks?{query}", authorization="Bearer rig")[0] == OK
+        file.write_text(json.dumps({hashlib.sha256(b"secret").hexdigest(): "viewer/other"}))
+        assert [closed(one) for one in (ended, changed)] == [1008] * 2
+        stream.read()  # to its end
+        assert get(address, f"tracks?{query}", authorization="Bearer rig")[0] == http.client.UNAUTHORIZED
+        assert get(address, f"tracks?{query}", authorization="Bearer secret")[0] == OK
+
+
+GOOD = hashlib.sha256(b"secret").hexdigest()
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (None, ""),
+        ("[]", ""),
+        ("{}", ""),
+        ("garbage", ""),
+        ('{"00": "viewer/map"}', "64 hexadecimal digits"),
+        (json.dumps({hashlib.sha256(b"").hexdigest(): "viewer/map"}), "the empty token"),
+        (json.dumps({GOOD: ""}), "viewer/NAME"),
+        (json.dumps({GOOD: "garage"}), "viewer/NAME"),
+        (json.dumps({GOOD: "garage/a/b"}), "viewer/NAME"),
+        (json.dumps({GOOD: "*/*"}), "reads all"),
+        (json.dumps({GOOD: "garage/*"}), "viewer/NAME"),
+    ],
+)
+def test_a_file_of_tokens_that_cannot_be_used_ends_the_start(tmp_path: Path, content: str | None, said: str) -> None:
+    """One line with the setting and the file; names without rights, and digests of no token, are such."""
     file = tmp_path / "tokens.json"
     if content is not None:
         file.write_text(content)
     source: Any = Watched()
-    with pytest.raises(ClientError, match=f"setting http_tokens: {file}"):
+    with pytest.raises(ClientError, match=f"setting http_tokens: {file}.*{said}"):
         application(source, Settings(http_tokens=str(file)))
+    file.write_text(json.dumps({GOOD.upper(): "viewer/map"}))
+    application(source, Settings(http_tokens=str(file)))
+
+
+def test_a_name_with_a_wildcard_has_no_rights() -> None:
+    """Whoever gives it: a certificate, or a function of one's own."""
+    for name in ("*/*", "garage/*", "*/rig"):
+        caller = Caller(name)
+        for check in (caller.may_read, caller.may_publish, caller.may_command):
+            with pytest.raises(NotAllowedError):
+                check(f"{name}/*")
+
+
+def test_an_empty_setting_of_tokens_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of a variable of a shell that is not set: it does not let everybody in."""
+    for name in ("HTTP_TOKENS", "GRPC_TOKENS"):
+        with monkeypatch.context() as patch:
+            patch.setenv(f"OPTIPMB_{name}", "")
+            with pytest.raises(SettingsInvalidError, match=f"setting {name.lower()}"):
+                load()
 
 
 def test_pages_of_strangers_open_no_socket(session: Session, address: str) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from json_senders import Edge, damaged, document, exists, post
 from optipmb_schemas import MessageError, encode_json
-from optipmb_service.edges import inputs
+from optipmb_service.edges import access, inputs
 from optipmb_service.edges.http import detections
 from optipmb_service.edges.inputs import Inputs
 from optipmb_service.edges.json_frames import FrameReader, separate
@@ -457,6 +457,59 @@ def test_tokens_send_their_own_streams(endpoint: str, tmp_path: Path) -> None:
     with Edge(endpoint, http="0.0.0.0:8080") as edge:
         answer = edge.post(both)
         assert (answer.status, "set http_tokens" in answer.body["error"]) == (HTTPStatus.FORBIDDEN, True)
+
+
+def test_a_sender_whose_token_is_taken_out_is_closed(
+    endpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether it sends or not; its next requests are refused."""
+    monkeypatch.setattr(access, "LOOK_S", 0.05)
+    file = tmp_path / "tokens.json"
+    file.write_text(json.dumps({hashlib.sha256(b"node").hexdigest(): "site/node"}))
+    header = {"header": ["authorization: Bearer node"]}
+    with (
+        Edge(endpoint, http_tokens=str(file)) as edge,
+        socket(edge.address, STREAM, **header) as busy,
+        socket(edge.address, STREAM, **header) as idle,
+    ):
+        file.write_text("{}")
+        busy.send('{"objects": []}')
+        with contextlib.suppress(OSError):
+            while busy.recv_data(control_frame=True)[0] != ABNF.OPCODE_CLOSE:
+                busy.send('{"objects": []}')
+        assert idle.recv_data(control_frame=True)[0] == ABNF.OPCODE_CLOSE
+        assert edge.post(stamped(0), STREAM, authorization="Bearer node").status == HTTPStatus.UNAUTHORIZED
+
+
+def test_one_name_has_a_quarter_of_the_places(endpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of those who send; idle sockets give theirs to others, and the status has who was refused."""
+    monkeypatch.setattr(access, "LOOK_S", 0.05)
+    file = tmp_path / "tokens.json"
+    names = {name: f"site/{name}" for name in ("one", "two", "three", "four", "node")}
+    file.write_text(json.dumps({hashlib.sha256(token.encode()).hexdigest(): name for token, name in names.items()}))
+    for idle_s in (3600.0, 0.0):
+        settings = {"http_tokens": str(file), "http_senders": 8, "sender_idle_s": idle_s}
+        with Edge(endpoint, **settings) as edge, contextlib.ExitStack() as opened:
+
+            def connect(name: str, edge: Edge = edge, opened: contextlib.ExitStack = opened) -> WebSocket:
+                header = {"header": [f"authorization: Bearer {name}"]}
+                return opened.enter_context(socket(edge.address, f"stream=site/{name}/lidar", **header))
+
+            held = [connect(name) for name in ("one", "one", "two", "two", "three", "three", "four", "four")]
+            for name in ("one", "node"):  # above its share, and above all
+                if idle_s:
+                    with pytest.raises(WebSocketBadStatusException) as raised:
+                        connect(name)
+                    assert raised.value.status_code == HTTPStatus.SERVICE_UNAVAILABLE
+                else:
+                    other = connect(name)
+                    other.send(json.dumps({"objects": []}))
+                    assert "seq" in json.loads(other.recv())
+            if idle_s:
+                with asked(edge.address, "/readyz") as response:
+                    assert json.loads(response.read())["senders_refused"] == {"site/one": 1, "site/node": 1}
+            else:
+                assert held[0].recv_data(control_frame=True)[0] == ABNF.OPCODE_CLOSE
 
 
 def test_a_second_edge_of_a_stream_is_told(endpoint: str) -> None:

@@ -55,8 +55,10 @@ def test_new_connections_have_the_certificate_of_the_files(tmp_path: Path, watch
 
 
 def test_readiness_names_addresses_without_protection(watched: Watched) -> None:
-    """Tokens on an address of the network without TLS; with it there is nothing to say."""
-    network = {"http": "0.0.0.0:80", "http_tokens": "watched:KEYS", "listen": []}
-    for settings, expected in (({}, ["http 0.0.0.0:80"]), ({"http_tls": "tls"}, None)):
+    """Without tokens, or with readable ones, on an address of the network; with tokens and TLS all is said."""
+    network = {"http": "0.0.0.0:80", "listen": []}
+    tokens, tls = {"http_tokens": "watched:KEYS"}, {"http_tls": "tls"}
+    said = ["http 0.0.0.0:80"]
+    for settings, expected in (({}, said), (tls, said), (tokens, said), (tokens | tls, None)):
         with served(watched, **network, **settings) as address, asked(address, "/readyz") as response:
             assert json.loads(response.read()).get("unprotected") == expected

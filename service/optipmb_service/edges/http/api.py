@@ -7,9 +7,11 @@ of each stream. Events are kept for a while, for slow readers and for those who 
 from __future__ import annotations
 
 import asyncio
+import collections
 import contextlib
+import math
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Protocol
 
@@ -22,6 +24,7 @@ from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from optipmb_service.edges import access
 from optipmb_service.edges.access import ANYBODY, Caller, NotAllowedError, name_by, token_names
 from optipmb_service.edges.readers import Feeds, Reader, Wish, listed
 
@@ -45,6 +48,7 @@ BEARER: Final = "bearer."  # a second subprotocol with the token of a browser, w
 NAMES: Final = 256
 RECENT: Final = 32  # newest messages of events, of more than a second, among which one has counts
 TRY_AGAIN, MALFORMED, TOO_BIG = 1013, 1008, 1009  # why a WebSocket was closed
+NOT_VALID: Final = "the token is not valid any more"
 MESSAGE_CHARACTERS: Final = 4096  # largest message of a reader
 STREAMING: Final = {"cache-control": "no-store, no-transform", "x-accel-buffering": "no"}  # for proxies
 HEADERS: Final = {"cache-control": "no-store", "x-content-type-options": "nosniff", "referrer-policy": "no-referrer"}
@@ -110,33 +114,76 @@ class Source(Protocol):
         """Return the next text, and its id if it is an event. Raises TimeoutError."""
 
 
+@dataclass(eq=False)
+class Occupant:
+    """A connection in a room.
+
+    Attributes:
+        name: of its caller.
+        yields: whether it may be closed for another one when it is idle.
+        used_s: monotonic time at which it was last used.
+        left: whether its place was given to another one.
+    """
+
+    name: str
+    yields: bool
+    used_s: float
+    left: bool = False
+
+
 class Room:
-    """Connections of a kind that are open now: a bounded number.
+    """Connections of a kind that are open now: a bounded number. An idle one gives its place to another.
+
+    Attributes:
+        refused: connections that found no place, by the name of their callers.
 
     Args:
         most: their largest number.
         who: they are, for the refusal.
+        share: of the places that one name may have; anybody has no name.
+        idle_s: time without use after which one gives its place.
     """
 
-    def __init__(self, most: int, who: str) -> None:
-        self.count = 0
+    def __init__(self, most: int, who: str, share: float = 1.0, idle_s: float = math.inf) -> None:
+        self.refused: collections.Counter[str] = collections.Counter()
+        self._places: set[Occupant] = set()
         self._most = most
+        self._of_a_name = max(1, int(most * share))
         self._who = who
+        self._idle_s = idle_s
+
+    @property
+    def count(self) -> int:
+        """Connections that are open now."""
+        return len(self._places)
 
     @contextlib.contextmanager
-    def entered(self) -> Iterator[None]:
-        """Count a connection meanwhile.
+    def entered(self, name: str = ANYBODY, *, yields: bool = False) -> Iterator[Occupant]:
+        """Count a connection meanwhile; `yields`: it may be closed for another one when it is idle.
 
         Raises:
             NoRoomError: there are too many.
         """
-        if self.count >= self._most:
-            raise NoRoomError(f"{self._most} {self._who} are here already")
-        self.count += 1  # before anything is awaited: those who come together are counted one by one
+        place = Occupant(name, yields, time.monotonic())
+        own = {one for one in self._places if one.name == name != ANYBODY}
+        if len(own) >= self._of_a_name:
+            self._make_room(own, place, f"{len(own)} {self._who} of {name} are here already")
+        elif self.count >= self._most:
+            self._make_room(self._places, place, f"{self._most} {self._who} are here already")
+        self._places.add(place)  # before anything is awaited: those who come together are counted one by one
         try:
-            yield
+            yield place
         finally:
-            self.count -= 1
+            self._places.discard(place)
+
+    def _make_room(self, places: set[Occupant], place: Occupant, reason: str) -> None:
+        idle = [one for one in places if one.yields and place.used_s - one.used_s >= self._idle_s]
+        if not idle:
+            self.refused[place.name] += 1
+            raise NoRoomError(reason)
+        longest = min(idle, key=lambda one: one.used_s)
+        longest.left = True
+        self._places.discard(longest)
 
 
 class Readers:
@@ -198,6 +245,18 @@ class Readers:
             raise NoTokenError("the token is missing or not valid")
         return Caller(name, self._reads(name))
 
+    async def is_revoked(self, connection: HTTPConnection, caller: Caller) -> bool:
+        """Return whether the token of an open connection has been taken out of the file, or has other rights now."""
+        try:
+            return isinstance(self._names, access.TokenFile) and await self.caller(connection) != caller
+        except NoTokenError:
+            return True
+
+    async def revoked(self, connection: HTTPConnection, caller: Caller) -> None:
+        """Wait until the token of an open connection has been taken out of the file, or has other rights."""
+        while not await self.is_revoked(connection, caller):  # noqa: ASYNC110 - a file tells nobody that it changes
+            await asyncio.sleep(access.LOOK_S)
+
     @contextlib.asynccontextmanager
     async def joined(self, keys: Sequence[str], source: Source) -> AsyncIterator[str]:
         """Hand over the publications of keys meanwhile; gives the id after which the reader of events begins.
@@ -231,20 +290,24 @@ class Readers:
             NoRoomError: there are too many readers.
             TransportError: the network cannot be used, or too many keys were asked for.
         """
-        headers = {**headers, **STREAMING}
+        headers, caller = {**headers, **STREAMING}, await self.caller(request)
         if request.method == "HEAD":
             return Response(headers=headers, media_type=EVENT_STREAM)
         async with contextlib.AsyncExitStack() as ended:
             ended.enter_context(self.room.entered())
             reader = source()
             begins = await ended.enter_async_context(self.joined(keys, reader))
-            return _Stream(self._lines(reader, begins, pause_s), ended.pop_all(), headers)
+            revoked = asyncio.create_task(self.revoked(request, caller))
+            ended.callback(revoked.cancel)
+            return _Stream(self._lines(reader, begins, pause_s, revoked), ended.pop_all(), headers)
 
-    async def _lines(self, reader: Source, begins: str, pause_s: float) -> AsyncIterator[bytes]:
+    async def _lines(
+        self, reader: Source, begins: str, pause_s: float, revoked: asyncio.Task[None]
+    ) -> AsyncIterator[bytes]:
         heard = time.monotonic()
         # The headers go with the first piece: the reader knows that it is connected.
         yield b": hello\n%b\n" % (f"id: {begins}\n".encode() if begins else b"")
-        while self._health.state() != "stopping":
+        while self._health.state() != "stopping" and not revoked.done():
             try:
                 text, event_id = await reader.take(POLL_S)
             except TimeoutError:
@@ -418,7 +481,8 @@ class Api:
             async with contextlib.AsyncExitStack() as joined:
                 await joined.enter_async_context(self._readers.joined(wish.keys(self._readers.keys), reader))
                 await websocket.accept(PROTOCOL if PROTOCOL in websocket.scope["subprotocols"] else None)
-                works = _send(websocket, reader), self._listen(websocket, caller, reader, joined)
+                listening = self._listen(websocket, caller, reader, joined)
+                works = _send(websocket, reader), listening, self._revoke(websocket, caller)
                 tasks = [asyncio.create_task(work) for work in works]
                 try:
                     done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -428,6 +492,11 @@ class Api:
                     await asyncio.wait(tasks)
                 for task in done:
                     task.result()
+
+    async def _revoke(self, websocket: WebSocket, caller: Caller) -> None:
+        """Close a WebSocket when its token is not valid any more."""
+        await self._readers.revoked(websocket, caller)
+        await websocket.close(MALFORMED, NOT_VALID)
 
     async def _listen(
         self, websocket: WebSocket, caller: Caller, reader: Reader, joined: contextlib.AsyncExitStack

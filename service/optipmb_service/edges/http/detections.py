@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import itertools
 import math
+import time
 from dataclasses import dataclass
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, Final, cast
@@ -18,11 +19,14 @@ from starlette.responses import Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from optipmb_service.edges import access
 from optipmb_service.edges.access import NotAllowedError
 from optipmb_service.edges.http.api import (
     HEADERS,
     MALFORMED,
+    NOT_VALID,
     PROTOCOL,
+    TRY_AGAIN,
     RequestError,
     Room,
     parameters_of,
@@ -41,7 +45,7 @@ if TYPE_CHECKING:
     from starlette.requests import HTTPConnection, Request
 
     from optipmb_service.edges.access import Caller
-    from optipmb_service.edges.http.api import Readers
+    from optipmb_service.edges.http.api import Occupant, Readers
     from optipmb_service.settings import Settings
     from optipmb_service.telemetry.health import ProcessHealth
     from optipmb_service.zenoh.client import Client
@@ -51,6 +55,9 @@ BODY_S: Final = 10.0
 
 WAIT_S: Final = 5.0
 """Longest wait for tracks."""
+
+SHARE: Final = 0.25
+"""Share of the places of senders that one name may have."""
 
 JSON: Final = "application/json"
 SELECTION: Final = ("classes", "confirmed", "min_existence", "fields")
@@ -95,7 +102,7 @@ class Senders:
         places: Mapping[str, Place],
         sessions: Callable[[str], str],
     ) -> None:
-        self.room = Room(settings.http_senders, "requests and sockets that send")
+        self.room = Room(settings.http_senders, "requests and sockets that send", SHARE, settings.sender_idle_s)
         self._health = health
         self._readers = readers
         self._settings = settings
@@ -116,7 +123,7 @@ class Senders:
         stream, wait_s = parameters.get("stream", ""), _wait(parameters)
         wish = wish_of({name: parameters[name] for name in SELECTION if name in parameters} | {"stream": "*/*/*"})
         inputs = self._opened()
-        with self.room.entered():
+        with self.room.entered(caller.name):
             _check_type(request)
             frames, is_array = self._frames.split(await self._body(request))
             if is_array and wait_s:
@@ -137,16 +144,36 @@ class Senders:
         caller = await self._caller(websocket)
         stream = parameters_of(websocket, ("stream",)).get("stream", "")
         sender = _Sender(self._opened(), self._frames, caller, stream, websocket.headers.get("traceparent", ""))
-        with self.room.entered(), contextlib.suppress(WebSocketDisconnect):
+        with self.room.entered(caller.name, yields=True) as place, contextlib.suppress(WebSocketDisconnect):
             await websocket.accept(PROTOCOL if PROTOCOL in websocket.scope["subprotocols"] else None)
             for index in itertools.count():
-                if (message := await websocket.receive())["type"] == "websocket.disconnect":
-                    return
-                if (text := message.get("text")) is None:
-                    await websocket.close(MALFORMED, "texts are expected")
+                if (text := await self._next(websocket, caller, place)) is None:
                     return
                 answer = await sender.send(text.encode())
                 await websocket.send_text(msgspec.json.encode({"index": index} | answer).decode())
+
+    async def _next(self, websocket: WebSocket, caller: Caller, place: Occupant) -> str | None:
+        """Return the next text of a socket; None when it has ended, or was closed here."""
+        while True:
+            message: Mapping[str, Any] | None = None
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(access.LOOK_S):
+                    message = await websocket.receive()
+            if message is not None and message["type"] == "websocket.disconnect":
+                return None
+            reason, code = "", MALFORMED
+            if place.left:
+                reason, code = "another sender needed the place of this idle one", TRY_AGAIN
+            elif await self._readers.is_revoked(websocket, caller):
+                reason = NOT_VALID
+            elif message is not None:
+                if (text := message.get("text")) is not None:
+                    place.used_s = time.monotonic()
+                    return str(text)
+                reason = "texts are expected"
+            if reason:
+                await websocket.close(code, reason)
+                return None
 
     async def _caller(self, request: HTTPConnection) -> Caller:
         """Return who sends.

@@ -96,6 +96,8 @@ def application(
             body["failure"] = failure
         if settings.unprotected:
             body["unprotected"] = settings.unprotected
+        if senders.room.refused:
+            body["senders_refused"] = {name or "anybody": count for name, count in senders.room.refused.items()}
         return _answer(body, well=well)
 
     # No coroutine: Starlette runs it on a thread, so that making the metrics of many streams delays no other answer.
