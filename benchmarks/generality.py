@@ -107,6 +107,7 @@ class Thinned:
     stride: int
     posed: bool
     distort: str
+    cut: float = 0.0
 
     def __getattr__(self, name: str) -> object:
         return getattr(self.whole, name)
@@ -120,12 +121,13 @@ class Thinned:
         return list(self.whole.poses)[:: self.stride]
 
     def frames(self) -> Iterator[DetectionFrame]:
-        """Yield them."""
+        """Yield them, with the detections of scores from `cut` on."""
         for frame in self.whole.frames():
             if frame.index % self.stride == 0:
                 pose = frame.pose if self.posed else STANDING
                 scores = {"": frame.score, "scaled": 0.4 * frame.score, "cubed": frame.score**3}[self.distort]
-                yield replace(frame, index=frame.index // self.stride, pose=pose, score=np.maximum(scores, LEAST))
+                kept = replace(frame, index=frame.index // self.stride, pose=pose, score=np.maximum(scores, LEAST))
+                yield kept.take(scores >= self.cut) if self.cut else kept
 
     def truth(self) -> Truth | None:
         """Return the annotations of them."""
@@ -150,6 +152,7 @@ class Cell:
     distort: str = ""
     fast: bool = False
     hindsight: float = 1.0
+    cut: float = 0.0
 
     def figures(self) -> Figures:
         """Return the figures of each class."""
@@ -157,8 +160,9 @@ class Cell:
         dataset = "kitti" if folder == "kitti" else "nuscenes"
         rules, near = rules_of(dataset), default_rules(dataset, "distance", CENTRE_DISTANCE)
         sequences = sequences_of(self.root, self.detector, fast=self.fast)
-        plain = self.stride == 1 and self.posed and not self.distort
-        taken = sequences if plain else [Thinned(one, self.stride, self.posed, self.distort) for one in sequences]
+        plain = self.stride == 1 and self.posed and not self.distort and not self.cut
+        how = self.stride, self.posed, self.distort, self.cut
+        taken = sequences if plain else [Thinned(one, *how) for one in sequences]
         tracked = []
         for one in taken:
             parameters = profiles.profile_for(self.profile, [one])
@@ -506,6 +510,7 @@ def main() -> None:
     parser.add_argument("--strides", default="1,2,5", help="of frames, with commas")
     parser.add_argument("--unposed", action="store_true", help="withhold the poses of the sensor")
     parser.add_argument("--distort", default="", choices=["", "scaled", "cubed"], help="scores x 0.4, or cubed")
+    parser.add_argument("--cut", type=float, default=0.0, help="leave out detections of lower scores")
     parser.add_argument("--hindsight", type=float, default=1.0, help="seconds; 0: as the service confirms tracks")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--fast", action="store_true", help="a few sequences only")
@@ -514,19 +519,18 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, help="folder of figures of cells")
     given = parser.parse_args()
     measured = functools.partial(figures, cache=given.cache)
+    shared = given.distort, given.fast, given.hindsight, given.cut
     if given.summary or given.table:
 
         def of(detector: str, stride: int, profile: str = "auto", *, posed: bool = True) -> Figures:
-            return measured(
-                Cell(given.root, detector, stride, profile, posed, given.distort, given.fast, given.hindsight)
-            )
+            return measured(Cell(given.root, detector, stride, profile, posed, *shared))
 
         summary = Summary(of, given.root, given.fast)
         for line in table(summary) if given.table else (": ".join(one) for one in summary.lines()):
             print(line, flush=True)
         return
     cells = [
-        Cell(given.root, detector, stride, name, not given.unposed, given.distort, given.fast, given.hindsight)
+        Cell(given.root, detector, stride, name, not given.unposed, *shared)
         for detector, stride in product(given.detectors.split(","), map(int, given.strides.split(",")))
         if stride in STRIDES[folder := DETECTORS[detector][0]]
         for profile in given.profiles.split(",")

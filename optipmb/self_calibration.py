@@ -36,7 +36,8 @@ along and across the heading:
 
 with `PRIOR_PAIRS` pairs of the profile's noise. The scatter is R of the class, and R' of the published box. The errors
 of a detector last, too: no filter sees the offset of a box from its object. It is larger along the heading, where half
-of an object is hidden, than across. `LASTING_RATIO` times the scatter is added to the published covariance.
+of an object is hidden, than across. `LASTING_RATIO` times the scatter is added to the published covariance of sure
+tracks; the curve of the profile tells how much more the errors of doubtful ones last.
 
 A threshold never excludes the upper half of the scores of a class. Detections that are filtered out teach nothing, so
 that otherwise a detector of low scores would remain silent for ever.
@@ -111,7 +112,7 @@ LEAST_NOISE, MOST_NOISE = 0.02, 2.0
 """Bounds of a learned standard deviation, m."""
 OUTLYING: Final = 9.0
 """Squared standard deviations that a pair counts for at most: a half-hidden object jumps."""
-LASTING_RATIO: Final = (0.0, 1.5, 1.0)
+LASTING_RATIO: Final = (0.0, 1.1, 0.7)
 """Lasting errors in units of the scatter, by column of it."""
 LEAST_PART: Final = 1.0
 """Part of the profile's variance that R has at least, so that the box of a half-hidden object stays with its track."""
@@ -379,9 +380,18 @@ def use_scatter(scatter: Array, table: Classes) -> None:
         measured = max(measured, LEAST_PART * own.noise_position * own.noise_position)
         own.noise_position = math.sqrt(measured)
         own.reported_position = 1.0 / (1.0 / reported - 1.0 / measured) if reported < measured else 0.0
-        for k in range(own.knots):
-            own.knot_along[k] = math.sqrt(lasting(scatter[c], ALONG, own.knot_along[k]))
-            own.knot_across[k] = math.sqrt(lasting(scatter[c], ACROSS, own.knot_across[k]))
+        if own.knots > 0:
+            grow(own.knot_along, own.knots, scatter[c], ALONG)
+            grow(own.knot_across, own.knots, scatter[c], ACROSS)
+
+
+@kernel
+def grow(curve: Array, knots: int, own: Array, axis: int) -> None:
+    """Scale the lasting errors of a class, m, so that those of its surest tracks are the learned ones."""
+    sure = curve[knots - 1]
+    factor = math.sqrt(lasting(own, axis, sure)) / sure if sure > 0.0 else 0.0
+    for k in range(knots):
+        curve[k] *= factor
 
 
 @kernel

@@ -82,6 +82,16 @@ def test_the_lasting_error_lies_along_and_across_the_heading() -> None:
     assert not added[:, 2:].any()
 
 
+def test_the_ellipse_of_a_doubtful_track_is_larger() -> None:
+    """With `generic`, whose errors grow with doubt: cars with scores of 0.6 and 0.95 before anything is learned."""
+    tracker = optipmb.OnlineTracker("generic")
+    for k in range(10):
+        boxes = {"center": [[0.0, 0.0, 0.8], [0.0, 30.0, 0.8]], "size": [[4.5, 1.9, 1.6]] * 2, "yaw": [0.0] * 2}
+        tracks = tracker.update(t=0.1 * k, **boxes, score=[0.95, 0.6], label=["car"] * 2)
+    sure, doubtful = (np.sqrt(np.linalg.det(one[:2, :2])) for one in tracks.covariance)
+    assert doubtful > 2.0 * sure
+
+
 def test_a_parked_car_hardly_moves() -> None:
     """Velocities are weighted by v^4 / (v^4 + (3 P_vv)^2): hardly any where the speed is not certain."""
     told, plain = (followed(one) for one in (with_calibration(speed=0.5), PAPER))

@@ -285,10 +285,10 @@ def test_scatter_is_summed_over_sure_pairs_as_in_numpy(seed: int) -> None:
 
 
 def test_learned_noise_goes_to_the_state_the_box_and_the_covariance() -> None:
-    """R and R' are the scatter, with the profile's for fifty pairs; a class without pairs keeps its own."""
+    """R and R' are the scatter, with the profile's for fifty pairs; lasting errors keep their shape over the knots."""
     scatter = np.array([[150.0, 12.0, 6.0], [0.0, 0.0, 0.0], [1e3, 1e-3, 1e-3], [1e3, 1e5, 1e5]])
     curve = np.zeros((4, 32))
-    curve[:, :2] = [0.15, 0.2]
+    curve[:, :2] = [0.3, 0.15]
     left = 1.0 / (1.0 / 0.06**2 - 1.0 / 0.3**2)
     columns = {"noise_position": 0.3, "reported_position": left, "knots": 2, "knot_along": curve, "knot_across": curve}
     rows = class_rows(4, **columns)
@@ -308,9 +308,9 @@ def test_learned_noise_goes_to_the_state_the_box_and_the_covariance() -> None:
         of_box = 1.0 / (1.0 / own["reported_position"] + 1.0 / measured) if own["reported_position"] else measured
         assert of_box == pytest.approx(min(reported, measured), rel=1e-9)
         for s, name in ((1, "knot_along"), (2, "knot_across")):
-            variance = (50.0 * curve[0, :2] ** 2 + LASTING_RATIO[s] ** 2 * one[s]) / (50.0 + one[0])
-            np.testing.assert_allclose(own[name][:2] ** 2, np.minimum(variance, MOST_NOISE**2), rtol=1e-12)
-            assert lasting(one, s, 0.15) == pytest.approx(min(variance[0], MOST_NOISE**2), rel=1e-12)
+            variance = min((50.0 * 0.15**2 + LASTING_RATIO[s] ** 2 * one[s]) / (50.0 + one[0]), MOST_NOISE**2)
+            assert lasting(one, s, 0.15) == pytest.approx(variance, rel=1e-12)
+            np.testing.assert_allclose(own[name][:2], np.sqrt(variance) * np.array([0.3, 0.15]) / 0.15, rtol=1e-12)
 
 
 @pytest.mark.parametrize("noise", [0.15, 0.4])
