@@ -102,6 +102,7 @@ def _of_class(kind: str, period: float) -> dict[str, Any]:
         "heading_sign": {"speed": 1.0 if agile or two_wheeled else 4.0},  # vehicles reverse at up to 4 m/s
         "birth_heading_speed": 1.0,
         "birth_over_clutter": True,  # a wide gate holds components that are of other objects
+        "crowded": True,
         "birth_overlap": 0.1,
         "motion": "cv" if agile else "ctra",
         "acceleration_time": None if agile else 1.0 if two_wheeled else 3.0,

@@ -281,6 +281,12 @@ class ClassParameters(ParameterTable):
         description="true: a detection from eta_score on is born unless a Poisson component explains it better than "
         "clutter; false: any component in its gate forbids the birth (the paper)",
     )
+    crowded: bool = Field(
+        default=False,
+        exclude_if=not_,
+        description="true: more clutter is expected, and gates are narrower, where detections are near each other; "
+        "false: both are as elsewhere (the paper)",
+    )
     birth_overlap: Probability = Field(
         default=1.0,
         exclude_if=(1.0).__eq__,

@@ -6,7 +6,8 @@ detector lists its boxes.
 People walk side by side, and their boxes overlap as two boxes of one person do (not in the paper). A detector is seldom
 sure of a second box of the same object. Where `sure_nms_iou` is more than eta_iou, boxes that overlap a better one by
 more than `sure_nms_iou` go first. Of the others, those go that overlap a better one that stays by more than eta_iou,
-unless the scores of both are high, ``z_s z_s' >= SURE_OF_BOTH``.
+unless the scores of both are high, ``z_s z_s' >= SURE_OF_BOTH``. Points have no size to overlap with: two of high
+scores may have boxes of the usual size that overlap by `SAME_PLACE`.
 """
 
 from __future__ import annotations
@@ -101,14 +102,15 @@ def select(detections: Columns, width: int, classes: Classes, most: int) -> tupl
     order = chosen[:above]
     sort_canonically(order, score, center, size, yaw, source)
     boxes, ordered_score = np.empty((above, 5)), np.empty(above)
-    ordered_label = np.empty(above, np.int64)
+    ordered_label, points = np.empty(above, np.int64), np.empty(above, np.bool_)
     for k in range(above):
         m = order[k]
+        points[k] = math.isnan(size[m, 0]) and math.isnan(size[m, 1])
         boxes[k, 0], boxes[k, 1], boxes[k, 4] = center[m, 0], center[m, 1], yaw[m]
         for s in range(2):
             boxes[k, 2 + s] = known_length(size[m, s], s, classes[label[m]])
         ordered_score[k], ordered_label[k] = score[m], label[m]
-    keep = non_maximum_suppression(boxes, ordered_score, ordered_label, classes, most)
+    keep = non_maximum_suppression(boxes, ordered_score, ordered_label, points, classes, most)
     if keep.shape[0] < above:
         above = -1
     kept = 0
@@ -185,12 +187,17 @@ def sort_canonically(order: Index, score: Array, center: Array, size: Array, yaw
 SURE_OF_BOTH: Final = 0.64
 """Product of two scores from which they are of two objects: 0.8 each."""
 
+SAME_PLACE: Final = 0.5
+"""Overlap of two boxes of the usual size from which two sure points are at one place."""
+
 
 @kernel
-def non_maximum_suppression(boxes: Array, score: Array, label: Index, classes: Classes, most: int) -> NDArray[np.bool_]:
+def non_maximum_suppression(
+    boxes: Array, score: Array, label: Index, points: NDArray[np.bool_], classes: Classes, most: int
+) -> NDArray[np.bool_]:
     """Keep each box unless a better one of its group overlaps it by more than the threshold of its class.
 
-    `boxes` (M, 5) are bird's-eye boxes, best first, with `score` (M,).
+    `boxes` (M, 5) are bird's-eye boxes, best first, with `score` (M,); `points` (M,) tells whose size is not known.
 
     Returns:
         (M,) whether the box is kept; empty where more than `most` overlaps had to be computed.
@@ -220,8 +227,12 @@ def non_maximum_suppression(boxes: Array, score: Array, label: Index, classes: C
                             left -= 1
                             if left < 0:
                                 return keep[:0]
-                            stands = not boxes_overlap(boxes[k], boxes[m], widest_overlap)
-                            unsure = own.nms_iou < widest_overlap and score[k] * score[m] < SURE_OF_BOTH
+                            sure = own.nms_iou < widest_overlap and score[k] * score[m] >= SURE_OF_BOTH
+                            limit = (
+                                max(widest_overlap, SAME_PLACE) if sure and points[k] and points[m] else widest_overlap
+                            )
+                            stands = not boxes_overlap(boxes[k], boxes[m], limit)
+                            unsure = own.nms_iou < widest_overlap and not sure
                             if unsure and stands and keep[k] and keep[m]:
                                 keep[m] = not boxes_overlap(boxes[k], boxes[m], own.nms_iou)
                     k = following[k]

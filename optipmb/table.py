@@ -77,6 +77,7 @@ class ClassRow(Protocol):
     announce_score: float
     birth_score: float
     birth_over_clutter: bool
+    crowded: bool
     birth_overlap: float
     birth_heading_speed: float
     adaptive_birth_rate: float

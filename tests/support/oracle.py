@@ -108,6 +108,7 @@ class Oracle:
             self._predict(now)
         self.stamp_ns = now
         measurements = self._preprocess(frame)
+        self._look_round(measurements)
         world = None
         if frame.cloud is not None and self.modules.adp:
             pose = frame.cloud.pose
@@ -198,6 +199,15 @@ class Oracle:
                 kept.append(found)
         return kept
 
+    def _look_round(self, zs: list[Measurement]) -> None:
+        """Where a class is crowded, each measurement's distance to the next of its class, and clutter among them."""
+        for z in zs:
+            c = self.classes[z.label]
+            others = [one for one in zs if one is not z and one.label == z.label and c.crowded]
+            near = [one for one in others if math.dist(one.xy, z.xy) <= c.gate]
+            z.spacing = min((math.dist(one.xy, z.xy) for one in near), default=math.inf)
+            z.clutter = c.clutter_rate / c.area + 0.05 * sum(one.score for one in near) / (math.pi * c.gate**2)
+
     def _detection_probability(self, component: Bernoulli | Poisson, world: Array | None) -> float:
         """ADP: p_d = p_d0 min[1, (1 - s_d) PTS / PTS_0 + s_d], without the points of the ground; over dt, if asked."""
         c = self.classes[component.label]
@@ -247,6 +257,9 @@ class Oracle:
     def _log_likelihood(self, component: Bernoulli | Poisson, z: Measurement) -> float:
         position = self.classes[z.label].measurement_noise.position
         value = log_likelihood(z.xy, component.mean, component.covariance, position)
+        if isinstance(component, Bernoulli) and math.dist(component.mean[:2], z.xy) > z.spacing:
+            off, S = z.xy - component.mean[:2], component.covariance[:2, :2] + position**2 * np.eye(2)
+            value = -math.inf if off @ np.linalg.solve(S, off) > 9.21 else value
         return value + (math.log(component.pi @ self._called(z, 1.0)) if isinstance(component, Bernoulli) else 0.0)
 
     def _suppressed_together(self, one: int, other: int) -> bool:
@@ -283,7 +296,7 @@ class Oracle:
     def _first_detection(self, z: Measurement, gate: list[int], p_d: list[float], p_a: float) -> NewObject:
         """Eqs. (First-Time Detection Hypothesis Update 1, 2), (Clutter Hypothesis), (Newborn Hypothesis)."""
         c = self.classes[z.label]
-        clutter = c.clutter_rate / c.area  # lambda_c
+        clutter = z.clutter  # lambda_c
         if gate:
             members = [self.poisson[j] for j in gate]
             log_e = np.array(

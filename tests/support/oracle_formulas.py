@@ -29,6 +29,8 @@ class Measurement:
     label: int
     score: float
     source: int
+    spacing: float = math.inf
+    clutter: float = 0.0
 
 
 def wrap(angle: float) -> float:

@@ -281,6 +281,7 @@ def random_parameters(
             "motion": str(rng.choice(["ctra", "cv"])), "acceleration_time": rng.choice([None, 0.5, 2.0]),
             "gate_deviations": rng.choice([0.0, 2.0]), "velocity_gate": 1.5 if seed % 2 else 0.0,
             "birth_over_clutter": bool(rng.random() < 0.5), "birth_overlap": rng.choice([0.02, 0.3, 1.0]),
+            "crowded": seed % 2 == 0,
             "ground_clearance": rng.choice([0.0, 0.2]), "sure_nms_iou": 0.7 if seed % 2 else 0.0,
             "confirm_from": rng.uniform(0.3, 0.9), "confirm_until": rng.uniform(0.0, 0.3),
         }  # fmt: skip

@@ -219,6 +219,27 @@ def test_people_side_by_side_are_two_where_both_are_sure(doubt: float, count: in
     assert len(tracks) == count
 
 
+@pytest.mark.parametrize(("doubt", "count"), [(0.1, 2), (0.6, 1)])
+def test_points_of_people_in_a_crowd_are_two_where_both_are_sure(doubt: float, count: int) -> None:
+    """Points without a size may be a third of a metre apart, unless the detector doubts the second."""
+    tracker = optipmb.OnlineTracker("generic")
+    for k in range(20):
+        points = {"x": [0.1 * k] * 2, "y": [0.0, 0.35], "score": [0.95, 1.0 - doubt], "class": ["pedestrian"] * 2}
+        tracks = tracker.update(points, t=0.1 * k)
+    assert len(tracks) == count
+
+
+def test_who_is_missed_in_a_crowd_leaves_the_next_one_alone() -> None:
+    """Of three people who walk .6 m apart the middle one is missed for half a second: all keep their ids and places."""
+    tracker, seen = optipmb.OnlineTracker("generic"), []
+    for k in range(40):
+        who = [0, 2] if 20 <= k < 25 else [0, 1, 2]
+        points = {"x": [0.1 * k] * len(who), "y": [0.6 * one for one in who], "score": [0.9] * len(who)}
+        tracks = tracker.update({**points, "class": ["pedestrian"] * len(who)}, t=0.1 * k)
+        seen.append(dict(zip(tracks.id.tolist(), np.round(tracks.center[:, 1], 1).tolist(), strict=True)))
+    assert seen[-1] == seen[19] == {1: 0.0, 2: 0.6, 3: 1.2}
+
+
 def test_a_stamp_that_goes_back_is_refused() -> None:
     """The tracker does not go back in time, and says by the path which field was wrong; equal stamps are fine."""
     tracker = optipmb.Tracker(KITTI)

@@ -74,6 +74,6 @@ def test_suppression_gives_up_at_its_bound() -> None:
     """Long thin boxes across each other overlap too little to suppress one another."""
     angles = np.linspace(0, 3, 30)
     star = np.c_[np.zeros((30, 2)), np.full(30, 20.0), np.full(30, 0.05), angles]
-    score, label, classes = np.full(30, 0.5), np.zeros(30, np.int64), class_rows(1, nms_iou=0.5)
-    assert non_maximum_suppression(star, score, label, classes, 30 * 29 // 2).all()
-    assert non_maximum_suppression(star, score, label, classes, 30 * 29 // 2 - 1).shape == (0,)
+    given = np.full(30, 0.5), np.zeros(30, np.int64), np.zeros(30, np.bool_), class_rows(1, nms_iou=0.5)
+    assert non_maximum_suppression(star, *given, 30 * 29 // 2).all()
+    assert non_maximum_suppression(star, *given, 30 * 29 // 2 - 1).shape == (0,)

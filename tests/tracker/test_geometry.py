@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import optipmb
 from optipmb.detection_probability import CELLS, NOWHERE, SIDE, boxes_in_sensor, boxes_of_cells, cells_of_points
 from optipmb.hypotheses import UNLIMITED
-from optipmb.preprocess import non_maximum_suppression
+from optipmb.preprocess import SAME_PLACE, non_maximum_suppression
 
 Array = NDArray[np.float64]
 COMPILING = settings(deadline=None)  # the first call compiles
@@ -67,13 +67,14 @@ def test_iou_is_symmetric_and_moves_with_the_world(
 @pytest.mark.parametrize("mixed", [False, True])
 @pytest.mark.parametrize("seed", range(3))
 def test_suppression_is_the_greedy_one_per_group(seed: int, *, mixed: bool, group: list[int]) -> None:
-    """A box goes when a better KEPT one of its group overlaps it by more than its class and both scores allow."""
+    """A box goes when a better KEPT one of its group overlaps it by more than its class, scores and sizes allow."""
     rng = np.random.default_rng(seed)
     boxes = rng.uniform([0, 0, 1, 1, -3], [12, 12, 5, 2, 3], (60, 5))
     if mixed:  # specks next to giants, many at the same x
         boxes[:, 0] = np.round(boxes[:, 0])
         boxes[:, 2:4] = 10 ** rng.uniform(-0.5, 1.2, (60, 2))
     label, score = rng.integers(0, 3, 60), np.sort(rng.uniform(0.5, 1.0, 60))[::-1].copy()
+    points = rng.random(60) < 0.5
     thresholds, sure = np.array([0.0, 0.1, 0.5]), np.array([0.2, 0.0, 0.6])
     standing: list[int] = []
     wanted: list[int] = []
@@ -81,13 +82,17 @@ def test_suppression_is_the_greedy_one_per_group(seed: int, *, mixed: bool, grou
         c = label[i]
         rivals = [k for k in standing if group[label[k]] == group[c]]
         overlap = {k: textbook.iou(boxes[i], boxes[k]) for k in rivals}
-        if any(overlap[k] > max(thresholds[c], sure[c]) for k in rivals):
+        limit = {k: max(thresholds[c], sure[c]) for k in rivals}
+        if sure[c] > thresholds[c]:
+            both = [k for k in rivals if points[i] and points[k] and score[i] * score[k] >= 0.64]
+            limit |= {k: max(sure[c], SAME_PLACE) for k in both}
+        if any(overlap[k] > limit[k] for k in rivals):
             continue
         standing.append(i)
         if all(overlap[k] <= thresholds[c] or score[i] * score[k] >= 0.64 for k in rivals if k in wanted):
             wanted.append(i)
     classes = class_rows(3, nms_iou=thresholds, sure_nms_iou=sure, suppressed_with=group)
-    found = non_maximum_suppression(boxes, score, label, classes, UNLIMITED)
+    found = non_maximum_suppression(boxes, score, label, points, classes, UNLIMITED)
     np.testing.assert_array_equal(np.flatnonzero(found), wanted)
     assert 0 < len(wanted) < 60
 

@@ -16,14 +16,18 @@ from scipy.optimize import linear_sum_assignment
 
 from optipmb.association import UNASSIGNED
 from optipmb.association import associate as associate_pairs
+from optipmb.density import Bernoullis, objects_in
 from optipmb.hypotheses import (
     CLUTTER,
     DEVIATIONS_2,
+    FALSE_SHARE,
     FEW,
     FROM_POISSON,
     NEWBORN,
     Hypotheses,
+    crowd,
     detection_costs,
+    exclude_neighbours,
     first_detections,
     gate,
     gate_radii,
@@ -31,6 +35,7 @@ from optipmb.hypotheses import (
     pairs_of_few,
     pairs_of_many,
 )
+from optipmb.preprocess import Measurements
 
 Array = NDArray[np.float64]
 NOTHING = np.zeros(0)
@@ -116,8 +121,8 @@ def test_costs_stay_finite_where_likelihoods_vanish() -> None:
 def test_a_component_worse_than_clutter_takes_no_birth_from_a_high_score(*, over_clutter: bool) -> None:
     """With e below lambda_c a high score is newborn where the profile says so; a low score stays with its component."""
     log_e = np.log([0.001, 0.001, 0.1])
-    measured = np.array([0.9, 0.1, 0.9]), np.zeros(3), np.zeros(3, np.int64)
-    classes = class_rows(1, clutter_intensity=0.01, birth_intensity=0.002, birth_score=0.5)
+    measured = np.array([0.9, 0.1, 0.9]), np.zeros(3), np.zeros(3, np.int64), np.full(3, 0.01)
+    classes = class_rows(1, birth_intensity=0.002, birth_score=0.5)
     classes["birth_over_clutter"] = over_clutter
     kind, _, existence = first_detections(np.arange(3), log_e, *measured, classes)
     np.testing.assert_array_equal(kind, [NEWBORN if over_clutter else FROM_POISSON, FROM_POISSON, FROM_POISSON])
@@ -127,12 +132,44 @@ def test_a_component_worse_than_clutter_takes_no_birth_from_a_high_score(*, over
 
 def test_a_score_too_low_to_announce_is_clutter_with_a_component_or_without() -> None:
     """It may continue a track, and starts none."""
-    measured = np.array([0.1, 0.1, 0.2]), np.zeros(3), np.zeros(3, np.int64)
-    classes = class_rows(1, clutter_intensity=0.01, birth_intensity=0.002, birth_score=0.5, announce_score=0.15)
+    measured = np.array([0.1, 0.1, 0.2]), np.zeros(3), np.zeros(3, np.int64), np.full(3, 0.01)
+    classes = class_rows(1, birth_intensity=0.002, birth_score=0.5, announce_score=0.15)
     kind, cost, existence = first_detections(np.array([0, 2]), np.log([0.1, 0.1]), *measured, classes)
     np.testing.assert_array_equal(kind, [CLUTTER, CLUTTER, FROM_POISSON])
     np.testing.assert_allclose(cost, [-math.log(0.01), -math.log(0.01), -math.log(0.11)])
     np.testing.assert_allclose(existence, [0.0, 0.0, 0.1 / 0.11])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_neighbours_tell_clutter_and_narrow_the_gate(seed: int) -> None:
+    """In a crowd, as the double loop does; a pair beyond the measurement's neighbour stays within 99 % of S."""
+    rng = np.random.default_rng(seed)
+    mean, covariance, label = random_objects(rng, 30)
+    position, measured, score = rng.normal(0, 4, (60, 2)), rng.integers(0, 2, 60), rng.uniform(0.1, 1.0, 60)
+    position[:9, 0] += 1000.0 * np.arange(9)  # alone
+    gates, noise = np.array([1.5, 5.0]), np.array([0.2, 0.7])
+    classes = class_rows(2, gate=gates, clutter_intensity=0.001, noise_position=noise, crowded=[seed != 2, True])
+    columns = np.full(60, np.nan), np.full((60, 2), np.nan), np.full((60, 4), np.nan), score, measured, measured
+    z = Measurements(position, *columns)
+    spacing, clutter = crowd(z, classes)
+    apart = np.linalg.norm(position[:, None] - position, axis=2)
+    near = (measured[:, None] == measured) & (apart <= gates[measured, None]) & ~np.eye(60, dtype=np.bool_)
+    near &= classes["crowded"][measured, None]
+    np.testing.assert_allclose(spacing, np.where(near, apart, np.inf).min(axis=1), rtol=1e-12)
+    expected = 0.001 + FALSE_SHARE * (near * score).sum(axis=1) / (math.pi * gates[measured] ** 2)
+    np.testing.assert_allclose(clutter, expected, rtol=1e-12)
+
+    pairs = np.argwhere(label[:, None] == measured).astype(np.int64)
+    n, m = np.ascontiguousarray(pairs.T)
+    objects = Bernoullis.of(np.zeros(30 * Bernoullis.width)).replaced(mean=mean, covariance=covariance)
+    found = np.zeros(len(n))
+    exclude_neighbours(n, m, found, objects_in(objects.words), z, spacing, classes)
+    off = position[m] - mean[n, :2]
+    spread = covariance[n, :2, :2] + noise[measured[m], None, None] ** 2 * np.eye(2)
+    squared = (off * np.linalg.solve(spread, off[..., None])[..., 0]).sum(axis=1)
+    far = (np.linalg.norm(off, axis=1) > spacing[m]) & (squared > DEVIATIONS_2)
+    np.testing.assert_array_equal(found == -np.inf, far)
+    assert 0 < far.sum() < len(far)
 
 
 @pytest.mark.parametrize("dt", [0.0, 0.05, 0.1, 0.5])
@@ -150,8 +187,8 @@ def test_gates_widen_with_unknown_speed(dt: float) -> None:
 def test_first_detections_hold_over_all_magnitudes(log_e: list[float]) -> None:
     """E is summed as logarithms: no overflow, no underflow, r in [0, 1]."""
     arguments = np.zeros(len(log_e), np.int64), np.array(log_e), np.array([0.5]), np.zeros(1)
-    classes = class_rows(1, clutter_intensity=1e-3, birth_intensity=1e-4, birth_score=0.5)
-    _, cost, existence = first_detections(*arguments, np.zeros(1, np.int64), classes)
+    classes = class_rows(1, birth_intensity=1e-4, birth_score=0.5)
+    _, cost, existence = first_detections(*arguments, np.zeros(1, np.int64), np.array([1e-3]), classes)
     total = np.logaddexp.reduce([*log_e, math.log(1e-3)])
     assert cost[0] == pytest.approx(-total, rel=1e-10, abs=1e-10)
     assert existence[0] == pytest.approx(math.exp(np.logaddexp.reduce(log_e) - total), rel=1e-9, abs=1e-300)
