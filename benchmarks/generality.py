@@ -17,8 +17,10 @@ and every fifth frame of KITTI. Columns in addition to `optipmb evaluate`:
 - speed: root mean square error of the velocity of moving objects in KITTI, m/s, against labels half a second apart.
 
 With `--summary` it prints the figures by which a change of the default is judged, a line each. With `--table` it prints
-figures of each detector at the full rate, with `auto` and with its tuned profile. With `--cache` a cell is computed
-once for each state of the tracker.
+figures of each detector at the full rate, with `auto` and with its tuned profile. With `--shown` it prints MOTA of what
+is shown beside the best cut of the same tracks by their mean score, as recordings and as streams show it: all cells,
+also of detectors that only write scores from .3 and from .5 on, and the sample. With `--cache` a cell is computed once
+for each state of the tracker.
 """
 
 from __future__ import annotations
@@ -40,8 +42,8 @@ import numpy as np
 from optipmb_tools.datasets import open_dataset
 from optipmb_tools.evaluation import default_rules
 from optipmb_tools.evaluation.calibration import calibration, rows_of, sample
-from optipmb_tools.evaluation.cases import CENTRE_DISTANCE, best_pairs
-from optipmb_tools.evaluation.clear import clear
+from optipmb_tools.evaluation.cases import CENTRE_DISTANCE, best_pairs, match_frames, prepare
+from optipmb_tools.evaluation.clear import clear, combine, sweep
 from optipmb_tools.geometry import Pose, stack_poses, to_sensor, to_world
 from optipmb_tools.results import FullTable, full_table, stacked
 from optipmb_tools.results.kitti import LEAST_SHOWN
@@ -57,7 +59,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from optipmb_tools.datasets import DataSequence, DetectionFrame, Truth
+    from optipmb_tools.evaluation import Rules
     from optipmb_tools.evaluation.cases import Case
+    from optipmb_tools.evaluation.clear import Counts
     from optipmb_tools.geometry import Bools, Floats, Ints
     from optipmb_tools.tuning.scoring import Measured, Scorer
 
@@ -225,9 +229,8 @@ def track(clip: Clip, parameters: Parameters, *, posed: bool, hindsight: float) 
         result = tracker.step(density, frame)
         density, found[index] = result.density, result.tracks
     if hindsight:
-        ends = np.searchsorted(clip.stamps, clip.stamps + round(hindsight * 1e9), "right").tolist()
-        later = [[found[k] for k in range(index + 1, end)] for index, end in enumerate(ends)]
-        found = {index: with_hindsight(one, later[index], parameters, same_axes=posed) for index, one in found.items()}
+        changed = with_hindsight(list(found.values()), parameters, velocity_s=hindsight if posed else 0.0)
+        found = {index: found[index].replaced(**columns) for index, columns in zip(found, changed, strict=True)}
     table = full_table(parameters.labels, found)
     confirmed, when = stacked(list(found.values()), "confirmed").astype(np.bool_), table.frame
     rotation, translation = clip.rotation[when], clip.translation[when]
@@ -238,6 +241,100 @@ def track(clip: Clip, parameters: Parameters, *, posed: bool, hindsight: float) 
         center, yaw = to_sensor(rotation, translation, table.center, table.yaw)
         table = replace(table, box2d=clip.camera.boxes(center, table.size, yaw, LEAST_SHOWN)[0])
     return table, confirmed
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Counts of one class in one cell: what is shown beside what is known."""
+
+    best: Counts  # of the tracks from the best mean score on
+    recording: Counts  # of the tracks that `optipmb track` shows
+    stream: Counts  # of those that a service shows
+    early: tuple[int, int]  # objects that a stream shows within a second of their first track, and all
+    minutes: float
+
+    def figures(self) -> tuple[float, ...]:
+        """Return MOTA of the three, the share of early objects and false boxes a minute in streams."""
+        counts = self.best.mota, self.recording.mota, self.stream.mota
+        return *counts, self.early[0] / max(self.early[1], 1), self.stream.false / max(self.minutes, LEAST)
+
+
+def shown_of(sequences: Sequence[DataSequence], rules: Rules, names: Sequence[str], profile: str) -> dict[str, Shown]:
+    """Return the counts of each class over some sequences."""
+    near = replace(rules, measure="distance", limit=CENTRE_DISTANCE)
+    cases: dict[str, list[tuple[Case, Case, Case]]] = {name: [] for name in names}
+    early, seconds = dict.fromkeys(names, (0, 0)), 0.0
+    for one in sequences:
+        parameters = profiles.profile_for(profile, [one])
+        clip = load(one, parameters, rules)
+        seconds += float(np.ptp(clip.stamps)) * 1e-9
+        table, told = track(clip, parameters, posed=True, hindsight=0.0)
+        _, whole = track(clip, parameters, posed=True, hindsight=1.0)
+        for name in names:
+            mine = table.names == name
+            truth = of_class(clip, name, rules).world if name in clip.labels else clip.world.take([])
+            parts = [
+                prepare(truth, table.take(rows), name, near, one.name) for rows in (mine, mine & whole, mine & told)
+            ]
+            cases[name].append((parts[0], parts[1], parts[2]))
+            found, every = _early(parts[0], parts[2], clip.stamps)
+            early[name] = early[name][0] + found, early[name][1] + every
+    return {
+        name: Shown(
+            max(
+                sweep([case for case, _, _ in parts], near).results,
+                key=lambda one: np.nan_to_num(one.mota, nan=-np.inf),
+            ),
+            combine(clear(case, near) for _, case, _ in parts),
+            combine(clear(case, near) for _, _, case in parts),
+            early[name],
+            seconds / 60.0,
+        )
+        for name, parts in cases.items()
+    }
+
+
+def _early(case: Case, told: Case, stamps: Ints) -> tuple[int, int]:
+    """Return how many objects that are tracked for a second are shown within a second, and how many there are."""
+    known, shown = (match_frames(one) >= 0 for one in (case, told))
+    when, found, every = stamps[case.truth_frame], 0, 0
+    for one in np.unique(case.truth_id[known & ~case.ignored]):
+        rows = case.truth_id == one
+        begun = when[rows & known].min()
+        if when[rows & known].max() - begun >= SECOND:
+            every += 1
+            found += bool(shown[rows & (when <= begun + SECOND)].any())
+    return found, every
+
+
+SECOND = 1_000_000_000
+
+
+def shown_table(root: Path, detectors: Sequence[str], strides: Sequence[int], *, fast: bool) -> Iterator[str]:
+    """Yield the rows of the table of what is shown."""
+    yield f"{'cell':26} {'class':10} {'best cut':>8} {'recording':>9} {'stream':>6} {'early':>5} {'false/min':>9}"
+    sample = Path(__file__).parent.parent / "examples"
+    found: list[tuple[float, ...]] = []
+    for detector, stride, least in product((*detectors, "crossing"), strides, (0.0, 0.3, 0.5)):
+        if detector == "crossing":
+            opened = open_dataset("table", sample / "crossing.csv", truth=str(sample / "crossing_truth.csv"))
+            sequences, names, rules = tuple(opened.sequences(["all"])), tuple(opened.labels), default_rules("table")
+        else:
+            folder, names = DETECTORS[detector]
+            if stride not in STRIDES[folder]:
+                continue
+            sequences, rules = sequences_of(root, detector, fast=fast), rules_of(folder.partition("-")[0])
+        taken = [Thinned(one, stride, posed=True, distort="", cut=least) for one in sequences]
+        for name, one in shown_of(taken, rules, names, "auto").items():
+            if one.best.truth:
+                found.append(one.figures())
+                best, recording, stream, early, false = found[-1]
+                cell = f"{detector} 1/{stride} from {least:g}"
+                yield f"{cell:26} {name:10} {best:8.1%} {recording:9.1%} {stream:6.1%} {early:5.0%} {false:9.1f}"
+    best, recording, stream, early, false = np.array(found).T
+    for name, gap in (("recordings", best - recording), ("streams", best - stream)):
+        yield f"best cut less shown, {name}: mean {gap.mean():.1%}, largest {gap.max():.1%}"
+    yield f"early: {early.mean():.1%} in the mean; false a minute: {false.mean():.1f}"
 
 
 def existence_error(existence: Floats, true: Bools) -> float | None:
@@ -516,9 +613,15 @@ def main() -> None:
     parser.add_argument("--fast", action="store_true", help="a few sequences only")
     parser.add_argument("--summary", action="store_true", help="print the figures by which the default is judged")
     parser.add_argument("--table", action="store_true", help="print the table of docs/tuning.md")
+    parser.add_argument("--shown", action="store_true", help="print what is shown beside the best cut")
     parser.add_argument("--cache", type=Path, help="folder of figures of cells")
     given = parser.parse_args()
     measured = functools.partial(figures, cache=given.cache)
+    if given.shown:
+        strides = tuple(map(int, given.strides.split(",")))
+        for line in shown_table(given.root, given.detectors.split(","), strides, fast=given.fast):
+            print(line, flush=True)
+        return
     shared = given.distort, given.fast, given.hindsight, given.cut
     if given.summary or given.table:
 

@@ -6,13 +6,16 @@ independent, although they are nearly the same in neighbouring frames, which mak
 the published tracks, so that the recursion stays the paper's:
 
     evidence    e_k = lambda e_{k-1} + (1 - lambda) l_k,     l_k = ln[z_s / (1 - z_s)], or -l_miss where missed
-    existence   f(e_k)
+    existence   p = f(e_k), with a history logit p = o + w_e logit f(e_k) + w_T ln(1 + T) + w_s s + w_v min(v, `WALK`)
+    share       s = min(h / (rho n), `FULL_SHARE`)
     covariance  F P F + U diag(along(e_k), across(e_k))^2 U' on x and y, U turned by the heading
     score       (1 - w) x_s + w (1 + e_k / e_max) / 2        e_max the bound of l_k
     velocity    v v^4 / [v^4 + (3 P_vv)^2]                   below one standard deviation hardly any
 
 f, along and across are piecewise linear and were measured on training data, as were the factors F of speed and turn
 rate: process noise that lets a braking car stay one track is more than most objects show. lambda holds for one period.
+Evidence is of the last half second. The history is of the whole track: T seconds since its first detection, h of its n
+looks detected, at the recall rho of the class, and its published speed v, as standing clutter lasts too.
 Without a calibration in the profile, existence is r, the covariance is P, and the evidence stays zero.
 
 The state rests on measurement noise R that is larger than a detector's usual error, so that a half-hidden car whose box
@@ -37,12 +40,18 @@ from optipmb.predict import wrap
 
 if TYPE_CHECKING:
     from optipmb.rows import Array, Index
-    from optipmb.table import Classes
+    from optipmb.table import Classes, ClassRow
 
     Box = tuple[float, float, float]
 
 SURE: Final = 14.0
 """Bound of the log odds of a detection, either sign: a score of one in a million from certain."""
+
+FULL_SHARE: Final = 1.2
+"""Most that the share of detected looks counts for, in units of the recall."""
+
+WALK: Final = 2.0
+"""Speed from which more does not make an object surer, m/s."""
 
 UNSURE: Final = 3.0
 """Variances of a speed at whose square half of the velocity is published: parked cars hardly move."""
@@ -50,9 +59,20 @@ UNSURE: Final = 3.0
 
 @kernel
 def log_odds(score: float) -> float:
-    """Return ln[z_s / (1 - z_s)] of a score in (0, 1], bounded by `SURE`."""
-    odds = math.log(score) - math.log1p(-score)  # a score of one has infinite log odds
-    return min(max(odds, -SURE), SURE)
+    """Return ln[z_s / (1 - z_s)] of a score in [0, 1], bounded by `SURE`."""
+    if score <= 0.0 or score >= 1.0:
+        return math.copysign(SURE, score - 0.5)
+    return min(max(math.log(score) - math.log1p(-score), -SURE), SURE)
+
+
+@kernel
+def use_history(existence: float, age: float, share: float, velocity: Array, own: ClassRow) -> float:
+    """Return p by f(e_k), T in seconds, h / n and the published velocity (2,)."""
+    odds = own.history_offset + own.history_existence * log_odds(existence)
+    odds += own.history_duration * math.log1p(age)
+    odds += own.history_share * min(share / own.recall, FULL_SHARE)
+    odds += own.history_speed * min(math.hypot(velocity[0], velocity[1]), WALK)
+    return 1.0 / (1.0 + math.exp(-odds))
 
 
 @kernel

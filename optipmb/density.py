@@ -81,6 +81,8 @@ class Bernoullis(Rows):
         score: (N,) confidence score x_s.
         evidence: (N,) mean log odds of the latest detections (`optipmb.calibration`).
         heading_odds: (N,) log odds that the object faces along phi and not the other way (`optipmb.lightweight`).
+        hits: (N,) number of frames that detected it.
+        looks: (N,) number of frames that had it in view, since the first detection; parts of it count in part.
         extracted: (N,) bool, whether the track was ever extracted (t in T).
         confirmed: (N,) bool, whether the track was confirmed when it was last extracted (`optipmb.extract`).
     """
@@ -99,6 +101,8 @@ class Bernoullis(Rows):
     score = Column(np.float64)
     evidence = Column(np.float64)
     heading_odds = Column(np.float64)
+    hits = Column(np.float64)
+    looks = Column(np.float64)
     extracted = Column(np.bool_)
     confirmed = Column(np.bool_)
 

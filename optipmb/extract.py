@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from optipmb.calibration import calibrate_rows, follow_box
+from optipmb.calibration import calibrate_rows, follow_box, use_history
 from optipmb.compiled import kernel
 from optipmb.density import (
     OMEGA,
@@ -76,8 +76,8 @@ class Tracks(Rows):
         age: (N,) s since the first detection.
         time_since_detection: (N,) s since the last one.
         detection: (N,) int64, index of this frame's detection in the caller's arrays, -1 while missed.
-        confirmed: (N,) bool: the existence reached `confirm_from` and has not fallen below `confirm_until` since.
-            People and planners look at confirmed tracks; the others may be of nothing.
+        confirmed: (N,) bool: the existence reached `confirm_from` and has not fallen below `confirm_until` since in a
+            frame that missed it. People and planners look at confirmed tracks; the others may be of nothing.
     """
 
     part = "tracks"
@@ -163,7 +163,12 @@ def extract(
     label, existence = tracks.label, tracks.existence
     evidence = objects.evidence[rows]
     calibrate_rows(label, evidence, tracks.yaw, classes, existence, tracks.score, velocity, covariance)
-    confirm(rows, label, existence, classes, objects.confirmed, tracks.confirmed)
+    for k in range(count):
+        n, own = rows[k], classes[label[k]]
+        if own.history_known:
+            share = objects.hits[n] / objects.looks[n]
+            existence[k] = use_history(existence[k], tracks.age[k], share, velocity[k], own)
+    confirm(rows, label, existence, measurement, classes, objects.confirmed, tracks.confirmed)
     return words
 
 
@@ -192,12 +197,17 @@ def select_tracks(
 
 
 @kernel
-def confirm(rows: Index, label: Index, existence: Array, classes: Classes, confirmed: Flags, now: Flags) -> None:
-    """Confirm tracks with hysteresis: write `now` (K,) by the published existence, and `confirmed` of their objects."""
+def confirm(
+    rows: Index, label: Index, existence: Array, measurement: Index, classes: Classes, confirmed: Flags, now: Flags
+) -> None:
+    """Confirm tracks with hysteresis: write `now` (K,) by the published existence, and `confirmed` of their objects.
+
+    A confirmed track stays so while it is detected; `measurement` (N,) is negative where an object is missed.
+    """
     for k in range(rows.shape[0]):
-        own = classes[label[k]]
-        now[k] = existence[k] >= (own.confirm_until if confirmed[rows[k]] else own.confirm_from)
-        confirmed[rows[k]] = now[k]
+        n, own = rows[k], classes[label[k]]
+        stays = confirmed[n] and (measurement[n] >= 0 or existence[k] >= own.confirm_until)
+        confirmed[n] = now[k] = stays or existence[k] >= own.confirm_from
 
 
 def sound(tracks: Tracks) -> bool:

@@ -273,7 +273,7 @@ def follow_looks(
     """Correct score and evidence of the posterior `objects` by the looks of the frame, and return its misses.
 
     Objects out of view keep their score and evidence as `before`, in the prediction; objects partly in view are missed
-    for that part of the time since the last look.
+    for that part of the time since the last look. A look at a part of an object counts in part.
     """
     count, known, stamp_ns = len(objects), update.known, moment.stamp_ns
     row, hit = update.row[:known], update.measurement[:known] >= 0
@@ -283,10 +283,12 @@ def follow_looks(
     share = looks.counted[row]
     hidden = ~hit & (share == 0.0)
     objects.score[:known][hidden] = before.score[row][hidden]
+    part = np.where(hit, 1.0, share)
+    objects.looks[:known] = before.looks[row] + part
     label = objects.label[:known]
     latest = -table["missed_evidence"][label]
     latest[hit] = [log_odds(score) for score in measurements.score[update.measurement[:known][hit]].tolist()]
-    kept = table["memory"][label] ** (np.where(hit, 1.0, share) * looks.time[row] / table.period)
+    kept = table["memory"][label] ** (part * looks.time[row] / table.period)
     kept[objects.born_ns[:known] == stamp_ns] = 1.0
     objects.evidence[:known] = kept * before.evidence[row] + (1.0 - kept) * latest
     return Misses(missed_from_ns=missed_from_ns, looked_ns=looked_ns)

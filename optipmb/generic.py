@@ -43,6 +43,11 @@ EXISTENCE: Final = tuple(
 DOUBT: Final = ((0.5, 0.6, 0.8, 0.9, 0.95, 0.98), (3.2, 2.75, 2.4, 2.1, 1.8, 1.0))
 """Lasting errors relative to those of sure tracks, by existence: boxes of far and half-hidden objects, which have low
 scores, are off."""
+HISTORY: Final = (
+    {"offset": -2.2, "existence": 0.8, "duration": 0.9, "share": 2.3, "speed": 0.0},
+    {"offset": -3.8, "existence": 0.4, "duration": 1.25, "share": 2.0, "speed": 1.15},
+)
+"""How whole tracks count: of vehicles, and of people and cyclists, who move where they are not clutter."""
 
 
 def generic_parameters(labels: Iterable[str], period: float, *, name: str = "auto") -> Parameters:
@@ -106,8 +111,8 @@ def _of_class(kind: str, period: float) -> dict[str, Any]:
         "birth_overlap": 0.1,
         "motion": "cv" if agile else "ctra",
         "acceleration_time": None if agile else 1.0 if two_wheeled else 3.0,
-        "confirm_from": 0.4 if agile else 0.55,
-        "confirm_until": 0.25 if agile else 0.4,
+        "confirm_from": 0.6,
+        "confirm_until": 0.5,
         "calibration": {
             "memory": round(0.8 ** (10.0 * period), 4),  # 0.8 over a tenth of a second
             "missed": 1.0,
@@ -117,6 +122,7 @@ def _of_class(kind: str, period: float) -> dict[str, Any]:
             "across": _lasting(0.07, EXISTENCE[agile]),
             "speed": 0.3 if agile else 0.5,
             "turn_rate": 0.5 if agile else 0.4,
+            "history": HISTORY[agile or two_wheeled],
         },
         "reported_noise": {"position": 0.04, "heading": 0.3} if agile else {"position": 0.06, "heading": 0.06},
         "process_noise": {

@@ -1,16 +1,16 @@
-"""Existence and velocity of tracks in hindsight: from their frame and later ones (not in the paper).
+"""Existence, `confirmed` and velocity of tracks in hindsight: a decision about each whole track (not in the paper).
 
-The existence probability of a track rises and falls with the scores of its detections. Objects are detected again, and
-clutter ends, so the frames after a frame tell more about its tracks. The existence of a track of frame k becomes
+Row by row an object is shown late, and again and again for a moment only. Where later frames are known, a track is
+shown as a whole, from its first detection to its last, gaps included, or not at all:
 
-    logit p'_k = mean of logit p_j over the frames j of the track from k on, within a time
+    logit p = mean of logit p_j over the frames j of the track up to its last detection
 
-with log odds of at most `SURE`. The track is confirmed from `confirm_from` on, without hysteresis, so that the result
-depends on those frames alone. Recordings and outputs with a delay use this function.
+with log odds of at most `SURE`. It is confirmed from `confirm_from` on, at most from `EVEN`. The frames after the last
+detection keep their existence, and are not confirmed. Recordings and outputs with a delay use this function.
 
-Tracks are thus confirmed from their first frames on, in which their speed is hardly known. The velocity of a track is
-the mean of its velocities in the later frames j, taken back over the time d between with their acceleration a along the
-heading u and turn rate omega:
+Tracks are thus shown from their first frames on, in which their speed is hardly known. The velocity of a track is the
+mean of its velocities in the frames j of some time after it, taken back over the time d between with their acceleration
+a along the heading u and turn rate omega:
 
     v' = sum w_j R(-omega_j d) (v_j - a_j d u_j) / sum w_j,    w_j = 1 / (P_vv,j + `AGILITY` d^2)
 
@@ -19,65 +19,108 @@ It is weighted as in `optipmb.calibration`, with the variance 1 / max w_j. The c
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+import math
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from optipmb.calibration import SURE, UNSURE
+from optipmb.compiled import kernel
 from optipmb.density import V
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Sequence
 
-    from optipmb.extract import Tracks
+    from numpy.typing import NDArray
+
     from optipmb.parameters import Parameters
-    from optipmb.rows import Array
+    from optipmb.rows import Array, Index
 
 
 AGILITY: Final = 0.3
 """Variance of the acceleration that a track does not tell, m^2/s^4."""
 LEAST_VARIANCE: Final = 1e-6
 """Of a speed, m^2/s^2."""
+ROUNDING: Final = 1e-6
+"""Of the difference of two ages, s."""
+EVEN: Final = 0.5
+"""Existence from which showing a track is right more often than not."""
 
 
 def with_hindsight(
-    tracks: Tracks, later: Iterable[Tracks], parameters: Parameters, *, same_axes: bool = False
-) -> Tracks:
-    """Return the tracks of a frame with existence and `confirmed` of hindsight, and velocity with `same_axes`.
+    frames: Sequence[Any], parameters: Parameters, *, velocity_s: float = 0.0, show: float | None = None
+) -> list[dict[str, NDArray[Any]]]:
+    """Return the columns of the tracks of consecutive frames that differ in hindsight, for each frame.
+
+    These are `existence` and `confirmed` of whole tracks, and `velocity` with `velocity_s`.
 
     Args:
-        tracks: of the frame.
-        later: of the frames within the time after it, in the same session.
+        frames: tracks, or messages with the same columns, of one session.
         parameters: the profile.
-        same_axes: all frames are in the same axes; with an estimated motion of the sensor they are not.
+        velocity_s: time of later frames by which velocities are estimated, s; zero where axes change between frames,
+            as with an estimated motion of the sensor.
+        show: existence from which tracks are confirmed; None: as the profile says.
     """
-    total, count = _log_odds(tracks.existence), np.ones(len(tracks))
-    weight = 1.0 / np.maximum(tracks.covariance[:, V, V], LEAST_VARIANCE)
-    most, velocity = weight.copy(), weight[:, None] * tracks.velocity
-    for one in later:
-        _, place, row = np.intersect1d(tracks.id, one.id, assume_unique=True, return_indices=True)
-        total[place] += _log_odds(one.existence[row])
-        count[place] += 1.0
-        if same_axes:
-            seconds = one.age[row] - tracks.age[place]
-            own = 1.0 / (np.maximum(one.covariance[row, V, V], LEAST_VARIANCE) + AGILITY * seconds**2)
-            along = np.exp(1j * one.yaw[row])
-            before = one.velocity[row] @ (1.0, 1j) - one.acceleration[row] * seconds * along
-            before *= own * np.exp(-1j * one.yaw_rate[row] * seconds)
-            most[place] = np.maximum(most[place], own)
-            weight[place] += own
-            velocity[place] += np.column_stack((before.real, before.imag))
-    existence = 1.0 / (1.0 + np.exp(-total / count))
-    confirm_from = np.array([one.confirm_from for one in parameters.classes.values()])
-    found = tracks.replaced(existence=existence, confirmed=existence >= confirm_from[tracks.label])
-    if not same_axes:
-        return found
-    velocity /= weight[:, None]
-    squared, doubt = (velocity**2).sum(axis=1), UNSURE / most
-    return found.replaced(velocity=velocity * (squared**2 / (squared**2 + doubt**2))[:, None])
+    if not frames:
+        return []
+    columns = ("id", "label", "existence", "age", "time_since_detection")
+    identity, label, existence, age, unseen = (
+        np.concatenate([getattr(one, name) for one in frames]) for name in columns
+    )
+    order = np.argsort(identity, kind="stable")
+    first = np.flatnonzero(np.diff(identity[order], prepend=-1))
+    track = np.repeat(np.arange(len(first)), np.diff(first, append=len(order)))
+    place, back = np.arange(len(order)), np.argsort(order, kind="stable")
+    detected = np.where(unseen[order] == 0.0, place, -1)
+    shown = place <= np.maximum.reduceat(detected, first)[track] if len(order) else detected >= 0
+    total = np.bincount(track, np.where(shown, _log_odds(existence[order]), 0.0), len(first))
+    odds = total / np.maximum(np.bincount(track, shown, len(first)), 1.0)
+    existence[order] = np.where(shown, 1.0 / (1.0 + np.exp(-odds[track])), existence[order])
+    least = np.array([min(one.confirm_from, EVEN) if show is None else show for one in parameters.classes.values()])
+    changed: dict[str, NDArray[Any]] = {"existence": existence, "confirmed": shown[back] & (existence >= least[label])}
+    if velocity_s > 0.0:
+        variance = np.concatenate([one.covariance[:, V, V] for one in frames])
+        motion = (
+            np.concatenate([getattr(one, name) for one in frames]) for name in ("acceleration", "yaw", "yaw_rate")
+        )
+        velocity = np.concatenate([one.velocity for one in frames])
+        given = np.column_stack((np.maximum(variance, LEAST_VARIANCE), *motion, age, velocity))[order]
+        changed["velocity"] = later_velocities(track, given, velocity_s)[back]
+    ends = np.cumsum([len(one.id) for one in frames])[:-1]
+    parts = {name: np.split(column, ends) for name, column in changed.items()}
+    return [{name: part[k] for name, part in parts.items()} for k in range(len(frames))]
 
 
 def _log_odds(existence: Array) -> Array:
     with np.errstate(divide="ignore"):
         odds: Array = np.log(existence) - np.log1p(-existence)
     return np.asarray(np.clip(odds, -SURE, SURE))
+
+
+@kernel
+def later_velocities(track: Index, given: Array, seconds: float) -> Array:
+    """Return v' (R, 2) of rows ordered by track and time.
+
+    `given` (R, 7): variance of the speed, acceleration, heading, turn rate, age, velocity.
+    """
+    count = track.shape[0]
+    out = np.empty((count, 2))
+    for i in range(count):
+        most = total = x = y = 0.0
+        j = i
+        while j < count and track[j] == track[i] and given[j, 4] - given[i, 4] <= seconds + ROUNDING:
+            variance, acceleration, yaw, turn_rate = given[j, 0], given[j, 1], given[j, 2], given[j, 3]
+            dt = given[j, 4] - given[i, 4]
+            weight = 1.0 / (variance + AGILITY * dt * dt)
+            vx = given[j, 5] - acceleration * dt * math.cos(yaw)
+            vy = given[j, 6] - acceleration * dt * math.sin(yaw)
+            cos, sin = math.cos(turn_rate * dt), math.sin(turn_rate * dt)
+            x += weight * (cos * vx + sin * vy)
+            y += weight * (cos * vy - sin * vx)
+            most, total = max(most, weight), total + weight
+            j += 1
+        x, y = x / total, y / total
+        squared, doubt = x * x + y * y, UNSURE / most
+        share = squared * squared / (squared * squared + doubt * doubt)
+        out[i, 0], out[i, 1] = share * x, share * y
+    return out

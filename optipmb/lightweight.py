@@ -58,6 +58,7 @@ def light_weight_filter(
     mean, covariance, auxiliary, identity = posterior.mean, posterior.covariance, posterior.auxiliary, posterior.id
     born_ns, seen_ns, score, evidence = posterior.born_ns, posterior.seen_ns, posterior.score, posterior.evidence
     heading_odds, extracted, confirmed = posterior.heading_odds, posterior.extracted, posterior.confirmed
+    hits, looks = posterior.hits, posterior.looks
     # What the evidence keeps over the time since the frame before; in a first detection over one nominal period.
     periods = moment.dt / moment.period
     memory_of_frame, sign_memory_of_frame = np.empty(len(classes)), np.empty(len(classes))
@@ -69,7 +70,7 @@ def light_weight_filter(
         if n == NEW:
             identity[k] = next_id
             born_ns[k], extracted[k], confirmed[k] = stamp_ns, False, False
-            evidence[k] = heading_odds[k] = 0.0
+            evidence[k] = heading_odds[k] = hits[k] = looks[k] = 0.0
             for s in range(4):
                 auxiliary[k, s] = measurements.auxiliary[m, s]
             next_id += 1
@@ -77,11 +78,12 @@ def light_weight_filter(
             identity[k] = objects.id[n]
             born_ns[k], seen_ns[k], extracted[k] = objects.born_ns[n], objects.seen_ns[n], objects.extracted[n]
             confirmed[k], evidence[k] = objects.confirmed[n], objects.evidence[n]
-            heading_odds[k] = objects.heading_odds[n]
+            heading_odds[k], hits[k], looks[k] = objects.heading_odds[n], objects.hits[n], objects.looks[n]
             for s in range(4):
                 auxiliary[k, s] = objects.auxiliary[n, s]
         own, first = classes[label[k]], born_ns[k] == stamp_ns
         score[k] = 0.0
+        looks[k] += 1.0
         latest = -own.missed_evidence
         if m >= 0:
             z_s = measurements.score[m]
@@ -94,6 +96,7 @@ def light_weight_filter(
             x_len = 1.0 + (stamp_ns - born_ns[k]) * 1e-9 / moment.period
             score[k] = (1.0 - math.exp(-x_len)) * z_s
             seen_ns[k] = stamp_ns
+            hits[k] += 1.0
             latest = log_odds(z_s)
             if own.sign_memory == 0.0 or heading_unknown(covariance[k]):  # the sign is not followed
                 heading_odds[k] = 0.0

@@ -136,6 +136,16 @@ class HeadingSign(ParameterTable):
     speed: NonNegative = Field(default=1.0, description="v_0: speed from which an object counts as driving, m/s")
 
 
+class History(ParameterTable):
+    """Weights of what is known of a whole track in its existence (`optipmb.calibration`)."""
+
+    offset: float = Field(description="o: log odds of a track of which nothing is known")
+    existence: NonNegative = Field(description="w_e: of the log odds of the existence by the evidence")
+    duration: NonNegative = Field(description="w_T: of ln(1 + T), T the time since the first detection, s")
+    share: NonNegative = Field(description="w_s: of the share of detected looks, in units of the detector's recall")
+    speed: NonNegative = Field(description="w_v: of the published speed, m/s, up to a fast walk")
+
+
 class Calibration(ParameterTable):
     """How the tracks of a class turned out on training data, by their evidence (`optipmb.calibration`).
 
@@ -161,6 +171,9 @@ class Calibration(ParameterTable):
         default=1.0, exclude_if=(1.0).__eq__, description="factor on the standard deviation of their speed"
     )
     turn_rate: Positive = Field(default=1.0, exclude_if=(1.0).__eq__, description="the same for their turn rate")
+    history: History | None = Field(
+        default=None, exclude_if=lambda value: value is None, description="how the whole track counts; None: not at all"
+    )
 
     @model_validator(mode="after")
     def _columns(self) -> Calibration:

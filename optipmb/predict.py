@@ -412,6 +412,7 @@ def predict_density(
         new.existence[k] = old.existence[n] * survival[old.label[n]]
         new.id[k], new.seen_ns[k] = old.id[n], old.seen_ns[n]
         new.score[k], new.evidence[k], new.heading_odds[k] = old.score[n], old.evidence[n], old.heading_odds[n]
+        new.hits[k], new.looks[k] = old.hits[n], old.looks[n]
         new.extracted[k], new.confirmed[k] = old.extracted[n], old.confirmed[n]
 
     undetected = components_in(component_words)

@@ -194,8 +194,16 @@ def on_curve(odds: float, curve: Array) -> float:
 
 
 @kernel
+def recall(counts: Array) -> float:
+    """Return rho of a class."""
+    best = best_from(counts)
+    share: float = (PRIOR_RECALL * PRIOR + counts[HITS, best:].sum()) / (PRIOR + counts[LOOKS, best:].sum())
+    return share
+
+
+@kernel
 def calibrate(classes: Array, score: Array, label: Index, table: Classes) -> Array:
-    """Return scores (2, M) by the curves, and bound the thresholds in `table` by the lower edge of the median score.
+    """Return scores (2, M) by the curves; write rho to `table`, with thresholds below the edge of the median score.
 
     `classes` are the counts, (C, `COUNTS`, `BINS`).
     """
@@ -205,6 +213,7 @@ def calibrate(classes: Array, score: Array, label: Index, table: Classes) -> Arr
         for k in range(2):
             out[k, m] = on_curve(odds, curve[k, label[m]])
     for c in range(classes.shape[0]):
+        table[c].recall = recall(classes[c])
         given = classes[c, GIVEN]
         half, below, median = 0.5 * given.sum(), 0.0, 0
         while median < BINS - 1 and below + given[median] < half:
@@ -226,10 +235,7 @@ def needed_shares(classes: Array) -> Array:
     """Return the share s of looks, for each class, in which a lasting object is detected."""
     needed = np.empty(classes.shape[0])
     for c in range(classes.shape[0]):
-        best = best_from(classes[c])
-        hits = PRIOR_RECALL * PRIOR + classes[c, HITS, best:].sum()
-        looks = PRIOR + classes[c, LOOKS, best:].sum()
-        needed[c] = min(max(1.0 - 3.0 * (1.0 - hits / looks), LEAST_SHARE), MOST_SHARE)
+        needed[c] = min(max(1.0 - 3.0 * (1.0 - recall(classes[c])), LEAST_SHARE), MOST_SHARE)
     return needed
 
 

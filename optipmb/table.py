@@ -56,6 +56,13 @@ class ClassRow(Protocol):
         score_of_evidence: weight of the evidence in the score.
         factor_speed: on the standard deviation of the published speed.
         factor_turn_rate: on the standard deviation of the published turn rate.
+        recall: share of looks in which the surest objects are detected; learned with `self_calibration`.
+        history_known: whether the whole track counts in its existence; the next five are zero where not.
+        history_offset: o.
+        history_existence: w_e.
+        history_duration: w_T.
+        history_share: w_s.
+        history_speed: w_v.
         knots: number of knots of the calibration, zero without one.
         knot_evidence: (`MAX_KNOTS`,) where its curves bend, ascending; this and the next are zero from `knots` on.
         knot_existence: (`MAX_KNOTS`,) existence probability there.
@@ -117,6 +124,13 @@ class ClassRow(Protocol):
     score_of_evidence: float
     factor_speed: float
     factor_turn_rate: float
+    recall: float
+    history_known: bool
+    history_offset: float
+    history_existence: float
+    history_duration: float
+    history_share: float
+    history_speed: float
     knots: int
     knot_evidence: Curve
     knot_existence: Curve
@@ -259,6 +273,7 @@ def _values(p: ClassParameters) -> dict[str, Any]:
         "reported_position": _left_over(p, "position"),
         "reported_heading": _left_over(p, "heading"),
         "memory": 1.0,
+        "recall": 1.0,
     }
     for name, speed in (("birth_known", birth.speed), ("birth_unknown", birth.unknown_speed)):
         values[name] = (birth.position, birth.position, speed, birth.heading, birth.turn_rate, birth.acceleration)
@@ -274,6 +289,9 @@ def _values(p: ClassParameters) -> dict[str, Any]:
             "factor_speed": calibration.speed,
             "factor_turn_rate": calibration.turn_rate,
         }
+        if calibration.history is not None:
+            values["history_known"] = True
+            values |= {f"history_{name}": value for name, value in calibration.history.model_dump().items()}
         for name in ("evidence", "existence", "along", "across"):
             curve = getattr(calibration, name)
             values[f"knot_{name}"] = (*curve, *(0.0,) * (MAX_KNOTS - len(curve)))

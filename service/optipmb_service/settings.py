@@ -481,6 +481,8 @@ class OutputSettings(BaseModel):
     """messages a second"""
     delay_s: float = Field(default=0.0, ge=0, le=10)
     """tracks are those of the present minus this; existence and `confirmed` also use the frames since then"""
+    show: float | None = Field(default=None, ge=0, le=1)
+    """existence from which tracks are confirmed; None: as the session confirms them, with `delay_s` from 0.5 at most"""
     longest_s: float = Field(default=0.5, gt=0, le=30)
     """no output while the newest frame is older"""
     clock: Literal["system", "arrival"] = "system"

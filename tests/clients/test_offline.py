@@ -9,9 +9,8 @@ from optipmb_client.errors import UsageError
 from optipmb_schemas import PATHS
 from optipmb_tools.datasets import Dataset, Preloaded, open_dataset, selected_frames
 from optipmb_tools.run.profiles import read_profile
-from optipmb_tools.run.tracking import Tracking, track, track_whole
+from optipmb_tools.run.tracking import Tracking, decided, track, track_whole
 
-from optipmb import Tracks
 from optipmb.hindsight import with_hindsight
 
 
@@ -38,21 +37,18 @@ def test_predicted_paths_are_written_with_all_columns(dataset: Dataset, tmp_path
             > np.trace(columns["path_covariance"][:, 0], axis1=1, axis2=2)).all()  # fmt: skip
 
 
-def test_hindsight_is_of_the_seconds_after_a_frame(dataset: Dataset) -> None:
-    """Existence, `confirmed` and velocity are by the frames of the next half second; nothing else changes."""
+@pytest.mark.parametrize("how", [{"hindsight_s": 0.5}, {"show": 0.3}, {"hindsight_s": 0.5, "show": 0.9}], ids=str)
+def test_tracks_are_confirmed_as_asked(dataset: Dataset, how: dict[str, float]) -> None:
+    """Existence, `confirmed` and velocity are in hindsight where there is one, from the existence that is asked for."""
     (sequence,), parameters = dataset.sequences(["0000"]), read_profile("scene")
-    plain, found = (track_whole(parameters, sequence, hindsight_s=seconds).tracks for seconds in (0.0, 0.5))
-    told = {}
-    for index, one in plain.items():
-        columns = {name: np.array(getattr(one, name)) for name in Tracks.described}
-        told[index] = Tracks(**columns | {"confirmed": columns["confirmed"].astype(np.bool_)})
-    for index, one in found.items():
-        later = [told[k] for k in range(index + 1, 20) if plain[k].stamp_ns - one.stamp_ns <= 500_000_000]
-        wanted = with_hindsight(told[index], later, parameters, same_axes=True)
-        changed = {"existence": wanted.existence, "confirmed": wanted.confirmed.astype(np.int64)}
-        changed["velocity"] = wanted.velocity
-        assert one == plain[index].model_copy(update=changed)
-    assert any(one != plain[index] for index, one in found.items())
+    plain = track_whole(parameters, sequence)
+    found, shown = decided(plain, Tracking(parameters, **how)), how.get("show")
+    columns = with_hindsight(list(plain.tracks.values()), parameters, velocity_s=0.5, show=shown)
+    for (index, one), changed in zip(found.items(), columns, strict=True):
+        own = plain.tracks[index]
+        update = changed if "hindsight_s" in how else {"confirmed": own.existence >= 0.3}
+        assert one == own.model_copy(update=update | {"confirmed": update["confirmed"].astype(np.int64)})
+    assert any(one != plain.tracks[index] for index, one in found.items())
 
 
 def test_what_is_reported_is_what_was_written(dataset: Dataset, tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ from oracle_formulas import (
     predict,
     report,
     ukf_update,
+    with_history,
 )
 from scipy.optimize import linear_sum_assignment
 
@@ -47,6 +48,8 @@ class Bernoulli:
     id: int = 0
     extracted: bool = False
     confirmed: bool = False
+    hits: int = 1
+    looks: int = 1
     detection: int = -1
     measurement: Measurement | None = None
     pi: Array = field(default_factory=lambda: np.ones(1))  # over the classes of its group, in their order
@@ -348,6 +351,7 @@ class Oracle:
         survivors = []
         for i, b in enumerate(self.bernoulli):
             c = self.classes[b.label]
+            b.looks, b.hits = b.looks + 1, b.hits + (i in chosen)
             if i in chosen:
                 z = zs[chosen[i]]
                 b.mean, b.covariance = ukf_update(b.mean, b.covariance, z, self.classes[z.label])
@@ -427,7 +431,10 @@ class Oracle:
             told = v if c.calibration is None or v == 0.0 else v**5 / (v**4 + (3 * covariance[2, 2]) ** 2)
             sign, doubt = confidence(c, b.heading_odds)
             covariance = covariance + np.diag([0.0, 0.0, 0.0, doubt, 0.0, 0.0])
-            b.confirmed = existence >= (c.confirm_until if b.confirmed else c.confirm_from)
+            if c.calibration is not None and c.calibration.history is not None:
+                existence = with_history(c.calibration.history, existence, b, (now - b.born_ns) * 1e-9, abs(told))
+            stays = b.confirmed and (b.detection >= 0 or existence >= c.confirm_until)
+            b.confirmed = stays or existence >= c.confirm_from
             rows.append(
                 {
                     "id": b.id, "label": b.label, "center": [x, y, b.auxiliary[3]], "size": b.auxiliary[:3], "yaw": phi,

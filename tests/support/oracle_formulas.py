@@ -301,6 +301,14 @@ def report(c: Any, z: Measurement | None, m: Array, P: Array) -> tuple[Array, Ar
     return mean, rest @ P @ rest.T + K @ np.diag(left) @ K.T
 
 
+def with_history(history: Any, existence: float, b: Any, age: float, speed: float) -> float:
+    """Existence of a track by all of its frames, at a recall of one."""
+    odds = float(np.clip(np.log(existence) - np.log1p(-existence), -14.0, 14.0))
+    odds = history.offset + history.existence * odds + history.duration * math.log1p(age)
+    odds += history.share * min(b.hits / b.looks, 1.2) + history.speed * min(speed, 2.0)
+    return 1.0 / (1.0 + math.exp(-odds))
+
+
 def calibrate(c: Any, b: Any, m: Array, P: Array) -> tuple[float, float, Array]:
     """Reported existence, score and covariance of a track: curves over the evidence, level at their ends."""
     if c.calibration is None:

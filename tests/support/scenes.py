@@ -317,7 +317,12 @@ def _calibration(rng: np.random.Generator) -> dict[str, Any]:
         "existence": np.sort(rng.uniform(0, 1, knots)).tolist(),
         "along": rng.uniform(0, 1, knots).tolist(),
         "across": rng.uniform(0, 1, knots).tolist(),
+        "history": None if knots % 2 else _history(knots),
     }
+
+
+def _history(knots: int) -> dict[str, float]:
+    return {"offset": 1.0 - knots, "existence": 0.7, "duration": 0.9, "share": 0.5 * knots, "speed": 1.1}
 
 
 def boxes(  # noqa: PLR0913 - a detection has this many columns

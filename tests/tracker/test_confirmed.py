@@ -36,14 +36,15 @@ SIMPLE: dict[str, Any] = {
 
 @pytest.mark.parametrize("seed", range(4))
 def test_confirmation_has_hysteresis(seed: int) -> None:
-    """From the upper threshold on, and while not below the lower one; rows that are not extracted stay as they were."""
+    """From the upper threshold on, and while detected or not below the lower one; other rows stay as they were."""
     rng = np.random.default_rng(seed)
     label, rows, existence = rng.integers(0, 2, 30), np.flatnonzero(rng.random(30) < 0.6), rng.uniform(0, 1, 30)
     before, upper, lower = rng.random(30) < 0.5, np.array([0.5, 0.8]), np.array([0.2, 0.8])
     found, classes = before.astype(np.int64), class_rows(2, confirm_from=upper, confirm_until=lower)
-    told = np.full(rows.size, 7)
-    confirm(rows, label[rows], existence[: rows.size], classes, found, told)
-    wanted = existence[: rows.size] >= np.where(before, lower[label], upper[label])[rows]
+    told, measurement = np.full(rows.size, 7), rng.integers(-1, 2, 30)
+    confirm(rows, label[rows], existence[: rows.size], measurement, classes, found, told)
+    stays = before & (measurement >= 0)
+    wanted = stays[rows] | (existence[: rows.size] >= np.where(before, lower[label], upper[label])[rows])
     np.testing.assert_array_equal(told, wanted)
     np.testing.assert_array_equal(found[rows], wanted)
     np.testing.assert_array_equal(np.delete(found, rows), np.delete(before, rows))

@@ -14,42 +14,46 @@ from optipmb.hindsight import with_hindsight
 PARAMETERS = optipmb.generic_parameters(["car", "pedestrian"], 0.1)
 
 
-def tracks(existence: dict[int, float], label: int = 0) -> optipmb.Tracks:
-    """Return tracks of some ids with these existence probabilities, else all alike."""
+def tracks(existence: dict[int, float], label: int = 0, missed: tuple[int, ...] = ()) -> optipmb.Tracks:
+    """Return tracks of some ids with these existence probabilities, else all alike but for the missed ones."""
     count = len(existence)
     columns: dict[str, Any] = {
         name: np.ones((count, *column.shape), column.number) for name, column in optipmb.Tracks.described.items()
     }
     columns |= {"id": np.array(list(existence), np.int64), "label": np.full(count, label)}
+    columns["time_since_detection"] = np.isin(columns["id"], missed) * 0.1
     return optipmb.Tracks(**columns | {"existence": np.array(list(existence.values()), float)})
 
 
-def test_existence_is_by_the_mean_log_odds_of_the_frames_that_have_the_track() -> None:
-    """Tracks end and begin between frames; certain ones count with bounded log odds; all other columns stay."""
+def test_existence_is_by_the_mean_log_odds_of_the_track_up_to_its_last_detection() -> None:
+    """Certain frames count with bounded log odds, gaps count, and the frames after the last detection stay."""
     frames = [
         tracks({2: 0.3, 5: 0.9, 7: 1.0}, label=1),
-        tracks({1: 0.5, 2: 0.8, 7: 0.01}),
-        tracks({2: 0.7, 9: 0.1}),
+        tracks({1: 0.5, 2: 0.8, 7: 0.01}, missed=(2,)),
+        tracks({2: 0.7, 7: 0.8, 9: 0.1}, missed=(7,)),
     ]
-    found = with_hindsight(frames[0], frames[1:], PARAMETERS)
-    odds = {2: [0.3, 0.8, 0.7], 5: [0.9], 7: [1.0 / (1.0 + math.exp(-14.0)), 0.01]}
-    for k, identity in enumerate((2, 5, 7)):
-        mean = float(np.mean([math.log(p / (1.0 - p)) for p in odds[identity]]))
-        assert found.existence[k] == pytest.approx(1.0 / (1.0 + math.exp(-mean)), rel=1e-9)
-    assert found.confirmed.tolist() == (found.existence >= 0.5).tolist() == [True, True, True]
-    for name, column in found.columns():
-        if name not in {"existence", "confirmed"}:
-            assert column.tobytes() == getattr(frames[0], name).tobytes(), name
+    found = with_hindsight(frames, PARAMETERS)
+    odds = {1: [0.5], 2: [0.3, 0.8, 0.7], 5: [0.9], 7: [1.0 / (1.0 + math.exp(-14.0)), 0.01], 9: [0.1]}
+    for given, columns in zip(frames, found, strict=True):
+        for k, identity in enumerate(given.id.tolist()):
+            mean = float(np.mean([math.log(p / (1.0 - p)) for p in odds[identity]]))
+            ended = identity == 7 and given is frames[2]
+            wanted = 0.8 if ended else 1.0 / (1.0 + math.exp(-mean))
+            assert columns["existence"][k] == pytest.approx(wanted, rel=1e-9)
+            assert columns["confirmed"][k] == (not ended and wanted >= 0.5)
+    assert set(found[0]) == {"existence", "confirmed"}
 
 
-def test_clutter_that_fades_was_never_confirmed() -> None:
-    """A track that is confirmed when it begins, and doubted in all frames after, is not in hindsight."""
-    found = with_hindsight(tracks({1: 0.6}), [tracks({1: 0.2})] * 3, PARAMETERS)
-    assert found.confirmed.tolist() == [False]
+def test_a_track_is_confirmed_as_a_whole() -> None:
+    """Clutter that fades was never confirmed, an object that becomes sure was from its first frame on."""
+    frames = [tracks({1: 0.6, 2: 0.3}), *[tracks({1: 0.2, 2: 0.9})] * 3]
+    assert [one["confirmed"].tolist() for one in with_hindsight(frames, PARAMETERS)] == [[False, True]] * 4
+    shown = with_hindsight(frames, PARAMETERS, show=0.2)
+    assert [one["confirmed"].tolist() for one in shown] == [[True, True]] * 4
 
 
 def test_velocity_of_a_first_frame_is_told_by_the_frames_after_it() -> None:
-    """An object that brakes along a bend: later velocities are taken back; in other axes the velocity stays."""
+    """An object that brakes along a bend: later velocities are taken back, of the time that is asked for."""
     found = []
     for k in range(6):
         seconds, turn = 0.1 * k, 0.2 * 0.1 * k
@@ -67,8 +71,8 @@ def test_velocity_of_a_first_frame_is_told_by_the_frames_after_it() -> None:
             "covariance": covariance,
         }
         found.append(one.replaced(**columns))
-    seen = with_hindsight(found[0], found[1:], PARAMETERS, same_axes=True)
-    assert seen.velocity[0] == pytest.approx([12.0, 0.0], abs=0.05)
-    assert np.linalg.norm(seen.velocity[1]) < 0.01  # less than a standard deviation: it stands
-    stays = with_hindsight(found[0], found[1:], PARAMETERS)
-    assert stays.velocity.tobytes() == found[0].velocity.tobytes()
+    seen = with_hindsight(found, PARAMETERS, velocity_s=1.0)[0]["velocity"]
+    assert seen[0] == pytest.approx([12.0, 0.0], abs=0.05)
+    assert np.linalg.norm(seen[1]) < 0.01  # less than a standard deviation: it stands
+    near = with_hindsight(found, PARAMETERS, velocity_s=0.2)[0]["velocity"]
+    assert near.tobytes() == with_hindsight(found[:3], PARAMETERS, velocity_s=1.0)[0]["velocity"].tobytes()

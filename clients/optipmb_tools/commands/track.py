@@ -59,9 +59,20 @@ class TrackOptions:
     hindsight: Annotated[
         float,
         typer.Option(
-            min=0.0, max=10.0, help="Seconds after a frame by which its tracks are confirmed; 0: as the service does."
+            min=0.0,
+            max=10.0,
+            help="Show tracks as a whole or not, with velocities by so many seconds after a frame; 0: as the service.",
         ),
     ] = 1.0
+    show: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            max=1.0,
+            help="Least probability of tracks that are shown (confirmed); default: that of the profile, 0.5 at most.",
+            show_default=False,
+        ),
+    ] = None
     fuse: Annotated[
         bool,
         typer.Option("--fuse", help="The sensors of a recording feed one density, by turns: by the column sensor."),
@@ -149,8 +160,8 @@ def track(
 
     From a bag of ROS 2, --out FILE.mcap makes a bag with the tracks as TrackedObjects, Detection3DArray and markers.
 
-    A profile may also be a TOML file here. Existence, confirmed and velocity also use the second after each frame; with
-    --hindsight 0, replaying the same data through a service gives the same files.
+    A profile may also be a TOML file here. Tracks are shown (confirmed) as a whole, by all of their frames, or not at
+    all; with --hindsight 0, replaying the same data through a service gives the same files.
     With --rejoin, a table also says which tracks are of the same object; ids stay (docs/gaps.md).
     With --smooth, positions, headings and velocities also use later frames, which no service can.
 
@@ -194,6 +205,7 @@ def track(
                     full=how.full,
                     smooth=how.smooth,
                     hindsight_s=how.hindsight,
+                    show=how.show,
                     sensors=sensors,
                     rejoin=rejoin,
                     view=how.view,

@@ -116,13 +116,11 @@ def track_whole(
     *,
     sensors: Sensors = ALIKE,
     smooth: bool = False,
-    hindsight_s: float = 0.0,
     on_frame: Callable[[], None] = lambda: None,
 ) -> Tracked:
     """Track one sequence, with `smooth` so that states are given all frames of their track.
 
-    Frames that name their sensor are used as `sensors` say. Existence and `confirmed` are also by the frames of the
-    next `hindsight_s` seconds.
+    Frames that name their sensor are used as `sensors` say.
 
     Raises:
         UsageError: A frame holds values that the tracker refuses.
@@ -131,7 +129,6 @@ def track_whole(
     _warm()
     begun = time.monotonic()
     found: dict[int, Tracks] = {}
-    extracted: dict[int, optipmb.Tracks] = {}
     steps: list[int] = []
     checks: defaultdict[str, VelocityCheck] = defaultdict(VelocityCheck)  # by sensor
     clouds = detections = estimated = 0
@@ -155,7 +152,6 @@ def track_whole(
         steps.append(time.perf_counter_ns() - started)
         density = result.density
         found[frame.index] = _message(parameters, sequence, frame, result)
-        extracted[frame.index] = result.tracks
         if smoother is not None:
             smoother.add(frame.index, density, result.tracks)
         checks[frame.sensor].add(taken, estimated=density.sensor_motion is not None)
@@ -176,31 +172,9 @@ def track_whole(
         for index, one in smoother.tracks():
             paths = predict_tracks(one, parameters.horizons, parameters) if parameters.horizons else None
             found[index] = found[index].model_copy(update=fields_of(one, paths))
-    _use_hindsight(found, extracted, hindsight_s, parameters, same_axes=not (smooth or estimated))
     counts = clouds, detections, dict(left_out), estimated
     doubts = tuple(one.contradiction for one in checks.values() if one.contradiction)
     return Tracked(found, *counts, learned_noise(density), doubts, tuple(steps), time.monotonic() - begun)
-
-
-def _use_hindsight(
-    frames: dict[int, Tracks],
-    extracted: Mapping[int, optipmb.Tracks],
-    seconds: float,
-    parameters: Parameters,
-    *,
-    same_axes: bool,
-) -> None:
-    """Write existence, `confirmed` and velocity in hindsight to the messages of all frames; 0 s: leave them."""
-    order = sorted(frames) if seconds else []
-    stamps = np.array([frames[index].stamp_ns for index in order], np.int64)
-    ends = np.searchsorted(stamps, stamps + round(seconds * 1e9), "right").tolist()
-    for place, (index, end) in enumerate(zip(order, ends, strict=True)):
-        later = (extracted[k] for k in order[place + 1 : end])
-        one = with_hindsight(extracted[index], later, parameters, same_axes=same_axes)
-        changed = {"existence": one.existence, "confirmed": one.confirmed.astype(np.int64)}
-        if same_axes:
-            changed["velocity"] = one.velocity
-        frames[index] = frames[index].model_copy(update=changed)
 
 
 def fields_of(tracks: optipmb.Tracks, paths: PredictedPaths | None, **others: Any) -> dict[str, Any]:
@@ -262,10 +236,27 @@ class Tracking:
     modules: Modules | None = None
     full: bool = False  # also write all columns of the tracks
     smooth: bool = False  # estimate states from all frames of their track (`optipmb_tools.run.smoothing`)
-    hindsight_s: float = 0.0  # time after a frame that tells which of its tracks exist (`optipmb.hindsight`)
+    hindsight_s: float = 0.0  # time after a frame that tells its velocities (`optipmb.hindsight`); 0: no hindsight
+    show: float | None = None  # existence from which tracks are confirmed; None: as the profile says
     sensors: Sensors = ALIKE  # how frames that name their sensor are used
     rejoin: "Rejoin | None" = None  # join tracks over gaps (`optipmb_tools.run.rejoining`)
     view: Path | None = None  # page of the tracks, of one sequence
+
+
+def decided(tracked: Tracked, how: Tracking) -> dict[int, Tracks]:
+    """Return the tracks by frame index, confirmed as `how` says; velocities change where all frames have equal axes."""
+    found = dict(sorted(tracked.tracks.items()))
+    changed: list[dict[str, NDArray[Any]]] = [{} for _ in found]
+    if how.hindsight_s:
+        velocity_s = 0.0 if how.smooth or tracked.estimated else how.hindsight_s
+        changed = with_hindsight(list(found.values()), how.parameters, velocity_s=velocity_s, show=how.show)
+    elif how.show is not None:
+        changed = [{"confirmed": one.existence >= how.show} for one in found.values()]
+    for index, columns in zip(found, changed, strict=True):
+        if columns:
+            update = columns | {"confirmed": columns["confirmed"].astype(np.int64)}
+            found[index] = found[index].model_copy(update=update)
+    return found
 
 
 @dataclass(frozen=True)
@@ -304,11 +295,11 @@ def _track_one(job: _Job, name: str) -> tuple[TrackedSequence, Path | Columns]:
     dataset, how = job.dataset, job.how
     sequence = job.sequences[name] if name in job.sequences else dataset.sequences([name])[0]
     options: dict[str, Any] = {"sensors": how.sensors, "smooth": how.smooth, "on_frame": job.on_frame}
-    options["hindsight_s"] = how.hindsight_s
     found = track_whole(how.parameters, sequence, how.classes, how.modules, **options)
     if how.rejoin is not None and found.estimated:
         expected = "expected boxes in a world frame, or poses of the sensor"
         raise UsageError(f"--rejoin: sequence {name}: {expected}; here the motion of the sensor is estimated")
+    found = replace(found, tracks=decided(found, how))
     objects = None if how.rejoin is None else how.rejoin.objects(found.tracks, how.parameters)
     written = Results(dataset, job.out, full=how.full).write(sequence, found.tracks, objects)
     if how.view is not None:

@@ -42,7 +42,7 @@ class FixedRate:
     def __init__(self, settings: OutputSettings) -> None:
         self._period_ns = round(SECOND / settings.rate_hz)
         self._delay_ns, self._longest_ns = round(settings.delay_s * SECOND), round(settings.longest_s * SECOND)
-        self._by_arrival = settings.clock == "arrival"
+        self._by_arrival, self._show = settings.clock == "arrival", settings.show
         self._frames: list[Tracked] = []
         """By stamp: the newest frames, up to the one before the delay."""
         self._arrived_ns = 0
@@ -115,9 +115,12 @@ class FixedRate:
         shown, later = frames[place], frames[place + 1 :]
         tracks, shown_ns = shown.estimates, _stamp_of(shown)
         if later:
-            tracks = with_hindsight(tracks, (one.estimates for one in later), parameters)
+            seen = [tracks, *(one.estimates for one in later)]
+            tracks = tracks.replaced(**with_hindsight(seen, parameters, show=self._show)[0])
         elif wanted_ns > shown_ns:
             tracks = tracks_ahead(tracks, (wanted_ns - shown_ns) * 1e-9, self._table)
+        if self._show is not None and not later:
+            tracks = tracks.replaced(confirmed=tracks.existence >= self._show)
         return replace(
             shown,
             estimates=tracks,

@@ -173,8 +173,7 @@ def test_with_a_delay_frames_since_tell_which_tracks_exist(process: Callable[...
         own = columns(one.tracks[message.seq])
         assert 400 * MS <= wall_ns - message.stamp_ns <= 500 * MS
         since = [each for each in one.tracks[message.seq + 1 :] if each.stamp_ns + LATENCY_NS <= wall_ns]
-        later = (optipmb.Tracks(**columns(each)) for each in since)
-        wanted = dict(with_hindsight(optipmb.Tracks(**own), later, PROFILE).columns())
+        wanted = own | with_hindsight([one.tracks[message.seq], *since], PROFILE)[0]
         assert all(column.tobytes() == wanted[name].tobytes() for name, column in columns(message).items())
         changed += wanted["existence"].tobytes() != own["existence"].tobytes()
     assert changed > 1
