@@ -27,14 +27,13 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.errors import DensityError
+from optipmb.density import ROUNDING
 
 if TYPE_CHECKING:
     from optipmb.association import Survivors
-    from optipmb.density import Density
     from optipmb.preprocess import Measurements
     from optipmb.rows import Array, Index
-    from optipmb.table import Classes, ClassTable
+    from optipmb.table import Classes
 
 
 CHANGE_ODDS: Final = 3.0
@@ -57,30 +56,46 @@ UNGROUPED: Final = np.zeros((0, 0))
 """Posteriors, and Lambda, where the profile has no groups."""
 
 
-def predict_classes(density: Density, kept: Index | None, dt: float, table: ClassTable) -> Array | None:
-    """Return pi_+ of the objects of a density that stay; None where the profile has no groups.
+@kernel
+def predict_classes(
+    kept: Index, label: Index, posterior: Array, memory: Array, confusion: Array, classes: Classes
+) -> Array:
+    """Return pi_+ (K, C) of the objects that stay.
 
     Objects whose density has none, of a profile without groups or of an earlier version, begin as if first detected as
     their class with a score of 1.
 
     Arguments of its own:
-        kept: (K,) objects that stay; None: all.
+        kept: (K,) objects that stay.
+        posterior: (N, C) pi, (0, 0) where the density has none.
+        memory: (C,) lambda^(dt/T).
+        confusion: Lambda; of (0, 0) the result has no columns.
 
     Raises:
-        DensityError: an object has probabilities of classes outside its group.
+        ValueError: the posteriors are of other objects, or an object has probabilities of classes outside its group.
     """
-    confusion = table.confusion
-    if not len(confusion):
-        return None
-    label, posterior = density.bernoulli.label, density.class_probability
-    likely = confusion.T[label]
-    if posterior is None:
-        posterior = likely / likely.sum(axis=1, keepdims=True)
-    elif not np.allclose(np.where(likely > 0.0, posterior, 0.0).sum(axis=1), 1.0) or (posterior < 0.0).any():
-        raise DensityError("classes.probability", "probabilities of the classes of each object's group", "others")
-    memory = table["class_memory"][label, None] ** (dt / table.period)
-    predicted = np.where(likely > 0.0, memory * posterior + (1.0 - memory) / table["group_size"][label, None], 0.0)
-    return predicted if kept is None else predicted[kept]
+    count, known = confusion.shape[0], posterior.shape[0] > 0
+    if count and known and posterior.shape != (label.shape[0], count):
+        raise ValueError("posteriors of other objects")
+    out = np.zeros((kept.shape[0], count))
+    for k in range(kept.shape[0] if count else 0):
+        n, total = kept[k], 0.0
+        for c in range(count):
+            likely = confusion[c, label[n]]
+            if likely > 0.0:
+                out[k, c] = posterior[n, c] if known else likely
+                total += out[k, c]
+            if known and posterior[n, c] < 0.0:
+                raise ValueError("a negative probability")
+        if known:
+            if abs(total - 1.0) > ROUNDING:
+                raise ValueError("probabilities of other classes")
+            total = 1.0
+        for c in range(count):
+            if confusion[c, label[n]] > 0.0:
+                kept_part, size = memory[label[n]], classes[label[n]].group_size
+                out[k, c] = kept_part * (out[k, c] / total) + (1.0 - kept_part) / size
+    return out
 
 
 @kernel

@@ -23,7 +23,7 @@ import numpy as np
 from optipmb.compiled import kernel
 from optipmb.errors import DensityError
 from optipmb.lost_objects import EMBEDDING, Appearance, Beginnings, Lost, Places, Rejoining, Statistics, Tracklets
-from optipmb.rows import Column, Rows, arrays_of, record, shown, views_of
+from optipmb.rows import INDEX, Column, Rows, arrays_of, record, shown, views_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -172,7 +172,9 @@ SLOT: Final = BINS + 2
 SCATTER: Final = 3
 """Shapes of `SelfCalibration`; a slot has looks and ticks of 0.1 ms behind the bins."""
 NO_BIN: Final = -1
-
+REAL: Final = np.dtype(np.float64)
+COUNTER: Final = np.dtype(np.uint16)
+"""Types of its arrays, beside `INDEX`."""
 
 ENOUGH: Final = 3.0
 """Evidence for a motion of the sensor from which it is used, and"""
@@ -311,6 +313,26 @@ def labels_within(object_words: Array, component_words: Array, classes: int) -> 
     return bool(good)
 
 
+def fits(density: Density, classes: int) -> bool:
+    """Tell whether the parts of a density have the shapes that they need; labels are not looked at."""
+    misses, count, own = density.misses, len(density.bernoulli), density.self_calibration
+    if misses is not None and len(misses) != count:
+        return False
+    arrays: tuple[tuple[object, tuple[int, ...], object], ...]
+    arrays = ((density.class_probability, (count, classes), REAL), (density.sensor, (5,), REAL))
+    if own is not None:
+        arrays += (
+            (own.classes, (classes, COUNTS, BINS), REAL),
+            (own.objects, (count, SLOTS, SLOT), COUNTER),
+            (own.components, (len(density.poisson),), INDEX),
+            (own.scatter, (classes, SCATTER), REAL),
+        )
+    for array, shape, kind in arrays:
+        if array is not None and not (isinstance(array, np.ndarray) and array.shape == shape and array.dtype == kind):
+            return False
+    return True
+
+
 def check_fitting(density: Density, labels: tuple[str, ...]) -> None:
     """Refuse a density whose parts do not fit together, for which kernels would read beyond its arrays.
 
@@ -319,14 +341,7 @@ def check_fitting(density: Density, labels: tuple[str, ...]) -> None:
     Raises:
         DensityError: names the column, the expected content and the content found.
     """
-    misses, objects, pi, own = density.misses, density.bernoulli, density.class_probability, density.self_calibration
-    good = pi is None or (isinstance(pi, np.ndarray) and pi.shape == (len(objects), len(labels)))
-    good &= misses is None or len(misses) == len(objects)
-    if own is not None:
-        for name, (shape, kind) in _shapes(len(labels), len(objects), len(density.poisson)).items():
-            column = getattr(own, name)
-            good &= isinstance(column, np.ndarray) and column.shape == shape and column.dtype == kind
-    if good and labels_within(objects.words, density.poisson.words, len(labels)):
+    if fits(density, len(labels)) and labels_within(density.bernoulli.words, density.poisson.words, len(labels)):
         return
     columns = columns_of(density)
     density_of(density.stamp_ns, density.next_id, columns, labels)  # names the column
@@ -485,7 +500,7 @@ def density_of(stamp_ns: int, next_id: int, columns: Mapping[str, Any], labels: 
         own = _self_calibration(columns, _shapes(len(labels), len(bernoulli), len(poisson)))
     motion = columns.get(SENSOR)
     if motion is not None:
-        if not (isinstance(motion, np.ndarray) and motion.shape == (5,) and (np.abs(motion) <= MOST_COUNTED).all()):
+        if not (shown(motion) == "(5,) float64" and (np.abs(motion) <= MOST_COUNTED).all()):
             raise DensityError(SENSOR, f"(5,) finite numbers up to {MOST_COUNTED:g}", shown(motion))
         motion = np.array(motion, np.float64)
     joining = _rejoining(columns, stamp_ns, next_id, len(labels)) if f"{Tracklets.part}.id" in columns else None

@@ -116,10 +116,11 @@ def extract(
     moment: Columns,
     two_thresholds: bool,
     classes: Classes,
-) -> Array:
-    """Return the array of `Tracks`, and mark extracted and confirmed objects in the array of the new posterior.
+) -> tuple[Array, Index]:
+    """Return the array of `Tracks` and the object (K,) of each, and mark extracted and confirmed objects.
 
-    `measurement` (N,) is negative where an object is missed; `two_thresholds` tells whether OTE is on.
+    They are marked in the array of the new posterior. `measurement` (N,) is negative where an object is missed;
+    `two_thresholds` tells whether OTE is on.
     """
     objects, z, now = objects_in(object_words), Measurements(*measurements), Moment(*moment)
     rows = select_tracks(objects, misses_counted_from(objects, missed_from_ns), now, two_thresholds, classes)
@@ -169,7 +170,7 @@ def extract(
             share = objects.hits[n] / objects.looks[n]
             existence[k] = use_history(existence[k], tracks.age[k], share, velocity[k], own)
     confirm(rows, label, existence, measurement, classes, objects.confirmed, tracks.confirmed)
-    return words
+    return words, rows
 
 
 @kernel

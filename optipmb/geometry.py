@@ -65,7 +65,7 @@ def intersection_area(first: Array, second: Array) -> float:
             here = limit - side * polygon[i, axis]
             there = limit - side * polygon[j, axis]
             if here >= 0.0:
-                clipped[kept] = polygon[i]
+                clipped[kept, 0], clipped[kept, 1] = polygon[i, 0], polygon[i, 1]
                 kept += 1
             if (here >= 0.0) != (there >= 0.0):
                 t = here / (here - there)
@@ -74,7 +74,7 @@ def intersection_area(first: Array, second: Array) -> float:
                 kept += 1
         count = kept
         for i in range(count):
-            polygon[i] = clipped[i]
+            polygon[i, 0], polygon[i, 1] = clipped[i, 0], clipped[i, 1]
         if count == 0:
             return 0.0
     doubled = 0.0

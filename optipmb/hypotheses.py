@@ -15,7 +15,7 @@ import numpy as np
 
 from optipmb.class_posterior import weigh_by_class
 from optipmb.compiled import kernel
-from optipmb.density import OMEGA, PHI, A, V, X, Y
+from optipmb.density import OMEGA, PHI, STATE, A, V, X, Y
 from optipmb.errors import EffortError
 from optipmb.frame import PLAIN
 from optipmb.geometry import END_OF_CHAIN, block, empty_torus, insert
@@ -260,7 +260,9 @@ def halt(objects: Bernoullis, measurements: Measurements, moment: Moment, classe
                 and turn**2 <= (TURNED * own.noise_heading) ** 2
             ):
                 mean[X], mean[Y], mean[PHI], mean[V], mean[OMEGA], mean[A] = x, y, phi, 0.0, 0.0, 0.0
-                covariance[:] = np.diag(own.birth_unknown**2)
+                for s in range(STATE):
+                    for t in range(STATE):
+                        covariance[s, t] = own.birth_unknown[s] ** 2 if s == t else 0.0
                 covariance[V, V] = SLOW**2
                 break
 

@@ -24,9 +24,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from optipmb.class_posterior import predict_classes
+from optipmb.class_posterior import UNGROUPED, predict_classes
 from optipmb.compiled import kernel
 from optipmb.density import (
+    CLASSES,
     COMPONENT,
     NO_FRAME,
     OBJECT,
@@ -48,6 +49,7 @@ from optipmb.density import (
     objects_in,
     whole_periods,
 )
+from optipmb.errors import DensityError
 
 if TYPE_CHECKING:
     from optipmb.rows import Array, Columns, Index
@@ -339,6 +341,8 @@ def centred(points: Array, s: int) -> float:
     return shift
 
 
+NO_MEMORY: Final = np.zeros(0)
+"""In place of the memory of the classes of a group where the profile has no groups."""
 LONGEST_STEP_S: Final = 6.0
 """Longest time between two frames, s, over which an object is followed although its class forgets it sooner."""
 
@@ -359,43 +363,56 @@ def predict(density: Density, moment: Moment, table: ClassTable) -> tuple[Densit
     Raises:
         DensityError: the parts of the density do not fit together, or a label is of no class.
     """
-    misses, stays = density.misses, moment.before_ns == NO_FRAME or moment.dt == 0.0
-    if stays or misses is not None or len(table.confusion) or density.self_calibration is not None:
-        check_fitting(density, density.labels)
-    if stays:
-        pi = predict_classes(density, None, 0.0, table)
-        parts = density.bernoulli, density.poisson
-        return Density(moment.stamp_ns, density.next_id, *parts, density.labels, misses, pi), 0
+    misses, pi = density.misses, density.class_probability
+    grouped = len(table.confusion) > 0
+    times = moment.dt / table.period if moment.before_ns != NO_FRAME else 0.0
+    memory = table["class_memory"] ** times if grouped else NO_MEMORY
+    given = density.bernoulli.words, density.missed_from_ns, UNGROUPED if pi is None else pi, density.poisson.words
     try:
-        kept, objects, components, repaired = predict_density(
-            density.bernoulli.words, density.missed_from_ns, density.poisson.words, tuple(moment), table.classes
+        kept, objects, likely, components, repaired = predict_density(
+            *given, tuple(moment), (memory, table.confusion), table.classes
         )
-    except ValueError:
+    except ValueError as error:
         check_fitting(density, density.labels)  # names the column
-        raise
-    pi = predict_classes(density, kept, moment.dt, table)
+        raise DensityError(CLASSES, "probabilities of the classes of each object's group", "others") from error
     if misses is not None and kept.shape[0] < len(misses):
         misses = misses.take(kept)
     parts = Bernoullis.of(objects), Poissons.of(components)
+    pi = likely if grouped else None
     return Density(moment.stamp_ns, density.next_id, *parts, density.labels, misses, pi), repaired
 
 
 @kernel
 def predict_density(
-    object_words: Array, missed_from_ns: Index, component_words: Array, moment: Columns, classes: Classes
-) -> tuple[Index, Array, Array, int]:
+    object_words: Array,
+    missed_from_ns: Index,
+    class_probability: Array,
+    component_words: Array,
+    moment: Columns,
+    grouped: tuple[Array, Array],
+    classes: Classes,
+) -> tuple[Index, Array, Array, Array, int]:
     """Predict the objects and components that are within the limit of their class (eq. PPP_prediction, MB_prediction).
 
+    `class_probability`, and `grouped` with memory and confusion, are those of `predict_classes`.
+
     Returns:
-        The (K,) objects that stay, the arrays of the predicted objects and components, and how many covariances had to
-        be repaired.
+        The (K,) objects that stay, the array of the predicted objects, pi_+, the array of the predicted components, and
+        how many covariances had to be repaired.
 
     Raises:
-        ValueError: a label is of no class; its parameters would be read beyond their array.
+        ValueError: a label is of no class, or a column has another length: kernels would read beyond an array; or
+            posteriors are of other classes.
     """
     if not labels_within(object_words, component_words, len(classes)):
         raise ValueError("labels of classes that there are not")
-    now = Moment(*moment)
+    now, label = Moment(*moment), objects_in(object_words).label
+    if missed_from_ns.shape[0] not in (0, label.shape[0]):
+        raise ValueError("misses of other objects")
+    if now.before_ns == NO_FRAME or now.dt == 0.0:
+        every = np.arange(label.shape[0])
+        pi = predict_classes(every, label, class_probability, *grouped, classes)
+        return every, object_words, pi, component_words, 0
     survival = np.empty(len(classes))
     for c in range(len(classes)):
         survival[c] = classes[c].survival ** (now.dt / now.period)
@@ -415,6 +432,7 @@ def predict_density(
         new.hits[k], new.looks[k] = old.hits[n], old.looks[n]
         new.extracted[k], new.confirmed[k] = old.extracted[n], old.confirmed[n]
 
+    pi = predict_classes(kept, old.label, class_probability, *grouped, classes)
     undetected = components_in(component_words)
     chosen = rows_within(undetected.label, undetected.born_ns, now.before_ns, True, now, classes)
     carried = np.empty(chosen.shape[0] * COMPONENT)
@@ -422,7 +440,7 @@ def predict_density(
     repaired += predict_rows(chosen, undetected, later, now.dt, classes)
     for k in range(chosen.shape[0]):
         later.weight[k] = undetected.weight[chosen[k]] * survival[undetected.label[chosen[k]]]
-    return kept, predicted, carried, repaired
+    return kept, predicted, pi, carried, repaired
 
 
 @kernel

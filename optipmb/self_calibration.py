@@ -52,7 +52,22 @@ import numpy as np
 
 from optipmb.calibration import log_odds
 from optipmb.compiled import kernel
-from optipmb.density import BINS, COUNTS, NO_BIN, PHI, SLOT, SLOTS, SelfCalibration, V, X, Y, objects_in
+from optipmb.density import (
+    BINS,
+    COUNTS,
+    FROM_LAST_DETECTION,
+    NO_BIN,
+    PHI,
+    SLOT,
+    SLOTS,
+    Moment,
+    SelfCalibration,
+    V,
+    X,
+    Y,
+    components_in,
+    objects_in,
+)
 from optipmb.frame import PLAIN
 from optipmb.predict import rows_within
 from optipmb.rows import read_only
@@ -61,10 +76,10 @@ from optipmb.undetected import AGED, MARKED
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from optipmb.density import Density, Moment
+    from optipmb.density import Density, Misses, Poissons
     from optipmb.frame import Frame
     from optipmb.preprocess import Measurements
-    from optipmb.rows import Array, Index
+    from optipmb.rows import Array, Columns, Index
     from optipmb.table import Classes, ClassTable
     from optipmb.tracker import Update
 
@@ -171,10 +186,15 @@ def isotonic(detections: Array, objects: Array, out: Array) -> None:
 
 
 @kernel
-def curves(classes: Array, table: Classes) -> Array:
-    """Return the curves of the shares that last, and of the shares of objects, (2, C, `BINS`)."""
+def curves(classes: Array, label: Index, table: Classes) -> Array:
+    """Return the curves of the shares that last, and of the shares of objects, (2, C, `BINS`).
+
+    Those of classes that no detection has had, nor one of `label` (M,), are not written.
+    """
     out = np.empty((2, classes.shape[0], BINS))
     for c in range(classes.shape[0]):
+        if classes[c, GIVEN].sum() == 0.0 and not (label == c).any():
+            continue
         isotonic(classes[c, DETECTIONS], classes[c, LASTING], out[0, c])
         if table[c].constant_velocity:
             isotonic(classes[c, DETECTIONS], of_objects(classes[c]), out[1, c])
@@ -207,7 +227,7 @@ def calibrate(classes: Array, score: Array, label: Index, table: Classes) -> Arr
 
     `classes` are the counts, (C, `COUNTS`, `BINS`).
     """
-    curve, out = curves(classes, table), np.empty((2, score.shape[0]))
+    curve, out = curves(classes, label, table), np.empty((2, score.shape[0]))
     for m in range(score.shape[0]):
         odds = log_odds(score[m])
         for k in range(2):
@@ -228,6 +248,14 @@ def calibrate(classes: Array, score: Array, label: Index, table: Classes) -> Arr
             own.announce_score = min(own.announce_score, objects)
             own.birth_score = min(own.birth_score, objects)
     return out
+
+
+@kernel
+def calibrate_frame(classes: Array, scatter: Array, score: Array, label: Index, table: Classes) -> tuple[Array, Array]:
+    """Return the scores of `calibrate`, (M,) each, and write thresholds and learned noise to `table`."""
+    use_scatter(scatter, table)
+    lasting, meant = calibrate(classes, score, label, table)
+    return lasting, meant
 
 
 @kernel
@@ -453,6 +481,34 @@ def learn_scatter(
     return out
 
 
+@kernel
+def learn_frame(
+    counts: tuple[Array, Slots, Index, Array],
+    before_words: Array,
+    prior: tuple[Array, Array],
+    posterior: tuple[Array, Index, Index, Index, Index],
+    detections: tuple[Array, Array, Index, Index],
+    position: Array,
+    moment: Columns,
+    table: Classes,
+) -> tuple[Array, Slots, Index, Array]:
+    """Return the arrays of `SelfCalibration` after a frame, by `learn` and `learn_scatter`, whose arguments these are.
+
+    Arguments of its own:
+        counts: the arrays before it, in their order; the scatter last.
+        prior: arrays of the predicted objects and components.
+        posterior: array of the objects; `row`, `measurement` and `fate` of `Update`; and `Misses.looked_ns`, (0,) where
+            every frame looks at all objects.
+    """
+    classes, slots, bins, scatter = counts
+    (words, row, hit, fate, looked_ns), now = posterior, Moment(*moment)
+    looked = looked_ns == now.stamp_ns if looked_ns.shape[0] else np.ones(hit.shape[0], np.bool_)
+    given, label = (classes.copy(), slots, bins), components_in(prior[1]).label
+    found = learn(given, before_words, (words, hit, looked), label, fate, detections, now.dt)
+    stamps = now.stamp_ns, now.before_ns
+    return (*found, learn_scatter(scatter, prior[0], words, (row, hit), position, stamps, table))
+
+
 class Scores(NamedTuple):
     """The scores of a frame.
 
@@ -474,15 +530,15 @@ class Scores(NamedTuple):
 def calibrated(density: Density, frame: Frame, table: ClassTable) -> tuple[Scores, ClassTable]:
     """Return the calibrated scores of a frame, and parameters whose thresholds they may be compared with."""
     own, table = SelfCalibration.of(density), table.copy()
-    lasting, meant = read_only(calibrate(own.classes, frame.score, frame.label, table.classes))
-    use_scatter(own.scatter, table.classes)
-    return Scores(density, frame.score, lasting, meant, frame.label), table
+    lasting, meant = calibrate_frame(own.classes, own.scatter, frame.score, frame.label, table.classes)
+    return Scores(density, frame.score, read_only(lasting), read_only(meant), frame.label), table
 
 
 def followed(
     scores: Scores,
     prior: Density,
-    posterior: Density,
+    poisson: Poissons,
+    misses: Misses | None,
     update: Update,
     measurements: Measurements,
     rows: Index,
@@ -491,25 +547,29 @@ def followed(
 ) -> SelfCalibration:
     """Return the counts after a frame, and write the scores of the detector to the objects of the new posterior.
 
-    `rows` (M,) is the detection of each measurement.
+    Arguments of its own:
+        prior: the predicted density.
+        poisson, misses: of the posterior.
+        rows: (M,) detection of each measurement.
     """
-    density, objects, hit = scores.before, posterior.bernoulli, update.measurement
-    own, poisson, fate = SelfCalibration.of(density), density.poisson, update.fate
+    density, fate, looked_ns = scores.before, update.fate, FROM_LAST_DETECTION if misses is None else misses.looked_ns
+    own, before = SelfCalibration.of(density), density.poisson
     bins = own.components
     if len(prior.poisson) < len(bins):
-        bins = bins[rows_within(poisson.label, poisson.born_ns, density.stamp_ns, True, moment, table.classes)]
-    if not len(posterior.poisson):  # perhaps without RPP
+        bins = bins[rows_within(before.label, before.born_ns, density.stamp_ns, True, moment, table.classes)]
+    if not len(poisson):  # perhaps without RPP
         fate = np.where(fate >= 0, MARKED, fate)
-    looked = (
-        np.ones(len(objects), np.bool_) if posterior.misses is None else posterior.misses.looked_ns == moment.stamp_ns
+    classes, objects, components, scatter = learn_frame(
+        (own.classes, own.objects, bins, own.scatter),
+        density.bernoulli.words,
+        (prior.bernoulli.words, prior.poisson.words),
+        (update.objects, update.row, update.measurement, fate, looked_ns),
+        (scores.given, scores.meant, scores.label, rows),
+        measurements.position,
+        tuple(moment),
+        table.classes,
     )
-    counts = own.classes.copy(), own.objects, bins
-    detections = scores.given, scores.meant, scores.label, rows
-    after = objects.words, hit, looked
-    found = learn(counts, density.bernoulli.words, after, prior.poisson.label, fate, detections, moment.dt)
-    words, stamps = (prior.bernoulli.words, objects.words), (moment.stamp_ns, moment.before_ns)
-    scatter = learn_scatter(own.scatter, *words, (update.row, hit), measurements.position, stamps, table.classes)
-    return SelfCalibration(*found, scatter)
+    return SelfCalibration(classes, objects, components, scatter)
 
 
 def learned_noise(density: Density) -> tuple[str, ...]:

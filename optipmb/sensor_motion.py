@@ -32,17 +32,18 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.density import ENOUGH, LEAST_MOVED_S, NO_FRAME, OMEGA, PHI, V
+from optipmb.density import ENOUGH, LEAST_MOVED_S, NO_FRAME, OMEGA, PHI, V, X, Y, objects_in
+from optipmb.predict import heading_unknown
 from optipmb.relocation import Relocation
 from optipmb.rows import read_only
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from optipmb.density import Density
+    from optipmb.density import Bernoullis, Density
     from optipmb.frame import Frame
     from optipmb.rows import Array, Index
-    from optipmb.table import ClassTable
+    from optipmb.table import Classes, ClassTable
 
 
 MOST: Final = 64
@@ -102,13 +103,25 @@ STANDING: Final = (0.3, 0.01)
 """Speed, m/s, and turn rate, rad/s, below which a sensor may be taken to stand again."""
 
 
+LEAST_EVIDENCE: Final = 0.1
+"""Evidence of a motion that is not found again which counts as none: the estimate ends."""
+ROUNDING: Final = 1e-6
+"""Margin of comparisons of places, m."""
+EVIDENCE, SECONDS = 3, 4
+"""Places in `Density.sensor`."""
+NOTHING: Final = np.zeros(0)
+"""In place of `Density.sensor` where that is None."""
+STAYS, MOVES, BEGINS = range(3)
+"""How a density follows the sensor: not at all, by its motion, or by that and with speeds over ground from now on."""
+
+
 class Pairs(NamedTuple):
     """Objects and detections that may belong together.
 
     Attributes:
         start: (N, 2) places of the objects.
         label: (N,) their classes.
-        target: (M, 2) places of the detections.
+        target: (M, 2) places of the detections, ascending along x.
         target_label: (M,) their classes.
     """
 
@@ -118,92 +131,200 @@ class Pairs(NamedTuple):
     target_label: Index
 
 
-def follow_sensor(density: Density, frame: Frame, table: ClassTable) -> Density:
-    """Find the motion of the sensor and carry a density into the axes of the frame.
+def follow_sensor(density: Density, frame: Frame, table: ClassTable) -> tuple[Density, Array | None]:
+    """Return a density in the axes of a frame, and `Density.sensor` after it, by the motion of the sensor.
 
     The density stays where the sensor stands. A frame with a pose ends the estimate.
     """
-    dt = (frame.stamp_ns - density.stamp_ns) * 1e-9
+    dt, before = (frame.stamp_ns - density.stamp_ns) * 1e-9, density.sensor
     if density.stamp_ns == NO_FRAME or dt < SHORTEST_S:
-        return density
-    unknown = density if density.sensor is None else replace(density, sensor=None)
+        return density, before
     if dt > LONGEST_S or (frame.pose is not None and not frame.pose.is_identity):
-        return unknown
-    objects = density.bernoulli
-    recent = np.flatnonzero((objects.seen_ns == density.stamp_ns) & (objects.existence >= SURE))
-    rows = recent[np.argsort(np.hypot(*objects.mean[recent, :2].T), kind="stable")[:MOST]]
-    best = np.argsort(-frame.score, kind="stable")[:MOST]
-    start, target = np.ascontiguousarray(objects.mean[rows, :2]), np.ascontiguousarray(frame.center[best, :2])
-    pairs = Pairs(start, objects.label[rows], target, frame.label[best])
-    ahead = np.column_stack((np.cos(objects.mean[rows, PHI]), np.sin(objects.mean[rows, PHI])))
-    free = objects.covariance[rows, OMEGA, OMEGA] == 0.0  # to move in any direction: their heading is unknown
-    before = None if density.sensor_motion is None else density.sensor_motion * dt
-    if before is not None:
-        found = _continued(pairs, objects.mean[rows, V, None] * dt * ahead, before, dt)
-        if found is not None:
+        return density, None
+    given = NOTHING if before is None else before.copy()  # which may be written to, as one type for the kernel
+    detections = frame.score, frame.center, frame.label
+    step, motion, after = next_motion(density.bernoulli.words, given, *detections, dt, density.stamp_ns, table.classes)
+    if step == BEGINS:
+        density = _over_ground(density, motion, dt, frame)
+    if step != STAYS:
+        density = _relocation(motion).density(density)
+    return density, read_only(after) if after.shape[0] else None
+
+
+@kernel
+def next_motion(
+    object_words: Array,
+    sensor: Array,
+    score: Array,
+    center: Array,
+    label: Index,
+    dt: float,
+    before_ns: int,
+    classes: Classes,
+) -> tuple[int, Array, Array]:
+    """Find the motion of the sensor from the frame before to this one.
+
+    Arguments of its own:
+        object_words: array of the `Bernoullis` of the frame before.
+        sensor: (5,) `Density.sensor`, or `NOTHING`.
+        score, center, label: of all detections of the frame.
+        dt: s since the frame before.
+        before_ns: stamp of that frame.
+
+    Returns:
+        `STAYS`, `MOVES` or `BEGINS`; the motion t and theta (3,), zero where the density stays; and the next `sensor`.
+    """
+    objects, none = objects_in(object_words), np.zeros(0)
+    distance = np.full(objects.label.shape[0], math.inf)
+    for n in range(objects.label.shape[0]):
+        sure = objects.seen_ns[n] == before_ns and objects.existence[n] >= SURE
+        if sure and 0 <= objects.label[n] < len(classes):  # others are refused in the prediction
+            distance[n] = math.hypot(objects.mean[n, X], objects.mean[n, Y])
+    doubt = np.empty(score.shape[0])
+    for d in range(score.shape[0]):
+        doubt[d] = -score[d]
+    rows, best = least(distance, MOST), least(doubt, MOST)
+    along = np.empty(best.shape[0])
+    for k in range(best.shape[0]):
+        along[k] = center[best[k], 0]
+    order = least(along, MOST)
+    start, target = np.empty((rows.shape[0], 2)), np.empty((order.shape[0], 2))
+    start_label, target_label = np.empty(rows.shape[0], np.int64), np.empty(order.shape[0], np.int64)
+    for k in range(rows.shape[0]):
+        n = rows[k]
+        start[k, 0], start[k, 1], start_label[k] = objects.mean[n, X], objects.mean[n, Y], objects.label[n]
+    for k in range(order.shape[0]):
+        d = best[order[k]]
+        target[k, 0], target[k, 1], target_label[k] = center[d, 0], center[d, 1], label[d]
+    pairs, stays, guess = Pairs(start, start_label, target, target_label), np.zeros(3), np.zeros(3)
+    used = in_use(sensor)
+    if used:
+        for s in range(3):
+            guess[s] = sensor[s] * dt
+        found = continued(pairs, driven(objects, rows, dt), guess, dt)
+        if found.shape[0]:
             still = math.hypot(found[0], found[1]) < STANDING[0] * dt and abs(found[2]) < STANDING[1] * dt
-            return unknown if still else _carried(density, found, dt)
-    found = _begun(pairs, dt)
-    after = _fading(density, dt) if found is None else _weighed(density, pairs, ahead, free, found, dt, table)
-    if found is not None and after.sensor_motion is not None:
-        return _carried(after if before is not None else _over_ground(after, found, dt, frame), found, dt)
-    if before is not None and together(pairs, np.zeros(3)).sum() < SHARE * len(rows):
-        return _carried(density, before, dt)  # neither continued nor stopped: left to the next frame
-    return after
+            return (STAYS, stays, none) if still else (MOVES, found, moving(found, dt))
+    found, after = begun(pairs, dt), none
+    if found.shape[0]:
+        after = weighed(none if used else sensor, pairs, objects, rows, found, dt, classes)
+        if in_use(after):
+            return MOVES if used else BEGINS, found, moving(found, dt)
+    elif sensor.shape[0] and not used and sensor[EVIDENCE] * KEPT ** (10.0 * dt) > LEAST_EVIDENCE:
+        after = sensor.copy()
+        after[EVIDENCE] *= KEPT ** (10.0 * dt)
+    if used and together(pairs, stays).sum() < SHARE * rows.shape[0]:
+        return MOVES, guess, moving(guess, dt)  # neither continued nor stopped: left to the next frame
+    return STAYS, stays, after
 
 
-def _continued(pairs: Pairs, driven: Array, guess: Array, dt: float) -> Array | None:
-    """Return the motion near the guess, the guess itself where there are few objects; None without any."""
-    start = pairs.start + np.where(np.hypot(*driven.T)[:, None] > MOVING * dt, driven, 0.0)
+@kernel
+def in_use(sensor: Array) -> bool:
+    """Tell whether a motion has enough evidence, as `Density.sensor_motion` does."""
+    return bool(sensor.shape[0] > 0 and sensor[EVIDENCE] >= ENOUGH and sensor[SECONDS] >= LEAST_MOVED_S)
+
+
+@kernel
+def moving(motion: Array, dt: float) -> Array:
+    """Return `Density.sensor` of a sensor that made a motion."""
+    return np.array([motion[0] / dt, motion[1] / dt, motion[2] / dt, ENOUGH, LEAST_MOVED_S])
+
+
+@kernel
+def least(value: Array, most: int) -> Index:
+    """Return the rows of the least values, at most so many and ascending, the first of equal ones; none of infinity."""
+    rows, count = np.empty(min(most, value.shape[0]), np.int64), 0
+    for n in range(value.shape[0]):
+        if value[n] == math.inf or (count == most and value[n] >= value[rows[most - 1]]):
+            continue
+        k = min(count, most - 1)
+        while k > 0 and value[rows[k - 1]] > value[n]:
+            rows[k] = rows[k - 1]
+            k -= 1
+        rows[k] = n
+        count = min(count + 1, most)
+    return rows[:count]
+
+
+@kernel
+def driven(objects: Bernoullis, rows: Index, dt: float) -> Array:
+    """Return where objects (K,) that move are after dt, over ground (K, 2)."""
+    out = np.empty((rows.shape[0], 2))
+    for k in range(rows.shape[0]):
+        n = rows[k]
+        way, phi = objects.mean[n, V] * dt, objects.mean[n, PHI]
+        dx, dy = way * math.cos(phi), way * math.sin(phi)
+        moves = math.hypot(dx, dy) > MOVING * dt
+        out[k, 0] = objects.mean[n, X] + (dx if moves else 0.0)
+        out[k, 1] = objects.mean[n, Y] + (dy if moves else 0.0)
+    return out
+
+
+@kernel
+def continued(pairs: Pairs, start: Array, guess: Array, dt: float) -> Array:
+    """Return the motion near the guess, the guess itself where there are few objects; (0,) without any."""
     reach, turn, trust = 1.0 + CHANGE[0] * dt * dt, 0.02 + CHANGE[1] * dt * dt, (0.15 / (0.05 + dt * dt)) ** 2
-    found, count, _ = common_motion(pairs._replace(start=start), guess, reach, turn, trust)
-    if count >= max(CREW // 2, 0.5 * SHARE * len(start)):
+    ahead = Pairs(start, pairs.label, pairs.target, pairs.target_label)
+    found, count, _ = common_motion(ahead, guess, reach, turn, trust)
+    if count >= max(CREW // 2, 0.5 * SHARE * start.shape[0]):
         return found
-    return guess if len(start) < CREW else None
+    return guess if start.shape[0] < CREW else np.zeros(0)
 
 
-def _begun(pairs: Pairs, dt: float) -> Array | None:
-    """Return a motion that a sensor may have begun; None where it seems to stand."""
-    start, few = pairs.start, len(pairs.start) < CREW
-    apart = 1.0 - together(pairs, np.zeros(3))
-    if few or apart.sum() < STILL * len(start) or np.hypot(*start.T).mean() > FARTHEST:
-        return None
-    found, count, cost = common_motion(pairs, np.zeros(3), FASTEST[0] * dt, FASTEST[1] * dt, 0.0)
-    if count < max(CREW, SHARE * len(start)) or cost > (1.0 - NEARER) * apart.sum():
-        return None
-    size = np.hypot(*(taken(start, found) - start)[together(pairs, found) > 0.0].T)
-    clear = size.mean() >= LEAST_MOTION
-    return found if clear and _drives(found, dt) else None
+@kernel
+def begun(pairs: Pairs, dt: float) -> Array:
+    """Return a motion that a sensor may have begun; (0,) where it seems to stand."""
+    start, none, zero = pairs.start, np.zeros(0), np.zeros(3)
+    count = start.shape[0]
+    apart = count - together(pairs, zero).sum()
+    far = 0.0
+    for n in range(count):
+        far += math.hypot(start[n, 0], start[n, 1])
+    if count < CREW or apart < STILL * count or far > FARTHEST * count:
+        return none
+    found, joined, cost = common_motion(pairs, zero, FASTEST[0] * dt, FASTEST[1] * dt, 0.0)
+    if joined < max(CREW, SHARE * count) or cost > (1.0 - NEARER) * apart:
+        return none
+    moved, held, size = taken(start, found), together(pairs, found), 0.0
+    for n in range(count):
+        if held[n] > 0.0:
+            size += math.hypot(moved[n, 0] - start[n, 0], moved[n, 1] - start[n, 1])
+    return found if size >= LEAST_MOTION * joined and drives(found, dt) else none
 
 
-def _weighed(
-    density: Density, pairs: Pairs, ahead: Array, free: NDArray[np.bool_], motion: Array, dt: float, table: ClassTable
-) -> Density:
-    """Return a density with a motion and its evidence, which adds to the evidence of a similar motion before."""
+@kernel
+def weighed(
+    before: Array, pairs: Pairs, objects: Bernoullis, rows: Index, motion: Array, dt: float, classes: Classes
+) -> Array:
+    """Return `Density.sensor` with a motion and its evidence, which adds to that of a similar motion before."""
+    count = rows.shape[0]
     cos, sin = math.cos(motion[2]), math.sin(motion[2])
-    turned = ahead @ np.array([[cos, sin], [-sin, cos]])
-    reach = (UNKNOWN * dt * table["birth_unknown"][:, V])[pairs.label]
-    walks = table["constant_velocity"][pairs.label] | free
-    standing = sideways(pairs, ahead, reach, walks)
-    moving = sideways(pairs._replace(start=taken(pairs.start, motion)), turned, reach, walks)
-    gained = standing - moving
-    evidence, seconds, rate = gained.sum() - max(gained.max(), 0.0) - FITTED, dt, motion / dt
-    before = density.sensor if density.sensor_motion is None else None
-    if before is not None:
-        off = rate - before[:3]
-        if math.hypot(off[0], off[1]) < 1.0 + CHANGE[0] * dt and abs(off[2]) < 0.1 + CHANGE[1] * dt:
-            evidence, seconds = evidence + before[3] * KEPT ** (10.0 * dt), seconds + before[4]
-    return replace(density, sensor=read_only(np.array([*rate, max(evidence, 0.0), seconds])))
+    ahead, turned = np.empty((count, 2)), np.empty((count, 2))
+    reach, walks = np.empty(count), np.empty(count, np.bool_)
+    for k in range(count):
+        n, own = rows[k], classes[pairs.label[k]]
+        ahead[k, 0], ahead[k, 1] = math.cos(objects.mean[n, PHI]), math.sin(objects.mean[n, PHI])
+        turned[k, 0], turned[k, 1] = cos * ahead[k, 0] - sin * ahead[k, 1], sin * ahead[k, 0] + cos * ahead[k, 1]
+        reach[k] = UNKNOWN * dt * own.birth_unknown[V]
+        walks[k] = own.constant_velocity or heading_unknown(objects.covariance[n])
+    moved = Pairs(taken(pairs.start, motion), pairs.label, pairs.target, pairs.target_label)
+    here, there = sideways(pairs, ahead, reach, walks), sideways(moved, turned, reach, walks)
+    evidence, strongest, seconds = 0.0, 0.0, dt
+    for k in range(count):
+        gained = here[k] - there[k]
+        evidence, strongest = evidence + gained, max(strongest, gained)
+    evidence = evidence - strongest - FITTED
+    rate = motion[0] / dt, motion[1] / dt, motion[2] / dt
+    if before.shape[0]:
+        off = math.hypot(rate[0] - before[0], rate[1] - before[1])
+        if off < 1.0 + CHANGE[0] * dt and abs(rate[2] - before[2]) < 0.1 + CHANGE[1] * dt:
+            evidence += before[EVIDENCE] * KEPT ** (10.0 * dt)
+            seconds += before[SECONDS]
+    return np.array([rate[0], rate[1], rate[2], max(evidence, 0.0), seconds])
 
 
-def _fading(density: Density, dt: float) -> Density:
-    """Return a density with less evidence of a motion that was not found again."""
-    if density.sensor is None or density.sensor_motion is not None:
-        return density if density.sensor is None else replace(density, sensor=None)
-    return replace(density, sensor=read_only(density.sensor * [1.0, 1.0, 1.0, KEPT ** (10.0 * dt), 1.0]))
-
-
-def _drives(motion: Array, dt: float) -> bool:
+@kernel
+def drives(motion: Array, dt: float) -> bool:
     """Tell whether a vehicle can have made a motion: forwards along an axis of the sensor, not too fast in a bend."""
     way, half = math.hypot(motion[0], motion[1]), 0.5 * motion[2]
     x = math.cos(half) * motion[0] + math.sin(half) * motion[1]
@@ -217,7 +338,7 @@ def _over_ground(density: Density, motion: Array, dt: float, frame: Frame) -> De
     if np.isfinite(frame.velocity).any():
         return density
     mean = objects.mean.copy()
-    apparent = (taken(mean[:, :2], motion) - mean[:, :2]) / dt
+    apparent = (_relocation(motion).points(mean[:, :2]) - mean[:, :2]) / dt
     along = apparent[:, 0] * np.cos(mean[:, PHI]) + apparent[:, 1] * np.sin(mean[:, PHI])
     mean[:, V] -= np.where(objects.seen_ns > objects.born_ns, along, 0.0)
     free = (objects.covariance[:, OMEGA, OMEGA] == 0.0) & (objects.seen_ns > objects.born_ns)
@@ -228,15 +349,14 @@ def _over_ground(density: Density, motion: Array, dt: float, frame: Frame) -> De
     return replace(density, bernoulli=objects.replaced(mean=mean))
 
 
-def _carried(density: Density, motion: Array, dt: float) -> Density:
-    """Return a density in the axes of a sensor that made a motion."""
-    moved = _relocation(motion).density(density)
-    return replace(moved, sensor=read_only(np.array([*motion / dt, ENOUGH, LEAST_MOVED_S])))
-
-
+@kernel
 def taken(points: Array, motion: Array) -> Array:
     """Return points (N, 2) where a motion (3,), t and theta, takes them."""
-    return _relocation(motion).points(points)
+    out, cos, sin = np.empty((points.shape[0], 2)), math.cos(motion[2]), math.sin(motion[2])
+    for n in range(points.shape[0]):
+        out[n, 0] = cos * points[n, 0] - sin * points[n, 1] + motion[0]
+        out[n, 1] = sin * points[n, 0] + cos * points[n, 1] + motion[1]
+    return out
 
 
 def _relocation(motion: Array) -> Relocation:
@@ -245,11 +365,29 @@ def _relocation(motion: Array) -> Relocation:
 
 
 @kernel
+def first_beyond(target: Array, x: float) -> int:
+    """Return the row of the first target that is not below a place along x, by less than `ROUNDING`."""
+    low, high = 0, target.shape[0]
+    while low < high:
+        middle = (low + high) // 2
+        if target[middle, 0] < x - ROUNDING:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@kernel
 def nearest(x: float, y: float, label: int, target: Array, target_label: Index, most: float) -> tuple[int, float]:
-    """Return the nearest target of a class and its squared distance, -1 and `most` where none is nearer than that."""
+    """Return the nearest target of a class and its squared distance, -1 and `most` where none is nearer than that.
+
+    Targets ascend along x.
+    """
     best, least = -1, most
-    for m in range(target.shape[0]):
+    for m in range(first_beyond(target, x - math.sqrt(most)), target.shape[0]):
         dx, dy = target[m, 0] - x, target[m, 1] - y
+        if dx > 0.0 and dx * dx >= least:
+            break
         squared = dx * dx + dy * dy
         if target_label[m] == label and squared < least:
             best, least = m, squared
@@ -305,25 +443,26 @@ def common_motion(pairs: Pairs, guess: Array, reach: float, turn: float, trust: 
     Returns:
         The motion (3,), how many points it brings to targets, and the sum of their distances, each from 0 to 1.
     """
-    start, label, target, target_label = pairs.start, pairs.label, pairs.target, pairs.target_label
+    start, target = pairs.start, pairs.target
     motion, votes_best, far_best = guess.copy(), 0, math.inf
     side = min(MOST_CELLS, 2 * math.ceil(reach / CELL) + 2)
     low = -0.5 * CELL * side
-    votes, voters = np.zeros((side + 2, side + 2), np.int64), np.empty((start.shape[0] * target.shape[0], 2), np.int64)
     angles = min(MOST_ANGLES, math.ceil(turn / ANGLE))
+    near = within(pairs, guess, 0.5 * CELL * side, angles * ANGLE)
+    votes, voters = np.zeros((side + 2, side + 2), np.int64), np.empty((near.shape[0], 2), np.int64)
     for a in range(-angles, angles + 1):
         theta = guess[2] + a * ANGLE
         cos, sin = math.cos(theta), math.sin(theta)
         count = 0
-        for n in range(start.shape[0]):
+        for k in range(near.shape[0]):
+            n, m = near[k, 0], near[k, 1]
             x = cos * start[n, 0] - sin * start[n, 1] + guess[0]
             y = sin * start[n, 0] + cos * start[n, 1] + guess[1]
-            for m in range(target.shape[0]):
-                i, j = math.floor((target[m, 0] - x - low) / CELL), math.floor((target[m, 1] - y - low) / CELL)
-                if target_label[m] == label[n] and 0 <= i < side and 0 <= j < side:
-                    votes[i + 1, j + 1] += 1
-                    voters[count, 0], voters[count, 1] = i, j
-                    count += 1
+            i, j = math.floor((target[m, 0] - x - low) / CELL), math.floor((target[m, 1] - y - low) / CELL)
+            if 0 <= i < side and 0 <= j < side:
+                votes[i + 1, j + 1] += 1
+                voters[count, 0], voters[count, 1] = i, j
+                count += 1
         for k in range(4 * count):  # squares of four cells, which meet in a corner of the cell of a pair
             i, j = voters[k // 4, 0] + k % 2, voters[k // 4, 1] + k // 2 % 2
             found = votes[i, j] + votes[i + 1, j] + votes[i, j + 1] + votes[i + 1, j + 1]
@@ -341,6 +480,23 @@ def common_motion(pairs: Pairs, guess: Array, reach: float, turn: float, trust: 
     for n in range(held.shape[0]):
         count += held[n] > 0.0
     return motion, count, held.shape[0] - held.sum()
+
+
+@kernel
+def within(pairs: Pairs, guess: Array, reach: float, turn: float) -> Index:
+    """Return the pairs of a class (K, 2) that motions near the guess may bring together: at most so far and turned."""
+    start, target, count = pairs.start, pairs.target, 0
+    near, moved = np.empty((start.shape[0] * target.shape[0], 2), np.int64), taken(start, guess)
+    for n in range(start.shape[0]):
+        most = reach + turn * math.hypot(start[n, 0], start[n, 1]) + ROUNDING
+        for m in range(first_beyond(target, moved[n, 0] - most), target.shape[0]):
+            dx, dy = target[m, 0] - moved[n, 0], target[m, 1] - moved[n, 1]
+            if dx > most:
+                break
+            if pairs.target_label[m] == pairs.label[n] and abs(dy) <= most:
+                near[count, 0], near[count, 1] = n, m
+                count += 1
+    return near[:count]
 
 
 @kernel

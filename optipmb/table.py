@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias
 
@@ -12,6 +11,7 @@ import numpy as np
 from optipmb.class_names import common_name
 from optipmb.compiled import kernel
 from optipmb.parameters import MAX_KNOTS
+from optipmb.rows import record
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -160,7 +160,7 @@ OUT_OF_REACH: Final = 2.0
 """A threshold above all scores."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class ClassTable:
     """The classes of a profile and the parameters common to them.
 
@@ -194,9 +194,11 @@ class ClassTable:
         return np.column_stack((size, np.where(unknown[:, 3], 0.5 * size[:, 2], auxiliary[:, 3])))
 
     def copy(self) -> ClassTable:
-        """Return a table whose classes may be written."""
-        classes: Any = np.array(self.classes)
-        return replace(self, classes=classes)
+        """Return a table whose classes may be written: copied as bytes, for numpy would copy field by field."""
+        given: Any = self.classes
+        classes: Any = np.frombuffer(bytearray(given.tobytes()), CLASS)
+        times = self.period, self.detection_time, self.unseen_time
+        return ClassTable(classes, *times, self.confusion, self.attention)
 
     def restrict(self, parameters: Parameters) -> None:
         """Put thresholds out of reach of scores, where detections start no tracks or a class has no attention."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -17,7 +17,9 @@ from optipmb.density import (
     Density,
     Moment,
     Poissons,
+    check_fitting,
     components_in,
+    fits,
     misses_counted_from,
     objects_in,
 )
@@ -277,8 +279,11 @@ class Tracker:
         """
         moment, table, modules = self._moment(density, frame), self._table, self.modules
         cloud = frame.cloud if modules.adp else None
+        if not fits(density, len(self._labels)):
+            check_fitting(density, self._labels)
+        sensor = density.sensor
         if self.parameters.sensor_motion:
-            density = follow_sensor(density, frame, table)
+            density, sensor = follow_sensor(density, frame, table)
 
         # PMB prediction
         predicted, repaired = predict(density, moment, table)
@@ -308,32 +313,34 @@ class Tracker:
         since_ns = prior.missed_from_ns if looks is None else looks.misses.missed_from_ns
         likely = UNGROUPED if prior.class_probability is None else prior.class_probability
         given = prior.bernoulli.words, since_ns, likely, prior.poisson.words, len(predicted.poisson), prior.next_id
-        still = density.sensor is None  # poses are known, or not needed
+        still = sensor is None  # poses are known, or not needed
         after = Update(*update(given, p_d, tuple(z), tuple(moment), table.confusion, table.classes, still))
         objects = Bernoullis.of(after.objects)
         poisson = Poissons.of(after.components) if modules.rpp else Poissons.empty()
         misses = None if looks is None else follow_looks(looks, after, prior.bernoulli, objects, z, moment, table)
         pi = None if prior.class_probability is None else after.class_probability
         born = len(objects) - after.known
-        next_id, labels, sensor = prior.next_id + born, density.labels, density.sensor
-        posterior = Density(moment.stamp_ns, next_id, objects, poisson, labels, misses, pi, sensor=sensor)
+        next_id, labels = prior.next_id + born, density.labels
+        own = None
         if scores is not None:
-            own = followed(scores, predicted, posterior, after, z, chosen, moment, table)
-            posterior = replace(posterior, self_calibration=own)
+            own = followed(scores, predicted, poisson, misses, after, z, chosen, moment, table)
+        posterior = Density(moment.stamp_ns, next_id, objects, poisson, labels, misses, pi, own, sensor)
 
         # Track extraction
         shown = objects.words, posterior.missed_from_ns, after.measurement, tuple(z), tuple(moment)
-        tracks, joined = Tracks.of(extract(*shown, modules.ote, table.classes)), None
+        words, rows = extract(*shown, modules.ote, table.classes)
+        tracks, joined = Tracks.of(words), None
         if self._rejoin is not None:
             before = density.rejoining, posterior, tracks, self._rejoin, self._kinds
             joined = rejoin_tracks(*before, frame.embedding, (chosen, after.measurement))
             posterior, tracks = joined.density, joined.tracks
             objects, pi = posterior.bernoulli, posterior.class_probability
+            rows = np.searchsorted(objects.id, tracks.id)
         paths = paths_of(tracks, self._horizons, table) if self._horizons.size else None
-        pi = None if pi is None else pi[np.searchsorted(objects.id, tracks.id)]
+        pi = None if pi is None else pi[rows]
         removed, repaired = (frame.score.shape[0], below_score, suppressed), repaired + after.repaired
         diagnostics = Diagnostics(cloud is not None, *removed, after.detected, born, repaired)
-        measured = None if all_measured(objects.words) else measured_bits(objects, tracks.id)
+        measured = None if all_measured(objects.words) else measured_bits(objects, rows)
         return StepResult(posterior, tracks, diagnostics, paths, pi, measured, joined)
 
     def _moment(self, density: Density, frame: Frame) -> Moment:

@@ -101,7 +101,8 @@ def with_births(
     words = np.empty(count * COMPONENT)
     new = components_in(words)
     mean, covariance, label, auxiliary, born_ns = new.mean, new.covariance, new.label, new.auxiliary, new.born_ns
-    new.weight[:] = weight
+    for k in range(count):
+        new.weight[k] = weight[k]
     for k in range(old):
         j = kept[k]
         copy_state(components.mean, components.covariance, j, mean, covariance, k)

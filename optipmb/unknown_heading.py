@@ -132,9 +132,8 @@ def all_measured(object_words: Array) -> bool:
     return bool(good)
 
 
-def measured_bits(objects: Bernoullis, identity: Index) -> NDArray[np.uint8]:
-    """Return `StepResult.measured` of the objects with these ids."""
-    rows = np.searchsorted(objects.id, identity)
+def measured_bits(objects: Bernoullis, rows: Index) -> NDArray[np.uint8]:
+    """Return `StepResult.measured` of some objects."""
     known = ~np.isnan(objects.auxiliary[rows])
     heading = objects.covariance[rows, OMEGA, OMEGA] != 0.0
     bits: NDArray[np.uint8] = np.uint8(1) * heading + np.uint8(2) * known[:, :3].all(axis=1) + np.uint8(4) * known[:, 3]

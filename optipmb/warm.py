@@ -22,7 +22,6 @@ from optipmb.geometry import bev_iou
 from optipmb.parameters import Parameters, load_profile, parse_parameters
 from optipmb.paths import predict_tracks
 from optipmb.rejoin import Kinds, Rejoin, match, pair_scores
-from optipmb.sensor_motion import Pairs, common_motion, sideways
 from optipmb.tracker import Modules, Tracker, update
 from optipmb.zones import Shapes, Zone, crossings, locate
 
@@ -90,7 +89,7 @@ def build() -> None:
 def _run() -> Parameters:
     """Call all kernels that every tracker needs; return the parameters of one."""
     curve = dict.fromkeys(("evidence", "existence", "along", "across"), (0.1, 0.9))
-    document = load_profile("nuscenes").model_dump() | {"self_calibration": True}
+    document = load_profile("nuscenes").model_dump() | {"self_calibration": True, "sensor_motion": True}
     document["classes"]["pedestrian"] |= {
         "score_filter": 0.1,
         "birth_score": 0.5,
@@ -128,10 +127,6 @@ def _run() -> Parameters:
         Tracker(parameters, max_pairs=8).step(posterior, given)
     Tracker(parameters, Modules(habm=False)).step(posterior, given)
     bev_iou(np.zeros((1, 5)), np.zeros((1, 5)))
-    place, label = np.zeros((1, 2)), np.zeros(1, np.int64)
-    pairs = Pairs(place, label, place, label)
-    common_motion(pairs, np.zeros(3), 0.0, 0.0, 0.0)
-    sideways(pairs, place, np.zeros(1), np.zeros(1, np.bool_))
     line = Zone("line", line=((0.0, 0.0), (1.0, 0.0)))
     locate(np.zeros((1, 3)), np.zeros((1, 2)), *Shapes.of([line]))
     crossings(np.array(line.line), 0.0, 0.0, 0.0, 0.0)

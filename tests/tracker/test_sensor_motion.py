@@ -18,10 +18,12 @@ from optipmb.sensor_motion import (
     TURNED,
     Pairs,
     common_motion,
+    least,
     nearest,
     sideways,
     taken,
     together,
+    within,
 )
 
 if TYPE_CHECKING:
@@ -174,6 +176,19 @@ def test_a_sensor_that_stops_stands() -> None:
     assert found[-1].sensor_motion is None
 
 
+def test_evidence_that_nothing_adds_to_ends() -> None:
+    """Cars that move alike for a fifth of a second and then stand: in the end nothing is kept of it."""
+    tracker, (first, second, third, *_) = optipmb.Tracker(GENERIC), street(15.0, 10.0)
+    density = tracker.initial()
+    for t, boxes, _ in (first, second, third):
+        density = tracker.step(density, frame_of(t, boxes)).density
+    assert density.sensor is not None
+    assert density.sensor_motion is None
+    for k in range(1, 80):
+        density = tracker.step(density, frame_of(third[0] + 0.1 * k, third[1])).density
+    assert density.sensor is None
+
+
 def test_frames_with_a_pose_are_not_estimated() -> None:
     """A given pose is used, and ends the estimate."""
     tracker = optipmb.Tracker(GENERIC)
@@ -225,7 +240,8 @@ def test_the_motion_is_the_rigid_fit_of_the_pairs_it_joins(seed: int) -> None:
     start, label = rng.uniform(-40.0, 40.0, (20, 2)), rng.integers(0, 2, 20)
     true = np.array([-6.0, 0.8, 0.06]) + rng.normal(0.0, [0.5, 0.2, 0.01])
     target = np.vstack((taken(start, true)[:14] + rng.normal(0.0, 0.05, (14, 2)), rng.uniform(-40.0, 40.0, (8, 2))))
-    target_label = np.r_[label[:14], rng.integers(0, 2, 8)]
+    order = target[:, 0].argsort()
+    target, target_label = target[order], np.r_[label[:14], rng.integers(0, 2, 8)][order]
     pairs = Pairs(start, label, target, target_label)
     motion, count, cost = common_motion(pairs, np.zeros(3), 10.0, 0.15, 0.0)
     np.testing.assert_allclose(motion, true, atol=0.1)
@@ -248,6 +264,29 @@ def test_the_motion_is_the_rigid_fit_of_the_pairs_it_joins(seed: int) -> None:
     theta = np.angle(((p - p.mean()).conj() * (q - q.mean())).sum())
     shift = q.mean() - np.exp(1j * theta) * p.mean()
     np.testing.assert_allclose(motion, [shift.real, shift.imag, theta], atol=1e-9)
+
+
+@pytest.mark.parametrize("count", [0, 1, 5, 40])
+def test_the_least_values_come_in_their_order(count: int) -> None:
+    """By numpy's stable sort, equal values among them; those that are infinite do not."""
+    value = np.random.default_rng(count).integers(0, 6, count).astype(float)
+    value[value == 5.0] = np.inf
+    wanted = [row for row in np.argsort(value, kind="stable").tolist() if value[row] < np.inf]
+    assert [least(value, most).tolist() for most in (1, 7, 64)] == [wanted[:most] for most in (1, 7, 64)]
+
+
+def test_all_pairs_that_a_motion_may_bring_together_are_near() -> None:
+    """Of one class, under any motion within reach and turn of the guess."""
+    rng, guess = np.random.default_rng(1), np.array([1.0, -2.0, 0.1])
+    start, target = rng.uniform(-40.0, 40.0, (30, 2)), rng.uniform(-40.0, 40.0, (30, 2))
+    label = rng.integers(0, 2, 30)
+    pairs = Pairs(start, label, target[target[:, 0].argsort()], label)
+    near, brought = set(map(tuple, within(pairs, guess, 3.0, 0.05).tolist())), set[tuple[int, int]]()
+    for _ in range(200):
+        moved = taken(start, guess + rng.uniform(-1.0, 1.0, 3) * [0.0, 0.0, 0.05])
+        apart = np.abs(pairs.target[None] - moved[:, None]).max(axis=2)
+        brought |= set(map(tuple, np.argwhere((apart <= 3.0) & (label[:, None] == label[None])).tolist()))
+    assert brought <= near < set(itertools.product(range(30), range(30)))
 
 
 def test_few_points_follow_the_guess() -> None:
