@@ -17,7 +17,7 @@ help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
 	@echo "make install a virtual environment with everything, and compiled kernels"
 	@echo "make test    lint, types, schemas, tests"
-	@echo "make wheel   build the wheel, install it alone into an empty environment, and use it there"
+	@echo "make wheel   build the wheel with machine code, install it alone into an empty environment, and use it there"
 	@echo "make check   lint, types, and the tests nearest to what changed since SINCE=main, in less than a minute"
 	@echo "make accuracy  hold the figures of accuracy on KITTI and nuScenes, where their data are"
 	@echo "make mutants  make N=25 small faults by SEED=1 in a copy, and print which ones the nearest tests miss"
@@ -129,7 +129,7 @@ SEED ?= 1
 mutants: kernels
 	$(BIN)/python tests/mutants.py $(SEED) $(if $(filter command line,$(origin N)),$(N),25)
 
-# Both wheels, once for all that install them.
+# Both wheels without machine code, once for all that install them.
 dist: $(VENV)/.installed
 	mkdir -p out
 	rm -rf out/dist
@@ -161,7 +161,7 @@ schemas: $(VENV)/.installed
 	$(BIN)/python -m optipmb_schemas.protobuf.export --check schemas
 	$(BIN)/python docs/reference.py --check docs/reference.md
 
-wheel: kernels dist
+wheel: dist
 	sh tests/wheel.sh $(PYTHON) $(BIN) out/dist
 
 # The baseline is compared with and not obeyed: machines differ, and no test fails by a time. Processor time is counted,

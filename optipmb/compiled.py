@@ -35,6 +35,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 import numba
 import numpy as np
+from llvmlite.binding import get_host_cpu_features
 from numba.core import config, event
 from numba.core.caching import IndexDataCacheFile
 
@@ -52,13 +53,20 @@ _log: Final = logging.getLogger(__package__)
 def _digest() -> str:
     """Digest of the source of the whole package; times of files would change when an image is packed."""
     digest = hashlib.blake2b(digest_size=16)
-    for file in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(file.read_bytes())
+    folder = Path(__file__).parent
+    for file in sorted(folder.rglob("*.py")):
+        digest.update(bytes(file.relative_to(folder)) + file.read_bytes())
     return digest.hexdigest()
 
 
 _SOURCES: Final = _digest()
 
+SHIPPED: Final = Path(__file__).parent / "machine_code"
+"""Folder with the machine code that a wheel brings (packaging/wheels.sh); a checkout has none."""
+PROCESSOR: Final = "x86-64-v2"
+"""Processor that it is compiled for, by the name that LLVM has for it, and"""
+FEATURES: Final = ("cx16", "popcnt", "sahf", "sse3", "sse4.1", "sse4.2", "ssse3")
+"""what the processor needs for it, which is all that this one has beyond the first of its kind."""
 STEPS: Final = 4
 """Lines about the progress of a compilation where there is no terminal; on one, a line moves."""
 
@@ -105,15 +113,16 @@ class _Progress(event.Listener):
             _log.warning("optipmb: compiling the tracker, once after an installation; it takes up to a minute")
 
     def count(self, name: str) -> None:
-        """Count a compiled kernel, and show how far it is."""
+        """Count a compiled kernel, once for all types of arguments, and show how far it is."""
+        if name in self.compiled:
+            return
         self.compiled.add(name)
         if self.is_helper:
             print(name, flush=True)  # noqa: T201 - to that process
         elif self.announced:
             done, count = len(self.compiled), len(self.kernels | self.compiled)
             if sys.stderr is not None and sys.stderr.isatty():
-                end = "\n" if done == count else "\r"
-                print(f"optipmb: compiled {done} of {count} kernels ", end=end, file=sys.stderr, flush=True)  # noqa: T201 - moves
+                print(f"optipmb: compiled {done} of {count} kernels ", end="\r", file=sys.stderr, flush=True)  # noqa: T201 - moves
             elif STEPS * done // count > STEPS * (done - 1) // count:
                 _log.warning("optipmb: compiled %d of %d kernels", done, count)
 
@@ -210,6 +219,15 @@ class _Index(IndexDataCacheFile):
         except (AttributeError, ImportError):
             return {}
 
+    def load(self, key: Any) -> Any:
+        """Return machine code: of this installation, or else of the wheel; None where there is none."""
+        data = super().load(key)  # type: ignore[no-untyped-call]  # as above
+        signature, (triple, *_), code = key
+        if data is None and _runs_shipped():
+            shipped: Any = IndexDataCacheFile(str(SHIPPED), Path(self._index_name).stem, self._source_stamp)  # type: ignore[no-untyped-call]
+            data = shipped.load((signature, (triple, PROCESSOR, ""), code))
+        return data
+
     def save(self, key: Any, data: Any) -> None:
         """Save machine code; one process at a time, for numba reads the index and then replaces it."""
         with ExitStack() as stack:
@@ -219,22 +237,34 @@ class _Index(IndexDataCacheFile):
             super().save(key, data)  # type: ignore[no-untyped-call]  # numba ships no types
 
 
+@cache
+def _runs_shipped() -> bool:
+    """Tell whether there is machine code for this processor, and none for another one was asked for."""
+    options: Any = config
+    try:
+        features = get_host_cpu_features()  # type: ignore[no-untyped-call]  # llvmlite ships no types
+    except RuntimeError:  # of an unknown kind
+        return False
+    asked = options.CPU_NAME, options.CPU_FEATURES
+    return SHIPPED.is_dir() and asked == (None, None) and all(features.get(name) for name in FEATURES)
+
+
 class _PackageIndex(_Index):
     """An index of the package: where one kernel has no machine code, helper processes compile all that all need."""
 
     def load(self, key: Any) -> Any:
         """Return the machine code of one kernel, None where it has to be compiled here."""
-        data = super().load(key)  # type: ignore[no-untyped-call]  # as above
+        data = super().load(key)
         if data is None and progress.built is None and (count := _processes()):
             with _one_at_a_time(Path(self._cache_path)) as writable:
-                data = super().load(key)  # type: ignore[no-untyped-call]  # as above
+                data = super().load(key)
                 if data is None and writable:
                     progress.built = set()
                     try:
                         _compile_all(count, progress.built)
                     except OSError as error:  # no right, no memory, too many processes, no interpreter any more
                         _log.warning("optipmb: cannot start other processes (%s): this one compiles alone", error)
-                    data = super().load(key)  # type: ignore[no-untyped-call]  # as above
+                    data = super().load(key)
         return data
 
 
@@ -294,6 +324,7 @@ def _compile_all(count: int, built: set[str]) -> None:
         for name in names:
             built.add(name.strip())
             progress.count(name.strip())
+    _log.warning("optipmb: compiled the kernels that every tracker needs, %d", len(built))
 
 
 @cache

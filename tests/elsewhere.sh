@@ -6,7 +6,7 @@
 #   CONSTRAINTS  versions to install; the newest that pyproject.toml allows by default
 set -eu
 python=$1
-wheel=$(ls "$2"/optipmb-*.whl)
+wheel=$(ls "$2"/optipmb-*-none-any.whl)
 root=$(cd "$(dirname "$0")/.." && pwd)
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT INT TERM

@@ -352,7 +352,7 @@ PATHS = {"start": start, "csv": csv_in_and_out, "python": python, "node": node, 
 
 def main(arguments: Sequence[str]) -> None:
     folder, *names = arguments
-    (wheel,) = Path(folder).resolve().glob("optipmb-*.whl")
+    (wheel,) = Path(folder).resolve().glob("optipmb-*-none-any.whl")
     (node_wheel,) = Path(folder).resolve().glob("optipmb_node-*.whl")
     base = Path(tempfile.mkdtemp(prefix="optipmb-paths-"))
     rows, halts = [], 0

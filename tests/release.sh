@@ -1,5 +1,5 @@
 #!/bin/sh
-# Prepares a release and stops before publishing: a clean tree, the version in the changelog, all tests, both wheels and the source
+# Prepares a release and stops before publishing: a clean tree, the version in the changelog, all tests, all wheels and the source
 # archive in dist/, checked. Called as: sh tests/release.sh BIN
 set -eu
 bin=$1
@@ -15,6 +15,7 @@ make test wheel accuracy alone
 rm -rf dist && mkdir -p out
 "$bin/python" -m build --outdir dist .
 "$bin/python" -m build --wheel --outdir dist node
+sh packaging/wheels.sh dist
 "$bin/python" -m twine check --strict dist/*
 "$bin/python" -m cyclonedx_py requirements docker/requirements.lock --output-file out/sbom.cdx.json
 echo "release: dist/ is ready. To publish $version:"

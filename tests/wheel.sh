@@ -1,29 +1,27 @@
 #!/bin/sh
-# Installs the wheel alone into a fresh environment, and uses it from there: what the source tree adds is not there, so
-# that a file missing from the wheel shows. Called as: sh tests/wheel.sh PYTHON BIN DIST
+# Installs the wheel with machine code alone into a fresh environment, and uses it from there: what the source tree adds
+# is not there, so that a file missing from the wheel shows, and nothing may be compiled. Called as: sh tests/wheel.sh PYTHON BIN DIST
 #   PYTHON  interpreter that makes the fresh environment
 #   BIN     folder of an environment with pip
-#   DIST    folder with the wheel
+#   DIST    folder with the wheel without machine code
 set -eu
 python=$1
 case $2 in /*) bin=$2 ;; *) bin=$PWD/$2 ;; esac
 root=$(cd "$(dirname "$0")/.." && pwd)
-wheel=$(ls "$3"/optipmb-*.whl)
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT INT TERM
+mkdir "$work/dist" "$work/home"
+cp "$3"/optipmb-*-none-any.whl "$work/dist"
+PIP_CONSTRAINT=$root/requirements.lock sh "$root/packaging/wheels.sh" "$work/dist" "$python"
+wheel=$(ls "$work"/dist/optipmb-*-manylinux*.whl)
 
 "$python" -m venv --without-pip "$work/venv"
 "$bin/python" -m pip --python "$work/venv/bin/python" install --quiet --no-compile --disable-pip-version-check \
   --constraint "$root/requirements.lock" "$wheel[service]"
 
-# Machine code is kept by the digest of the package's sources. These are the same, so what was compiled from the source
-# tree serves here too, which spares a minute; whatever is missing is compiled.
-cache=$(echo "$work"/venv/lib/python3*/site-packages/optipmb)/__pycache__
-mkdir -p "$cache"
-find "$root/optipmb" -name '*.nb[ci]' -exec cp -t "$cache" {} +
-
 cd "$work" # nothing of the source tree is importable from here
-unset PYTHONPATH
+unset PYTHONPATH NUMBA_CACHE_DIR
+export HOME="$work/home"
 "$work/venv/bin/python" - <<'PYTHON'
 from pathlib import Path
 
@@ -40,6 +38,9 @@ for package in (optipmb, optipmb_client, optipmb_schemas, optipmb_service, optip
 for profile in ("kitti", "nuscenes"):
     assert optipmb.load_profile(profile).classes, profile
 PYTHON
+"$work/venv/bin/optipmb" track "$root/examples/crossing.csv" --out "$work/crossing" >"$work/said" 2>&1
+! grep "compil" "$work/said"
+"$work/venv/bin/python" -c 'import optipmb; assert optipmb.warm_up(rejoin=True) == 0'
 "$work/venv/bin/optipmb" --help >/dev/null
 "$work/venv/bin/optipmb" --version
 "$work/venv/bin/optipmb-service" --help >/dev/null

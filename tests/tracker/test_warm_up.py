@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import json
 import os
+import platform
 import re
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from typing import Any
 import pytest
 
 import optipmb
+from optipmb.compiled import PROCESSOR
 from optipmb.warm import kernels
 
 pytestmark = pytest.mark.timeout(300)  # they compile kernels
@@ -75,6 +77,23 @@ import numpy as np
 import optipmb.warm
 
 optipmb.warm._run = lambda: optipmb.bev_iou(np.zeros((1, 5)), np.zeros((1, 5)))
+"""
+
+
+# With a folder for `SHIPPED`: how many kernels are compiled for one call.
+WITH_SHIPPED = """
+import sys
+from pathlib import Path
+import numpy as np
+import optipmb.compiled
+from optipmb.warm import compilations
+
+optipmb.compiled.SHIPPED = Path(sys.argv[1])
+lacking = sys.argv[2:]
+features = optipmb.compiled.get_host_cpu_features()
+optipmb.compiled.get_host_cpu_features = lambda: {name: has and name not in lacking for name, has in features.items()}
+optipmb.bev_iou(np.zeros((1, 5)), np.zeros((1, 5)))
+print(compilations())
 """
 
 
@@ -180,3 +199,26 @@ def test_a_compilation_is_announced_once_with_its_progress(setting: str) -> None
     counts = [re.fullmatch(r"optipmb: compiled (\d+) of (\d+) kernels", line) for line in progress]
     assert [int(found[1]) for found in counts if found] == list(range(1, len(progress) + 1))
     assert len(progress) < 10
+
+
+def compiled_with(shipped: Path, *lacking: str, **environment: str) -> int:
+    """How many kernels a call compiles in a process with an empty cache and machine code of a wheel."""
+    with tempfile.TemporaryDirectory() as cache:
+        variables = os.environ | {"NUMBA_CACHE_DIR": cache, "OPTIPMB_COMPILE_PROCESSES": "0"} | environment
+        command = [sys.executable, "-W", "ignore", "-c", WITH_SHIPPED, str(shipped), *lacking]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=280, check=True, env=variables)
+        for file in Path(cache).rglob("*.nb[ci]"):
+            if "NUMBA_CPU_NAME" in environment:
+                file.rename(shipped / file.name)
+    return int(done.stdout)
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="wheels have machine code of x86-64 alone")
+def test_machine_code_of_a_wheel_runs_where_the_processor_can(tmp_path: Path) -> None:
+    """Compiled for all processors, it is found without a cache; one that lacks a feature of theirs compiles."""
+    portable = {"NUMBA_CPU_NAME": PROCESSOR, "NUMBA_CPU_FEATURES": ""}
+    assert compiled_with(tmp_path, **portable) > 0
+    assert any(tmp_path.glob("*.nbc"))
+    assert compiled_with(tmp_path) == 0
+    assert compiled_with(tmp_path, "sse4.2") > 0
+    assert compiled_with(tmp_path, NUMBA_CPU_FEATURES="-avx") > 0
