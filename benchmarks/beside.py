@@ -1,4 +1,4 @@
-"""Compare the step of this checkout with another one: `python benchmarks/beside.py OTHER [--profile FILE]`.
+"""Compare the step of this checkout with another one: `python benchmarks/beside.py OTHER [--profile NAME ...]`.
 
 Each has a process of its own; they measure in turns, a few hundredths of a second each, so that what else the machine
 does meets both. Processor time of the thread; the ratio is the median over single turns.
@@ -31,8 +31,7 @@ def serve(tree: Path, profile: str) -> None:
 
     if not (optipmb.__file__ or "").startswith(str(tree)):
         raise RuntimeError(f"{optipmb.__file__} is not in {tree}")
-    if profile:
-        settled.PARAMETERS = optipmb.load_profile(profile)
+    settled.PARAMETERS = optipmb.load_profile(profile)
     scenes = {objects: settled.settled(objects) for objects in STEPS}
     for tracker, density, frame in scenes.values():
         for _ in range(WARM):
@@ -51,7 +50,7 @@ def serve(tree: Path, profile: str) -> None:
 class Side:
     """The process of one checkout."""
 
-    def __init__(self, tree: Path, profile: str = "") -> None:
+    def __init__(self, tree: Path, profile: str) -> None:
         self._process = subprocess.Popen(  # noqa: S603 - it calls itself
             [sys.executable, __file__, str(tree), "--serve", "--profile", profile],
             env=os.environ | {"PYTHONPATH": str(tree)},
@@ -86,29 +85,30 @@ def main() -> None:
     """Measure, and print a table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("other", type=Path, help="checkout of another version")
-    parser.add_argument("--profile", default="", help="profile of this checkout, as that of the other; default: kitti")
+    parser.add_argument("--profile", nargs="+", default=["generic", "kitti"], help="profiles, the default one first")
     parser.add_argument("--turns", type=int, default=60)
     parser.add_argument("--serve", action="store_true", help="one side, which calls itself so")
     options = parser.parse_args()
     if options.serve:
-        serve(options.other, options.profile)
+        serve(options.other, *options.profile)
         return
-    other, this = sides = Side(options.other.resolve()), Side(HERE, options.profile)
-    print("| objects | other, least ms | this | median ms | this | ratio of turns | quartiles |")
-    print("| ---: | ---: | ---: | ---: | ---: | ---: | --- |")
-    for objects in STEPS:
-        turns = []
-        for turn in range(options.turns):
-            first, second = (other, this) if turn % 2 else (this, other)
-            taken = {first: first.turn(objects), second: second.turn(objects)}
-            turns.append((*taken[other], *taken[this]))
-        least, middle, this_least, this_middle = zip(*turns, strict=True)
-        low, ratio, high = quantiles(b / a for a, b in zip(middle, this_middle, strict=True))
-        times = (min(least), min(this_least), median(middle), median(this_middle))
-        shown = " | ".join(f"{one:.4f}" for one in times)
-        print(f"| {objects} | {shown} | {ratio:.3f} | {low:.3f} to {high:.3f} |")
-    for side in sides:
-        side.end()
+    print("| profile | objects | other, least ms | this | median ms | this | ratio of turns | quartiles |")
+    print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | --- |")
+    for profile in options.profile:
+        other, this = sides = Side(options.other.resolve(), profile), Side(HERE, profile)
+        for objects in STEPS:
+            turns = []
+            for turn in range(options.turns):
+                first, second = (other, this) if turn % 2 else (this, other)
+                taken = {first: first.turn(objects), second: second.turn(objects)}
+                turns.append((*taken[other], *taken[this]))
+            least, middle, this_least, this_middle = zip(*turns, strict=True)
+            low, ratio, high = quantiles(b / a for a, b in zip(middle, this_middle, strict=True))
+            times = (min(least), min(this_least), median(middle), median(this_middle))
+            shown = " | ".join(f"{one:.4f}" for one in times)
+            print(f"| {profile} | {objects} | {shown} | {ratio:.3f} | {low:.3f} to {high:.3f} |")
+        for side in sides:
+            side.end()
 
 
 if __name__ == "__main__":

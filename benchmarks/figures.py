@@ -12,7 +12,6 @@ import json
 import os
 import platform
 import subprocess
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +19,8 @@ import numpy as np
 import pytest
 from lower_bound import arguments, bare
 from plots import STAGES, draw
-from settled import PARAMETERS, recorded, settled
+from settled import PROFILES, recorded, settled
+from turns import CALLS, CLOCK, ROUNDS, in_turns, summary
 
 import optipmb
 from optipmb.detection_probability import points_in_boxes
@@ -34,42 +34,19 @@ IMAGES = PAGE.parent / "images"
 OBJECTS = (10, 20, 50, 100, 200, 400, 800)
 POINTS = (0, 30_000, 120_000)
 BOXES = 100
-ROUNDS = 30
-CALLS = 10
-Times = dict[str, np.ndarray]
-CLOCK = time.thread_time_ns
-"""Processor time of this thread: what else the machine does is not in it, but for the caches that it empties."""
-
-
-def in_turns(tasks: dict[str, Callable[[], object]], rounds: int = ROUNDS, calls: int = CALLS) -> Times:
-    """Milliseconds of every call of every task, a few calls of each in turn."""
-    spent: dict[str, list[int]] = {name: [] for name in tasks}
-    for task in tasks.values():
-        task()
-    for _ in range(rounds):
-        for name, task in tasks.items():
-            for _ in range(calls):
-                begun = CLOCK()
-                task()
-                spent[name].append(CLOCK() - begun)
-    return {name: np.array(times) / 1e6 for name, times in spent.items()}
-
-
-def summary(times: np.ndarray) -> dict[str, float]:
-    """Median, 99th percentile and smallest of milliseconds."""
-    return {"median": float(np.median(times)), "p99": float(np.percentile(times, 99)), "least": float(times.min())}
 
 
 def dense() -> dict[str, Any]:
-    """Steps of growing scenes, and the bare arithmetic of the same frames."""
+    """Steps of growing scenes by both profiles, and the bare arithmetic of the same frames, of the tuned one."""
     tasks: dict[str, Callable[[], object]] = {}
     for objects in OBJECTS:
-        tracker, density, frame = settled(objects)
-        given = arguments(PARAMETERS, density, frame)
-        tasks[f"step {objects}"] = lambda t=tracker, d=density, f=frame: t.step(d, f)
+        for profile in PROFILES:
+            tracker, density, frame = settled(objects, profile=profile)
+            tasks[f"{profile} {objects}"] = lambda t=tracker, d=density, f=frame: t.step(d, f)
+        given = arguments(tracker.parameters, density, frame)
         tasks[f"bare {objects}"] = lambda a=given: bare(*a)
     times = in_turns(tasks)
-    return {kind: {n: summary(times[f"{kind} {n}"]) for n in OBJECTS} for kind in ("step", "bare")}
+    return {kind: {n: summary(times[f"{kind} {n}"]) for n in OBJECTS} for kind in (*PROFILES, "bare")}
 
 
 def growth(steps: dict[int, dict[str, float]]) -> float:
@@ -82,7 +59,7 @@ def clouds() -> dict[str, Any]:
     """Points in a hundred boxes, alone and as part of a step."""
     tasks: dict[str, Callable[[], object]] = {}
     for points in POINTS:
-        tracker, density, frame = settled(BOXES, points)
+        tracker, density, frame = settled(BOXES, points, PROFILES[0])
         tasks[f"step {points}"] = lambda t=tracker, d=density, f=frame: t.step(d, f)
         if frame.cloud is not None:
             boxes = density.bernoulli
@@ -139,7 +116,7 @@ def stages() -> dict[str, dict[str, float]]:
         return timed
 
     for objects, points in ((10, 0), (100, 0), (800, 0), (100, 30_000)):
-        tracker, density, frame = settled(objects, points)
+        tracker, density, frame = settled(objects, points, PROFILES[0])
         taken = []
         with pytest.MonkeyPatch.context() as patch:
             for stage in STAGES:
@@ -156,7 +133,7 @@ def share_of_kernels() -> dict[int, dict[str, float]]:
     """Microseconds of a step spent in compiled code, in calling it, and in numpy and the interpreter."""
     from profiled import shares  # noqa: PLC0415 - it replaces functions of the tracker, after everything else
 
-    return {objects: shares(*settled(objects)) for objects in (10, 100, 800)}
+    return {objects: shares(*settled(objects, profile=PROFILES[0])) for objects in (10, 100, 800)}
 
 
 def peers(python: str) -> dict[str, dict[str, list[float]]]:
@@ -181,16 +158,17 @@ def tables(found: dict[str, Any]) -> str:
     lines = [f"Measured on: {found['conditions']}.", ""]
     others = found["peers"]
     lines += [
-        "| objects | median ms | p99 ms | least ms | us per object | bare arithmetic ms | ratio to it |"
-        + "".join(f" {n} ms | ratio |" for n in others)
+        "| objects | median ms | p99 ms | least ms | us per object | `kitti` ms | ratio to it "
+        "| bare arithmetic ms | ratio |" + "".join(f" {n} ms | ratio |" for n in others)
     ]
-    lines += ["| ---: " * (7 + 2 * len(others)) + "|"]
+    lines += ["| ---: " * (9 + 2 * len(others)) + "|"]
     for n in OBJECTS:
-        step, floor = found["dense"]["step"][n], found["dense"]["bare"][n]
+        step, tuned, floor = (found["dense"][kind][n] for kind in (*PROFILES, "bare"))
         row = (
             f"| {n} | {step['median']:.3f} | {step['p99']:.3f} | {step['least']:.3f} | {1e3 * step['median'] / n:.1f} "
         )
-        row += f"| {floor['median']:.3f} | {step['median'] / floor['median']:.1f} |"
+        row += f"| {tuned['median']:.3f} | {step['median'] / tuned['median']:.2f} "
+        row += f"| {floor['median']:.3f} | {tuned['median'] / floor['median']:.1f} |"
         for times in others.values():
             median = np.median(times[str(n)]) if str(n) in times else None
             row += f" {median:.1f} | {median / step['median']:.0f} |" if median else " | |"
@@ -241,7 +219,7 @@ def main() -> None:
     for name, part in (("dense", dense), ("clouds", clouds), ("sequences", sequences), ("stages", stages)):
         print(f"measuring: {name}", flush=True)
         found[name] = part()
-    found["growth"] = growth(found["dense"]["step"])
+    found["growth"] = growth(found["dense"][PROFILES[0]])
     found["peers"] = peers(chosen.peers) if chosen.peers else {}
     found["shares"] = share_of_kernels()
     text = tables(found)

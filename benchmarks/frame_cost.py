@@ -1,12 +1,13 @@
 """Cost of a frame in the service, part by part, compared with another version of the code in one run.
 
-python benchmarks/frame_cost.py [--beside DIR] [--objects N] [--points N] [--scene NAME] [--rejoin] [--rounds N]
+python benchmarks/frame_cost.py [--beside DIR] [--profile NAME ...] [--objects N] [--points N] [--scene NAME]
+    [--rejoin] [--rounds N]
 
 A frame goes its way through one process, with everything real but the network and the store: a packet is handed over,
 decoded, tracked and published, and every tenth frame a checkpoint is encoded. What counts is the processor time of the
-thread. `--beside` names a checkout of another version: rounds of the two follow each other, each in a process of its
-own, and the medians of the rounds are compared. `--rejoin` compares a session that joins tracks over gaps with one that
-does not, which take each frame in turns.
+thread, by the default profile and by a tuned one. `--beside` names a checkout of another version: rounds of the two
+follow each other, each in a process of its own, and the medians of the rounds are compared. `--rejoin` compares a
+session that joins tracks over gaps with one that does not, which take each frame in turns.
 """
 
 from __future__ import annotations
@@ -132,7 +133,7 @@ def measured(options: argparse.Namespace) -> list[dict[str, float]]:
         network,
         reporter=ProblemReporter(problems.append),
         tracker=optipmb.Tracker,
-        profiles=Profiles.read("generic" if options.scene else "nuscenes", {}),
+        profiles=Profiles.read(options.one, {}),
         rejoin={JOINING: {}},
     )
     frames = load.generated(options.objects, options.points, RATE_HZ)
@@ -169,16 +170,17 @@ def roots(tree: Path) -> str:
 
 
 def rounds(trees: Sequence[Path], options: argparse.Namespace) -> list[dict[str, float]]:
-    """Measure the checkouts side by side; return the medians of the rounds."""
+    """Measure checkouts and profiles side by side; return the medians of the rounds."""
     seen: list[list[list[dict[str, float]]]] = []
     for _ in range(options.rounds):
         started = [
             subprocess.Popen(  # noqa: S603 - it calls itself, with its own options
-                [sys.executable, __file__, "--one", *sys.argv[1:]],
+                [sys.executable, __file__, *sys.argv[1:], "--one", profile],
                 env=os.environ | {"PYTHONPATH": roots(tree)},
                 stdout=subprocess.PIPE,
                 text=True,
             )
+            for profile in options.profile
             for tree in trees
         ]
         seen.append([one for process in started for one in json.loads(process.communicate()[0])])
@@ -189,23 +191,27 @@ def main() -> None:
     """Measure, and print a table of microseconds per frame."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--beside", type=Path, help="checkout of another version")
+    parser.add_argument("--profile", nargs="+", default=["generic", "nuscenes"], help="the default and a tuned one")
     parser.add_argument("--objects", type=int, default=40)
     parser.add_argument("--points", type=int, default=0)
     parser.add_argument("--scene", help="one of tests/support/gaps.py in the place of objects that drive in circles")
     parser.add_argument("--rejoin", action="store_true", help="compare a session that joins tracks over gaps")
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--one", action="store_true", help="one round of the packages on the search path, as JSON")
+    parser.add_argument("--one", help="one round of the packages on the search path by this profile, as JSON")
     options = parser.parse_args()
     if options.one:
         print(json.dumps(measured(options)))
         return
     trees = [*([options.beside.resolve()] if options.beside else []), HERE]
     results = rounds(trees, options)
-    print("| part | " + " | ".join(["us"] if len(results) == 1 else ["before", "after", "ratio"]) + " |")
+    kinds = ("", ", joining") if options.rejoin else ("",)
+    columns = [
+        f"`{profile}`{', before' if tree is not HERE else ''}{kind}"
+        for profile, tree, kind in itertools.product(options.profile, trees, kinds)
+    ]
+    print("| part, us | " + " | ".join(columns) + " |")
     for part in results[0]:
-        values = [result[part] for result in results]
-        ratio = f"{values[-1] / values[0]:.2f}" if values[0] else "-"
-        print(f"| {part} | " + " | ".join([*(f"{value:.1f}" for value in values), *[ratio] * (len(values) - 1)]) + " |")
+        print(f"| {part} | " + " | ".join(f"{result[part]:.1f}" for result in results) + " |")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,7 @@
 """The bare arithmetic of a frame in one compiled loop: what no tracker with these formulas can be faster than.
 
+`python benchmarks/lower_bound.py` prints the step of both profiles beside it, the default first.
+
 Everything that has to be found out is given: which pairs lie in the gate, which pairs win. Nothing is allocated,
 checked, sorted, searched, assigned, suppressed, pruned or put together. The rest are the numbers themselves: every
 object and component is predicted by the unscented transform, every gated pair gets its likelihood and its cost, every
@@ -14,6 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import numba
 import numpy as np
+from settled import PROFILES, settled
+from turns import in_turns
 
 from optipmb.association import associate
 from optipmb.class_posterior import UNGROUPED, Groups
@@ -105,7 +109,7 @@ def arguments(parameters: optipmb.Parameters, density: optipmb.Density, frame: o
     old, undetected = predicted.bernoulli, predicted.poisson
     p_d = table["detection"][np.concatenate((old.label, undetected.label))]
     objects, components = objects_in(old.words), components_in(undetected.words)
-    groups = Groups(UNGROUPED, table.confusion)
+    groups = Groups(UNGROUPED if predicted.class_probability is None else predicted.class_probability, table.confusion)
     found = local_hypotheses(objects, components, p_d, measurements, groups, table.period, table.classes)
     assigned = associate(found.row, found.measurement, found.detection_cost, found.first_cost, len(old))
     before, waiting = density.bernoulli, density.poisson
@@ -144,3 +148,29 @@ def arguments(parameters: optipmb.Parameters, density: optipmb.Density, frame: o
         np.empty((winners.size, 6)),
         np.empty((winners.size, 6, 6)),
     )
+
+
+def main() -> None:
+    """Measure in turns, and print a table of medians."""
+    sizes, tasks = (10, 100, 800), dict[str, Any]()
+    for objects in sizes:
+        for profile in PROFILES:
+            tracker, density, frame = settled(objects, profile=profile)
+            given = arguments(tracker.parameters, density, frame)
+            tasks[f"{profile} {objects}"] = lambda t=tracker, d=density, f=frame: t.step(d, f)
+            tasks[f"{profile} {objects} bare"] = lambda a=given: bare(*a)
+    times = {name: float(np.median(spent)) for name, spent in in_turns(tasks).items()}
+    default, tuned = PROFILES
+    print(f"| objects | `{default}` ms | ratio to bare | `{tuned}` ms | ratio to bare | `{default}` to `{tuned}` |")
+    print("| ---: " * 6 + "|")
+    for objects in sizes:
+        row = [f"{objects}"]
+        for profile in PROFILES:
+            step = times[f"{profile} {objects}"]
+            row += [f"{step:.4f}", f"{step / times[f'{profile} {objects} bare']:.2f}"]
+        row.append(f"{times[f'{default} {objects}'] / times[f'{tuned} {objects}']:.2f}")
+        print("| " + " | ".join(row) + " |")
+
+
+if __name__ == "__main__":
+    main()

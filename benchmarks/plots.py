@@ -22,7 +22,7 @@ def scaling(found: dict[str, Any], path: Path) -> None:
     """Time of a step against the number of objects, with the bare arithmetic and other trackers."""
     figure = Figure(figsize=(7.5, 5.4), layout="constrained")
     axes = figure.add_subplot()
-    step, floor = found["dense"]["step"], found["dense"]["bare"]
+    step, floor = found["dense"]["generic"], found["dense"]["bare"]
     sizes = list(step)
     for name, times in found["peers"].items():
         colour, marker = PEER_STYLES.get(name.rpartition(" ")[0], (SKY, "v"))

@@ -115,7 +115,7 @@ class Cluster:
         options = ("--connect", self.router.endpoint, "--cluster", self.url, "--instance", name)
         # Bounds of one careless node; here one node stands for many.
         free = dict.fromkeys(("OPTIPMB_NODE_SESSIONS", "OPTIPMB_NODE_RATE", "OPTIPMB_NODE_MB_S"), "0")
-        more = {"OPTIPMB_MAX_SESSIONS": "50000", "OPTIPMB_IDLE_S": "36000", "OPTIPMB_LOG_LEVEL": "info"}
+        more = {"OPTIPMB_MAX_SESSIONS": "10000", "OPTIPMB_IDLE_S": "36000", "OPTIPMB_LOG_LEVEL": "info"}
         member = self._context.enter_context(ServiceProcess(*options, environment=free | more, listen=False))
         member.wait_ready()
         self.members.append(member)

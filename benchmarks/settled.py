@@ -17,14 +17,16 @@ if TYPE_CHECKING:
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 
 PARAMETERS = optipmb.load_profile("kitti")
+PROFILES = ("generic", "kitti")
+"""The default, and a tuned one."""
 HERE = optipmb.Pose(np.array([0.0, 0.0, SENSOR_HEIGHT]), np.array([1.0, 0.0, 0.0, 0.0]))
 
 
-def frame_of(given: SceneFrame) -> optipmb.Frame:
+def frame_of(given: SceneFrame, parameters: optipmb.Parameters) -> optipmb.Frame:
     """The tracker's frame of a frame of the scene."""
     cloud = None if given.scan is None else optipmb.PointCloud(given.scan, HERE)
     frame, _ = optipmb.make_frame(
-        PARAMETERS,
+        parameters,
         stamp_ns=given.stamp_ns,
         labels=LABELS,
         label=given.label,
@@ -37,10 +39,13 @@ def frame_of(given: SceneFrame) -> optipmb.Frame:
     return frame
 
 
-def settled(objects: int, points: int = 0) -> tuple[optipmb.Tracker, optipmb.Density, optipmb.Frame]:
+def settled(
+    objects: int, points: int = 0, profile: str | None = None
+) -> tuple[optipmb.Tracker, optipmb.Density, optipmb.Frame]:
     """A tracker, its density after ten frames of the dense scene, and the eleventh frame."""
-    *before, last = (frame_of(given) for given in dense_scene(objects, points=points))
-    tracker = optipmb.Tracker(PARAMETERS)
+    parameters = PARAMETERS if profile is None else optipmb.load_profile(profile)
+    *before, last = (frame_of(given, parameters) for given in dense_scene(objects, points=points))
+    tracker = optipmb.Tracker(parameters)
     density = tracker.initial()
     for frame in before:
         density = tracker.step(density, frame).density

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from lower_bound import arguments, bare
-from settled import PARAMETERS, recorded, settled
+from settled import PARAMETERS, PROFILES, recorded, settled
 
 import optipmb
 from optipmb.lightweight import turn_around
@@ -23,9 +23,10 @@ OBJECTS = (10, 20, 50, 100, 200, 400, 800)
 
 @pytest.mark.parametrize("points", [0, 30_000, 120_000])
 @pytest.mark.parametrize("objects", OBJECTS)
-def test_step(benchmark: BenchmarkFixture, objects: int, points: int) -> None:
+@pytest.mark.parametrize("profile", PROFILES)
+def test_step(benchmark: BenchmarkFixture, profile: str, objects: int, points: int) -> None:
     """One step of the full tracker."""
-    tracker, density, frame = settled(objects, points)
+    tracker, density, frame = settled(objects, points, profile)
     result = benchmark(tracker.step, density, frame)
     benchmark.extra_info["measurements"] = result.diagnostics.detections
     benchmark.extra_info["bernoullis"] = len(result.density.bernoulli)
