@@ -45,7 +45,7 @@ from optipmb_service.session.worlds import Worlds  # noqa: TC001 - pydantic read
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-VERSION: Final = 4
+VERSION: Final = 5
 MAGIC: Final = b"OPTIPMB\0"
 DIGEST: Final = 16
 _START: Final = MAGIC + VERSION.to_bytes(2, "big")

@@ -375,7 +375,7 @@ def test_the_head_of_the_first_format_is_read() -> None:
     data = GOLDEN.read_bytes()
     magic, version, starts, next_id, digest = struct.unpack_from(">8sHQQ16s", data)
     (length,) = struct.unpack_from(">I", data, 42)
-    assert (magic, version, starts, next_id) == (b"OPTIPMB\0", 4, 1, 2)
+    assert (magic, version, starts, next_id) == (b"OPTIPMB\0", 5, 1, 2)
     assert digest == hashlib.sha256(data[:26] + data[42:]).digest()[:16]
     assert msgpack.unpackb(data[46 : 46 + length]) == {"run": 0, "events": {}}
     assert numbers_in(data) == Incarnation(starts, next_id)
