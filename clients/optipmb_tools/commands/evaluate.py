@@ -1,5 +1,6 @@
 """`optipmb evaluate`: result files against the truth."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -109,6 +110,8 @@ def evaluate(
 
     if how.plot is not None and (len(tracks) == 1 or how.plot.suffix != ".png"):
         raise UsageError(f"--plot {how.plot}: expected a .png of several --tracks, received {len(tracks)} of them")
+    if data.truth is not None and (data.data, data.dataset, data.root) == (None, None, None):
+        data = dataclasses.replace(data, data=data.truth, truth=None)  # a table of objects is its own truth
     more = {"tracks": " ".join(map(str, tracks))} if data.named()[0] == "table" else {}
     opened = data.open(**more)
     column = _column(by)

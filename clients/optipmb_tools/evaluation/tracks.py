@@ -11,7 +11,7 @@ from optipmb_tools.datasets import DataSequence, DatasetError, Truth
 from optipmb_tools.datasets.interface import class_like
 from optipmb_tools.datasets.kitti import KittiSequence
 from optipmb_tools.datasets.nuscenes import NuScenesSequence
-from optipmb_tools.datasets.table import ObjectTable, TableOptions, TableSequence, read_objects
+from optipmb_tools.datasets.table import ObjectTable, TableOptions, TableSequence, read_objects, span
 from optipmb_tools.results import FullTable, ResultTable, full_path, full_table, read_full
 from optipmb_tools.results.kitti import LEAST_SHOWN, read_kitti_results
 from optipmb_tools.results.nuscenes import NUSCENES_FILE, read_nuscenes_results, result_table
@@ -25,6 +25,7 @@ By = Literal["id", "object"]
 """Column that tells which rows are of one track."""
 
 _BETTER = 0.5  # share of the distance from which another frame fits much better
+_FAR = 20.0  # m from the truth, from which tracks are of other coordinates
 _ENOUGH = 20  # boxes from which distances are compared
 
 
@@ -88,6 +89,10 @@ def _shifted(sequences: Sequence[DataSequence], pairs: Sequence[tuple[Truth, Res
     for sequence, (truth, tracks) in zip(sequences, pairs, strict=True):
         placed = tracks.to_world(sequence.poses)
         here, before, after = (_apart(truth, placed, shift) for shift in (0, -1, 1))
+        if _FAR < here < np.inf:
+            text = f"tracks lie {here:.3g} m from the truth of their frame"
+            notes.append(f"{sequence.name}: {text}: another origin, other axes or another unit?")
+            continue
         if min(before, after) < _BETTER * here < np.inf:
             other = "before" if before < after else "after"
             text = (
@@ -173,6 +178,14 @@ def _from_table(path: Path, sequence: DataSequence, by: By) -> ResultTable:
         return replace(full_table((), {}), notes=(f"{path}: no tracks of {sequence.name}",))
     rows, frame, _, notes = table.at(key, sequence.stamps, sequence.numbers)
     boxes = table.boxes
+    if (frame < 0).any() and getattr(sequence, "is_truth", False) and (frame >= 0).any():
+        left_out = int((frame < 0).sum())
+        notes.append(f"{path}: {left_out} rows are at no frame of the truth, and no detections say more: left out")
+        rows, frame = rows[left_out:], frame[left_out:]
+    if (frame < 0).all() and len(frame):
+        own = table.boxes.frame_stamp[table.boxes.row[rows]]
+        expected = f"stamps of the frames of {sequence.name}, {span(sequence.stamps)}"
+        raise DatasetError(path, expected, f"{span(own)}: another clock, or another unit?")
     if (frame < 0).any():
         line = table.line(int(rows[np.flatnonzero(frame < 0)[0]]))
         raise DatasetError(path, f"stamps of the frames of {sequence.name}", "another stamp", line=line)

@@ -192,6 +192,11 @@ def match_stamps(stamps: NDArray[Any], wanted: NDArray[Any]) -> Ints:
     return np.where(abs(stamps[nearest] - wanted) <= 0.5 * period, nearest, -1)
 
 
+def span(stamps: Ints) -> str:
+    """Return the first and the last stamp, for messages."""
+    return f"{stamps.min() / 1e9:.9g} to {stamps.max() / 1e9:.9g} s" if len(stamps) else "no stamps"
+
+
 def truth_at(name: str, stamps: Ints, numbers: NDArray[Any] | None, table: ObjectTable, key: str) -> Truth:
     """Return the objects of a recording at the frames of its detections; arguments as for `ObjectTable.at`.
 
@@ -202,7 +207,8 @@ def truth_at(name: str, stamps: Ints, numbers: NDArray[Any] | None, table: Objec
     rows, frame, seen, notes = table.at(key, stamps, numbers)
     outside, count, steps = int((frame < 0).sum()), int(seen.sum()), np.diff(stamps[seen])
     if outside == len(rows) and outside and len(stamps):
-        raise DatasetError(path, f"boxes at the stamps of {name}", "none of its stamps")
+        given = boxes.frame_stamp[boxes.row[rows]]
+        raise DatasetError(path, f"boxes at the stamps of {name}, {span(stamps)}", f"none of its stamps, {span(given)}")
     if outside:
         notes.append(f"{path}: {outside} rows are at no frame of {name}: left out")
     rows, frame = rows[outside:], frame[outside:]
@@ -247,6 +253,7 @@ class TableSequence(DataSequence):
         self._truth = truth
         self._origin = origin
         self.reports = boxes.reports
+        self.is_truth = truth is not None and truth[0].boxes is boxes
         self.apart = boxes.apart
         rows = np.flatnonzero(boxes.frame_key == key)
         self._stamps, first, frame = np.unique(boxes.frame_stamp[rows], return_index=True, return_inverse=True)
