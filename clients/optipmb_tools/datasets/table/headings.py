@@ -22,6 +22,8 @@ from optipmb_tools.geometry import Bools, Floats, Ints, wrap_angle
 ENOUGH_MOVES: Final = 5  # moves from which headings are compared with motion
 REFUSED_MOVES: Final = 80  # moves of several objects from which headings are refused
 FORWARD: Final = 0.8  # share of forward moves from which traffic shares a motion, not the sensor
+ONE_WAY: Final = 0.7  # length of the mean direction of moves from which they share one
+_POSES: Final = "pose columns, or --option poses=FILE"
 _MOST_SHOWN: Final = 6
 _TILTED: Final = 1 / 12  # of a turn: largest angle about x and y of a box that stands upright
 _INVERSE: Final = np.array([1.0, -1.0, -1.0, -1.0])
@@ -116,7 +118,7 @@ def _heading(reading: Reading, draft: Draft) -> Floats:
     if unit != "none":
         unknown = int(np.isnan(yaw).sum())
         if unknown < len(yaw):
-            moving = unposed and is_moving(yaw, long)
+            moving = unposed and (is_moving(yaw, long) or one_way(long))
             column = draft.roles.get("yaw", Column("", None, ""))
             way = _Way(
                 strict=draft.scored,
@@ -132,7 +134,7 @@ def _heading(reading: Reading, draft: Draft) -> Floats:
         reading.note("pose", "no columns for the pose of the sensor: boxes are assumed to be in the world frame")
         if unit != "none" and is_moving(found, long):
             text = f"the sensor seems to move, boxes share a motion in {moves.common.share:.0%} of the frames"
-            reading.doubt("pose", f"{text}: add its poses", "pose columns, or --option poses=FILE")
+            reading.doubt("pose", f"{text}: add its poses", _POSES)
     return found
 
 
@@ -187,11 +189,13 @@ def read_heading(
     what = f"if it is measured from {other.replace('-clockwise', ' clockwise')}"
     option = f"--option heading={other}, or heading={usual} to keep it"
     wins: Literal["taken", "doubt", "refused"] = "refused" if way.strict and not way.moving else "doubt"
+    if way.moving:  # of a sensor without poses: moves of what stands are its own
+        what, option = "along another axis; the sensor moves, or all go one way", _POSES
     if way.bearing and other == "y-clockwise":
         wins, what = "taken", f"yaw is in {found}, clockwise from y"
     claims = [
         Claim(axis, share(found, axis)[0], text, "" if asked or unit else "--option yaw=degrees, radians"),
-        Claim(other, share(found, other)[0], what, option, wins, sure),
+        Claim(other, share(found, other)[0], what, option, wins, sure and shares[other][0] > FORWARD),
     ]
     if way.bearing and not (count or way.compass or zero):
         reading.doubt("yaw", f"{text}; it may be clockwise from north", "--option heading=y-clockwise, or heading=x")
@@ -232,6 +236,12 @@ def is_moving(yaw: Floats, moves: Moves) -> bool:
     off = off[np.isfinite(off)]
     forward = float(np.mean(off < SAME_DIRECTION)) if len(off) >= ENOUGH_MOVES else 1.0
     return moves.common.bounds[0] > MOST and forward < FORWARD
+
+
+def one_way(moves: Moves) -> bool:
+    """Return whether boxes go in one direction, as what stands does beside a sensor that moves."""
+    unit = moves.step / np.maximum(np.linalg.norm(moves.step, axis=1, keepdims=True), 1e-9)
+    return len(np.unique(moves.object)) > 1 and float(np.linalg.norm(unit.mean(axis=0))) > ONE_WAY
 
 
 def _velocity(reading: Reading, draft: Draft) -> Floats | None:
