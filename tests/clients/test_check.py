@@ -392,7 +392,8 @@ def test_check_prints_the_findings_without_tracking(tmp_path: Path, capsys: pyte
     right = result_of(run_here(capsys, "check", write(tmp_path / "a.csv", street()), "--json"))
     topics = {one["topic"]: one["text"] for one in right["findings"]}
     assert topics["time"] == "stamps are in seconds: frames at 10 Hz"
-    assert topics["columns"].startswith("columns found: stamp from t, x, y")
+    assert right["columns"][0] == {"role": "stamp", "column": "t", "unit": "", "example": "0.0"}
+    assert [one["role"] for one in right["columns"][1:3]] == ["x", "y"]
     assert right["recordings"] == [
         {"recording": "a", "frames": FRAMES, "Hz": 10.0, "seconds": 4.9, "longest_gap_s": 0.1, "boxes": 2 * FRAMES}
     ]

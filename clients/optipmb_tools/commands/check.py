@@ -2,15 +2,16 @@
 
 import itertools
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
 
-from optipmb_tools.commands.options import AsJson, DataOptions, plain_table, print_json, print_table, reading
+from optipmb_tools.commands.options import AsJson, DataOptions, plain_table, print_json, print_table, reading, say
 from optipmb_tools.datasets.interface import class_like
 from optipmb_tools.datasets.motion import headings_along
-from optipmb_tools.datasets.table.findings import Finding
+from optipmb_tools.datasets.table.findings import Finding, Understood
 from optipmb_tools.files import DatasetError
 
 # Kinds of objects that a profile for unknown detectors tells apart
@@ -23,30 +24,41 @@ if TYPE_CHECKING:
     from optipmb_tools.geometry import Floats
 
 
-def check(data: DataOptions, *, as_json: AsJson = False) -> None:
+def check(
+    data: DataOptions,
+    *,
+    plot: Annotated[
+        Path | None, typer.Option("--plot", help="Picture of the first seconds from above to write (.png).")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
     """Show how your data are read, without tracking.
 
     Units, rate, classes, headings against the motion of the boxes, suspicious rows, and the options that read them
     otherwise. Status 1: track would refuse the data; the findings marked as WRONG say why. Where tracks may be wrong, a
-    finding is doubtful; where none is, the last line of the findings is "all right".
+    finding is doubtful; where none is, the last line of the findings is "all right". The last table shows how each
+    column of a table is read, with a row of it; --plot shows whether an axis is mirrored or a heading is wrong.
     """
     name, root = data.named()
     chosen: Many[DataSequence] = []
     findings: list[dict[str, Any]] = []
+    columns: list[dict[str, Any]] = []
     if name == "table" and root is not None:
         from optipmb_tools.datasets.table import TableDataset  # noqa: PLC0415  packages of an extra
 
         options = {option: str(value) for option, value in data.options(name).items()}
         found: list[Finding] = []
+        understood: list[Understood] = []
         try:
             with reading(root):
-                table = TableDataset(root, options, lenient=True, findings=found)
+                table = TableDataset(root, options, lenient=True, findings=found, understood=understood)
                 chosen = list(table.sequences(data.sequences or ["all"]))
         except DatasetError as error:
             if error.path.startswith("--"):
                 raise
             found.append(Finding("data", str(error), wrong=True))
         findings = [asdict(one) for one in found]
+        columns = [asdict(one) for one in understood]
     else:
         chosen = data.open().sequences
         share, moves = headings_along(chosen)
@@ -58,9 +70,17 @@ def check(data: DataOptions, *, as_json: AsJson = False) -> None:
         received = f"received none in {len(chosen)} recordings"
         findings.append(asdict(Finding("data", f"expected boxes, {received}", wrong=True)))
     if as_json:
-        print_json({"command": "check", "findings": findings, "recordings": recordings, "classes": classes})
+        print_json(
+            {"command": "check", "findings": findings, "recordings": recordings, "classes": classes, "columns": columns}
+        )
     else:
-        _print(findings, recordings, classes)
+        shown = [{"read as": one["role"] or "(not used)", **one} for one in columns]
+        _print(findings, recordings, classes, [{k: v for k, v in one.items() if k != "role"} for one in shown])
+    if plot is not None and chosen:
+        from optipmb_tools.views.first_seconds import draw_first_seconds  # noqa: PLC0415  an extra
+
+        draw_first_seconds(plot, chosen[0].name, chosen[0].frames())
+        say(f"picture in {plot}")
     if any(one["wrong"] for one in findings):
         raise typer.Exit(1)
 
@@ -86,7 +106,8 @@ def _classes(sequences: "Many[DataSequence]") -> list[dict[str, Any]]:
     found = []
     for name, parts in rows.items():
         values = np.concatenate(parts)
-        size = " x ".join(f"{side:.3g}" for side in np.median(values[:, :3], axis=0))
+        sides = np.median(values[:, :3], axis=0)
+        size = " x ".join(f"{side:.3g}" for side in sides) if np.isfinite(sides).any() else "unknown"
         scores = f"{values[:, 3].min():.3g} to {values[:, 3].max():.3g}"
         tracked = class_like(name, KINDS) or "other"
         found.append({"class": name, "kind": tracked, "boxes": len(values), "size": size, "scores": scores})

@@ -30,7 +30,7 @@ from optipmb_tools.datasets.interface import (
 from optipmb_tools.datasets.table import pixels
 from optipmb_tools.datasets.table.columns import ALIASES
 from optipmb_tools.datasets.table.draft import Boxes
-from optipmb_tools.datasets.table.findings import Finding, Reading
+from optipmb_tools.datasets.table.findings import Finding, Reading, Understood
 from optipmb_tools.datasets.table.names import NO_ID
 from optipmb_tools.datasets.table.read import read_tables
 from optipmb_tools.files import DatasetError
@@ -332,6 +332,7 @@ class TableDataset(Dataset):
         options: see `OPTIONS`.
         lenient: Whether errors become findings (`Reading`), where nothing is to be tracked.
         findings: Gets the assumptions and errors, also of a table that cannot be read.
+        understood: Gets the columns that were found, with `lenient`.
 
     Raises:
         DatasetError: A file, a column, a value or an option is wrong.
@@ -348,6 +349,7 @@ class TableDataset(Dataset):
         *,
         lenient: bool = False,
         findings: list[Finding] | None = None,
+        understood: list[Understood] | None = None,
     ) -> None:
         options = dict(options or {})
         for name in options:
@@ -365,7 +367,9 @@ class TableDataset(Dataset):
         others = read_objects(Path(truth), _tables(Path(truth)), shared) if truth is not None else []
         notes += [note for one in others for note in one.notes]
         read_by = openlabel.options_of(files) | options
-        reading = Reading(path, read_by, lenient, named=shared.named, findings=[] if findings is None else findings)
+        reading = Reading(path, read_by, lenient, named=shared.named)
+        reading.findings = reading.findings if findings is None else findings
+        reading.understood = reading.understood if understood is None else understood
         tables = read_tables(files, reading, scored=True)
         origin = min(int(boxes.frame_stamp.min(initial=0)) for _, boxes in tables)
         if not any(len(boxes.frame_stamp) for _, boxes in tables):

@@ -44,6 +44,16 @@ class Claim:
     sure: bool = True  # whether there is enough evidence to refuse by
 
 
+@dataclass(frozen=True)
+class Understood:
+    """Column of a table that is read, or is not."""
+
+    role: str  # meaning; empty: it is not used
+    column: str
+    unit: str  # in its name
+    example: str  # of the first row
+
+
 @dataclass
 class Reading:
     """Files of a recording, options of the user, and findings.
@@ -53,6 +63,7 @@ class Reading:
         options: Options of the data set.
         lenient: Errors become findings; the reader goes on as if nothing were known.
         files: Each file with the first of its rows; empty: all rows are in `path`.
+        understood: Columns that were found, for people.
         named: Options `column.*` and `class.*`, with the error if they name nothing in the tables read so far.
     """
 
@@ -61,6 +72,7 @@ class Reading:
     lenient: bool = False
     files: tuple[tuple[Path, int], ...] = ()
     findings: list[Finding] = field(default_factory=list)
+    understood: list[Understood] = field(default_factory=list)
     named: dict[str, DatasetError | None] = field(default_factory=dict)
 
     @property

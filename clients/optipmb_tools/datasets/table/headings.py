@@ -45,7 +45,8 @@ class _Way:
     """Circumstances in which headings are read."""
 
     strict: bool  # headings that disagree with the motion are refused, and not only noted
-    moving: bool  # the sensor moves and has no poses: then motion says little about headings
+    unposed: bool  # there are no poses
+    moving: bool  # and the sensor moves: then motion says little about headings
     free: bool  # the motion gives the sense of the headings
     compass: bool  # they stand beside latitudes
     bearing: bool  # their name is that of a bearing
@@ -118,10 +119,11 @@ def _heading(reading: Reading, draft: Draft) -> Floats:
     if unit != "none":
         unknown = int(np.isnan(yaw).sum())
         if unknown < len(yaw):
-            moving = unposed and (is_moving(yaw, long) or one_way(long))
+            moving = unposed and is_moving(yaw, long)
             column = draft.roles.get("yaw", Column("", None, ""))
             way = _Way(
                 strict=draft.scored,
+                unposed=unposed,
                 moving=moving,
                 free=column.name == CORNERED,
                 compass="x" not in draft.roles and column.base in {"heading", *BEARINGS},
@@ -189,13 +191,14 @@ def read_heading(
     what = f"if it is measured from {other.replace('-clockwise', ' clockwise')}"
     option = f"--option heading={other}, or heading={usual} to keep it"
     wins: Literal["taken", "doubt", "refused"] = "refused" if way.strict and not way.moving else "doubt"
-    if way.moving:  # of a sensor without poses: moves of what stands are its own
-        what, option = "along another axis; the sensor moves, or all go one way", _POSES
+    explains = shares[other][0] > FORWARD
+    if way.unposed and count and not explains:  # moves of what stands beside a sensor are its own
+        what, option = "along another axis: a sensor that moves?", _POSES
     if way.bearing and other == "y-clockwise":
         wins, what = "taken", f"yaw is in {found}, clockwise from y"
     claims = [
         Claim(axis, share(found, axis)[0], text, "" if asked or unit else "--option yaw=degrees, radians"),
-        Claim(other, share(found, other)[0], what, option, wins, sure and shares[other][0] > FORWARD),
+        Claim(other, share(found, other)[0], what, option, wins, sure and explains),
     ]
     if way.bearing and not (count or way.compass or zero):
         reading.doubt("yaw", f"{text}; it may be clockwise from north", "--option heading=y-clockwise, or heading=x")
@@ -216,7 +219,7 @@ def read_heading(
                 one,
                 share(found, one)[1],
                 f"if it is {one}" if one != axis and not way.free else "",
-                f"--option heading={one}, or heading={axis} to keep it",
+                _POSES if way.unposed and one_way(moves) else f"--option heading={one}, or heading={axis} to keep it",
                 "taken" if way.free else "doubt",
             )
             for one in ways

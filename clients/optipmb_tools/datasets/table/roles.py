@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from optipmb_tools.datasets.table.columns import ALIASES, NOTHING, Column, candidates, find_columns, normalised, turn_of
 from optipmb_tools.datasets.table.corners import with_boxes
 from optipmb_tools.datasets.table.draft import Draft
-from optipmb_tools.datasets.table.findings import Reading
+from optipmb_tools.datasets.table.findings import Reading, Understood
 from optipmb_tools.datasets.table.pixels import METRES
 from optipmb_tools.table_files import NO_VALUE, Columns, frame_numbers, is_number, unique_texts
 
@@ -19,6 +19,7 @@ _MOST_SHOWN: Final = 6
 _NEEDED: Final = ("x", "y", "lat", "lon", "l", "w")  # with texts they are refused where a text stands
 _FEW_CLASSES: Final = 64
 _LONGEST: Final = 30.0  # boxes that are longer, in metres, are suspicious
+_LONGEST_TEXT: Final = 24
 _LOOKED_AT: Final = 200  # texts of a column that tell whether it has numbers
 _SPARED: Final = ("z", "h", "score", "class")  # without a value in any row they are as without a column
 
@@ -30,6 +31,12 @@ def step(reading: Reading, draft: Draft) -> Draft:
     boxes = with_boxes(reading, columns, roles)
     if boxes is not columns:
         roles = find(reading, boxes)
+    if reading.lenient:
+        first = {name: str(values[0])[:_LONGEST_TEXT] if len(values) else "" for name, values in boxes.items()}
+        rows = [Understood(role, one.name, one.unit or "", first[one.name]) for role, one in roles.items()]
+        used = {one.column for one in rows}
+        rows += [Understood("", name, "", first[name]) for name in boxes if name not in used]
+        reading.understood += [one for one in rows if one not in reading.understood]
     kind, members = (None if "yaw" in roles else turn_of(map(normalised, boxes))) or ("", [])
     return replace(draft, columns=boxes, roles=roles, turn_of=kind, turn_columns=tuple(members))
 
@@ -68,8 +75,6 @@ def note(reading: Reading, draft: Draft) -> Draft:
         long = int((draft.size[:, :2] > _LONGEST).any(axis=1).sum())
         if long:
             reading.note("rows", f"{long} boxes are longer than {_LONGEST:g} m")
-        pairs = (role if role == one.name else f"{role} from {one.name}" for role, one in draft.roles.items())
-        reading.note("columns", f"columns found: {', '.join(pairs)}")
     used = {one.name for one in draft.roles.values()} | set(draft.turn_columns)
     used |= set(draft.placed.columns if draft.placed else ())
     unused = [name for name in draft.columns if name not in used]
