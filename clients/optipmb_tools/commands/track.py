@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 _SHOWN = 20  # recordings that are named
 _MANY = 50  # detections of which some should make tracks
 _HARDLY = 0.05  # share of the rows of tracks that are confirmed, below which numbers may have another meaning
-_SHORT = 2.0  # rows of a track up to which nothing was followed
+_SHORT = 3.0  # rows of a track up to which nothing was followed
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ from optipmb_tools.datasets.table.findings import HALF, NOISE, Claim, Reading
 from optipmb_tools.datasets.table.poses import rotated
 from optipmb_tools.datasets.table.scores import FEW
 from optipmb_tools.files import DatasetError
-from optipmb_tools.geometry import Bools, Floats, Ints, wrap_angle
+from optipmb_tools.geometry import Floats, Ints, wrap_angle
 
 ENOUGH_MOVES: Final = 5  # moves from which headings are compared with motion
 REFUSED_MOVES: Final = 80  # moves of several objects from which headings are refused
@@ -308,14 +308,12 @@ def read_velocity(reading: Reading, velocity: Floats, moves: Moves, draft: Draft
                 ("point backwards", -along[axes]),
                 ("are of another unit or relative to the sensor", known.velocity),
             )
-            how = next(word for word, one in ways if _near(one, known.velocity, most)[mine].mean() >= HALF)
+            off_by = [float(np.median(np.linalg.norm(one - known.velocity, axis=1)[mine])) for _, one in ways]
+            best = int(np.argmin(off_by[:2]))
+            how = ways[best if off_by[best] < np.median(most[mine]) else -1][0]
             reading.note("velocity", f"{text}: they {how}", "--option velocity=sensor keeps them")
             return axes, wrong
     clash = f"velocities and motion disagree: {np.median(speed):.3g} m/s on average, boxes move at"
     clash += f" {np.median(real):.3g} m/s; another unit, or relative to the sensor?"
     claims = [Claim(axes, Evidence(float(fits.sum()), len(known)))]
     return reading.decide("velocity", claims, "moves have the velocity of their box", clash=clash, least=HALF), none
-
-
-def _near(one: Floats, other: Floats, most: Floats) -> Bools:
-    return np.asarray(np.linalg.norm(one - other, axis=1) < most, dtype=np.bool_)

@@ -39,8 +39,8 @@ def _poses(reading: Reading, draft: Draft) -> Floats | None:
         return _poses_at(reading, Path(reading.options["poses"]), draft.stamps.ns)
     if not {"pose_x", "pose_y"} <= draft.roles.keys():
         return None
-    stem = draft.roles["pose_x"].name.removesuffix("0")
-    listed = [name for name in draft.columns if re.fullmatch(rf"{re.escape(stem)}\d(\d|\.\d)?", name)]
+    stem = re.escape(re.sub(r"[._]?0([._]0)?$", "", draft.roles["pose_x"].name))
+    listed = [name for name in draft.columns if re.fullmatch(rf"{stem}[._]?\d+([._]\d)?", name)]
     if len(listed) in {_SEVEN, _MATRIX - 4, _MATRIX}:
         return _of_list(reading, np.column_stack([column_numbers(reading, draft, "pose", name) for name in listed]))
     return _of_columns(reading, draft, "pose_")

@@ -17,6 +17,7 @@ from optipmb_tools.table_files import NO_VALUE, Columns, frame_numbers, is_numbe
 
 _MOST_SHOWN: Final = 6
 _NEEDED: Final = ("x", "y", "lat", "lon", "l", "w")  # with texts they are refused where a text stands
+_MATRICES: Final = (12, 16)  # numbers of a pose
 _FEW_CLASSES: Final = 64
 _LONGEST: Final = 30.0  # boxes that are longer, in metres, are suspicious
 _LONGEST_TEXT: Final = 24
@@ -58,6 +59,11 @@ def find(reading: Reading, columns: Columns) -> dict[str, Column]:
     for role, one in find_columns(columns, taken).items():  # refused when it is read, as a number is expected
         if role not in found and one.name in words - used and (role in _NEEDED or _has_units(columns[one.name])):
             found[role] = one
+    cells = [
+        name for name in columns if re.fullmatch(r"(.*[._])?(ego|sensor|lidar)?_?pose(_matrix)?[._]\d[._]\d", name)
+    ]
+    if "pose_x" not in found and len(cells) in _MATRICES:  # a matrix by rows, which `poses` reads as a whole
+        found |= {role: Column(name, None, "") for role, name in zip(("pose_x", "pose_y"), cells, strict=False)}
     track = found.get("id")
     over_ground = track is not None and track.base == "track" and columns[track.name].dtype.kind == "f"
     if track is not None and over_ground and {"lat", "lon"} <= found.keys() and "yaw" not in found:

@@ -47,10 +47,10 @@ def order(reading: Reading, draft: Draft) -> Draft:
         return draft
     base = draft.roles["l"].base
     stated = base == "l" or base.endswith(("_l", "length"))
-    return replace(draft, size=read_sizes(reading, draft.size, draft.name, stated=stated))
+    return replace(draft, size=read_sizes(reading, draft.size, draft.name, stated=stated, tall="h" in draft.roles))
 
 
-def read_sizes(reading: Reading, sizes: Floats, names: np.ndarray, *, stated: bool) -> Floats:
+def read_sizes(reading: Reading, sizes: Floats, names: np.ndarray, *, stated: bool, tall: bool) -> Floats:
     """Return length, width, height of sizes (B, 3) in the order of the columns, whose names may be `stated`.
 
     The order is that in which vehicles are longer than wide and high; height, width, length where the longest is last.
@@ -77,11 +77,13 @@ def read_sizes(reading: Reading, sizes: Floats, names: np.ndarray, *, stated: bo
     held = reading.decide("sizes", claims, asked=asked)
     found = sizes[:, [held.index(letter) for letter in "lwh"]]
     if not {"size_factor", "length_factor"} & reading.options.keys():
-        _check_sizes(reading, found[some], names[some], kinds)
+        _check_sizes(reading, found[some], names[some], kinds, sides=2 + tall)
     return found
 
 
-def _check_sizes(reading: Reading, sizes: Floats, names: np.ndarray, kinds: Mapping[str, str | None]) -> None:
+def _check_sizes(
+    reading: Reading, sizes: Floats, names: np.ndarray, kinds: Mapping[str, str | None], *, sides: int
+) -> None:
     """Doubt sizes that would be usual ones of their classes if they were multiplied by a factor."""
     usual = {name: USUAL[kind] for name, kind in kinds.items() if kind is not None and kind in USUAL}
     rows = np.isin(names, list(usual)) & np.isfinite(sizes).all(axis=1)
@@ -90,7 +92,7 @@ def _check_sizes(reading: Reading, sizes: Floats, names: np.ndarray, kinds: Mapp
     claims = []
     for factor, unit in FACTORS.items():
         size = sizes[rows] * float(factor)
-        fits = ((size >= bounds[:, :, 0]) & (size <= bounds[:, :, 1])).all(axis=1)
+        fits = ((size >= bounds[:, :, 0]) & (size <= bounds[:, :, 1]))[:, :sides].all(axis=1)
         both = f", or length_factor={factor} of all lengths" if unit not in {"", "halves", "doubled"} else ""
         option = f"--option size_factor={factor}{both}"
         claims.append(
