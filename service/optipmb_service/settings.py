@@ -45,7 +45,7 @@ from pydantic_settings import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from optipmb.zones import Zone
 
@@ -967,6 +967,7 @@ def load(
     _check_tokens(settings)
     _check_patterns(settings)
     _check_fused(settings)
+    _check_names(settings)
     _check_cluster(settings)
     _check_zones(settings)
     _check_mqtt(settings)
@@ -1072,17 +1073,23 @@ def _check_fused(settings: Settings) -> None:
             if both is not None:
                 streams = f"a stream feeds one session, {both[0]} and {both[1]} of {other} have some in common"
                 raise SettingsInvalidError(f"setting {path}: {streams}")
-    named = {"fuse": settings.fuse, "inputs": settings.inputs, "ros2.streams": settings.ros2.streams}
+
+
+def _check_names(settings: Settings) -> None:
+    """Refuse sensors that have the name of a fused session.
+
+    Raises:
+        SettingsInvalidError: a setting names one.
+    """
+    named: dict[str, Iterable[str]] = {"fuse": settings.fuse, "inputs": settings.inputs}
+    named["ros2.streams"] = settings.ros2.streams
     named["mqtt.inputs"] = [re.sub(r"\{\d\}", "*", one) for one in settings.mqtt.inputs]
-    for path, patterns in named.items():
-        for pattern in patterns:
-            node, _, sensor = pattern.rpartition("/")
-            fuses = any(_overlap(node, one.rpartition("/")[0]) for one in settings.fuse)
-            if (sensor == "fused" and fuses) or (node.endswith("/fused") and settings.fused):
-                part = "sensor" if sensor == "fused" else "node"
-                raise SettingsInvalidError(
-                    f"setting {path}: no {part} is named fused, as its tracks, received {pattern}"
-                )
+    for path, name in ((path, name) for path, names in named.items() for name in names):
+        node, _, sensor = name.rpartition("/")
+        fuses = any(_overlap(node, one.rpartition("/")[0]) for one in settings.fuse)
+        if (sensor == "fused" and fuses) or (node.endswith("/fused") and settings.fused):
+            part = "sensor" if sensor == "fused" else "node"
+            raise SettingsInvalidError(f"setting {path}: no {part} is named fused, as its tracks, received {name}")
 
 
 def _overlap(one: str, other: str) -> bool:

@@ -10,18 +10,19 @@ import socket
 import subprocess
 import sys
 import threading
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from json_senders import Edge
 from optipmb_client.errors import ClientError
 from optipmb_schemas import Keys, ServiceStatus
 from optipmb_service.app.health_command import ask
 from optipmb_service.edges.http import Server, application, server
-from optipmb_service.edges.http.server import CONNECTIONS, REQUESTS
+from optipmb_service.edges.http.server import CONNECTIONS, REQUESTS, SLICE
 from optipmb_service.edges.readers import BURST
 from optipmb_service.settings import Settings
 from optipmb_service.telemetry.metrics import NAMESPACE, SERVICE_METRICS
@@ -30,7 +31,8 @@ from router import Node, Sensor, until
 from routers import free_endpoint, open_router
 from service_process import ServiceProcess
 from watched import STREAM, Watched, served
-from websocket import WebSocketException, create_connection
+from websocket import ABNF, WebSocketException, create_connection
+from wsproto import WSConnection
 
 KEYS = Keys()
 SENSOR = Sensor()
@@ -124,6 +126,57 @@ def test_websockets_keep_no_probe_out(monkeypatch: pytest.MonkeyPatch) -> None:
         sockets[-1].ping()
         with pytest.raises((WebSocketException, OSError)):
             sockets[0].recv()
+
+
+@pytest.mark.parametrize("path", ["ws?stream=a/b/c", "detections?stream=a/b/c"])
+@pytest.mark.parametrize("frames", [b"\x00\x81" + bytes(4) + b"a", b"\x89\x80" + bytes(4)], ids=["pieces", "pings"])
+def test_messages_in_pieces_hold_no_loop(path: str, frames: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Six clients send pieces of a byte, or pings, without end: a turn of the loop reads a few, and they are closed."""
+    sizes: list[int] = []
+    receive = WSConnection.receive_data
+
+    def received(self: WSConnection, data: bytes) -> None:
+        sizes.append(len(data))
+        receive(self, data)
+
+    monkeypatch.setattr(WSConnection, "receive_data", received)
+    data = b"\x01\x81" + bytes(4) + b"a" + frames * 300_000
+    with Edge(free_endpoint(), router=True) as edge, ThreadPoolExecutor(6) as pool:
+        url = f"ws://{edge.address}/api/v1/{path}"
+        sockets = [create_connection(url, timeout=60, suppress_origin=True) for _ in range(6)]
+        sending = [pool.submit(send_all, one.sock, data) for one in sockets]
+        assert get(edge.address, "/healthz")[0] == 200
+        for one in sockets:
+            while (found := one.recv_data(control_frame=True))[0] != ABNF.OPCODE_CLOSE:
+                pass
+            assert int.from_bytes(found[1][:2], "big") == 1008
+            one.shutdown()
+        wait(sending, timeout=60)
+    assert max(sizes) <= SLICE
+    assert sum(sizes) < 6 * 10 * SLICE
+
+
+def test_a_large_message_in_usual_pieces_is_taken() -> None:
+    """Of a kilobyte, and pings between them; many small messages at once are answered one by one."""
+    with Edge(free_endpoint(), router=True) as edge:
+        url = f"ws://{edge.address}/api/v1/detections?stream=site/node/lidar"
+        with closing(create_connection(url, timeout=60, suppress_origin=True)) as sender:
+            text = json.dumps({"objects": []}).encode() + b" " * 600_000
+            starts = range(0, len(text), 1000)
+            for at in starts:
+                sender.send_frame(ABNF(at == starts[-1], 0, 0, 0, 0 if at else 1, 1, text[at : at + 1000]))
+                if at % 100_000 == 0:
+                    sender.ping()
+            assert json.loads(sender.recv())["index"] == 0
+            for _ in range(300):
+                sender.send(json.dumps({"objects": []}))
+            found = [json.loads(sender.recv()) for _ in range(300)]
+            assert [one["index"] for one in found] == list(range(1, 301))
+
+
+def send_all(connection: socket.socket, data: bytes) -> None:
+    with contextlib.suppress(OSError):
+        connection.sendall(data)
 
 
 def test_slow_requests_keep_no_probe_out() -> None:

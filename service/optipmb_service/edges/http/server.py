@@ -26,8 +26,9 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.wsproto_impl import WSProtocol
+from wsproto.events import CloseConnection
 
-from optipmb_service.edges.http.api import STATUS, Api, Readers, parameters_of, refuse
+from optipmb_service.edges.http.api import MALFORMED, STATUS, Api, Readers, parameters_of, refuse
 from optipmb_service.edges.http.detections import Senders
 from optipmb_service.edges.http.page import page
 from optipmb_service.edges.http.tls import ServerCertificate
@@ -53,6 +54,11 @@ KEEP_ALIVE_S: Final = 5
 HEAD_BYTES: Final = 16 * 1024
 SEND_S: Final = 30.0  # a connection whose peer takes nothing for so long is aborted
 SEND_BYTES: Final = 2**16  # what the system holds for a connection, so that it is soon known
+SLICE: Final = 4096  # bytes of a WebSocket that are read in one turn of the loop
+PIECES: Final = 256  # pieces of a message that may be smaller than `PIECE_BYTES`
+PIECE_BYTES: Final = 512
+PINGS: Final = 1000  # pings of a peer between two of its messages
+LINGER_S: Final = 1.0  # how long a refused peer may take to read why
 PING_S: Final = 20.0  # period of pings, and longest wait for their answers
 
 UNAVAILABLE: Final = 503
@@ -292,7 +298,71 @@ class _Bounded(asyncio.Protocol):
 
 
 class _Socket(_Bounded, WSProtocol):
-    """A WebSocket."""
+    """A WebSocket of which a turn of the loop reads a bounded part, so that none delays the others."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._unread = bytearray()
+        self._reading: asyncio.Handle | None = None
+        self._pieces = self._pings = 0
+        self._refused = False
+
+    def data_received(self, data: bytes) -> None:
+        if not self._refused:
+            self._unread += data
+            if self._reading is None and not self.read_paused:
+                self._read()
+
+    async def receive(self) -> Any:
+        """Return the next message, and go on with those behind it."""
+        message = await super().receive()
+        if self._unread and self._reading is None and not self.read_paused:
+            self.transport.pause_reading()
+            self._reading = self.loop.call_soon(self._read)
+        return message
+
+    def handle_message(self, event: Any) -> None:
+        self._pieces += event.frame_finished
+        super().handle_message(event)
+        if self._pieces > PIECES and 0 < self.buffer.length < self._pieces * PIECE_BYTES:
+            self._refuse(f"a message in pieces of {PIECE_BYTES} bytes or more is expected")
+        if event.message_finished:
+            self._pieces = self._pings = 0
+
+    def handle_ping(self, event: Any) -> None:
+        self._pings += 1
+        super().handle_ping(event)
+        if self._pings > PINGS:
+            self._refuse(f"at most {PINGS} pings between two messages are expected")
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._unread.clear()
+        super().connection_lost(exc)
+
+    def _read(self) -> None:
+        """Read a part; the next one is read in another turn, when the application has taken the message before."""
+        self._reading = None
+        part = bytes(self._unread[:SLICE])
+        del self._unread[:SLICE]
+        if part and not self.transport.is_closing():
+            super().data_received(part)
+        if self._refused:
+            self._unread.clear()
+        if self.read_paused:
+            return
+        if self._unread:
+            self.transport.pause_reading()
+            self._reading = self.loop.call_soon(self._read)
+        else:
+            self.transport.resume_reading()
+
+    def _refuse(self, reason: str) -> None:
+        """Close with the reason; what its peer still sends is not looked at, so that it can read this."""
+        if not self.close_sent:
+            self.close_sent = self._refused = True
+            self.queue.put_nowait({"type": "websocket.disconnect", "code": MALFORMED, "reason": reason})
+            self.transport.write(self.conn.send(CloseConnection(code=MALFORMED, reason=reason)))
+            self.close_timer = self.loop.call_later(LINGER_S, self.transport.abort)
 
 
 class _Connection(_Bounded, H11Protocol):
