@@ -22,7 +22,7 @@ from optipmb_schemas.errors import invalid, show
 from optipmb_schemas.json_form import EdgeDetections, EdgeObject
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
     from optipmb import Georeference, GroundCamera
@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 
 MOST_FRAMES: Final = 256
 """Frames of an array."""
+
+MOST_SEPARATE: Final = 256
+"""Objects of a frame that says nothing of others: each costs a step of the tracker."""
 
 SECOND: Final = 1_000_000_000
 DIGITS: Final = 20
@@ -89,8 +92,8 @@ class JsonFrame(NamedTuple):
     arrived_ns: int
 
 
-def separate(frame: JsonFrame) -> list[JsonFrame]:
-    """Return a frame for each object of one that says nothing of other objects; one that looks nowhere without any.
+def separate(frame: JsonFrame) -> Iterator[JsonFrame]:
+    """Yield a frame for each object of one that says nothing of other objects; one that looks nowhere without any.
 
     The field of view of each holds the object alone, 2 m to both sides and at least 3 m and three standard deviations
     in range. Stamps are 1 us apart.
@@ -103,8 +106,7 @@ def separate(frame: JsonFrame) -> list[JsonFrame]:
         pose = Pose(message.pose.translation, message.pose.quaternion)
         places = (places - pose.translation) @ pose.rotation
     if not len(places):
-        return [frame._replace(message=message.model_copy(update={"field_of_view": NOWHERE}))]
-    frames = []
+        yield frame._replace(message=message.model_copy(update={"field_of_view": NOWHERE}))
     spread = message.position_covariance
     variances = np.full(len(places), nan) if spread is None else spread[:, 0, 0] + spread[:, 1, 1]
     for at, (place, variance) in enumerate(zip(places.tolist(), variances.tolist(), strict=True)):
@@ -112,8 +114,7 @@ def separate(frame: JsonFrame) -> list[JsonFrame]:
             name: column[at : at + 1] for name in COLUMNS if (column := getattr(message, name)) is not None
         }
         values |= {"field_of_view": _beside(place, variance), "stamp_ns": message.stamp_ns + at * STEP_NS}
-        frames.append(frame._replace(message=message.model_copy(update=values)))
-    return frames
+        yield frame._replace(message=message.model_copy(update=values))
 
 
 def _beside(place: list[float], variance: float) -> schemas.FieldOfView:
@@ -237,6 +238,9 @@ class FrameReader:
         if rules.complete is False and (name := next((one for one in SEPARATE if one in given), "")):
             expected = "none, for each object becomes a frame by `complete` in `inputs`"
             raise schemas.MessageError("invalid_value", name, expected, "one")
+        if rules.complete is False and len(message.label) > MOST_SEPARATE:
+            expected = f"at most {MOST_SEPARATE} objects, each of which becomes a frame by `complete` in `inputs`"
+            raise schemas.MessageError("too_large", "objects", expected, str(len(message.label)))
         if classes := rules.classes:
             names = [classes.get(name, name) for name in message.labels]
             labels = tuple(dict.fromkeys(names))

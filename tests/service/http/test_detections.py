@@ -22,7 +22,7 @@ from optipmb_schemas import MessageError, encode_json
 from optipmb_service.edges import access, inputs
 from optipmb_service.edges.http import detections
 from optipmb_service.edges.inputs import Inputs
-from optipmb_service.edges.json_frames import FrameReader, separate
+from optipmb_service.edges.json_frames import MOST_SEPARATE, FrameReader, separate
 from optipmb_service.settings import InputSettings, Settings, load
 from optipmb_service.telemetry import problem_reporter
 from optipmb_service.zenoh.client import Client
@@ -204,6 +204,18 @@ def test_objects_of_incomplete_frames_are_told_apart() -> None:
         assert [(one["seq"], one["duplicate"]) for one in answers] == [(0, False), (1, False), (0, True)]
         answer = edge.post({"objects": objects * 50}, STREAM)
         assert (answer.status, answer.body["frames"][0]["seq"]) == (HTTPStatus.ACCEPTED, 101)
+
+
+def test_incomplete_frames_have_a_bounded_number_of_objects() -> None:
+    """Each costs a step: more are refused, and reported; of complete frames the limits hold."""
+    rules = {"site/*/lidar": {"complete": False}}
+    with Edge(free_endpoint(), router=True, inputs=rules) as edge, Node(edge.settings.listen[0]) as node:
+        objects = [CAR | {"position": [at, 5]} for at in range(MOST_SEPARATE + 1)]
+        refused = edge.post(stamped(0, objects=objects), STREAM)
+        assert (refused.status, error(refused.body)) == (HTTPStatus.BAD_REQUEST, ("too_large", "objects"))
+        assert str(MOST_SEPARATE) in node.problem(SENSOR.stream, "too_large").expected
+        assert edge.post(stamped(0, objects=objects), "stream=site/node/radar").status == HTTPStatus.ACCEPTED
+        assert edge.post(stamped(0, objects=objects[1:]), STREAM).status == HTTPStatus.ACCEPTED
 
 
 def test_keys_tell_frames_without_stamps(edge: Edge) -> None:
