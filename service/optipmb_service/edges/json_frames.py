@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import time
+from codecs import BOM_UTF8
 from datetime import datetime
 from functools import cache
 from math import atan2, hypot, nan, pi, sqrt
@@ -157,6 +158,7 @@ class FrameReader:
         Raises:
             MessageError: it is none, or has too many.
         """
+        payload = payload.removeprefix(BOM_UTF8)
         if payload.lstrip(b" \t\r\n")[:1] != b"[":
             return [payload], False
         try:
@@ -182,6 +184,7 @@ class FrameReader:
         most = self._limits.max_json_bytes
         if len(payload) > most:
             raise schemas.MessageError("too_large", "", f"at most {most} bytes of JSON", f"{len(payload)} bytes")
+        payload = payload.removeprefix(BOM_UTF8)
         try:
             if mapping is not None:
                 return self._mapped(msgspec.json.decode(payload), stream, mapping)

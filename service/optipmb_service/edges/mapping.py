@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+from codecs import BOM_UTF8
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final
 
@@ -83,7 +84,7 @@ def mapping_of(one: MqttInput) -> PayloadMapping | None:
 def is_of(payload: bytes, only: Mapping[str, bool | int | str]) -> bool:
     """Return whether a payload has these values at their paths; one that is no JSON may be of any input."""
     try:
-        document = msgspec.json.decode(payload) if only else None
+        document = msgspec.json.decode(payload.removeprefix(BOM_UTF8)) if only else None
     except (ValueError, msgspec.DecodeError, RecursionError):
         return True
     return all(_at(document, path) == value for path, value in only.items())

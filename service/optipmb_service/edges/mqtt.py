@@ -226,6 +226,10 @@ class Unsent:
 TAKEN_OVER_S: Final = 30.0
 """Pause after another client of this name has taken the connection."""
 
+MANY: Final = 5
+MANY_S: Final = 60.0
+"""So many connections within so long are those of two clients of one name, where the broker gives no reason."""
+
 
 class Bridge(Component):
     """From the network to the broker. Create and run it on one loop.
@@ -273,6 +277,8 @@ class Bridge(Component):
         self._reader = Reader(self._wish, settings.stale_s)
         self._client = client
         self._feeds = Feeds(client, places_of(settings), Bounds(EVENTS, inf, EVENT_BYTES))
+        self._opened: collections.deque[float] = collections.deque(maxlen=MANY)
+        """Monotonic times of the last connections."""
         self._lost = 0
         self._unsent: list[Unsent] = []
         self._most = 0  # bytes of a packet that the broker takes; 0: it does not say
@@ -324,6 +330,9 @@ class Bridge(Component):
                     if error.code == TAKEN_OVER:  # they would take it from each other again and again
                         why = f"duplicate_name: another client is {self._identifier}, too; {error}"
                         pause_s = TAKEN_OVER_S
+                    elif len(self._opened) == MANY and self._opened[-1] - self._opened[0] <= MANY_S:
+                        likely = f"another client of the name {self._identifier} is likely"
+                        why = f"{error}; {MANY} connections within a minute: {likely}"
                     if why != self._why:
                         log.warning("mqtt_disconnected", broker=self._mqtt.broker, reason=why)
                     self._why = why
@@ -338,6 +347,7 @@ class Bridge(Component):
         broker = urlsplit(self._mqtt.broker)
         self._most = await link.open(broker.hostname or "", broker.port or PORTS[broker.scheme])
         self._largest.clear()
+        self._opened.append(time.monotonic())
         self._note(self._alive, await link.publish(self._alive, b"1", 1, retain=True))
         self.connected, self._why = True, ""
         log.info("mqtt_connected", broker=self._mqtt.broker, protocol=self._version.name, most_bytes=self._most)

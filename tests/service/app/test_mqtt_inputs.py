@@ -17,7 +17,7 @@ from broker import CONNACK, CONNECT, PUBLISH, mosquitto
 from json_senders import damaged, document, exists
 from optipmb_schemas import Detections, Keys, MessageError, decode
 from optipmb_service.edges.json_frames import FrameReader
-from optipmb_service.edges.mapping import PayloadMapping, mapping_of
+from optipmb_service.edges.mapping import PayloadMapping, is_of, mapping_of
 from optipmb_service.settings import MappingSettings, MqttInput, Settings, load
 from optipmb_service.zenoh.client import Client
 from router import Node, Sensor, plain
@@ -207,6 +207,24 @@ async def test_a_message_that_feeds_no_stream_is_a_problem(tmp_path: Path) -> No
             assert bridge.inputs.refused == {("mqtt", "other_sensor"): 0, ("mqtt", "invalid_value"): 2}
     problems = {(one["code"], one["path"]) for one in lines if one["event"] == "problem"}
     assert problems == {("invalid_value", "other"), ("invalid_value", "sensors/no de/det")}
+
+
+async def test_another_bridge_of_the_name_is_named(start: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where the broker says nothing: connections that end again and again are those of two clients of one name."""
+    monkeypatch.setattr(mqtt, "RETRY_S", 0.05)
+    monkeypatch.setattr(mqtt, "TAKEN_OVER", -1)
+    endpoint, inputs = start()[1], {SENSOR.stream: {"topic": "sensor"}}
+    with mosquitto(tmp_path) as address, capture_logs() as lines:
+        async with bridged(endpoint, address, inputs), bridged(endpoint, address, inputs):
+            await until(lambda: any("another client of the name" in one.get("reason", "") for one in lines))
+    ended = [one["reason"] for one in lines if one["event"] == "mqtt_disconnected"]
+    assert "likely" not in ended[0]
+
+
+def test_a_byte_order_mark_hides_no_value() -> None:
+    """By which a payload is that of an input."""
+    payload = b'\xef\xbb\xbf{"camera": "gate"}'
+    assert [is_of(payload, {"camera": name}) for name in ("gate", "yard")] == [True, False]
 
 
 def cut(address: str, topic: str, payload: bytes) -> None:

@@ -441,6 +441,34 @@ def test_a_socket_answers_each_text(edge: Edge) -> None:
             pass
 
 
+def test_a_path_with_a_slash_is_that_without(edge: Edge) -> None:
+    """No redirection, which a sender would not follow with its body."""
+    with asked(edge.address, f"/api/v1/detections/?{STREAM}", "POST") as response:
+        assert response.status == HTTPStatus.UNSUPPORTED_MEDIA_TYPE
+
+
+def test_a_byte_order_mark_is_read(edge: Edge) -> None:
+    """Before a frame or an array, as editors and some languages write it."""
+    for payload in (b'{"objects": []}', b'[{"objects": []}]'):
+        assert edge.post(b"\xef\xbb\xbf" + payload, STREAM).status == HTTPStatus.ACCEPTED
+    with socket(edge.address, STREAM) as connection:
+        connection.send("\ufeff" + '{"objects": []}')
+        assert "seq" in json.loads(connection.recv())
+
+
+def test_a_body_of_two_lengths_is_refused(edge: Edge) -> None:
+    """A proxy in front may go by the other one: the connection ends."""
+    host, _, port = edge.address.rpartition(":")
+    head = f"POST /api/v1/detections?{STREAM} HTTP/1.1\r\nhost: {edge.address}\r\ncontent-type: application/json\r\n"
+    body = b"f\r\n" + b'{"objects": []}' + b"\r\n0\r\n\r\n"
+    with open_connection((host, int(port)), 60) as connection:
+        lengths = f"content-length: {len(body)}\r\ntransfer-encoding: chunked\r\n\r\n"
+        connection.sendall((head + lengths).encode() + body)
+        answer = b"".join(iter(lambda: connection.recv(4096), b""))
+    assert answer.startswith(b"HTTP/1.1 400 ")
+    assert answer.count(b"HTTP/1.1") == 1
+
+
 def test_pages_of_named_origins_may_send(watched: Watched) -> None:
     """A browser asks before it sends: the answer allows POST with a content type and a token."""
     asks = {"origin": "https://map.example", "access-control-request-method": "POST"}

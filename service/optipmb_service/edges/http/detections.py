@@ -113,8 +113,9 @@ class Senders:
         self._inputs: Inputs | None = None
 
     def routes(self) -> list[Route | WebSocketRoute]:
-        path = "/api/v1/detections"
-        return [Route(path, self.post, methods=["POST"]), WebSocketRoute(path, self.socket)]
+        paths = ("/api/v1/detections", "/api/v1/detections/")  # many clients do not follow a redirection of a POST
+        posts = [Route(path, self.post, methods=["POST"]) for path in paths]
+        return [*posts, *(WebSocketRoute(path, self.socket) for path in paths)]
 
     async def post(self, request: Request) -> Response:
         """Hand the frames of a request to the network."""

@@ -61,6 +61,7 @@ PINGS: Final = 1000  # pings of a peer between two of its messages
 LINGER_S: Final = 1.0  # how long a refused peer may take to read why
 PING_S: Final = 20.0  # period of pings, and longest wait for their answers
 
+BAD: Final = 400
 UNAVAILABLE: Final = 503
 FORBIDDEN: Final = 403
 MISDIRECTED: Final = 421
@@ -161,6 +162,9 @@ class _Guarded:
         headers = Headers(scope=scope)
         if self._requests - sum(room.count for room in self._rooms) >= REQUESTS:
             answer = PlainTextResponse(f"{REQUESTS} requests are being answered; ask again", UNAVAILABLE)
+        elif {"content-length", "transfer-encoding"} <= set(headers):  # a proxy in front may go by the other one
+            closes = {"connection": "close"}
+            answer = PlainTextResponse("content-length or transfer-encoding is expected, not both", BAD, closes)
         elif (path not in MONITORING or is_socket) and not self._knows(headers.get("host", "")):
             answer = PlainTextResponse("unknown host; see the setting http_hosts", MISDIRECTED)
         elif (is_socket or scope["method"] == "POST") and not self._welcomes(headers):
