@@ -12,8 +12,13 @@ From the outside in:
     telemetry       metrics, health, problems, logs
 """
 
-from importlib.metadata import version
-
-__version__ = version("optipmb")
-
 __all__ = ["__version__"]
+
+
+def __getattr__(name: str) -> str:
+    """Return the version when it is asked for: reading it takes half of the time before signals have handlers."""
+    if name != "__version__":
+        raise AttributeError(f"module {__name__} has no attribute {name}")
+    from importlib.metadata import version  # noqa: PLC0415 - for the same reason
+
+    return version("optipmb")

@@ -183,6 +183,16 @@ def caught(pid: int) -> bool:
     return bool(mask >> (signal.SIGTERM - 1) & 1)
 
 
+def test_little_is_loaded_before_signals_have_handlers() -> None:
+    """Process 1 of a container gets no signal before: not even the version is read."""
+    code = (
+        "import sys; import optipmb_service.__main__ as one; print(one.__name__, 'importlib.metadata' in sys.modules)"
+    )
+    command = [sys.executable, "-S", "-c", f"import sys; sys.path[:] = {sys.path!r}; {code}"]
+    loaded = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout
+    assert loaded == "optipmb_service.__main__ False\n"
+
+
 @pytest.mark.parametrize("alone", [True, False], ids=["alone", "process 1"])
 @pytest.mark.parametrize("options", [(), ("--workers", "2"), ("mqtt",)], ids=lambda one: " ".join(one) or "run")
 def test_a_signal_before_the_imports_ends_the_process(*, options: tuple[str, ...], alone: bool) -> None:
