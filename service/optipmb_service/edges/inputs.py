@@ -42,7 +42,7 @@ CACHE: Final = 400
 """Detections that a publisher keeps for recovery: 20 s of a sensor at 20 Hz."""
 
 INLINE_BYTES: Final = 64 * 2**10
-"""Larger messages are handed to the network on a thread: each is cut into fragments and may wait for the link."""
+"""Larger frames are read, and handed to the network, on a thread: that takes a while, and may wait for the link."""
 
 WINDOW: Final = 64
 """Frames of a stream that may be without tracks."""

@@ -8,6 +8,7 @@ import json
 import re
 import shutil
 import subprocess
+import threading
 import time
 from collections.abc import Iterator
 from http import HTTPStatus
@@ -414,6 +415,21 @@ def test_latitude_and_heading_become_the_world(tmp_path: Path) -> None:
     np.testing.assert_allclose(message.yaw, [0.3, np.nan], atol=1e-9)
     assert (message.labels, message.label.tolist()) == (("pedestrian",), [0, 0])
     assert message.stamp_ns == 1_795_766_400_000_000_001
+
+
+def test_large_frames_hold_no_loop(edge: Edge, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are read on a thread of their own, small ones at once."""
+    threads: list[str] = []
+    read = FrameReader.read
+
+    def reading(self: FrameReader, *arguments: Any) -> Any:
+        threads.append(threading.current_thread().name)
+        return read(self, *arguments)
+
+    monkeypatch.setattr(FrameReader, "read", reading)
+    for count in (1, 3000):
+        assert edge.post({"objects": [CAR] * count}, STREAM).status == HTTPStatus.ACCEPTED
+    assert [name == "http" for name in threads] == [True, False]
 
 
 def test_a_page_of_a_stranger_cannot_send(edge: Edge) -> None:

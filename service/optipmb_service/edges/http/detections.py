@@ -32,7 +32,7 @@ from optipmb_service.edges.http.api import (
     parameters_of,
     wish_of,
 )
-from optipmb_service.edges.inputs import Inputs, RefusedError
+from optipmb_service.edges.inputs import INLINE_BYTES, Inputs, RefusedError
 from optipmb_service.edges.json_frames import FrameReader
 from optipmb_service.edges.readers import Publication
 from optipmb_service.settings import is_loopback
@@ -275,7 +275,10 @@ class _Sender:
         refused: schemas.MessageError | RefusedError
         name = ""
         try:
-            frame = self.frames.read(payload, self.stream)
+            if len(payload) <= INLINE_BYTES:
+                frame = self.frames.read(payload, self.stream)
+            else:
+                frame = await asyncio.to_thread(self.frames.read, payload, self.stream)
             name = frame.message.stream
             self.caller.may_publish(name)
             found = await self.inputs.send(frame, self.frames.rules(name), repeats, self.traceparent, wait_s)
