@@ -161,8 +161,8 @@ def test_a_map_gets_the_newest_tracks_as_points(session: Session, watched: Watch
         few = get(address, f"{query}&format=geojson&fields=speed")[1]["features"][0]
         assert (len(few["geometry"]["coordinates"]), "speed" in few["properties"]) == (3, True)
         assert "class" not in few["properties"]
-        assert get(address, "tracks?stream=other/*/*&format=geojson")[1]["path"] == "sites"
-        assert get(address, f"{query}&format=kml")[1]["path"] == "format"
+        assert get(address, "tracks?stream=other/*/*&format=geojson")[1]["error"]["path"] == "sites"
+        assert get(address, f"{query}&format=kml")[1]["error"]["path"] == "format"
 
 
 def test_the_newest_frame_is_that_of_the_latest_run(session: Session, address: str) -> None:
@@ -219,10 +219,10 @@ def test_a_bad_parameter_is_refused_with_its_path(address: str, query: str, path
     """The same for every way to read, with the name as it was written; a WebSocket before its handshake."""
     for way in ("tracks", "zones", "stream"):
         status, answer = get(address, f"{way}?{query}")
-        assert (status, answer["path"]) == (http.client.BAD_REQUEST, path)
-        assert answer["error"].startswith(f"{path}: expected ")
+        assert (status, answer["error"]["path"]) == (http.client.BAD_REQUEST, path)
+        assert answer["error"]["message"].startswith(f"{path}: expected ")
     status, body = refused(address, query)
-    assert (status, json.loads(body)["path"]) == (http.client.BAD_REQUEST, path)
+    assert (status, json.loads(body)["error"]["path"]) == (http.client.BAD_REQUEST, path)
 
 
 def test_no_parameter_is_ignored(address: str) -> None:
@@ -238,14 +238,15 @@ def test_no_parameter_is_ignored(address: str) -> None:
         with asked(address, f"/{path}") as response:
             assert (response.status, path) == (http.client.BAD_REQUEST, path)
             assert (
-                json.loads(response.read())["path"] == path.rpartition("&" if "&" in path else "?")[2].partition("=")[0]
+                json.loads(response.read())["error"]["path"]
+                == path.rpartition("&" if "&" in path else "?")[2].partition("=")[0]
             )
 
 
 def test_the_newest_tracks_are_not_predicted(address: str) -> None:
     """Nothing of a fixed rate is kept to be asked for."""
     status, answer = get(address, f"tracks?stream={ALL}&predict=1")
-    assert (status, answer["path"]) == (http.client.BAD_REQUEST, "predict")
+    assert (status, answer["error"]["path"]) == (http.client.BAD_REQUEST, "predict")
 
 
 def test_tokens_decide_who_reads_what(guarded: str, session: Session) -> None:
@@ -630,7 +631,7 @@ def test_too_many_patterns_are_refused_with_the_reason(session: Session, watched
                 assert response.status == OK
         with asked(address, "/api/v1/stream?stream=garage/rig/further") as response:
             assert response.status == http.client.SERVICE_UNAVAILABLE
-            assert "too many new streams" in json.loads(response.read())["error"]
+            assert "too many new streams" in json.loads(response.read())["error"]["message"]
         with asked(address, f"/api/v1/stream?stream=garage/rig/s{BURST - 1}") as response:
             assert response.status == OK
 

@@ -97,6 +97,7 @@ def sent(edge: Edge, body: Any, way: str) -> dict[str, Any]:
 
 def error(body: Any) -> tuple[str, str]:
     (one,) = body["frames"]
+    assert body["error"] == one["error"]
     return one["error"]["code"], one["error"]["path"]
 
 
@@ -326,7 +327,7 @@ def test_damaged_documents_get_a_path(edge: Edge, endpoint: str, way: str) -> No
             else:
                 answer = edge.post(text, query)
                 assert answer.status in {HTTPStatus.ACCEPTED, HTTPStatus.BAD_REQUEST}, (text, answer)
-                answers = answer.body.get("frames", [{"error": answer.body}])
+                answers = answer.body.get("frames", [answer.body])
             assert all(exists(one["error"]["path"], text) for one in answers if "error" in one), (answers, text)
             if number % 20 == 0:
                 assert edge.post(frame(number // 20), STREAM).status == HTTPStatus.ACCEPTED
@@ -512,7 +513,7 @@ def test_tokens_send_their_own_streams(endpoint: str, tmp_path: Path) -> None:
             assert edge.post(both, **tokens[name]).status == HTTPStatus.FORBIDDEN
     with Edge(endpoint, http="0.0.0.0:8080") as edge:
         answer = edge.post(both)
-        assert (answer.status, "set http_tokens" in answer.body["error"]) == (HTTPStatus.FORBIDDEN, True)
+        assert (answer.status, "set http_tokens" in answer.body["error"]["message"]) == (HTTPStatus.FORBIDDEN, True)
 
 
 def test_a_sender_whose_token_is_taken_out_is_closed(
@@ -629,7 +630,7 @@ def test_a_body_has_a_bound_and_a_time(edge: Edge, monkeypatch: pytest.MonkeyPat
 def test_a_parameter_that_is_wrong_is_named(edge: Edge, query: str, path: str) -> None:
     """Before the body is read."""
     answer = edge.post(stamped(0), query)
-    assert (answer.status, answer.body["path"]) == (HTTPStatus.BAD_REQUEST, path)
+    assert (answer.status, answer.body["error"]["path"]) == (HTTPStatus.BAD_REQUEST, path)
 
 
 def test_problems_beyond_the_rate_come_later(monkeypatch: pytest.MonkeyPatch) -> None:

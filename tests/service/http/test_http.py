@@ -30,7 +30,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from router import Node, Sensor, until
 from routers import free_endpoint, open_router
 from service_process import ServiceProcess
-from watched import STREAM, Watched, served
+from watched import STREAM, Watched, asked, served
 from websocket import ABNF, WebSocketException, create_connection
 from wsproto import WSConnection
 
@@ -229,6 +229,30 @@ def test_what_nobody_serves_is_not_found() -> None:
         assert get(address, "/metrics") == (200, "one 1\n")
         assert json.loads(get(address, "/api/v1/asyncapi.json")[1])["asyncapi"] == "3.0.0"
         assert get(address, "/nothing")[0] == 404
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "headers", "status", "code"),
+    [
+        ("GET", "/api/v1/track", {}, 404, "not_found"),
+        ("PUT", "/api/v1/detections", {}, 405, "method_not_allowed"),
+        ("POST", "/api/v1/tracks", {}, 405, "method_not_allowed"),
+        ("GET", "/api/v1/tracks", {}, 400, "missing_field"),
+        ("GET", "/api/v1/streams", {"host": "stranger.example.org"}, 421, "unknown_host"),
+        ("POST", "/api/v1/detections", {"origin": "https://stranger.example"}, 403, "other_origin"),
+        ("POST", "/api/v1/detections", {"content-type": "text/plain"}, 415, "wrong_type"),
+    ],
+)
+def test_what_is_refused_has_one_shape(method: str, path: str, headers: dict[str, str], status: int, code: str) -> None:
+    """A code, a path and a message; where nothing is, the paths and the methods that there are."""
+    with Edge(free_endpoint(), router=True) as edge, asked(edge.address, path, method, **headers) as response:
+        assert response.status == status
+        error = json.loads(response.read())["error"]
+        assert (error["code"], isinstance(error["path"], str), bool(error["message"])) == (code, True, True)
+        if status in {404, 405}:
+            assert error["paths"]["/api/v1/detections"] == ["POST"]
+            assert error["paths"]["/api/v1/tracks"] == ["GET", "HEAD"]
+            assert (response.headers["allow"] is not None) is (status == 405)
 
 
 def test_an_address_in_use_is_one_error() -> None:

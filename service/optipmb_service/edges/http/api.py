@@ -70,31 +70,40 @@ class NoRoomError(Exception):
 
 
 class RequestError(Exception):
-    """A request that cannot be read, with the status of its answer."""
+    """A request that cannot be read, with the status and the code of its answer."""
 
-    def __init__(self, status: HTTPStatus, reason: str) -> None:
+    def __init__(self, status: HTTPStatus, code: str, reason: str) -> None:
         super().__init__(reason)
         self.status = status
+        self.code = code
 
 
-STATUS: Final[dict[type[Exception], HTTPStatus]] = {
-    schemas.MessageError: HTTPStatus.BAD_REQUEST,
-    NoTokenError: HTTPStatus.UNAUTHORIZED,
-    NotAllowedError: HTTPStatus.FORBIDDEN,
-    NoRoomError: HTTPStatus.SERVICE_UNAVAILABLE,
-    TransportError: HTTPStatus.SERVICE_UNAVAILABLE,
-    RequestError: HTTPStatus.BAD_REQUEST,  # or its own
+STATUS: Final[dict[type[Exception], tuple[HTTPStatus, str]]] = {
+    schemas.MessageError: (HTTPStatus.BAD_REQUEST, "invalid_value"),  # or its own code
+    NoTokenError: (HTTPStatus.UNAUTHORIZED, "no_token"),
+    NotAllowedError: (HTTPStatus.FORBIDDEN, "not_allowed"),
+    NoRoomError: (HTTPStatus.SERVICE_UNAVAILABLE, "busy"),
+    TransportError: (HTTPStatus.SERVICE_UNAVAILABLE, "unlinked"),
+    RequestError: (HTTPStatus.BAD_REQUEST, "malformed"),  # or its own
 }
+"""Status and code of the answers to errors."""
+
+
+def refusal(
+    status: int, code: str, message: str, path: str = "", headers: Mapping[str, str] | None = None, **about: object
+) -> JSONResponse:
+    """Return the answer to a request that is refused; it has the same form for all."""
+    body = {"error": {"code": code, "path": path, "message": message} | about}
+    return JSONResponse(body, status, HEADERS | dict(headers or {}))
 
 
 async def refuse(connection: HTTPConnection, error: Exception) -> Response | None:
-    """Answer what cannot be answered otherwise: with the status of the error, its text and its path."""
-    status = next(status for kind, status in STATUS.items() if isinstance(error, kind))
-    body = {"error": str(error), "path": getattr(error, "path", "")}
-    headers = HEADERS | ANSWERS.get(status, {})
+    """Answer what cannot be answered otherwise."""
+    status, code = next(one for kind, one in STATUS.items() if isinstance(error, kind))
+    headers = ANSWERS.get(status, {})
     if isinstance(error, RequestError):  # the rest of its body is not read
-        status, headers = error.status, HEADERS | {"connection": "close"}
-    response = JSONResponse(body, status, headers)
+        status, headers = error.status, {"connection": "close"}
+    response = refusal(status, getattr(error, "code", code), str(error), getattr(error, "path", ""), headers)
     if not isinstance(connection, WebSocket):
         return response
     await connection.send_denial_response(response)

@@ -206,7 +206,9 @@ class Senders:
             RequestError: it is too large, or does not come in time.
         """
         most = self._settings.limits.max_json_bytes
-        too_large = RequestError(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"a body of at most {most} bytes is expected")
+        too_large = RequestError(
+            HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too_large", f"a body of at most {most} bytes is expected"
+        )
         length, body = request.headers.get("content-length", ""), bytearray()
         is_over = length.isdecimal() and (len(length) > LENGTH_DIGITS or int(length) > most)
         if is_over and "expect" in request.headers:  # it asks before it sends
@@ -220,16 +222,17 @@ class Senders:
         except TimeoutError:
             if not is_over:
                 late = f"the body did not come within {BODY_S:g} s"
-                raise RequestError(HTTPStatus.REQUEST_TIMEOUT, late) from None
+                raise RequestError(HTTPStatus.REQUEST_TIMEOUT, "late", late) from None
         except ClientDisconnect:
-            raise RequestError(HTTPStatus.BAD_REQUEST, "the sender has gone") from None
+            raise RequestError(HTTPStatus.BAD_REQUEST, "malformed", "the sender has gone") from None
         if is_over:
             raise too_large
         return bytes(body)
 
     def _answer(self, frames: list[dict[str, Any]], retry_s: float, selection: Selection | None) -> Response:
         """Return the answer about frames, and when refused ones may come again."""
-        refused = [one["error"]["code"] for one in frames if "error" in one]
+        errors = [one["error"] for one in frames if "error" in one]
+        refused = [one["code"] for one in errors]
         body: dict[str, Any] = {"accepted": len(frames) - len(refused), "refused": len(refused), "frames": frames}
         statuses = {STATUS.get(code, HTTPStatus.BAD_REQUEST) for code in refused}
         headers = dict(HEADERS)
@@ -238,6 +241,7 @@ class Senders:
         elif body["accepted"]:
             status = HTTPStatus.MULTI_STATUS
         else:
+            body["error"] = errors[0]
             status = statuses.pop() if len(statuses) == 1 else HTTPStatus.BAD_REQUEST
             if status in {HTTPStatus.TOO_MANY_REQUESTS, HTTPStatus.SERVICE_UNAVAILABLE}:
                 headers["retry-after"] = str(math.ceil(retry_s))
@@ -327,7 +331,7 @@ def _check_type(request: Request) -> None:
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if kind != JSON or "content-encoding" in request.headers:
         expected = f"content-type {JSON} without content-encoding is expected"
-        raise RequestError(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, expected)
+        raise RequestError(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "wrong_type", expected)
 
 
 def _wait(parameters: Mapping[str, str]) -> float:

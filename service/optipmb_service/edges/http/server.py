@@ -19,16 +19,18 @@ from typing import TYPE_CHECKING, Any, Final
 import uvicorn
 from optipmb_client.errors import ClientError
 from optipmb_schemas.asyncapi import document
+from optipmb_schemas.errors import show
 from starlette.applications import Starlette
 from starlette.datastructures import Headers
+from starlette.exceptions import HTTPException
 from starlette.middleware.cors import CORSMiddleware
-from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.responses import JSONResponse, Response
 from starlette.routing import BaseRoute, Route
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.wsproto_impl import WSProtocol
 from wsproto.events import CloseConnection
 
-from optipmb_service.edges.http.api import MALFORMED, STATUS, Api, Readers, parameters_of, refuse
+from optipmb_service.edges.http.api import MALFORMED, STATUS, Api, Readers, parameters_of, refusal, refuse
 from optipmb_service.edges.http.detections import Senders
 from optipmb_service.edges.http.page import page
 from optipmb_service.edges.http.tls import ServerCertificate
@@ -64,6 +66,7 @@ PING_S: Final = 20.0  # period of pings, and longest wait for their answers
 BAD: Final = 400
 UNAVAILABLE: Final = 503
 FORBIDDEN: Final = 403
+NOT_FOUND: Final = 404
 MISDIRECTED: Final = 421
 ANY: Final = "*"
 
@@ -125,7 +128,14 @@ def application(
         *senders.routes(),
         *page(health, readers, settings, places),
     ]
-    refusals: dict[Any, Any] = dict.fromkeys(STATUS, refuse)
+    paths = {route.path: sorted(route.methods or ()) for route in routes if isinstance(route, Route)}
+
+    async def not_there(request: Request, error: HTTPException) -> Response:
+        code = "not_found" if error.status_code == NOT_FOUND else "method_not_allowed"
+        message = f"{request.method} {show(request.url.path)[1:-1]}: {error.detail}; see `paths` for what there is"
+        return refusal(error.status_code, code, message, headers=error.headers, paths=paths)
+
+    refusals: dict[Any, Any] = dict.fromkeys(STATUS, refuse) | {HTTPException: not_there}
     answers: ASGIApp = Starlette(routes=routes, exception_handlers=refusals)
     if settings.http_origins:
         allowed = ["authorization", "content-type", "idempotency-key"]
@@ -161,14 +171,15 @@ class _Guarded:
             return
         headers = Headers(scope=scope)
         if self._requests - sum(room.count for room in self._rooms) >= REQUESTS:
-            answer = PlainTextResponse(f"{REQUESTS} requests are being answered; ask again", UNAVAILABLE)
+            answer = refusal(UNAVAILABLE, "busy", f"{REQUESTS} requests are being answered; ask again")
         elif {"content-length", "transfer-encoding"} <= set(headers):  # a proxy in front may go by the other one
             closes = {"connection": "close"}
-            answer = PlainTextResponse("content-length or transfer-encoding is expected, not both", BAD, closes)
+            reason = "content-length or transfer-encoding is expected, not both"
+            answer = refusal(BAD, "malformed", reason, headers=closes)
         elif (path not in MONITORING or is_socket) and not self._knows(headers.get("host", "")):
-            answer = PlainTextResponse("unknown host; see the setting http_hosts", MISDIRECTED)
+            answer = refusal(MISDIRECTED, "unknown_host", "unknown host; see the setting http_hosts")
         elif (is_socket or scope["method"] == "POST") and not self._welcomes(headers):
-            answer = PlainTextResponse("page of another origin; see the setting http_origins", FORBIDDEN)
+            answer = refusal(FORBIDDEN, "other_origin", "page of another origin; see the setting http_origins")
         self._requests += 1
         try:
             await answer(scope, receive, send)

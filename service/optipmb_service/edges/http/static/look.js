@@ -132,7 +132,7 @@ async function listen() { // by fetch, because EventSource sends no token
   try {
     const answer = await get(`live?stream=${encodeURIComponent(chosen)}`, { signal: mine.signal });
     const refusal = answer.ok ? "" : await answer.text();
-    if (mine === source) why = refusal.startsWith("{") ? JSON.parse(refusal).error : refusal;
+    if (mine === source) why = refusal.startsWith("{") ? JSON.parse(refusal).error.message : refusal;
     dirty = true;
     if (answer.ok) {
       const reader = answer.body.pipeThrough(new TextDecoderStream()).getReader();
