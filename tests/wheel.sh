@@ -38,9 +38,7 @@ for package in (optipmb, optipmb_client, optipmb_schemas, optipmb_service, optip
 for profile in ("kitti", "nuscenes"):
     assert optipmb.load_profile(profile).classes, profile
 PYTHON
-"$work/venv/bin/optipmb" track "$root/examples/crossing.csv" --out "$work/crossing" >"$work/said" 2>&1
-! grep "compil" "$work/said"
-"$work/venv/bin/python" -c 'import optipmb; assert optipmb.warm_up(rejoin=True) == 0'
+"$work/venv/bin/python" -c 'import optipmb; assert optipmb.warm_up(rejoin=True) == 0, "kernels were compiled"'
 "$work/venv/bin/optipmb" --help >/dev/null
 "$work/venv/bin/optipmb" --version
 "$work/venv/bin/optipmb-service" --help >/dev/null

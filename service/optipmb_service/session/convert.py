@@ -8,6 +8,7 @@ be viewed.
 from __future__ import annotations
 
 from functools import lru_cache
+from math import isfinite
 from operator import attrgetter
 from struct import unpack
 from typing import TYPE_CHECKING, Any, Final
@@ -171,14 +172,17 @@ def tracks_of(result: optipmb.StepResult, stream: str, frame_id: FrameId, **fiel
         **fields,
     }
     others: dict[str, Any] = {}
-    if result.measured is not None or result.class_probability is not None:
-        others |= schemas.track_fields(measured=result.measured, class_probability=result.class_probability)
+    sound, pi = optipmb.sound(tracks), result.class_probability
+    if result.measured is not None:
+        others["measured"] = read_only(result.measured.astype(np.int64))
+    if pi is not None:
+        others["class_probability"], sound = read_only(pi.astype(np.float32)), sound and isfinite(pi.sum())
     if (joined := result.joined) is not None:  # ids of tracks and products of probabilities
         probability = joined.probability.astype(np.float32)
         others |= {"object": read_only(joined.object), "object_probability": read_only(probability)}
     if (paths := result.paths) is not None:
         others |= schemas.path_fields(paths.horizons, paths.mean, paths.covariance)
-    if not optipmb.sound(tracks):
+    if not sound:
         columns: dict[str, Any] = dict(tracks.columns()) | {"confirmed": tracks.confirmed.astype(np.int64)}
         schemas.Tracks(**header, **columns, **others)
     return Tracked(tracks, header, others)

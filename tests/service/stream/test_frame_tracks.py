@@ -84,3 +84,11 @@ def test_what_few_sessions_have_is_in_the_bytes(count: int) -> None:
     assert message.class_probability.shape == classes.shape
     assert message.object.tolist() == (one.id // 2).tolist()
     assert message.delivery == schemas.Delivery(**delivery(0))
+
+
+def test_class_probabilities_that_are_no_numbers_are_refused() -> None:
+    """They are the error of their field, in whatever row."""
+    classes = np.full((3, len(PARAMETERS.labels)), 1 / len(PARAMETERS.labels))
+    classes[2, 0] = np.nan
+    with pytest.raises(schemas.MessageError, match="class_probability"):
+        made(sound_tracks(3), None, classes)
