@@ -29,7 +29,7 @@ from optipmb_service.app.worker import warm_up
 from optipmb_service.session import convert
 from optipmb_service.session.checkpoint import encode_checkpoint
 from optipmb_service.session.session import Session
-from optipmb_service.streams import stream as stream_module
+from optipmb_service.streams.outbox import Outbox
 from optipmb_service.streams.profiles import Profiles
 from optipmb_service.streams.stream import Stream
 from optipmb_service.streams.streams import Streams
@@ -112,7 +112,7 @@ def measured(options: argparse.Namespace) -> list[dict[str, float]]:
     parts = Parts()
     timed: tuple[tuple[str, Any, str], ...] = (
         ("handing over", Streams, "receive"),
-        ("decoding", stream_module, "message_of"),
+        ("decoding", Packet, "message"),
         ("session", Session, "on_detections"),
         ("session", Session, "on_points"),
         ("conversion", convert, "frame_of"),
@@ -120,7 +120,7 @@ def measured(options: argparse.Namespace) -> list[dict[str, float]]:
         ("conversion", convert, "tracks_of"),
         ("step", optipmb.Tracker, "step"),
         ("joining", tracker_module, "rejoin_tracks"),
-        ("publishing", Stream, "_send"),
+        ("publishing", Outbox, "_send"),
         ("metrics", Metrics, "received"),
         ("metrics", Metrics, "published"),
         ("metrics", Metrics, "tracks"),

@@ -84,10 +84,11 @@ def streams_of(
     reporter: Any = None,
     tracker: Any = chained,
     traces: Any = None,
+    arm: Any = lambda *_: None,
     **settings: Any,
 ) -> Streams:
     parts: Any = around  # in the place of several
-    streams = Streams(
+    return Streams(
         Settings(instance="test", store="none", step_limit_s=60, **settings),  # kernels may have to be compiled
         profiles or Profiles.read("nuscenes", {}),
         open_publisher=parts.open_publisher,
@@ -97,12 +98,11 @@ def streams_of(
         member=parts,
         checkpoints=parts,
         log=log,
-        arm=lambda *_: None,
+        arm=arm,
         metrics=Metrics(),
         tracker=tracker,
+        traces=traces,
     )
-    streams.traces = traces
-    return streams
 
 
 def packet_of(message: Detections | Points) -> Packet:

@@ -28,7 +28,8 @@ from optipmb_service.streams.intake import Intake
 from optipmb_service.streams.kept_tracks import TrackQuery
 from optipmb_service.streams.persistence import DAY_S, CheckpointWriter
 from optipmb_service.streams.queries import ServiceQueries, StreamQueries, members_of
-from optipmb_service.streams.streams import Scheduler, Streams
+from optipmb_service.streams.scheduler import Scheduler
+from optipmb_service.streams.streams import Streams
 from optipmb_service.telemetry.health import Component
 from optipmb_service.telemetry.metrics import (
     NETWORK_METRICS,
@@ -255,7 +256,7 @@ class Service(Component):
 
     def detections_of(self, stream: str) -> str:
         """Return the pattern of the streams whose detections belong to the tracks of a stream."""
-        return self._streams.fusion.seen_by(stream)
+        return self._streams.parts.fusion.seen_by(stream)
 
     def client(self) -> Client:
         """Return what an edge in this process uses of the network."""

@@ -142,16 +142,15 @@ class Arrivals:
 
     def answer(self, *streams: str) -> None:
         """Note that all has come which the caches of these streams held."""
-        for stream in streams:
-            self._asked.add(stream)
-            self.answered[stream] = None
+        self._asked.update(streams)
+        self.answered |= dict.fromkeys(streams)
         while len(self.answered) > MOST:
             oldest = next(iter(self.answered))
             del self.answered[oldest]
             self._asked.discard(oldest)
 
     def ask_again(self, stream: str) -> None:
-        """Note that the cache of a stream has not answered in full."""
+        """Note that the cache of a stream has not answered in full; for any thread."""
         self._asked.discard(stream)
 
     def to_ask(self, caches: Mapping[str, bool]) -> list[str]:

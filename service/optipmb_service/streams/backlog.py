@@ -21,6 +21,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Final, Literal
 
 import structlog
@@ -122,7 +123,7 @@ class Backlog:
         self.unasked = False
         """Whether the member that is to track the session has yet to ask for the held messages."""
         self.answered: set[str] = set()
-        """Streams whose publishers' caches have been received completely."""
+        """Streams whose publishers' caches have been received completely, with messages that are held still."""
         self.closed = False
         """Whether its stream has ended, or it is forgotten: what arrives needs another one."""
         self.seen_ns = now_ns
@@ -133,12 +134,18 @@ class Backlog:
         self._held: deque[tuple[Packet, bool]] = deque()
         """Packets in order of arrival, each with whether it was received to be tracked here."""
         self._schedule: Callable[[], None] | None = None
+        self._answered: Callable[..., None] = _nowhere
         self._scheduled = self._rung = False
 
-    def attach(self, schedule: Callable[[], None]) -> None:
-        """Let a stream take from the backlog; `schedule` has its turn come."""
+    def attach(self, schedule: Callable[[], None], answered: Callable[..., None]) -> None:
+        """Let a stream take from the backlog.
+
+        Args:
+            schedule: has its turn come.
+            answered: is a command of it, with the streams of which all has been taken that their caches held.
+        """
         with self._lock:
-            self._schedule = schedule
+            self._schedule, self._answered = schedule, answered
             self.closed, self._scheduled, self._rung = False, False, False
             self.shed = Shed()
             self._shed_of: dict[str, int] = {}
@@ -153,7 +160,7 @@ class Backlog:
         with self._lock:
             if self._held:
                 self.state = "foreign"
-            self._schedule = None
+            self._schedule, self._answered = None, _nowhere
             self.closed = self.state != "foreign"
             return self.closed
 
@@ -226,14 +233,14 @@ class Backlog:
         if wakes and self._schedule is not None:
             self._schedule()
 
-    def cache_answered(self, stream: str, then: Command) -> None:
-        """Note that a publisher's cache was received completely; `then` runs after its messages, if they are queued."""
+    def cache_answered(self, stream: str) -> None:
+        """Note that a publisher's cache was received completely: `answered` follows its messages."""
         with self._lock:
             waits = self.state != "live" or bool(self._missed or self._held)
             if waits:
                 self.answered.add(stream)
         if not waits:
-            self.command(then, urgent=False)
+            self.command(partial(self._answered, stream), urgent=False)
 
     # States
 
@@ -339,23 +346,18 @@ class Backlog:
                     packet = self._missed.popleft() if self._missed else self._held.popleft()[0]
                     self._bounds.held.add(-packet.held)
                     return packet
+                if self.answered:
+                    answered, self.answered = self.answered, set()
+                    return partial(self._answered, *answered)
                 if self._clouds:
                     return self._unqueue(self._clouds.popleft())
             item = self._frames.popleft() if self._frames else None
             return self._unqueue(item) if isinstance(item, Packet) else item
 
-    def take_answered(self) -> set[str]:
-        """Take the streams whose caches are complete, once all was taken that came of them."""
-        with self._lock:
-            if self.state != "live" or self._missed or self._held:
-                return set()
-            answered, self.answered = self.answered, set()
-            return answered
-
     @property
     def empty(self) -> bool:
         """Whether nothing can be taken, or soon."""
-        return not (self._frames or self._clouds or self._urgent or self._held or self._missed)
+        return not (self._frames or self._clouds or self._urgent or self._held or self._missed or self.answered)
 
     @property
     def clouds_waiting(self) -> bool:
@@ -398,7 +400,7 @@ class Backlog:
 
     def _ready(self) -> bool:
         if self.state == "live":
-            return bool(self._frames or self._clouds or self._held or self._missed)
+            return bool(self._frames or self._clouds or self._held or self._missed or self.answered)
         return self.state == "foreign" and bool(self._frames)
 
     def _wakes(self) -> bool:
@@ -496,6 +498,10 @@ class Backlog:
             self._shed_of[packet.origin] = self._shed_of.get(packet.origin, 0) + 1
         else:
             self.shed.clouds += 1
+
+
+def _nowhere(*_: str) -> None:
+    """Take the answers of caches while there is no stream."""
 
 
 def _oldest(packets: deque[Packet]) -> Packet:

@@ -84,7 +84,9 @@ class Intake:
         self._inputs = inputs
         self._standby = standby
         self._linger_ns = round(linger_s * SECOND)
-        self._directory = streams.directory
+        self._directory = streams.parts.directory
+        self._fusion = streams.parts.fusion
+        self._keys = streams.parts.keys
         self._subscribed: set[Input] = set()
         self._known: dict[str, bool] = {}
         """The streams whose inputs are in line, each with whether its publisher has a cache."""
@@ -142,7 +144,7 @@ class Intake:
     @property
     def standing_by(self) -> int:
         """Streams that are known here and tracked elsewhere."""
-        session_of = self._streams.fusion.session_of
+        session_of = self._fusion.session_of
         return sum(not self._member.holds(session_of(stream)) for stream in self._directory.streams())
 
     def hand_over(self, sessions: Iterable[str], give: Callable[[Packet], None]) -> None:
@@ -172,10 +174,10 @@ class Intake:
     def _stream(self, key: str) -> str | None:
         """Return the stream of a token's key; None when it is none that may publish."""
         try:
-            stream = self._streams.keys.stream_of(key)
+            stream = self._keys.stream_of(key)
         except schemas.MessageError:
             return None
-        return None if self._streams.fusion.is_session(stream) else stream
+        return None if self._fusion.is_session(stream) else stream
 
     def _published(self, key: str, token: str, present: bool) -> None:  # noqa: FBT001 - as the network calls it
         stream = self._stream(key)
@@ -184,8 +186,8 @@ class Intake:
 
     def _discovered(self, key: str, present: bool) -> None:  # noqa: FBT001 - as the network calls it
         now_ns = time.monotonic_ns()
-        for stream in self._streams.keys.discovered_streams(key):
-            if self._streams.fusion.is_session(stream):
+        for stream in self._keys.discovered_streams(key):
+            if self._fusion.is_session(stream):
                 continue
             if self._directory.discovered(stream, key, now_ns, present=present):
                 self._wake.set()
@@ -198,7 +200,7 @@ class Intake:
             return True  # to be reported
         is_raw = self._directory.noticed(stream, time.monotonic_ns(), recoverable=recoverable)
         if is_raw and stream not in self._known:
-            self._streams.expect(self._streams.fusion.session_of(stream))
+            self._streams.expect(self._fusion.session_of(stream))
             if self._directory.announces(stream):
                 self._wake.set()
         return is_raw
@@ -317,7 +319,7 @@ class Intake:
         self, looked: dict[str, bool], came: set[int], held: set[int], *, everything: bool, strained: bool
     ) -> set[str]:
         """Return the new streams that are to be taken in by a later step."""
-        session_of = self._streams.fusion.session_of
+        session_of = self._fusion.session_of
         new = [
             stream
             for stream, cached in looked.items()
@@ -344,7 +346,7 @@ class Intake:
             return {Input("detections"), Input("points")}
         wanted = {Input("discovery")} if discovering else set()
         for stream, cached in streams.items():
-            own = partition_of(self._streams.fusion.session_of(stream)) in received
+            own = partition_of(self._fusion.session_of(stream)) in received
             if own:
                 wanted.add(Input("points", stream, cached))
             # The discoverer's subscription to all includes streams without a cache.
@@ -354,7 +356,7 @@ class Intake:
 
     def _coming(self, streams: dict[str, bool], came: set[int], held: set[int]) -> list[str]:
         """Return the sessions of which others may have messages: newly held ones, and new streams."""
-        session_of = self._streams.fusion.session_of
+        session_of = self._fusion.session_of
         coming = {session_of(stream) for stream in streams if came and partition_of(session_of(stream)) in came}
         coming |= {
             session

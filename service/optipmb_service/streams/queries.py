@@ -108,9 +108,11 @@ class StreamQueries:
 
     def __init__(self, streams: Streams, tracks: TrackQuery) -> None:
         self._streams = streams
+        self._parts = streams.parts
+        self._instance = streams.parts.settings.instance
         self._tracks = tracks
-        self._keys = streams.keys
-        self._profiles = streams.sessions.profiles
+        self._keys = streams.parts.keys
+        self._profiles = streams.parts.sessions.profiles
         self._digests = ThreadPoolExecutor(1, "digest")
         self._room_for_wildcards = threading.Semaphore(MOST_WILDCARDS)
         self._commands: dict[str, tuple[_Command, bool]] = {
@@ -134,7 +136,7 @@ class StreamQueries:
         except schemas.MessageError as error:
             self._refuse(request, error)
             return
-        session = self._streams.fusion.session_of(stream)
+        session = self._parts.fusion.session_of(stream)
         try:
             if self._streams.elsewhere(session):
                 request.finish()  # another instance tracks the stream, and answers
@@ -146,7 +148,7 @@ class StreamQueries:
             self._refuse(request, error, stream)
 
     def _refuse(self, request: Query, error: Exception, stream: str = "") -> None:
-        guarded(request, partial(_raise, error), instance=self._streams.instance, stream=stream)
+        guarded(request, partial(_raise, error), instance=self._instance, stream=stream)
 
     def _command(self, request: Query, name: str, stream: str, session: str) -> None:
         """Have a stream answer.
@@ -162,7 +164,7 @@ class StreamQueries:
         command, urgent = self._commands[name]
 
         def answer(one: Stream) -> None:
-            guarded(request, lambda: self._run(command, one, request), instance=self._streams.instance, stream=stream)
+            guarded(request, lambda: self._run(command, one, request), instance=self._instance, stream=stream)
 
         # A stream can be set up ahead of its first frame, by a valid request.
         creates = name == "parameters" and self._sets(request)
@@ -188,7 +190,7 @@ class StreamQueries:
             full = RefusedError(
                 "key", f"at most {MOST_WILDCARDS} queries about many streams open at once", "another one"
             )
-            guarded(request, partial(_raise, full), instance=self._streams.instance)
+            guarded(request, partial(_raise, full), instance=self._instance)
             return
 
         def finish() -> None:
@@ -235,16 +237,15 @@ class StreamQueries:
     def _run(self, command: _Command, stream: Stream, request: Query) -> Future[None] | None:
         """Carry out a command; a state is answered by another thread, which makes its digest first."""
         # Where several instances run, the one that tracks the stream answers.
-        state = None if stream.elsewhere else command(stream, request)
+        state = None if self._streams.elsewhere(stream.name) else command(stream, request)
         if state is None:
             return None
         return self._digests.submit(guarded, request, lambda: self._tell(request, state, request.key))
 
     def _state(self, stream: Stream) -> _State:
-        state = stream.state()
-        if state is None or stream.session is None:
+        if (session := stream.session) is None:
             return self._nothing(stream.name, "new"), None
-        return state, stream.session.snapshot()
+        return stream.counts.state(session), session.snapshot()
 
     def _density(self, stream: Stream, request: Query) -> None:
         session = stream.session
@@ -312,7 +313,7 @@ class StreamQueries:
         """
         if not request.payload:
             return empty
-        return schemas.decode(request.payload, type(empty), encoding=request.encoding, limits=self._streams.limits)
+        return schemas.decode(request.payload, type(empty), encoding=request.encoding, limits=self._parts.limits)
 
 
 def _raise(error: Exception) -> None:
@@ -356,8 +357,10 @@ class ServiceQueries:
         workers: int,
     ) -> None:
         self._streams = streams
-        self._keys = streams.keys
-        self._member = streams.member
+        self._parts = streams.parts
+        self._instance = streams.parts.settings.instance
+        self._keys = streams.parts.keys
+        self._member = streams.parts.member
         self._status = status
         self._metrics = metrics
         self._handed_over = hand_over
@@ -368,7 +371,7 @@ class ServiceQueries:
 
     def answer(self, request: Query) -> None:
         """Answer with the status of the service, its metrics, or both when the key has a `*`; or have streams moved."""
-        instance = self._streams.instance
+        instance = self._instance
         orders = {self._keys.move(instance): self._move, self._keys.drain(instance): self._drain}
         if request.key == self._keys.recent():
             self._handovers.submit(guarded, request, lambda: self._hand_over(request))
@@ -381,7 +384,7 @@ class ServiceQueries:
             guarded(request, partial(_raise, many), instance=instance)
 
     def _report(self, request: Query) -> None:
-        instance = self._streams.instance
+        instance = self._instance
         status, metrics = self._keys.status(instance), self._keys.metrics(instance)
         if request.matches(status):
             request.answer(status, self._status())
@@ -390,7 +393,7 @@ class ServiceQueries:
 
     def _hand_over(self, request: Query) -> None:
         """Answer with recent messages of sessions, whose names are lines, to the member that tracks them."""
-        key = self._keys.recent(self._streams.instance)
+        key = self._keys.recent(self._instance)
 
         def give(packet: Packet) -> None:
             about = f"{packet.key}\n{packet.traceparent}" if packet.traceparent else packet.key
@@ -400,27 +403,27 @@ class ServiceQueries:
 
     def _order(self, request: Query, order: Callable[[Query], None]) -> None:
         try:
-            guarded(request, lambda: order(request), instance=self._streams.instance)
+            guarded(request, lambda: order(request), instance=self._instance)
         finally:
             self._moving.release()
 
     def _move(self, request: Query) -> None:
         """Have a stream brought here, and say so."""
-        asked = move_asked(request, self._streams.limits, self._workers)
+        asked = move_asked(request, self._parts.limits, self._workers)
         try:
-            brought = self._member.bring(self._streams.fusion.session_of(asked.stream), MOVE_S)
+            brought = self._member.bring(self._parts.fusion.session_of(asked.stream), MOVE_S)
             received = "" if brought else "none in time"
         except StoreError as error:
             received = str(error)
         if received:
             failed = schemas.MessageError("invalid_value", "worker", "a worker to which the stream comes", received)
-            request.refuse(problem_with(failed, instance=self._streams.instance, stream=asked.stream))
+            request.refuse(problem_with(failed, instance=self._instance, stream=asked.stream))
         else:
             request.answer(request.key, asked)
 
     def _drain(self, request: Query) -> None:
         """Have all streams taken by others, and say so."""
-        asked = drain_asked(request, self._streams.limits)
+        asked = drain_asked(request, self._parts.limits)
         received = "none" if asked.drain and not self._member.others else ""
         if not received:
             self._member.drain(drains=asked.drain)

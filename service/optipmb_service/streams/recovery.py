@@ -1,14 +1,9 @@
-"""Recovery of frames that a session has missed: from the log of messages, and from the caches of publishers.
-
-Their frames go into the backlog before all others. The session drops frames that it has tracked, or has from
-another source. The log is read when a session is opened, and when it is silent: its frames may be there and not arrive,
-as behind a cut between two routers.
-"""
+"""Recovery of frames that a session has missed, from the log of messages."""
 
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import structlog
 
@@ -28,9 +23,6 @@ if TYPE_CHECKING:
     Take = Callable[[list[Packet]], None]
 
 log = structlog.get_logger("optipmb_service")
-
-MOST_PAUSES: Final = 8
-"""Longest pause between two reads that find nothing, in times of the silence before the first one."""
 
 
 class Log:
@@ -120,41 +112,3 @@ def positions_of(checkpoint: Checkpoint) -> dict[str, Position]:
             at = Position(frozenset(), first.epoch, first.seq - 1, tracked=False)
         positions[name or checkpoint.stream] = at
     return positions
-
-
-class LogCheck:
-    """Schedule of the reads of the log for one session whose frames do not arrive.
-
-    The control loop begins a read; the tracking thread, or the thread of the log, ends it.
-
-    Args:
-        silent_ns: silence after which the log is read; pauses double up to `MOST_PAUSES` times as long.
-    """
-
-    def __init__(self, silent_ns: int) -> None:
-        self._silent_ns = self._pause_ns = silent_ns
-        self._next_ns = 0
-        self.under_way = False
-
-    def due_ns(self, age_ns: int, now_ns: int) -> int | None:
-        """Return since when the log is to be read; None: it is not now.
-
-        Args:
-            age_ns: time since the last frame of the sensor that is silent for longest.
-            now_ns: monotonic time.
-        """
-        if age_ns < self._silent_ns:
-            self._pause_ns, self._next_ns = self._silent_ns, 0
-        waits = self.under_way or now_ns < self._next_ns or age_ns < self._silent_ns
-        return None if waits else self._next_ns
-
-    def begin(self, now_ns: int) -> None:
-        self.under_way = True
-        self._next_ns = now_ns + self._pause_ns
-        self._pause_ns = min(2 * self._pause_ns, MOST_PAUSES * self._silent_ns)
-
-    def end(self, *, found: bool) -> None:
-        """End a read; where it found frames, the next one is due at once."""
-        if found:
-            self._pause_ns, self._next_ns = self._silent_ns, 0
-        self.under_way = False

@@ -7,7 +7,6 @@ guards the table of backlogs; nothing slow is done under it.
 from __future__ import annotations
 
 import contextlib
-import queue
 import threading
 import time
 from functools import lru_cache, partial
@@ -15,17 +14,17 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import optipmb_schemas as schemas
-import structlog
 
 import optipmb
 from optipmb_service.cluster.leases import Change, partition_of
 from optipmb_service.session.counts import MessageCounters
-from optipmb_service.session.problems import problem_of
 from optipmb_service.session.values import SECOND
 from optipmb_service.streams.admission import Admission
 from optipmb_service.streams.backlog import MEGABYTE, Backlog, Bounds, ByteBudget
 from optipmb_service.streams.directory import StreamDirectory
+from optipmb_service.streams.parts import Parts
 from optipmb_service.streams.profiles import FUSED, Fusion
+from optipmb_service.streams.rivals import Rivals
 from optipmb_service.streams.session_factory import PARTS, SessionFactory
 from optipmb_service.streams.stream import Stream
 
@@ -39,13 +38,12 @@ if TYPE_CHECKING:
     from optipmb_service.streams.persistence import CheckpointWriter
     from optipmb_service.streams.profiles import Profiles
     from optipmb_service.streams.recovery import Log
+    from optipmb_service.streams.scheduler import Scheduler
     from optipmb_service.streams.traces import Traces
     from optipmb_service.telemetry.metrics import Metrics
     from optipmb_service.telemetry.problem_reporter import ProblemReporter
     from optipmb_service.zenoh.inputs import Packet
     from optipmb_service.zenoh.transport import StreamPublisher
-
-log = structlog.get_logger("optipmb_service")
 
 MAX_UNPROVEN: Final = 256
 """Streams at once that have not sent a valid message yet."""
@@ -119,37 +117,39 @@ class Streams:
         tracker: Callable[[optipmb.Parameters], Any] = optipmb.Tracker,
         traces: Traces | None = None,
     ) -> None:
-        self.open_publisher = open_publisher
-        self.ask_cache = ask_cache
-        self.reporter = reporter
-        self.scheduler = scheduler
-        self.member = member
-        self.checkpoints = checkpoints
-        self.log = log
-        self.arm = arm
-        self.metrics = metrics
-        self.traces = traces
-        self.instance = settings.instance
-        self.keys = schemas.Keys(settings.prefix)
-        self.fusion = Fusion.of(settings)
-        self.directory = StreamDirectory(
-            settings.instance,
-            round(settings.idle_s * SECOND),
-            lambda stream: self.tracked(self.fusion.session_of(stream)),
+        fusion = Fusion.of(settings)
+        self.parts = Parts(
+            settings=settings,
+            keys=schemas.Keys(settings.prefix),
+            limits=settings.limits.limits(),
+            fusion=fusion,
+            sessions=SessionFactory(settings, profiles, fusion, tracker, self._report),
+            admission=Admission(settings, self._used, self._evict_for_another),
+            directory=StreamDirectory(
+                settings.instance,
+                round(settings.idle_s * SECOND),
+                lambda stream: self.tracked(fusion.session_of(stream)),
+            ),
+            member=member,
+            checkpoints=checkpoints,
+            log=log,
+            reporter=reporter,
+            metrics=metrics,
+            traces=traces,
+            open_publisher=open_publisher,
+            ask_cache=ask_cache,
+            submit=scheduler.submit,
+            arm=arm,
+            admit=self.admit,
+            discard=self.discard,
         )
-        self.limits = settings.limits.limits()
-        self.sessions = SessionFactory(settings, profiles, self.fusion, tracker, self._report)
-        self.queue_frames = settings.queue_frames
-        self.step_limit_ns = round(settings.step_limit_s * SECOND)
-        self.silent_ns = round(settings.lease_s * SECOND)
-        self.folder = settings.folder
         self.queued = ByteBudget(settings.memory_mb * MEGABYTE // 2)
         """Bytes that wait in the queues of all streams."""
-        self.admission = Admission(settings, self._used, self._evict_for_another)
-        self._settings = settings
-        self._rivals = Rivals(settings.instance, round(RIVAL_LEASES * settings.lease_s * SECOND))
         self.parsed = lru_cache(MAX_KEYS)(self._parsed)
         """Returns the stream of a key and its session, or raises MessageError."""
+        self._settings = settings
+        self._member = member
+        self._rivals = self._no_rivals()
         self._bounds = Bounds(
             self._lose,
             settings.queue_frames,
@@ -181,24 +181,24 @@ class Streams:
             # Only members that receive the detections of all streams receive it.
             named = ""
             with contextlib.suppress(schemas.MessageError):  # the key of a stream, with the name of a session
-                named = self.keys.stream_of(packet.key)
+                named = self.parts.keys.stream_of(packet.key)
             self._refuse("invalid_value", packet, named, error.expected, error.received)
             return
         topic: Literal["detections", "points"] = "detections" if packet.frame else "points"
-        if not self.member.holds(session):
-            self.metrics.foreign(topic, packet.size)
+        if not self._member.holds(session):
+            self.parts.metrics.foreign(topic, packet.size)
             self._push(session, packet, own=False)
             return
-        self.metrics.received(topic, packet.size)
-        if exceeded := self.admission.exceeded(stream, packet.size, packet.now_ns):
+        self.parts.metrics.received(topic, packet.size)
+        if exceeded := self.parts.admission.exceeded(stream, packet.size, packet.now_ns):
             self._refuse("quota", packet, stream, exceeded, "more")
         else:
             self._push(session, packet, own=True)
 
     def passed_by(self, key: str, size: int) -> None:
         """Count detections that were discovered and are of no use here, unless they come by a subscription as well."""
-        if not self.member.holds(self.parsed(key)[1]):
-            self.metrics.foreign("detections", size)
+        if not self._member.holds(self.parsed(key)[1]):
+            self.parts.metrics.foreign("detections", size)
 
     def cache_answered(self, key: str) -> None:
         """Note that all has come which the cache of a publisher held."""
@@ -206,9 +206,8 @@ class Streams:
             stream, session = self.parsed(key)
         except schemas.MessageError:
             return
-        backlog, one = self._backlogs.get(session), self._streams.get(session)
-        if backlog is not None:
-            backlog.cache_answered(stream, lambda: None if one is None else one.on_caches_answered(stream))
+        if (backlog := self._backlogs.get(session)) is not None:
+            backlog.cache_answered(stream)
 
     def _push(self, session: str, packet: Packet, *, own: bool) -> None:
         while True:
@@ -225,13 +224,13 @@ class Streams:
         with self._lock:
             backlog = self._backlogs.get(session)
             if backlog is None:
-                crowded = self.member.holds(session) and self._crowded()
+                crowded = self._member.holds(session) and self._crowded()
                 if crowded and len(self._newcomers) >= MAX_NEWCOMERS:
                     return None
                 backlog = self._backlog(session, now_ns)
                 if crowded:
                     self._newcomers[session] = None
-                elif self.member.holds(session):
+                elif self._member.holds(session):
                     self._attach(backlog)
                     backlog.go_live()
             return backlog
@@ -267,7 +266,7 @@ class Streams:
                     return self._attach(backlog)
                 backlog = self._backlog(session, time.monotonic_ns())
                 stream = self._attach(backlog)
-                if self.member.holds(session):
+                if self._member.holds(session):
                     backlog.go_live()
             return stream
 
@@ -275,7 +274,7 @@ class Streams:
         """Forget a stream that has ended, but not the counts of its messages."""
         with self._lock:
             if self._streams.get(stream.name) is stream:
-                self._past += stream.totals()
+                self._past += stream.counts.totals()
                 del self._streams[stream.name]
                 self._unproven.discard(stream)
                 if stream.backlog.detach():
@@ -299,7 +298,7 @@ class Streams:
         with self._lock:
             totals, streams = self._past, list(self._streams.values())
         for stream in streams:
-            totals += stream.totals()
+            totals += stream.counts.totals()
         return totals
 
     def tracked(self, session: str) -> bool:
@@ -308,7 +307,7 @@ class Streams:
 
     def elsewhere(self, session: str) -> bool:
         """Whether another instance tracks a session, and answers for it."""
-        return not self.member.holds(session) and self.of(session) is None
+        return not self._member.holds(session) and self.of(session) is None
 
     def occupied(self) -> set[int]:
         """Return the partitions with a stream whose state is not kept yet."""
@@ -328,7 +327,7 @@ class Streams:
 
     def expect(self, session: str) -> None:
         """Keep messages of a session that is new to all members until its own has asked for them."""
-        if session not in self._backlogs and not self.member.holds(session):
+        if session not in self._backlogs and not self._member.holds(session):
             with self._lock:
                 if session not in self._backlogs:
                     self._backlog(session, time.monotonic_ns()).unasked = True
@@ -354,7 +353,7 @@ class Streams:
                 backlog = self._backlog(session, time.monotonic_ns())
             if backlog is None:
                 return
-            if holds := self.member.holds(session):
+            if holds := self._member.holds(session):
                 lost = backlog.bring(packets)
         if lost:
             self._lose(session, lost)
@@ -395,17 +394,18 @@ class Streams:
         if (command := commands.get(change)) is None:
             return
         for stream in [one for one in self._all() if partition_of(one.name) == partition]:
-            if change is not Change.RENEWED and not self.member.holds(stream.name):
+            if change is not Change.RENEWED and not self._member.holds(stream.name):
                 # Before its session ends: later messages are held for the next member.
                 stream.backlog.leave(asked_for=change is Change.RECALLED and stream.session is not None)
             stream.tell(command)
 
     def on_owner(self) -> Callable[[str, str, bool], None]:
         """Forget who tracks what; return what notes, from now on, that an instance does so, or no longer."""
-        self._rivals = Rivals(
-            self.instance, round(RIVAL_LEASES * self._settings.lease_s * SECOND), self._rivals.doubted
-        )
+        self._rivals = self._no_rivals(self._rivals.doubted)
         return self._rivals.on_owner
+
+    def _no_rivals(self, doubted: Iterable[str] = ()) -> Rivals:
+        return Rivals(self._settings.instance, round(RIVAL_LEASES * self._settings.lease_s * SECOND), doubted)
 
     @property
     def doubts_owners(self) -> bool:
@@ -418,7 +418,7 @@ class Streams:
         """Have every session that changed give its state to the checkpoint writer."""
         changed = [stream for stream in self._all() if stream.changed]  # thousands may be silent
         if changed:
-            self.scheduler.submit(partial(self._keep_some, iter(changed)))
+            self.parts.submit(partial(self._keep_some, iter(changed)))
 
     @staticmethod
     def _keep_some(changed: Iterator[Stream]) -> bool:
@@ -431,7 +431,7 @@ class Streams:
     def kept(self, checkpoint: Checkpoint) -> None:
         """Note that a checkpoint is durable."""
         if (stream := self._streams.get(checkpoint.stream)) is not None:
-            stream.durable = checkpoint.base.reached
+            stream.outbox.durable = checkpoint.base.reached
 
     def keep_now(self) -> None:
         """Give all changed states to the checkpoint writer, after the tracking thread has ended."""
@@ -463,11 +463,11 @@ class Streams:
         idle_ns = round(self._settings.idle_s * SECOND)
         streams = [stream for stream in self._all() if stream.session is not None]
         for stream in streams:
-            if self.member.fence(stream.name) is None:
+            if self._member.fence(stream.name) is None:
                 # It began at the very moment in which its partition was left.
                 stream.tell(Stream.on_lost)
             if stream.fused and stream.session and stream.session.arrivals.waiting and stream.backlog.idle:
-                self.command(stream.name, Stream.on_caches_answered, urgent=False)  # or a publisher may be gone
+                self.command(stream.name, Stream.on_answered, urgent=False)  # or a publisher may be gone
             stream.sensors.look_for_silent(now_ns, self._settings.stale_s)
             if now_ns - stream.meter.active_ns > idle_ns and stream.backlog.idle:
                 self.command(stream.name, lambda one: self._close_idle(one, idle_ns), urgent=False)
@@ -481,13 +481,14 @@ class Streams:
 
     def _read_log(self, streams: list[Stream], now_ns: int) -> None:
         """Have the log read for silent sessions, those first that wait longest; a few at a time."""
-        silent = ((one.log_check.due_ns(one.sensors.silent_ns(now_ns), now_ns), one) for one in streams)
-        due = [(since_ns, one) for since_ns, one in silent if since_ns is not None]
-        free = LOG_READS - sum(one.log_check.under_way for one in streams)
-        for _, one in sorted(due, key=lambda one: one[0])[: max(0, free)]:
-            one.log_check.begin(now_ns)
-            if not self.command(one.name, Stream.look_in_log, urgent=False):
-                one.log_check.end(found=False)
+        checks = [(one, one.sources.log_check) for one in streams]
+        silent = ((check.due_ns(one.sensors.silent_ns(now_ns), now_ns), one, check) for one, check in checks)
+        due = [(since_ns, one, check) for since_ns, one, check in silent if since_ns is not None]
+        free = LOG_READS - sum(check.under_way for _, check in checks)
+        for _, one, check in sorted(due, key=lambda one: one[0])[: max(0, free)]:
+            check.begin(now_ns)
+            if not self.command(one.name, lambda one: one.sources.look_in_log(one.session), urgent=False):
+                check.end(found=False)
 
     def _evict(self, streams: list[Stream]) -> None:
         """Close sessions, the least recently used first, while all together keep more than the process may."""
@@ -531,7 +532,7 @@ class Streams:
 
     def admit(self, session: str) -> Incarnation | None:
         """Count a session that begins; return the stream's last incarnation, None when there is no room."""
-        incarnation = self.admission.admit(session)
+        incarnation = self.parts.admission.admit(session)
         if incarnation is not None:
             self._let_in()
         return incarnation
@@ -574,9 +575,7 @@ class Streams:
         self._report(code, stream, expected, received)
 
     def _report(self, code: str, stream: str, expected: str, received: str, count: int = 1, path: str = "key") -> None:
-        texts = {"path": path, "expected": expected, "received": received}
-        problem = problem_of(code, stream=stream, instance=self.instance, subject="Stream", count=count, **texts)
-        self.reporter.report(problem, time.monotonic_ns())
+        self.parts.report(code, stream, expected, received, path=path, count=count)
 
     # The table
 
@@ -585,125 +584,25 @@ class Streams:
             return list(self._streams.values())
 
     def _parsed(self, key: str) -> tuple[str, str]:
-        stream = self.keys.stream_of(key)
-        if self.fusion.is_session(stream):
+        stream, fusion = self.parts.keys.stream_of(key), self.parts.fusion
+        if fusion.is_session(stream):
             part = "sensor" if stream.endswith(f"/{FUSED}") else "node"
             raise schemas.MessageError("invalid_value", "key", f"a {part} not named {FUSED}, as its tracks", key)
-        return stream, self.fusion.session_of(stream)
+        return stream, fusion.session_of(stream)
 
     def _backlog(self, session: str, now_ns: int) -> Backlog:
         backlog = self._backlogs[session] = Backlog(session, self._bounds, now_ns)
         return backlog
 
     def _attach(self, backlog: Backlog) -> Stream:
-        stream = self._streams[backlog.session] = Stream(backlog.session, self, backlog)
+        stream = self._streams[backlog.session] = Stream(self.parts, backlog)
         self._unproven.add(stream)
         return stream
 
     def _crowded(self) -> bool:
         """Whether too many streams have not sent a valid message yet, as far as is known; called with the lock."""
-        most = MAX_UNPROVEN_STRAINED if self.member.strained else MAX_UNPROVEN
+        most = MAX_UNPROVEN_STRAINED if self._member.strained else MAX_UNPROVEN
         if len(self._unproven) >= most:
             known = self._streams.get
             self._unproven = {one for one in self._unproven if not one.occupied and known(one.name) is one}
         return len(self._unproven) >= most
-
-
-class Scheduler:
-    """A thread that does the work that was submitted, first come first served.
-
-    One is enough: most of a frame is under the interpreter's lock. It is a daemon: a step that does not end must not
-    keep the process.
-    """
-
-    def __init__(self) -> None:
-        self._queue: queue.SimpleQueue[Callable[[], bool] | None] = queue.SimpleQueue()
-        self._began_ns: int | None = None
-        self._thread = threading.Thread(target=self._run, name="tracking", daemon=True)
-        self._thread.start()
-
-    def submit(self, work: Callable[[], bool]) -> None:
-        """Have the thread call `work`, which does a bounded piece and returns whether there is more."""
-        self._queue.put(work)
-
-    @property
-    def busy_s(self) -> float:
-        """Seconds that the present piece of work has taken; 0 while the thread waits."""
-        began_ns = self._began_ns
-        return 0.0 if began_ns is None else (time.monotonic_ns() - began_ns) / 1e9
-
-    def close(self, timeout: float) -> bool:
-        """End the thread after the submitted work; False when it did not end in time (s)."""
-        self._queue.put(None)
-        self._thread.join(timeout)
-        return not self._thread.is_alive()
-
-    def _run(self) -> None:
-        while (work := self._queue.get()) is not None:
-            self._began_ns = time.monotonic_ns()
-            try:
-                if work():
-                    self._queue.put(work)
-            except Exception:
-                log.exception("internal_error", thread="tracking")  # one stream must not end the thread of all
-            self._began_ns = None
-
-
-class Rivals:
-    """Streams that several instances track, for they share no store: it is reported, nothing is decided by it.
-
-    Tokens that come and go while a link is cut and heals may be told wrongly. So the own ones are not asked for, and
-    the others are asked for once more before a stream is reported. One member of all looks, the discoverer: what the
-    network takes for a token grows with how many others look at it.
-
-    Args:
-        instance: name of this one.
-        patience_ns: how long two may say so while one takes over from the other, monotonic time.
-        doubted: streams that seemed to have several owners when these were asked for before.
-    """
-
-    def __init__(self, instance: str, patience_ns: int, doubted: Iterable[str] = ()) -> None:
-        self._instance = instance
-        self._patience_ns = patience_ns
-        self._asked_again = frozenset(doubted)
-        self._lock = threading.Lock()
-        self._owners: dict[str, set[str]] = {}
-        self._shared: set[str] = set()
-        """Streams with several owners elsewhere."""
-        self._since_ns: dict[str, int] = {}
-        self.doubted: set[str] = set()
-        """Streams that seem to have had several owners for too long; the owners are to be asked for again."""
-
-    def on_owner(self, stream: str, instance: str, present: bool) -> None:  # noqa: FBT001 - as the network calls it
-        """Note that an instance tracks a stream, or does so no longer."""
-        if instance == self._instance:
-            return
-        with self._lock:
-            owners = self._owners.setdefault(stream, set())
-            (owners.add if present else owners.discard)(instance)
-            (self._shared.add if len(owners) > 1 else self._shared.discard)(stream)
-            if not owners:
-                del self._owners[stream]
-
-    def tracks(self, stream: str) -> bool:
-        """Whether another instance says that it tracks a stream."""
-        return stream in self._owners
-
-    def contested(self, now_ns: int, here: Iterable[str]) -> Iterator[tuple[str, list[str]]]:
-        """Yield the streams that several instances have tracked for longer than is right, and their names.
-
-        Args:
-            now_ns: monotonic time.
-            here: the streams that this instance tracks.
-        """
-        with self._lock:
-            shared = {stream: sorted(self._owners[stream]) for stream in self._shared}
-            for stream in here:
-                if stream in self._owners:
-                    shared[stream] = sorted({self._instance, *self._owners[stream]})
-        self._since_ns = {stream: self._since_ns.get(stream, now_ns) for stream in shared}
-        for stream, since_ns in self._since_ns.items():
-            if now_ns - since_ns > self._patience_ns and stream not in self.doubted:
-                self.doubted.add(stream)
-                if stream in self._asked_again:
-                    yield stream, shared[stream]

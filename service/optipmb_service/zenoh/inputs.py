@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
+import optipmb_schemas as schemas
 import structlog
 from optipmb_client.zenoh.late_join import CacheQueries, LateJoin
 from optipmb_client.zenoh.session import NEWEST
@@ -90,6 +91,20 @@ class Packet:
         self.origin, _, topic = self.key.rpartition("/")
         self.frame = topic == "detections"
         self.held = PACKET_BYTES + (0 if self.payload is None else self.size)
+
+    def message(self, stream: str, limits: schemas.Limits) -> schemas.Detections | schemas.Points:
+        """Return the message, decoded.
+
+        Raises:
+            MessageError: it is none, or not one of this stream.
+        """
+        if self.payload is None:
+            raise schemas.MessageError("too_large", "", f"at most {limits.max_bytes} bytes", f"{self.size} bytes")
+        kind: type[schemas.Detections | schemas.Points] = schemas.Detections if self.frame else schemas.Points
+        message = schemas.decode(self.payload, kind, encoding=self.encoding, limits=limits)
+        if message.stream != stream:
+            raise schemas.MessageError("invalid_value", "stream", repr(stream), repr(message.stream))
+        return message
 
 
 class Topic:

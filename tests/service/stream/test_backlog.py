@@ -30,7 +30,7 @@ def bounds_of(**limits: Any) -> Bounds:
 def live(**limits: Any) -> Backlog:
     """Return a backlog whose stream processes messages as they come."""
     backlog = Backlog("a/b/c", bounds_of(**limits), 0)
-    backlog.attach(lambda: None)
+    backlog.attach(lambda: None, lambda *_: None)
     backlog.go_live()
     return backlog
 
@@ -125,7 +125,7 @@ def test_what_waits_for_a_takeover_is_bounded(arrivals: list[tuple[int, bool, fl
         times = [entry.now_ns for entry in one.recent()]
         assert times == sorted(times)
         assert all(now_s * SECOND - at <= 5 * SECOND + 1 for at in times)
-        one.attach(lambda: None)
+        one.attach(lambda: None, lambda *_: None)
         one.go_live()
         taken(one)
     assert budget.used == 0
@@ -168,7 +168,7 @@ def test_what_others_received_goes_before_what_was_held_here() -> None:
     for number in (1, 2):
         backlog.push(packet(number, size=number))
     backlog.bring([packet(0), packet(1, size=1)])
-    backlog.attach(lambda: None)
+    backlog.attach(lambda: None, lambda *_: None)
     backlog.go_live()
     assert numbers(taken(backlog)) == [0, 1, 2]
 
@@ -194,7 +194,7 @@ def test_every_message_ends_in_one_place(actions: list[str], room: int) -> None:
     """Through all changes of a session, each message to be tracked here is taken, handed over, or counted, once."""
     queued, held, lost = ByteBudget(room * PACKET_BYTES), ByteBudget(room * PACKET_BYTES), Lost()
     backlog = Backlog("a/b/c", bounds_of(lost=lost, frames=4, clouds=2, queued=queued, held=held, keep_ns=0), 0)
-    backlog.attach(lambda: None)
+    backlog.attach(lambda: None, lambda *_: None)
     sent, ended = list[int](), list[int]()
     changes: dict[str, Any] = {
         "foreign": lambda number: backlog.push(packet(1000 + number), own=False),

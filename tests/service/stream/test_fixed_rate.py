@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import optipmb_service.streams.stream as module
 import pytest
 from fusing import FRONT, FUSED, REAR
 from optipmb_schemas import Detections, Problem, Tracks, decode
 from optipmb_service.session.checkpoint import encode_checkpoint
 from optipmb_service.settings import load
+from optipmb_service.streams import outbox, parts, sensor_meters, sources, stream
 from optipmb_service.streams.profiles import Profiles
 from optipmb_service.streams.stream import Stream
 from registries import Around, packet_of, streams_of
@@ -45,8 +45,10 @@ class Process(Around):
         self.problems: list[Problem] = []
         self._armed: list[tuple[int, Callable[[], None]]] = []
         given = {"outputs": {"*/*/*": outputs} if outputs else {}, "recovery_wait_s": 0.0, **settings}
-        self.streams = streams_of(self, tracker=optipmb.Tracker, reporter=self, **given)
-        self.streams.arm = lambda wake, at_ns: self._armed.append((at_ns, wake))
+        self.streams = streams_of(self, tracker=optipmb.Tracker, reporter=self, arm=self._arm, **given)
+
+    def _arm(self, wake: Callable[[], None], at_ns: int) -> None:
+        self._armed.append((at_ns, wake))
 
     def monotonic_ns(self) -> int:
         """Return the monotonic time; it passes by `until` alone."""
@@ -95,7 +97,8 @@ def process(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Process]:
 
     def make(outputs: dict[str, Any], wall_ns: int = 0, **settings: Any) -> Process:
         made = Process(outputs, wall_ns or SENSOR.stamp_ns(0), **settings)
-        monkeypatch.setattr(module, "time", made)
+        for module in (outbox, parts, sensor_meters, sources, stream):
+            monkeypatch.setattr(module, "time", made)
         return made
 
     return make

@@ -112,9 +112,6 @@ def member_of(network: Network, held: set[int]) -> tuple[Intake, Any]:
     streams = SimpleNamespace(
         on_owner=lambda: None,
         doubts_owners=False,
-        instance="m",
-        keys=KEYS,
-        fusion=Fusion(),
         receive=None,
         passed_by=None,
         cache_answered=None,
@@ -128,7 +125,8 @@ def member_of(network: Network, held: set[int]) -> tuple[Intake, Any]:
         take_up=lambda *_: None,
         changed=lambda *_: None,
     )
-    streams.directory = directory.StreamDirectory("m", 3600 * SECOND, streams.tracked)
+    known = directory.StreamDirectory("m", 3600 * SECOND, streams.tracked)
+    streams.parts = SimpleNamespace(keys=KEYS, fusion=Fusion(), directory=known)
     untyped: Any = streams, Holding(held), network
     return Intake(*untyped, standby=False, linger_s=10.0), streams
 
@@ -302,7 +300,7 @@ class Kept:
 
     def tracked(self) -> list[int]:
         self.others.run()
-        return [state.frames for one in self.streams.tracking() if (state := one.state()) is not None]
+        return [one.session.counters.frames for one in self.streams.tracking() if one.session is not None]
 
 
 SENSOR = Sensor(STREAMS[0])
@@ -341,8 +339,8 @@ def test_what_is_put_off_counts_as_received(monkeypatch: pytest.MonkeyPatch) -> 
     """Each message of a stream that waits for room counts as received once, and none as another member's."""
     kept = Kept(monkeypatch)
     counted: Counter[str] = Counter()
-    monkeypatch.setattr(kept.streams.metrics, "received", lambda topic, _: counted.update([f"received {topic}"]))
-    monkeypatch.setattr(kept.streams.metrics, "foreign", lambda topic, _: counted.update([f"foreign {topic}"]))
+    monkeypatch.setattr(kept.streams.parts.metrics, "received", lambda topic, _: counted.update([f"received {topic}"]))
+    monkeypatch.setattr(kept.streams.parts.metrics, "foreign", lambda topic, _: counted.update([f"foreign {topic}"]))
     for number in range(5):
         kept.streams.receive(detections(number))
     kept.crowded(False)

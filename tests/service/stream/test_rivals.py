@@ -1,6 +1,6 @@
 """Streams that several instances track."""
 
-from optipmb_service.streams.streams import Rivals
+from optipmb_service.streams.rivals import Rivals
 
 
 def test_a_stream_with_two_owners_is_contested_after_a_while() -> None:

@@ -8,13 +8,13 @@ from typing import Any
 
 from optipmb_service.session.counts import MessageCounters
 from optipmb_service.session.values import MAX_SENSORS
-from optipmb_service.streams import backlog, stream
+from optipmb_service.streams import backlog, opening, outbox, stream
 from optipmb_service.zenoh.inputs import Packet
 from registries import Around, packet_of, streams_of
 from router import Sensor
 
 SENSOR = Sensor()
-TRACED = {str(Path(module.__file__)) for module in (stream, backlog)}
+TRACED = {str(Path(module.__file__)) for module in (stream, opening, outbox, backlog)}
 
 
 def packet(seq: int) -> Packet:
