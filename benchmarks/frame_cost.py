@@ -29,7 +29,7 @@ from optipmb_service.app.worker import warm_up
 from optipmb_service.session import convert
 from optipmb_service.session.checkpoint import encode_checkpoint
 from optipmb_service.session.session import Session
-from optipmb_service.streams.outbox import Outbox
+from optipmb_service.streams.outbox import StreamOutbox
 from optipmb_service.streams.profiles import Profiles
 from optipmb_service.streams.stream import Stream
 from optipmb_service.streams.streams import Streams
@@ -120,7 +120,7 @@ def measured(options: argparse.Namespace) -> list[dict[str, float]]:
         ("conversion", convert, "tracks_of"),
         ("step", optipmb.Tracker, "step"),
         ("joining", tracker_module, "rejoin_tracks"),
-        ("publishing", Outbox, "_send"),
+        ("publishing", StreamOutbox, "_send"),
         ("metrics", Metrics, "received"),
         ("metrics", Metrics, "published"),
         ("metrics", Metrics, "tracks"),

@@ -14,7 +14,7 @@ from fleet import PROFILE, Fleet, RouterProcess
 from optipmb_schemas import Detections, Points, ServiceStatus, SessionState, encode, encoding_of
 from optipmb_service.cluster.leases import PARTITIONS
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Tracked
+from optipmb_service.session.values import TrackedFrame
 from proxy import Proxy
 from router import Node, Sensor, plain, until
 from service_process import ServiceProcess
@@ -95,7 +95,7 @@ def with_clouds(sensor: Sensor, frames: int) -> dict[int, set[bytes]]:
     for seq in range(frames):
         outputs += session.on_points(sensor.points(seq), 0)
         outputs += session.on_detections(sensor.detections(seq, has_points=True), 0)
-    tracked = [one.tracks for one in outputs if isinstance(one, Tracked)]
+    tracked = [one.tracks for one in outputs if isinstance(one, TrackedFrame)]
     assert all(one.cloud_used for one in tracked)
     return {one.seq: {plain(one)} for one in tracked}
 

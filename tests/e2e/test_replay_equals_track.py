@@ -9,7 +9,7 @@ import pytest
 from commands import result_of, run_here
 from optipmb_schemas import PATHS, Detections, Keys, encode, encoding_of
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Tracked
+from optipmb_service.session.values import TrackedFrame
 from optipmb_tools.datasets import open_dataset
 from optipmb_tools.recordings.files import RecordingWriter
 from optipmb_tools.run.tracking import track_whole
@@ -124,7 +124,7 @@ def test_a_recording_of_a_publisher_of_the_world_frame(
             assert message.frame == "world"
             key = Keys().detections(sensor.stream)
             writer.add(key, encode(message), encoding_of(message), seq)
-            expected += [one.tracks for one in session.on_detections(message, 0) if isinstance(one, Tracked)]
+            expected += [one.tracks for one in session.on_detections(message, 0) if isinstance(one, TrackedFrame)]
     (sequence,) = open_dataset("mcap", path).sequences(["all"])
     found = list(track_whole(parameters, sequence).tracks.values())
     assert len(found) == len(expected) == 30

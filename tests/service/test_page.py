@@ -88,7 +88,7 @@ def test_every_log_event_is_described() -> None:
 def test_every_problem_is_described() -> None:
     """The code and the schemas report the codes of the table."""
     reported = set(get_args(Code))
-    for call in calls_of({"problem_of", "_problem", "of", "jumped", "Finding", "_refuse", "_report", "report"}):
+    for call in calls_of({"problem_of", "_problem", "of", "jumped", "CheckFinding", "_refuse", "_report", "report"}):
         code = call.args[0] if call.args else None
         reported |= texts(code) if isinstance(code, ast.Constant) else set()
         reported |= {text for keyword in call.keywords if keyword.arg == "code" for text in texts(keyword.value)}

@@ -12,14 +12,14 @@ import numpy as np
 from optipmb_schemas import Detections, Events, Points, Problem, Tracks, encode
 from optipmb_service.session.checkpoint import digest_of
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Begun, Output, Policy, Quarantined, Tracked, events_of
+from optipmb_service.session.values import Begun, Output, Policy, Quarantined, TrackedFrame, events_of
 from router import Sensor
 
 import optipmb
 
 
 def tracks(outputs: Iterable[Output]) -> list[Tracks]:
-    return [output.tracks for output in outputs if isinstance(output, Tracked)]
+    return [output.tracks for output in outputs if isinstance(output, TrackedFrame)]
 
 
 def problems(outputs: Iterable[Output]) -> list[Problem]:
@@ -75,7 +75,7 @@ def undisturbed(
     outputs: list[Output] = []
     for one in messages:
         outputs += session.on_detections(one, 0) if isinstance(one, Detections) else session.on_points(one, 0)
-    tracked = [one for one in outputs if isinstance(one, Tracked)]
+    tracked = [one for one in outputs if isinstance(one, TrackedFrame)]
     events = [bare_events(events_of(one.header, one.events, None)) for one in tracked if one.events]
     return [plain(one) for one in tracks(outputs)], digest_of(session.snapshot()), events
 

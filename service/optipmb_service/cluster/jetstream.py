@@ -14,7 +14,7 @@ import re
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from optipmb_service.cluster.nats_connection import NatsConnection, RefusedError, text_of, token
+from optipmb_service.cluster.nats_connection import NatsConnection, NatsRefusedError, text_of, token
 from optipmb_service.cluster.store import KEPT, Record
 
 if TYPE_CHECKING:
@@ -158,7 +158,7 @@ class JetStream:
         await self._ready()
         try:
             answer = await self._connection.ask(f"STREAM.MSG.GET.{self._name}", which)
-        except RefusedError as refused:
+        except NatsRefusedError as refused:
             if refused.code == NOTHING_THERE:
                 return None
             raise
@@ -188,7 +188,7 @@ class JetStream:
             if code == NOT_THE_NEWEST:
                 return None
             if code != UNDECIDED:
-                raise RefusedError(error)
+                raise NatsRefusedError(error)
             await asyncio.sleep(AGAIN_S)  # the caller sets the bound
 
     async def _save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:

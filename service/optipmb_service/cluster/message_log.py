@@ -23,14 +23,14 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 import structlog
 from nats.errors import Error as NatsError
 
-from optipmb_service.cluster.nats_connection import ERRORS, NO_STREAM, NatsConnection, RefusedError, text_of, token
+from optipmb_service.cluster.nats_connection import ERRORS, NO_STREAM, NatsConnection, NatsRefusedError, text_of, token
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping, Sequence
 
     from nats.aio.msg import Msg
 
-    from optipmb_service.cluster.store import Missed, Position
+    from optipmb_service.cluster.store import LogQuery, Position
 
 
 log = structlog.get_logger("optipmb_service")
@@ -157,7 +157,7 @@ class MessageLog:
 
         Raises:
             NatsError: the servers cannot be reached, or do not answer.
-            RefusedError: they do not want to.
+            NatsRefusedError: they do not want to.
         """
         name = self._names[topic]
         if name in self._there:
@@ -179,7 +179,7 @@ class MessageLog:
         Raises:
             NotKeptError: the log will never take it.
             NatsError: the servers cannot be reached, or do not answer.
-            RefusedError: they do not take it now.
+            NatsRefusedError: they do not take it now.
         """
         subject, headers = self._subject(message.topic, message.stream), message.headers
         # The server closes the connection over a message that is too large with its headers; the client counts without.
@@ -193,7 +193,7 @@ class MessageLog:
                 break
             await asyncio.sleep(AGAIN_S)
         if "error" in answer:
-            refused = RefusedError(answer["error"])
+            refused = NatsRefusedError(answer["error"])
             raise NotKeptError(str(refused)) if refused.code == TOO_LARGE else refused
         return not answer.get("duplicate", False)
 
@@ -242,7 +242,7 @@ class MessageLog:
         request = {"subjects_filter": head + any_of * ".*"}
         try:
             state = (await self.connection.ask(f"STREAM.INFO.{name}", request))["state"]
-        except RefusedError as refused:
+        except NatsRefusedError as refused:
             if refused.code == NO_STREAM:
                 return []
             raise
@@ -265,7 +265,7 @@ class MessageLog:
             return []
         try:
             messages = await self.connection.read(self._names[topic], request)
-        except RefusedError:  # the log does not exist yet
+        except NatsRefusedError:  # the log does not exist yet
             self._missing_until[topic] = time.monotonic() + MISSING_S
             return []
         return [_found(topic, one) for one in messages]
@@ -326,7 +326,7 @@ class LogReader:
         self._turns = asyncio.Semaphore(READ_AT_ONCE)
 
     def missed(
-        self, wanted: Missed, take: Callable[[list[LogMessage]], None], again_s: Sequence[float] = LOOK_AGAIN_S
+        self, wanted: LogQuery, take: Callable[[list[LogMessage]], None], again_s: Sequence[float] = LOOK_AGAIN_S
     ) -> None:
         """Read what a session has missed, without waiting for it.
 
@@ -355,7 +355,9 @@ class LogReader:
     def close(self, timeout: float) -> None:
         self._log.connection.close(timeout)
 
-    async def _missed(self, wanted: Missed, take: Callable[[list[LogMessage]], None], again_s: Sequence[float]) -> None:
+    async def _missed(
+        self, wanted: LogQuery, take: Callable[[list[LogMessage]], None], again_s: Sequence[float]
+    ) -> None:
         following: dict[str, int | None] = {}
         for number, pause_s in enumerate((0.0, *again_s)):
             await asyncio.sleep(pause_s)

@@ -50,7 +50,7 @@ _SEED: Final = re.compile(r"-+BEGIN USER NKEY SEED-+\s+(\S+)\s+-+END")
 _SEED_BYTES: Final = 36  # of a user's seed: a prefix of two, the seed, a checksum
 
 
-class RefusedError(Exception):
+class NatsRefusedError(Exception):
     """The server's answer to a request that it did not carry out.
 
     Attributes:
@@ -62,7 +62,7 @@ class RefusedError(Exception):
         self.code = error.get("err_code")
 
 
-ERRORS: Final = (NatsError, RefusedError, TimeoutError, OSError)  # failures of a request to the servers
+ERRORS: Final = (NatsError, NatsRefusedError, TimeoutError, OSError)  # failures of a request to the servers
 
 
 class SecuredClient(Client):
@@ -202,7 +202,7 @@ class NatsConnection:
         }
         try:
             await self.ask(f"STREAM.CREATE.{name}", {**config, **bounds})
-        except RefusedError as refused:
+        except NatsRefusedError as refused:
             if refused.code != EXISTS:  # somebody who runs the servers may have changed it
                 raise
 
@@ -210,11 +210,11 @@ class NatsConnection:
         """Send a request to JetStream, and return the answer.
 
         Raises:
-            RefusedError: it says no.
+            NatsRefusedError: it says no.
         """
         answer = await self.request(f"$JS.API.{what}", json.dumps(request).encode())
         if "error" in answer:
-            raise RefusedError(answer["error"])
+            raise NatsRefusedError(answer["error"])
         return answer
 
     async def request(self, subject: str, data: bytes, headers: dict[str, str] | None = None) -> dict[str, Any]:
@@ -227,7 +227,7 @@ class NatsConnection:
         """Return the messages of a JetStream stream that a request names, from the server that is nearest.
 
         Raises:
-            RefusedError: there is no such stream, or none that answers now.
+            NatsRefusedError: there is no such stream, or none that answers now.
         """
         client = self.client()
         inbox = client.new_inbox()
@@ -241,7 +241,7 @@ class NatsConnection:
                 if status in ENDS:
                     break
                 if status == NOBODY:
-                    raise RefusedError({"err_code": NO_STREAM, "description": f"nobody answers for {name}"})
+                    raise NatsRefusedError({"err_code": NO_STREAM, "description": f"nobody answers for {name}"})
                 if status is not None:
                     raise NatsError(f"status {status}")
                 messages.append(message)

@@ -114,7 +114,7 @@ class Position:
 
 
 @dataclass(frozen=True)
-class Missed:
+class LogQuery:
     """Part of the log that a session needs.
 
     Attributes:

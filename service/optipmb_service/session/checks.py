@@ -43,7 +43,7 @@ SCORED_EVERY: Final = 8
 """Frames of which one is looked at for that: in each it would take a tenth of the session's time."""
 
 
-class Finding(NamedTuple):
+class CheckFinding(NamedTuple):
     """Doubt about a frame; the fields of its problem."""
 
     code: str
@@ -64,7 +64,7 @@ class SensorChecks:
 
     def add(
         self, message: schemas.Detections, frame: optipmb.Frame, arrived_ns: int, policy: Policy, *, estimated: bool
-    ) -> list[Finding]:
+    ) -> list[CheckFinding]:
         """Return problems of a frame that arrived (monotonic).
 
         Args:
@@ -76,17 +76,17 @@ class SensorChecks:
         """
         findings = []
         if found := self._stamps.add(message.stamp_ns, arrived_ns):
-            findings.append(Finding("clock", "stamp_ns", "stamps in nanoseconds that advance with time", found))
+            findings.append(CheckFinding("clock", "stamp_ns", "stamps in nanoseconds that advance with time", found))
         if policy.jumps == "report" and (found := self._poses.add(message, policy)):
             expected = "a pose where the motion of the sensor leads, or a `relocation`"
-            findings.append(Finding("world_jump", "pose", expected, found))
+            findings.append(CheckFinding("world_jump", "pose", expected, found))
         if policy.needs_view and message.field_of_view is None and not self._is_blind:
             self._is_blind = True
-            findings.append(Finding("no_view", "field_of_view", "where the sensor sees", "nothing"))
+            findings.append(CheckFinding("no_view", "field_of_view", "where the sensor sees", "nothing"))
         if message.size is not None and self._sizes.add(frame):
-            findings.append(Finding("size", "size", SIZES, self._sizes.contradiction))
+            findings.append(CheckFinding("size", "size", SIZES, self._sizes.contradiction))
         if message.velocity is not None and self._velocities.add(frame, estimated=estimated):
-            findings.append(Finding("velocity", "velocity", EXPECTED, self._velocities.contradiction))
+            findings.append(CheckFinding("velocity", "velocity", EXPECTED, self._velocities.contradiction))
         return findings
 
 
@@ -102,7 +102,7 @@ class ScoreChecks:
         self._checks: dict[str, ScoreCheck] = {}
         """By sensor; the check of the profile has an empty name."""
 
-    def add(self, frame_id: FrameId, frame: optipmb.Frame, parameters: optipmb.Parameters) -> list[Finding]:
+    def add(self, frame_id: FrameId, frame: optipmb.Frame, parameters: optipmb.Parameters) -> list[CheckFinding]:
         """Return the classes that lose most of their detections, looking at one frame of some.
 
         Args:
@@ -133,7 +133,7 @@ class ScoreCheck:
         self._given = np.zeros(len(self._filters), np.int64)
         self._removed = np.zeros(len(self._filters), np.int64)
 
-    def add(self, frame: optipmb.Frame) -> list[Finding]:
+    def add(self, frame: optipmb.Frame) -> list[CheckFinding]:
         """Count the detections below the filter; return each class that loses most of them, once."""
         filters, size = self._filters, len(self._filters)
         self._given += np.bincount(frame.label, minlength=size)
@@ -146,7 +146,7 @@ class ScoreCheck:
             label = self._parameters.labels[index]
             received = f"{self._removed[index]} of {self._given[index]} below {filters[index]:g}"
             expected = f"most scores of {label} above the filter of the profile {self._parameters.name}"
-            findings.append(Finding("score_filter", f"{label}.score", expected, received))
+            findings.append(CheckFinding("score_filter", f"{label}.score", expected, received))
             filters[index] = 0.0  # reported
         return findings
 

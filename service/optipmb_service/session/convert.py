@@ -20,7 +20,7 @@ import optipmb
 from optipmb.frame import Embedding, frame_of_checked
 from optipmb.rows import read_only
 from optipmb.table import ClassTable
-from optipmb_service.session.values import Tracked
+from optipmb_service.session.values import TrackedFrame
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -147,7 +147,7 @@ def density_of(
     )
 
 
-def tracks_of(result: optipmb.StepResult, stream: str, frame_id: FrameId, **fields: Any) -> Tracked:
+def tracks_of(result: optipmb.StepResult, stream: str, frame_id: FrameId, **fields: Any) -> TrackedFrame:
     """Return the tracks of a frame, with paths and classes if there are any.
 
     What the tracker made of checked detections needs one look, not the checks of a message from elsewhere; where that
@@ -185,4 +185,4 @@ def tracks_of(result: optipmb.StepResult, stream: str, frame_id: FrameId, **fiel
     if not sound:
         columns: dict[str, Any] = dict(tracks.columns()) | {"confirmed": tracks.confirmed.astype(np.int64)}
         schemas.Tracks(**header, **columns, **others)
-    return Tracked(tracks, header, others)
+    return TrackedFrame(tracks, header, others)

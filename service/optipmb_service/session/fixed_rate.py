@@ -11,7 +11,7 @@ from optipmb_schemas import PATHS
 from optipmb.hindsight import with_hindsight
 from optipmb.paths import tracks_ahead
 from optipmb.table import ClassTable
-from optipmb_service.session.values import SECOND, Begun, Tracked
+from optipmb_service.session.values import SECOND, Begun, TrackedFrame
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -27,7 +27,7 @@ MOST_FRAMES: Final = 200
 """Frames held for a delay; beyond them the delay is shorter."""
 
 
-def _stamp_of(tracked: Tracked) -> int:
+def _stamp_of(tracked: TrackedFrame) -> int:
     stamp_ns: int = tracked.header["stamp_ns"]
     return stamp_ns
 
@@ -43,7 +43,7 @@ class FixedRate:
         self._period_ns = round(SECOND / settings.rate_hz)
         self._delay_ns, self._longest_ns = round(settings.delay_s * SECOND), round(settings.longest_s * SECOND)
         self._by_arrival, self._show = settings.clock == "arrival", settings.show
-        self._frames: list[Tracked] = []
+        self._frames: list[TrackedFrame] = []
         """By stamp: the newest frames, up to the one before the delay."""
         self._arrived_ns = 0
         """Monotonic arrival of the newest stamp."""
@@ -61,7 +61,7 @@ class FixedRate:
         for one in outputs:
             if isinstance(one, Begun):
                 frames.clear()
-            elif isinstance(one, Tracked):  # corrected ones come up to the newest
+            elif isinstance(one, TrackedFrame):  # corrected ones come up to the newest
                 place = bisect_left(frames, _stamp_of(one), key=_stamp_of)
                 same = place < len(frames) and _stamp_of(frames[place]) == _stamp_of(one)
                 frames[place : place + same] = [one]
@@ -86,7 +86,7 @@ class FixedRate:
         side = "behind" if behind_ns > 0 else "ahead"
         return f"{abs(behind_ns) / SECOND:.3f} s {side}" if self._wrong and not known else ""
 
-    def due(self, now_ns: int, wall_ns: int, parameters: optipmb.Parameters) -> Tracked | None:
+    def due(self, now_ns: int, wall_ns: int, parameters: optipmb.Parameters) -> TrackedFrame | None:
         """Return the tracks that are due, if any.
 
         Args:

@@ -87,7 +87,7 @@ class SensorQueue:
 
     Args:
         policy: how long frames wait; may be replaced.
-        timeline: of the past.
+        timeline: places of the frames that have been processed.
     """
 
     def __init__(self, policy: Policy, timeline: Timeline) -> None:

@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from optipmb_service.session.state import Inputs
     from optipmb_service.session.timeline import Decision, Timeline
     from optipmb_service.session.transition import Outcome
-    from optipmb_service.session.values import Reached, Reason, Tracked
+    from optipmb_service.session.values import Reached, Reason, TrackedFrame
 
     Condition = Literal["new", "running", "recovering", "quarantined", "closed"]
 
@@ -337,7 +337,7 @@ class Session:
         self.arrivals.end()
         return self._advance(now_ns)
 
-    def again(self) -> list[Tracked]:
+    def again(self) -> list[TrackedFrame]:
         """Return the tracks of the window once more, as of this run."""
         tracked = [one.tracks for one in self._window.again() if one.tracks is not None]
         for one in tracked:

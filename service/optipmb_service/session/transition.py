@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
     from optipmb.zones import Event
     from optipmb_service.session.state import Inputs, Position, ProcessedFrame
-    from optipmb_service.session.values import Policy, Reason, Tracked
+    from optipmb_service.session.values import Policy, Reason, TrackedFrame
     from optipmb_service.session.worlds import Relocated
 
 GIVE_UP_NS: Final = SECOND
@@ -69,7 +69,7 @@ class Outcome:
     """
 
     frame: ProcessedFrame
-    tracks: Tracked | None = None
+    tracks: TrackedFrame | None = None
     begun: Begun | None = None
     unknown: dict[str, int] | None = None
     effort: optipmb.EffortError | None = None

@@ -156,7 +156,7 @@ class Incarnation:
 
 
 @dataclass(slots=True)
-class Tracked:
+class TrackedFrame:
     """Tracks of a frame.
 
     The message is built when somebody reads it. The bytes to publish are put together without it: the columns of the
@@ -266,7 +266,7 @@ class Quarantined:
     dump: bytes
 
 
-Output = Tracked | schemas.Problem | Begun | Quarantined
+Output = TrackedFrame | schemas.Problem | Begun | Quarantined
 
 
 class RefusedError(ValueError):

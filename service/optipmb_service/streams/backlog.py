@@ -13,7 +13,7 @@ arriving ones are held, too.
 
 A stream takes packets that the session has missed first (`recover`), then the held ones, then queued ones. A change of
 the state moves all waiting messages; none is copied between waiting places. A dropped message that was to be tracked
-here is counted: `shed` of the queues, `Bounds.lost` of held ones.
+here is counted: `shed` of the queues, `BacklogBounds.lost` of held ones.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class ByteBudget:
 
 
 @dataclass(frozen=True)
-class Bounds:
+class BacklogBounds:
     """Limits that all backlogs of a process share.
 
     Attributes:
@@ -102,7 +102,7 @@ class Shed:
 
 
 @dataclass(slots=True)
-class _Sender:
+class _Queued:
     frames: int = 0
     clouds: int = 0
     bytes: int = 0
@@ -117,7 +117,7 @@ class Backlog:
         now_ns: monotonic time.
     """
 
-    def __init__(self, session: str, bounds: Bounds, now_ns: int) -> None:
+    def __init__(self, session: str, bounds: BacklogBounds, now_ns: int) -> None:
         self.session = session
         self.state: Literal["foreign", "opening", "live"] = "foreign"
         self.unasked = False
@@ -153,7 +153,7 @@ class Backlog:
             self._clouds: deque[Packet] = deque()
             self._frames: deque[Packet | Command] = deque()
             self._urgent: deque[Command] = deque()
-            self._senders: dict[str, _Sender] = {}
+            self._senders: dict[str, _Queued] = {}
 
     def detach(self) -> bool:
         """End with a stream that has nothing left to do; False: messages are held for another member."""
@@ -436,7 +436,7 @@ class Backlog:
     def _queue(self, packet: Packet) -> None:
         """Queue a packet; the oldest of its sender make room for it."""
         origin, held, bounds = packet.origin, packet.held, self._bounds
-        sender = self._senders.get(origin) or _Sender()
+        sender = self._senders.get(origin) or _Queued()
         if packet.frame and sender.frames >= bounds.frames:
             self._shed_frame(origin)
         elif not packet.frame and sender.clouds >= bounds.clouds:

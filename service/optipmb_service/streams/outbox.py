@@ -1,4 +1,4 @@
-"""Outbox: the outputs of one stream's sessions on their way to the network, the log and the reporter of problems."""
+"""Outbox of one stream: outputs of its sessions on their way to the network, the log and the reporter of problems."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_client.trace_context import attachment_of
 
 from optipmb_service.session.counts import MAX_COUNT
-from optipmb_service.session.values import SECOND, Begun, Quarantined, Tracked
+from optipmb_service.session.values import SECOND, Begun, Quarantined, TrackedFrame
 from optipmb_service.settings import FARTHEST
 from optipmb_service.streams.persistence import save_dump
 
@@ -41,7 +41,7 @@ class Ticket(NamedTuple):
     trace: FrameTrace | None = None
 
 
-class Outbox:
+class StreamOutbox:
     """Tracks and events of one stream: published at once, or as soon as the write lease holds again.
 
     Args:
@@ -63,7 +63,7 @@ class Outbox:
         self._traces = parts.traces
         self._publisher: StreamPublisher | None = None
         self._fixed_rate: FixedRate | None = None
-        self._unpublished: list[tuple[bytes, bytes | None, Tracked, int, Context | None]] = []
+        self._unpublished: list[tuple[bytes, bytes | None, TrackedFrame, int, Context | None]] = []
         """Encoded tracks and events that wait for the write lease, each with the time that its frame waited, ns."""
         self._ids = b""
         """Ids of the newest tracks, as the bytes of int64."""
@@ -96,7 +96,7 @@ class Outbox:
     def deliver(self, outputs: Sequence[Output], session: Session | None) -> None:
         """Publish, log and report outputs of a session."""
         for output in outputs:
-            if isinstance(output, Tracked):
+            if isinstance(output, TrackedFrame):
                 self._check_place(output)
                 self._send(output)
             elif isinstance(output, Begun):
@@ -160,7 +160,7 @@ class Outbox:
                 log.warning("publish_failed", stream=self._stream, error=str(error))
         return fixed_rate.due_ns
 
-    def _send(self, tracked: Tracked, *, again: bool = False) -> None:
+    def _send(self, tracked: TrackedFrame, *, again: bool = False) -> None:
         """Publish tracks and events of a frame, `again` events alone, now or when the write lease holds again."""
         ticket: Ticket = tracked.ticket
         passed_ns = time.monotonic_ns() - ticket.now_ns
@@ -173,7 +173,7 @@ class Outbox:
         self._unpublished.append((b"" if again else tracked.encoded(delivery), events, tracked, waited_ns, span))
         self.publish()
 
-    def _delivery(self, tracked: Tracked, waited_ns: int) -> dict[str, Any]:
+    def _delivery(self, tracked: TrackedFrame, waited_ns: int) -> dict[str, Any]:
         return {
             "instance": self._parts.settings.instance,
             "received_ns": tracked.ticket.wall_ns,
@@ -214,7 +214,7 @@ class Outbox:
                     path = f"zones.{zone.name}.classes"
                     self._parts.report("unknown_class", self._stream, expected, repr(label), path=path)
 
-    def _check_place(self, tracked: Tracked) -> None:
+    def _check_place(self, tracked: TrackedFrame) -> None:
         """Report, once, tracks that are far from the place of the site: as of coordinates of a grid, such as UTM."""
         if self._is_far or not self._policy.has_place:
             return

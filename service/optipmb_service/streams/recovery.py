@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import structlog
 
-from optipmb_service.cluster.store import Missed, Position
+from optipmb_service.cluster.store import LogQuery, Position
 from optipmb_service.session.timeline import number_of
 from optipmb_service.zenoh.inputs import Packet
 
@@ -50,7 +50,7 @@ class Log:
             return
         takes = iter((first,))
         try:
-            wanted = Missed(
+            wanted = LogQuery(
                 streams=() if fused else (session,),
                 common=self._fusion.feeds(session) if fused else "",
                 belongs=lambda stream: self._fusion.session_of(stream) == session,
@@ -64,7 +64,7 @@ class Log:
     def look(self, checkpoint: Checkpoint, then: Take) -> None:
         """Call `then` soon, once, with the frames after the newest ones of a checkpoint."""
         positions = newest_of(checkpoint)
-        wanted = Missed(tuple(positions), common="", belongs=lambda _: False, positions=positions)
+        wanted = LogQuery(tuple(positions), common="", belongs=lambda _: False, positions=positions)
         self._reader.missed(wanted, lambda messages: then(self._packets(messages)), again_s=())
 
     def tracks(

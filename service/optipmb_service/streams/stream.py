@@ -19,7 +19,7 @@ import structlog
 from optipmb_service.session.checkpoint import forgotten
 from optipmb_service.streams.counters import StreamCounters
 from optipmb_service.streams.opening import Opening
-from optipmb_service.streams.outbox import Outbox, Ticket
+from optipmb_service.streams.outbox import StreamOutbox, Ticket
 from optipmb_service.streams.sensor_meters import SensorMeters
 from optipmb_service.streams.sources import Sources
 from optipmb_service.telemetry.stream_meter import StreamMeter
@@ -61,7 +61,7 @@ class Stream:
         self.meter = StreamMeter(time.monotonic_ns())
         self.sensors = SensorMeters(self.name, self.meter, parts)
         self.policy = parts.sessions.policy(self.name)
-        self.outbox = Outbox(self.name, parts, self.policy, self.meter)
+        self.outbox = StreamOutbox(self.name, parts, self.policy, self.meter)
         self.opening = Opening(parts, self.policy, backlog)
         self.sources = Sources(parts, backlog)
         self._parts = parts

@@ -20,7 +20,7 @@ from optipmb_service.cluster.leases import Change, partition_of
 from optipmb_service.session.counts import MessageCounters
 from optipmb_service.session.values import SECOND
 from optipmb_service.streams.admission import Admission
-from optipmb_service.streams.backlog import MEGABYTE, Backlog, Bounds, ByteBudget
+from optipmb_service.streams.backlog import MEGABYTE, Backlog, BacklogBounds, ByteBudget
 from optipmb_service.streams.directory import StreamDirectory
 from optipmb_service.streams.parts import Parts
 from optipmb_service.streams.profiles import FUSED, Fusion
@@ -150,7 +150,7 @@ class Streams:
         self._settings = settings
         self._member = member
         self._rivals = self._no_rivals()
-        self._bounds = Bounds(
+        self._bounds = BacklogBounds(
             self._lose,
             settings.queue_frames,
             settings.queue_clouds,

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from opentelemetry.context import Context
     from opentelemetry.sdk.trace import ReadableSpan
 
-    from optipmb_service.session.values import Tracked
+    from optipmb_service.session.values import TrackedFrame
     from optipmb_service.zenoh.inputs import Packet
 
 log = structlog.get_logger("optipmb_service")
@@ -98,7 +98,7 @@ class Traces:
         span.end(ended_ns)
         return FrameTrace(set_span_in_context(span), ended_ns)
 
-    def tracked(self, trace: FrameTrace, tracked: Tracked) -> Context:
+    def tracked(self, trace: FrameTrace, tracked: TrackedFrame) -> Context:
         """Record `wait` and `step` of a frame whose step has just ended, begin `publish`, and return its context."""
         now_ns, header = time.time_ns(), tracked.header
         about = {

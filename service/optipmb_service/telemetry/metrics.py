@@ -49,7 +49,7 @@ QUANTILES: Final = ("0.5", "0.99")
 
 @dataclass(frozen=True)
 class MetricFamily:
-    """A row of the list.
+    """Declaration of a metric: its type and help text, and how its values are read.
 
     Attributes:
         kind: type of the metric in Prometheus.

@@ -12,7 +12,7 @@ from nats_process import NatsProcess
 from optipmb_schemas import Keys
 from optipmb_service.cluster import message_log
 from optipmb_service.cluster.message_log import LogMessage, LogReader, MessageLog, Retention
-from optipmb_service.cluster.store import Missed, Position
+from optipmb_service.cluster.store import LogQuery, Position
 from optipmb_service.session.checkpoint import forgotten
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Policy
@@ -27,7 +27,7 @@ STREAM = "a/b/c"
 EPOCH = bytes(16)
 FRAMES = 20
 TRACKED = 4
-LAST_TRACKED = Missed((STREAM,), "", lambda _: False, {STREAM: Position(frozenset(), EPOCH, TRACKED, tracked=True)})
+LAST_TRACKED = LogQuery((STREAM,), "", lambda _: False, {STREAM: Position(frozenset(), EPOCH, TRACKED, tracked=True)})
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import structlog
 from nats_process import NatsProcess, NatsTrio, started
 from optipmb_service.app.cli import nats_server
 from optipmb_service.cluster.message_log import ALONE_TRIES, OVERHEAD, LogMessage, LogWriter, MessageLog, Retention
-from optipmb_service.cluster.nats_connection import RefusedError
+from optipmb_service.cluster.nats_connection import NatsRefusedError
 from router import until
 from routers import free_endpoint
 
@@ -76,7 +76,7 @@ def test_a_failure_holds_until_something_is_written(log: MessageLog, monkeypatch
     async def refusing(one: LogMessage) -> bool:
         failures.append(writer.failure)
         if len(failures) < ROOM - 2:
-            raise RefusedError({"description": "no room"})
+            raise NatsRefusedError({"description": "no room"})
         return await put(one)
 
     monkeypatch.setattr(log, "put", refusing)
@@ -130,7 +130,7 @@ def test_a_message_that_lets_no_other_be_written_is_given_up(log: MessageLog, mo
             if one.seq == ROOM:
                 tries.append(at_once)
             if one.seq == ROOM or at_once > 1:
-                raise RefusedError({"description": "closed"})
+                raise NatsRefusedError({"description": "closed"})
             return await put(one)
         finally:
             at_once -= 1

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_service.session.values import SECOND
-from optipmb_service.streams.backlog import UNASKED_NS, UNLIMITED, Backlog, Bounds, ByteBudget
+from optipmb_service.streams.backlog import UNASKED_NS, UNLIMITED, Backlog, BacklogBounds, ByteBudget
 from optipmb_service.zenoh.inputs import PACKET_BYTES, Packet
 
 TOPICS = {True: "detections", False: "points"}
@@ -21,9 +21,9 @@ class Lost:
         self.packets += packets
 
 
-def bounds_of(**limits: Any) -> Bounds:
+def bounds_of(**limits: Any) -> BacklogBounds:
     """Return bounds; the default is none."""
-    bounds = Bounds(Lost(), UNLIMITED, UNLIMITED, UNLIMITED, ByteBudget(), ByteBudget(), UNLIMITED)
+    bounds = BacklogBounds(Lost(), UNLIMITED, UNLIMITED, UNLIMITED, ByteBudget(), ByteBudget(), UNLIMITED)
     return replace(bounds, **limits)
 
 

@@ -9,7 +9,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from optipmb_service.session.convert import tracks_of
 from optipmb_service.session.timeline import FrameId
-from optipmb_service.session.values import Tracked
+from optipmb_service.session.values import TrackedFrame
 
 import optipmb
 from optipmb.rejoin import Joined
@@ -27,7 +27,7 @@ def sound_tracks(count: int) -> optipmb.Tracks:
     return optipmb.Tracks(**columns | {"id": np.arange(count) * 3})
 
 
-def made(tracks: optipmb.Tracks, *parts: Any, frame_id: FrameId = FRAME, **fields: Any) -> Tracked:
+def made(tracks: optipmb.Tracks, *parts: Any, frame_id: FrameId = FRAME, **fields: Any) -> TrackedFrame:
     """Tracks of a frame, with parts of the tracker's result that few profiles have."""
     header: dict[str, Any] = {"session": "0" * 32, "revision": 0, "profile": PARAMETERS.name, "cloud_used": False}
     header |= {"gap": 0, "ignored": 0, "labels": PARAMETERS.labels}

@@ -16,7 +16,7 @@ from optipmb_schemas.json_form import tracks_json
 from optipmb_schemas.protobuf.convert import from_proto, to_proto
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Policy, Tracked
+from optipmb_service.session.values import Policy, TrackedFrame
 from optipmb_service.settings import MOST_ZONES, RejoinSettings
 from sessions import Merged, plain, problems, tracks
 
@@ -48,10 +48,10 @@ MESSAGES = [message_of(seq, one) for seq, one in enumerate(FRAMES)]
 fresh = partial(Session, STREAM, GENERIC)
 
 
-def in_order(policy: Policy = POLICY, messages: list[Detections] = MESSAGES) -> tuple[list[Tracked], Session]:
+def in_order(policy: Policy = POLICY, messages: list[Detections] = MESSAGES) -> tuple[list[TrackedFrame], Session]:
     session = fresh(policy)
     outputs = [one for message in messages for one in session.on_detections(message, 0)]
-    return [one for one in outputs if isinstance(one, Tracked)], session
+    return [one for one in outputs if isinstance(one, TrackedFrame)], session
 
 
 @pytest.mark.parametrize(

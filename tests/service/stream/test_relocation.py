@@ -12,7 +12,7 @@ from fusing import FUSED
 from optipmb_schemas import Detections, FieldOfView, Pose, Relocation, Tracks, decode, encode
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Output, Policy, Tracked
+from optipmb_service.session.values import Output, Policy, TrackedFrame
 from real_data import kitti_root
 from recorded import recording
 from router import SECOND, Sensor
@@ -320,7 +320,7 @@ def test_nothing_crosses_a_line_by_a_motion() -> None:
     yard = Zone("yard", polygon=((8.0, -50.0), (60.0, -50.0), (60.0, 50.0), (8.0, 50.0)), min_s=0.0)
     one = session(policy=Policy(zones=(line, yard)))
     outputs = feed(one, jumping(14, 10, JUMP._replace(theta=0.0)))
-    events = [event for output in outputs if isinstance(output, Tracked) for event in output.events]
+    events = [event for output in outputs if isinstance(output, TrackedFrame) for event in output.events]
     assert {(event.zone, event.kind, event.how) for event in events} == {("yard", "entered", "appeared")}
     assert len(events) == 3
 

@@ -11,7 +11,7 @@ from optipmb_client.merging import FinalEvents
 from optipmb_schemas import Events, Problem, decode
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Output, Policy, Tracked
+from optipmb_service.session.values import Output, Policy, TrackedFrame
 from optipmb_service.settings import SettingsInvalidError, SiteSettings, ZoneSettings, load
 from optipmb_service.streams.profiles import Profiles
 from optipmb_service.streams.streams import Streams
@@ -36,7 +36,7 @@ def final(outputs: Iterable[Output]) -> list[Event]:
     """Return the events of the highest revision of each frame, as a reader has them in the end."""
     newest: dict[int, tuple[int, int, tuple[Event, ...]]] = {}
     for one in outputs:
-        if isinstance(one, Tracked):
+        if isinstance(one, TrackedFrame):
             seq, head = one.header["seq"], (one.run, one.header["revision"])
             if head >= newest.get(seq, (0, 0, ()))[:2]:
                 newest[seq] = (*head, one.events)
@@ -103,7 +103,7 @@ def test_numbers_go_on_when_all_zones_come_back() -> None:
     for policy, frames in ((Policy(), range(40, 50)), (POLICY, range(50, 60))):
         session = Session.restore(decode_checkpoint(encode_checkpoint(session.snapshot())), 0, policy)
         outputs = feed(session, frames, SENSOR)
-        assert policy.zones or not any(one.events or one.counts for one in outputs if isinstance(one, Tracked))
+        assert policy.zones or not any(one.events or one.counts for one in outputs if isinstance(one, TrackedFrame))
     again = Session(SENSOR.stream, PROFILE, POLICY, incarnation=session.incarnation)
     for events in (final(outputs), final(feed(again, range(60, 70), SENSOR))):
         entered = [one.n for one in events if (one.zone, one.kind) == ("yard", "entered")]

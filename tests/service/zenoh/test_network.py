@@ -35,7 +35,7 @@ from optipmb_schemas import (
 )
 from optipmb_service.app.workers import QUERIES
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Tracked
+from optipmb_service.session.values import TrackedFrame
 from optipmb_service.settings import load
 from optipmb_service.zenoh.transport import Transport
 from router import Node, Sensor, plain, until
@@ -53,7 +53,7 @@ def offline(sensor: Sensor, seqs: Any, **changes: Any) -> list[bytes]:
     """What a session alone makes of the frames."""
     session = Session(sensor.stream, NUSCENES)
     outputs = [output for seq in seqs for output in session.on_detections(sensor.detections(seq, **changes), 0)]
-    return [plain(output.tracks) for output in outputs if isinstance(output, Tracked)]
+    return [plain(output.tracks) for output in outputs if isinstance(output, TrackedFrame)]
 
 
 def test_frames_become_tracks(node: Node) -> None:

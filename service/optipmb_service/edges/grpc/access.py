@@ -1,4 +1,4 @@
-"""Names of callers over gRPC, from certificates or tokens; `edge.access` has their rights.
+"""Names of callers over gRPC, from certificates or tokens; `edges.access` has their rights.
 
 The certificates of the gateway are read again when their files have changed, so that they can be renewed.
 """

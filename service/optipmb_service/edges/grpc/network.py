@@ -53,7 +53,7 @@ PublisherKey = tuple[str, int, int]
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """Something that came, as a response of any streaming method.
+    """Message of the network, encoded as a response of any streaming method.
 
     Attributes:
         tracks: of which it is, if it is of any.
