@@ -9,8 +9,8 @@ import pytest
 from commands import result_of, run_here
 from fusing import FRONT, FUSED, REAR, SIDE, drive
 from optipmb_schemas import Detections, Keys, Tracks, encode, encoding_of
+from optipmb_service.session.policy import Policy
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Policy
 from optipmb_tools.datasets import DatasetError, open_dataset
 from optipmb_tools.datasets.fused import FusedSequence
 from optipmb_tools.recordings.files import RecordingWriter

@@ -8,8 +8,8 @@ import pytest
 from fleet import Fleet
 from fusing import FUSED, drive
 from optipmb_schemas import Detections, Keys, MoveRequest, ServiceStatus, SessionState, Tracks, decode
+from optipmb_service.session.policy import Policy
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Policy
 from router import Node, until
 from sessions import Merged
 

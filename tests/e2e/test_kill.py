@@ -15,7 +15,7 @@ from fleet import Fleet
 from optipmb_client import Connection
 from optipmb_client.incoming import Inbox
 from optipmb_schemas import Detections
-from optipmb_service.session.values import Policy
+from optipmb_service.session.policy import Policy
 from optipmb_service.settings import ZoneSettings
 from real_data import kitti_root
 from recorded import KEYS, Recording, Replay, kitti

@@ -13,8 +13,8 @@ import pytest
 from fleet import PROFILE, Fleet, RouterProcess
 from optipmb_schemas import Detections, Points, ServiceStatus, SessionState, encode, encoding_of
 from optipmb_service.cluster.leases import PARTITIONS
+from optipmb_service.session.outputs import TrackedFrame
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import TrackedFrame
 from proxy import Proxy
 from router import Node, Sensor, plain, until
 from service_process import ServiceProcess

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from commands import result_of, run_here
 from optipmb_schemas import PATHS, Detections, Keys, encode, encoding_of
+from optipmb_service.session.outputs import TrackedFrame
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import TrackedFrame
 from optipmb_tools.datasets import open_dataset
 from optipmb_tools.recordings.files import RecordingWriter
 from optipmb_tools.run.tracking import track_whole

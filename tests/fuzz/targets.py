@@ -15,8 +15,9 @@ from optipmb_service.edges.mapping import PayloadMapping
 from optipmb_service.edges.readers import Pace
 from optipmb_service.session.checkpoint import CheckpointError, decode_checkpoint, encode_checkpoint, seal
 from optipmb_service.session.convert import density_of
+from optipmb_service.session.identity import Incarnation
+from optipmb_service.session.policy import Policy
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Incarnation, Policy
 from optipmb_service.settings import MappingSettings, Settings
 from router import Sensor
 

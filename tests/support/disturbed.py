@@ -17,8 +17,8 @@ from lease_log import Alone
 from optipmb_service.cluster.sqlite import SqliteStore
 from optipmb_service.cluster.store import load_newest
 from optipmb_service.session.checkpoint import CheckpointError, decode_checkpoint, encode_checkpoint, state_bytes
+from optipmb_service.session.policy import Policy
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Policy
 from router import SECOND, Sensor
 from sessions import Merged, chained
 

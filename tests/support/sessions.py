@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from optipmb_schemas import Detections, Events, Points, Problem, Tracks, encode
 from optipmb_service.session.checkpoint import digest_of
+from optipmb_service.session.outputs import Begun, Output, Quarantined, TrackedFrame, events_of
+from optipmb_service.session.policy import Policy
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Begun, Output, Policy, Quarantined, TrackedFrame, events_of
 from router import Sensor
 
 import optipmb

@@ -22,8 +22,8 @@ from optipmb_service import __version__
 from optipmb_service.app.lifecycle import CLOSE_S, HANDOVER_S, LAST_S, Deadline, Steps
 from optipmb_service.app.storage import open_log, open_store
 from optipmb_service.cluster.member import Member
+from optipmb_service.session.policy import SECOND
 from optipmb_service.session.problems import problem_of
-from optipmb_service.session.values import SECOND
 from optipmb_service.streams.intake import Intake
 from optipmb_service.streams.kept_tracks import TrackQuery
 from optipmb_service.streams.persistence import DAY_S, CheckpointWriter

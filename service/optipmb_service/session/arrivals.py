@@ -9,15 +9,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from optipmb_service.session.policy import MAX_SENSORS, SECOND
 from optipmb_service.session.timeline import WINDOW, FusedTimeline, number_of
-from optipmb_service.session.values import MAX_SENSORS, SECOND
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from optipmb_service.session.pending import PendingFrame, SensorQueue
+    from optipmb_service.session.policy import Policy
     from optipmb_service.session.timeline import FrameId, SeenNumbers, Timeline
-    from optipmb_service.session.values import Policy
 
 BACK_NS: Final = 5 * SECOND
 """Longest delay of a token after a session has begun: a client that lost its router tries every 4 s at least.

@@ -28,22 +28,17 @@ import optipmb
 from optipmb.zones import MOST, Event, Seen, ZoneState
 from optipmb_service.session import convert
 from optipmb_service.session.counts import MAX_COUNT, Count, Deliveries, FrameCounts, present
+from optipmb_service.session.identity import Binary, Epoch, Incarnation, SensorName, Whole
+from optipmb_service.session.policy import MAX_CLOUD_WAIT_NS, MAX_SENSORS
 from optipmb_service.session.state import UNPLACED, FilterState, ProcessedFrame, SensorState
 from optipmb_service.session.timeline import EPOCHS, WINDOW, FrameId, SeenNumbers
-from optipmb_service.session.values import (
-    MAX_CLOUD_WAIT_NS,
-    MAX_ERROR,
-    MAX_SENSORS,
-    Binary,
-    Epoch,
-    Incarnation,
-    SensorName,
-    Whole,
-)
 from optipmb_service.session.worlds import Worlds  # noqa: TC001 - pydantic reads the annotation
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+MAX_ERROR: Final = 400
+"""Characters kept of an error."""
 
 VERSION: Final = 5
 MAGIC: Final = b"OPTIPMB\0"

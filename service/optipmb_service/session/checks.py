@@ -11,13 +11,13 @@ import optipmb
 from optipmb.doubts import EXPECTED as SIZES
 from optipmb.doubts import SizeCheck
 from optipmb.velocity_check import EXPECTED, VelocityCheck
-from optipmb_service.session.values import MAX_SENSORS, SECOND
+from optipmb_service.session.policy import MAX_SENSORS, SECOND
 
 if TYPE_CHECKING:
     import optipmb_schemas as schemas
 
+    from optipmb_service.session.policy import Policy
     from optipmb_service.session.timeline import FrameId
-    from optipmb_service.session.values import Policy
 
 CHECKED_FRAMES: Final = 20
 """Frames after which the advance of their stamps is looked at."""

@@ -20,7 +20,7 @@ import optipmb
 from optipmb.frame import Embedding, frame_of_checked
 from optipmb.rows import read_only
 from optipmb.table import ClassTable
-from optipmb_service.session.values import TrackedFrame
+from optipmb_service.session.outputs import TrackedFrame
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

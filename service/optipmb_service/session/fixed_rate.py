@@ -11,13 +11,14 @@ from optipmb_schemas import PATHS
 from optipmb.hindsight import with_hindsight
 from optipmb.paths import tracks_ahead
 from optipmb.table import ClassTable
-from optipmb_service.session.values import SECOND, Begun, TrackedFrame
+from optipmb_service.session.outputs import Begun, TrackedFrame
+from optipmb_service.session.policy import SECOND
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     import optipmb
-    from optipmb_service.session.values import Output
+    from optipmb_service.session.outputs import Output
     from optipmb_service.settings import OutputSettings
 
 CLOCK_NS: Final = 5 * SECOND

@@ -5,18 +5,19 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from optipmb_service.session.policy import MAX_SENSORS, SECOND
 from optipmb_service.session.problems import problem_of, sentence
 from optipmb_service.session.timeline import JUMP_FRAMES, Verdict
-from optipmb_service.session.values import MAX_SENSORS, SECOND
 
 if TYPE_CHECKING:
     import numpy as np
     import optipmb_schemas as schemas
 
     import optipmb
+    from optipmb_service.session.outputs import Begun
+    from optipmb_service.session.policy import Policy
     from optipmb_service.session.timeline import Decision, FrameId
     from optipmb_service.session.transition import Outcome
-    from optipmb_service.session.values import Begun, Policy
 
 
 class FrameProblems:

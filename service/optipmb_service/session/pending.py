@@ -15,9 +15,9 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final
 
 from optipmb_service.session.checks import SensorChecks
+from optipmb_service.session.policy import MAX_SENSORS
 from optipmb_service.session.state import size_of
 from optipmb_service.session.timeline import JUMP_FRAMES, WINDOW, FusedTimeline, Order, Verdict
-from optipmb_service.session.values import MAX_SENSORS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterator, Sequence
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     import optipmb_schemas as schemas
 
     from optipmb_service.session.checkpoint import Checkpoint
+    from optipmb_service.session.policy import Policy
     from optipmb_service.session.state import FilterState, Inputs
     from optipmb_service.session.timeline import Decision, FrameId, Timeline
-    from optipmb_service.session.values import Policy
 
     Judged = tuple[Timeline, Decision, Timeline]
 

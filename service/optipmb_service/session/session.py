@@ -26,36 +26,28 @@ from optipmb.self_calibration import learned_noise
 from optipmb.zones import ZoneState
 from optipmb_service.session import convert
 from optipmb_service.session.arrivals import Arrivals
-from optipmb_service.session.checkpoint import Checkpoint
+from optipmb_service.session.checkpoint import MAX_ERROR, Checkpoint
 from optipmb_service.session.checks import ScoreChecks
 from optipmb_service.session.counts import Counters, Deliveries, present, total
 from optipmb_service.session.frame_problems import FrameProblems
+from optipmb_service.session.identity import Incarnation
+from optipmb_service.session.outputs import Begun, Output, Quarantined, RefusedError, events_of
 from optipmb_service.session.pending import PendingFrame, SensorQueues
+from optipmb_service.session.policy import MAX_CLOUD_WAIT_NS, SECOND, Policy
 from optipmb_service.session.state import FilterState, ProcessedFrame
 from optipmb_service.session.timeline import FrameId, FusedTimeline, StreamTimeline, Verdict
 from optipmb_service.session.transition import Transition
-from optipmb_service.session.values import (
-    MAX_CLOUD_WAIT_NS,
-    MAX_ERROR,
-    SECOND,
-    Begun,
-    Incarnation,
-    Output,
-    Policy,
-    Quarantined,
-    RefusedError,
-    events_of,
-)
 from optipmb_service.session.window import ReorderWindow
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from optipmb_service.session.identity import Reached
+    from optipmb_service.session.outputs import Reason, TrackedFrame
     from optipmb_service.session.pending import Judged, SensorQueue
     from optipmb_service.session.state import Inputs
     from optipmb_service.session.timeline import Decision, Timeline
     from optipmb_service.session.transition import Outcome
-    from optipmb_service.session.values import Reached, Reason, TrackedFrame
 
     Condition = Literal["new", "running", "recovering", "quarantined", "closed"]
 

@@ -14,8 +14,8 @@ from pydantic import Field
 
 from optipmb.rows import record
 from optipmb_service.session.counts import Count, FrameCounts
+from optipmb_service.session.identity import Epoch, Incarnation, Reached, Whole
 from optipmb_service.session.timeline import Cursor, FrameId, Order, Placement, Verdict
-from optipmb_service.session.values import MAX_LABELS, Epoch, Incarnation, Reached, Whole
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     import optipmb
     from optipmb.zones import ZoneState
     from optipmb_service.session.worlds import Worlds
+
+MAX_LABELS: Final = 256
+"""Unknown class names remembered as reported."""
 
 ClassName = Annotated[str, Field(strict=True, max_length=64)]
 _Metres = Annotated[float, Field(strict=True, allow_inf_nan=False)]

@@ -29,13 +29,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from optipmb.rows import record
 from optipmb_service.session.counts import Count  # noqa: TC001 - pydantic reads the annotation
-from optipmb_service.session.values import (
-    MAX_SENSORS,
-    Epoch,
-    JumpLimits,
-    SensorName,
-    Whole,
-)
+from optipmb_service.session.identity import Epoch, SensorName, Whole  # noqa: TC001 - as above
+from optipmb_service.session.policy import MAX_SENSORS, JumpLimits
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

@@ -32,17 +32,19 @@ from optipmb.rows import record
 from optipmb.zones import Shapes, ZoneState, adapted, end, observe
 from optipmb_service.session import convert
 from optipmb_service.session.counts import FrameCounts, total
-from optipmb_service.session.state import FilterState, PoseHistory, SensorState
+from optipmb_service.session.outputs import Begun
+from optipmb_service.session.policy import MAX_SENSORS, SECOND
+from optipmb_service.session.state import MAX_LABELS, FilterState, PoseHistory, SensorState
 from optipmb_service.session.timeline import JUMP_FRAMES, FrameId, Verdict
-from optipmb_service.session.values import MAX_LABELS, MAX_SENSORS, SECOND, Begun
 from optipmb_service.session.worlds import in_one_world, relocated
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from optipmb.zones import Event
+    from optipmb_service.session.outputs import Reason, TrackedFrame
+    from optipmb_service.session.policy import Policy
     from optipmb_service.session.state import Inputs, Position, ProcessedFrame
-    from optipmb_service.session.values import Policy, Reason, TrackedFrame
     from optipmb_service.session.worlds import Relocated
 
 GIVE_UP_NS: Final = SECOND

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     import optipmb_schemas as schemas
 
     from optipmb_service.session.checkpoint import Checkpoint
+    from optipmb_service.session.policy import Policy
     from optipmb_service.session.state import FilterState, Inputs, ProcessedFrame
     from optipmb_service.session.timeline import FrameId, Placement
     from optipmb_service.session.transition import Outcome, Transition
-    from optipmb_service.session.values import Policy
 
 
 class ReorderWindow:

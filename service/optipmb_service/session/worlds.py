@@ -20,7 +20,8 @@ from pydantic import Field
 import optipmb
 from optipmb.rows import record
 from optipmb.zones import relocated as relocated_zones
-from optipmb_service.session.values import MAX_SENSORS, SensorName, Whole
+from optipmb_service.session.identity import SensorName, Whole  # noqa: TC001 - pydantic reads the annotation
+from optipmb_service.session.policy import MAX_SENSORS
 
 if TYPE_CHECKING:
     import optipmb_schemas as schemas

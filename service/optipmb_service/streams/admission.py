@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
-from optipmb_service.session.values import SECOND, Incarnation
+from optipmb_service.session.identity import Incarnation
+from optipmb_service.session.policy import SECOND
 from optipmb_service.streams.backlog import MEGABYTE
 
 if TYPE_CHECKING:

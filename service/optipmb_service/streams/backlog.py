@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import structlog
 
-from optipmb_service.session.values import SECOND
+from optipmb_service.session.policy import SECOND
 from optipmb_service.zenoh.inputs import Packet
 
 if TYPE_CHECKING:

@@ -26,7 +26,7 @@ import optipmb_schemas as schemas
 import structlog
 
 from optipmb_service.cluster.leases import PARTITIONS, Change, partition_of
-from optipmb_service.session.values import SECOND
+from optipmb_service.session.policy import SECOND
 from optipmb_service.zenoh.inputs import Input
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ import structlog
 
 from optipmb_service.session.checkpoint import CheckpointError
 from optipmb_service.session.counts import total
-from optipmb_service.session.values import Incarnation
+from optipmb_service.session.identity import Incarnation
 from optipmb_service.streams.outbox import Ticket
 from optipmb_service.zenoh.inputs import Packet
 
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from optipmb_service.session.checkpoint import Checkpoint
+    from optipmb_service.session.policy import Policy
     from optipmb_service.session.session import Session
-    from optipmb_service.session.values import Policy
     from optipmb_service.streams.backlog import Backlog
     from optipmb_service.streams.parts import Parts
 

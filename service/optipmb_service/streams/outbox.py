@@ -10,7 +10,8 @@ from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_client.trace_context import attachment_of
 
 from optipmb_service.session.counts import MAX_COUNT
-from optipmb_service.session.values import SECOND, Begun, Quarantined, TrackedFrame
+from optipmb_service.session.outputs import Begun, Quarantined, TrackedFrame
+from optipmb_service.session.policy import SECOND
 from optipmb_service.settings import FARTHEST
 from optipmb_service.streams.persistence import save_dump
 
@@ -20,8 +21,10 @@ if TYPE_CHECKING:
     from opentelemetry.context import Context
 
     from optipmb_service.session.fixed_rate import FixedRate
+    from optipmb_service.session.identity import Reached
+    from optipmb_service.session.outputs import Output
+    from optipmb_service.session.policy import Policy
     from optipmb_service.session.session import Session
-    from optipmb_service.session.values import Output, Policy, Reached
     from optipmb_service.streams.parts import Parts
     from optipmb_service.streams.traces import FrameTrace
     from optipmb_service.telemetry.stream_meter import StreamMeter

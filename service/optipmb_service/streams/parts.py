@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import optipmb_schemas as schemas
 
     from optipmb_service.cluster.member import Member
-    from optipmb_service.session.values import Incarnation
+    from optipmb_service.session.identity import Incarnation
     from optipmb_service.settings import Settings
     from optipmb_service.streams.admission import Admission
     from optipmb_service.streams.directory import StreamDirectory

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
     from optipmb_service.cluster.member import Member
     from optipmb_service.cluster.store import LeaseStore
-    from optipmb_service.session.values import Incarnation
+    from optipmb_service.session.identity import Incarnation
 
 log = structlog.get_logger("optipmb_service")
 

@@ -22,8 +22,9 @@ import optipmb
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.session.checkpoint import digest_of
 from optipmb_service.session.convert import density_of
+from optipmb_service.session.outputs import RefusedError
+from optipmb_service.session.policy import SECOND
 from optipmb_service.session.problems import problem_of
-from optipmb_service.session.values import SECOND, RefusedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence

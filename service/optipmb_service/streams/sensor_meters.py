@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
-from optipmb_service.session.values import MAX_SENSORS, SECOND
+from optipmb_service.session.policy import MAX_SENSORS, SECOND
 from optipmb_service.telemetry.stream_meter import StreamMeter
 
 if TYPE_CHECKING:

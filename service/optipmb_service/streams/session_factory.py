@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any, Final
 import optipmb
 from optipmb.zones import MOST
 from optipmb_service.session.fixed_rate import FixedRate
+from optipmb_service.session.policy import SECOND, Policy
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import SECOND, Policy
 from optipmb_service.streams.backlog import MEGABYTE
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from optipmb_service.session.checkpoint import Checkpoint
-    from optipmb_service.session.values import Incarnation
+    from optipmb_service.session.identity import Incarnation
     from optipmb_service.settings import Settings
     from optipmb_service.streams.profiles import Fusion, Profiles
 

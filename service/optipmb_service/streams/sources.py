@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 from optipmb_client.errors import ConnectionFailed as TransportError
 
-from optipmb_service.session.values import SECOND
+from optipmb_service.session.policy import SECOND
 
 if TYPE_CHECKING:
     from optipmb_service.session.arrivals import Arrivals

@@ -28,8 +28,8 @@ from optipmb_service.zenoh.inputs import Packet
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from optipmb_service.session.outputs import Output
     from optipmb_service.session.session import Session
-    from optipmb_service.session.values import Output
     from optipmb_service.streams.backlog import Backlog
     from optipmb_service.streams.parts import Parts
 

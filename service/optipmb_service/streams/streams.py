@@ -18,7 +18,7 @@ import optipmb_schemas as schemas
 import optipmb
 from optipmb_service.cluster.leases import Change, partition_of
 from optipmb_service.session.counts import MessageCounters
-from optipmb_service.session.values import SECOND
+from optipmb_service.session.policy import SECOND
 from optipmb_service.streams.admission import Admission
 from optipmb_service.streams.backlog import MEGABYTE, Backlog, BacklogBounds, ByteBudget
 from optipmb_service.streams.directory import StreamDirectory
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from optipmb_service.cluster.member import Member
     from optipmb_service.session.checkpoint import Checkpoint
-    from optipmb_service.session.values import Incarnation
+    from optipmb_service.session.identity import Incarnation
     from optipmb_service.settings import Settings
     from optipmb_service.streams.persistence import CheckpointWriter
     from optipmb_service.streams.profiles import Profiles

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from opentelemetry.context import Context
     from opentelemetry.sdk.trace import ReadableSpan
 
-    from optipmb_service.session.values import TrackedFrame
+    from optipmb_service.session.outputs import TrackedFrame
     from optipmb_service.zenoh.inputs import Packet
 
 log = structlog.get_logger("optipmb_service")

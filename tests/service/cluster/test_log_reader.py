@@ -14,8 +14,8 @@ from optipmb_service.cluster import message_log
 from optipmb_service.cluster.message_log import LogMessage, LogReader, MessageLog, Retention
 from optipmb_service.cluster.store import LogQuery, Position
 from optipmb_service.session.checkpoint import forgotten
+from optipmb_service.session.policy import Policy
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Policy
 from optipmb_service.streams.profiles import Fusion
 from optipmb_service.streams.recovery import Log
 from optipmb_service.zenoh.inputs import Packet

@@ -1,7 +1,7 @@
 """What a session knows of its sources: whose caches are asked, who has answered, and for how long frames wait."""
 
 from optipmb_service.session.arrivals import BACK_NS, MOST, Arrivals
-from optipmb_service.session.values import Policy
+from optipmb_service.session.policy import Policy
 
 POLICY = Policy(recovery_wait_ns=4 * BACK_NS)
 

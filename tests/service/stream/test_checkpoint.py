@@ -25,8 +25,9 @@ from optipmb_service.session.checkpoint import (
     seal,
     state_bytes,
 )
+from optipmb_service.session.identity import Incarnation
+from optipmb_service.session.policy import Policy
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Incarnation, Policy
 from router import SECOND, Sensor
 from sessions import Merged, chained, feed, problems, tracks
 

@@ -1,6 +1,6 @@
 """Which streams a discoverer announces that have no session."""
 
-from optipmb_service.session.values import SECOND
+from optipmb_service.session.policy import SECOND
 from optipmb_service.streams.directory import BACK_NS, MAX_UNPROVEN_ANNOUNCED, QUEUED_NS, UNPROVEN_NS, StreamDirectory
 
 IDLE_NS = 600 * SECOND

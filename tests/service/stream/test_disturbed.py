@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 from optipmb_schemas import Detections, MessageError, Points, decode, encode
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
+from optipmb_service.session.policy import Policy
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Policy
 from router import SECOND, Sensor
 from sessions import Merged, chained
 

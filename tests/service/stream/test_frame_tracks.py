@@ -8,8 +8,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from optipmb_service.session.convert import tracks_of
+from optipmb_service.session.outputs import TrackedFrame
 from optipmb_service.session.timeline import FrameId
-from optipmb_service.session.values import TrackedFrame
 
 import optipmb
 from optipmb.rejoin import Joined

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_schemas import Detections, Pose
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
+from optipmb_service.session.policy import MAX_SENSORS, Policy
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import MAX_SENSORS, Policy
 from router import SECOND, Sensor
 from sessions import Failing, Merged, begun, chained, delayed, feed, problems, tracks
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from optipmb_schemas import Keys
 from optipmb_service.cluster.leases import PARTITIONS, Change, partition_of
-from optipmb_service.session.values import SECOND
+from optipmb_service.session.policy import SECOND
 from optipmb_service.streams import directory, streams
 from optipmb_service.streams.backlog import UNASKED_NS
 from optipmb_service.streams.intake import DISCOVERY, NEW_STREAMS, Intake

@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_schemas import Detections, Pose, Relocation
 from optipmb_service.session.checkpoint import state_bytes
+from optipmb_service.session.outputs import Output
+from optipmb_service.session.policy import Policy
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Output, Policy
 from router import Sensor
 from sessions import begun, chained, problems, tracks
 

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from optipmb_client.errors import UsageError
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint
+from optipmb_service.session.policy import Policy
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Policy
 from optipmb_service.streams.persistence import DUMPS, MAX_DUMPS, save_dump
 from optipmb_tools.cli import run
 from optipmb_tools.run import dumps as client

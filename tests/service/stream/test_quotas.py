@@ -7,7 +7,7 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 from optipmb_schemas import Keys
-from optipmb_service.session.values import Incarnation
+from optipmb_service.session.identity import Incarnation
 from optipmb_service.settings import Settings
 from optipmb_service.streams.admission import Admission, victim_of
 from optipmb_service.telemetry.stream_meter import StreamMeter

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from optipmb_schemas import Detections, Points, Pose, encode
 from optipmb_service.session.checkpoint import state_bytes
+from optipmb_service.session.policy import Policy
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Policy
 from real_data import kitti_root, nuscenes_root
 from recorded import Recording, recording
 from router import SECOND

@@ -15,8 +15,9 @@ from optipmb_schemas import Detections, Tracks, decode, encode
 from optipmb_schemas.json_form import tracks_json
 from optipmb_schemas.protobuf.convert import from_proto, to_proto
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
+from optipmb_service.session.outputs import TrackedFrame
+from optipmb_service.session.policy import Policy
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Policy, TrackedFrame
 from optipmb_service.settings import MOST_ZONES, RejoinSettings
 from sessions import Merged, plain, problems, tracks
 

@@ -11,8 +11,9 @@ import pytest
 from fusing import FUSED
 from optipmb_schemas import Detections, FieldOfView, Pose, Relocation, Tracks, decode, encode
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
+from optipmb_service.session.outputs import Output, TrackedFrame
+from optipmb_service.session.policy import Policy
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Output, Policy, TrackedFrame
 from real_data import kitti_root
 from recorded import recording
 from router import SECOND, Sensor

@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
+from optipmb_service.session.outputs import Output
+from optipmb_service.session.policy import Policy
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Output, Policy
 from router import SECOND, Sensor
 from sessions import Merged, begun, chained, feed, problems, tracks
 

@@ -10,8 +10,10 @@ import pytest
 import sessions
 from optipmb_schemas import PATHS
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint
+from optipmb_service.session.identity import Incarnation
+from optipmb_service.session.outputs import Output, RefusedError
+from optipmb_service.session.policy import Policy
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Incarnation, Output, Policy, RefusedError
 from router import SECOND, Sensor, plain
 from sessions import begun, problems, tracks
 

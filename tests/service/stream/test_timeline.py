@@ -2,9 +2,9 @@
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from optipmb_service.session.policy import JumpLimits
 from optipmb_service.session.state import FilterState, SensorState
 from optipmb_service.session.timeline import WINDOW, Cursor, Decision, FrameId, StreamTimeline, Timeline, Verdict
-from optipmb_service.session.values import JumpLimits
 
 import optipmb
 

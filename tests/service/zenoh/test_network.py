@@ -34,8 +34,8 @@ from optipmb_schemas import (
     encoding_of,
 )
 from optipmb_service.app.workers import QUERIES
+from optipmb_service.session.outputs import TrackedFrame
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import TrackedFrame
 from optipmb_service.settings import load
 from optipmb_service.zenoh.transport import Transport
 from router import Node, Sensor, plain, until
