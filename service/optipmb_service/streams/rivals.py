@@ -34,6 +34,10 @@ class Rivals:
         self.doubted: set[str] = set()
         """Streams that seem to have had several owners for too long; the owners are to be asked for again."""
 
+    def again(self) -> Rivals:
+        """Return the rivals of a new look at all owners, to whom those doubted now are no surprise."""
+        return Rivals(self._instance, self._patience_ns, self.doubted)
+
     def on_owner(self, stream: str, instance: str, present: bool) -> None:  # noqa: FBT001 - as the network calls it
         """Note that an instance tracks a stream, or does so no longer."""
         if instance == self._instance:

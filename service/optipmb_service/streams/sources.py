@@ -21,7 +21,11 @@ if TYPE_CHECKING:
     from optipmb_service.session.session import Session
     from optipmb_service.streams.backlog import Backlog
     from optipmb_service.streams.parts import Parts
+    from optipmb_service.streams.stream import Stream
     from optipmb_service.zenoh.inputs import Packet
+
+LOG_READS: Final = 32
+"""Sessions that read the log at once: thousands that are silent are no load on its servers."""
 
 MOST_PAUSES: Final = 8
 """Longest pause between two reads that find nothing, in times of the silence before the first one."""
@@ -57,9 +61,9 @@ class Sources:
                 self._parts.ask_cache(stream, partial(self._arrived, arrivals, stream))
         return arrivals.complete(awaited, now_ns)
 
-    def look_in_log(self, session: Session | None) -> None:
+    def look_in_log(self, stream: Stream) -> None:
         """Recover what the log has of the session's sensors after their newest frames."""
-        if session is None or self._parts.log is None:
+        if (session := stream.session) is None or self._parts.log is None:
             self.log_check.end(found=False)
             return
 
@@ -76,6 +80,18 @@ class Sources:
             self._backlog.cache_answered(cache)
         else:
             arrivals.ask_again(cache)
+
+
+def read_logs(streams: list[Stream], now_ns: int) -> None:
+    """Have the log read for silent sessions, those first that wait longest; a few at a time."""
+    checks = [(one, one.sources.log_check) for one in streams]
+    silent = ((check.due_ns(one.sensors.silent_ns(now_ns), now_ns), one, check) for one, check in checks)
+    due = [(since_ns, one, check) for since_ns, one, check in silent if since_ns is not None]
+    free = LOG_READS - sum(check.under_way for _, check in checks)
+    for _, one, check in sorted(due, key=lambda one: one[0])[: max(0, free)]:
+        check.begin(now_ns)
+        if not one.backlog.command(partial(one.sources.look_in_log, one), urgent=False):
+            check.end(found=False)
 
 
 class LogCheck:

@@ -26,6 +26,7 @@ from optipmb_service.streams.parts import Parts
 from optipmb_service.streams.profiles import FUSED, Fusion
 from optipmb_service.streams.rivals import Rivals
 from optipmb_service.streams.session_factory import PARTS, SessionFactory
+from optipmb_service.streams.sources import read_logs
 from optipmb_service.streams.stream import Stream
 
 if TYPE_CHECKING:
@@ -71,9 +72,6 @@ SWEEP_REST: Final = 200
 
 MOST_REST_NS: Final = 5 * SECOND
 
-LOG_READS: Final = 32
-"""Sessions that read the log at once: thousands that are silent are no load on its servers."""
-
 LITTLE: Final = 0.1
 """Part of an equal share of the memory: a session that keeps less is not closed for it.
 
@@ -87,17 +85,10 @@ class Streams:
     Args:
         settings: in force.
         profiles: the parameters that can be had.
-        open_publisher: opens the publishers of a stream (`Transport.open_publisher`).
-        ask_cache: asks the caches of a stream (`Transport.ask_cache`).
-        reporter: takes problems.
-        scheduler: runs the streams.
-        member: knows which streams are tracked here.
-        checkpoints: writes and reads checkpoints.
-        log: the log of detections, if there is one.
-        arm: calls a function at a monotonic time (ns).
-        metrics: counts messages.
         tracker: makes the trackers of sessions.
-        traces: records spans of frames, where it is asked for.
+        scheduler: runs the streams.
+
+    The others are the attributes of `Parts`.
     """
 
     def __init__(  # noqa: PLR0913 - the parts that it brings together
@@ -149,7 +140,7 @@ class Streams:
         """Returns the stream of a key and its session, or raises MessageError."""
         self._settings = settings
         self._member = member
-        self._rivals = self._no_rivals()
+        self._rivals = Rivals(settings.instance, round(RIVAL_LEASES * settings.lease_s * SECOND))
         self._bounds = BacklogBounds(
             self._lose,
             settings.queue_frames,
@@ -401,11 +392,8 @@ class Streams:
 
     def on_owner(self) -> Callable[[str, str, bool], None]:
         """Forget who tracks what; return what notes, from now on, that an instance does so, or no longer."""
-        self._rivals = self._no_rivals(self._rivals.doubted)
+        self._rivals = self._rivals.again()
         return self._rivals.on_owner
-
-    def _no_rivals(self, doubted: Iterable[str] = ()) -> Rivals:
-        return Rivals(self._settings.instance, round(RIVAL_LEASES * self._settings.lease_s * SECOND), doubted)
 
     @property
     def doubts_owners(self) -> bool:
@@ -472,23 +460,12 @@ class Streams:
             if now_ns - stream.meter.active_ns > idle_ns and stream.backlog.idle:
                 self.command(stream.name, lambda one: self._close_idle(one, idle_ns), urgent=False)
         if self._settings.cluster:
-            self._read_log(streams, now_ns)
+            read_logs(streams, now_ns)
         for name, owners in self._rivals.contested(now_ns, [stream.name for stream in streams]):
             tracked = f"it is tracked by {' and '.join(owners)}"
             self._report("contested", name, "one `store`, or `cluster`, for all instances", tracked)
         self._evict(streams)
         self._trim(now_ns, idle_ns)
-
-    def _read_log(self, streams: list[Stream], now_ns: int) -> None:
-        """Have the log read for silent sessions, those first that wait longest; a few at a time."""
-        checks = [(one, one.sources.log_check) for one in streams]
-        silent = ((check.due_ns(one.sensors.silent_ns(now_ns), now_ns), one, check) for one, check in checks)
-        due = [(since_ns, one, check) for since_ns, one, check in silent if since_ns is not None]
-        free = LOG_READS - sum(check.under_way for _, check in checks)
-        for _, one, check in sorted(due, key=lambda one: one[0])[: max(0, free)]:
-            check.begin(now_ns)
-            if not self.command(one.name, lambda one: one.sources.look_in_log(one.session), urgent=False):
-                check.end(found=False)
 
     def _evict(self, streams: list[Stream]) -> None:
         """Close sessions, the least recently used first, while all together keep more than the process may."""
