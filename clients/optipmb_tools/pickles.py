@@ -111,7 +111,7 @@ class _Reader(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in self._functions:
             how = "the folder preds of its JSON files is read" if module.startswith("torch") else "convert it"
-            received = f"{module}.{name}: {how}, see docs/own-data.md"
+            received = f"{module}.{name}: {how}, see docs/detectors.md"
             raise DatasetError(self._path, f"{_EXPECTED}, of arrays alone", received)
         return self._functions[module, name]
 

@@ -1,4 +1,4 @@
-"""The commands and programs of the tutorials run as they stand on the pages."""
+"""The commands and programs of the pages run as they stand there, and print what they promise."""
 
 import csv
 import re
@@ -15,17 +15,23 @@ SET_UP = ("pip install ", "python3 -m venv ")
 
 
 def run(page: str, heading: str, capsys: pytest.CaptureFixture[str]) -> str:
-    """Run the blocks of a section of a page twice, without installations; return the second output."""
+    """Run the blocks of a section of a page twice, without installations; return the second output.
+
+    What a page says that a program prints is compared with what it prints.
+    """
     (section,) = re.findall(
-        rf"^## {re.escape(heading)}\n(.*?)(?=^## |\Z)", (ROOT / page).read_text(), re.DOTALL | re.MULTILINE
+        rf"^##? {re.escape(heading)}\n(.*?)(?=^##? |\Z)", (ROOT / page).read_text(), re.DOTALL | re.MULTILINE
     )
     for _ in range(2):
         printed = []
-        for language, text in re.findall(r"^```(sh|python)\n(.*?)^```", section, re.DOTALL | re.MULTILINE):
+        for language, text, promised in re.findall(
+            r"^```(sh|python)\n(.*?)^```\n(?:\nIt prints:\n\n```\n(.*?)^```)?", section, re.DOTALL | re.MULTILINE
+        ):
             if language == "python":
                 Path("program.py").write_text(text)
                 runpy.run_path("program.py")
                 printed.append(capsys.readouterr().out)
+                assert promised in {"", printed[-1]}
                 continue
             lines = text.replace("\\\n", "").splitlines()
             others = [line for line in lines if not line.startswith(("optipmb ", *SET_UP))]
@@ -70,9 +76,22 @@ def test_a_table_with_other_names(folder: Path, capsys: pytest.CaptureFixture[st
     assert {row.split(",")[2] for row in rows} == {"1"}
 
 
-def test_coming_from_another_tracker(capsys: pytest.CaptureFixture[str]) -> None:
-    """The program on the page prints one confirmed track."""
-    assert run("docs/migrate.md", "norfair, motpy, SORT", capsys).splitlines()[-1].startswith("[1] [[3.2")
+@pytest.mark.parametrize(
+    ("page", "heading"),
+    [
+        ("gaps.md", "The same object after a gap"),
+        ("gaps.md", "While tracking"),
+        ("gaps.md", "Appearance"),
+        ("own-data.md", "Your own data: CSV, Parquet, JSON Lines"),
+        ("own-data.md", "Latitude and longitude"),
+        ("own-data.md", "Evaluate, tune, plot, replay"),
+    ],
+)
+def test_a_section_of_a_page(page: str, heading: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each of its commands ends with status 0, each of its programs prints what the page says."""
+    if heading.startswith("Evaluate"):
+        run("docs/own-data.md", "Your own data: CSV, Parquet, JSON Lines", capsys)
+    run(f"docs/{page}", heading, capsys)
 
 
 def test_trackers_side_by_side(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

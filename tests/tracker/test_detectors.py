@@ -187,12 +187,17 @@ def test_a_tracker_takes_results(form: str) -> None:
         alone.update(empty, t=0.1, **how)
 
 
-def test_the_page_prints_what_it_says(capsys: pytest.CaptureFixture[str]) -> None:
-    """The code of docs/frameworks.md and the text below it."""
-    page = (Path(__file__).parents[2] / "docs" / "frameworks.md").read_text(encoding="utf-8")
-    code, printed = re.findall(r"^```\w*\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
-    exec(compile(code, "frameworks.md", "exec"), {})  # noqa: S102 - of this repository
-    assert capsys.readouterr().out == printed
+def test_the_page_prints_what_it_says(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each program of docs/detectors.md, and the text below it."""
+    root = Path(__file__).parents[2]
+    monkeypatch.chdir(root)
+    page = (root / "docs" / "detectors.md").read_text(encoding="utf-8")
+    block = r"^```python\n(.*?)^```\n\nIt prints:\n\n```\n(.*?)^```"
+    programs = re.findall(block, page, re.DOTALL | re.MULTILINE)
+    assert len(programs) == page.count("```python")
+    for code, printed in programs:
+        exec(compile(code, "detectors.md", "exec"), {})  # noqa: S102 - of this repository
+        assert capsys.readouterr().out == printed
 
 
 def test_results_are_not_changed() -> None:
