@@ -75,7 +75,7 @@ TASKS: Final = (
     ("shutdown, Docker stop, Kubernetes", "`grace_s`, `http` (`/healthz`, `/readyz`)"),
     ("log level, JSON logs", "`log_level`, `log_format`"),
     ("Prometheus, Grafana, monitoring", "`http`, `http_streams`"),
-    ("OpenTelemetry, Jaeger, tracing, spans", "`traces`; see [Traces](traces.md)"),
+    ("OpenTelemetry, Jaeger, tracing, spans", "`traces`; see [Traces](operation.md#traces)"),
     ("ROS, ROS 2, topics, tf", "`ros2`; see [ROS 2](ros2.md)"),
     ("name of the service, several services on one network", "`instance`, `prefix`"),
     (

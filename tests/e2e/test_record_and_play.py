@@ -267,7 +267,7 @@ def test_a_car_keeps_its_id_where_the_world_moves(
     service: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The example of the documentation prints one track in both worlds; its recording plays to the same bytes."""
-    page = (REPOSITORY / "docs" / "relocation.md").read_text(encoding="utf-8")
+    page = (REPOSITORY / "docs" / "operation.md").read_text(encoding="utf-8")
     found = re.search(r"# When the world moves.*?```python\n(.*?)```", page, re.DOTALL)
     assert found is not None
     where = f', connect="{service.endpoint}"'

@@ -162,7 +162,7 @@ FIGURES = {
         f"a bridge holds {message_log.HELD_BYTES // 2**20} MB",
         f"`standby_mb` ({default('standby_mb')}) of",
     },
-    "state.md": {
+    "operation.md": {
         f"`idle_s` ({default('idle_s'):g}) without messages, ",
         f"`keep_days` ({default('keep_days'):g}); last ids of {sqlite.NUMBERS:,} streams",
         f"table `aside` | the newest {sqlite.ASIDE} |",
