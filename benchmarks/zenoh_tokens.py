@@ -10,9 +10,6 @@ before it was declared.
     python benchmarks/zenoh_tokens.py
 """
 
-# The link of the client library, which has types, is not used here.
-# mypy: ignore-errors
-
 import json
 import subprocess
 import sys

@@ -9,20 +9,21 @@ from pathlib import Path
 
 import pytest
 from commands import run_here
+from optipmb_service.app.cli import main as service_command
 
 ROOT = Path(__file__).parents[2]
 SET_UP = ("pip install ", "python3 -m venv ")
 
 
-def run(page: str, heading: str, capsys: pytest.CaptureFixture[str]) -> str:
-    """Run the blocks of a section of a page twice, without installations; return the second output.
+def run(page: str, heading: str, capsys: pytest.CaptureFixture[str], times: int = 2) -> str:
+    """Run the blocks of a section of a page twice, without installations; return the last output.
 
     What a page says that a program prints is compared with what it prints.
     """
     (section,) = re.findall(
         rf"^##? {re.escape(heading)}\n(.*?)(?=^##? |\Z)", (ROOT / page).read_text(), re.DOTALL | re.MULTILINE
     )
-    for _ in range(2):
+    for _ in range(times):
         printed = []
         for language, text, promised in re.findall(
             r"^```(sh|python)\n(.*?)^```\n(?:\nIt prints:\n\n```\n(.*?)^```)?", section, re.DOTALL | re.MULTILINE
@@ -79,6 +80,7 @@ def test_a_table_with_other_names(folder: Path, capsys: pytest.CaptureFixture[st
 @pytest.mark.parametrize(
     ("page", "heading"),
     [
+        ("faq.md", "Why is my object not shown?"),
         ("gaps.md", "The same object after a gap"),
         ("gaps.md", "While tracking"),
         ("gaps.md", "Appearance"),
@@ -90,8 +92,34 @@ def test_a_table_with_other_names(folder: Path, capsys: pytest.CaptureFixture[st
 def test_a_section_of_a_page(page: str, heading: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Each of its commands ends with status 0, each of its programs prints what the page says."""
     if heading.startswith("Evaluate"):
-        run("docs/own-data.md", "Your own data: CSV, Parquet, JSON Lines", capsys)
-    run(f"docs/{page}", heading, capsys)
+        run("docs/own-data.md", "Your own data: CSV, Parquet, JSON Lines", capsys, times=1)
+    run(f"docs/{page}", heading, capsys, times=1)
+
+
+@pytest.mark.parametrize("program", ["optipmb", "optipmb-service"])
+def test_the_commands_of_the_cheat_sheet_exist(program: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each has a help that names its options."""
+    page = (ROOT / "docs" / "cheatsheet.md").read_text()
+    commands = [shlex.split(line) for line in re.findall(rf"`{program} ([^`]+)`", page)]
+    assert len(commands) > 5
+    for words in commands:
+        command = [words[0]] if not words[0].startswith("-") else []
+        group = [words[1]] if words[0] == "camera" else []
+        if program == "optipmb":
+            shown = run_here(capsys, *command, *group, "--help").stdout
+        else:
+            with pytest.raises(SystemExit):
+                service_command([*command, "--help"])
+            shown = capsys.readouterr().out
+        assert all(word in shown for word in words if word.startswith("--")), words
+
+
+def test_variables_stand_for_options(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """OPTIPMB_CONNECT and OPTIPMB_ZENOH_CONFIG are --connect, with commas between several, and --config."""
+    monkeypatch.setenv("OPTIPMB_CONNECT", "tcp/127.0.0.1:1,tcp/127.0.0.1:2")
+    assert "nothing answers at tcp/127.0.0.1:1, tcp/127.0.0.1:2" in run_here(capsys, "status").stderr
+    monkeypatch.setenv("OPTIPMB_ZENOH_CONFIG", "nowhere.json5")
+    assert "nowhere.json5" in run_here(capsys, "status").stderr
 
 
 def test_trackers_side_by_side(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -30,6 +30,11 @@ class PaceOptions:
         return Pace(speed_of(self.speed), self.window, self.patience, self.wait)
 
 
+def _endpoints(given: list[str] | None) -> list[str] | None:
+    """Split endpoints at commas, as the service reads them from the same variable."""
+    return [one for text in given for one in text.split(",")] if given else given
+
+
 @dataclass(frozen=True, kw_only=True)
 class ServiceOptions:
     """Options of the connection to a service."""
@@ -39,14 +44,21 @@ class ServiceOptions:
         typer.Option(
             "--connect",
             metavar="ENDPOINT",
+            envvar="OPTIPMB_CONNECT",
+            callback=_endpoints,
             help=f"Router or service, several times for several; default: {DEFAULT_ENDPOINT}, or what --config says.",
             show_default=False,
         ),
     ] = None
     config: Annotated[
-        Path | None, typer.Option("--config", help="Zenoh configuration file, for TLS and passwords.")
+        Path | None,
+        typer.Option(
+            "--config", envvar="OPTIPMB_ZENOH_CONFIG", help="Zenoh configuration file, for TLS and passwords."
+        ),
     ] = None
-    prefix: Annotated[str, typer.Option("--prefix", help="First part of all keys, as the service has it.")] = PREFIX
+    prefix: Annotated[
+        str, typer.Option("--prefix", envvar="OPTIPMB_PREFIX", help="First part of all keys, as the service has it.")
+    ] = PREFIX
 
     def connection(self, timeout: float = 5.0) -> Connection:
         """Return a connection over Zenoh."""
