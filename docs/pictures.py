@@ -97,11 +97,15 @@ def draw_ellipses(axes: Axes, tracks: list[optipmb.OnlineTracks], found: list[tu
 def draw_existence(axes: Axes, tracks: list[optipmb.OnlineTracks]) -> None:
     """Draw the existence of the car and of the false detection."""
     ghost = next(int(i) for one in tracks for i in one.id if i != 1)
-    for identity, colour, name in ((1, CAR, "car, missed from 3.0 s to 3.9 s"), (ghost, GHOST, "two false detections")):
+    for identity, colour, name in (
+        (1, CAR, "car, missed from 3.0 s to 3.9 s"),
+        (ghost, GHOST, "two false detections at one place"),
+    ):
         rows = [row_of(one, identity) for one in tracks]
         values = [np.nan if i is None else one.existence[i] for one, i in zip(tracks, rows, strict=True)]
         axes.plot(np.arange(FRAMES) / RATE, values, color=colour, label=name)
-    axes.axhline(0.5, color=TRUTH, linestyle="--", label="confirmed from here on")
+    confirmed = optipmb.load_profile("generic").classes["car"].confirm_from
+    axes.axhline(confirmed, color=TRUTH, linestyle="--", label="confirmed from here on")
     axes.set_ylim(0.0, 1.05)
     axes.set_xlabel("time (s)")
     axes.set_ylabel("existence")

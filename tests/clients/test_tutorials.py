@@ -57,16 +57,23 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_getting_started(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The sample is checked, tracked, drawn and evaluated, by the command and in Python."""
     page = "docs/getting-started.md"
-    run(page, "2. Look at your detections", capsys)
+    text = (ROOT / page).read_text()
+    (promised,) = re.findall(r"^```text\n( +finding.*?)^```", text, re.DOTALL | re.MULTILINE)
+    read = run(page, "2. Look at your detections", capsys)
+    assert [line.rstrip() for line in read.splitlines()] == promised.splitlines()
     told = run(page, "3. Track", capsys)
     with (folder / "tracks.csv").open() as file:
         shown = {row["id"] for row in csv.DictReader(file) if row["confirmed"] == "1"}
     assert f"80 frames, {len(shown)} tracks, " in told
-    assert f"80 frames, {len(shown)} tracks, " in (ROOT / page).read_text()
+    assert f"80 frames, {len(shown)} tracks, " in text
+    assert told.splitlines()[-1] in text
     figures = run(page, "4. Look at the tracks", capsys)
     assert (folder / "crossing.png").stat().st_size > 10_000
-    assert re.search(r"car +confirmed .*\n +≥ 0\.\d+ +97\.\d+ .* 0 +0\n", figures)
-    assert run(page, "5. The same in Python", capsys).splitlines()[0] in (ROOT / page).read_text()
+    (promised,) = re.findall(r"^```text\n(class .*?)^```", text, re.DOTALL | re.MULTILINE)
+    assert all(line in figures for line in promised.splitlines())
+    assert run(page, "5. The same in Python", capsys).startswith(
+        re.findall(r"^```text\n(OnlineTracks.*?)^```", text, re.DOTALL | re.MULTILINE)[0]
+    )
 
 
 def test_a_table_with_other_names(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
