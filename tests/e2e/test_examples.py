@@ -120,7 +120,7 @@ def test_two_sensors_work_twice(fused: ServiceProcess, time: int) -> None:
     with Program(connected(block("fusion.md", "python"), fused.endpoint)) as program:
         lines = program.until(r"radar: track \d+ at 58\.")
     if time == 1:
-        promised = (REPOSITORY / "docs/fusion.md").read_text().partition("for each frame and track:\n\n```\n")[2]
+        promised = (REPOSITORY / "docs/fusion.md").read_text().partition("for each frame with a track:\n\n```\n")[2]
         assert lines[1:3] == promised.splitlines()[:2]
         assert lines[-1] == promised.splitlines()[3]
     assert len({line.split()[2] for line in lines[-20:]}) == 1
