@@ -2,6 +2,7 @@
 
 import math
 import re
+import signal
 import subprocess
 import sys
 import threading
@@ -18,6 +19,7 @@ from optipmb_client.incoming import Inbox
 from optipmb_client.links import linked
 from optipmb_client.zenoh import DEFAULT_ENDPOINT, Connection
 from optipmb_client.zenoh import connection as connecting
+from router import until
 from routers import free_endpoint, open_client, open_router
 
 
@@ -72,6 +74,19 @@ def test_a_connection_may_wait_for_ever(endpoint: str) -> None:
     """With an infinite timeout a connection opens; it has a router when it is open."""
     with Connection(endpoint, timeout=math.inf) as connection:
         assert connection._session.linked()
+
+
+def test_an_interrupt_ends_the_wait_for_a_router() -> None:
+    """Ctrl-C raises KeyboardInterrupt in a connection that waits for ever."""
+    main = threading.get_ident()
+
+    def interrupt() -> None:
+        until(lambda: any(one.name == "open" for one in threading.enumerate()), "waiting")
+        signal.pthread_kill(main, signal.SIGINT)
+
+    threading.Thread(target=interrupt).start()
+    with pytest.raises(KeyboardInterrupt):
+        Connection(free_endpoint(), timeout=math.inf)
 
 
 def test_a_router_that_comes_later_within_the_timeout_is_waited_for() -> None:

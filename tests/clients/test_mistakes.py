@@ -121,6 +121,18 @@ def test_every_mistake_gets_its_sentence(
         assert not (tmp_path / "t.csv").exists()
 
 
+def test_a_place_where_nothing_can_be_written_is_refused_at_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Below a file, and in a folder without the right: before the data are read, and with the place itself."""
+    (tmp_path / "file").write_text("")
+    assert run(["track", "absent.csv", "--out", str(tmp_path / "file" / "t.csv")]) == 2
+    assert f"{tmp_path / 'file'} is a file" in capsys.readouterr().err
+    monkeypatch.setattr("os.access", lambda *_: False)
+    assert run(["track", "absent.csv", "--out", str(tmp_path / "new" / "t.csv")]) == 2
+    assert f"{tmp_path} cannot be written to" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("package", "command", "extra"),
     [

@@ -394,6 +394,7 @@ def test_detections_are_named_or_alone(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"detections/three\.json"):
         count("three")
     (sequence,) = NuScenesDataset(tmp_path).sequences(["all"])
+    assert len(sequence.stamps) == len(sequence)
     assert len(sequence) == 3
 
 

@@ -58,6 +58,14 @@ def write(path: Path, camera: optipmb.GroundCamera, names: str, pose: str = "") 
     return path
 
 
+def test_check_calls_sizes_unknown(capsys: pytest.CaptureFixture[str]) -> None:
+    """Pixel boxes have no size in metres, and the table of classes says so."""
+    sample = REPOSITORY / "examples" / "detectors"
+    done = run_here(capsys, "check", sample / "pixel_boxes.csv", "--camera", sample / "gate.toml")
+    assert "nan" not in done.stdout
+    assert re.search(r"^car +car +29 +unknown ", done.stdout, re.MULTILINE)
+
+
 def test_the_page_does_what_it_says(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

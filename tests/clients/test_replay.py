@@ -196,6 +196,26 @@ def test_a_refused_profile_is_told_in_the_words_of_the_service(
         run(link, dataset, tmp_path, profile="waymo")
 
 
+def test_an_interrupt_says_what_is_complete(
+    endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first sequence is written, the second is not, and the error says so."""
+    written: list[object] = []
+
+    def interrupted(*_: object) -> tuple[set[object], set[object]]:
+        until(lambda: bool(written), "a frame of the second")
+        raise KeyboardInterrupt
+
+    def slow() -> None:
+        if list(tmp_path.iterdir()):
+            written.append(1)
+
+    monkeypatch.setattr("concurrent.futures.wait", interrupted)
+    with FakeService(endpoint), pytest.raises(KeyboardInterrupt, match=f"1 of 2 recordings are in {tmp_path}"):
+        run(link, dataset, tmp_path, "0000", "0001", streams=1, on_frame=slow)
+    assert [path.name for path in tmp_path.iterdir()] == ["0000.txt"]
+
+
 def test_one_failing_sequence_ends_the_others_and_closes_their_sessions(
     endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path
 ) -> None:

@@ -7,6 +7,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeAlias, TypeVar
@@ -75,15 +76,36 @@ class KeyNumbers:
 
 
 def opened(config: zenoh.Config) -> Opened:
-    """Open a session of Zenoh's.
+    """Open a session of Zenoh's, on a thread: Ctrl-C, which `zenoh.open` does not see, ends the wait for an answer.
 
     Raises:
         ConnectionFailed: The configuration or an endpoint cannot be used, or there is no answer.
     """
+    answer: Future[Opened] = Future()
+
+    def attempt() -> None:
+        found: Opened | BaseException
+        try:
+            found = zenoh.open(config)
+        except BaseException as error:  # noqa: BLE001  the waiting thread raises it
+            found = error
+        if answer.set_running_or_notify_cancel() and isinstance(found, BaseException):
+            answer.set_exception(found)
+        elif isinstance(found, BaseException):
+            return
+        elif answer.cancelled():
+            close_session(found)
+        else:
+            answer.set_result(found)
+
+    threading.Thread(target=attempt, name="open", daemon=True).start()
     try:
-        return zenoh.open(config)
+        return answer.result()
     except zenoh.ZError as error:
         raise ConnectionFailed(reason(error)) from error
+    except KeyboardInterrupt:
+        answer.cancel()
+        raise
 
 
 def close_session(session: Opened) -> None:

@@ -106,8 +106,12 @@ def _classes(sequences: "Many[DataSequence]") -> list[dict[str, Any]]:
     found = []
     for name, parts in rows.items():
         values = np.concatenate(parts)
-        sides = np.median(values[:, :3], axis=0)
-        size = " x ".join(f"{side:.3g}" for side in sides) if np.isfinite(sides).any() else "unknown"
+        known = [side[~np.isnan(side)] for side in values[:, :3].T]
+        size = (
+            " x ".join(f"{np.median(side):.3g}" if len(side) else "?" for side in known)
+            if any(map(len, known))
+            else "unknown"
+        )
         scores = f"{values[:, 3].min():.3g} to {values[:, 3].max():.3g}"
         tracked = class_like(name, KINDS) or "other"
         found.append({"class": name, "kind": tracked, "boxes": len(values), "size": size, "scores": scores})

@@ -40,8 +40,14 @@ def reading(root: Path | None) -> Status:
 
 
 def _out(out: Path) -> Path:
-    """Refuse a file in a format that is not written."""
+    """Refuse a file in a format that is not written, and a place where none can be, before anything is computed."""
     suffix = out.suffix.lower()
+    place = next(one for one in (out, *out.absolute().parents) if one.exists())
+    folder = place if place.is_dir() else place.parent
+    if place != out and not place.is_dir():
+        raise UsageError(f"--out {out}: expected a place in a folder, but {place} is a file")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise UsageError(f"--out {out}: {folder} cannot be written to")
     known = suffix in (*SUFFIXES, *FEATURES, ".mcap") or is_openlabel(out)
     if not out.is_dir() and not known and re.fullmatch(r"\.[a-z]{2,}[a-z0-9]*", suffix):
         raise UsageError(f"--out {out}: expected a folder, or a table ({', '.join((*SUFFIXES, *FEATURES, OPENLABEL))})")
@@ -269,8 +275,8 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
             values[name] = group(**{one.name: values.pop(one.name) for one in members[name]})
         try:
             command(**values)
-        except KeyboardInterrupt:  # the parser would end without a word
-            raise typer.Abort from None
+        except KeyboardInterrupt as interrupt:  # the parser would end without a word
+            raise typer.Abort(*interrupt.args) from None
 
     spread = [one for name, whole in given.items() for one in members.get(name, [whole])]
     own = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in spread]

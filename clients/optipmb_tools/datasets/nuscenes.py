@@ -373,6 +373,11 @@ class NuScenesSequence(DataSequence):
                 raise DatasetError(path, f"a LIDAR_TOP keyframe of sample {token}", "none")
         return tuple(keyframes[token] for token in self.samples)
 
+    @property
+    def stamps(self) -> Ints:
+        """(F,) nanoseconds of the samples; no detections are read."""
+        return np.asarray(self.stamp_us * 1000, dtype=np.int64)
+
     @cached_property
     def poses(self) -> tuple[Pose, ...]:
         """World from LiDAR, one per frame."""

@@ -21,6 +21,7 @@ import numpy as np
 from optipmb_schemas import Tracks
 from optipmb_schemas.json_form import shown
 
+from optipmb_tools.files import remove_unfinished
 from optipmb_tools.geometry import Floats, Ints
 from optipmb_tools.results import full_path, stacked, write_full
 from optipmb_tools.results.exports import is_features, is_openlabel, write_features
@@ -228,6 +229,12 @@ class Results:
         if here:
             self._taken[sequence.name] = written
         return here
+
+    def state(self, sequences: "Sequence[DataSequence]") -> str:
+        """Remove unfinished files of a run that ends early, and say what is complete."""
+        remove_unfinished(self._out, [one.name for one in sequences])
+        done = sum(isinstance(one, Path) for one in self._taken.values())
+        return f"{done} of {len(sequences)} recordings are in {self._out}"
 
     def close(self, sequences: "Sequence[DataSequence]") -> list[str]:
         """Write the table in the order of the names, or the file of a benchmark that holds all sequences.

@@ -192,6 +192,7 @@ def replay(
         ServiceUnavailable: No service answers.
         ServiceRefused: The service does not know the profile, or takes no more streams.
         UsageError: No such class.
+        KeyboardInterrupt: With what is complete in `out`.
     """
     run = f"{dataset.name}-{secrets.token_hex(3)}"
     results = Results(dataset, out, full=how.full)
@@ -216,9 +217,11 @@ def replay(
                 done, pending = concurrent.futures.wait(pending, TICK_S, concurrent.futures.FIRST_EXCEPTION)
                 for future in done:
                     future.result()
-        except BaseException:  # one sequence failed, or an interrupt: the others end early and close their sessions
+        except BaseException as error:  # one sequence failed, or an interrupt: the others close their sessions early
             stop.set()
             pool.shutdown(cancel_futures=True)
+            if isinstance(error, KeyboardInterrupt):
+                raise KeyboardInterrupt(results.state(sequences)) from None
             raise
     results.close(sequences)
     return [future.result() for future in futures]
