@@ -553,6 +553,18 @@ def test_the_server_is_gone_for_longer_than_a_lease(cluster: Cluster) -> None:
     assert service.end()[0] == 0
 
 
+def test_the_example_names_a_process_that_ends(tmp_path: Path) -> None:
+    """With the last line of its log, and status 1."""
+    program = tmp_path / "service"
+    program.write_text('#!/bin/sh\necho "$1: the address is in use" >&2\n[ "$1" = nats ] || exec sleep 60\n')
+    program.chmod(0o755)
+    script = Path(__file__).parents[2] / "examples" / "cluster.sh"
+    environment = os.environ | {"SERVICE": str(program), "STORE": str(tmp_path)}
+    done = subprocess.run(["/bin/sh", script], env=environment, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 1
+    assert "nats has ended; its last line: nats: the address is in use\n" in done.stderr
+
+
 def test_the_topology_of_kubernetes_runs_as_processes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The example starts it with one command, tracks come through either router, and an interrupt ends all of it."""
     routers = [free_endpoint() for _ in range(2)]

@@ -52,7 +52,7 @@ PASSED_ON: Final = {"allow_extra_args": True, "ignore_unknown_options": True}
 NATS: Final = "nats-server"
 NATS_PAYLOAD_MB: Final = 8  # largest message; a checkpoint may have three quarters of it; the default of NATS is 1
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
+app = typer.Typer(add_completion=False)
 
 
 class RouterOptions(TypedDict, total=False):

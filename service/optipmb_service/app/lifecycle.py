@@ -292,8 +292,12 @@ async def watch_keys(asked: StopRequest, session: Callable[[], Session | None], 
 
 
 def say_ready(what: str, name: str, endpoints: Iterable[str]) -> None:
-    """Print the line that starters wait for, the only one on stdout: name and endpoints."""
-    print(f"ready {what}={name} endpoints={','.join(endpoints)}", flush=True)  # noqa: T201 - it is the interface
+    """Print the line that starters wait for, the only one on stdout: name and endpoints.
+
+    In one write: `print` makes two where Python does not buffer, and a log line could come between text and end.
+    """
+    sys.stdout.write(f"ready {what}={name} endpoints={','.join(endpoints)}\n")
+    sys.stdout.flush()
 
 
 def report_ready(

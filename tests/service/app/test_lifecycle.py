@@ -10,10 +10,11 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from optipmb_schemas import Keys, SessionState
-from optipmb_service.app.lifecycle import LAST_S, EndBound, Steps, StopRequest, longest_end_s
+from optipmb_service.app.lifecycle import LAST_S, EndBound, Steps, StopRequest, longest_end_s, say_ready
 from optipmb_service.app.workers import WORKERS_S
 from processes import descendants, wait_until_ended
 from router import Node, Sensor
@@ -74,6 +75,14 @@ def ends(folder: Path, hang: str = "") -> tuple[dict[str, tuple[int, float]], di
             ended = dict(zip(started, threads.map(ServiceProcess.end, started.values()), strict=True))
         assert wait_until_ended(below, 0.0) == set()
         return ended, {name: one.errors for name, one in started.items()}
+
+
+def test_the_line_ready_is_one_write(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Text and end, so that no log line comes between them where output is not buffered."""
+    written: list[str] = []
+    monkeypatch.setattr("sys.stdout", SimpleNamespace(write=written.append, flush=lambda: None))
+    say_ready("instance", "edge-1", ["tcp/127.0.0.1:7447"])
+    assert written == ["ready instance=edge-1 endpoints=tcp/127.0.0.1:7447\n"]
 
 
 def test_a_session_that_hangs_in_its_close_keeps_no_process(tmp_path: Path) -> None:
