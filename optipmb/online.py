@@ -60,7 +60,7 @@ ALIASES: Final = MappingProxyType({
     "class": "label", "name": "label", "category": "label", "type": "label",
 })  # fmt: skip
 """Other names of columns."""
-WITHOUT: Final = MappingProxyType({"z": 0.0, "h": 1.5, "score": 1.0})
+WITHOUT: Final = MappingProxyType({"z": 0.0, "h": 1.5, "score": 1.0, "label": "object"})
 """Values of the columns that may be missing, as in the tables of `optipmb track`."""
 BOXES: Final = ("center", "score", "label")
 OTHERS: Final = ("size", "yaw", "velocity", "position_covariance", "embedding")
@@ -76,6 +76,8 @@ NEAR_M: Final = 0.1
 """Least distance from a camera at which a box is projected."""
 DOUBTED: Final = 20
 """Frames in succession with odd times after which a warning follows."""
+DOUBTED_LONG: Final = 2
+"""The same of times in which every object is lost."""
 STEPS_NS: Final = 10**6, 10**10
 """Times between frames that are not odd: no object is followed from one frame to the next over ten seconds."""
 
@@ -471,8 +473,8 @@ class OnlineTracker:
         step_ns = frame.stamp_ns - self.density.stamp_ns
         is_odd = self.density.stamp_ns >= 0 and not STEPS_NS[0] <= step_ns <= STEPS_NS[1]
         self._odd_steps = self._odd_steps + 1 if is_odd else 0
-        if self._odd_steps == DOUBTED:
-            seconds = f"{DOUBTED} frames in succession, the last {step_ns / 1e9:g} s after the one before"
+        if self._odd_steps == (DOUBTED_LONG if step_ns > STEPS_NS[1] else DOUBTED):
+            seconds = f"{self._odd_steps} frames in succession, the last {step_ns / 1e9:g} s after the one before"
             warn(f"t: expected seconds (stamp_ns: nanoseconds), received {seconds}", stacklevel=3)
         if self._sizes.add(frame):
             warn(f"size: expected {SIZES}, received {self._sizes.contradiction}", stacklevel=3)
@@ -512,6 +514,9 @@ class OnlineTracker:
         rows = np.flatnonzero(places[label] < 0)
         if len(rows) and not self._leave_out:
             expected = f"one of {', '.join(known)} (unknown_classes='leave out' takes any)"
+            if names == (WITHOUT["label"],):
+                expected = f"a column class, as {known[0]}: without one boxes are of class {names[0]}, which"
+                expected += f" optipmb.generic_parameters(['{names[0]}'], 0.1) tracks, the profile does not"
             raise FrameError(f"label[{rows[0]}]", expected, repr(str(given[rows[0]])))
         for name, place in zip(names, places.tolist(), strict=True):
             if place >= 0 and self._names[place] == known[place]:
@@ -555,11 +560,12 @@ def _columns(boxes: Any, arrays: Mapping[str, ArrayLike]) -> dict[str, Any]:
     columns |= {
         name: given[name] for name in ("yaw", "score", "position_covariance", "embedding", "label") if name in given
     }
-    columns.setdefault("score", [WITHOUT["score"]] * len(columns.get("center", ())))
-    if "size" not in columns and "center" not in given and "z" not in given and "center" in columns:
+    if "center" not in columns:
+        raise FrameError("center", "the columns x and y, or center", f"the columns {', '.join(given)}")
+    for name in ("score", "label"):
+        columns.setdefault(name, [WITHOUT[name]] * len(columns["center"]))
+    if "size" not in columns and "center" not in given and "z" not in given:
         columns["center"][:, 2] = np.nan
-    if missing := [name for name in BOXES if name not in columns]:
-        raise FrameError(missing[0], f"a column for each of {', '.join(BOXES)}", f"the columns {', '.join(given)}")
     if isinstance(columns["label"], str):
         columns["label"] = [columns["label"]] * len(columns["center"])
     columns = {name: _nested(values) for name, values in columns.items()}
@@ -637,7 +643,8 @@ def _stacked(given: Mapping[str, Any], parts: Sequence[str]) -> Array:
     columns = []
     for part in parts:
         if part not in given and part not in WITHOUT:
-            raise FrameError(part, f"the columns {', '.join(parts)}", f"the columns {', '.join(given)}")
+            needed = " and ".join(one for one in parts if one not in WITHOUT)
+            raise FrameError(part, f"the columns {needed}", f"the columns {', '.join(given)}")
         values = given.get(part, [WITHOUT.get(part)] * count)
         try:
             column = np.asarray(values, dtype=np.float64)

@@ -94,6 +94,20 @@ def test_the_tracks_that_are_shown_are_the_confirmed_ones(bench: Bench) -> None:
         assert [line.split()[at] for at, line in zip((1, 0, 0), lines[: len(rows)], strict=False)] == rows
 
 
+def test_data_and_truth_have_a_line_of_assumptions_each(bench: Bench) -> None:
+    """Where they are read in different ways; a table without truth is answered with the option."""
+    found = bench.table("d.csv", cars(id=None, score=np.full(FRAMES * CARS, 0.9)))
+    truth = bench.table("truth.csv", cars(id=None, object=np.tile([1, 2], FRAMES), scale=1000.0, h=None))
+    tracks = bench.table("tracks.csv", cars())
+    options = ["column.id=object"]
+    said = bench.run("evaluate", found, "--truth", truth, "--tracks", tracks, options=options).stderr
+    assert f"{found}: stamps are in seconds" in said
+    assert f"{truth}: stamps are in milliseconds" in said
+    done = bench.run("evaluate", found, "--tracks", tracks)
+    assert done.returncode == 2
+    assert "--truth FILE" in done.stderr
+
+
 def test_tracks_may_be_a_table_of_text(bench: Bench) -> None:
     """A `.txt` with names of columns is a table of tracks; a format of a benchmark in its place is named."""
     bench.evaluate(cars(), cars())

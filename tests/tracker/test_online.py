@@ -157,9 +157,9 @@ def test_nothing_detected_is_a_frame() -> None:
     ("boxes", "when", "text"),
     [
         (flat(0, "barrier"), {"t": 1.0}, r"label\[0\]: expected one of Car, Pedestrian, Cyclist .* 'barrier'"),
-        ({"yaw": [1.0]}, {"t": 1.0}, "center: expected a column for each of center, score, label"),
-        ({"x": [1.0]}, {"t": 1.0}, "y: expected the columns x, y, z"),
-        ({**flat(0), "vx": [1.0]}, {"t": 1.0}, "vy: expected the columns vx, vy"),
+        ({"yaw": [1.0]}, {"t": 1.0}, "center: expected the columns x and y, or center, received the columns yaw"),
+        ({"x": [1.0]}, {"t": 1.0}, "y: expected the columns x and y, received the columns x"),
+        ({**flat(0), "vx": [1.0]}, {"t": 1.0}, "vy: expected the columns vx and vy"),
         ({**flat(0), "velocity_x": [1.0]}, {"t": 1.0}, "velocity_x: expected columns among center, "),
         ({**flat(0), "x": ["far"]}, {"t": 1.0}, "x: expected numbers, received list of ..far"),
         ({**flat(0), "y": [1.0, 2.0]}, {"t": 1.0}, "y: expected .1,. numbers, one for each box, received .2,."),
@@ -203,7 +203,7 @@ def test_what_is_wrong_is_named_and_changes_nothing(boxes: Any, when: dict[str, 
 @pytest.mark.parametrize(
     ("unit", "change", "text"),
     [
-        (1e3, {}, r"t: expected seconds .*, received 20 frames in succession, the last 100 s after the one before"),
+        (1e3, {}, r"t: expected seconds .*, received 2 frames in succession, the last 100 s after the one before"),
         (0.0, {}, r"t: expected seconds .*, received 20 frames in succession, the last 0 s after"),
         (1.0, {"l": [1.9], "w": [4.5]}, "size: expected length, width, height.*, received 100 of 100 vehicles wider"),
         (1.0, {"l": [4500.0], "w": [1900.0]}, "size: .* in metres, received 100 of 100 boxes of sizes as 4500"),
@@ -241,6 +241,15 @@ def test_slow_frames_and_frames_in_parts_are_not_doubted() -> None:
     for k in range(40):
         slow.update(flat(0), t=5.0 * k)
         parts.update(flat(k), t=0.1 * (k // 2))
+
+
+def test_boxes_without_a_class_are_objects() -> None:
+    """As in tables: a profile with the class `object` tracks them, another one says what to do."""
+    boxes = {"x": [1.0], "y": [2.0], "l": [4.0], "w": [2.0], "yaw": [0.0]}
+    tracker = optipmb.OnlineTracker(optipmb.generic_parameters(["object"], 0.1))
+    assert tracker.update(boxes, t=0.0).name.tolist() == ["object"]
+    with pytest.raises(optipmb.FrameError, match=r"expected a column class, as car: without one .*\['object'\]"):
+        optipmb.OnlineTracker().update(boxes, t=0.0)
 
 
 def test_one_class_is_of_all_boxes_and_none_is_no_column() -> None:

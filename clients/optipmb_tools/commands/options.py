@@ -286,13 +286,28 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def in_short(notes: Sequence[str]) -> list[str]:
-    """Return the first clauses of assumptions, `PLACE: TEXT: MORE (--option NAME=VALUE)`, as a line, then the rest."""
+    """Return the first clauses of assumptions, `PLACE: TEXT: MORE (--option NAME=VALUE)`, as a line, then the rest.
+
+    Data and truth that are read in different ways have a line each, with the name of the file.
+    """
     assumed = [note for note in notes if isinstance(note, Assumption)]
     if len(assumed) <= 1:
         return list(notes)
-    clauses = dict.fromkeys(re.split(r": | \(--|; ", note.partition(": ")[2])[0] for note in assumed)
-    others = [note for note in notes if not isinstance(note, Assumption)]
-    return [f"{', '.join(clauses)} (--verbose says more)", *others]
+    of_place: dict[str, dict[str, None]] = {}
+    for place, _, text in (note.partition(": ") for note in assumed):
+        of_place.setdefault(place, {})[re.split(r": | \(--|; ", text)[0]] = None
+    places: dict[str, list[str]] = {}
+    for place, clauses in of_place.items():
+        places.setdefault(", ".join(clauses), []).append(place)
+    lines = [
+        f"{clauses if len(places) == 1 else f'{alike[0]}{_more(alike)}: {clauses}'} (--verbose says more)"
+        for clauses, alike in places.items()
+    ]
+    return [*lines, *(note for note in notes if not isinstance(note, Assumption))]
+
+
+def _more(places: Sequence[str]) -> str:
+    return f" and {len(places) - 1} more" if len(places) > 1 else ""
 
 
 def _option(text: str) -> tuple[str, float | str]:

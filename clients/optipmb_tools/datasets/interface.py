@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 Points = NDArray[np.float32]
 _T = TypeVar("_T")
 
+ANNOTATIONS = "annotations to compare with; of a table: --truth FILE"
 IDENTITY = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
 

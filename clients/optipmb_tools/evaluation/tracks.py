@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from optipmb_tools.datasets import DataSequence, DatasetError, Truth
-from optipmb_tools.datasets.interface import class_like
+from optipmb_tools.datasets.interface import ANNOTATIONS, class_like
 from optipmb_tools.datasets.kitti import KittiSequence
 from optipmb_tools.datasets.nuscenes import NuScenesSequence
 from optipmb_tools.datasets.table import ObjectTable, TableOptions, TableSequence, read_objects, span
@@ -53,7 +53,7 @@ def read_compared(
     for sequence in sequences:
         truth = sequence.truth()
         if truth is None:
-            raise DatasetError(f"sequence {sequence.name}", "annotations to compare with", "none")
+            raise DatasetError(f"sequence {sequence.name}", ANNOTATIONS, "none")
         pairs.append((truth, read_tracks(results, sequence, by)))
     detected = _alike((label for one in sequences for label in one.labels), names)
     known = (*names, *detected.values())

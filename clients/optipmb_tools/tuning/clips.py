@@ -11,6 +11,7 @@ import numpy as np
 from optipmb import Frame, Modules, Parameters, Tracker, Tracks
 from optipmb_tools.camera import Camera
 from optipmb_tools.datasets import DataSequence, DatasetError, Truth
+from optipmb_tools.datasets.interface import ANNOTATIONS
 from optipmb_tools.evaluation import Rules
 from optipmb_tools.geometry import Floats, Ints, stack_poses, to_sensor
 from optipmb_tools.results import FullTable, full_table
@@ -49,7 +50,7 @@ def load(sequence: DataSequence, parameters: Parameters, rules: Rules) -> Clip:
     frames = list(sequence.frames())  # first: a generated scene takes its truth from the scans that its frames needed
     truth = sequence.truth()
     if truth is None:
-        raise DatasetError(f"sequence {sequence.name}", "annotations to compare with", "none")
+        raise DatasetError(f"sequence {sequence.name}", ANNOTATIONS, "none")
     if truth.labelled is not None:
         received = (
             f"labels in {int(truth.labelled.sum())} of {len(frames)}: interpolate them, or take detections of these"
