@@ -16,6 +16,7 @@ from optipmb_tools.evaluation import Rules
 from optipmb_tools.evaluation.clear import ClearResult
 from optipmb_tools.results import ResultTable, full_table
 from optipmb_tools.views import pictures
+from optipmb_tools.views.comparison import draw_comparison
 from optipmb_tools.views.pictures import WIDTH_PX, Panel, animate_tracks, draw_tracks
 from PIL import Image
 
@@ -47,6 +48,32 @@ def text_of(path: Path, monkeypatch: pytest.MonkeyPatch, *arguments: object) -> 
     monkeypatch.setattr(Figure, "savefig", remember)
     draw_tracks(path, *arguments)  # type: ignore[arg-type]  # passed on as they are
     return found
+
+
+def test_a_miss_with_a_track_that_is_not_confirmed_shows_that_track(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A dotted line in the place of crosses, where such a track is at the object."""
+    sequence, truth, tracks = scene()
+    results: list[ClearResult] = [evaluate_clear(truth, tracks, name, RULES) for name in truth.labels]
+    rows = truth.take(~truth.ignored & (truth.frame % 7 == 3))
+    columns = (rows.frame, rows.id, rows.label, rows.center, rows.size, rows.yaw)
+    others = ResultTable(rows.labels, *columns, np.ones(len(rows)), rows.box2d)
+    texts = text_of(tmp_path / "a.png", monkeypatch, sequence, [Panel(tracks, results, "", others)], truth)
+    assert "track that is not confirmed" in texts
+    assert "miss" not in texts
+
+
+def test_a_comparison_has_the_identity_switches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside the shares of each class, with its number at each bar."""
+    from matplotlib.axes import Axes  # noqa: PLC0415 - matplotlib is an extra
+
+    numbers: list[str] = []
+    monkeypatch.setattr(Axes, "bar_label", lambda _axes, _bar, labels, **_: numbers.extend(labels))
+    draw_comparison(
+        tmp_path / "c.png", {"car": {"a": {"MOTA": 0.5}, "b": {"MOTA": 0.6}}}, {"car": {"a": 7.0, "b": None}}
+    )
+    assert numbers == ["7", "-"]
 
 
 def test_a_picture_shows_tracks_truth_sensor_and_failures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

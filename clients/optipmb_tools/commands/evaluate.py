@@ -135,7 +135,12 @@ def evaluate(
     if how.plot is not None:
         from optipmb_tools.views.comparison import draw_comparison  # noqa: PLC0415  an extra
 
-        draw_comparison(how.plot, shares(compared))
+        found = shares(compared)
+        switches = {
+            name: {tracker: clear[name]["IDS"] if name in clear else None for tracker, (clear, _) in compared.items()}
+            for name in found
+        }
+        draw_comparison(how.plot, found, switches)
     if not as_json:
         shown = comparison_tables(compared) if others else first.tables
         for table in shown:

@@ -167,7 +167,8 @@ def _report(tuned: "Tuned", dataset: str) -> Group:
     changes = _table("changed", "from", "to")
     for change in tuned.changes:
         changes.add_row(change.path, str(change.start), str(change.value))
-    return Group(figures, Text(), changes, Text(_objective(tuned)), Text(), Text(_calibration(tuned)), Text())
+    shown = changes if tuned.changes else Text("no value was better than that of the initial profile")
+    return Group(figures, Text(), shown, Text(_objective(tuned)), Text(), Text(_calibration(tuned)), Text())
 
 
 def _calibration(tuned: "Tuned") -> str:

@@ -30,6 +30,7 @@ _INK, _TRUTH = "#222222", "#B5B5B5"
 _MARGIN = 6.0
 _MARKERS = "os^vDPX*"  # of classes
 _BREAK = 5  # a path is not drawn across more missing frames than this
+_NEAR_M = 2.0  # as far as tracks of an object may be in figures of centres
 
 # Of moving pictures
 FRAMES = 70  # of a longer sequence every second frame is drawn, or every third …
@@ -63,6 +64,7 @@ class Panel(NamedTuple):
     tracks: ResultTable
     results: "Sequence[ClearResult]" = ()  # CLEAR figures of the classes; their misses and identity switches are marked
     title: str = ""
+    unconfirmed: ResultTable | None = None  # rows that are left out, drawn where they explain a miss
 
 
 @contextlib.contextmanager
@@ -116,7 +118,7 @@ def draw_tracks(path: Path, sequence: DataSequence, panels: Sequence[Panel], tru
             _draw_sensor(axes, sensor, sequence)
         _draw_paths(axes, panel.tracks, last_frame=len(sequence) - 1)
         if truth is not None:
-            _draw_failures(axes, truth, panel.results)
+            _draw_failures(axes, truth, panel)
         axes.label_outer()
     _legend(figure, grid)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -190,9 +192,12 @@ def _draw_paths(axes: "Axes", tracks: ResultTable, last_frame: int) -> None:
         label = box_label = "_"
 
 
-def _draw_failures(axes: "Axes", truth: Truth, results: "Sequence[ClearResult]") -> None:
+def _draw_failures(axes: "Axes", truth: Truth, panel: Panel) -> None:
+    results = panel.results
     place = {(int(f), int(i)): row for row, (f, i) in enumerate(zip(truth.frame, truth.id, strict=True))}
     misses = [place[miss.frame, miss.truth] for result in results for miss in result.misses]
+    if panel.unconfirmed is not None:
+        misses = _draw_unconfirmed(axes, truth, misses, panel.unconfirmed)
     if misses:
         axes.plot(
             *truth.center[misses, :2].T, "x", color=_INK, markersize=3, markeredgewidth=0.6, label="miss", zorder=6
@@ -206,6 +211,28 @@ def _draw_failures(axes: "Axes", truth: Truth, results: "Sequence[ClearResult]")
                 f"{switch.old} to {switch.new}", (x, y), xytext=(8, -9), textcoords="offset points", fontsize=8
             )
             label = "_"
+
+
+def _draw_unconfirmed(axes: "Axes", truth: Truth, misses: list[int], tracks: ResultTable) -> list[int]:
+    """Draw the tracks at missed objects that are not confirmed; return the misses without any."""
+    rows_at: dict[int, Ints] = {int(tracks.frame[rows[0]]): rows for rows in _rows_by_id(tracks.frame)}
+    used, without = [], []
+    for miss in misses:
+        rows = rows_at.get(int(truth.frame[miss]), np.empty(0, dtype=np.int64))
+        distance = np.linalg.norm(tracks.center[rows, :2] - truth.center[miss, :2], axis=1)
+        near = int(distance.argmin()) if len(rows) else 0
+        if len(rows) and distance[near] <= _NEAR_M:
+            used.append(int(rows[near]))
+        else:
+            without.append(miss)
+    label = "track that is not confirmed"
+    for rows in _rows_by_id(tracks.id[used]):
+        mine = np.sort(np.array(used)[rows])
+        path = _broken(tracks.frame[mine], tracks.center[mine])
+        colour = colour_of(int(tracks.id[mine[0]]))
+        axes.plot(*path, color=colour, linewidth=2.0, linestyle=(0, (1.0, 1.0)), label=label, zorder=4)
+        label = "_"
+    return without
 
 
 def _legend(figure: "Figure", grid: "Sequence[Axes]") -> None:
@@ -422,14 +449,16 @@ def draw_results(
     panels = []
     for folder, name, own in zip(folders, names, results, strict=True):
         table = read_tracks(folder, sequence).to_world(sequence.poses)
+        others = None
         best = [result.sweep.results[result.sweep.best] for result in own]
         if every:
             best = [result.total for result in own]
         elif score is None and table.confirmed is not None:
+            others = table.take(~table.confirmed)
             table, best = table.shown, [result.shown for result in own]
         else:
             table = _from_score(table, own, score)
-        panels.append(Panel(table, best, name if len(names) > 1 else ""))
+        panels.append(Panel(table, best, name if len(names) > 1 else "", others))
     if picture.suffix == ".gif":
         animate_tracks(picture, sequence, panels[0].tracks, sequence.truth())
     else:
