@@ -28,3 +28,12 @@ def test_a_page_is_one_small_file_with_the_confirmed_tracks(tmp_path: Path) -> N
     data = json.loads(re.search(r"const data = (.*?), colours", text)[1])  # type: ignore[index]  # it is there
     assert [track[0] for track in data["tracks"]] == ids[:-1].tolist()
     np.testing.assert_allclose(np.cumsum(data["tracks"][3][5]) / 100, places[:, 3, 0], atol=0.006)
+
+
+def test_tracks_have_the_colour_of_their_class_in_the_legend(tmp_path: Path) -> None:
+    """The class of a track is a place in the list of those that the page names, not of all of the profile."""
+    page = tmp_path / "page.html"
+    tracks = tracks_message("a/b/c", 0, [1, 2], labels=("car", "bus", "dog"), label=[2, 0], confirmed=np.ones(2, int))
+    write_page(page, "two", {0: tracks})
+    data = json.loads(re.search(r"const data = (.*?), colours", page.read_text())[1])  # type: ignore[index]  # as above
+    assert [data["labels"][track[1]] for track in data["tracks"]] == ["dog", "car"]

@@ -25,28 +25,32 @@ def write_page(path: Path, title: str, tracks: Mapping[int, Tracks]) -> None:
     for place, one, confirmed in parts:
         for row in confirmed.tolist():
             rows.setdefault(int(one.id[row]), []).append((place, one, row))
-    labels: list[str] = next((list(one.labels) for one in tracks.values()), [])
+    names: list[str] = next((list(one.labels) for one in tracks.values()), [])
+    labels = sorted({names[int(one.label[row])] for track in rows.values() for _, one, row in track})
     places = np.vstack([np.zeros((0, 2)), *(one.center[confirmed, :2] for _, one, confirmed in parts)])
     corners = np.array([places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M]) if len(places) else np.eye(2)
     start = tracks[order[0]].stamp_ns if order else 0
     data = {
-        "labels": sorted({labels[int(one.label[row])] for track in rows.values() for _, one, row in track}),
+        "labels": labels,
         "times": [round((tracks[index].stamp_ns - start) / 1e9, 3) for index in order] or [0.0],
         "extent": corners.round(2).ravel().tolist(),
-        "tracks": [_row(number, track) for number, track in sorted(rows.items())],
+        "tracks": [
+            _row(number, track, labels.index(names[int(track[-1][1].label[track[-1][2]])]))
+            for number, track in sorted(rows.items())
+        ],
     }
     text = (importlib.resources.files(__package__) / "page.html").read_text(encoding="utf-8")
     content = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
     write_whole(path, text.replace("{{title}}", html.escape(title)).replace("{{data}}", content).encode())
 
 
-def _row(number: int, track: list[tuple[int, Tracks, int]]) -> list[Any]:
+def _row(number: int, track: list[tuple[int, Tracks, int]], label: int) -> list[Any]:
     """Return id, class, length and width of a track, and the steps of its frames, x, y and headings."""
     _, newest, row = track[-1]
     values = np.array([[*one.center[at, :2], one.yaw[at]] for _, one, at in track])
     length, width = newest.size[row, :2].round(2).tolist()
     columns = (_steps(column) for column in (100 * values).T)
-    return [number, int(newest.label[row]), length, width, _steps(np.array([f for f, _, _ in track])), *columns]
+    return [number, label, length, width, _steps(np.array([f for f, _, _ in track])), *columns]
 
 
 def _steps(values: Floats) -> list[int]:

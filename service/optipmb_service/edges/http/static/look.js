@@ -347,21 +347,23 @@ function box(track) {
   pen.globalAlpha = bold ? 1 : sure(track[SCORE]);
   line([[x, y], front], tint, 1.6, track[FACING] < KNOWN ? [2, 3] : []); // dotted: it may face the other way
   if (Math.hypot(track[VX], track[VY]) > SLOW) arrow(x, y, x + track[VX], y + track[VY], tint);
-  const px = toScreen(x, y)[0], py = toScreen(x, Math.max(...around.map(([, top]) => top)))[1]; // above its middle
+  const edges = around.map((corner) => toScreen(...corner)), across = edges.map(([px]) => px), down = edges.map(([, py]) => py);
   pen.textAlign = "center";
   pen.font = `${bold ? "bold " : ""}12px system-ui, sans-serif`;
   pen.lineWidth = 3;
   pen.setLineDash([]);
   pen.strokeStyle = ink.veil;
   const name = bold || view.scale > NAMED ? `${object(track)} ${frame.labels[track[LABEL]]}` : object(track);
-  let above = py - 4;
-  const wide = pen.measureText(name).width, taken = ([x, y, w]) => Math.abs(x - px) < (w + wide) / 2 && Math.abs(y - above) < 12;
-  while (names.some(taken) && above > py - 20) above -= 13; // above the names that are there, near its box
-  if (bold || !names.some(taken)) {
-    names.push([px, above, wide]);
-    pen.strokeText(name, px, above);
+  const wide = pen.measureText(name).width, [cx, cy] = toScreen(x, y);
+  const free = ([px, py]) => !names.some(([x, y, w]) => Math.abs(x - px) < (w + wide) / 2 && Math.abs(y - py) < 12);
+  const places = [ // above, below, right, left: all beside its box, or none
+    [cx, Math.min(...down) - 4], [cx, Math.max(...down) + 13], [Math.max(...across) + wide / 2 + 4, cy + 4], [Math.min(...across) - wide / 2 - 4, cy + 4]];
+  const place = places.find(free) || (bold ? places[0] : null);
+  if (place) {
+    names.push([...place, wide]);
+    pen.strokeText(name, ...place);
     pen.fillStyle = ink.ink;
-    pen.fillText(name, px, above);
+    pen.fillText(name, ...place);
   }
   pen.globalAlpha = 1;
 }
