@@ -8,8 +8,8 @@ from lease_log import Alone
 from optipmb_service.cluster.sqlite import SqliteStore
 from optipmb_service.cluster.store import Fenced, StoreError
 from optipmb_service.session.checkpoint import Checkpoint, CheckpointError, encode_checkpoint
-from optipmb_service.session.session import Session
 from optipmb_service.session.identity import Incarnation
+from optipmb_service.session.session import Session
 from optipmb_service.streams.persistence import CheckpointWriter
 from router import Sensor, until
 
