@@ -203,7 +203,7 @@ def test_a_column_of_ids_may_be_named_in_each_table(bench: Bench) -> None:
     assert counts(bench.evaluate(other, cars(), options=["column.id=number"])) == RIGHT
     assert counts(bench.evaluate(cars(), other, options=["column.id=number"])) == RIGHT
     done = bench.run("check", bench.table("truth.csv", other), "--json", options=["column.id=number"])
-    assert "id from number" in next(one["text"] for one in result_of(done)["findings"] if one["topic"] == "columns")
+    assert {"id": "number"}.items() <= {one["role"]: one["column"] for one in result_of(done)["columns"]}.items()
 
 
 def test_the_truth_of_a_folder_is_matched_by_the_names_of_files(bench: Bench) -> None:
@@ -422,3 +422,18 @@ def test_truth_that_is_a_frame_late_is_named(bench: Bench) -> None:
     late = bench.evaluate(cars(t=cars()["t"] + 0.1), cars())
     assert "m from that of the frame after: does one of the two count frames from 1?" in late.stderr
     assert "count frames from 1" not in bench.evaluate(cars(), cars()).stderr
+
+
+def test_a_truth_needs_no_detections(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The frames of the truth are compared; tracks far away, or of another clock, are told from wrong ones."""
+    bench = Bench(tmp_path, capsys)
+    truth = bench.table("truth.csv", cars())
+    more = cars(np.arange(FRAMES + 10) / 10)
+    result = bench.run("evaluate", "--truth", truth, "--tracks", bench.table("u.csv", more), "--json")
+    assert result_of(result)["classes"]["car"]["all"]["MOTA"] == 1.0
+    assert "rows are at no frame of the truth" in result.stderr
+    far = bench.run("evaluate", "--truth", truth, "--tracks", bench.table("v.csv", cars() | {"y": cars()["y"] + 6e5}))
+    assert "6e+05 m from the truth" in far.stderr
+    late = bench.run("evaluate", "--truth", truth, "--tracks", bench.table("w.csv", cars() | {"t": cars()["t"] + 1e9}))
+    assert "0 to 4.9 s" in late.stderr
+    assert "another clock" in late.stderr

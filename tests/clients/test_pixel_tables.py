@@ -8,7 +8,7 @@ import pytest
 from commands import result_of, run_here
 from optipmb_tools.datasets.table import TableDataset
 from optipmb_tools.files import DatasetError
-from optipmb_tools.table_files import read_table
+from optipmb_tools.table_files import read_table, write_table
 from real_data import REPOSITORY
 
 import optipmb
@@ -192,3 +192,22 @@ def test_tables_that_no_camera_places_are_refused(
     done = run_here(capsys, "track", tmp_path / "d.csv", *words, "--out", tmp_path / "out")
     assert done.returncode == 2
     assert message in done.stderr
+
+
+def test_middles_and_shares_are_read(tmp_path: Path, camera: optipmb.GroundCamera) -> None:
+    """Boxes by their middles, in pixels or in shares of the image, are those of the corners."""
+    plain = write(tmp_path / "a.csv", camera, "x1,y1,x2,y2")
+    expected = TableDataset(plain, {"camera": str(tmp_path / "gate.toml")}).sequences(["all"])[0]
+    rows = read_table(plain)
+    boxes = np.column_stack([rows[name] for name in ("x1", "y1", "x2", "y2")])
+    middles = np.column_stack([0.5 * (boxes[:, :2] + boxes[:, 2:]), boxes[:, 2:] - boxes[:, :2]])
+    for names, scale, options in (
+        (("xc", "yc", "w", "h"), 1.0, {}),
+        (("x", "y", "w", "h"), 1.0, {"box": "cxcywh"}),
+        (("x_center", "y_center", "width", "height"), np.array([1920, 1080, 1920, 1080]), {}),
+    ):
+        values = dict(zip(names, (middles / scale).T, strict=True))
+        write_table(tmp_path / "b.csv", {"t": rows["t"], **values, "class": rows["class"], "score": rows["score"]})
+        data = TableDataset(tmp_path / "b.csv", {"camera": str(tmp_path / "gate.toml"), **options})
+        for one, other in zip(data.sequences(["all"])[0].frames(), expected.frames(), strict=True):
+            assert np.allclose(one.center[:, :2], other.center[:, :2], atol=1e-3)

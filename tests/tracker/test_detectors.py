@@ -258,3 +258,18 @@ def test_results_that_are_none_are_refused(result: Any, how: dict[str, Any], pat
         optipmb.from_detector(result, **how)
     assert caught.value.path == path
     assert text in str(caught.value)
+
+
+def test_a_map_of_classes_is_by_label() -> None:
+    """A dictionary has the names of the labels, wherever they begin."""
+    result = {
+        "pred_boxes": np.tile([0.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0], (2, 1)),
+        "pred_scores": [0.9, 0.8],
+        "pred_labels": [1, 7],
+    }
+    found = optipmb.from_detector(result, classes={1: "Car", 7: "Pedestrian"})
+    assert found["label"] == ["Car", "Pedestrian"]
+    with pytest.raises(optipmb.FrameError, match=r"pred_labels\[1\]: expected one of 1, received 7"):
+        optipmb.from_detector(result, classes={1: "Car"})
+    with pytest.raises(optipmb.FrameError, match="names of classes"):
+        optipmb.OnlineTracker().update({"box": [[1, 2, 3, 4]], "class": [2]}, t=0.0, camera=CAMERA)

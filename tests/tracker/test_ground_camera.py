@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING, Any, Final
 
 import cv2
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 import optipmb
+from optipmb.camera_files import read_lens, read_pose
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -489,3 +491,78 @@ def test_the_tracker_refuses_what_no_camera_gives(mount: str, given: dict[str, A
     with pytest.raises(optipmb.FrameError) as caught:
         tracker.update(**{name: value for name, value in boxes.items() if value is not None})
     assert caught.value.path == path
+
+
+MATRIX = "[[1050.0, 0.0, 960.0], [0.0, 1040.0, 540.0], [0.0, 0.0, 1.0]]"
+FLAT = "[1050.0, 0.0, 960.0, 0.0, 1040.0, 540.0, 0.0, 0.0, 1.0]"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"K: {FLAT}  # of the lens\ndistortion_coeffs: [-0.1, 0.02, 0.0, 0.0]\n",
+        (
+            "cam0:\n  camera_model: pinhole\n  distortion_model: radtan\n"
+            "  distortion_coeffs: [-0.1, 0.02, 0.0, 0.0]\n  intrinsics: [1050.0, 1040.0, 960.0, 540.0]\n"
+        ),
+        f'{{"camera_matrix": {MATRIX}, "dist_coeff": [[-0.1, 0.02, 0.0, 0.0]]}}',
+        f"M1:\n  data: {FLAT}\nD1:\n  data:\n    - -0.1\n    - 0.02\n    - 0.0\n    - 0.0\n",
+        f"mtx: {MATRIX}\ndist: [-0.1, 0.02, 0.0, 0.0]\nfisheye_model: 0\n",
+    ],
+)
+def test_lenses_of_other_programs_are_read(tmp_path: Path, text: str) -> None:
+    """Comments, blocks, JSON, and other names of the matrix and the distortion."""
+    (tmp_path / "lens").write_text(text)
+    found = read_lens(tmp_path / "lens", [1920, 1080])
+    assert found["intrinsics"] == [1050.0, 1040.0, 960.0, 540.0]
+    assert found["distortion"] == [-0.1, 0.02, 0.0, 0.0]
+    assert found["model"] == "opencv"
+    if text.startswith("K"):
+        (tmp_path / "lens").write_text(text + "fisheye_model: 1\n")
+        assert read_lens(tmp_path / "lens", None)["model"] == "fisheye"
+
+
+def test_a_matrix_without_a_distortion_is_a_question(tmp_path: Path) -> None:
+    """A lens whose distortion has no known name is not taken for a straight one."""
+    (tmp_path / "lens.yaml").write_text(f"K: {FLAT}\nlens_terms: [-0.1, 0.02]\n")
+    with pytest.raises(optipmb.ParameterError, match=r"distortion: .*says that it has none.*lens_terms"):
+        read_lens(tmp_path / "lens.yaml", None)
+
+
+def test_poses_of_other_programs_are_read(tmp_path: Path) -> None:
+    """R and t, rvec and tvec, and a matrix from the world to the camera give its place and turn."""
+    expected = optipmb.GroundCamera.parse(pinhole()).pinhole
+    assert expected is not None
+    turn = expected.pose.rotation.T
+    shift = -turn @ np.array(expected.position)
+    rvec = cv2.Rodrigues(turn)[0].ravel()
+    whole = np.column_stack([turn, shift]).tolist()
+    for document in (
+        {"R": turn.tolist(), "t": shift.tolist()},
+        {"rvec": rvec.tolist(), "tvec": shift[:, None].tolist()},
+        {"extrinsic": [*whole, [0.0, 0.0, 0.0, 1.0]]},
+    ):
+        (tmp_path / "c.json").write_text(json.dumps(document))
+        found = read_pose(tmp_path / "c.json")
+        assert np.allclose(found["position"], expected.position)
+        assert np.allclose(found["quaternion"], expected.quaternion) or np.allclose(
+            found["quaternion"], -np.array(expected.quaternion)
+        )
+
+
+def test_a_map_that_no_camera_sees_is_refused_and_coordinates_may_be_large() -> None:
+    """A mirrored matrix is refused; of metres of a grid the places keep their digits."""
+    near = np.array([[0.0, -0.02, 10.0], [-0.02, 0.0, 10.0], [0.0, -0.001, 1.0]])
+    for sign in (1.0, -1.0):
+        far = near.copy()
+        far[1] *= sign
+        far[:2] += np.array([[691_000.0], [5_336_000.0]]) * far[2]
+        document = {"image": [1920, 1080], "homography": {"matrix": far.tolist(), "reference": [960.0, 100.0]}}
+        if sign < 0.0:
+            with pytest.raises(optipmb.ParameterError, match="mirrored"):
+                optipmb.GroundCamera.parse(document)
+            continue
+        camera = optipmb.GroundCamera.parse(document)
+        pixels = np.array([[900.0, 200.0], [1000.0, 50.0]])
+        places = camera.ground(pixels)
+        assert np.allclose(camera.project(np.insert(places, 2, 0.0, axis=1)), pixels, atol=1e-5)

@@ -368,6 +368,7 @@ def test_damaged_documents_get_a_path(edge: Edge, endpoint: str, way: str) -> No
             "invalid_value",
             "objects[1].embedding",
         ),
+        ({"objects": [CAR, CAR | {"yaw": 90}]}, "invalid_value", "objects[1].yaw"),
         ({"objects": [], "object": []}, "invalid_value", "object"),
         ({"objects": [], "frame": "sensor"}, "missing_field", "pose"),
         ({"objects": [], "frame": "map"}, "invalid_value", "frame"),
