@@ -170,6 +170,7 @@ COUNTS: Final = 6
 SLOTS: Final = 3
 SLOT: Final = BINS + 2
 SCATTER: Final = 3
+AXES: Final = 2
 """Shapes of `SelfCalibration`; a slot has looks and ticks of 0.1 ms behind the bins."""
 NO_BIN: Final = -1
 REAL: Final = np.dtype(np.float64)
@@ -192,6 +193,10 @@ class SelfCalibration:
             the oldest first.
         scatter: (C, `SCATTER`) of the classes: pairs of a sure track and its detection, and the sums of the squared
             scatter of those detections along and across the heading, m^2.
+        innovations: (N, 2) last innovation of each detected object along and across its heading, m; zero where it was
+            missed.
+        lagged: (C, 2) of the classes: sums of the products of innovations and those before along and across, negated
+            and without the gain, m^2.
         components: (J,) int64 bin of the detection of each Poisson component, `NO_BIN` where it is not known.
     """
 
@@ -199,6 +204,8 @@ class SelfCalibration:
     objects: NDArray[np.uint16]
     components: Index
     scatter: Array
+    innovations: Array
+    lagged: Array
 
     @classmethod
     def of(cls, density: Density) -> SelfCalibration:
@@ -210,6 +217,8 @@ class SelfCalibration:
             np.zeros((len(density.bernoulli), SLOTS, SLOT), np.uint16),
             np.full(len(density.poisson), NO_BIN, np.int64),
             np.zeros((len(density.labels), SCATTER)),
+            np.zeros((len(density.bernoulli), AXES)),
+            np.zeros((len(density.labels), AXES)),
         )
 
 
@@ -378,6 +387,8 @@ def _shapes(classes: int, objects: int, components: int) -> dict[str, tuple[tupl
         "objects": ((objects, SLOTS, SLOT), np.uint16),
         "components": ((components,), np.int64),
         "scatter": ((classes, SCATTER), np.float64),
+        "innovations": ((objects, AXES), np.float64),
+        "lagged": ((classes, AXES), np.float64),
     }
 
 
@@ -562,13 +573,15 @@ def _appearance(columns: Mapping[str, Any], stamp_ns: int, live: int, lost: int,
 
 
 def _self_calibration(columns: Mapping[str, Any], shapes: Mapping[str, tuple[tuple[int, ...], Any]]) -> SelfCalibration:
-    """Return the counts of scores, none of which is negative or above `MOST_COUNTED`."""
+    """Return the counts of scores, none of which is negative or above `MOST_COUNTED`, and the innovations within it."""
     found = {}
     for name, (shape, kind) in shapes.items():
         column, path = columns.get(f"{COUNTED}.{name}"), f"{COUNTED}.{name}"
         if not isinstance(column, np.ndarray) or column.dtype != kind or column.shape != shape:
             raise DensityError(path, f"{shape} {kind.__name__}", shown(column))
         low, high = (NO_BIN, BINS - 1) if kind is np.int64 else (0, MOST_COUNTED)
+        if name in {"innovations", "lagged"}:
+            low = -MOST_COUNTED
         if column.size and not low <= column.min() <= column.max() <= high:
             raise DensityError(path, f"numbers from {low} to {high:g}", f"{column.min():g} to {column.max():g}")
         found[name] = np.array(column, order="C")

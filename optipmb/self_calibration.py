@@ -34,7 +34,14 @@ along and across the heading:
 
     sigma^2 = mean of nu epsilon        E[nu epsilon] = R where the filter is right
 
-with `PRIOR_PAIRS` pairs of the profile's noise. The scatter is R of the class, and R' of the published box. The errors
+with `PRIOR_PAIRS` pairs of the profile's noise. Where the process noise of the class is more than its objects need, the
+filter follows every box and takes scatter for motion. Then the innovations of neighbouring frames have opposite signs,
+and their product tells what is missing. A filter that believes its boxes alone, and gives its speed the share g of an
+innovation, K_v dt, has E[nu nu'] = -(1 + g)^2 R:
+
+    sigma^2 = mean of nu epsilon + max(0, -mean of nu nu' / (1 + g)^2)
+
+The scatter is R of the class, and R' of the published box. The errors
 of a detector last, too: no filter sees the offset of a box from its object. It is larger along the heading, where half
 of an object is hidden, than across. `LASTING_RATIO` times the scatter is added to the published covariance of sure
 tracks; the curve of the profile tells how much more the errors of doubtful ones last.
@@ -69,6 +76,7 @@ from optipmb.density import (
     objects_in,
 )
 from optipmb.frame import PLAIN
+from optipmb.hypotheses import DEVIATIONS_2
 from optipmb.predict import rows_within
 from optipmb.rows import read_only
 from optipmb.undetected import AGED, MARKED
@@ -123,7 +131,7 @@ PAIRS, ALONG, ACROSS = range(3)
 """Columns of the scatter of a class."""
 PRIOR_PAIRS: Final = 50.0
 SURE_S: Final = 1.0
-LEAST_NOISE, MOST_NOISE = 0.02, 2.0
+LEAST_NOISE, MOST_NOISE = 0.02, 10.0
 """Bounds of a learned standard deviation, m."""
 OUTLYING: Final = 9.0
 """Squared standard deviations that a pair counts for at most: a half-hidden object jumps."""
@@ -251,9 +259,15 @@ def calibrate(classes: Array, score: Array, label: Index, table: Classes) -> Arr
 
 
 @kernel
-def calibrate_frame(classes: Array, scatter: Array, score: Array, label: Index, table: Classes) -> tuple[Array, Array]:
-    """Return the scores of `calibrate`, (M,) each, and write thresholds and learned noise to `table`."""
-    use_scatter(scatter, table)
+def calibrate_frame(
+    classes: Array, sums: tuple[Array, Array], score: Array, label: Index, table: Classes
+) -> tuple[Array, Array]:
+    """Return the scores of `calibrate`, (M,) each, and write thresholds and learned noise to `table`.
+
+    `sums` are `scatter` and `lagged` of `SelfCalibration`.
+    """
+    scatter, lagged = sums
+    use_scatter(squares(scatter, lagged), table)
     lasting, meant = calibrate(classes, score, label, table)
     return lasting, meant
 
@@ -391,6 +405,16 @@ def learn(
 
 
 @kernel
+def squares(scatter: Array, lagged: Array) -> Array:
+    """Return the pairs of the classes and the sums of their squared scatter along and across, (C, 3), m^2."""
+    out = scatter.copy()
+    for c in range(out.shape[0]):
+        for s in range(lagged.shape[1]):
+            out[c, ALONG + s] += max(lagged[c, s], 0.0)
+    return out
+
+
+@kernel
 def learned(own: Array, axis: int, prior: float) -> float:
     """Return the variance of a class along an axis, m^2, from its row of the scatter (3,) and the prior variance."""
     variance: float = (PRIOR_PAIRS * prior + own[axis]) / (PRIOR_PAIRS + own[PAIRS])
@@ -399,7 +423,11 @@ def learned(own: Array, axis: int, prior: float) -> float:
 
 @kernel
 def use_scatter(scatter: Array, table: Classes) -> None:
-    """Write the learned noise, R, R_x and the lasting errors, to the rows of a table."""
+    """Write the learned noise, R, R_x and the lasting errors, to the rows of a table; `scatter` as of `squares`.
+
+    Gates hold 99 % of the differences of two boxes. The area of the profile is for its noise: a detector with errors of
+    metres looks over more water, and its clutter and births are spread over so much more.
+    """
     for c in range(scatter.shape[0]):
         own = table[c]
         if scatter[c, PAIRS] == 0.0:
@@ -412,8 +440,11 @@ def use_scatter(scatter: Array, table: Classes) -> None:
         reported = 0.5 * (along + across)
         measured = 0.5 * (learned(scatter[c], ALONG, measured) + learned(scatter[c], ACROSS, measured))
         measured = max(measured, LEAST_PART * own.noise_position * own.noise_position)
+        own.clutter_intensity *= own.noise_position * own.noise_position / measured
+        own.birth_intensity *= own.noise_position * own.noise_position / measured
         own.noise_position = math.sqrt(measured)
         own.reported_position = 1.0 / (1.0 / reported - 1.0 / measured) if reported < measured else 0.0
+        own.gate = max(own.gate, math.sqrt(2.0 * DEVIATIONS_2 * measured))
         if own.knots > 0:
             grow(own.knot_along, own.knots, scatter[c], ALONG)
             grow(own.knot_across, own.knots, scatter[c], ACROSS)
@@ -438,52 +469,70 @@ def lasting(own: Array, axis: int, prior: float) -> float:
 
 @kernel
 def learn_scatter(
-    scatter: Array,
+    sums: tuple[Array, Array],
+    innovations: Array,
+    before_words: Array,
     prior_words: Array,
     words: Array,
     hits: tuple[Index, Index],
     position: Array,
     moment: tuple[int, int],
     table: Classes,
-) -> Array:
-    """Return the scatter (C, 3) with the pairs of a frame.
+) -> tuple[Array, Array, Array]:
+    """Return scatter (C, 3) and lagged products (C, 2) with the pairs of a frame, and the innovations (K, 2).
 
     Arguments of its own:
-        prior_words, words: arrays of the predicted and the updated `Bernoullis`.
+        sums: `scatter` and `lagged` of `SelfCalibration`.
+        innovations: of the objects of the frame before.
+        before_words, prior_words, words: arrays of those, of the predicted and of the updated `Bernoullis`.
         hits: `row` and `measurement` of the updated ones, as in `optipmb.tracker.Update`.
         position: (M, 2) or (M, 5) of the measurements.
         moment: stamps of the frame and of the one before.
     """
-    out, prior, objects = scatter.copy(), objects_in(prior_words), objects_in(words)
-    (row, measurement), (stamp_ns, before_ns) = hits, moment
+    scatter, lagged = sums
+    out, products, known = scatter.copy(), lagged.copy(), squares(scatter, lagged)
+    before, prior, objects = objects_in(before_words), objects_in(prior_words), objects_in(words)
+    (row, measurement), (stamp_ns, before_ns), b = hits, moment, 0
+    kept = np.zeros((row.shape[0], lagged.shape[1]))
     for k in range(row.shape[0]):
         n, m, c = row[k], measurement[k], objects.label[k]
-        if n < 0 or m < 0 or not prior.confirmed[n] or prior.seen_ns[n] != before_ns:
+        if n < 0 or m < 0:
             continue
-        if stamp_ns - prior.born_ns[n] < SURE_S * 1e9:
+        while before.id[b] < prior.id[n]:
+            b += 1
+        cos, sin = math.cos(objects.mean[k, PHI]), math.sin(objects.mean[k, PHI])
+        nu_x, nu_y = position[m, 0] - prior.mean[n, X], position[m, 1] - prior.mean[n, Y]
+        kept[k, 0], kept[k, 1] = cos * nu_x + sin * nu_y, cos * nu_y - sin * nu_x
+        if not prior.confirmed[n] or prior.seen_ns[n] != before_ns or stamp_ns - prior.born_ns[n] < SURE_S * 1e9:
             continue
         if position.shape[1] > PLAIN and (position[m, 2] != 1.0 or position[m, 4] != 1.0):
             continue  # with a covariance of its own
-        cos, sin = math.cos(objects.mean[k, PHI]), math.sin(objects.mean[k, PHI])
         usual = table[c].noise_position ** 2
-        nu_x, nu_y = position[m, 0] - prior.mean[n, X], position[m, 1] - prior.mean[n, Y]
         e_x, e_y = position[m, 0] - objects.mean[k, X], position[m, 1] - objects.mean[k, Y]
-        along = (cos * nu_x + sin * nu_y) * (cos * e_x + sin * e_y)
-        across = (cos * nu_y - sin * nu_x) * (cos * e_y - sin * e_x)
+        along = kept[k, 0] * (cos * e_x + sin * e_y)
+        across = kept[k, 1] * (cos * e_y - sin * e_x)
         out[c, PAIRS] += 1.0
-        out[c, ALONG] += min(max(along, 0.0), OUTLYING * learned(scatter[c], ALONG, usual))
-        out[c, ACROSS] += min(max(across, 0.0), OUTLYING * learned(scatter[c], ACROSS, usual))
+        out[c, ALONG] += min(max(along, 0.0), OUTLYING * learned(known[c], ALONG, usual))
+        out[c, ACROSS] += min(max(across, 0.0), OUTLYING * learned(known[c], ACROSS, usual))
+        spread = 0.5 * (prior.covariance[n, X, X] + prior.covariance[n, Y, Y]) + usual
+        of_speed = (cos * prior.covariance[n, V, X] + sin * prior.covariance[n, V, Y]) / spread
+        gain = min(max(of_speed * (stamp_ns - before_ns) * 1e-9, 0.0), 1.0)
+        for s in range(lagged.shape[1]):
+            product = min(max(kept[k, s] * innovations[b, s], -OUTLYING * spread), OUTLYING * spread)
+            products[c, s] -= product / (1.0 + gain) ** 2
     for c in range(out.shape[0]):
         if out[c, PAIRS] > MASS:
-            kept = MASS / out[c, PAIRS]
+            share = MASS / out[c, PAIRS]
             for s in range(out.shape[1]):
-                out[c, s] *= kept
-    return out
+                out[c, s] *= share
+            for s in range(lagged.shape[1]):
+                products[c, s] *= share
+    return out, products, kept
 
 
 @kernel
 def learn_frame(
-    counts: tuple[Array, Slots, Index, Array],
+    counts: tuple[Array, Slots, Index, tuple[Array, Array], Array],
     before_words: Array,
     prior: tuple[Array, Array],
     posterior: tuple[Array, Index, Index, Index, Index],
@@ -491,22 +540,25 @@ def learn_frame(
     position: Array,
     moment: Columns,
     table: Classes,
-) -> tuple[Array, Slots, Index, Array]:
+) -> tuple[Array, Slots, Index, Array, Array, Array]:
     """Return the arrays of `SelfCalibration` after a frame, by `learn` and `learn_scatter`, whose arguments these are.
 
     Arguments of its own:
-        counts: the arrays before it, in their order; the scatter last.
+        counts: the arrays before it; `sums` and `innovations` last.
         prior: arrays of the predicted objects and components.
         posterior: array of the objects; `row`, `measurement` and `fate` of `Update`; and `Misses.looked_ns`, (0,) where
             every frame looks at all objects.
     """
-    classes, slots, bins, scatter = counts
+    classes, slots, bins, sums, innovations = counts
     (words, row, hit, fate, looked_ns), now = posterior, Moment(*moment)
     looked = looked_ns == now.stamp_ns if looked_ns.shape[0] else np.ones(hit.shape[0], np.bool_)
     given, label = (classes.copy(), slots, bins), components_in(prior[1]).label
     found = learn(given, before_words, (words, hit, looked), label, fate, detections, now.dt)
     stamps = now.stamp_ns, now.before_ns
-    return (*found, learn_scatter(scatter, prior[0], words, (row, hit), position, stamps, table))
+    scatter, lagged, kept = learn_scatter(
+        sums, innovations, before_words, prior[0], words, (row, hit), position, stamps, table
+    )
+    return (*found, scatter, lagged, kept)
 
 
 class Scores(NamedTuple):
@@ -530,7 +582,8 @@ class Scores(NamedTuple):
 def calibrated(density: Density, frame: Frame, table: ClassTable) -> tuple[Scores, ClassTable]:
     """Return the calibrated scores of a frame, and parameters whose thresholds they may be compared with."""
     own, table = SelfCalibration.of(density), table.copy()
-    lasting, meant = calibrate_frame(own.classes, own.scatter, frame.score, frame.label, table.classes)
+    sums = own.scatter, own.lagged
+    lasting, meant = calibrate_frame(own.classes, sums, frame.score, frame.label, table.classes)
     return Scores(density, frame.score, read_only(lasting), read_only(meant), frame.label), table
 
 
@@ -559,8 +612,8 @@ def followed(
         bins = bins[rows_within(before.label, before.born_ns, density.stamp_ns, True, moment, table.classes)]
     if not len(poisson):  # perhaps without RPP
         fate = np.where(fate >= 0, MARKED, fate)
-    classes, objects, components, scatter = learn_frame(
-        (own.classes, own.objects, bins, own.scatter),
+    classes, objects, components, scatter, lagged, innovations = learn_frame(
+        (own.classes, own.objects, bins, (own.scatter, own.lagged), own.innovations),
         density.bernoulli.words,
         (prior.bernoulli.words, prior.poisson.words),
         (update.objects, update.row, update.measurement, fate, looked_ns),
@@ -569,13 +622,14 @@ def followed(
         tuple(moment),
         table.classes,
     )
-    return SelfCalibration(classes, objects, components, scatter)
+    return SelfCalibration(classes, objects, components, scatter, innovations, lagged)
 
 
 def learned_noise(density: Density) -> tuple[str, ...]:
     """Return the learned noise of the detections of each class in words, of classes with `PRIOR_PAIRS` pairs."""
     own, lines = density.self_calibration, []
-    for name, row in zip(density.labels, () if own is None else own.scatter.tolist(), strict=own is not None):
+    known = [] if own is None else squares(own.scatter, own.lagged).tolist()
+    for name, row in zip(density.labels, known, strict=own is not None):
         if row[PAIRS] >= PRIOR_PAIRS:
             white, last = (
                 math.sqrt(0.5 * (along**2 * row[ALONG] + across**2 * row[ACROSS]) / row[PAIRS])

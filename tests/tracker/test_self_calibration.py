@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +43,7 @@ from optipmb.self_calibration import (
     learn_scatter,
     learned,
     needed_shares,
+    squares,
     use_scatter,
 )
 from optipmb.undetected import AGED, MARKED
@@ -249,15 +251,22 @@ def test_frames_are_counted_as_plain_python_counts(seed: int) -> None:
 
 @SEEDS
 def test_scatter_is_summed_over_sure_pairs_as_in_numpy(seed: int) -> None:
-    """Tracks that are confirmed, a second old and detected twice in a row; a pair counts for nine variances at most."""
+    """Tracks that are confirmed, a second old and detected twice in a row; products with their innovations before."""
     rng, count, second = np.random.default_rng(seed), 40, 10**9
     now, before = 20 * second, 19 * second
+    root = rng.normal(0.0, 0.3, (count, 6, 6))
     prior = Bernoullis.of(np.zeros(count * Bernoullis.width)).replaced(
+        id=2 + 2 * np.arange(count),
         mean=rng.normal(0.0, 0.5, (count, 6)),
+        covariance=root @ np.swapaxes(root, 1, 2),
         confirmed=rng.random(count) < 0.8,
         seen_ns=np.where(rng.random(count) < 0.8, before, before - second),
         born_ns=rng.choice([now - second // 2, now - second, now - 2 * second], count),
     )
+    old = Bernoullis.of(np.zeros((count + 9) * Bernoullis.width)).replaced(
+        id=np.sort(np.r_[prior.id, 1 + 8 * np.arange(9)])
+    )
+    last = rng.normal(0.0, 0.5, (count + 9, 2))
     row = np.r_[np.sort(rng.choice(count, 30, replace=False)), [-1, -1]]
     objects = Bernoullis.of(np.zeros(32 * Bernoullis.width)).replaced(
         mean=rng.normal(0.0, 0.5, (32, 6)), label=rng.integers(0, 2, 32)
@@ -265,23 +274,34 @@ def test_scatter_is_summed_over_sure_pairs_as_in_numpy(seed: int) -> None:
     measurement = np.where(rng.random(32) < 0.9, rng.permutation(32), -1)
     own = np.where(rng.random(32) < 0.2, 2.0, 1.0)
     position = np.column_stack((rng.normal(0.0, 0.5, (32, 2)), own, np.zeros(32), own))
-    scatter, noise = np.array([[10.0, 0.5, 0.2], [MASS, 50.0, 400.0]]), np.array([0.3, 0.25])
-    hits, rows = (row, measurement), class_rows(2, noise_position=noise)
-    found = learn_scatter(scatter, prior.words, objects.words, hits, position, (now, before), rows)
+    scatter, lagged = np.array([[10.0, 0.5, 0.2], [MASS, 50.0, 400.0]]), np.array([[8.0, -3.0], [20.0, 40.0]])
+    noise, known = np.array([0.3, 0.25]), squares(scatter, lagged)
+    np.testing.assert_allclose(known - scatter, np.column_stack((np.zeros(2), np.maximum(lagged, 0.0))))
+    hits, rows, words = (row, measurement), class_rows(2, noise_position=noise), (old.words, prior.words, objects.words)
+    found, products, kept = learn_scatter((scatter, lagged), last, *words, hits, position, (now, before), rows)
 
     k = np.flatnonzero((row >= 0) & (measurement >= 0))
     n, m = row[k], measurement[k]
-    sure = prior.confirmed[n] & (prior.seen_ns[n] == before) & (now - prior.born_ns[n] >= second) & (own[m] == 1.0)
-    k, n, m = k[sure], n[sure], m[sure]
     axis, c = np.exp(-1j * objects.mean[k, PHI]), objects.label[k]
     nu, residual = (((position[m, :2] - one[:, :2]) @ [1, 1j]) * axis for one in (prior.mean[n], objects.mean[k]))
-    most = OUTLYING * (PRIOR_PAIRS * noise[:, None] ** 2 + scatter[:, 1:]) / (PRIOR_PAIRS + scatter[:, :1])
-    products = np.column_stack((nu.real * residual.real, nu.imag * residual.imag))
-    wanted = scatter.copy()
-    np.add.at(wanted, c, np.column_stack((np.ones(len(k)), np.clip(products, 0.0, most[c]))))
-    wanted *= np.minimum(1.0, MASS / wanted[:, :1])
+    wanted = np.zeros((32, 2))
+    wanted[k] = np.column_stack((nu.real, nu.imag))
+    np.testing.assert_allclose(kept, wanted, atol=1e-12)
+    sure = prior.confirmed[n] & (prior.seen_ns[n] == before) & (now - prior.born_ns[n] >= second) & (own[m] == 1.0)
+    k, n, nu, residual, c = k[sure], n[sure], nu[sure], residual[sure], c[sure]
+    most = OUTLYING * (PRIOR_PAIRS * noise[:, None] ** 2 + known[:, 1:]) / (PRIOR_PAIRS + scatter[:, :1])
+    squared = np.column_stack((nu.real * residual.real, nu.imag * residual.imag))
+    added = np.zeros((2, 5))
+    np.add.at(added[:, :3], c, np.column_stack((np.ones(len(k)), np.clip(squared, 0.0, most[c]))))
+    spread = (0.5 * np.trace(prior.covariance[n, :2, :2], axis1=1, axis2=2) + noise[c] ** 2)[:, None]
+    turned = np.column_stack((axis[sure].real, -axis[sure].imag))
+    gain = np.clip((turned * prior.covariance[n, V, :2]).sum(axis=1)[:, None] / spread, 0.0, 1.0)
+    lag = -np.column_stack((nu.real, nu.imag)) * last[np.searchsorted(old.id, prior.id[n])]
+    np.add.at(added[:, 3:], c, np.clip(lag, -OUTLYING * spread, OUTLYING * spread) / (1.0 + gain) ** 2)
+    both = np.column_stack((scatter, lagged)) + added
+    both *= np.minimum(1.0, MASS / both[:, :1])
     assert len(k) > 2
-    np.testing.assert_allclose(found, wanted, rtol=1e-12)
+    np.testing.assert_allclose(np.column_stack((found, products)), both, rtol=1e-9)
 
 
 def test_learned_noise_goes_to_the_state_the_box_and_the_covariance() -> None:
@@ -291,6 +311,7 @@ def test_learned_noise_goes_to_the_state_the_box_and_the_covariance() -> None:
     curve[:, :2] = [0.3, 0.15]
     left = 1.0 / (1.0 / 0.06**2 - 1.0 / 0.3**2)
     columns = {"noise_position": 0.3, "reported_position": left, "knots": 2, "knot_along": curve, "knot_across": curve}
+    columns |= {"gate": 3.0, "clutter_intensity": 0.01, "birth_intensity": 0.002}
     rows = class_rows(4, **columns)
     use_scatter(scatter, rows)
     for own, one in zip(rows, scatter, strict=True):
@@ -305,12 +326,34 @@ def test_learned_noise_goes_to_the_state_the_box_and_the_covariance() -> None:
 
         measured, reported = max(mean(0.3), LEAST_PART * 0.3**2), mean(0.06)
         assert own["noise_position"] ** 2 == pytest.approx(measured, rel=1e-12)
+        assert own["gate"] == pytest.approx(max(3.0, math.sqrt(2.0 * 9.21 * measured)))
+        assert own["clutter_intensity"] == pytest.approx(0.01 * 0.3**2 / measured)
+        assert own["birth_intensity"] == pytest.approx(0.002 * 0.3**2 / measured)
         of_box = 1.0 / (1.0 / own["reported_position"] + 1.0 / measured) if own["reported_position"] else measured
         assert of_box == pytest.approx(min(reported, measured), rel=1e-9)
         for s, name in ((1, "knot_along"), (2, "knot_across")):
             variance = min((50.0 * 0.15**2 + LASTING_RATIO[s] ** 2 * one[s]) / (50.0 + one[0]), MOST_NOISE**2)
             assert lasting(one, s, 0.15) == pytest.approx(variance, rel=1e-12)
             np.testing.assert_allclose(own[name][:2], np.sqrt(variance) * np.array([0.3, 0.15]) / 0.15, rtol=1e-12)
+
+
+def test_errors_of_metres_are_learned() -> None:
+    """Of boats in a radar that turns every two seconds: scatter from a metre to four, and ellipses that hold most."""
+    rng, tracker = np.random.default_rng(0), optipmb.OnlineTracker(optipmb.generic_parameters(["boat"], 2.0))
+    start, velocity, within = rng.uniform(-800.0, 800.0, (8, 2)), rng.uniform(-5.0, 5.0, (8, 2)), []
+    for k in range(150):
+        place = start + 2.0 * k * velocity
+        off = place + 3.0 * rng.standard_normal((8, 2))
+        tracks = tracker.update(t=2.0 * k, x=off[:, 0], y=off[:, 1], score=[0.9] * 8, label=["boat"] * 8)
+        if k >= 75:
+            wrong = tracks.center[:, :2] - place[tracks.detection]
+            squared = (wrong * np.linalg.solve(tracks.covariance[:, :2, :2], wrong[..., None])[..., 0]).sum(axis=1)
+            within.extend(squared[tracks.detection >= 0] <= 5.99)
+    own = tracker.density.self_calibration
+    assert own is not None
+    pairs, along, across = squares(own.scatter, own.lagged)[0]
+    assert 1.0 < math.sqrt(0.5 * (along + across) / pairs) < 4.0
+    assert np.mean(within) > 0.6
 
 
 @pytest.mark.parametrize("noise", [0.15, 0.4])
