@@ -307,7 +307,7 @@ def _set_real(body: Any, column: str, value: float) -> None:
         (lambda body: body["head"].update(next_id=0), "next_id"),
         (lambda body: body.update(head=None), "head"),
         (lambda body: body.update(window=[]), "head"),
-        (lambda body: body["head"]["density"].pop("bernoulli"), "bernoulli: expected bytes, 448 for each row"),
+        (lambda body: body["head"]["density"].pop("bernoulli"), "bernoulli: expected bytes, 464 for each row"),
         (lambda body: body["head"]["density"].update(bernoulli=[]), "head.density.bernoulli: expected a valid bytes"),
         (lambda body: body["head"]["density"].update(poisson=b"0" * 391), "poisson: expected bytes, 392 for each row"),
         (lambda body: body["head"]["density"].update(misses=b"0" * 16), "misses"),

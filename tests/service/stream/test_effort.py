@@ -19,7 +19,7 @@ def test_a_density_that_is_too_much_for_every_frame_is_given_up() -> None:
     close = {"center": np.c_[np.linspace(0, 1, 20), np.zeros(20), np.ones(20)], "size": np.full((20, 3), 0.01)}
     assert len(tracks(feed(one, range(1), SENSOR, objects=20, **close))) == 1
     refused = feed(one, range(1, 11), SENSOR, objects=20, **close)
-    assert [problem.code for problem in problems(refused)] == ["overload"] * 10
+    assert [problem.code for problem in problems(refused)].count("overload") == 10
     outputs = feed(one, range(11, 13), SENSOR, objects=20, **close)
     assert begun(outputs)[:1] == ["effort"]
     assert one.counters.refused >= 10

@@ -202,5 +202,5 @@ def test_the_command_refuses_what_is_no_dump(tmp_path: Path, capsys: pytest.Capt
     assert run(["track"]) == 2
     assert capsys.readouterr().err.count("\n") == 2
     good = schemas.decode_dump(failed()[1])
-    with pytest.raises(UsageError, match="bernoulli: expected bytes, 448 for each row, received 40 bytes"):
+    with pytest.raises(UsageError, match="bernoulli: expected bytes, 464 for each row, received 40 bytes"):
         client.replay(replace(good, density=good.density | {"bernoulli": bytes(40)}))
