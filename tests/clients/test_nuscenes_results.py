@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_service import FakeService
-from nuscenes_cases import Rows, disturbed_tracks, truth_tracks, write
+from nuscenes_cases import Rows, disturbed_tracks, message, truth_tracks, write
 from nuscenes_tables import box, crowd, write_detections, write_root
 from optipmb_client import Connection
 from optipmb_tools.datasets import DatasetError
@@ -118,7 +118,7 @@ def test_bytes_do_not_depend_on_the_order_of_closing(root: Path, tmp_path: Path)
     for number in range(3):
         dataset = NuScenesDataset(root)
         sequences = dataset.sequences(["all"])
-        tracks = [dict(enumerate(truth_tracks(sequence))) for sequence in sequences]
+        tracks = [dict(enumerate(map(message, truth_tracks(sequence)))) for sequence in sequences]
         results = Results(dataset, tmp_path / str(number))
 
         def end(sequence: NuScenesSequence, found: dict[int, Any], results: Results = results) -> None:
@@ -143,14 +143,16 @@ def test_the_file_of_all_scenes_comes_with_the_last(root: Path, tmp_path: Path) 
     dataset = NuScenesDataset(root)
     first, second = dataset.sequences(["all"])
     results = Results(dataset, tmp_path)
-    results.take(first, results.write(first, {0: rows(2)}))
+    results.take(first, results.write(first, {0: message(rows(2))}))
     with pytest.raises(IndexError):  # there is no such frame
-        results.write(second, dict.fromkeys(range(len(second) + 1), rows(1)))
+        results.write(second, dict.fromkeys(range(len(second) + 1), message(rows(1))))
     results.close([first, second])
-    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["scene-0103.json"]
-    results.take(second, results.write(second, {0: rows(1)}))
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["scene-0103.json"] * 2
+    results.take(second, results.write(second, {0: message(rows(1))}))
     results.close([first, second])
-    assert sorted(path.name for path in tmp_path.rglob("*.json")) == ["scene-0103.json", "scene-0916.json", FILE]
+    for folder in (tmp_path, tmp_path / "shown"):
+        files = sorted(path.name for place in (folder, folder / "scenes") for path in place.glob("*.json"))
+        assert files == ["scene-0103.json", "scene-0916.json", FILE]
     part = read_nuscenes_results(tmp_path / "scenes" / "scene-0103.json")
     assert list(part.rows) == list(first.samples)
 

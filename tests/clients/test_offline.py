@@ -8,6 +8,7 @@ import pytest
 from optipmb_client.errors import UsageError
 from optipmb_schemas import PATHS
 from optipmb_tools.datasets import Dataset, Preloaded, open_dataset, selected_frames
+from optipmb_tools.evaluation.tracks import read_tracks
 from optipmb_tools.run.profiles import read_profile
 from optipmb_tools.run.tracking import Tracking, decided, track, track_whole
 
@@ -49,6 +50,24 @@ def test_tracks_are_confirmed_as_asked(dataset: Dataset, how: dict[str, float]) 
         update = changed if "hindsight_s" in how else {"confirmed": own.existence >= 0.3}
         assert one == own.model_copy(update=update | {"confirmed": update["confirmed"].astype(np.int64)})
     assert any(one != plain.tracks[index] for index, one in found.items())
+
+
+def test_result_files_come_with_those_of_the_tracks_that_are_shown(dataset: Dataset, tmp_path: Path) -> None:
+    """The same file in a folder beside it has the confirmed rows, by which an evaluation tells them."""
+    (sequence,), how = dataset.sequences(["0000"]), Tracking(read_profile("scene"), hindsight_s=1.0)
+    (result,) = track(dataset, [sequence], tmp_path, how)
+    found = decided(track_whole(how.parameters, sequence), how)
+    wanted = [(k, i) for k, one in found.items() for i in one.id[one.confirmed > 0].tolist()]
+    every, shown = (
+        [tuple(map(int, line.split()[:2])) for line in path.read_text().splitlines()]
+        for path in (result.file, tmp_path / "shown" / "0000.txt")
+    )
+    assert shown == wanted
+    assert 0 < len(shown) < len(every)
+    table = read_tracks(tmp_path, sequence)
+    assert table.confirmed is not None
+    rows = zip(table.frame.tolist(), table.id.tolist(), table.confirmed.tolist(), strict=True)
+    assert {(k, i) for k, i, told in rows if told} == set(wanted)
 
 
 def test_what_is_reported_is_what_was_written(dataset: Dataset, tmp_path: Path) -> None:

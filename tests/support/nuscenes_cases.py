@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from optipmb_schemas import Tracks
 from optipmb_tools.datasets import DetectionFrame
 from optipmb_tools.datasets.nuscenes import NuScenesDataset, NuScenesSequence
+from optipmb_tools.results import column_shape
 from optipmb_tools.results.nuscenes import NUSCENES_CLASSES, scene_file
 
 Floats = NDArray[np.float64]
@@ -37,6 +39,20 @@ class Rows:
     @property
     def existence(self) -> Floats:
         return self.score
+
+
+def message(rows: Rows) -> Tracks:
+    """Return tracks as a message, all confirmed."""
+    count = len(rows.id)
+    columns = {
+        name: np.ones((count, *column_shape(name)), array.dtype)
+        for name, array in Tracks.arrays.items()
+        if array.rows == Tracks.arrays["id"].rows
+    }
+    header = {"stream": "s", "epoch": bytes(16), "seq": 0, "stamp_ns": 0, "session": "0" * 32, "profile": "p"}
+    header |= {"cloud_used": False, "labels": rows.labels}
+    known = {name: getattr(rows, name) for name in COLUMNS}
+    return Tracks.trusted(header | columns | known)
 
 
 def write(dataset: NuScenesDataset, sequence: NuScenesSequence, frames: Sequence[Rows], out: Path) -> Path:

@@ -23,9 +23,16 @@ from optipmb_tools.evaluation.figures import defined
 from optipmb_tools.evaluation.gospa import CUTOFF, ORDER, GospaResult, evaluate_gospa
 from optipmb_tools.evaluation.hota import HotaResult, evaluate_hota
 from optipmb_tools.evaluation.identity import IdentityResult, evaluate_identity, velocity_errors
-from optipmb_tools.evaluation.tracks import By, read_compared, read_full_tracks, result_file
+from optipmb_tools.evaluation.tracks import (
+    By,
+    read_compared,
+    read_full_tracks,
+    result_file,
+    scene_table,
+    shown_submission,
+)
 from optipmb_tools.results import FullTable, ResultTable
-from optipmb_tools.results.nuscenes import read_nuscenes_results, result_table, scene_file
+from optipmb_tools.results.nuscenes import read_nuscenes_results, scene_file
 
 _ROUNDING = 1e-9
 
@@ -166,7 +173,7 @@ def load_recordings(
 
 
 def _nuscenes_recordings(sequences: Sequence[DataSequence], results: Path) -> list[Recording]:
-    submission = read_nuscenes_results(results)
+    submission, shown = read_nuscenes_results(results), shown_submission(results)
     recordings = []
     for sequence in sequences:
         if not isinstance(sequence, NuScenesSequence):
@@ -174,7 +181,7 @@ def _nuscenes_recordings(sequences: Sequence[DataSequence], results: Path) -> li
         truth = sequence.truth()
         if truth is None:
             raise DatasetError(f"sequence {sequence.name}", "annotations to compare with", "none")
-        table = result_table(submission, sequence.name, sequence.samples)
+        table = scene_table(submission, shown, sequence)
         # The benchmark compares near boxes only, by class; truth farther away is ignored already.
         reach = np.array([CLASS_RANGE.get(name, 0.0) for name in table.labels] or [0.0])
         near = sequence.ego_distance(table.frame, table.center) < reach[table.label]

@@ -12,9 +12,11 @@ from optipmb_tools.datasets.interface import ANNOTATIONS, class_like
 from optipmb_tools.datasets.kitti import KittiSequence
 from optipmb_tools.datasets.nuscenes import NuScenesSequence
 from optipmb_tools.datasets.table import ObjectTable, TableOptions, TableSequence, read_objects, span
+from optipmb_tools.evaluation.calibration import rows_of
 from optipmb_tools.results import FullTable, ResultTable, full_path, full_table, read_full
 from optipmb_tools.results.kitti import LEAST_SHOWN, read_kitti_results
-from optipmb_tools.results.nuscenes import NUSCENES_FILE, read_nuscenes_results, result_table
+from optipmb_tools.results.nuscenes import NUSCENES_FILE, Submission, read_nuscenes_results, result_table
+from optipmb_tools.results.output import SHOWN
 from optipmb_tools.table_files import SUFFIXES, is_table
 
 _OTHERS = ("Van", "Truck", "Person_sitting", "Person", "Tram")
@@ -137,17 +139,35 @@ def read_tracks(results: Path, sequence: DataSequence, by: By = "id") -> ResultT
         DatasetError: there is no such file, or it is wrong, or has frames that the sequence lacks, or no objects.
     """
     if isinstance(sequence, NuScenesSequence) and (results.suffix == ".json" or (results / NUSCENES_FILE).is_file()):
-        scene = result_table(read_nuscenes_results(results), sequence.name, sequence.samples)
         _refuse_objects(results, by)
-        return scene.to_sensor(sequence.poses)
+        files = read_nuscenes_results(results), shown_submission(results)
+        return scene_table(*files, sequence).to_sensor(sequence.poses)
     path = result_file(results, sequence.name)
     if is_table(path) or (path == results and (path.suffix != ".txt" or hasattr(sequence, "tables"))):
         return _with_image(path, _from_table(path, sequence, by).to_sensor(sequence.poses), sequence)
     _refuse_objects(path, by)
-    table = read_kitti_results(path)
+    table, shown = read_kitti_results(path), path.parent / SHOWN / path.name
+    if shown.is_file():
+        table = _with_shown(table, read_kitti_results(shown))
     if len(table) and table.frame[-1] >= len(sequence):
         raise DatasetError(path, f"frames from 0 to {len(sequence) - 1}", f"frame {table.frame[-1]}")
     return _with_image(path, table, sequence)
+
+
+def shown_submission(results: Path) -> Submission | None:
+    """Return the nuScenes tracks that are shown, of a folder of `optipmb track`; None where no file tells."""
+    path = results / SHOWN / NUSCENES_FILE
+    return read_nuscenes_results(path) if path.is_file() else None
+
+
+def scene_table(every: Submission, shown: Submission | None, sequence: NuScenesSequence) -> ResultTable:
+    """Return the tracks of a scene in the world frame, confirmed where they are among the shown ones."""
+    table = result_table(every, sequence.name, sequence.samples)
+    return table if shown is None else _with_shown(table, result_table(shown, sequence.name, sequence.samples))
+
+
+def _with_shown(table: ResultTable, shown: ResultTable) -> ResultTable:
+    return replace(table, confirmed=rows_of(shown.frame, shown.id, table.frame, table.id) >= 0)
 
 
 def _refuse_objects(path: Path, by: By) -> None:

@@ -43,6 +43,8 @@ DECIMALS: Final = {
 }
 """Decimals of columns in text: 0.1 mm, 1e-4 rad, 1 mm/s, probabilities to 1e-4."""
 FULL: Final = "full"  # digits of text that give every bit of a number
+SHOWN: Final = "shown"
+"""Folder beside the result files of a benchmark, which rank all tracks: the same files of the tracks that are shown."""
 
 
 def track_columns(
@@ -136,6 +138,13 @@ class Objects:
         return {"object": number, "object_probability": probability}
 
 
+def _shown(tracks: Tracks) -> Tracks:
+    """Return the tracks of a message that are shown."""
+    rows, of_tracks = shown(tracks), Tracks.arrays["id"].rows
+    columns = {name: getattr(tracks, name) for name, array in Tracks.arrays.items() if array.rows == of_tracks}
+    return tracks.model_copy(update={name: one[rows] for name, one in columns.items() if one is not None})
+
+
 class TrackCounts(NamedTuple):
     """Counts of the tracks of a sequence."""
 
@@ -193,6 +202,7 @@ class Results:
         self._dataset = dataset
         self._out = out
         self._full = full
+        self._submission = "submission" in dict(dataset.arguments.options)
         self._features = is_features(out)
         self._table = self._features or (is_table(out) and not out.is_dir())
         self._taken: dict[str, Path | Columns] = {}
@@ -217,6 +227,8 @@ class Results:
         if self._table:
             return track_columns(sequence.name, tracks, sequence, full=self._full, georeference=place, objects=objects)
         path = self._dataset.write(self._out, sequence, tracks)
+        if not self._submission:
+            self._dataset.write(self._out / SHOWN, sequence, {index: _shown(one) for index, one in tracks.items()})
         if self._full:
             write_full(full_path(path), tracks)
         else:
@@ -250,4 +262,6 @@ class Results:
             write_tracks(self._out, columns, self._dataset.digits)
         elif not is_openlabel(self._out) and all(one.name in self._taken for one in sequences):
             self._dataset.join(self._out, sequences)
+            if not self._submission:
+                self._dataset.join(self._out / SHOWN, sequences)
         return []
