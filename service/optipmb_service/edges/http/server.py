@@ -14,10 +14,12 @@ import ipaddress
 import socket
 import threading
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import uvicorn
 from optipmb_client.errors import ClientError
+from optipmb_schemas import openapi
 from optipmb_schemas.asyncapi import document
 from optipmb_schemas.errors import show
 from starlette.applications import Starlette
@@ -114,16 +116,13 @@ def application(
     def metrics(_: Request) -> Response:
         return Response(health.metrics.text(), media_type=CONTENT_TYPE, headers={"cache-control": "no-store"})
 
-    def asyncapi(request: Request) -> Response:
-        parameters_of(request, ())
-        return Response(interface(), media_type="application/json", headers={"cache-control": "no-store"})
-
     routes: list[BaseRoute] = [Route("/healthz", alive), Route("/readyz", ready), Route("/metrics", metrics)]
     places = places or {}
     readers = Readers(health, settings, places)
     senders = Senders(health, readers, settings, places, sessions)
     routes += [
-        Route("/api/v1/asyncapi.json", asyncapi),
+        Route("/api/v1/asyncapi.json", _document(interface)),
+        Route("/openapi.json", _document(partial(openapi.document, settings.http or openapi.ADDRESS))),
         *Api(readers).routes(),
         *senders.routes(),
         *page(health, readers, settings, places),
@@ -142,6 +141,16 @@ def application(
         origins = settings.http_origins
         answers = CORSMiddleware(answers, allow_origins=origins, allow_methods=["GET", "POST"], allow_headers=allowed)
     return _Guarded(answers, settings, (readers.room, senders.room))
+
+
+def _document(make: Callable[[], str]) -> Callable[[Request], Response]:
+    """Return what answers with a document in JSON."""
+
+    def answer(request: Request) -> Response:
+        parameters_of(request, ())
+        return Response(make(), media_type="application/json", headers={"cache-control": "no-store"})
+
+    return answer
 
 
 def _answer(body: dict[str, object], *, well: bool) -> Response:
