@@ -16,13 +16,14 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import h11
 import pytest
 from json_senders import Edge
 from optipmb_client.errors import ClientError
 from optipmb_schemas import Keys, ServiceStatus
 from optipmb_service.app.health_command import ask
 from optipmb_service.edges.http import Server, application, server
-from optipmb_service.edges.http.server import CONNECTIONS, REQUESTS, SLICE
+from optipmb_service.edges.http.server import CHUNKED_SLICE, CONNECTIONS, REQUESTS, SLICE
 from optipmb_service.edges.readers import BURST
 from optipmb_service.settings import Settings
 from optipmb_service.telemetry.metrics import NAMESPACE, SERVICE_METRICS
@@ -154,6 +155,35 @@ def test_messages_in_pieces_hold_no_loop(path: str, frames: bytes, monkeypatch: 
         wait(sending, timeout=60)
     assert max(sizes) <= SLICE
     assert sum(sizes) < 6 * 10 * SLICE
+
+
+def test_a_body_in_tiny_chunks_holds_no_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Six clients send theirs in chunks of a byte: a turn of the loop reads a few, and all are taken in the end."""
+    sizes: list[int] = []
+    receive = h11.Connection.receive_data
+
+    def received(self: h11.Connection, data: bytes) -> None:
+        sizes.append(len(data))
+        receive(self, data)
+
+    monkeypatch.setattr(h11.Connection, "receive_data", received)
+    text = b'{"objects": []}' + b" " * 20_000
+    chunks = b"".join(b"1\r\n%b\r\n" % text[at : at + 1] for at in range(len(text))) + b"0\r\n\r\n"
+    with Edge(free_endpoint(), router=True) as edge, ThreadPoolExecutor(6) as pool:
+        host, _, port = edge.address.rpartition(":")
+        head = f"POST /api/v1/detections?stream=a/b/c HTTP/1.1\r\nhost: {edge.address}\r\nconnection: close\r\n"
+        head += "content-type: application/json\r\ntransfer-encoding: chunked\r\n\r\n"
+
+        def send(_number: int) -> bytes:
+            with socket.create_connection((host, int(port)), 60) as connection:
+                connection.sendall(head.encode() + chunks)
+                return connection.recv(1000)
+
+        answers = pool.map(send, range(6))
+        assert get(edge.address, "/healthz")[0] == 200
+        assert all(one.startswith(b"HTTP/1.1 202 ") for one in answers)
+    assert max(sizes) <= SLICE
+    assert sum(size > CHUNKED_SLICE for size in sizes) <= 6 + 1, "of each the first part, which has the head"
 
 
 def test_a_large_message_in_usual_pieces_is_taken() -> None:

@@ -17,6 +17,7 @@ import time
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
+import h11
 import uvicorn
 from optipmb_client.errors import ClientError
 from optipmb_schemas import openapi
@@ -58,7 +59,8 @@ KEEP_ALIVE_S: Final = 5
 HEAD_BYTES: Final = 16 * 1024
 SEND_S: Final = 30.0  # a connection whose peer takes nothing for so long is aborted
 SEND_BYTES: Final = 2**16  # what the system holds for a connection, so that it is soon known
-SLICE: Final = 4096  # bytes of a WebSocket that are read in one turn of the loop
+SLICE: Final = 4096  # bytes of a WebSocket, and of the head of a request, that are read in one turn of the loop
+CHUNKED_SLICE: Final = 1024  # the same of a body in chunks
 PIECES: Final = 256  # pieces of a message that may be smaller than `PIECE_BYTES`
 PIECE_BYTES: Final = 512
 PINGS: Final = 1000  # pings of a peer between two of its messages
@@ -390,15 +392,46 @@ class _Socket(_Bounded, WSProtocol):
 
 
 class _Connection(_Bounded, H11Protocol):
-    """A connection that ends when its first request does not come."""
+    """A connection that ends when its first request does not come.
+
+    Of a head, and of a body in chunks, which may be tiny, a turn of the loop reads a bounded part.
+    """
+
+    _reading: asyncio.Handle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as the base class has it
         super().connection_made(transport)
+        self._unread = bytearray()
         self._head = self.loop.call_later(HEAD_S, self._end_without_request)
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._head.cancel()
+        self._unread.clear()
+        if self._reading is not None:
+            self._reading.cancel()
         super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        self._unread += data
+        if self._reading is None:
+            self._read()
+
+    def _read(self) -> None:
+        self._reading = None
+        most = SLICE
+        if self.conn.their_state is h11.SEND_BODY:
+            is_chunked = any(name == b"transfer-encoding" for name, _ in self.headers)
+            most = CHUNKED_SLICE if is_chunked else len(self._unread)
+        part = bytes(self._unread[:most])
+        del self._unread[:most]
+        super().data_received(part)
+        if self.transport.is_closing() or self.transport.get_protocol() is not self:
+            self._unread.clear()
+        elif self._unread:
+            self.transport.pause_reading()
+            self._reading = self.loop.call_soon(self._read)
+        elif not self.flow.read_paused:
+            self.transport.resume_reading()
 
     def on_response_complete(self) -> None:
         self.since = time.monotonic()
