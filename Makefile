@@ -12,12 +12,13 @@ KITTI = --dataset kitti --root $(DATA)/kitti --detections pointrcnn
 NUSCENES = --dataset nuscenes --root $(DATA)/nuscenes --detections centerpoint
 
 FUZZ_TARGETS := fuzz-messages fuzz-checkpoints fuzz-protobuf fuzz-frames
-.PHONY: help kernels dist docs pictures release image demo-files compare demo test accuracy alone bounds ray bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests check mutants lowest paths pythons repeat schemas wheel clean tune ablate
+.PHONY: help kernels dist wheels docs pictures release image demo-files compare demo test accuracy alone bounds ray bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests check mutants lowest paths pythons repeat schemas wheel clean tune ablate
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
 	@echo "make install a virtual environment with everything, and compiled kernels"
 	@echo "make test    lint, types, schemas, tests"
 	@echo "make wheel   build the wheel with machine code, install it alone into an empty environment, and use it there"
+	@echo "make wheels  build wheels with machine code for each Python of this machine, beside the wheel in DIST=out/dist"
 	@echo "make check   lint, types, and the tests nearest to what changed since SINCE=main, in less than a minute"
 	@echo "make accuracy  hold the figures of accuracy on KITTI and nuScenes, where their data are"
 	@echo "make mutants  make N=25 small faults by SEED=1 in a copy, and print which ones the nearest tests miss"
@@ -136,6 +137,11 @@ dist: $(VENV)/.installed
 	$(BIN)/python -m build --wheel --outdir out/dist . >out/build.log || { cat out/build.log; exit 1; }
 	$(BIN)/python -m build --wheel --outdir out/dist node >>out/build.log || { cat out/build.log; exit 1; }
 	$(BIN)/python -m twine check --strict out/dist/* >>out/build.log || { cat out/build.log; exit 1; }
+
+# Wheels with machine code beside the wheel without it in DIST, for each Python of this machine.
+DIST ?= out/dist
+wheels:
+	sh packaging/wheels.sh $(DIST)
 
 # The wheel with the oldest packages that pyproject.toml allows; and with the newest Python on this machine.
 lowest: dist

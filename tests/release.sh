@@ -15,7 +15,7 @@ make test wheel accuracy alone
 rm -rf dist && mkdir -p out
 "$bin/python" -m build --outdir dist .
 "$bin/python" -m build --wheel --outdir dist node
-sh packaging/wheels.sh dist
+make wheels DIST=dist
 "$bin/python" -m twine check --strict dist/*
 "$bin/python" -m cyclonedx_py requirements docker/requirements.lock --output-file out/sbom.cdx.json
 echo "release: dist/ is ready. To publish $version:"

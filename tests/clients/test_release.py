@@ -63,13 +63,14 @@ def release(work: Path) -> "tuple[subprocess.CompletedProcess[str], list[str]]":
 
 
 def test_it_tests_builds_checks_and_stops_before_publishing(checkout: Path) -> None:
-    """All tests, two wheels, the check of their content; tag and upload are printed for a person to run."""
+    """All tests, wheels without and with machine code, their check; tag and upload are printed for a person to run."""
     done, calls = release(checkout)
     assert done.returncode == 0, done.stderr
     assert calls[1:] == [
         "make test wheel accuracy alone",
         "python -m build --outdir dist .",
         "python -m build --wheel --outdir dist node",
+        "make wheels DIST=dist",
         "python -m twine check --strict dist/*",
         "python -m cyclonedx_py requirements docker/requirements.lock --output-file out/sbom.cdx.json",
     ]
