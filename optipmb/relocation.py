@@ -78,26 +78,30 @@ class Relocation(NamedTuple):
         """
         if not any(self):
             return density
-        moved = replace(density, bernoulli=self._rows(density.bernoulli), poisson=self._rows(density.poisson))
-        if density.rejoining is not None:
-            moved = replace(moved, rejoining=density.rejoining.moved(self))
-        if density.sensor is None:
-            return moved
-        cos, sin = math.cos(self.theta), math.sin(self.theta)
-        vx, vy, turn, *evidence = density.sensor.tolist()
-        v = cos * vx - sin * vy + turn * self.y, sin * vx + cos * vy - turn * self.x
-        return replace(moved, sensor=read_only(np.array([*v, turn, *evidence])))
+        bernoulli, poisson = self._rows(density.bernoulli), self._rows(density.poisson)
+        rejoining, sensor = density.rejoining, density.sensor
+        if rejoining is not None:
+            rejoining = rejoining.moved(self)
+        if sensor is not None:
+            cos, sin = math.cos(self.theta), math.sin(self.theta)
+            vx, vy, turn, *evidence = sensor.tolist()
+            v = cos * vx - sin * vy + turn * self.y, sin * vx + cos * vy - turn * self.x
+            sensor = read_only(np.array([*v, turn, *evidence]))
+        return replace(density, bernoulli=bernoulli, poisson=poisson, rejoining=rejoining, sensor=sensor)
 
     def _rows(self, rows: _Rows) -> _Rows:
         turn = np.eye(6)
         turn[:2, :2] = (math.cos(self.theta), -math.sin(self.theta)), (math.sin(self.theta), math.cos(self.theta))
-        mean, auxiliary = rows.mean.copy(), rows.auxiliary
+        moved = type(rows).of(rows.words.copy())
+        mean, auxiliary, covariance = moved.mean, moved.auxiliary, moved.covariance
         mean[:, :2] = self.points(mean[:, :2])
         heading = mean[:, PHI] + self.theta
         mean[:, PHI] = heading - 2.0 * math.pi * np.ceil((heading - math.pi) / (2.0 * math.pi))
+        covariance[...] = turn @ covariance @ turn.T
+        farthest = np.abs(mean[:, :2]).max(initial=0.0)
         if self.z:
-            auxiliary = auxiliary + np.array([0.0, 0.0, 0.0, self.z])
-        farthest = max(np.abs(mean[:, :2]).max(initial=0.0), np.nanmax(np.abs(auxiliary[:, 3]), initial=0.0))
+            auxiliary[:, 3] += self.z
+            farthest = max(farthest, np.nanmax(np.abs(auxiliary[:, 3]), initial=0.0))
         if farthest > MAX_COORDINATE:
             raise DensityError(f"{rows.part}.mean", f"coordinates up to {MAX_COORDINATE:g} m", f"{farthest:g}")
-        return rows.replaced(mean=mean, covariance=turn @ rows.covariance @ turn.T, auxiliary=auxiliary)
+        return moved

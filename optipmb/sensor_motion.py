@@ -466,6 +466,8 @@ def common_motion(pairs: Pairs, guess: Array, reach: float, turn: float, trust: 
         for k in range(4 * count):  # squares of four cells, which meet in a corner of the cell of a pair
             i, j = voters[k // 4, 0] + k % 2, voters[k // 4, 1] + k // 2 % 2
             found = votes[i, j] + votes[i + 1, j] + votes[i, j + 1] + votes[i + 1, j + 1]
+            if found < votes_best:
+                continue
             dx, dy = low + CELL * i, low + CELL * j
             far = dx * dx + dy * dy + (20.0 * a * ANGLE) ** 2
             if found > votes_best or (found == votes_best and far < far_best):
