@@ -19,6 +19,7 @@ from optipmb.extract import sound
 from optipmb.field_of_view import FieldOfView
 from optipmb.frame import PointCloud, Pose, make_frame
 from optipmb.geometry import bev_iou
+from optipmb.hindsight import later_velocities
 from optipmb.parameters import Parameters, load_profile, parse_parameters
 from optipmb.paths import predict_tracks
 from optipmb.rejoin import Kinds, Rejoin, match, pair_scores
@@ -127,6 +128,7 @@ def _run() -> Parameters:
         Tracker(parameters, max_pairs=8).step(posterior, given)
     Tracker(parameters, Modules(habm=False)).step(posterior, given)
     bev_iou(np.zeros((1, 5)), np.zeros((1, 5)))
+    later_velocities(np.zeros(1, np.int64), np.ones((1, 7)), 0.0)
     line = Zone("line", line=((0.0, 0.0), (1.0, 0.0)))
     locate(np.zeros((1, 3)), np.zeros((1, 2)), *Shapes.of([line]))
     crossings(np.array(line.line), 0.0, 0.0, 0.0, 0.0)
