@@ -133,6 +133,7 @@ def crossing(rate: float, parked: int, crossing: int, flipped: str, lanes: Array
     speed = np.repeat([[-12.0, 0.0], [0.0, 0.0], [0.0, 9.0]], [6, parked, crossing], axis=0)
     yaw = np.r_[np.full(6, math.pi), rng.choice([0.0, math.pi], parked), np.full(crossing, 0.5 * math.pi)]
     yaw += math.pi * (rng.random(count) < {"none": 0.0, "random": 0.5, "all": 1.0}[flipped])
+    yaw[yaw > math.pi] -= 2.0 * math.pi
     return [
         (
             k / rate,
