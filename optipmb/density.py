@@ -23,7 +23,7 @@ import numpy as np
 from optipmb.compiled import kernel
 from optipmb.errors import DensityError
 from optipmb.lost_objects import EMBEDDING, Appearance, Beginnings, Lost, Places, Rejoining, Statistics, Tracklets
-from optipmb.rows import INDEX, Column, Rows, arrays_of, record, shown, views_of
+from optipmb.rows import Column, Rows, arrays_of, record, shown, views_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -173,9 +173,7 @@ SCATTER: Final = 3
 AXES: Final = 2
 """Shapes of `SelfCalibration`; a slot has looks and ticks of 0.1 ms behind the bins."""
 NO_BIN: Final = -1
-REAL: Final = np.dtype(np.float64)
-COUNTER: Final = np.dtype(np.uint16)
-"""Types of its arrays, beside `INDEX`."""
+
 
 ENOUGH: Final = 3.0
 """Evidence for a motion of the sensor from which it is used, and"""
@@ -327,15 +325,11 @@ def fits(density: Density, classes: int) -> bool:
     misses, count, own = density.misses, len(density.bernoulli), density.self_calibration
     if misses is not None and len(misses) != count:
         return False
-    arrays: tuple[tuple[object, tuple[int, ...], object], ...]
-    arrays = ((density.class_probability, (count, classes), REAL), (density.sensor, (5,), REAL))
+    arrays: list[tuple[object, tuple[int, ...], object]]
+    arrays = [(density.class_probability, (count, classes), np.float64), (density.sensor, (5,), np.float64)]
     if own is not None:
-        arrays += (
-            (own.classes, (classes, COUNTS, BINS), REAL),
-            (own.objects, (count, SLOTS, SLOT), COUNTER),
-            (own.components, (len(density.poisson),), INDEX),
-            (own.scatter, (classes, SCATTER), REAL),
-        )
+        shapes = _shapes(classes, count, len(density.poisson))
+        arrays += [(getattr(own, name), *shape_and_kind) for name, shape_and_kind in shapes.items()]
     for array, shape, kind in arrays:
         if array is not None and not (isinstance(array, np.ndarray) and array.shape == shape and array.dtype == kind):
             return False
@@ -579,6 +573,7 @@ def _self_calibration(columns: Mapping[str, Any], shapes: Mapping[str, tuple[tup
         column, path = columns.get(f"{COUNTED}.{name}"), f"{COUNTED}.{name}"
         if not isinstance(column, np.ndarray) or column.dtype != kind or column.shape != shape:
             raise DensityError(path, f"{shape} {kind.__name__}", shown(column))
+        low: float
         low, high = (NO_BIN, BINS - 1) if kind is np.int64 else (0, MOST_COUNTED)
         if name in {"innovations", "lagged"}:
             low = -MOST_COUNTED
