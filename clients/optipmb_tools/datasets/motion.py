@@ -291,21 +291,22 @@ def _some(frame: Ints) -> "Iterable[Ints]":
         yield rows[: MOST_BOXES * (1 + len(rows) // MOST_BOXES) : 1 + len(rows) // MOST_BOXES]
 
 
-def are_people(frame: Ints, xy: Floats, size: Floats | None, moves: Moves) -> bool:
-    """Tell whether boxes (B,) are of people: by sizes (B, 3), or by speeds and distances where these are unknown."""
-    speed = np.hypot(*moves.velocity.T)
-    if len(moves) >= SURE_MOVES and float(np.quantile(speed, 0.95)) > RUNNING:
+def are_people(frame: Ints, xy: Floats, size: Floats | None, speed: Floats) -> bool:
+    """Tell whether boxes (B,) are of people: by sizes (B, 3), or by distances where these are unknown.
+
+    None of them goes faster than people do, by their speeds (S,) to the next frame in m/s.
+    """
+    if len(speed) < SURE_MOVES or float(np.quantile(speed, 0.9)) > RUNNING:
         return False
     if size is not None:
         low, high = (np.array(one) for one in zip(*PERSON, strict=True))
-        return len(size) > 0 and float(np.mean(((size >= low) & (size <= high)).all(axis=1))) > MOST_ALONE
-    distances = []
+        return bool(np.mean(((size >= low) & (size <= high)).all(axis=1)) > MOST_ALONE)
+    distances = [np.empty(0)]
     for rows in _some(frame):
         away = np.linalg.norm(xy[rows][:, None] - xy[rows][None], axis=2)
         np.fill_diagonal(away, np.inf)
         distances.append(away.min(axis=1, initial=np.inf))
-    nearest = np.concatenate(distances) if distances else np.empty(0)
-    return len(moves) >= SURE_MOVES and int((nearest < ELBOWS).sum()) >= SURE_MOVES
+    return int((np.concatenate(distances) < ELBOWS).sum()) >= SURE_MOVES
 
 
 def find_reports(key: Ints, seconds: Floats, xy: Floats, kind: Ints) -> Reports | None:

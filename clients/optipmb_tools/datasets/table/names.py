@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from optipmb_tools.datasets.motion import are_people, find_moves
+from optipmb_tools.datasets.motion import are_people, find_moves, next_steps
 from optipmb_tools.datasets.table.draft import Draft
 from optipmb_tools.datasets.table.findings import HALF, Reading
 from optipmb_tools.geometry import Ints
@@ -75,8 +75,10 @@ def people(reading: Reading, draft: Draft) -> Draft:
     if not draft.scored or "class" in draft.roles or set(draft.name.tolist()) != {NO_CLASS}:
         return draft
     size = None if draft.centres or not {"l", "w", "h"} <= draft.roles.keys() else draft.size
-    stamps = np.unique(draft.stamps.ns[draft.row], return_inverse=True)[1]
-    if not are_people(stamps + draft.series[draft.row] * len(draft.row), draft.center[:, :2], size, draft.moves):
+    row, xy = draft.row, draft.center[:, :2]
+    frame = np.unique(draft.stamps.ns[row], return_inverse=True)[1] + draft.series[row] * len(row)
+    steps, times = next_steps(draft.series[row], draft.stamps.ns[row] / 1e9, xy, draft.kind)
+    if not are_people(frame, xy, size, steps / times):
         return draft
     what = "speeds and distances" if size is None else "sizes"
     reading.note(
