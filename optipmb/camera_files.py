@@ -58,6 +58,13 @@ def read_lens(path: Path, image: Any) -> dict[str, Any]:
     """
     known = read_numbers(path)
     matrix, distortion = (_named(known, names) for names in (_MATRIX, _DISTORTION))
+    if {"fx", "fy", "cx", "cy"} <= known.keys():
+        matrix = " ".join(known[name] for name in ("fx", "fy", "cx", "cy"))
+    if {"k1", "k2", "p1", "p2"} <= known.keys():
+        distortion = " ".join(known[name] for name in ("k1", "k2", "p1", "p2", "k3") if name in known)
+    projection = _projection(path, known) if matrix is None else None
+    if projection is not None:  # of a straightened image
+        matrix, distortion = " ".join(map(str, projection[0].ravel())), distortion or ""
     numbers = _numbers(path, "camera_matrix", matrix)
     if len(numbers) not in {4, 9}:
         raise ParameterError("intrinsics", "a matrix camera_matrix of 9 numbers", f"{len(numbers)} in {path}")
@@ -104,12 +111,30 @@ def read_pose(path: Path) -> dict[str, Any]:
             expected = "R of 9 numbers, or rvec of 3, and t of 3"
             raise ParameterError("extrinsics", expected, f"{values.size} and {translation.size} in {path}")
         rotation = values.reshape(3, 3) if values.size == 9 else _rodrigues(values)  # noqa: PLR2004 - 3 x 3
+    elif (projection := _projection(path, known)) is not None:
+        _, rotation, translation = projection
     else:
-        expected = "R and t, rvec and tvec, or a matrix extrinsic, from the world to the camera"
+        expected = "R and t, rvec and tvec, or a matrix extrinsic or projection, from the world to the camera"
         raise ParameterError("extrinsics", expected, f"the names {', '.join(known)} in {path}")
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0.0:
         raise ParameterError("extrinsics", "a rotation from the world to the camera", str(rotation.tolist()))
     return {"position": (-rotation.T @ translation).tolist(), "quaternion": _quaternion(rotation.T)}
+
+
+def _projection(path: Path, known: Mapping[str, str]) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Return the intrinsics (3, 3), rotation (3, 3) and translation (3,) of a projection (3, 4); None without one."""
+    text = _named(known, r"p|p2|projection(_?matrix)?|proj(_?mat)?|camera_projection(_matrix)?")
+    if text is None or len(values := _numbers(path, "projection", text)) != 12:  # noqa: PLR2004 - 3 x 4
+        return None
+    matrix = np.array(values).reshape(3, 4)
+    turn, upper = np.linalg.qr(np.flipud(matrix[:, :3]).T)  # an RQ decomposition
+    upper, turn = np.fliplr(np.flipud(upper.T)), np.flipud(turn.T)
+    sign = np.diag(np.sign(np.diag(upper)))
+    upper, turn = upper @ sign, sign @ turn
+    shift = np.linalg.solve(upper, matrix[:, 3])
+    if np.linalg.det(turn) < 0.0:
+        turn, shift = -turn, -shift
+    return upper / upper[2, 2], turn, shift
 
 
 def _rodrigues(vector: np.ndarray) -> np.ndarray:

@@ -581,6 +581,8 @@ def _renamed(
     given = {name: on_host(values) for name, values in {**_named(boxes), **arrays}.items() if values is not None}
     if unknown := [name for name in given if name not in known]:
         pixels = " (pixel boxes need camera=)" if unknown[0] in KNOWN_PIXELS else ""
+        if {"boxes", "bbox", "bboxes", "xyxy", "instances", "pred_boxes"} & set(unknown):
+            pixels = " (boxes of an image: update({'box', 'class', 'score'}, camera=…))"
         raise FrameError(unknown[0], f"columns among {', '.join(known)}{pixels}", f"the columns {', '.join(given)}")
     whole = {part: name for name, parts in flat for part in parts}
     renamed = [ALIASES.get(name, name) for name in given]
@@ -630,6 +632,10 @@ def _named(boxes: Any) -> dict[str, Any]:
             raise FrameError("boxes", "a structured array, or columns by name", f"{boxes.shape} {boxes.dtype}")
         return {name: boxes[name] for name in boxes.dtype.names}
     columns = getattr(boxes, "column_names", getattr(boxes, "columns", None))  # pyarrow; pandas and polars
+    if columns is None and not hasattr(boxes, "keys"):
+        expected = "columns by name, a list of boxes, or a result that from_detector takes; of boxes of an image "
+        expected += "update({'box', 'class', 'score'}, camera=…)"
+        raise FrameError("boxes", expected, type(boxes).__name__)
     return {str(name): boxes[name] for name in (boxes if columns is None else columns)}
 
 

@@ -273,3 +273,10 @@ def test_a_map_of_classes_is_by_label() -> None:
         optipmb.from_detector(result, classes={1: "Car"})
     with pytest.raises(optipmb.FrameError, match="names of classes"):
         optipmb.OnlineTracker().update({"box": [[1, 2, 3, 4]], "class": [2]}, t=0.0, camera=CAMERA)
+
+
+@pytest.mark.parametrize("result", [{"boxes": [[1, 2, 3, 4]], "labels": [1], "scores": [0.9]}, object()])
+def test_boxes_of_an_image_are_told_the_way(result: object) -> None:
+    """Results of detectors in images that have no form name the columns that `update` takes with a camera."""
+    with pytest.raises(optipmb.FrameError, match=r"update\(\{'box', 'class', 'score'\}, camera=…\)"):
+        optipmb.OnlineTracker().update(result, t=0.0)

@@ -507,6 +507,10 @@ FLAT = "[1050.0, 0.0, 960.0, 0.0, 1040.0, 540.0, 0.0, 0.0, 1.0]"
         ),
         f'{{"camera_matrix": {MATRIX}, "dist_coeff": [[-0.1, 0.02, 0.0, 0.0]]}}',
         f"M1:\n  data: {FLAT}\nD1:\n  data:\n    - -0.1\n    - 0.02\n    - 0.0\n    - 0.0\n",
+        (
+            '{"intrinsics": {"fx": 1050.0, "fy": 1040.0, "cx": 960.0, "cy": 540.0}, '
+            '"distortion": {"k1": -0.1, "k2": 0.02, "p1": 0.0, "p2": 0.0}}'
+        ),
         f"mtx: {MATRIX}\ndist: [-0.1, 0.02, 0.0, 0.0]\nfisheye_model: 0\n",
     ],
 )
@@ -541,6 +545,7 @@ def test_poses_of_other_programs_are_read(tmp_path: Path) -> None:
         {"R": turn.tolist(), "t": shift.tolist()},
         {"rvec": rvec.tolist(), "tvec": shift[:, None].tolist()},
         {"extrinsic": [*whole, [0.0, 0.0, 0.0, 1.0]]},
+        {"projection": (np.array([[1050.0, 0, 960], [0, 1040, 540], [0, 0, 1]]) @ np.array(whole)).tolist()},
     ):
         (tmp_path / "c.json").write_text(json.dumps(document))
         found = read_pose(tmp_path / "c.json")
