@@ -110,7 +110,7 @@ def generated(objects: int, points: int, rate: float, seed: int = 0) -> Frames:
                     label=index % 2,
                     center=middle + RADIUS_M * around + random.normal(0, NOISE_M, (objects, 3)),
                     size=np.where(index[:, None] % 2 == 0, [4.5, 1.9, 1.6], [0.8, 0.7, 1.8]),
-                    yaw=angle + np.pi / 2,
+                    yaw=(angle + np.pi / 2) % (2 * np.pi),
                     velocity=RADIUS_M * turn * along,
                     score=np.full(objects, 0.8),
                     has_points=points > 0,
