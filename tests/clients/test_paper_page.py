@@ -4,9 +4,6 @@ import re
 from pathlib import Path
 from pkgutil import resolve_name
 
-import pytest
-from optipmb_tools.cli import run
-
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE = (DOCS / "paper.md").read_text(encoding="utf-8")
 
@@ -37,16 +34,3 @@ def test_each_table_and_figure_has_its_row() -> None:
     """Figures 1 to 5 and tables I to VI."""
     items = [line.split("|")[1].strip() for line in section("Tables and figures").splitlines() if line.startswith("| ")]
     assert items[2:] == ["Fig. 1, 2", "Fig. 3", "Fig. 4", "Fig. 5", *TABLES]
-
-
-@pytest.mark.parametrize(("page", "least"), [("paper.md", 8), ("tuning.md", 6)])
-def test_the_commands_of_a_page_exist(page: str, least: int, capsys: pytest.CaptureFixture[str]) -> None:
-    """Every command has a help, and every option in it is named there."""
-    text = (DOCS / page).read_text(encoding="utf-8")
-    lines = [line for line in text.replace("\\\n", "").splitlines() if line.startswith("optipmb ")]
-    assert len(lines) >= least
-    for line in lines:
-        command, *words = line.split()[1:]
-        assert run([command, "--help"]) == 0
-        text = capsys.readouterr().out
-        assert all(word in text for word in words if word.startswith("--")), line

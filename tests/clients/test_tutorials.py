@@ -1,15 +1,20 @@
 """The commands and programs of the pages run as they stand there, and print what they promise."""
 
+import contextlib
 import csv
+import io
 import re
 import runpy
 import shlex
 import subprocess
+from functools import cache
+from itertools import takewhile
 from pathlib import Path
 
 import pytest
 from commands import run_here
 from optipmb_service.app.cli import main as service_command
+from optipmb_tools.cli import run as client_command
 
 ROOT = Path(__file__).parents[2]
 SET_UP = ("pip install ", "python3 -m venv ")
@@ -103,22 +108,37 @@ def test_a_section_of_a_page(page: str, heading: str, capsys: pytest.CaptureFixt
     run(f"docs/{page}", heading, capsys, times=1)
 
 
-@pytest.mark.parametrize("program", ["optipmb", "optipmb-service"])
-def test_the_commands_of_the_cheat_sheet_exist(program: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """Each has a help that names its options."""
-    page = (ROOT / "docs" / "cheatsheet.md").read_text()
-    commands = [shlex.split(line) for line in re.findall(rf"`{program} ([^`]+)`", page)]
-    assert len(commands) > 5
-    for words in commands:
-        command = [words[0]] if not words[0].startswith("-") else []
-        group = [words[1]] if words[0] == "camera" else []
-        if program == "optipmb":
-            shown = run_here(capsys, *command, *group, "--help").stdout
-        else:
-            with pytest.raises(SystemExit):
-                service_command([*command, "--help"])
-            shown = capsys.readouterr().out
-        assert all(word in shown for word in words if word.startswith("--")), words
+def commands(text: str) -> list[list[str]]:
+    """Return the calls of our two programs in a page, in blocks and in the text, as words."""
+    blocks = "\n".join(re.findall(r"^```sh\n(.*?)^```", text, re.DOTALL | re.MULTILINE)).replace("\\\n", " ")
+    lines = [
+        *re.findall(r"(?:^|\s)(optipmb(?:-service)? .*)$", blocks, re.MULTILINE),
+        *re.findall(r"`(optipmb(?:-service)? [^`]+)`", text),
+    ]
+    found = (shlex.split(line.replace("\\|", "|"), comments=True) for line in lines if line.count("'") % 2 == 0)
+    return [list(takewhile(lambda word: word not in {"&", "&&", "|", ">"}, words)) for words in found]
+
+
+@cache
+def helped(*command: str) -> str:
+    """Return the help of a command."""
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
+        (service_command if command[0] == "optipmb-service" else client_command)([*command[1:], "--help"])
+    return printed.getvalue()
+
+
+@pytest.mark.parametrize("page", ["README.md", *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md")))])
+def test_the_commands_of_every_page_exist(page: str) -> None:
+    """Each command that a page prints has a help, and each of its options is named there."""
+    for program, *words in commands((ROOT / page).read_text()):
+        names = list(takewhile(lambda word: re.fullmatch(r"[a-z][a-z-]*", word), words))[
+            : 2 if words[:1] == ["camera"] else 1
+        ]
+        shown = helped(program, *names)
+        assert "sage:" in shown, (program, *words)
+        wrong = [word for word in words if word.startswith("--") and word.partition("=")[0] not in shown]
+        assert not wrong, (program, *words)
 
 
 def test_variables_stand_for_options(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
