@@ -39,7 +39,7 @@ help:
 	@echo "make containers  build the image, run the compose file's stack in containers, and show that it works"
 	@echo "make tune    tune profiles from DATA=... (out/tune-*/tuned.toml), beginning at those of the paper"
 	@echo "make ablate  print the figures of docs/ablation.md and docs/ablation/*.csv from DATA=..."
-	@echo "make pictures draw the pictures of the pages again, into docs/images"
+	@echo "make pictures draw the pictures of the pages again, into docs/images, and the outputs of the notebooks"
 	@echo "make docs    build the documentation site into out/site and check its links"
 	@echo "make release test, build and check a release, and print what would publish it"
 	@echo "make image   build the image for PLATFORMS=linux/amd64,linux/arm64, and push it to PUSH=REPOSITORY"
@@ -190,6 +190,7 @@ docs: $(DOCS)/.installed
 # Not live.png, live-phone.png, and the figures of performance.
 pictures: kernels
 	$(BIN)/python docs/pictures.py docs/images
+	$(BIN)/python docs/notebooks.py examples
 
 # Everything that a release needs, up to publishing.
 release: $(VENV)/.installed
