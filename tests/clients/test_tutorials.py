@@ -89,6 +89,7 @@ def test_a_table_with_other_names(folder: Path, capsys: pytest.CaptureFixture[st
     assert {row.split(",")[2] for row in rows} == {"1"}
 
 
+@pytest.mark.timeout(400)  # the joining of tracks may have to be compiled
 @pytest.mark.parametrize(
     ("page", "heading"),
     [
