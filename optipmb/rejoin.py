@@ -988,10 +988,12 @@ def rejoin_tracks(
 def _without(density: Density, identity: Index) -> Density:
     stays = ~np.isin(density.bernoulli.id, identity)
     own, pi, misses = density.self_calibration, density.class_probability, density.misses
+    if own is not None:
+        own = replace(own, objects=own.objects[stays], innovations=own.innovations[stays])
     return replace(
         density,
         bernoulli=density.bernoulli.take(stays),
         misses=None if misses is None else misses.take(stays),
         class_probability=None if pi is None else pi[stays],
-        self_calibration=None if own is None else replace(own, objects=own.objects[stays]),
+        self_calibration=own,
     )
