@@ -13,7 +13,7 @@ from optipmb_tools.datasets import DatasetError, open_dataset
 from optipmb_tools.geometry import Floats, Ints, Pose, planar_pose, wrap_angle
 from optipmb_tools.results import full_table
 from optipmb_tools.results.kitti import SUBMISSION_SCORES, read_kitti_results, write_kitti_results
-from optipmb_tools.run.profiles import profile_for, read_profile
+from optipmb_tools.run.profiles import profile_for
 from optipmb_tools.run.tracking import track_whole
 from real_data import kitti_root
 
