@@ -574,7 +574,6 @@ def _self_calibration(columns: Mapping[str, Any], shapes: Mapping[str, tuple[tup
         if not isinstance(column, np.ndarray) or column.dtype != kind or column.shape != shape:
             raise DensityError(path, f"{shape} {kind.__name__}", shown(column))
         low: float
-        low: float
         low, high = (NO_BIN, BINS - 1) if kind is np.int64 else (0.0, MOST_COUNTED)
         if name in {"innovations", "lagged"}:
             low = -MOST_COUNTED
