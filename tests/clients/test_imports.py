@@ -63,8 +63,8 @@ IO = {"threading", "asyncio", "socket", "queue", "sqlite3", "os", "tempfile", "s
 
 COMPUTATION = {
     "__future__", "collections", "contextlib", "dataclasses", "enum", "difflib", "functools", "hashlib", "importlib",
-    "itertools", "math", "numba", "numpy", "operator", "optipmb", "pathlib", "pydantic", "pydantic_core", "re", "sys",
-    "tomllib", "types", "typing",
+    "itertools", "llvmlite", "math", "numba", "numpy", "operator", "optipmb", "pathlib", "pydantic", "pydantic_core",
+    "re", "sys", "tomllib", "types", "typing",
 }  # fmt: skip
 EXCEPTIONS = {
     # to show why a first frame takes a while; a folder; processes that compile

@@ -213,7 +213,7 @@ def test_an_interrupt_says_what_is_complete(
     monkeypatch.setattr("concurrent.futures.wait", interrupted)
     with FakeService(endpoint), pytest.raises(KeyboardInterrupt, match=f"1 of 2 recordings are in {tmp_path}"):
         run(link, dataset, tmp_path, "0000", "0001", streams=1, on_frame=slow)
-    assert [path.name for path in tmp_path.iterdir()] == ["0000.txt"]
+    assert [path.name for path in tmp_path.glob("*.txt")] == ["0000.txt"]
 
 
 def test_one_failing_sequence_ends_the_others_and_closes_their_sessions(

@@ -50,7 +50,7 @@ def publishing(stream: str, label: str, length: float) -> Iterator[None]:
                     label=[label] * 3,
                     center=[[12 * math.cos(angle), 12 * math.sin(angle), 0.0] for angle in angles],
                     size=[[length, 1.0, 1.6]] * 3,
-                    yaw=[angle + math.pi / 2 for angle in angles],
+                    yaw=[(angle + math.pi / 2) % (2.0 * math.pi) for angle in angles],
                     velocity=[[-3.6 * math.sin(angle), 3.6 * math.cos(angle)] for angle in angles],
                     score=[0.9] * 3,
                     pose=([100.0, 50.0, 0.0], [1.0, 0.0, 0.0, 0.0]),

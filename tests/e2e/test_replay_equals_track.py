@@ -114,7 +114,7 @@ def test_a_recording_of_a_publisher_of_the_world_frame(
                 objects=8,
                 center=np.c_[20 * np.arange(8) + 5 * np.cos(angle), 5 * np.sin(angle), np.ones(8)]
                 + chance.normal(0, 0.05, (8, 3)),
-                yaw=angle + np.pi / 2 + chance.normal(0, 0.02, 8),  # beyond pi too
+                yaw=np.remainder(angle + np.pi / 2 + chance.normal(0, 0.02, 8), 2 * np.pi),  # beyond pi too
                 position_covariance=SPREADS if seq % 2 else None,
                 has_points=False,
             )

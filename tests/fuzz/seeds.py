@@ -60,9 +60,15 @@ def main() -> None:
     parameters = optipmb.load_profile("kitti")
     small = parameters.model_copy(update={"classes": dict(list(parameters.classes.items())[:1]), "provenance": ""})
     one = Session(sensor.stream, small, tracker=chained)
-    _write("checkpoints", "empty", encode_checkpoint(one.snapshot())[HEAD:])
+    _write("checkpoints", "empty", _body(one))
     feed(one, [0, 2, 1], sensor, objects=1)
-    _write("checkpoints", "window", encode_checkpoint(one.snapshot())[HEAD:])
+    _write("checkpoints", "window", _body(one))
+
+
+def _body(session: Session) -> bytes:
+    """Return what follows the head of a checkpoint and its numbers."""
+    data = encode_checkpoint(session.snapshot())[HEAD:]
+    return data[4 + int.from_bytes(data[:4]) :]
 
 
 def _write(corpus: str, name: str, data: bytes) -> None:

@@ -48,7 +48,7 @@ def seen(
         moving = (after - place) / dt if velocity and k + 1 < len(path) else None
         xy = place + rng.normal(0, 0.05, place.shape)
         facing = yaw + rng.normal(0, 0.03, len(yaw)) + np.pi * (turned == k)
-        frames.append(boxes(parameters, k * dt, xy, yaw=facing, velocity=moving, label=label))
+        frames.append(boxes(parameters, k * dt, xy, yaw=np.angle(np.exp(1j * facing)), velocity=moving, label=label))
     return steps(parameters, frames)
 
 

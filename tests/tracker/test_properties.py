@@ -79,7 +79,7 @@ def test_extreme_frames_leave_a_valid_density(seed: int) -> None:
             label=rng.integers(0, len(parameters.labels), count),
             center=np.clip(near, -1e8, 1e8),
             size=10 ** rng.uniform(-8, 8, (count, 3)) if rng.random() < 0.5 else rng.uniform(1, 5, (count, 3)),
-            yaw=np.clip(rng.normal(0, 10 ** rng.choice([0, 8]), count), -1e8, 1e8),
+            yaw=np.clip(rng.normal(0, 10 ** rng.choice([0, 8]), count), -6.4, 6.4),
             score=rng.uniform(0.2, 1, count),
             velocity=np.clip(rng.normal(0, 10 ** rng.choice([0, 2, 3]), (count, 2)), -1e3, 1e3),
             cloud=optipmb.PointCloud(
@@ -150,7 +150,7 @@ def moved(given: SceneFrame, angle: float, shift: np.ndarray) -> SceneFrame:
         cloud = SceneCloud(cloud.xyz, SensorPose(rotation @ cloud.pose.translation + shift, quaternion))
     velocity = None if given.velocity is None else given.velocity @ rotation[:2, :2].T
     center = given.center @ rotation.T + shift
-    return replace(given, center=center, yaw=given.yaw + angle, velocity=velocity, cloud=cloud)
+    return replace(given, center=center, yaw=np.angle(np.exp(1j * (given.yaw + angle))), velocity=velocity, cloud=cloud)
 
 
 @pytest.mark.parametrize("unknown", [0.0, 0.5, 1.0])

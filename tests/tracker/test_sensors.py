@@ -99,7 +99,7 @@ def followed(pictures: Pictures, use: Sensor | None = None, base: Parameters = K
             label=np.zeros(len(rows), np.int64),
             center=np.c_[rows[:, :2], np.full(len(rows), 0.8)],
             size=np.tile(SIZES[sensor], (len(rows), 1)),
-            yaw=rows[:, 2],
+            yaw=np.remainder(rows[:, 2], 2.0 * math.pi),
             score=rows[:, 3],
             pose=STILL,
             field_of_view=VIEWS[sensor],

@@ -43,6 +43,7 @@ DECIMALS: Final = {
 }
 """Decimals of columns in text: 0.1 mm, 1e-4 rad, 1 mm/s, probabilities to 1e-4."""
 FULL: Final = "full"  # digits of text that give every bit of a number
+_RANKED: Final = {".txt", ".json"}
 SHOWN: Final = "shown"
 """Folder beside the result files of a benchmark, which rank all tracks: the same files of the tracks that are shown."""
 
@@ -227,7 +228,7 @@ class Results:
         if self._table:
             return track_columns(sequence.name, tracks, sequence, full=self._full, georeference=place, objects=objects)
         path = self._dataset.write(self._out, sequence, tracks)
-        if not self._submission:
+        if path.suffix in _RANKED and not self._submission:
             self._dataset.write(self._out / SHOWN, sequence, {index: _shown(one) for index, one in tracks.items()})
         if self._full:
             write_full(full_path(path), tracks)
@@ -262,6 +263,6 @@ class Results:
             write_tracks(self._out, columns, self._dataset.digits)
         elif not is_openlabel(self._out) and all(one.name in self._taken for one in sequences):
             self._dataset.join(self._out, sequences)
-            if not self._submission:
+            if (self._out / SHOWN).is_dir():
                 self._dataset.join(self._out / SHOWN, sequences)
         return []

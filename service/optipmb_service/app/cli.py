@@ -203,8 +203,8 @@ def config_command(
         return
     plain = {name: value for name, value in values.items() if not isinstance(value, dict)}
     for name, value in plain.items():
-        # TOML has no null: a setting without a value is a comment.
-        shown = f"# {name} is not set" if value is None else f"{name} = {_toml(value)}"
+        # TOML has no null: a setting without a value is a comment; some may not be set and empty.
+        shown = f"# {name} is not set" if value is None or value == "" else f"{name} = {_toml(value)}"
         typer.echo(f"{shown}  # {loaded.sources[name]}")
     for name in values.keys() - plain.keys():
         typer.echo(f"\n[{name}]  # {loaded.sources[name]}")

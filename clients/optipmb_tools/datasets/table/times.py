@@ -182,13 +182,11 @@ def _serial_days(reading: Reading, numbers: np.ndarray, key: Ints) -> Ints | Non
     """Return stamps in nanoseconds of days with decimals, as spreadsheets and MATLAB count them; None of others."""
     if numbers.dtype.kind != "f" or not len(numbers):
         return None
-    step = median_step(np.round(numbers * DAY, 4), key)  # such numbers have the digits of microseconds
     for program, (epoch, (low, high)) in _DAYS.items():
-        if (
-            low <= numbers.min()
-            and numbers.max() <= min(high, numbers.min() + 1.0)
-            and PERIODS[0] <= step <= PERIODS[1]
-        ):
+        if not low <= numbers.min() <= numbers.max() <= min(high, numbers.min() + 1.0):
+            continue
+        step = median_step(np.round(numbers * DAY, 4), key)  # such numbers have the digits of microseconds
+        if PERIODS[0] <= step <= PERIODS[1]:
             reading.note("time", f"stamps are days of {program}", "--option time=UNIT")
             return np.round((numbers - epoch) * DAY * 1e4).astype(np.int64) * 100_000
     return None
