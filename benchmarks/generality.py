@@ -318,7 +318,8 @@ def shown_table(root: Path, detectors: Sequence[str], strides: Sequence[int], *,
     for detector, stride, least in product((*detectors, "crossing"), strides, (0.0, 0.3, 0.5)):
         if detector == "crossing":
             opened = open_dataset("table", sample / "crossing.csv", truth=str(sample / "crossing_truth.csv"))
-            sequences, names, rules = tuple(opened.sequences(["all"])), tuple(opened.labels), default_rules("table")
+            sequences, rules = tuple(opened.sequences(["all"])), default_rules("table")
+            names = profiles.profile_for("auto", sequences).labels
         else:
             folder, names = DETECTORS[detector]
             if stride not in STRIDES[folder]:

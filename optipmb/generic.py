@@ -47,7 +47,8 @@ HISTORY: Final = (
     {"offset": -2.3, "existence": 0.8, "duration": 1.1, "share": 2.3, "speed": 0.1},
     {"offset": -3.8, "existence": 0.4, "duration": 1.25, "share": 2.0, "speed": 1.15},
 )
-"""How whole tracks count: of vehicles, and of people and cyclists, who move where they are not clutter."""
+"""How whole tracks count: of cars, and of people and cyclists, who move where they are not clutter. Boxes of trucks and
+buses that last are often parts of something else."""
 
 
 def generic_parameters(labels: Iterable[str], period: float, *, name: str = "auto") -> Parameters:
@@ -122,7 +123,7 @@ def _of_class(kind: str, period: float) -> dict[str, Any]:
             "across": _lasting(0.07, EXISTENCE[agile]),
             "speed": 0.3 if agile else 0.5,
             "turn_rate": 0.5 if agile else 0.4,
-            "history": HISTORY[agile or two_wheeled],
+            "history": None if sized else HISTORY[agile or two_wheeled],
         },
         "reported_noise": {"position": 0.04, "heading": 0.3} if agile else {"position": 0.06, "heading": 0.06},
         "process_noise": {
