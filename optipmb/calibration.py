@@ -7,7 +7,7 @@ the published tracks, so that the recursion stays the paper's:
 
     evidence    e_k = lambda e_{k-1} + (1 - lambda) l_k,     l_k = ln[z_s / (1 - z_s)], or -l_miss where missed
     existence   p = f(e_k), with a history logit p = o + w_e logit f(e_k) + w_T ln(1 + T) + w_s s + w_v min(v, `WALK`)
-    share       s = min(h / (rho n), `FULL_SHARE`)
+    share       s = min((h - 1) / (rho (n - 1)), `FULL_SHARE`), zero in the first look
     covariance  F P F + U diag(along(e_k), across(e_k))^2 U' on x and y, U turned by the heading
     score       (1 - w) x_s + w (1 + e_k / e_max) / 2        e_max the bound of l_k
     velocity    v v^4 / [v^4 + (3 P_vv)^2]                   below one standard deviation hardly any
@@ -15,7 +15,8 @@ the published tracks, so that the recursion stays the paper's:
 f, along and across are piecewise linear and were measured on training data, as were the factors F of speed and turn
 rate: process noise that lets a braking car stay one track is more than most objects show. lambda holds for one period.
 Evidence is of the last half second. The history is of the whole track: T seconds since its first detection, h of its n
-looks detected, at the recall rho of the class, and its published speed v, as standing clutter lasts too.
+looks detected, at the recall rho of the class, and its published speed v, as standing clutter lasts too. The first
+detection made the track and tells nothing: a single one seldom shows it.
 Without a calibration in the profile, existence is r, the covariance is P, and the evidence stays zero.
 
 The state rests on measurement noise R that is larger than a detector's usual error, so that a half-hidden car whose box
@@ -67,7 +68,7 @@ def log_odds(score: float) -> float:
 
 @kernel
 def use_history(existence: float, age: float, share: float, velocity: Array, own: ClassRow) -> float:
-    """Return p by f(e_k), T in seconds, h / n and the published velocity (2,)."""
+    """Return p by f(e_k), T in seconds, (h - 1) / (n - 1) and the published velocity (2,)."""
     odds = own.history_offset + own.history_existence * log_odds(existence)
     odds += own.history_duration * math.log1p(age)
     odds += own.history_share * min(share / own.recall, FULL_SHARE)

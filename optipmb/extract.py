@@ -167,7 +167,7 @@ def extract(
     for k in range(count):
         n, own = rows[k], classes[label[k]]
         if own.history_known:
-            share = objects.hits[n] / objects.looks[n]
+            share = (objects.hits[n] - 1.0) / max(objects.looks[n] - 1.0, 1.0)
             existence[k] = use_history(existence[k], tracks.age[k], share, velocity[k], own)
     confirm(rows, label, existence, measurement, classes, objects.confirmed, tracks.confirmed)
     return words, rows

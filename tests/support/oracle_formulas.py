@@ -305,7 +305,7 @@ def with_history(history: Any, existence: float, b: Any, age: float, speed: floa
     """Existence of a track by all of its frames, at a recall of one."""
     odds = float(np.clip(np.log(existence) - np.log1p(-existence), -14.0, 14.0))
     odds = history.offset + history.existence * odds + history.duration * math.log1p(age)
-    odds += history.share * min(b.hits / b.looks, 1.2) + history.speed * min(speed, 2.0)
+    odds += history.share * min((b.hits - 1) / max(b.looks - 1, 1), 1.2) + history.speed * min(speed, 2.0)
     return 1.0 / (1.0 + math.exp(-odds))
 
 
