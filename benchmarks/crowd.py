@@ -28,7 +28,7 @@ from optipmb_tools.tuning.scoring import rules_of
 from scipy.optimize import linear_sum_assignment
 
 import optipmb
-from optipmb.hindsight import with_hindsight
+from optipmb.learning.hindsight import with_hindsight
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -23,7 +23,7 @@ from settled import PROFILES, recorded, settled
 from turns import CALLS, CLOCK, ROUNDS, in_turns, summary
 
 import optipmb
-from optipmb.detection_probability import points_in_boxes
+from optipmb.filter.detection_probability import points_in_boxes
 
 if TYPE_CHECKING:
     from collections.abc import Callable

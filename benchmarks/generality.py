@@ -53,7 +53,7 @@ from optipmb_tools.tuning.clips import Clip, load, of_class
 from optipmb_tools.tuning.scoring import plain_figures, rules_of, scorer_of
 
 import optipmb
-from optipmb.hindsight import with_hindsight
+from optipmb.learning.hindsight import with_hindsight
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -578,7 +578,7 @@ def table(given: Summary) -> Iterator[str]:
 def _state(profile: str) -> str:
     """Return a digest of the tracker, the profiles and this file."""
     folder = Path(optipmb.__file__).parent
-    files = [*folder.glob("*.py"), *folder.glob("profiles/*.toml"), Path(__file__)]
+    files = [*folder.rglob("*.py"), *folder.rglob("*.toml"), Path(__file__)]
     content = b"".join(one.read_bytes() for one in sorted(files))
     return hashlib.sha256(content + profile.encode()).hexdigest()[:16]
 

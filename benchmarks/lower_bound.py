@@ -19,14 +19,14 @@ import numpy as np
 from settled import PROFILES, settled
 from turns import in_turns
 
-from optipmb.association import associate
-from optipmb.class_posterior import UNGROUPED, Groups
-from optipmb.density import Moment, components_in, objects_in
-from optipmb.hypotheses import local_hypotheses
-from optipmb.predict import predict, predict_state
-from optipmb.preprocess import preprocess
-from optipmb.table import ClassTable
-from optipmb.update import ukf_update, workspace
+from optipmb.filter.association import associate
+from optipmb.filter.class_posterior import UNGROUPED, Groups
+from optipmb.filter.hypotheses import local_hypotheses
+from optipmb.filter.predict import predict, predict_state
+from optipmb.filter.preprocess import preprocess
+from optipmb.filter.update import ukf_update, workspace
+from optipmb.model.density import Moment, components_in, objects_in
+from optipmb.model.table import ClassTable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     import optipmb
-    from optipmb.table import ClassRow
+    from optipmb.model.table import ClassRow
 
     Array = NDArray[np.float64]
     Index = NDArray[np.int64]

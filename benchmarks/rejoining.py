@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from optipmb_tools.geometry import Floats, Ints
 
     from optipmb import Frame, Parameters
-    from optipmb.lost_objects import Tracklets
+    from optipmb.model.lost_objects import Tracklets
 
 LENGTHS = (1, 2, 3, 5, 10, 20, 40)
 LEVELS = (0.8, 0.9, 0.95, 0.98, 0.99, 1.01)

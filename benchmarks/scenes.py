@@ -22,7 +22,7 @@ from optipmb_tools.tuning.clips import load, track_clip
 from optipmb_tools.tuning.scoring import Measured, Scorer, rules_of, scorer_of
 
 import optipmb
-from optipmb.geometry import bev_iou
+from optipmb.filter.geometry import bev_iou
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -9,14 +9,14 @@ import pytest
 from settled import PARAMETERS, settled
 
 import optipmb
-from optipmb.association import associate
-from optipmb.class_posterior import UNGROUPED, Groups
-from optipmb.density import Density, Moment, components_in, objects_in
-from optipmb.detection_probability import points_in_boxes
-from optipmb.hypotheses import UNLIMITED, local_hypotheses
-from optipmb.predict import predict
-from optipmb.preprocess import non_maximum_suppression, preprocess
-from optipmb.table import CLASS, ClassTable
+from optipmb.filter.association import associate
+from optipmb.filter.class_posterior import UNGROUPED, Groups
+from optipmb.filter.detection_probability import points_in_boxes
+from optipmb.filter.hypotheses import UNLIMITED, local_hypotheses
+from optipmb.filter.predict import predict
+from optipmb.filter.preprocess import non_maximum_suppression, preprocess
+from optipmb.model.density import Density, Moment, components_in, objects_in
+from optipmb.model.table import CLASS, ClassTable
 
 if TYPE_CHECKING:
     from pytest_benchmark.fixture import BenchmarkFixture

@@ -13,7 +13,7 @@ from lower_bound import arguments, bare
 from settled import PARAMETERS, PROFILES, recorded, settled
 
 import optipmb
-from optipmb.lightweight import turn_around
+from optipmb.filter.lightweight import turn_around
 
 if TYPE_CHECKING:
     from pytest_benchmark.fixture import BenchmarkFixture

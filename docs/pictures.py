@@ -18,8 +18,8 @@ from optipmb_tools.run.rejoining import Rejoin, tracklets
 from optipmb_tools.run.tracking import track_whole
 
 import optipmb
-from optipmb.rejoin import motion_of, motion_score
-from optipmb.zones import Zone, ZoneState, observe
+from optipmb.joining.rejoin import motion_of, motion_score
+from optipmb.world.zones import Zone, ZoneState, observe
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

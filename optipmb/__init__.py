@@ -19,20 +19,20 @@ Or as a pure function, from a density and a frame to the next density and tracks
 Pure computation: no files but profiles and calibrations, no network, no state outside the density.
 """
 
-from optipmb.class_names import class_indices, common_name
-from optipmb.density import Bernoullis, Density, Poissons, bytes_of, columns_in, columns_of, density_of
-from optipmb.detection_probability import points_in_boxes
+from optipmb.cameras.ground_camera import GroundCamera
 from optipmb.detectors import from_detector
-from optipmb.errors import DensityError, EffortError, FrameError, OptipmbError, ParameterError
-from optipmb.extract import Tracks, sound
-from optipmb.field_of_view import FieldOfView
-from optipmb.frame import Frame, PointCloud, Pose, make_frame
-from optipmb.generic import generic_parameters
-from optipmb.geometry import bev_iou
-from optipmb.georeference import Geographic, Georeference
-from optipmb.ground_camera import GroundCamera
-from optipmb.online import OnlineTracker, OnlineTracks
-from optipmb.parameters import (
+from optipmb.filter.detection_probability import points_in_boxes
+from optipmb.filter.extract import Tracks, sound
+from optipmb.filter.field_of_view import FieldOfView
+from optipmb.filter.geometry import bev_iou
+from optipmb.filter.paths import PredictedPaths, predict_tracks
+from optipmb.joining.rejoin import Rejoin
+from optipmb.model.class_names import class_indices, common_name
+from optipmb.model.density import Bernoullis, Density, Poissons, bytes_of, columns_in, columns_of, density_of
+from optipmb.model.errors import DensityError, EffortError, FrameError, OptipmbError, ParameterError
+from optipmb.model.frame import Frame, PointCloud, Pose, make_frame
+from optipmb.model.generic import generic_parameters
+from optipmb.model.parameters import (
     Calibration,
     ClassParameters,
     HeadingSign,
@@ -45,11 +45,11 @@ from optipmb.parameters import (
     profile_source,
     profiles,
 )
-from optipmb.paths import PredictedPaths, predict_tracks
-from optipmb.rejoin import Rejoin
-from optipmb.relocation import Relocation
+from optipmb.model.relocation import Relocation
+from optipmb.online import OnlineTracker, OnlineTracks
 from optipmb.tracker import Diagnostics, Modules, StepResult, Tracker
 from optipmb.warm import warm_up
+from optipmb.world.georeference import Geographic, Georeference
 
 __version__ = "0.1.0"
 

@@ -7,14 +7,14 @@ service may run many streams side by side without threads inside a frame. Divisi
 What the stages of a step take is described once, here; docstrings list what a stage takes beyond that.
 
     objects, components    predicted objects (N) and Poisson components (J): `mean` (N, 6), `covariance` (N, 6, 6), …
-    measurements           Z_k (M), as `optipmb.preprocess.Measurements`
-    hypotheses             the local hypotheses of the frame, as `optipmb.hypotheses.Hypotheses`
+    measurements           Z_k (M), as `optipmb.filter.preprocess.Measurements`
+    hypotheses             the local hypotheses of the frame, as `optipmb.filter.hypotheses.Hypotheses`
     row, measurement       (K,) object and measurement of each pair or result
     label                  classes, indices into the parameters
     p_d                    (N,) detection probabilities
-    moment                 stamps and times of the frame, as `optipmb.density.Moment`
+    moment                 stamps and times of the frame, as `optipmb.model.density.Moment`
     missed_from_ns         (N,) stamps from which misses count
-    classes, table         parameters of the classes, as `optipmb.table.ClassTable`
+    classes, table         parameters of the classes, as `optipmb.model.table.ClassTable`
     mean_out, …            receive results
 """
 
@@ -37,7 +37,7 @@ import numba
 import numpy as np
 from llvmlite.binding import get_host_cpu_features
 from numba.core import config, event
-from numba.core.caching import IndexDataCacheFile
+from numba.core.caching import IndexDataCacheFile, InTreeCacheLocator
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -72,8 +72,8 @@ STEPS: Final = 4
 
 PROCESSES: Final = "OPTIPMB_COMPILE_PROCESSES"
 """Environment variable: how many processes compile; 0 compiles each kernel at its first call, in its own process."""
-JOINING: Final = frozenset({f"{__package__}.rejoin", f"{__package__}.appearance"})
-"""Modules whose kernels take as long to compile as all others, and few trackers need."""
+JOINING: Final = f"{__package__}.joining."
+"""Folder of modules whose kernels take as long to compile as all others, and few trackers need."""
 MOST_PROCESSES: Final = 4
 """More are not faster: one kernel takes a third of the time."""
 
@@ -190,7 +190,7 @@ def _compiled(function: F, *, nogil: bool) -> F:
     options: Any = config  # it has names that are set at run time
     if options.DISABLE_JIT:
         return calls.recorded(function)
-    common = function.__module__ not in JOINING
+    common = not function.__module__.startswith(JOINING)
     (progress.kernels if common else progress.others).add(f"{function.__module__}.{function.__qualname__}")
     jit = partial(numba.njit, nogil=nogil, error_model="numpy", no_cfunc_wrapper=True)
     try:
@@ -256,7 +256,7 @@ class _PackageIndex(_Index):
         """Return the machine code of one kernel, None where it has to be compiled here."""
         data = super().load(key)
         if data is None and progress.built is None and (count := _processes()):
-            with _one_at_a_time(Path(self._cache_path)) as writable:
+            with _one_at_a_time(_package_folder(Path(self._cache_path))) as writable:
                 data = super().load(key)
                 if data is None and writable:
                     progress.built = set()
@@ -279,6 +279,14 @@ def _processes() -> int:
     available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     wanted = os.environ.get(PROCESSES, "")
     return int(wanted) if wanted.isdecimal() else min(available, MOST_PROCESSES)
+
+
+def _package_folder(folder: Path) -> Path:
+    """Return the folder that numba gives to the modules of this file's folder, where it gives `folder` to others."""
+    if folder.name == "__pycache__":
+        return Path(__file__).parent / folder.name
+    name: str = InTreeCacheLocator.get_suitable_cache_subpath(__file__)  # type: ignore[no-untyped-call]  # as above
+    return folder.parent / name
 
 
 @contextmanager

@@ -19,13 +19,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from optipmb.errors import FrameError
+from optipmb.model.errors import FrameError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from optipmb.ground_camera import GroundCamera
-    from optipmb.rows import Array
+    from optipmb.cameras.ground_camera import GroundCamera
+    from optipmb.model.rows import Array
 
     Classes = Sequence[str] | Mapping[int, str] | None
 

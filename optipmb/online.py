@@ -21,14 +21,14 @@ from warnings import warn
 
 import numpy as np
 
-from optipmb.class_names import class_indices
 from optipmb.detectors import forms_of, from_detector, on_host
-from optipmb.doubts import EXPECTED as SIZES
-from optipmb.doubts import SizeCheck
-from optipmb.errors import FrameError
-from optipmb.frame import Pose, make_frame
+from optipmb.learning.doubts import EXPECTED as SIZES
+from optipmb.learning.doubts import SizeCheck
+from optipmb.learning.velocity_check import EXPECTED, VelocityCheck
+from optipmb.model.class_names import class_indices
+from optipmb.model.errors import FrameError
+from optipmb.model.frame import Pose, make_frame
 from optipmb.tracker import Tracker
-from optipmb.velocity_check import EXPECTED, VelocityCheck
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -39,15 +39,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from numpy.typing import ArrayLike, NDArray
 
-    from optipmb.density import Density
-    from optipmb.extract import Tracks
-    from optipmb.field_of_view import FieldOfView
-    from optipmb.frame import Frame, PointCloud
-    from optipmb.ground_camera import GroundCamera
-    from optipmb.parameters import Parameters
-    from optipmb.paths import PredictedPaths
-    from optipmb.rejoin import Rejoin
-    from optipmb.rows import Array, Index
+    from optipmb.cameras.ground_camera import GroundCamera
+    from optipmb.filter.extract import Tracks
+    from optipmb.filter.field_of_view import FieldOfView
+    from optipmb.filter.paths import PredictedPaths
+    from optipmb.joining.rejoin import Rejoin
+    from optipmb.model.density import Density
+    from optipmb.model.frame import Frame, PointCloud
+    from optipmb.model.parameters import Parameters
+    from optipmb.model.rows import Array, Index
     from optipmb.tracker import Modules
 
 

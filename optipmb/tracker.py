@@ -7,10 +7,24 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from optipmb.association import associate, forbid_births, surviving_objects
-from optipmb.class_posterior import UNGROUPED, Groups, update_classes
 from optipmb.compiled import kernel
-from optipmb.density import (
+from optipmb.filter.association import associate, forbid_births, surviving_objects
+from optipmb.filter.class_posterior import UNGROUPED, Groups, update_classes
+from optipmb.filter.detection_probability import detection_probability
+from optipmb.filter.extract import Tracks, extract
+from optipmb.filter.field_of_view import follow_looks, look
+from optipmb.filter.hypotheses import UNLIMITED, check_effort, halt, local_hypotheses
+from optipmb.filter.lightweight import light_weight_filter
+from optipmb.filter.paths import paths_of
+from optipmb.filter.predict import predict
+from optipmb.filter.preprocess import Measurements, preprocess
+from optipmb.filter.undetected import update_undetected, with_measurement_births
+from optipmb.filter.unknown_heading import all_measured, measured_bits
+from optipmb.filter.update import first_detected_states, ukf_updates
+from optipmb.joining.rejoin import Kinds, Rejoin, rejoin_tracks
+from optipmb.learning.self_calibration import calibrated, followed
+from optipmb.learning.sensor_motion import follow_sensor
+from optipmb.model.density import (
     NO_FRAME,
     OBJECT,
     Bernoullis,
@@ -23,33 +37,19 @@ from optipmb.density import (
     misses_counted_from,
     objects_in,
 )
-from optipmb.detection_probability import detection_probability
-from optipmb.errors import FrameError, ParameterError
-from optipmb.extract import Tracks, extract
-from optipmb.field_of_view import follow_looks, look
-from optipmb.hypotheses import UNLIMITED, check_effort, halt, local_hypotheses
-from optipmb.lightweight import light_weight_filter
-from optipmb.parameters import Parameters, load_profile
-from optipmb.paths import paths_of
-from optipmb.predict import predict
-from optipmb.preprocess import Measurements, preprocess
-from optipmb.rejoin import Kinds, Rejoin, rejoin_tracks
-from optipmb.rows import record
-from optipmb.self_calibration import calibrated, followed
-from optipmb.sensor_motion import follow_sensor
-from optipmb.table import ClassTable
-from optipmb.undetected import update_undetected, with_measurement_births
-from optipmb.unknown_heading import all_measured, measured_bits
-from optipmb.update import first_detected_states, ukf_updates
+from optipmb.model.errors import FrameError, ParameterError
+from optipmb.model.parameters import Parameters, load_profile
+from optipmb.model.rows import record
+from optipmb.model.table import ClassTable
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from optipmb.frame import Frame
-    from optipmb.paths import PredictedPaths
-    from optipmb.rejoin import Joined
-    from optipmb.rows import Array, Columns, Index
-    from optipmb.table import Classes
+    from optipmb.filter.paths import PredictedPaths
+    from optipmb.joining.rejoin import Joined
+    from optipmb.model.frame import Frame
+    from optipmb.model.rows import Array, Columns, Index
+    from optipmb.model.table import Classes
 
 
 class Prior(NamedTuple):
@@ -79,8 +79,8 @@ class Update(NamedTuple):
         objects: array of the objects of the posterior.
         class_probability: (K, C) their class posteriors, or (K, 0).
         components: array of the Poisson components.
-        fate: of the predicted ones (`optipmb.undetected.update_undetected`).
-        row: (K,) predicted object of each object of the posterior, or `optipmb.association.NEW`.
+        fate: of the predicted ones (`optipmb.filter.undetected.update_undetected`).
+        row: (K,) predicted object of each object of the posterior, or `optipmb.filter.association.NEW`.
         measurement: (K,) its measurement, negative where missed.
         known: how many objects are known ones.
         detected: how many of those have a measurement.
@@ -104,7 +104,7 @@ def update(
 ) -> Columns:
     """Update the prediction with the measurements: from the fields of the named tuples to the fields of `Update`.
 
-    `p_d` (N + J,) is of the objects and, behind them, of the components; `confusion` as in `optipmb.table.ClassTable`;
+    `p_d` (N + J,) is of the objects and, behind them, of the components; `confusion` as in `ClassTable`;
     `still` says whether the sensor stands, or its poses are known.
     """
     given, z, now = Prior(*prior), Measurements(*measurements), Moment(*moment)

@@ -77,14 +77,16 @@ class Environment:
 
     @property
     def kernels(self) -> Path:
-        """Folder of the tracker's machine code."""
-        return next(self.folder.glob("lib/python3.*/site-packages")) / "optipmb" / "__pycache__"
+        """Folder of the tracker, with its machine code."""
+        return next(self.folder.glob("lib/python3.*/site-packages")) / "optipmb"
 
     @staticmethod
     def copy_kernels(source: Path, target: Path) -> None:
         if source.is_dir() and target.is_dir():
-            for file in source.glob("*.nb[ci]"):
-                shutil.copy(file, target)
+            for file in source.rglob("*.nb[ci]"):
+                place = target / file.relative_to(source)
+                place.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy(file, place)
 
     def keep_kernels(self) -> None:
         """Keep this environment's machine code for the environments that follow."""

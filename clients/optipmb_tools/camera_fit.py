@@ -182,7 +182,7 @@ def _pose(pixels: Floats, points: Floats, lens: Mapping[str, Any], *, flat: bool
     from scipy.optimize import least_squares  # noqa: PLC0415  an extra
     from scipy.spatial.transform import Rotation  # noqa: PLC0415  as above
 
-    from optipmb.camera_lens import Lens  # noqa: PLC0415  loads the tracker
+    from optipmb.cameras.camera_lens import Lens  # noqa: PLC0415  loads the tracker
 
     own = Lens.model_validate(lens)
     rays = own.rays(pixels)

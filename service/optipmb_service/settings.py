@@ -47,7 +47,7 @@ from pydantic_settings import (
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from optipmb.zones import Zone
+    from optipmb.world.zones import Zone
 
 PREFIX: Final = "OPTIPMB_"  # of environment variables
 RUN: Final = secrets.token_hex(3)  # tells this process from one with its number in a container of the same host name
@@ -57,7 +57,7 @@ DEFAULT_LISTEN: Final = "tcp/127.0.0.1:7447"
 DEFAULT_GRPC: Final = "127.0.0.1:50051"
 DEFAULT_NATS: Final = "127.0.0.1:4222"
 DEFAULT_MQTT: Final = "mqtt://127.0.0.1:1883"
-MOST_ZONES: Final = 256  # as `optipmb.zones.MOST`; a test compares what settings repeat of the tracker
+MOST_ZONES: Final = 256  # as `optipmb.world.zones.MOST`; a test compares what settings repeat of the tracker
 
 
 def _form(pattern: str, expected: str) -> AfterValidator:
@@ -441,7 +441,7 @@ class ZoneSettings(BaseModel):
         if info.field_name == "line" and bool(value) is bool(info.data.get("polygon", not value)):
             raise ValueError(f"a polygon or a line, received {'both' if value else 'neither'}")
         if value:
-            from optipmb.zones import Zone  # noqa: PLC0415 - compiles kernels
+            from optipmb.world.zones import Zone  # noqa: PLC0415 - compiles kernels
 
             points = value
             if info.data.get("geo"):  # also around 180° of longitude neighbours are near each other
@@ -460,7 +460,7 @@ class ZoneSettings(BaseModel):
             ParameterError: these are too far from the site.
         """
         from optipmb import Georeference, ParameterError  # noqa: PLC0415 - compiles kernels
-        from optipmb.zones import Zone  # noqa: PLC0415 - compiles kernels
+        from optipmb.world.zones import Zone  # noqa: PLC0415 - compiles kernels
 
         values: dict[str, Any] = self.model_dump(exclude={"streams", "geo"}, exclude_none=True)
         if self.geo and site is not None:

@@ -21,7 +21,7 @@ from real_data import kitti_root
 import optipmb
 
 PAGE = Path(__file__).parents[2] / "docs" / "tuning.md"
-PROFILES = Path(optipmb.__file__).parent / "profiles"
+PROFILES = Path(optipmb.__file__).parent / "model/profiles"
 
 
 def calibration(profile: str, detections: str, name: str) -> CalibrationResult:

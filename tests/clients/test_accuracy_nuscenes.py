@@ -18,7 +18,7 @@ from real_data import all_nuscenes, nuscenes_root
 import optipmb
 
 DOCS = Path(__file__).parents[2] / "docs"
-PROFILES = Path(optipmb.__file__).parent / "profiles"
+PROFILES = Path(optipmb.__file__).parent / "model/profiles"
 
 
 @pytest.mark.parametrize(("name", "amota", "hota"), [("car", 0.85, 0.66), ("pedestrian", 0.92, 0.74)])

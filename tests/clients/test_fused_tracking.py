@@ -19,7 +19,7 @@ from optipmb_tools.run.tracking import track_whole
 from sessions import Merged
 
 import optipmb
-from optipmb.parameters import ALIKE
+from optipmb.model.parameters import ALIKE
 
 KITTI = optipmb.load_profile("kitti")
 COLUMNS = ("id", "center", "size", "yaw", "velocity", "existence", "score", "covariance", "age", "detection")

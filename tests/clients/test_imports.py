@@ -140,7 +140,7 @@ def test_a_session_is_pure(source: Path) -> None:
     assert not first(source) & IO
 
 
-@pytest.mark.parametrize("source", sorted(TRACKER.glob("*.py")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("source", sorted(TRACKER.rglob("*.py")), ids=lambda path: path.stem)
 def test_the_tracker_is_pure_computation(source: Path) -> None:
     """No network, clock or randomness; files are read by few modules; no state outside the density."""
     assert first(source) <= COMPUTATION | EXCEPTIONS.get(source.stem, set())

@@ -12,7 +12,7 @@ from optipmb_tools.evaluation.tracks import read_tracks
 from optipmb_tools.run.profiles import read_profile
 from optipmb_tools.run.tracking import Tracking, decided, track, track_whole
 
-from optipmb.hindsight import with_hindsight
+from optipmb.learning.hindsight import with_hindsight
 
 
 @pytest.fixture(scope="module")

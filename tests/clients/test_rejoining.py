@@ -18,8 +18,9 @@ from optipmb_tools.table_files import read_table
 from scipy.linalg import expm
 from scipy.optimize import Bounds, LinearConstraint, milp
 
-from optipmb import Parameters, generic_parameters, rejoin
-from optipmb.lost_objects import Tracklets
+from optipmb import Parameters, generic_parameters
+from optipmb.joining import rejoin
+from optipmb.model.lost_objects import Tracklets
 
 Array = NDArray[np.float64]
 GENERIC = generic_parameters(gaps.CLASSES, 0.1)

@@ -18,8 +18,8 @@ from optipmb_tools.run.smoothing import smooth
 from optipmb_tools.run.tracking import track_whole
 
 from optipmb import load_profile
-from optipmb.lightweight import turn_around
-from optipmb.table import ClassTable
+from optipmb.filter.lightweight import turn_around
+from optipmb.model.table import ClassTable
 
 Array = NDArray[np.float64]
 FRAMES = 60

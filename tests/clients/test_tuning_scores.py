@@ -15,7 +15,7 @@ from optipmb_tools.tuning.values import only
 from tuning_cases import Habits, Recorded, recorded
 
 import optipmb
-from optipmb.frame import calibrated
+from optipmb.model.frame import calibrated
 
 RULES = rules_of("scene")
 CARS = only(optipmb.load_profile("kitti"), "Car")

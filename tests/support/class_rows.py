@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from optipmb.table import CLASS
+from optipmb.model.table import CLASS
 
 
 def class_rows(count: int, **columns: Any) -> Any:

@@ -16,7 +16,7 @@ from optipmb_tools.run.rejoining import Rejoin
 from optipmb_tools.run.tracking import fields_of
 
 import optipmb
-from optipmb.lost_objects import Tracklets
+from optipmb.model.lost_objects import Tracklets
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

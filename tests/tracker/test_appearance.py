@@ -10,8 +10,8 @@ from optipmb_tools.run.rejoining import tracklets
 
 import optipmb
 from optipmb import OnlineTracker, Rejoin, Relocation, Tracker, generic_parameters
-from optipmb.appearance import Vectors, appearance_score
-from optipmb.lost_objects import DISTANCES, Appearance
+from optipmb.joining.appearance import Vectors, appearance_score
+from optipmb.model.lost_objects import DISTANCES, Appearance
 
 GENERIC = generic_parameters(gaps.CLASSES, 0.1)
 HOW = Rejoin(embedding_model="reid-7")

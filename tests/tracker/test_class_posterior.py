@@ -11,12 +11,19 @@ from class_rows import class_rows
 from scenes import random_parameters, steps
 
 import optipmb
-from optipmb.association import NEW, Survivors
-from optipmb.class_posterior import CHANGE_ODDS, UNGROUPED, Groups, label_probability, update_classes, weigh_by_class
-from optipmb.hypotheses import gate, groups
-from optipmb.parameters import parse_parameters
-from optipmb.preprocess import Measurements
-from optipmb.table import ClassTable
+from optipmb.filter.association import NEW, Survivors
+from optipmb.filter.class_posterior import (
+    CHANGE_ODDS,
+    UNGROUPED,
+    Groups,
+    label_probability,
+    update_classes,
+    weigh_by_class,
+)
+from optipmb.filter.hypotheses import gate, groups
+from optipmb.filter.preprocess import Measurements
+from optipmb.model.parameters import parse_parameters
+from optipmb.model.table import ClassTable
 
 if TYPE_CHECKING:
     from optipmb import Frame, Parameters

@@ -10,7 +10,7 @@ from class_rows import class_rows
 from scenes import boxes, random_parameters, steps
 
 import optipmb
-from optipmb.extract import confirm
+from optipmb.filter.extract import confirm
 
 SIMPLE: dict[str, Any] = {
     "score_filter": 0.05,

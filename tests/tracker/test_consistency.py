@@ -10,9 +10,9 @@ import oracle_formulas as textbook
 import pytest
 
 import optipmb
-from optipmb.predict import predict_state
-from optipmb.table import ClassTable
-from optipmb.update import ukf_update, workspace
+from optipmb.filter.predict import predict_state
+from optipmb.filter.update import ukf_update, workspace
+from optipmb.model.table import ClassTable
 
 DRIVES, FRAMES, SETTLED = 80, 20, 2
 FACING, HALF_TURN = np.array([1.0, 1.0, -1.0, 1.0, 1.0, -1.0]), np.array([0.0, 0.0, 0.0, math.pi, 0.0, 0.0])

@@ -9,8 +9,8 @@ import pytest
 from class_rows import class_rows
 
 import optipmb
-from optipmb.hypotheses import pairs_of_many
-from optipmb.preprocess import non_maximum_suppression
+from optipmb.filter.hypotheses import pairs_of_many
+from optipmb.filter.preprocess import non_maximum_suppression
 
 PARAMETERS = optipmb.load_profile("nuscenes")
 

@@ -11,8 +11,8 @@ import pytest
 from scenes import boxes
 
 import optipmb
-from optipmb.field_of_view import count_looks, in_view, shares_in_view, show
-from optipmb.hypotheses import close_gates
+from optipmb.filter.field_of_view import count_looks, in_view, shares_in_view, show
+from optipmb.filter.hypotheses import close_gates
 
 KITTI, NUSCENES = optipmb.load_profile("kitti"), optipmb.load_profile("nuscenes")
 CARS = {"kitti": (KITTI, "Car"), "nuscenes": (NUSCENES, "car")}

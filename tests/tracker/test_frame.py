@@ -14,8 +14,8 @@ from hypothesis.extra.numpy import arrays
 from scenes import Options, scene
 
 import optipmb
-from optipmb.errors import FrameError
-from optipmb.frame import MAX_COORDINATE, MAX_SPEED, MAX_YAW, _refuse, allowed
+from optipmb.model.errors import FrameError
+from optipmb.model.frame import MAX_COORDINATE, MAX_SPEED, MAX_YAW, _refuse, allowed
 
 KITTI = optipmb.load_profile("kitti")
 

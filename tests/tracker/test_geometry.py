@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import optipmb
-from optipmb.detection_probability import CELLS, NOWHERE, SIDE, boxes_in_sensor, boxes_of_cells, cells_of_points
-from optipmb.hypotheses import UNLIMITED
-from optipmb.preprocess import SAME_PLACE, non_maximum_suppression
+from optipmb.filter.detection_probability import CELLS, NOWHERE, SIDE, boxes_in_sensor, boxes_of_cells, cells_of_points
+from optipmb.filter.hypotheses import UNLIMITED
+from optipmb.filter.preprocess import SAME_PLACE, non_maximum_suppression
 
 Array = NDArray[np.float64]
 COMPILING = settings(deadline=None)  # the first call compiles

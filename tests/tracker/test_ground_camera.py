@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import optipmb
-from optipmb.camera_files import read_lens, read_pose
+from optipmb.cameras.camera_files import read_lens, read_pose
 
 if TYPE_CHECKING:
     from pathlib import Path

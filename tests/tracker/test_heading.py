@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scenes import boxes, steps
 
 import optipmb
-from optipmb.lightweight import follow_sign, turn_around
-from optipmb.predict import predict_state
+from optipmb.filter.lightweight import follow_sign, turn_around
+from optipmb.filter.predict import predict_state
 
 Array = NDArray[np.float64]
 DRIVES = 100

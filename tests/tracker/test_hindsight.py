@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import optipmb
-from optipmb.hindsight import with_hindsight
+from optipmb.learning.hindsight import with_hindsight
 
 PARAMETERS = optipmb.generic_parameters(["car", "pedestrian"], 0.1)
 

@@ -14,10 +14,9 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from optipmb.association import UNASSIGNED
-from optipmb.association import associate as associate_pairs
-from optipmb.density import Bernoullis, objects_in
-from optipmb.hypotheses import (
+from optipmb.filter.association import UNASSIGNED
+from optipmb.filter.association import associate as associate_pairs
+from optipmb.filter.hypotheses import (
     CLUTTER,
     DEVIATIONS_2,
     FALSE_SHARE,
@@ -35,7 +34,8 @@ from optipmb.hypotheses import (
     pairs_of_few,
     pairs_of_many,
 )
-from optipmb.preprocess import Measurements
+from optipmb.filter.preprocess import Measurements
+from optipmb.model.density import Bernoullis, objects_in
 
 Array = NDArray[np.float64]
 NOTHING = np.zeros(0)

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from read_only import read_only
 
-from optipmb.geometry import END_OF_CHAIN, block, box_iou, empty_torus, insert, iou_exceeds
-from optipmb.preprocess import sort_canonically
+from optipmb.filter.geometry import END_OF_CHAIN, block, box_iou, empty_torus, insert, iou_exceeds
+from optipmb.filter.preprocess import sort_canonically
 
 Array = NDArray[np.float64]
 COMPILING = settings(deadline=None)  # the first call compiles

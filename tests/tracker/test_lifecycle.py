@@ -10,7 +10,7 @@ import pytest
 from scenes import boxes, random_parameters, steps
 
 import optipmb
-from optipmb.parameters import parse_parameters
+from optipmb.model.parameters import parse_parameters
 
 SIMPLE = {
     "score_filter": 0.1, "nms_iou": 0.1, "survival": 0.99, "gate": 4.0, "detection": 0.9, "expected_points": 10.0,

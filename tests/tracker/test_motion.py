@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.integrate import quad, solve_ivp
 
-from optipmb.predict import (
+from optipmb.filter.predict import (
     TINY_PIVOT,
     ctra_displacement,
     predict_state,

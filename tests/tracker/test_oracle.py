@@ -11,7 +11,7 @@ from oracle import Oracle
 from scenes import Options, frame_of, random_parameters, scene
 
 import optipmb
-from optipmb.parameters import parse_parameters
+from optipmb.model.parameters import parse_parameters
 
 COMBINATIONS = list(product((True, False), repeat=4))
 PROFILES = ("kitti", "nuscenes")

@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from scenes import random_parameters
 
 import optipmb
-from optipmb.parameters import BirthSpread, ClassParameters, MeasurementNoise, ProcessNoise
+from optipmb.model.parameters import BirthSpread, ClassParameters, MeasurementNoise, ProcessNoise
 
 if TYPE_CHECKING:
     from pathlib import Path

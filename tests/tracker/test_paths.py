@@ -13,7 +13,7 @@ import pytest
 from class_rows import class_rows
 
 import optipmb
-from optipmb.paths import MAX_HORIZONS, predict_paths
+from optipmb.filter.paths import MAX_HORIZONS, predict_paths
 
 KITTI = optipmb.load_profile("kitti")
 LABELS = ("Car", "Pedestrian", "Cyclist")

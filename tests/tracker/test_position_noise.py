@@ -10,9 +10,9 @@ import pytest
 from class_rows import class_rows
 
 import optipmb
-from optipmb.hypotheses import gate
-from optipmb.preprocess import Measurements
-from optipmb.update import birth_states, ukf_updates
+from optipmb.filter.hypotheses import gate
+from optipmb.filter.preprocess import Measurements
+from optipmb.filter.update import birth_states, ukf_updates
 
 CARS, FRAMES, DT_NS = 6, 12, 100_000_000
 HALF = np.pi / 6

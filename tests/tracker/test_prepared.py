@@ -13,7 +13,7 @@ import numba
 import pytest
 from numba.core.caching import InTreeCacheLocator
 
-from optipmb import predict
+from optipmb.filter import predict
 from optipmb.prepared import PreparedCacheLocator
 from optipmb.warm import kernels
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 PROGRAM = """
 import optipmb
-from optipmb.predict import wrap
+from optipmb.filter.predict import wrap
 
 print(wrap(0.5))  # a small kernel
 """

@@ -16,7 +16,7 @@ from oracle_formulas import Measurement, confidence, report
 from scenes import Options, SceneCloud, SceneFrame, SensorPose, frame_of, partial, random_parameters, scene
 
 import optipmb
-from optipmb.parameters import parse_parameters
+from optipmb.model.parameters import parse_parameters
 
 SEEDS = range(4)
 SUPPORT = Path(__file__).resolve().parents[1] / "support"
@@ -262,7 +262,7 @@ def test_two_trackers_share_nothing() -> None:
 SCRIPT = """
 import optipmb
 from compare import digest
-from optipmb.parameters import parse_parameters
+from optipmb.model.parameters import parse_parameters
 from scenes import Options, frame_of, random_parameters, scene
 parameters = parse_parameters(random_parameters(5))
 tracker = optipmb.Tracker(parameters)

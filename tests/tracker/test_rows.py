@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import optipmb
-from optipmb.density import Misses, components_in, objects_in
-from optipmb.extract import tracks_in
+from optipmb.filter.extract import tracks_in
+from optipmb.model.density import Misses, components_in, objects_in
 
 if TYPE_CHECKING:
-    from optipmb.rows import Rows
+    from optipmb.model.rows import Rows
 
 RECORDS = pytest.mark.parametrize("record", [optipmb.Bernoullis, optipmb.Poissons, Misses, optipmb.Tracks])
 

@@ -14,7 +14,7 @@ import pytest
 from scenes import boxes
 
 import optipmb
-from optipmb.density import check_fitting, labels_within
+from optipmb.model.density import check_fitting, labels_within
 from optipmb.warm import compilations
 
 KITTI, NUSCENES = optipmb.load_profile("kitti"), optipmb.load_profile("nuscenes")

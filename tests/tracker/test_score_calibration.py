@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scenes import scene
 
 import optipmb
-from optipmb.frame import calibrated
+from optipmb.model.frame import calibrated
 
 KITTI = optipmb.load_profile("kitti")
 CURVE = {"detector": [0.2, 0.3, 0.6], "calibrated": [0.1, 0.6, 0.7]}

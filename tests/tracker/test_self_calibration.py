@@ -11,8 +11,8 @@ import pytest
 from class_rows import class_rows
 
 import optipmb
-from optipmb.density import BINS, COUNTS, NO_BIN, PHI, SCATTER, SLOT, SLOTS, STATE, Bernoullis, V
-from optipmb.self_calibration import (
+from optipmb.filter.undetected import AGED, MARKED
+from optipmb.learning.self_calibration import (
     ALONG,
     BIN,
     DETECTIONS,
@@ -46,7 +46,7 @@ from optipmb.self_calibration import (
     squares,
     use_scatter,
 )
-from optipmb.undetected import AGED, MARKED
+from optipmb.model.density import BINS, COUNTS, NO_BIN, PHI, SCATTER, SLOT, SLOTS, STATE, Bernoullis, V
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

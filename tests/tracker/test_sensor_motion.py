@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import optipmb
-from optipmb.density import NO_FRAME
-from optipmb.sensor_motion import (
+from optipmb.learning.sensor_motion import (
     APART,
     MOST_SIDEWAYS,
     NEAR,
@@ -25,6 +24,7 @@ from optipmb.sensor_motion import (
     together,
     within,
 )
+from optipmb.model.density import NO_FRAME
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from scenes import Options, SceneFrame, frame_of, partial, random_parameters, scene
 
 import optipmb
-from optipmb.geometry import boxes_overlap, iou_exceeds
-from optipmb.predict import heading_unknown, predict_state
-from optipmb.preprocess import Measurements
-from optipmb.unknown_heading import find_heading, lose_heading, show_heading, take_heading
-from optipmb.update import ukf_updates
+from optipmb.filter.geometry import boxes_overlap, iou_exceeds
+from optipmb.filter.predict import heading_unknown, predict_state
+from optipmb.filter.preprocess import Measurements
+from optipmb.filter.unknown_heading import find_heading, lose_heading, show_heading, take_heading
+from optipmb.filter.update import ukf_updates
 
 Array = NDArray[np.float64]
 NAN = math.nan

@@ -10,7 +10,7 @@ import oracle_formulas as textbook
 import pytest
 from numpy.typing import NDArray
 
-from optipmb.update import moment_match, ukf_update, workspace
+from optipmb.filter.update import moment_match, ukf_update, workspace
 
 Array = NDArray[np.float64]
 

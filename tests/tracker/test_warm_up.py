@@ -33,7 +33,7 @@ sys.path.insert(0, sys.argv[1])
 import numpy as np
 import optipmb
 from optipmb.warm import compilations, kernels
-from optipmb.zones import Zone, ZoneState, observe
+from optipmb.world.zones import Zone, ZoneState, observe
 from scenes import Options, random_parameters, scene
 
 compiled = optipmb.warm_up(rejoin=True)
@@ -71,12 +71,15 @@ print(json.dumps({"compiled": compiled, "later": compilations() - compiled, "gro
 """
 
 
-# Of a folder in PYTHONPATH: every process that starts with it has a warm-up of one kernel.
-ONE_KERNEL = """
-import numpy as np
+# Of a folder in PYTHONPATH: every process that starts with it has a warm-up of two kernels, in either order.
+TWO_KERNELS = """
+import os
 import optipmb.warm
+from optipmb.filter.calibration import log_odds
+from optipmb.model.density import whole_periods
 
-optipmb.warm._run = lambda: optipmb.bev_iou(np.zeros((1, 5)), np.zeros((1, 5)))
+calls = [lambda: log_odds(0.5), lambda: whole_periods(0, 1, 1.0)]
+optipmb.warm._run = lambda: [call() for call in calls[:: int(os.environ["ORDER"])]]
 """
 
 
@@ -115,13 +118,14 @@ def test_all_kernels_are_counted() -> None:
     """`kernels` has every kernel that a module defines."""
     folder = Path(optipmb.__file__).parent
     defined = set()
-    for path in folder.glob("*.py"):
+    for path in folder.rglob("*.py"):
+        module = ".".join(("optipmb", *path.relative_to(folder).with_suffix("").parts))
         for node in ast.parse(path.read_text(encoding="utf-8")).body:
             if isinstance(node, ast.FunctionDef):
                 if {"kernel", "long_kernel"} & {ast.unparse(one) for one in node.decorator_list}:
-                    defined.add(f"optipmb.{path.stem}.{node.name}")
+                    defined.add(f"{module}.{node.name}")
             elif isinstance(node, ast.AnnAssign) and ast.unparse(node.value or node).startswith("views_of("):
-                defined.add(f"optipmb.{path.stem}.{ast.unparse(node.target)}")
+                defined.add(f"{module}.{ast.unparse(node.target)}")
     assert set(kernels()) == defined
 
 
@@ -145,17 +149,19 @@ def test_kernels_are_counted_while_another_thread_imports(monkeypatch: pytest.Mo
 def test_programs_that_start_at_once_compile_once_together(tmp_path: Path) -> None:
     """One of them has the kernels compiled, by several processes; the other waits and loads them.
 
-    One kernel stands for all: what the warm-up calls is compiled, and nothing else differs.
+    Two kernels of different folders stand for all: what the warm-up calls is compiled, and nothing else differs.
     """
     program = "import optipmb; print(optipmb.warm_up())"
-    (tmp_path / "sitecustomize.py").write_text(ONE_KERNEL)
+    (tmp_path / "sitecustomize.py").write_text(TWO_KERNELS)
     with tempfile.TemporaryDirectory() as cache:
         environment = os.environ | {"NUMBA_CACHE_DIR": cache, "OPTIPMB_COMPILE_PROCESSES": "2"}
         environment["PYTHONPATH"] = f"{tmp_path}:{environment.get('PYTHONPATH', '')}"
         command = [sys.executable, "-c", program]
         started = [
-            subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
-            for _ in range(2)
+            subprocess.Popen(
+                command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment | {"ORDER": order}
+            )
+            for order in ("1", "-1")
         ]
         answers = [one.communicate(timeout=280) for one in started]
     assert [one.returncode for one in started] == [0, 0], answers

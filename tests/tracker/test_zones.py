@@ -12,7 +12,7 @@ import pytest
 from shapely import LineString, Point, Polygon
 
 from optipmb import ParameterError
-from optipmb.zones import COUNTS, Event, Shapes, Zone, ZoneState, end, locate, observe
+from optipmb.world.zones import COUNTS, Event, Shapes, Zone, ZoneState, end, locate, observe
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -112,7 +112,7 @@ def _fit(file: Path, how: FitOptions) -> None:
 
 def _convert(file: Path, how: FitOptions) -> None:
     from optipmb import GroundCamera, ParameterError  # noqa: PLC0415  loads the tracker
-    from optipmb.camera_files import read_pose  # noqa: PLC0415  as above
+    from optipmb.cameras.camera_files import read_pose  # noqa: PLC0415  as above
     from optipmb_tools.camera_fit import toml  # noqa: PLC0415  as above
 
     size = how.size()
@@ -142,7 +142,7 @@ def _print_places(file: Path, pixels: list[str]) -> None:
 
 def _lens(path: Path, image: list[int]) -> dict[str, Any]:
     from optipmb import ParameterError  # noqa: PLC0415  loads the tracker
-    from optipmb.camera_files import read_lens  # noqa: PLC0415  as above
+    from optipmb.cameras.camera_files import read_lens  # noqa: PLC0415  as above
 
     try:
         return read_lens(path, image)

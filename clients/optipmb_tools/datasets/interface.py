@@ -300,7 +300,7 @@ def class_like(name: str, names: Sequence[str]) -> str | None:
     """
     if name in names:
         return name
-    from optipmb.class_names import like  # noqa: PLC0415  loads the tracker, which equal names do not need
+    from optipmb.model.class_names import like  # noqa: PLC0415  loads the tracker, which equal names do not need
 
     return like(name, tuple(names))
 

@@ -20,7 +20,7 @@ from optipmb import (
     profiles,
     warm_up,
 )
-from optipmb.parameters import ALIKE
+from optipmb.model.parameters import ALIKE
 from optipmb_tools.datasets import DataSequence
 from optipmb_tools.datasets.motion import LEAST_ALONG, SURE_MOVES, headings_along
 

@@ -1,4 +1,4 @@
-"""Joining of the tracks of a recording over gaps, by the scores and the matching of `optipmb.rejoin`.
+"""Joining of the tracks of a recording over gaps, by the scores and the matching of `optipmb.joining.rejoin`.
 
 Beginnings before and after a track count for the rate of new objects, with the probabilities to be new that `TURNS`
 turns estimate.
@@ -13,9 +13,9 @@ from optipmb_client.errors import UsageError
 from optipmb_schemas import Tracks
 from optipmb_schemas.json_form import shown
 
-from optipmb import ParameterError, Parameters, rejoin
-from optipmb.lost_objects import Tracklets
-from optipmb.rejoin import (
+from optipmb import ParameterError, Parameters
+from optipmb.joining import rejoin
+from optipmb.joining.rejoin import (
     FIT_NS,
     KERNEL_M,
     LEAST_FIT_S,
@@ -26,6 +26,7 @@ from optipmb.rejoin import (
     pair_scores,
     size_score,
 )
+from optipmb.model.lost_objects import Tracklets
 from optipmb_tools.geometry import Floats, Ints
 from optipmb_tools.results import stacked
 from optipmb_tools.results.output import Objects
@@ -145,7 +146,7 @@ def _pairs(found: Tracklets, later: Ints, kinds: Kinds, gap_s: float) -> tuple[I
 
 
 def _size_scores(size: Floats, kind: Ints, before: Ints, after: Ints) -> Floats:
-    """Return `optipmb.rejoin.size_score` of pairs (P,) by the sizes (N, 3) of all tracks."""
+    """Return `optipmb.joining.rejoin.size_score` of pairs (P,) by the sizes (N, 3) of all tracks."""
     count, mean, square = np.zeros((3, int(kind.max(initial=-1)) + 1, 3))
     for axis, one in np.ndindex(3, len(count)):
         own = size[:, axis][(kind == one) & ~np.isnan(size[:, axis])]

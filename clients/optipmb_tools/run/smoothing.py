@@ -3,7 +3,7 @@
 The unscented Rauch-Tung-Striebel smoother (Särkkä, "Unscented Rauch-Tung-Striebel smoother", IEEE Transactions on
 Automatic Control 53(3), 2008), with the motion models of the tracker. From the last state of a track to its first,
 
-    X = m_k +- sqrt(n) S_k,  P_k = S_k S_k'        sigma points, as in `optipmb.predict`
+    X = m_k +- sqrt(n) S_k,  P_k = S_k S_k'        sigma points, as in `optipmb.filter.predict`
     m-, P-                                         mean and covariance of f(X); P- with Q
     D   = sum w (X - m_k) (f(X) - m-)'
     G   = D (P-)^-1
@@ -11,11 +11,11 @@ Automatic Control 53(3), 2008), with the motion models of the tracker. From the 
     P^s_k = P_k + G (P^s_{k+1} - P-) G'
 
 m_k and P_k are the state and covariance of every frame in which the filter holds the object; in frames in which it is a
-track, state and covariance of its published box (`optipmb.calibration`). So frames without detection need no rule of
-their own.
+track, state and covariance of its published box (`optipmb.filter.calibration`). So frames without detection need no
+rule of their own.
 
 An object does not turn by pi from frame to frame, so one sign of the heading holds for the whole track: the one in
-favour of which the mean of the log odds (`optipmb.lightweight`) is; and this mean is the confidence in it.
+favour of which the mean of the log odds (`optipmb.filter.lightweight`) is; and this mean is the confidence in it.
 
 Size, height, existence and score stay as the tracker tells them.
 """
@@ -26,15 +26,15 @@ from typing import Final
 import numpy as np
 
 from optipmb import Density, Parameters, Tracks
-from optipmb.calibration import calibrate_rows
-from optipmb.density import OMEGA, PHI, STATE, A, V
-from optipmb.lightweight import doubt, sign_probability
-from optipmb.predict import ORDER, SPREAD, WEIGHT, predict_state
-from optipmb.table import ClassTable
+from optipmb.filter.calibration import calibrate_rows
+from optipmb.filter.lightweight import doubt, sign_probability
+from optipmb.filter.predict import ORDER, SPREAD, WEIGHT, predict_state
+from optipmb.model.density import OMEGA, PHI, STATE, A, V
+from optipmb.model.table import ClassTable
 from optipmb_tools.geometry import Bools, Floats, Ints, wrap_angle
 
 _TURN: Final = np.array([-1.0 if s in {V, A} else 1.0 for s in range(STATE)])
-"""Diagonal of T: x -> T x and phi + pi describes the same motion (`optipmb.lightweight`)."""
+"""Diagonal of T: x -> T x and phi + pi describes the same motion (`optipmb.filter.lightweight`)."""
 
 
 class Smoother:
@@ -130,7 +130,7 @@ def smooth(
     """
     order = np.argsort(identity, kind="stable")
     before, after = order[:-1], order[1:]
-    known = covariance[:, OMEGA, OMEGA] != 0.0  # states of unknown heading stay (`optipmb.unknown_heading`)
+    known = covariance[:, OMEGA, OMEGA] != 0.0  # states of unknown heading stay (`optipmb.filter.unknown_heading`)
     follows = (identity[before] == identity[after]) & known[before] & known[after]
     before, after = before[follows], after[follows]
     predicted, spread, gain = _predictions(

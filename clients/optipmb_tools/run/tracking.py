@@ -35,10 +35,10 @@ from optipmb import (
     predict_tracks,
     warm_up,
 )
-from optipmb.hindsight import with_hindsight
-from optipmb.parameters import ALIKE
-from optipmb.self_calibration import learned_noise
-from optipmb.velocity_check import EXPECTED, VelocityCheck
+from optipmb.learning.hindsight import with_hindsight
+from optipmb.learning.self_calibration import learned_noise
+from optipmb.learning.velocity_check import EXPECTED, VelocityCheck
+from optipmb.model.parameters import ALIKE
 from optipmb_tools.datasets import DataSequence, Dataset, DatasetArguments, DetectionFrame, selected_frames
 from optipmb_tools.files import remove_unfinished
 from optipmb_tools.results.output import Latency, Results, TrackCounts, horizons_for, latency
@@ -236,7 +236,7 @@ class Tracking:
     modules: Modules | None = None
     full: bool = False  # also write all columns of the tracks
     smooth: bool = False  # estimate states from all frames of their track (`optipmb_tools.run.smoothing`)
-    hindsight_s: float = 0.0  # time after a frame that tells its velocities (`optipmb.hindsight`); 0: no hindsight
+    hindsight_s: float = 0.0  # time after a frame that tells its velocities (`learning.hindsight`); 0: no hindsight
     show: float | None = None  # existence from which tracks are confirmed; None: as the profile says
     sensors: Sensors = ALIKE  # how frames that name their sensor are used
     rejoin: "Rejoin | None" = None  # join tracks over gaps (`optipmb_tools.run.rejoining`)

@@ -1,4 +1,4 @@
-"""The calibration of one class (`optipmb.calibration`) from training data.
+"""The calibration of one class (`optipmb.filter.calibration`) from training data.
 
 Everything is tracked once for each memory that is tried. Then, of the tracks by their evidence:
 

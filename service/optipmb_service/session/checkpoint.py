@@ -25,7 +25,7 @@ from optipmb_schemas.model import first_error
 from pydantic import BaseModel, Field, ValidationError
 
 import optipmb
-from optipmb.zones import MOST, Event, Seen, ZoneState
+from optipmb.world.zones import MOST, Event, Seen, ZoneState
 from optipmb_service.session import convert
 from optipmb_service.session.counts import MAX_COUNT, Count, Deliveries, FrameCounts, present
 from optipmb_service.session.identity import Binary, Epoch, Incarnation, SensorName, Whole

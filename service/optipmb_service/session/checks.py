@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 import optipmb
-from optipmb.doubts import EXPECTED as SIZES
-from optipmb.doubts import SizeCheck
-from optipmb.velocity_check import EXPECTED, VelocityCheck
+from optipmb.learning.doubts import EXPECTED as SIZES
+from optipmb.learning.doubts import SizeCheck
+from optipmb.learning.velocity_check import EXPECTED, VelocityCheck
 from optipmb_service.session.policy import MAX_SENSORS, SECOND
 
 if TYPE_CHECKING:

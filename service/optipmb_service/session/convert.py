@@ -17,9 +17,9 @@ import numpy as np
 import optipmb_schemas as schemas
 
 import optipmb
-from optipmb.frame import Embedding, frame_of_checked
-from optipmb.rows import read_only
-from optipmb.table import ClassTable
+from optipmb.model.frame import Embedding, frame_of_checked
+from optipmb.model.rows import read_only
+from optipmb.model.table import ClassTable
 from optipmb_service.session.outputs import TrackedFrame
 
 if TYPE_CHECKING:

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Final
 
 from optipmb_schemas import PATHS
 
-from optipmb.hindsight import with_hindsight
-from optipmb.paths import tracks_ahead
-from optipmb.table import ClassTable
+from optipmb.filter.paths import tracks_ahead
+from optipmb.learning.hindsight import with_hindsight
+from optipmb.model.table import ClassTable
 from optipmb_service.session.outputs import Begun, TrackedFrame
 from optipmb_service.session.policy import SECOND
 

@@ -10,7 +10,7 @@ import numpy as np
 import optipmb_schemas as schemas
 
 import optipmb
-from optipmb.zones import COUNTS, Event
+from optipmb.world.zones import COUNTS, Event
 
 if TYPE_CHECKING:
     from optipmb_service.session.identity import Reached

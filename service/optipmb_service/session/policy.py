@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
-from optipmb.parameters import ALIKE
+from optipmb.model.parameters import ALIKE
 
 if TYPE_CHECKING:
     import optipmb
-    from optipmb.zones import Zone
+    from optipmb.world.zones import Zone
 
 SECOND: Final = 1_000_000_000
 

@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal, Self
 import optipmb_schemas as schemas
 
 import optipmb
-from optipmb.self_calibration import learned_noise
-from optipmb.zones import ZoneState
+from optipmb.learning.self_calibration import learned_noise
+from optipmb.world.zones import ZoneState
 from optipmb_service.session import convert
 from optipmb_service.session.arrivals import Arrivals
 from optipmb_service.session.checkpoint import MAX_ERROR, Checkpoint

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
 import optipmb_schemas as schemas
 from pydantic import Field
 
-from optipmb.rows import record
+from optipmb.model.rows import record
 from optipmb_service.session.counts import Count, FrameCounts
 from optipmb_service.session.identity import Epoch, Incarnation, Reached, Whole
 from optipmb_service.session.timeline import Cursor, FrameId, Order, Placement, Verdict
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     import optipmb
-    from optipmb.zones import ZoneState
+    from optipmb.world.zones import ZoneState
     from optipmb_service.session.worlds import Worlds
 
 MAX_LABELS: Final = 256

@@ -27,7 +27,7 @@ from dataclasses import field, replace
 from enum import StrEnum, unique
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from optipmb.rows import record
+from optipmb.model.rows import record
 from optipmb_service.session.counts import Count  # noqa: TC001 - pydantic reads the annotation
 from optipmb_service.session.identity import Epoch, SensorName, Whole  # noqa: TC001 - as above
 from optipmb_service.session.policy import MAX_SENSORS, JumpLimits

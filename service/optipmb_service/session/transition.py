@@ -28,8 +28,8 @@ import numpy as np
 import optipmb_schemas as schemas
 
 import optipmb
-from optipmb.rows import record
-from optipmb.zones import Shapes, ZoneState, adapted, end, observe
+from optipmb.model.rows import record
+from optipmb.world.zones import Shapes, ZoneState, adapted, end, observe
 from optipmb_service.session import convert
 from optipmb_service.session.counts import FrameCounts, total
 from optipmb_service.session.outputs import Begun
@@ -41,7 +41,7 @@ from optipmb_service.session.worlds import in_one_world, relocated
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from optipmb.zones import Event
+    from optipmb.world.zones import Event
     from optipmb_service.session.outputs import Reason, TrackedFrame
     from optipmb_service.session.policy import Policy
     from optipmb_service.session.state import Inputs, Position, ProcessedFrame

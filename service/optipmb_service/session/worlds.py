@@ -18,8 +18,8 @@ import numpy as np
 from pydantic import Field
 
 import optipmb
-from optipmb.rows import record
-from optipmb.zones import relocated as relocated_zones
+from optipmb.model.rows import record
+from optipmb.world.zones import relocated as relocated_zones
 from optipmb_service.session.identity import SensorName, Whole  # noqa: TC001 - pydantic reads the annotation
 from optipmb_service.session.policy import MAX_SENSORS
 

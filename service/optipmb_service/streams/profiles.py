@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 import optipmb_schemas as schemas
 
 import optipmb
-from optipmb.parameters import ALIKE
+from optipmb.model.parameters import ALIKE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -7,7 +7,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
 import optipmb
-from optipmb.zones import MOST
+from optipmb.world.zones import MOST
 from optipmb_service.session.fixed_rate import FixedRate
 from optipmb_service.session.policy import SECOND, Policy
 from optipmb_service.session.session import Session

@@ -218,7 +218,7 @@ def test_json_logs_and_an_own_profile(tmp_path: Path) -> None:
     """Log lines are JSON objects when asked for; a profile from a file is tracked with."""
     from importlib import resources  # noqa: PLC0415 - this test alone reads a shipped profile
 
-    text = resources.files("optipmb").joinpath("profiles", "nuscenes.toml").read_text()
+    text = resources.files("optipmb.model").joinpath("profiles", "nuscenes.toml").read_text()
     profile = tmp_path / "own.toml"
     profile.write_text(text.replace('name = "nuscenes"', 'name = "own"'))
     with ServiceProcess("--log-format", "json", "--profile", str(profile), "--instance", "x") as service:

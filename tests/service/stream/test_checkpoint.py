@@ -32,7 +32,7 @@ from router import SECOND, Sensor
 from sessions import Merged, chained, feed, problems, tracks
 
 import optipmb
-from optipmb.zones import ZoneState
+from optipmb.world.zones import ZoneState
 
 NUSCENES = optipmb.load_profile("nuscenes")
 SENSOR = Sensor()

@@ -18,7 +18,7 @@ from registries import Around, packet_of, streams_of
 from router import SECOND, Sensor
 
 import optipmb
-from optipmb.hindsight import with_hindsight
+from optipmb.learning.hindsight import with_hindsight
 
 MS = 1_000_000
 SENSOR = Sensor()

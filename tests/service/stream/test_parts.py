@@ -121,7 +121,7 @@ def test_clouds_of_other_publishers() -> None:
 def test_profiles_that_cannot_be_named_in_messages_are_refused(tmp_path: Path) -> None:
     """A profile whose name no message could carry ends the start, not the first frame."""
     own = tmp_path / "own.toml"
-    text = Path(optipmb.__file__).parent.joinpath("profiles", "kitti.toml").read_text()
+    text = Path(optipmb.__file__).parent.joinpath("model/profiles", "kitti.toml").read_text()
     own.write_text(text.replace('name = "kitti"', 'name = "not a name"'))
     with pytest.raises(optipmb.ParameterError, match="name"):
         Profiles.read(str(own), {})

@@ -21,9 +21,10 @@ from optipmb_service.session.session import Session
 from optipmb_service.settings import MOST_ZONES, RejoinSettings
 from sessions import Merged, plain, problems, tracks
 
-from optipmb import OnlineTracker, Rejoin, generic_parameters, zones
+from optipmb import OnlineTracker, Rejoin, generic_parameters
 from optipmb.online import KNOWN
-from optipmb.zones import Event, Zone
+from optipmb.world import zones
+from optipmb.world.zones import Event, Zone
 
 GENERIC = generic_parameters(gaps.CLASSES, 0.1)
 HOW = Rejoin(min_probability=0.6)

@@ -20,7 +20,7 @@ from router import SECOND, Sensor
 from sessions import Merged, begun, dumps, plain, problems, tracks
 
 import optipmb
-from optipmb.zones import Zone
+from optipmb.world.zones import Zone
 
 SENSOR = Sensor()
 PROFILE = optipmb.load_profile("nuscenes")

@@ -21,7 +21,7 @@ from router import SECOND, Sensor
 from sessions import feed
 
 import optipmb
-from optipmb.zones import Event, Zone
+from optipmb.world.zones import Event, Zone
 
 SENSOR = Sensor()
 PROFILE = optipmb.load_profile("nuscenes")

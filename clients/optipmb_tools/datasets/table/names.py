@@ -48,7 +48,7 @@ def spellings(reading: Reading, draft: Draft) -> Draft:
     free = [name for name in names.tolist() if name and name not in asked]
     if len(free) < 2:  # noqa: PLR2004  one name has no other spelling
         return replace(draft, kind=place)
-    from optipmb.class_names import common_name  # noqa: PLC0415  loads the tracker, which few tables need
+    from optipmb.model.class_names import common_name  # noqa: PLC0415  loads the tracker, which few tables need
 
     kind = {name: common_name(name) or _plain(name) for name in free}
     if len(set(kind.values())) == len(kind):

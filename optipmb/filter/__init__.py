@@ -1,0 +1,1 @@
+"""Stages of Algorithm 1, one module each."""

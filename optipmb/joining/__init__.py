@@ -1,0 +1,1 @@
+"""Joining of the tracks of one object over gaps."""

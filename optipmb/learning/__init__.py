@@ -1,0 +1,1 @@
+"""What the tracker learns about a sensor from its detections."""

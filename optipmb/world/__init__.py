@@ -1,0 +1,1 @@
+"""Tracks in the world: latitude and longitude, zones and their events."""
