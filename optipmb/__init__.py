@@ -22,15 +22,13 @@ Pure computation: no files but profiles and calibrations, no network, no state o
 from optipmb.cameras.ground_camera import GroundCamera
 from optipmb.detectors import from_detector
 from optipmb.filter.detection_probability import points_in_boxes
-from optipmb.filter.extract import Tracks, sound
-from optipmb.filter.field_of_view import FieldOfView
 from optipmb.filter.geometry import bev_iou
 from optipmb.filter.paths import PredictedPaths, predict_tracks
 from optipmb.joining.rejoin import Rejoin
 from optipmb.model.class_names import class_indices, common_name
 from optipmb.model.density import Bernoullis, Density, Poissons, bytes_of, columns_in, columns_of, density_of
 from optipmb.model.errors import DensityError, EffortError, FrameError, OptipmbError, ParameterError
-from optipmb.model.frame import Frame, PointCloud, Pose, make_frame
+from optipmb.model.frame import FieldOfView, Frame, PointCloud, Pose, make_frame
 from optipmb.model.generic import generic_parameters
 from optipmb.model.parameters import (
     Calibration,
@@ -46,6 +44,7 @@ from optipmb.model.parameters import (
     profiles,
 )
 from optipmb.model.relocation import Relocation
+from optipmb.model.tracks import Tracks, sound
 from optipmb.online import OnlineTracker, OnlineTracks
 from optipmb.tracker import Diagnostics, Modules, StepResult, Tracker
 from optipmb.warm import warm_up

@@ -7,7 +7,7 @@ service may run many streams side by side without threads inside a frame. Divisi
 What the stages of a step take is described once, here; docstrings list what a stage takes beyond that.
 
     objects, components    predicted objects (N) and Poisson components (J): `mean` (N, 6), `covariance` (N, 6, 6), …
-    measurements           Z_k (M), as `optipmb.filter.preprocess.Measurements`
+    measurements           Z_k (M), as `optipmb.model.stages.Measurements`
     hypotheses             the local hypotheses of the frame, as `optipmb.filter.hypotheses.Hypotheses`
     row, measurement       (K,) object and measurement of each pair or result
     label                  classes, indices into the parameters

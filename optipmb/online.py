@@ -40,14 +40,13 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from optipmb.cameras.ground_camera import GroundCamera
-    from optipmb.filter.extract import Tracks
-    from optipmb.filter.field_of_view import FieldOfView
     from optipmb.filter.paths import PredictedPaths
     from optipmb.joining.rejoin import Rejoin
     from optipmb.model.density import Density
-    from optipmb.model.frame import Frame, PointCloud
+    from optipmb.model.frame import FieldOfView, Frame, PointCloud
     from optipmb.model.parameters import Parameters
     from optipmb.model.rows import Array, Index
+    from optipmb.model.tracks import Tracks
     from optipmb.tracker import Modules
 
 

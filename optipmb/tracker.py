@@ -11,13 +11,13 @@ from optipmb.compiled import kernel
 from optipmb.filter.association import associate, forbid_births, surviving_objects
 from optipmb.filter.class_posterior import UNGROUPED, Groups, update_classes
 from optipmb.filter.detection_probability import detection_probability
-from optipmb.filter.extract import Tracks, extract
+from optipmb.filter.extract import extract
 from optipmb.filter.field_of_view import follow_looks, look
 from optipmb.filter.hypotheses import UNLIMITED, check_effort, halt, local_hypotheses
 from optipmb.filter.lightweight import light_weight_filter
 from optipmb.filter.paths import paths_of
 from optipmb.filter.predict import predict
-from optipmb.filter.preprocess import Measurements, preprocess
+from optipmb.filter.preprocess import preprocess
 from optipmb.filter.undetected import update_undetected, with_measurement_births
 from optipmb.filter.unknown_heading import all_measured, measured_bits
 from optipmb.filter.update import first_detected_states, ukf_updates
@@ -40,7 +40,9 @@ from optipmb.model.density import (
 from optipmb.model.errors import FrameError, ParameterError
 from optipmb.model.parameters import Parameters, load_profile
 from optipmb.model.rows import record
+from optipmb.model.stages import Measurements, Update
 from optipmb.model.table import ClassTable
+from optipmb.model.tracks import Tracks
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -70,32 +72,6 @@ class Prior(NamedTuple):
     components: Array
     n_predicted: int
     next_id: int
-
-
-class Update(NamedTuple):
-    """The PMB update of Algorithm 1.
-
-    Attributes:
-        objects: array of the objects of the posterior.
-        class_probability: (K, C) their class posteriors, or (K, 0).
-        components: array of the Poisson components.
-        fate: of the predicted ones (`optipmb.filter.undetected.update_undetected`).
-        row: (K,) predicted object of each object of the posterior, or `optipmb.filter.association.NEW`.
-        measurement: (K,) its measurement, negative where missed.
-        known: how many objects are known ones.
-        detected: how many of those have a measurement.
-        repaired: how many covariances had to be repaired.
-    """
-
-    objects: Array
-    class_probability: Array
-    components: Array
-    fate: Index
-    row: Index
-    measurement: Index
-    known: int
-    detected: int
-    repaired: int
 
 
 @kernel

@@ -14,15 +14,14 @@ import numpy as np
 from numba.core.dispatcher import Dispatcher
 
 from optipmb import compiled
-from optipmb.filter.extract import sound
-from optipmb.filter.field_of_view import FieldOfView
 from optipmb.filter.geometry import bev_iou
 from optipmb.filter.paths import predict_tracks
 from optipmb.joining.rejoin import Kinds, Rejoin, match, pair_scores
 from optipmb.learning.hindsight import later_velocities
 from optipmb.model.errors import EffortError
-from optipmb.model.frame import PointCloud, Pose, make_frame
+from optipmb.model.frame import FieldOfView, PointCloud, Pose, make_frame
 from optipmb.model.parameters import Parameters, load_profile, parse_parameters
+from optipmb.model.tracks import sound
 from optipmb.tracker import Modules, Tracker, update
 from optipmb.world.zones import Shapes, Zone, crossings, locate
 

@@ -31,10 +31,9 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from optipmb.cameras.camera_files import FilePath, read_calibration
 from optipmb.cameras.camera_lens import Intrinsics, Lens
-from optipmb.filter.field_of_view import FieldOfView
 from optipmb.model.class_names import common_name, like
 from optipmb.model.errors import FrameError, ParameterError
-from optipmb.model.frame import UNIT_TOLERANCE, Pose
+from optipmb.model.frame import UNIT_TOLERANCE, FieldOfView, Pose
 from optipmb.model.parameters import ParameterTable, Positive, checked
 from optipmb.model.table import usual_size
 

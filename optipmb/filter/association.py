@@ -20,7 +20,7 @@ forbids them while it is extracted without a detection, for fewer periods than e
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -29,18 +29,15 @@ from optipmb.filter.geometry import boxes_overlap
 from optipmb.filter.hypotheses import CLUTTER
 from optipmb.filter.predict import heading_unknown
 from optipmb.model.density import PHI, X, Y, whole_periods
+from optipmb.model.stages import NEW, UNASSIGNED, Survivors
 from optipmb.model.table import known_length
 
 if TYPE_CHECKING:
     from optipmb.filter.hypotheses import Hypotheses
-    from optipmb.filter.preprocess import Measurements
     from optipmb.model.density import Bernoullis, Moment
     from optipmb.model.rows import Array, Index
+    from optipmb.model.stages import Measurements
     from optipmb.model.table import Classes
-
-
-UNASSIGNED: Final = -1
-"""No measurement of an object, no object of a measurement."""
 
 
 @kernel
@@ -162,30 +159,6 @@ def forbid_births(
             detected[2 + s] = known_length(measurements.auxiliary[m, s], s, own)
         if boxes_overlap(predicted, detected, overlap):
             hypotheses.first_kind[m], hypotheses.first_existence[m] = CLUTTER, 0.0
-
-
-NEW: Final = -1
-"""`Survivors.row` of a first-time detection."""
-
-
-class Survivors(NamedTuple):
-    """The local hypotheses of the best global hypothesis that outlive pruning: one per object of the posterior.
-
-    Known objects come first, in their order; then the new ones, in the order of their measurements.
-
-    Attributes:
-        row: (K,) predicted object, or `NEW`.
-        measurement: (K,) its measurement, or `UNASSIGNED`.
-        existence: (K,) posterior existence probability r.
-        known: how many are known objects.
-        detected: how many of those have a measurement.
-    """
-
-    row: Index
-    measurement: Index
-    existence: Array
-    known: int
-    detected: int
 
 
 @kernel

@@ -30,9 +30,8 @@ from optipmb.compiled import kernel
 from optipmb.model.density import ROUNDING
 
 if TYPE_CHECKING:
-    from optipmb.filter.association import Survivors
-    from optipmb.filter.preprocess import Measurements
     from optipmb.model.rows import Array, Index
+    from optipmb.model.stages import Measurements, Survivors
     from optipmb.model.table import Classes
 
 

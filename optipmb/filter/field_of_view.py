@@ -14,164 +14,29 @@ plane upwards, range is the distance from the sensor.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import TYPE_CHECKING, Final, Protocol, Self
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from optipmb.compiled import kernel
 from optipmb.filter.calibration import log_odds
 from optipmb.model.density import PHI, STATE, Misses, Moment, X, Y
-from optipmb.model.errors import FrameError
+from optipmb.model.frame import FieldOfView
 from optipmb.model.rows import read_only, record
 
 if TYPE_CHECKING:
-    from optipmb.filter.preprocess import Measurements
     from optipmb.model.density import Bernoullis, Density
-    from optipmb.model.frame import Pose
     from optipmb.model.rows import Array, Columns, Index
+    from optipmb.model.stages import Measurements, Update
     from optipmb.model.table import ClassTable
-    from optipmb.tracker import Update
 
-
-NARROWEST: Final = 1e-3
-"""Least width of an interval of angles, rad."""
-
-FARTHEST: Final = 1e9
-"""Largest range, m: more than any two coordinates are apart."""
-
-ROUNDING: Final = 1e-9
-"""By how much an interval may be wider than the full turn, rad."""
 
 HALF: Final = 0.5
 """Share of a detection below which it lies outside."""
 
-_NO_LIMIT: Final = 2.0
-"""No sine and no cosine is larger."""
-
 _AXES_OF_WORLD: Final = read_only(np.eye(3)), read_only(np.zeros(3))
 """Rotation and translation where there is no pose."""
-
-
-class Intervals(Protocol):
-    """A field of view in another form, as messages have it."""
-
-    @property
-    def azimuth(self) -> Array:
-        """(2,) rad."""
-
-    @property
-    def elevation(self) -> Array:
-        """(2,) rad."""
-
-    @property
-    def range(self) -> Array:
-        """(2,) m."""
-
-
-@dataclass(frozen=True)
-class FieldOfView:
-    """Where a sensor detects objects; `azimuth`, `elevation` and `range` are intervals, each a pair.
-
-    Attributes:
-        azimuth: from, to, rad in [-2 pi, 2 pi]: the sector counter-clockwise from the one to the other, so that
-            (2.5, -2.5) looks backwards. (-pi, pi), the default, is the full circle.
-        elevation: from, to, rad in [-pi/2, pi/2].
-        range: from, to, m in [0, 1e9].
-        pose: world from sensor; None: the `pose` given to `make_frame`, else the axes of the world.
-
-    Raises:
-        FrameError: an interval is none, not finite, beyond its bounds, or narrower than a milliradian.
-    """
-
-    azimuth: tuple[float, float] = (-math.pi, math.pi)
-    elevation: tuple[float, float] = (-0.5 * math.pi, 0.5 * math.pi)
-    range: tuple[float, float] = (0.0, FARTHEST)
-    pose: Pose | None = None
-
-    def __post_init__(self) -> None:
-        bounds = (
-            ("azimuth", -2.0 * math.pi, 2.0 * math.pi),
-            ("elevation", -0.5 * math.pi, 0.5 * math.pi),
-            ("range", 0.0, FARTHEST),
-        )
-        for name, low, high in bounds:
-            object.__setattr__(self, name, _interval(name, getattr(self, name), low, high))
-        if not self.elevation[1] - self.elevation[0] >= NARROWEST:
-            raise FrameError(
-                "field_of_view.elevation", f"an end at least {NARROWEST:g} above the beginning", str(self.elevation)
-            )
-        if not self.range[1] > self.range[0]:
-            raise FrameError("field_of_view.range", "an end beyond the beginning", str(self.range))
-        if not NARROWEST <= self.width <= 2.0 * math.pi + ROUNDING:
-            raise FrameError(
-                "field_of_view.azimuth", f"a sector of {NARROWEST:g} rad to a full turn", str(self.azimuth)
-            )
-
-    @classmethod
-    def of(cls, view: Intervals | None, pose: Pose | None) -> Self | None:
-        """Return one of the same intervals, None where there is none.
-
-        Raises:
-            FrameError: an interval is none.
-        """
-        if view is None:
-            return None
-        azimuth, elevation, distance = ((one[0], one[1]) for one in (view.azimuth, view.elevation, view.range))
-        return cls(azimuth, elevation, distance, pose)
-
-    def at(self, pose: Pose) -> Self:
-        """Return the same intervals with a pose of the sensor."""
-        placed = object.__new__(type(self))
-        placed.__dict__.update(self.__dict__, pose=pose)
-        return placed
-
-    @property
-    def width(self) -> float:
-        """Width of the sector of azimuth, rad."""
-        begin, end = self.azimuth
-        return end - begin if end >= begin else end - begin + 2.0 * math.pi
-
-    @cached_property
-    def limits(self) -> Array:
-        """The intervals as `shares_in_view` compares them, (7,).
-
-        The direction (2,) of the middle of the sector, the cosine of half its width; the sines of the elevations; the
-        ranges. An interval that holds all angles has limits that no rounding reaches.
-        """
-        middle = self.azimuth[0] + 0.5 * self.width
-        full = self.width >= 2.0 * math.pi - ROUNDING
-        low, high = self.elevation
-        return np.array(
-            [
-                math.cos(middle),
-                math.sin(middle),
-                -_NO_LIMIT if full else math.cos(0.5 * self.width),
-                -_NO_LIMIT if low <= -0.5 * math.pi + ROUNDING else math.sin(low),
-                _NO_LIMIT if high >= 0.5 * math.pi - ROUNDING else math.sin(high),
-                *self.range,
-            ]
-        )
-
-
-def check_view(view: object) -> None:
-    """Raise a `FrameError` unless it is a field of view or None."""
-    if view is not None and not isinstance(view, FieldOfView):
-        raise FrameError("field_of_view", "a FieldOfView or None", type(view).__name__)
-
-
-def _interval(name: str, values: object, low: float, high: float) -> tuple[float, float]:
-    path, expected = f"field_of_view.{name}", f"two numbers from {low:g} to {high:g}"
-    try:
-        given = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise FrameError(path, expected, repr(values)[:80]) from error
-    # A float32 of the limit may be a little beyond it.
-    if given.shape != (2,) or not ((given >= low - 1e-6) & (given <= high + 1e-6)).all():
-        raise FrameError(path, expected, repr(values)[:80])
-    begin, end = np.clip(given, low, high).tolist()
-    return begin, end
 
 
 @record

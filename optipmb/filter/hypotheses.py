@@ -23,9 +23,9 @@ from optipmb.model.frame import PLAIN
 
 if TYPE_CHECKING:
     from optipmb.filter.class_posterior import Groups
-    from optipmb.filter.preprocess import Measurements
     from optipmb.model.density import Bernoullis, Density, Moment, Poissons
     from optipmb.model.rows import Array, Index
+    from optipmb.model.stages import Measurements
     from optipmb.model.table import Classes, ClassTable
 
     Targets = tuple[Array, Index, Array]  # positions, classes or groups, and widening of measurements

@@ -22,16 +22,15 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.filter.association import NEW
 from optipmb.filter.calibration import log_odds
 from optipmb.filter.predict import heading_unknown, wrap
 from optipmb.model.density import PHI, STATE, A, V
+from optipmb.model.stages import NEW
 
 if TYPE_CHECKING:
-    from optipmb.filter.association import Survivors
-    from optipmb.filter.preprocess import Measurements
     from optipmb.model.density import Bernoullis, Moment
     from optipmb.model.rows import Array
+    from optipmb.model.stages import Measurements, Survivors
     from optipmb.model.table import Classes, ClassRow
 
 

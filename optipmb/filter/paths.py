@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.filter.extract import sound, unsound
 from optipmb.filter.lightweight import doubt
 from optipmb.filter.predict import decay_and_turn, displacement, heading_unknown, predict_state, wrap
 from optipmb.filter.unknown_heading import scale_across, show_heading
@@ -24,14 +23,15 @@ from optipmb.model.errors import DensityError, FrameError
 from optipmb.model.parameters import HORIZONS, MAX_HORIZON_S, MAX_HORIZONS
 from optipmb.model.rows import record
 from optipmb.model.table import ClassTable
+from optipmb.model.tracks import sound, unsound
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from optipmb.filter.extract import Tracks
     from optipmb.model.parameters import Parameters
     from optipmb.model.rows import Array, Index
     from optipmb.model.table import Classes
+    from optipmb.model.tracks import Tracks
 
 
 MAX_STEPS: Final = 1000

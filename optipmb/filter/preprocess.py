@@ -13,7 +13,7 @@ scores may have boxes of the usual size that overlap by `SAME_PLACE`.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from optipmb.filter.geometry import END_OF_CHAIN, block, boxes_overlap, empty_to
 from optipmb.filter.hypotheses import UNLIMITED
 from optipmb.model.errors import EffortError
 from optipmb.model.frame import PLAIN
+from optipmb.model.stages import Measurements
 from optipmb.model.table import known_length
 
 if TYPE_CHECKING:
@@ -30,29 +31,6 @@ if TYPE_CHECKING:
     from optipmb.model.frame import Frame
     from optipmb.model.rows import Array, Columns, Index
     from optipmb.model.table import Classes, ClassTable
-
-
-class Measurements(NamedTuple):
-    """The measurement set Z_k, best score first.
-
-    Attributes:
-        position: (M, 2) z_xy, m; (M, 5) with rho_xx, rho_xy and rho_yy of `optipmb.model.frame` behind, where some
-            detection of the frame has another R than its class.
-        yaw: (M,) z_phi, rad, NaN where unknown.
-        velocity: (M, 2) z_v, m/s, NaN where unknown.
-        auxiliary: (M, 4) z_A = [length, width, height, z], NaN where unknown.
-        score: (M,) z_s in (0, 1].
-        label: (M,) class z_c.
-        source: (M,) index in the caller's arrays.
-    """
-
-    position: Array
-    yaw: Array
-    velocity: Array
-    auxiliary: Array
-    score: Array
-    label: Index
-    source: Index
 
 
 def preprocess(

@@ -18,9 +18,9 @@ from optipmb.model.density import COMPONENT, Poissons, components_in, copy_state
 
 if TYPE_CHECKING:
     from optipmb.filter.hypotheses import Hypotheses
-    from optipmb.filter.preprocess import Measurements
     from optipmb.model.density import Density, Moment
     from optipmb.model.rows import Array, Index
+    from optipmb.model.stages import Measurements
     from optipmb.model.table import Classes, ClassTable
 
 

@@ -22,18 +22,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.filter.association import NEW
 from optipmb.filter.hypotheses import FROM_POISSON
 from optipmb.filter.predict import ORDER, SPREAD, WEIGHT, heading_unknown, square_root, wrap
 from optipmb.filter.unknown_heading import LOST, face_along, find_heading, lose_heading, take_heading
 from optipmb.model.density import OMEGA, PHI, STATE, A, V, X, Y, copy_state
 from optipmb.model.frame import PLAIN
+from optipmb.model.stages import NEW
 
 if TYPE_CHECKING:
     from optipmb.filter.hypotheses import Hypotheses
-    from optipmb.filter.preprocess import Measurements
     from optipmb.model.density import Poissons
     from optipmb.model.rows import Array, Index
+    from optipmb.model.stages import Measurements
     from optipmb.model.table import Classes
 
     Buffers = tuple[Array, Array, Array, Array, Array, Array]

@@ -29,7 +29,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.filter.extract import Tracks, tracks_in
 from optipmb.joining.appearance import NOTHING, Vectors, aligned, appearance_score, seen
 from optipmb.model.class_names import common_name
 from optipmb.model.density import OMEGA, objects_in
@@ -37,6 +36,7 @@ from optipmb.model.errors import ParameterError
 from optipmb.model.frame import LONGEST_MODEL
 from optipmb.model.lost_objects import PLACES, Beginnings, Lost, Places, Rejoining, Statistics, Tracklets
 from optipmb.model.rows import arrays_of, views_of
+from optipmb.model.tracks import Tracks, tracks_in
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

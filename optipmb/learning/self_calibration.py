@@ -84,12 +84,11 @@ from optipmb.model.rows import read_only
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from optipmb.filter.preprocess import Measurements
     from optipmb.model.density import Density, Misses, Poissons
     from optipmb.model.frame import Frame
     from optipmb.model.rows import Array, Columns, Index
+    from optipmb.model.stages import Measurements, Update
     from optipmb.model.table import Classes, ClassTable
-    from optipmb.tracker import Update
 
     Slots = NDArray[np.uint16]
 
@@ -485,7 +484,7 @@ def learn_scatter(
         sums: `scatter` and `lagged` of `SelfCalibration`.
         innovations: of the objects of the frame before.
         before_words, prior_words, words: arrays of those, of the predicted and of the updated `Bernoullis`.
-        hits: `row` and `measurement` of the updated ones, as in `optipmb.tracker.Update`.
+        hits: `row` and `measurement` of the updated ones, as in `optipmb.model.stages.Update`.
         position: (M, 2) or (M, 5) of the measurements.
         moment: stamps of the frame and of the one before.
     """

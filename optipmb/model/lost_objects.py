@@ -11,7 +11,6 @@ from optipmb.model.rows import Column, Rows, record
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from optipmb.model.relocation import Relocation
     from optipmb.model.rows import Index
 
 PLACES: Final = 13
@@ -192,22 +191,3 @@ class Rejoining:
         none = np.zeros((classes, 3))
         since = Statistics(since_ns=np.full(classes, stamp_ns), count=none, mean=none, square=none)
         return cls(Tracklets.empty(), Places.empty(), Lost.empty(), Beginnings.empty(), since)
-
-    def moved(self, relocation: Relocation) -> Rejoining:
-        """Return the state in a world that has moved."""
-        turn = relocation._replace(x=0.0, y=0.0)
-
-        def tracks(rows: Any) -> Any:
-            points = {name: relocation.points(getattr(rows, name)) for name in ("begin", "end")}
-            ways = {name: turn.points(getattr(rows, name)) for name in ("begin_velocity", "end_velocity")}
-            return rows.replaced(yaw=rows.yaw + relocation.theta, **points, **ways)
-
-        places = relocation.points(self.places.place.reshape(-1, 2)).reshape(-1, PLACES * 2)
-        return Rejoining(
-            tracks(self.live),
-            self.places.replaced(place=places),
-            tracks(self.lost),
-            self.beginnings.replaced(place=relocation.points(self.beginnings.place)),
-            self.classes,
-            self.appearance,
-        )

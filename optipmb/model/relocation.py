@@ -20,14 +20,17 @@ import numpy as np
 from optipmb.model.density import PHI, Bernoullis, Poissons
 from optipmb.model.errors import DensityError
 from optipmb.model.frame import MAX_COORDINATE, Pose
+from optipmb.model.lost_objects import PLACES, Lost, Tracklets
 from optipmb.model.rows import read_only
 
 if TYPE_CHECKING:
     from optipmb.model.density import Density
+    from optipmb.model.lost_objects import Rejoining
     from optipmb.model.rows import Array
 
 Place = tuple[float, float, float]
 _Rows = TypeVar("_Rows", Bernoullis, Poissons)
+_Tracks = TypeVar("_Tracks", Tracklets, Lost)
 
 
 class Relocation(NamedTuple):
@@ -81,13 +84,30 @@ class Relocation(NamedTuple):
         bernoulli, poisson = self._rows(density.bernoulli), self._rows(density.poisson)
         rejoining, sensor = density.rejoining, density.sensor
         if rejoining is not None:
-            rejoining = rejoining.moved(self)
+            rejoining = self._rejoining(rejoining)
         if sensor is not None:
             cos, sin = math.cos(self.theta), math.sin(self.theta)
             vx, vy, turn, *evidence = sensor.tolist()
             v = cos * vx - sin * vy + turn * self.y, sin * vx + cos * vy - turn * self.x
             sensor = read_only(np.array([*v, turn, *evidence]))
         return replace(density, bernoulli=bernoulli, poisson=poisson, rejoining=rejoining, sensor=sensor)
+
+    def _rejoining(self, state: Rejoining) -> Rejoining:
+        turn = self._replace(x=0.0, y=0.0)
+
+        def tracks(rows: _Tracks) -> _Tracks:
+            points = {name: self.points(getattr(rows, name)) for name in ("begin", "end")}
+            ways = {name: turn.points(getattr(rows, name)) for name in ("begin_velocity", "end_velocity")}
+            return rows.replaced(yaw=rows.yaw + self.theta, **points, **ways)
+
+        places = self.points(state.places.place.reshape(-1, 2)).reshape(-1, PLACES * 2)
+        return replace(
+            state,
+            live=tracks(state.live),
+            places=state.places.replaced(place=places),
+            lost=tracks(state.lost),
+            beginnings=state.beginnings.replaced(place=self.points(state.beginnings.place)),
+        )
 
     def _rows(self, rows: _Rows) -> _Rows:
         turn = np.eye(6)

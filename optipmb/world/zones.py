@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from optipmb.filter.extract import Tracks
     from optipmb.model.relocation import Relocation
     from optipmb.model.rows import Array, Index
+    from optipmb.model.tracks import Tracks
 
 Point = tuple[float, float]
 Place = tuple[float, float, float]

@@ -134,6 +134,29 @@ def test_folders_of_the_service_import_what_the_page_says() -> None:
         assert own - {place, "__version__"} <= allowed[place], source
 
 
+def test_folders_of_the_tracker_import_what_the_page_says() -> None:
+    """What a folder imports, by types too, is in its row of docs/architecture.md; the modules on top import all."""
+    page = (DOCS / "architecture.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)/` \|.*\| ([^|]*) \|$", page.split("\n## The tracker")[1], re.MULTILINE)
+    allowed = {folder: set(re.findall(r"`(\w+)`", imports)) for folder, imports in rows}
+    assert set(allowed) == {path.parent.name for path in TRACKER.rglob("*.py")} - {TRACKER.name}
+    for source in sorted(TRACKER.glob("*/*.py")):
+        own = {name.split(".")[1] for name in imported(source) if name.startswith("optipmb.")}
+        assert own - {source.parent.name} <= allowed[source.parent.name], source
+
+
+def test_no_modules_of_the_tracker_import_each_other_in_a_circle() -> None:
+    """Imports for types count: each module can be read with those that it imports, and without the others."""
+    modules = {".".join(path.relative_to(TRACKER.parent).with_suffix("").parts): path for path in TRACKER.rglob("*.py")}
+    below = {
+        name: {module for one in imported(path) for module in (one, one.rpartition(".")[0])} & modules.keys()
+        for name, path in modules.items()
+    }
+    while free := {name for name, others in below.items() if not others & below.keys()}:
+        below = {name: others for name, others in below.items() if name not in free}
+    assert not below
+
+
 @pytest.mark.parametrize("source", sorted((SERVICE / "session").glob("*.py")), ids=lambda path: path.stem)
 def test_a_session_is_pure(source: Path) -> None:
     """A module of a session imports none that waits, stores, sends or logs."""

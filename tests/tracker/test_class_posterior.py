@@ -11,7 +11,6 @@ from class_rows import class_rows
 from scenes import random_parameters, steps
 
 import optipmb
-from optipmb.filter.association import NEW, Survivors
 from optipmb.filter.class_posterior import (
     CHANGE_ODDS,
     UNGROUPED,
@@ -21,8 +20,8 @@ from optipmb.filter.class_posterior import (
     weigh_by_class,
 )
 from optipmb.filter.hypotheses import gate, groups
-from optipmb.filter.preprocess import Measurements
 from optipmb.model.parameters import parse_parameters
+from optipmb.model.stages import NEW, Measurements, Survivors
 from optipmb.model.table import ClassTable
 
 if TYPE_CHECKING:

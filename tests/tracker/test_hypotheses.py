@@ -14,7 +14,6 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from optipmb.filter.association import UNASSIGNED
 from optipmb.filter.association import associate as associate_pairs
 from optipmb.filter.hypotheses import (
     CLUTTER,
@@ -34,8 +33,8 @@ from optipmb.filter.hypotheses import (
     pairs_of_few,
     pairs_of_many,
 )
-from optipmb.filter.preprocess import Measurements
 from optipmb.model.density import Bernoullis, objects_in
+from optipmb.model.stages import UNASSIGNED, Measurements
 
 Array = NDArray[np.float64]
 NOTHING = np.zeros(0)

@@ -11,8 +11,8 @@ from class_rows import class_rows
 
 import optipmb
 from optipmb.filter.hypotheses import gate
-from optipmb.filter.preprocess import Measurements
 from optipmb.filter.update import birth_states, ukf_updates
+from optipmb.model.stages import Measurements
 
 CARS, FRAMES, DT_NS = 6, 12, 100_000_000
 HALF = np.pi / 6

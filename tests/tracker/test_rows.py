@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import optipmb
-from optipmb.filter.extract import tracks_in
 from optipmb.model.density import Misses, components_in, objects_in
+from optipmb.model.tracks import tracks_in
 
 if TYPE_CHECKING:
     from optipmb.model.rows import Rows

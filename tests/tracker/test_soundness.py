@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 import optipmb
-from optipmb.filter.extract import MAX_AGE, MAX_COVARIANCE, MAX_PLACE, MAX_VALUE, unsound
+from optipmb.model.tracks import MAX_AGE, MAX_COVARIANCE, MAX_PLACE, MAX_VALUE, unsound
 
 ANYTHING = st.sampled_from([np.nan, np.inf, -np.inf, -1.0, -1e-300])
 SHAPES = {

@@ -16,9 +16,9 @@ from scenes import Options, SceneFrame, frame_of, partial, random_parameters, sc
 import optipmb
 from optipmb.filter.geometry import boxes_overlap, iou_exceeds
 from optipmb.filter.predict import heading_unknown, predict_state
-from optipmb.filter.preprocess import Measurements
 from optipmb.filter.unknown_heading import find_heading, lose_heading, show_heading, take_heading
 from optipmb.filter.update import ukf_updates
+from optipmb.model.stages import Measurements
 
 Array = NDArray[np.float64]
 NAN = math.nan
