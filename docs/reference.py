@@ -163,7 +163,7 @@ def settings() -> str:
         *(("cpm.PATTERN.", CpmSettings), ("cpm.PATTERN.sensors.", CpmSensor)),
         *(("ros2.", Ros2Settings), ("ros2.streams.NAME.", Ros2Stream), ("mqtt.", MqttSettings)),
         *(("inputs.PATTERN.", InputSettings), ("mqtt.inputs.STREAM.", MqttInput)),
-        ("mqtt.inputs.STREAM.mapping.", MappingSettings),
+        ("inputs.PATTERN.mapping.", MappingSettings),
     )
     rows = {}
     for prefix, table in tables:

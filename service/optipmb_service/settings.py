@@ -288,7 +288,7 @@ class MappingSettings(BaseModel):
 
 
 class MqttInput(BaseModel):
-    """A topic of sensors whose payloads are detections of a stream."""
+    """A topic of sensors whose payloads are detections of a stream; `inputs` says how they are read."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -296,13 +296,6 @@ class MqttInput(BaseModel):
     """topic; `+` stands for any part, which `{1}`, `{2}` … name in the stream; `$share/GROUP/TOPIC` is shared"""
     qos: Literal[0, 1, 2] = 1
     """quality of service that the broker is asked for"""
-    format: Literal["optipmb", "axis", "frigate", "scenescape", "mapped"] = "optipmb"
-    """form of payloads: frames as over HTTP, a known maker's, or that which `mapping` describes"""
-    mapping: MappingSettings | None = None
-    """paths of a payload, for the format `mapped`"""
-    only: dict[PathText, bool | int | str] = Field(default_factory=dict)
-    """values by their paths in the payload; other payloads are left out, or are of another input of the topic; for the
-    format `frigate` the camera of the stream, as `{ "after.camera" = "gate" }`"""
 
     @property
     def pattern(self) -> str:
@@ -494,6 +487,14 @@ class InputSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    format: Literal["optipmb", "axis", "frigate", "scenescape", "mapped"] = "optipmb"
+    """form of payloads: our JSON, a known maker's, or that which `mapping` describes; of a maker's the topic of MQTT or
+    the address of HTTP names the stream"""
+    mapping: MappingSettings | None = None
+    """paths of a payload, for the format `mapped`"""
+    only: dict[PathText, bool | int | str] = Field(default_factory=dict)
+    """values by their paths in the payload; other payloads are refused, over MQTT left out, or of another input of the
+    topic; for the format `frigate` the camera of the stream, as `{ "after.camera" = "gate" }`"""
     clock: Literal["sender", "arrival", "offset"] = "sender"
     """stamps of frames: the sender's; those of their arrival; or the sender's moved to the clock of this machine, which
     keeps their intervals and puts several sensors on one clock"""
@@ -506,6 +507,11 @@ class InputSettings(BaseModel):
     format `frigate`"""
     missing_s: float = Field(default=10.0, gt=0, le=3600)
     """time after the last report of an object from which it counts as missed, with `complete = false`"""
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether a frame has all objects."""
+        return self.format != "frigate" if self.complete is None else self.complete
 
 
 _USUAL: Final = InputSettings()
@@ -806,13 +812,7 @@ class Settings(BaseSettings):
 
     def input_of(self, stream: str) -> InputSettings:
         """Return how frames of a stream are read that come as JSON."""
-        one = next((one for pattern, one in self.inputs.items() if fnmatchcase(stream, pattern)), _USUAL)
-        if one.complete is None and any(
-            each.format == "frigate" and fnmatchcase(stream, re.sub(r"\{\d\}", "*", name))
-            for name, each in self.mqtt.inputs.items()
-        ):
-            return one.model_copy(update={"complete": False})
-        return one
+        return next((one for pattern, one in self.inputs.items() if fnmatchcase(stream, pattern)), _USUAL)
 
     def missing_s(self, session: str) -> float | None:
         """Return the time without a report after which objects count as missed; None: `unseen_time` of the profile.
@@ -823,10 +823,9 @@ class Settings(BaseSettings):
         feeding = list(self.fused_sessions[session].streams) if session in self.fused_sessions else []
         if sensor == "fused":
             feeding += [f"{node}/{one.split('/')[2]}" for one in self.fuse if fnmatchcase(node, one.rpartition("/")[0])]
-        known = (*self.inputs, *(re.sub(r"\{\d\}", "*", name) for name in self.mqtt.inputs)) if feeding else ()
-        names = [one for one in known if any(_overlap(one, each) for each in feeding)]
+        names = [one for one in self.inputs if any(_overlap(one, each) for each in feeding)]
         rules = map(self.input_of, names if feeding else [session])
-        return max((one.missing_s for one in rules if one.complete is False), default=None)
+        return max((one.missing_s for one in rules if not one.is_complete), default=None)
 
     @property
     def fused_sessions(self) -> dict[str, FusedSettings]:
@@ -970,6 +969,7 @@ def load(
     _check_names(settings)
     _check_cluster(settings)
     _check_zones(settings)
+    _check_formats(settings)
     _check_mqtt(settings)
     if settings.workers > 1 and settings.zenoh_config is not None and settings.is_router:
         # Its access control would be deaf to the workers, which come over a socket and without a certificate.
@@ -1132,13 +1132,28 @@ def _check_zones(settings: Settings) -> None:
             raise SettingsInvalidError(f"setting zones: at most {MOST_ZONES} for a session, {pattern} has {count}")
 
 
+def _check_formats(settings: Settings) -> None:
+    """Refuse inputs whose format lacks what it needs.
+
+    Raises:
+        SettingsInvalidError: there are such.
+    """
+    for pattern, one in settings.inputs.items():
+        path = f"setting inputs.{pattern}"
+        if one.format == "frigate" and "after.camera" not in one.only:
+            expected = 'the camera of the stream, as { "after.camera" = "gate" }'
+            raise SettingsInvalidError(f"{path}.only: {expected}: Frigate's events are of all cameras")
+        if (one.format == "mapped") is not (one.mapping is not None):
+            raise SettingsInvalidError(f"{path}.mapping: with the format mapped, and only with it")
+
+
 def _check_mqtt(settings: Settings) -> None:
     """Refuse input topics that are output topics, do not say their stream, or have a stream or a topic in common.
 
     Raises:
         SettingsInvalidError: there are such.
     """
-    seen: dict[str, MqttInput] = {}
+    seen: dict[str, tuple[MqttInput, Mapping[str, object]]] = {}
     for stream, one in settings.mqtt.inputs.items():
         path, pattern = f"setting mqtt.inputs.{stream}", re.sub(r"\{\d\}", "*", stream)
         try:
@@ -1147,12 +1162,10 @@ def _check_mqtt(settings: Settings) -> None:
             raise SettingsInvalidError(f"{path}: {error.expected}, received {stream!r}") from None
         if other := next((each for each in seen if _overlap(each, pattern)), None):
             raise SettingsInvalidError(f"{path}: one input for a stream, {other} has it, too")
-        if other := next((each for each, theirs in seen.items() if _have_in_common(one, theirs)), None):
+        values = settings.input_of(pattern).only
+        if other := next((each for each, theirs in seen.items() if _have_in_common(one, values, *theirs)), None):
             raise SettingsInvalidError(f"{path}.topic: one input for a topic, {other} has some of {one.topic!r}, too")
-        if one.format == "frigate" and "after.camera" not in one.only:
-            expected = 'the camera of the stream, as { "after.camera" = "gate" }'
-            raise SettingsInvalidError(f"{path}.only: {expected}: Frigate has one topic for all")
-        seen[pattern] = one
+        seen[pattern] = one, values
         parts = one.pattern.split("/")
         if any("+" in part and part != "+" for part in parts):
             raise SettingsInvalidError(f"{path}.topic: + stands for a whole part, received {one.topic!r}")
@@ -1164,13 +1177,13 @@ def _check_mqtt(settings: Settings) -> None:
         kinds = (f"{settings.prefix}/x/x/x/{kind}" for kind in settings.mqtt.topics)
         if one.pattern.startswith(f"{settings.prefix}/") or any(re.fullmatch(output, kind) for kind in kinds):
             raise SettingsInvalidError(f"{path}.topic: other topics than those that are published, {one.topic!r}")
-        if (one.format == "mapped") is not (one.mapping is not None):
-            raise SettingsInvalidError(f"{path}.mapping: with the format mapped, and only with it")
 
 
-def _have_in_common(one: MqttInput, other: MqttInput) -> bool:
-    """Return whether some message of a topic may be of two inputs."""
-    apart = any(one.only[path] != other.only[path] for path in one.only.keys() & other.only.keys())
+def _have_in_common(
+    one: MqttInput, values: Mapping[str, object], other: MqttInput, theirs: Mapping[str, object]
+) -> bool:
+    """Return whether some message of a topic may be of two inputs, whose payloads have values by paths alone."""
+    apart = any(values[path] != theirs[path] for path in values.keys() & theirs.keys())
     return not apart and _overlap(*(each.pattern.replace("*", "?").replace("+", "*") for each in (one, other)))
 
 

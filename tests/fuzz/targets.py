@@ -11,22 +11,22 @@ from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf.convert import transcode
 from optipmb_service.edges.grpc.selection import Filter
 from optipmb_service.edges.json_frames import FrameReader
-from optipmb_service.edges.mapping import PayloadMapping
 from optipmb_service.edges.readers import Pace
 from optipmb_service.session.checkpoint import CheckpointError, decode_checkpoint, encode_checkpoint, seal
 from optipmb_service.session.convert import density_of
 from optipmb_service.session.identity import Incarnation
 from optipmb_service.session.policy import Policy
 from optipmb_service.session.session import Session
-from optipmb_service.settings import MappingSettings, Settings
+from optipmb_service.settings import Settings
 from router import Sensor
 
 LIMITS = schemas.Limits(max_bytes=2**16, max_json_bytes=2**16, max_values=2**12)
 REQUESTS = (pb.TrackRequest, pb.PublishRequest, pb.SubscribeRequest, pb.SetParametersRequest)
 CONFIRMED = Filter(pb.TrackFilter(confirmed_only=True, classes=["car"], area=pb.Polygon(x=[0, 9, 0], y=[0, 0, 9])))
 SITES = {"a": {"origin": [48.0, 11.0, 500.0]}}
-FRAMES = FrameReader(Settings(sites=SITES, limits={"max_json_bytes": 2**16}))
-MAPPING = PayloadMapping(MappingSettings(objects="objects.*[]", name="class", position=("x", "y"), time="time"))
+MAPPING = {"objects": "objects.*[]", "name": "class", "position": ("x", "y"), "time": "time"}
+INPUTS = {"a/b/mapped": {"format": "mapped", "mapping": MAPPING}}
+FRAMES = FrameReader(Settings(sites=SITES, inputs=INPUTS, limits={"max_json_bytes": 2**16}))
 POLICY = Policy(checkpoint_bytes=2000)
 """So little that a restored session must go over its first frames again before it can be written down."""
 
@@ -96,9 +96,9 @@ def protobuf(data: bytes) -> None:
 
 def frames(data: bytes) -> None:
     """A frame in JSON becomes detections that are read again as they are, or is refused; so is a mapped payload."""
-    for mapping in (None, MAPPING):
+    for stream in ("a/b/c", "a/b/mapped"):
         with contextlib.suppress(schemas.MessageError):
-            message = FRAMES.read(data, "a/b/c", mapping).message
+            message = FRAMES.read(data, stream).message
             assert schemas.decode(schemas.encode(message), schemas.Detections) == message
 
 

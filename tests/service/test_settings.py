@@ -12,16 +12,17 @@ INPUTS: dict[str, dict[str, Any]] = {
     "a/{1}/c.topic": {"a/{1}/c": {"topic": "x"}},
     "a/b/c": {"a/{1}/c": {"topic": "x/+"}, "a/b/c": {"topic": "y"}},
     "a/b/d.topic": {"a/{1}/c": {"topic": "x/+"}, "a/b/d": {"topic": "x/y"}},
-    "a/b/e.topic": {"a/b/c": {"topic": "x", "only": {"n": 1}}, "a/b/e": {"topic": "x"}},
-    "a/b/c.only": {"a/b/c": {"topic": "x", "format": "frigate"}},
+    "a/b/e.topic": {"a/b/c": {"topic": "x"}, "a/b/e": {"topic": "x"}},
     "a/b/f.topic": {"a/b/f": {"topic": "optipmb/v1/a/b/f/tracks"}},
-    "a/b/c.format": {"a/b/c": {"topic": "x", "format": "yaml"}},
-    "a/b/c.mapping": {"a/b/c": {"topic": "x", "format": "mapped"}},
-    "a/b/c.mapping.objects": {
-        "a/b/c": {"topic": "x", "format": "mapped", "mapping": {"objects": "a b", "class": "c"}},
-    },
 }
 """Inputs over MQTT, by the setting that is named."""
+FORMATS: dict[str, dict[str, Any]] = {
+    "a/b/c.only": {"a/b/c": {"format": "frigate"}},
+    "a/b/c.format": {"a/b/c": {"format": "yaml"}},
+    "a/b/c.mapping": {"a/b/c": {"format": "mapped"}},
+    "a/b/c.mapping.objects": {"a/b/c": {"format": "mapped", "mapping": {"objects": "a b", "class": "c"}}},
+}
+"""The same of `inputs`."""
 JOINS = {"gap_s": 0, "min_probability": 1.0, "most": 0, "decide_s": 6, "other": 1, "embedding_model": ""}
 PATTERN = "a pattern of streams looks like site/*/lidar*"
 ONE_SITE = "patterns of one site, named without *, received"
@@ -60,7 +61,11 @@ NODES = {"a": {"streams": ["s/n/*"]}}
             "fused.b.streams: a stream feeds one session, s/*/*y and s/n/x* of fused.a.streams have some in common",
         ),
         *(({"rejoin": {"site/*/*": {name: value}}}, f"rejoin.site/*/*.{name}") for name, value in JOINS.items()),
-        *(({"mqtt": {"inputs": inputs}}, f"mqtt.inputs.{name}") for name, inputs in INPUTS.items()),
+        *(
+            ({"mqtt": {"inputs": inputs}, "inputs": {"a/b/c": {"only": {"n": 1}}}}, f"mqtt.inputs.{name}")
+            for name, inputs in INPUTS.items()
+        ),
+        *(({"inputs": inputs}, f"inputs.{name}") for name, inputs in FORMATS.items()),
     ],
 )
 def test_a_wrong_setting_is_named(options: dict[str, Any], text: str) -> None:

@@ -350,7 +350,7 @@ class Inputs:
         async with self._used(name) as stream:
             async with stream.lock:  # taken once: frames of a stream go out in the order in which they came
                 await self._prepare(name, stream)
-                parts = separate(frame) if rules.complete is False else [frame]
+                parts = [frame] if rules.is_complete else separate(frame)
                 before: Sent | None = None
                 for at, one in enumerate(parts):
                     if at and before is None:  # the frame has begun: sent again, its objects would be sent twice
@@ -550,7 +550,7 @@ def _mark(frame: JsonFrame, repeats: str, part: int, rules: InputSettings) -> _M
             return None
         name = f"stamp_ns {frame.message.stamp_ns}"
         # Several objects may be reported with one stamp; and stamps that are not used need not differ.
-        key = content if rules.complete is False or rules.clock == "arrival" else name.encode()
+        key = content if not rules.is_complete or rules.clock == "arrival" else name.encode()
     return _Mark(_digest(key), show(name)[1:-1], _digest(content), len(content))
 
 

@@ -10,6 +10,7 @@ import re
 import time
 from codecs import BOM_UTF8
 from datetime import datetime
+from fnmatch import fnmatchcase
 from functools import cache
 from math import atan2, hypot, nan, pi, sqrt
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -22,12 +23,13 @@ from optipmb_schemas import codec
 from optipmb_schemas.errors import invalid, show
 from optipmb_schemas.json_form import EdgeDetections, EdgeObject
 
+from optipmb_service.edges.mapping import PayloadMapping, mapping_of, other_value
+
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
     from optipmb import Georeference, GroundCamera
-    from optipmb_service.edges.mapping import PayloadMapping
     from optipmb_service.settings import Settings
 
 MOST_FRAMES: Final = 256
@@ -146,20 +148,21 @@ class FrameReader:
         self._sites = settings.sites
         self.rules = settings.input_of
         self._place = cache(self._place_of)
+        self._mappings = {pattern: mapping_of(one) for pattern, one in settings.inputs.items()}
         self._cameras = {
             one.camera: _calibration(f"inputs.{pattern}.camera", one.camera)
             for pattern, one in settings.inputs.items()
             if one.camera is not None
         }
 
-    def split(self, payload: bytes) -> tuple[list[bytes], bool]:
-        """Return the frames of a document, and whether it is an array of them.
+    def split(self, payload: bytes, stream: str) -> tuple[list[bytes], bool]:
+        """Return the frames of a document, and whether it is an array of them, as a maker's payload never is.
 
         Raises:
             MessageError: it is none, or has too many.
         """
         payload = payload.removeprefix(BOM_UTF8)
-        if payload.lstrip(b" \t\r\n")[:1] != b"[":
+        if payload.lstrip(b" \t\r\n")[:1] != b"[" or self._mapping(stream) is not None:
             return [payload], False
         try:
             frames = [bytes(one) for one in _frames.decode(payload)]
@@ -170,13 +173,12 @@ class FrameReader:
             raise schemas.MessageError("too_large" if frames else "invalid_value", "", expected, str(len(frames)))
         return frames, True
 
-    def read(self, payload: bytes, stream: str = "", mapping: PayloadMapping | None = None) -> JsonFrame:
+    def read(self, payload: bytes, stream: str = "") -> JsonFrame:
         """Return the frame of a document.
 
         Args:
             payload: the document.
-            stream: what the address says; empty: nothing.
-            mapping: where its objects are, if it is of another maker.
+            stream: what the address says; empty: nothing, and the document is ours.
 
         Raises:
             MessageError: it is not valid, with the path in the document.
@@ -185,8 +187,12 @@ class FrameReader:
         if len(payload) > most:
             raise schemas.MessageError("too_large", "", f"at most {most} bytes of JSON", f"{len(payload)} bytes")
         payload = payload.removeprefix(BOM_UTF8)
+        only = self.rules(stream).only
+        if (other := other_value(payload, only)) is not None:
+            path, received = other
+            raise invalid(path, f"{show(only[path])}, by `only` in `inputs`", received)
         try:
-            if mapping is not None:
+            if (mapping := self._mapping(stream)) is not None:
                 return self._mapped(msgspec.json.decode(payload), stream, mapping)
             return self._made(_frame.decode(payload), stream)
         except msgspec.ValidationError as error:
@@ -198,6 +204,9 @@ class FrameReader:
             raise
         except (ValueError, msgspec.DecodeError, RecursionError) as error:
             raise _malformed(error, payload) from None
+
+    def _mapping(self, stream: str) -> PayloadMapping | None:
+        return next((one for pattern, one in self._mappings.items() if fnmatchcase(stream, pattern)), None)
 
     def _mapped(self, payload: Any, stream: str, mapping: PayloadMapping) -> JsonFrame:
         frame, places = mapping.frame(payload)
@@ -238,10 +247,10 @@ class FrameReader:
 
     def _framed(self, message: schemas.Detections, given: Mapping[str, Any]) -> JsonFrame:
         rules = self.rules(message.stream)
-        if rules.complete is False and (name := next((one for one in SEPARATE if one in given), "")):
+        if not rules.is_complete and (name := next((one for one in SEPARATE if one in given), "")):
             expected = "none, for each object becomes a frame by `complete` in `inputs`"
             raise schemas.MessageError("invalid_value", name, expected, "one")
-        if rules.complete is False and len(message.label) > MOST_SEPARATE:
+        if not rules.is_complete and len(message.label) > MOST_SEPARATE:
             expected = f"at most {MOST_SEPARATE} objects, each of which becomes a frame by `complete` in `inputs`"
             raise schemas.MessageError("too_large", "objects", expected, str(len(message.label)))
         if classes := rules.classes:

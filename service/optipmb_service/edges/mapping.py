@@ -21,7 +21,7 @@ from optipmb_service.settings import MappingSettings
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from optipmb_service.settings import MqttInput
+    from optipmb_service.settings import InputSettings
 
 EACH: Final = "[]"
 ANY: Final = "*"
@@ -74,20 +74,20 @@ FORMATS: Final[dict[str, dict[str, Any]]] = {
 """Mappings of known makers: Axis' scene description, events of Frigate, and detections of SceneScape."""
 
 
-def mapping_of(one: MqttInput) -> PayloadMapping | None:
+def mapping_of(one: InputSettings) -> PayloadMapping | None:
     """Return how the payloads of an input are mapped; None: they are frames."""
     if one.format in FORMATS:
         return PayloadMapping(MappingSettings(**FORMATS[one.format]))
     return None if one.mapping is None else PayloadMapping(one.mapping)
 
 
-def is_of(payload: bytes, only: Mapping[str, bool | int | str]) -> bool:
-    """Return whether a payload has these values at their paths; one that is no JSON may be of any input."""
+def other_value(payload: bytes, only: Mapping[str, bool | int | str]) -> tuple[str, Any] | None:
+    """Return the first path at which a payload has another value, and that; None too where it is no JSON at all."""
     try:
         document = msgspec.json.decode(payload.removeprefix(BOM_UTF8)) if only else None
     except (ValueError, msgspec.DecodeError, RecursionError):
-        return True
-    return all(_at(document, path) == value for path, value in only.items())
+        return None
+    return next(((path, found) for path, value in only.items() if (found := _at(document, path)) != value), None)
 
 
 class PayloadMapping:

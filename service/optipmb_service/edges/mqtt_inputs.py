@@ -17,13 +17,12 @@ from optipmb_schemas.errors import show
 
 from optipmb_service.edges.inputs import LATER, RefusedError
 from optipmb_service.edges.json_frames import FrameReader
-from optipmb_service.edges.mapping import is_of, mapping_of
+from optipmb_service.edges.mapping import other_value
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
 
     from optipmb_service.edges.inputs import Inputs
-    from optipmb_service.edges.mapping import PayloadMapping
     from optipmb_service.settings import Settings
 
 RECEIVED: Final = 64
@@ -42,9 +41,7 @@ class _Row(NamedTuple):
     """An input of the settings."""
 
     topic: re.Pattern[str]
-    only: Mapping[str, bool | int | str]
     stream: str
-    mapping: PayloadMapping | None
 
 
 class MqttInputs:
@@ -62,7 +59,7 @@ class MqttInputs:
         self._inputs = inputs
         self._own = f"{settings.prefix}/"
         self._rows = [
-            _Row(re.compile(re.escape(one.pattern).replace(r"\+", "([^/]*)")), one.only, stream, mapping_of(one))
+            _Row(re.compile(re.escape(one.pattern).replace(r"\+", "([^/]*)")), stream)
             for stream, one in settings.mqtt.inputs.items()
         ]
         self._tasks: set[asyncio.Task[None]] = set()
@@ -70,24 +67,20 @@ class MqttInputs:
 
     def take(self, message: Any, confirm: Callable[[], object]) -> None:
         """Take a message of paho's; `confirm` is called when it is done with."""
-        found = (
-            []
-            if message.retain
-            else [(match, row) for row in self._rows if (match := row.topic.fullmatch(message.topic))]
-        )
+        matches = ((row, row.topic.fullmatch(message.topic)) for row in self._rows if not message.retain)
+        found = [row.stream.format("", *match.groups()) for row, match in matches if match]
         fits = len(message.payload) <= self._most_bytes  # a larger one is refused
-        target = next(((match, row) for match, row in found if not fits or is_of(message.payload, row.only)), None)
-        if target is None:  # an old message, counts that the bridge publishes, or the payload of another sensor
+        stream = next((one for one in found if not fits or self._is_of(message.payload, one)), None)
+        if stream is None:  # an old message, counts that the bridge publishes, or the payload of another sensor
             self._inputs.refused["mqtt", "other_sensor"] += bool(found)
             if not (found or message.retain or message.topic.startswith(self._own)):
                 self._report_topic(message.topic, "a topic of `mqtt.inputs`", "another one")
             confirm()
             return
-        match, row = target
         if not message.qos and len(self._tasks) >= WAITING:
             self._inputs.refused["mqtt", "busy"] += 1
             return
-        task = asyncio.create_task(self._taken(message, confirm, row.stream.format("", *match.groups()), row.mapping))
+        task = asyncio.create_task(self._taken(message, confirm, stream))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
@@ -96,11 +89,12 @@ class MqttInputs:
         for task in self._tasks:
             task.cancel()
 
-    async def _taken(
-        self, message: Any, confirm: Callable[[], object], stream: str, mapping: PayloadMapping | None
-    ) -> None:
+    def _is_of(self, payload: bytes, stream: str) -> bool:
+        return other_value(payload, self._frames.rules(stream).only) is None
+
+    async def _taken(self, message: Any, confirm: Callable[[], object], stream: str) -> None:
         try:
-            await self._send(message, stream, mapping)
+            await self._send(message, stream)
         except Exception:
             log.exception("internal_error", topic=message.topic)  # one message must not end the others
         confirm()
@@ -108,7 +102,7 @@ class MqttInputs:
     def _report_topic(self, topic: str, expected: str, received: str) -> None:
         self._inputs.report("", schemas.MessageError("invalid_value", show(topic)[1:-1], expected, received))
 
-    async def _send(self, message: Any, stream: str, mapping: PayloadMapping | None) -> None:
+    async def _send(self, message: Any, stream: str) -> None:
         """Send the frame of a message, as soon as that is possible."""
         try:
             self._inputs.client.keys.detections(stream)
@@ -116,7 +110,7 @@ class MqttInputs:
             self._report_topic(message.topic, f"levels that are names in {error.expected}", show(stream))
             return
         try:
-            frame = self._frames.read(message.payload, stream, mapping)
+            frame = self._frames.read(message.payload, stream)
         except schemas.MessageError as error:
             self._inputs.report(stream, error)
             return
@@ -141,13 +135,9 @@ def tried(settings: Settings, name: str, payload: bytes) -> str:
     Raises:
         ValueError: there is no such input, or the payload is not valid.
     """
-    one = settings.mqtt.inputs.get(name)
-    if one is None:
+    if name not in settings.mqtt.inputs:
         raise ValueError(
             f"option --input: one of {', '.join(settings.mqtt.inputs) or 'mqtt.inputs'}, received {name!r}"
         )
-    if not is_of(payload, one.only):
-        raise ValueError(f"a payload with {one.only}, as `only` of the input says")
-    stream = re.sub(r"\{(\d)\}", r"\1", name)
-    frame = FrameReader(settings).read(payload, stream, mapping_of(one))
+    frame = FrameReader(settings).read(payload, re.sub(r"\{(\d)\}", r"\1", name))
     return schemas.encode_json(frame.message).decode()

@@ -10,8 +10,7 @@ import pytest
 from optipmb_client.errors import ClientError
 from optipmb_schemas import Detections, MessageError
 from optipmb_service.edges.json_frames import FrameReader, separate
-from optipmb_service.edges.mapping import PayloadMapping, mapping_of
-from optipmb_service.settings import MappingSettings, MqttInput, load
+from optipmb_service.settings import load
 from router import Node
 from scipy.spatial.transform import Rotation
 
@@ -31,14 +30,17 @@ def calibration(tmp_path: Path) -> Path:
     return file
 
 
-def reader(calibration: Path) -> FrameReader:
-    inputs = {"garage/*/cam*": {"camera": str(calibration), "classes": {"Human": "pedestrian"}}}
+FRIGATE = {"format": "frigate", "only": {"after.camera": "gate"}}
+
+
+def reader(calibration: Path, **more: Any) -> FrameReader:
+    inputs = {"garage/*/cam*": {"camera": str(calibration), "classes": {"Human": "pedestrian"}} | more}
     return FrameReader(load(None, {"inputs": inputs}).settings)
 
 
 def read(calibration: Path, body: dict[str, Any], mapping: dict[str, Any] | None = None) -> Detections:
-    given = None if mapping is None else PayloadMapping(MappingSettings(**mapping))
-    return reader(calibration).read(json.dumps(body).encode(), STREAM, given).message
+    more = {} if mapping is None else {"format": "mapped", "mapping": mapping}
+    return reader(calibration, **more).read(json.dumps(body).encode(), STREAM).message
 
 
 def objects(**fields: Any) -> list[dict[str, Any]]:
@@ -106,8 +108,7 @@ def test_known_makers(calibration: Path) -> None:
     }
     payloads["scenescape as a list"] = payloads["scenescape"] | {"objects": listed}
     for name, payload in payloads.items():
-        mapping = mapping_of(MqttInput(topic="x", format=name.partition(" ")[0]))
-        found = reader(calibration).read(json.dumps(payload).encode(), STREAM, mapping).message
+        found = reader(calibration, format=name.partition(" ")[0]).read(json.dumps(payload).encode(), STREAM).message
         assert (found.stamp_ns, found.labels) == (expected.stamp_ns, expected.labels)
         np.testing.assert_allclose(found.center, expected.center, atol=1e-6)
         np.testing.assert_allclose(found.score, expected.score)
@@ -116,19 +117,26 @@ def test_known_makers(calibration: Path) -> None:
 def test_events_of_frigate(calibration: Path) -> None:
     """Each has one object, or none when it has ended or was a false positive; their stream is incomplete by default."""
     expected = read(calibration, {"objects": objects(score=0.5)[:1]})
-    mapping = mapping_of(MqttInput(topic="frigate/events", format="frigate"))
-    after = {"label": "car", "score": 0.5, "box": BOXES[0], "frame_time": 5.25, "false_positive": False}
+    after = {
+        "camera": "gate",
+        "label": "car",
+        "score": 0.5,
+        "box": BOXES[0],
+        "frame_time": 5.25,
+        "false_positive": False,
+    }
 
     def made(kind: str, **fields: Any) -> Detections:
         event = {"type": kind, "before": {}, "after": after | fields}
-        return reader(calibration).read(json.dumps(event).encode(), STREAM, mapping).message
+        return reader(calibration, **FRIGATE).read(json.dumps(event).encode(), STREAM).message
 
     found = made("update")
     np.testing.assert_array_equal(found.center, expected.center)
     assert (found.stamp_ns, found.score.tolist()) == (5_250_000_000, [0.5])
     assert len(made("end").label) == len(made("new", false_positive=True).label) == 0
-    rows = {"garage/{1}/cam": {"topic": "+/events", "format": "frigate", "only": {"after.camera": "gate"}}}
-    settings = load(None, {"mqtt": {"inputs": rows}, "inputs": {"garage/b/*": {"complete": True}}}).settings
+    with pytest.raises(MessageError, match=r"after.camera: expected 'gate', by `only` in `inputs`, received 'yard'"):
+        made("update", camera="yard")
+    settings = load(None, {"inputs": {"garage/b/*": FRIGATE | {"complete": True}, "garage/*/cam": FRIGATE}}).settings
     found = [settings.missing_s(stream) for stream in ("garage/a/cam", "garage/b/cam", "garage/a/lidar")]
     assert found == [10.0, None, None]
 
@@ -139,8 +147,7 @@ def test_fused_sessions_miss_objects_as_late_as_their_inputs() -> None:
     given = {
         "fuse": ["garage/a/*", "garage/b/lidar*"],
         "fused": {"all": {"streams": ["yard/*/cam"]}, "lidars": {"streams": ["yard/*/lidar"]}},
-        "inputs": {"garage/*/cam*": incomplete, "yard/gate/*": {"complete": False, "missing_s": 20}},
-        "mqtt": {"inputs": {"yard/gate/cam": {"topic": "e", "format": "frigate", "only": {"after.camera": "gate"}}}},
+        "inputs": {"garage/*/cam*": incomplete, "yard/gate/*": FRIGATE | {"missing_s": 20}},
     }
     settings = load(None, given).settings
     garage = [settings.missing_s(f"garage/{one}") for one in ("a/fused", "b/fused", "c/fused", "c/cam")]

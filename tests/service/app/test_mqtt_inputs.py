@@ -17,8 +17,8 @@ from broker import CONNACK, CONNECT, PUBLISH, mosquitto
 from json_senders import damaged, document, exists
 from optipmb_schemas import Detections, Keys, MessageError, decode
 from optipmb_service.edges.json_frames import FrameReader
-from optipmb_service.edges.mapping import PayloadMapping, is_of, mapping_of
-from optipmb_service.settings import MappingSettings, MqttInput, Settings, load
+from optipmb_service.edges.mapping import other_value
+from optipmb_service.settings import load
 from optipmb_service.zenoh.client import Client
 from router import Node, Sensor, plain
 from routers import free_endpoint
@@ -224,7 +224,7 @@ async def test_another_bridge_of_the_name_is_named(start: Any, tmp_path: Path, m
 def test_a_byte_order_mark_hides_no_value() -> None:
     """By which a payload is that of an input."""
     payload = b'\xef\xbb\xbf{"camera": "gate"}'
-    assert [is_of(payload, {"camera": name}) for name in ("gate", "yard")] == [True, False]
+    assert [other_value(payload, {"camera": name}) for name in ("gate", "yard")] == [None, ("camera", "gate")]
 
 
 def cut(address: str, topic: str, payload: bytes) -> None:
@@ -261,11 +261,12 @@ async def test_what_has_come_outlasts_its_connection(tmp_path: Path) -> None:
 async def test_cameras_of_a_topic_feed_streams_of_their_own(tmp_path: Path) -> None:
     """Events of Frigate by `after.camera`; events of a camera that no input has are left out, and counted."""
     endpoint, arrived = free_endpoint(), []
-    inputs = {
-        f"garage/{name}/cam": {"topic": "frigate/events", "format": "frigate", "only": {"after.camera": name}}
+    camera = str(calibration(tmp_path))
+    given = {
+        f"garage/{name}/cam": {"camera": camera, "format": "frigate", "only": {"after.camera": name}}
         for name in ("gate", "yard")
     }
-    given = {"garage/*/cam": {"camera": str(calibration(tmp_path))}}
+    inputs = {stream: {"topic": "frigate/events"} for stream in given}
     with mosquitto(tmp_path) as address, publisher(address) as client:
         router = {"connect": [], "listen": [endpoint], "router": True}
         async with bridged(endpoint, address, inputs, inputs=given, **router) as bridge:
@@ -285,9 +286,10 @@ async def test_damaged_payloads_end_nothing(start: Any, tmp_path: Path) -> None:
     inputs = {
         SENSOR.stream: {"topic": "sensor"},
         "yard/damaged/lidar": {"topic": "damaged"},
-        CAMERA: {"topic": "frigate", "format": "frigate", "only": {"after.camera": "gate"}},
+        CAMERA: {"topic": "frigate"},
     }
-    given = {CAMERA: {"camera": str(calibration(tmp_path))}}
+    only = {"after.camera": "gate"}
+    given = {CAMERA: {"camera": str(calibration(tmp_path)), "format": "frigate", "only": only}}
     with mosquitto(tmp_path) as address, Node(endpoint) as node, publisher(address) as client:
         async with bridged(endpoint, address, inputs, inputs=given) as bridge:
             for number, text in enumerate([*damaged(PAYLOADS["frigate"], 200), b" " * 10_000_000]):
@@ -307,13 +309,13 @@ async def test_damaged_payloads_end_nothing(start: Any, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["optipmb", "mapped", "axis", "frigate", "scenescape"])
 def test_damaged_payloads_get_a_path(name: str, tmp_path: Path) -> None:
     """An error in one of 200 payloads with a fault names a place that is in the payload."""
-    settings = load(None, {"inputs": {CAMERA: {"camera": str(calibration(tmp_path))}}}).settings
-    reader, refused = FrameReader(settings), []
-    mapping = mapping_of(MqttInput(topic="x", format=name, mapping=RADAR if name == "mapped" else None))
-    reader.read(json.dumps(PAYLOADS[name]).encode(), CAMERA, mapping)
+    needed = {"mapped": {"mapping": RADAR}, "frigate": {"only": {"after.camera": "gate"}}}.get(name, {})
+    given = {"camera": str(calibration(tmp_path)), "format": name} | needed
+    reader, refused = FrameReader(load(None, {"inputs": {CAMERA: given}}).settings), []
+    reader.read(json.dumps(PAYLOADS[name]).encode(), CAMERA)
     for text in damaged(PAYLOADS[name], 200):
         try:
-            reader.read(text, CAMERA, mapping)
+            reader.read(text, CAMERA)
         except MessageError as error:
             refused.append((error.path, text))
     assert len(refused) > 100
@@ -348,7 +350,8 @@ def calibration(folder: Path) -> Path:
 
 def read(settings: dict[str, Any], payload: Any) -> Any:
     text = payload if isinstance(payload, bytes) else json.dumps(payload).encode()
-    return FrameReader(Settings()).read(text, SENSOR.stream, PayloadMapping(MappingSettings(**settings)))
+    given = load(None, {"inputs": {SENSOR.stream: {"format": "mapped", "mapping": settings}}}).settings
+    return FrameReader(given).read(text, SENSOR.stream)
 
 
 def test_a_payload_of_another_maker_becomes_a_frame() -> None:
@@ -411,7 +414,7 @@ def test_the_settings_of_the_page(tmp_path: Path) -> None:
     file.write_text(re.findall(r"```toml\n(\[mqtt\.inputs.*?)```", text, re.DOTALL)[0])
     settings = load(file).settings
     payload = re.findall(r"```json\n(\{\"ts\".*?)```", text, re.DOTALL)[0]
-    (name,) = [name for name, one in settings.mqtt.inputs.items() if one.mapping]
+    (name,) = [name for name in settings.mqtt.inputs if "{1}" in name]
     made = json.loads(mqtt_inputs.tried(settings, name, payload.encode()))
     assert (made["labels"], made["score"]) == (["car"], [0.9])
     with pytest.raises(ValueError, match="option --input"):

@@ -161,6 +161,22 @@ def test_a_frame_that_is_sent_again_counts_once(endpoint: str, way: str) -> None
     assert len({(one.session, *one.id.tolist()) for one in tracks}) == 1
 
 
+@pytest.mark.parametrize("way", ["post", "socket"])
+def test_a_payload_of_another_maker_is_a_frame(start: Any, way: str) -> None:
+    """Of a stream whose format says so, be it a list; one of another sensor is refused with the path of `only`."""
+    mapping = {"objects": "[]", "class": "kind", "position": "at", "score": "conf", "score_scale": 0.01}
+    rules = {SENSOR.stream: {"format": "mapped", "mapping": mapping, "only": {"[0].unit": 7}}}
+    endpoint = start()[1]
+    payload = [{"kind": "car", "at": [9, 2, 1], "conf": 90, "unit": 7}, {"kind": "car", "at": [-9, 2, 1], "conf": 90}]
+    with Node(endpoint) as node, Edge(endpoint, inputs=rules) as edge:
+        other = sent(edge, [payload[0] | {"unit": 8}], way)["error"]
+        assert (other["path"], other["received"]) == ("[0].unit", "8")
+        assert sent(edge, [payload[0] | {"conf": 900}], way)["error"]["path"] == "[0].conf"
+        assert sent(edge, payload, way)["stream"] == SENSOR.stream
+        (tracks,) = node.tracks(SENSOR.stream, 1)
+    assert sorted(tracks.center[:, 0].tolist()) == [-9.0, 9.0]
+
+
 def test_incomplete_frames_say_nothing_of_other_objects(start: Any) -> None:
     """An object without a report for 9 s keeps its id, and ends after `missing_s`; frames sent again count once."""
     rules = {"site/*/lidar": {"complete": False, "missing_s": 10}}

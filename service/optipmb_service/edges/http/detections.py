@@ -126,7 +126,7 @@ class Senders:
         inputs = self._opened()
         with self.room.entered(caller.name):
             _check_type(request)
-            frames, is_array = self._frames.split(await self._body(request))
+            frames, is_array = self._frames.split(await self._body(request), stream)
             if is_array and wait_s:
                 raise schemas.MessageError(
                     "invalid_value", "wait", "one frame, not in an array", f"{len(frames)} frames"
