@@ -26,7 +26,7 @@ from typer.main import get_command
 from optipmb_service import __version__
 from optipmb_service.app import ENDING, health_command
 from optipmb_service.app.lifecycle import leave_or_restart
-from optipmb_service.app.processes import run_gateway, run_log, run_mqtt, run_ros2, run_router
+from optipmb_service.app.processes import run_bridge, run_gateway, run_log, run_ros2, run_router
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.settings import (
     DEFAULT_GRPC,
@@ -264,7 +264,7 @@ def mqtt_command(
         except (OSError, ValueError) as error:
             _wrong(str(error))
         return
-    leave_or_restart(asyncio.run(run_mqtt(settings)))
+    leave_or_restart(asyncio.run(run_bridge(settings, "mqtt")))
 
 
 @app.command("log")

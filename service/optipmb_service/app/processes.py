@@ -8,13 +8,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
+from importlib import import_module
 from typing import TYPE_CHECKING, Final
 
 import structlog
 
 from optipmb_service.app.lifecycle import grpc_edge, report_ready, run, run_client, sessions_of, unless
 from optipmb_service.telemetry.health import BEAT_S, Component
-from optipmb_service.telemetry.metrics import INPUT_METRICS, LOG_METRICS, MQTT_METRICS, PROBLEM_METRICS
+from optipmb_service.telemetry.metrics import LOG_METRICS, PROBLEM_METRICS
 from optipmb_service.zenoh.client import Client
 
 if TYPE_CHECKING:
@@ -49,15 +50,15 @@ async def run_gateway(settings: Settings) -> int:
     return await run_client(settings, serve)
 
 
-async def run_mqtt(settings: Settings) -> int:
-    from optipmb_service.edges.mqtt import Bridge  # noqa: PLC0415 - an extra that only this needs
+async def run_bridge(settings: Settings, name: str) -> int:
+    """Run the `Bridge` of a module of `edges`, as `edges.mqtt` has one."""
+    module = import_module(f"optipmb_service.edges.{name}")  # with an extra that only this needs
 
     async def serve(asked: StopRequest, health: ProcessHealth, client: Client) -> None:
-        bridge = Bridge(settings, client, sessions_of(settings))
-        health.metrics.add(MQTT_METRICS, lambda: bridge)
-        health.metrics.add(INPUT_METRICS, lambda: bridge.inputs)
+        bridge = module.Bridge(settings, client, sessions_of(settings))
+        bridge.add_metrics(health.metrics)
         running = asyncio.create_task(bridge.run())
-        report_ready(settings, health, bridge, "mqtt", settings.mqtt.broker, broker=settings.mqtt.broker)
+        report_ready(settings, health, bridge, name, *bridge.about.values(), **bridge.about)
         stop = asyncio.create_task(asked.wait())
         await asyncio.wait((stop, running), return_when=asyncio.FIRST_COMPLETED)
         health.ends()
@@ -70,7 +71,7 @@ async def run_mqtt(settings: Settings) -> int:
 
 
 async def run_ros2(settings: Settings) -> int:
-    from optipmb_service.edges.ros2.node import Ros2Node  # noqa: PLC0415 - as above
+    from optipmb_service.edges.ros2.node import Ros2Node  # noqa: PLC0415 - an extra that only this needs
     from optipmb_service.edges.ros2.work import Work  # noqa: PLC0415 - as above
 
     async def serve(asked: StopRequest, health: ProcessHealth) -> bool | None:

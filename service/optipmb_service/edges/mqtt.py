@@ -36,6 +36,7 @@ from optipmb_service.edges.inputs import Inputs
 from optipmb_service.edges.mqtt_inputs import RECEIVED, MqttInputs
 from optipmb_service.edges.readers import Bounds, Feeds, Reader, Text, Wish, places_of
 from optipmb_service.telemetry.health import Component
+from optipmb_service.telemetry.metrics import INPUT_METRICS, MQTT_METRICS
 
 if TYPE_CHECKING:
     import ssl
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
 
     from optipmb_service.edges.readers import Publication
     from optipmb_service.settings import Settings
+    from optipmb_service.telemetry.metrics import Metrics
     from optipmb_service.zenoh.client import Client
 
 T = TypeVar("T")
@@ -234,6 +236,9 @@ MANY_S: Final = 60.0
 class Bridge(Component):
     """From the network to the broker. Create and run it on one loop.
 
+    Attributes:
+        about: for the log, where it works.
+
     Args:
         settings: of the process.
         client: on the network; it is closed by the caller, after this.
@@ -246,6 +251,7 @@ class Bridge(Component):
     def __init__(self, settings: Settings, client: Client, sessions: Callable[[str], str] = str) -> None:
         super().__init__(client)
         self.inputs = Inputs(settings, client, "mqtt", sessions)
+        self.about = {"broker": settings.mqtt.broker}
         self._sources = MqttInputs(settings, self.inputs)
         self._denied: dict[str, str] = {}
         self.connected = False
@@ -288,6 +294,11 @@ class Bridge(Component):
         """Why the newest message was refused, by topic."""
         self._impossible: collections.OrderedDict[str, tuple[int, float]] = collections.OrderedDict()
         """Size that ended connections, and when, by topic."""
+
+    def add_metrics(self, metrics: Metrics) -> None:
+        """Add the figures of the bridge, and of its inputs, to those of the process."""
+        metrics.add(MQTT_METRICS, lambda: self)
+        metrics.add(INPUT_METRICS, lambda: self.inputs)
 
     @property
     def lost(self) -> int:
