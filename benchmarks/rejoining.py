@@ -41,7 +41,7 @@ from optipmb_tools.evaluation.clear import clear, combine
 from optipmb_tools.evaluation.hota import evaluate_hota
 from optipmb_tools.results import full_table, stacked
 from optipmb_tools.run import profiles
-from optipmb_tools.run.rejoining import Rejoin, joins, tracklets
+from optipmb_tools.run.rejoining import RejoinOptions, joins, tracklets
 from optipmb_tools.run.tracking import tracker_frame
 
 import optipmb
@@ -99,7 +99,7 @@ class How:
     def joins(self, tracks: dict[int, Tracks], parameters: Parameters) -> tuple[Tracklets, tuple[Ints, Ints, Floats]]:
         """Return the confirmed tracks and the joins."""
         found = tracklets(tracks, parameters.labels)
-        return found, decided(tracks, found) if self.online else joins(found, parameters, Rejoin.gap_s)
+        return found, decided(tracks, found) if self.online else joins(found, parameters, RejoinOptions.gap_s)
 
     def numbers(self, tracks: dict[int, Tracks], parameters: Parameters) -> Ints:
         """Return the object of each row, -1 of one that has none."""
@@ -107,7 +107,9 @@ class How:
             return stacked(list(tracks.values()), "object").astype(np.int64)
         stamps = np.repeat([one.stamp_ns for one in tracks.values()], [len(one.id) for one in tracks.values()])
         identity = ids_of(tracks)
-        number = Rejoin(min_probability=self.least).objects(tracks, parameters).columns(identity, stamps)["object"]
+        number = (
+            RejoinOptions(min_probability=self.least).objects(tracks, parameters).columns(identity, stamps)["object"]
+        )
         return np.where(number < 0, identity, number)
 
 
@@ -251,7 +253,7 @@ def main() -> None:
     parser.add_argument("--vectors", type=float, default=0.0, help="length of what changes in them, as 1.25")
     parser.add_argument("--min-probability", type=float, help="default: that of the product")
     given = parser.parse_args()
-    default = optipmb.Rejoin.min_probability if given.online else Rejoin.min_probability
+    default = optipmb.Rejoin.min_probability if given.online else RejoinOptions.min_probability
     how = How(given.min_probability or default, given.online, given.vectors)
     if given.seeds:
         generated(given.seeds, how, given.scenes)

@@ -14,7 +14,7 @@ from matplotlib.patches import Ellipse, Rectangle
 from optipmb_tools.cli import run
 from optipmb_tools.datasets import open_dataset
 from optipmb_tools.run import profiles
-from optipmb_tools.run.rejoining import Rejoin, tracklets
+from optipmb_tools.run.rejoining import RejoinOptions, tracklets
 from optipmb_tools.run.tracking import track_whole
 
 import optipmb
@@ -304,7 +304,7 @@ def draw_gap(axes: Axes) -> None:
         (sequence,) = open_dataset("table", table).sequences(["all"])
         parameters = profiles.profile_for("auto", [sequence])
         tracks = track_whole(parameters, sequence).tracks
-    found, objects = tracklets(tracks, parameters.labels), Rejoin().objects(tracks, parameters)
+    found, objects = tracklets(tracks, parameters.labels), RejoinOptions().objects(tracks, parameters)
     object_of = dict(zip(objects.id.tolist(), objects.object.tolist(), strict=True))
     earlier, later = np.flatnonzero([parameters.labels[one] == "car" for one in found.label.tolist()]).tolist()
     ends = found.take(np.array([earlier]))

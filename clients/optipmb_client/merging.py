@@ -41,7 +41,7 @@ class Novelty(enum.Enum):
     REPEATED = "nothing: the same tracks, or older ones"
 
 
-class _Frame(NamedTuple):
+class _Newest(NamedTuple):
     """Digest of the tracks of a frame that hold, and the newest (run, revision) of each session."""
 
     digest: bytes
@@ -52,7 +52,7 @@ class Merging:
     """Remembers what holds of each of the newest `capacity` frames, by numbers and a digest: some 500 bytes each."""
 
     def __init__(self, capacity: int) -> None:
-        self._frames: collections.OrderedDict[tuple[str, str | None, bytes, int], _Frame] = collections.OrderedDict()
+        self._frames: collections.OrderedDict[tuple[str, str | None, bytes, int], _Newest] = collections.OrderedDict()
         self._capacity = capacity
 
     def take(self, tracks: Tracks) -> Novelty:
@@ -64,7 +64,7 @@ class Merging:
         if known is not None and order <= known.newest.get(tracks.session, (-1, 0)):
             return Novelty.REPEATED
         digest = _digest(tracks)
-        self._frames[key] = _Frame(digest, {**(known.newest if known else {}), tracks.session: order})
+        self._frames[key] = _Newest(digest, {**(known.newest if known else {}), tracks.session: order})
         if known is not None:
             return Novelty.REPEATED if digest == known.digest else Novelty.CORRECTION
         if len(self._frames) > self._capacity:

@@ -83,7 +83,7 @@ class _Properties(Struct):
     transforms: dict[str, _Transform] = {}
 
 
-class _Frame(Struct):
+class _LabelFrame(Struct):
     frame_properties: _Properties = field(default_factory=_Properties)
     objects: dict[str, Any] = {}
 
@@ -117,7 +117,7 @@ def openlabel_records(path: Path, content: Any) -> list[dict[str, Any]]:
     wrong = next((key for key in whole.frames if not key.isdecimal()), None)
     if wrong is not None:
         raise DatasetError(path, "numbers as the keys of openlabel.frames", repr(wrong))
-    frames = {int(key): _converted(path, f"frames.{key}", one, _Frame) for key, one in whole.frames.items()}
+    frames = {int(key): _converted(path, f"frames.{key}", one, _LabelFrame) for key, one in whole.frames.items()}
     records: list[dict[str, Any]] = []
     flat: list[dict[str, Any]] = []
     for number, frame in sorted(frames.items()):
@@ -182,7 +182,7 @@ def _time(path: Path, place: str, value: str | float | None) -> dict[str, Any]:
 
 
 def _objects(
-    path: Path, place: str, number: int, frame: _Frame, static: Mapping[str, _Object]
+    path: Path, place: str, number: int, frame: _LabelFrame, static: Mapping[str, _Object]
 ) -> Iterator[tuple[str, str, str, _Data]]:
     """Yield place, id, class and data of the objects of a frame, then of standing ones."""
     for name, value in frame.objects.items():

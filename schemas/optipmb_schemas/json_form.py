@@ -83,7 +83,7 @@ FIELDS: Final = frozenset(msgspec.structs.asdict(EdgeTrack(0))) - {"id", "kind"}
 """Fields of an object that a reader may choose; `id` is always there."""
 
 
-class _Frame(Struct, frozen=True, tag_field="type", kw_only=True):
+class _FrameForm(Struct, frozen=True, tag_field="type", kw_only=True):
     stream: Annotated[str, Meta(description="Name of the stream.")]
     sensor: Annotated[str, Meta(description="Stream of the detections.")]
     time: Annotated[str, Meta(description="Time of the frame in UTC; absent if not in 2000 to 2100.")] | UnsetType = (
@@ -100,7 +100,7 @@ class _Frame(Struct, frozen=True, tag_field="type", kw_only=True):
     ) = UNSET
 
 
-class EdgeTracks(_Frame, frozen=True, tag="tracks", kw_only=True):
+class EdgeTracks(_FrameForm, frozen=True, tag="tracks", kw_only=True):
     """The tracks of one frame, also when there are none."""
 
     objects: Annotated[list[EdgeTrack], Meta(description="The tracks, ordered by id.")]
@@ -111,7 +111,7 @@ class EdgeTracks(_Frame, frozen=True, tag="tracks", kw_only=True):
     stale: Annotated[bool, Meta(description="Whether that is more than `stale_s`.")] | UnsetType = UNSET
 
 
-class EdgeEvent(_Frame, frozen=True, tag="event", kw_only=True, rename={"name": "class"}):
+class EdgeEvent(_FrameForm, frozen=True, tag="event", kw_only=True, rename={"name": "class"}):
     """What a track did in a zone or at a line."""
 
     zone: Annotated[str, Meta(description="Name of the zone or line.")]
@@ -134,7 +134,7 @@ class EdgeEvent(_Frame, frozen=True, tag="event", kw_only=True, rename={"name": 
     event_id: Annotated[str, Meta(description="Where a reader goes on: `after`. Absent over MQTT.")] | UnsetType = UNSET
 
 
-class EdgeZones(_Frame, frozen=True, tag="zones", kw_only=True):
+class EdgeZones(_FrameForm, frozen=True, tag="zones", kw_only=True):
     """Counts of the zones and lines after a frame, once a second."""
 
     zones: Annotated[

@@ -5,7 +5,7 @@ from functools import cache
 import gaps
 import numpy as np
 import pytest
-from optipmb_tools.run.rejoining import Rejoin, joins, tracklets
+from optipmb_tools.run.rejoining import RejoinOptions, joins, tracklets
 
 from optipmb import generic_parameters
 
@@ -21,7 +21,7 @@ def judged() -> gaps.Judged:
             recording = gaps.record(name, seed)
             tracks = gaps.tracked(recording.frames, parameters)
             rows = tracklets(tracks, parameters.labels)
-            joined = joins(rows, parameters, Rejoin.gap_s)
+            joined = joins(rows, parameters, RejoinOptions.gap_s)
             found += gaps.judge(rows, joined, gaps.owners(tracks, recording.source))
     return found
 

@@ -10,7 +10,7 @@ from optipmb_client import Publisher, Subscriber
 from optipmb_client.errors import ConnectionFailed
 from optipmb_client.incoming import Inbox
 from optipmb_client.zenoh import Connection
-from optipmb_client.zenoh.handles import Reading, Sender
+from optipmb_client.zenoh.handles import Dispatcher, Sender
 from optipmb_client.zenoh.session import MOST_KEYS
 
 ALONE: Final = '{mode: "peer", scouting: {delay: 0, multicast: {enabled: false}}, listen: {endpoints: []}}'
@@ -28,7 +28,7 @@ def _plain_cached(connection: Connection, key: str) -> Sender:
     return connection.plain_sender(key, "", cache=1)
 
 
-def _subscribed(connection: Connection, key: str) -> Reading:
+def _subscribed(connection: Connection, key: str) -> Dispatcher:
     return connection.subscribe(key, Inbox(1))
 
 

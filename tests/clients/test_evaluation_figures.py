@@ -13,7 +13,7 @@ from optipmb_tools.cli import run
 from optipmb_tools.datasets import DatasetError, open_dataset
 from optipmb_tools.datasets.kitti import KittiSequence
 from optipmb_tools.evaluation import default_rules, evaluate_files
-from optipmb_tools.evaluation.evaluate import Settings, evaluate_figures, load_recordings
+from optipmb_tools.evaluation.evaluate import FigureOptions, evaluate_figures, load_recordings
 from optipmb_tools.results.kitti import LEAST_SHOWN, read_kitti_results
 from optipmb_tools.table_files import write_table
 from real_data import kitti_root, nuscenes_root
@@ -96,7 +96,7 @@ def test_the_best_threshold_serves_all_figures(kitti: tuple[Path, Path]) -> None
     assert cars.best is not None
     assert cars.best.threshold == cars.ab3dmot[0].threshold
     assert cars.best.gospa.false < cars.everything.gospa.false
-    (given,) = evaluate_figures("kitti", recordings, ("Car",), Settings(limits=(0.5,)), {"Car": 2.0})
+    (given,) = evaluate_figures("kitti", recordings, ("Car",), FigureOptions(limits=(0.5,)), {"Car": 2.0})
     assert [result.limit for result in given.ab3dmot] == [0.5]
     assert given.best is not None
     assert given.best.hota.hota == 0.0

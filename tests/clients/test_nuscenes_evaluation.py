@@ -19,13 +19,13 @@ from optipmb_tools.datasets import DatasetError
 from optipmb_tools.datasets.nuscenes import NuScenesDataset, NuScenesSequence
 from optipmb_tools.evaluation.cases import Case
 from optipmb_tools.evaluation.nuscenes import (
-    Event,
-    Matching,
     NuScenesClass,
     NuScenesConfig,
     NuScenesScene,
     NuScenesScores,
+    ObjectState,
     Racks,
+    ThresholdMatches,
     TrackBoxes,
     evaluate_nuscenes,
     evaluate_scenes,
@@ -226,7 +226,7 @@ def naive_match(truth: Sequence[Row], tracks: Sequence[tuple[Row, float]], thres
         for one in objects:
             old = [t for t in free if t[1] == last.get(one[1]) and metres[one, t] < 2.0]
             if old and old[0] not in [row for _, row in chosen.values()]:
-                chosen[one] = (Event.MATCH, old[0])
+                chosen[one] = (ObjectState.MATCH, old[0])
         rest = [one for one in objects if one not in chosen]
         left = [t for t in free if t not in [row for _, row in chosen.values()]]
         best: tuple[tuple[int, float], list[tuple[Row, Row]]] = ((0, 0.0), [])
@@ -234,9 +234,9 @@ def naive_match(truth: Sequence[Row], tracks: Sequence[tuple[Row, float]], thres
             some = [(o, t) for o, t in zip(rest, order, strict=True) if t is not None and metres[o, t] < 2.0]
             best = min(best, ((-len(some), sum(metres[one] for one in some)), some), key=lambda pair: pair[0])
         for one, t in best[1]:
-            chosen[one] = (Event.SWITCH if last.get(one[1], t[1]) != t[1] else Event.MATCH, t)
+            chosen[one] = (ObjectState.SWITCH if last.get(one[1], t[1]) != t[1] else ObjectState.MATCH, t)
         for one in objects:
-            event, row = chosen.get(one, (Event.MISS, None))
+            event, row = chosen.get(one, (ObjectState.MISS, None))
             result.append((int(event), 0.0 if row is None else metres[one, row]))
             if row is not None:
                 last[one[1]] = row[1]
@@ -261,12 +261,12 @@ def test_matching_is_the_definition(seed: int) -> None:
     scores = {one: float(chance.random()) for one in range(10, 14)}
     made = pairing(truth, tracks, [scores[row[1]] for row in tracks])
     for threshold in (-math.inf, 0.5):
-        found = Matching.of(made, threshold)
+        found = ThresholdMatches.of(made, threshold)
         wanted = naive_match(truth, [(row, scores[row[1]]) for row in tracks], threshold)
         assert found.event.tolist() == [event for event, _ in wanted]
         assert found.distance == pytest.approx([metres for _, metres in wanted])
         kept = [row for row in tracks if scores[row[1]] >= threshold]
-        assert found.false_positives == len(kept) - sum(event != Event.MISS for event, _ in wanted)
+        assert found.false_positives == len(kept) - sum(event != ObjectState.MISS for event, _ in wanted)
         assert found.frames == len({row[0] for row in (*truth, *kept)})
 
 

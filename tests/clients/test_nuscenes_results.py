@@ -16,7 +16,7 @@ from optipmb_tools.datasets import DatasetError
 from optipmb_tools.datasets.nuscenes import NuScenesDataset, NuScenesSequence
 from optipmb_tools.results.nuscenes import NUSCENES_MAX_BOXES, read_nuscenes_results, result_table
 from optipmb_tools.results.output import Results
-from optipmb_tools.run.replay import Pace, Replaying, replay
+from optipmb_tools.run.replay import Replaying, ReplayPace, replay
 
 SCENES = [crowd("scene-0103", 1, 6), crowd("scene-0916", 2, 5, 1_538_984_233_000_000)]
 FILE = "tracking_results.json"
@@ -170,7 +170,7 @@ def test_other_classes_are_refused(root: Path, tmp_path: Path) -> None:
 def test_replaying_scenes_at_once_writes_the_same_file(endpoint: str, root: Path, tmp_path: Path) -> None:
     """Scenes replayed at the same time through a service give the file that one after the other gives."""
     dataset = NuScenesDataset(root)
-    pace = Pace(patience_s=3.0, service_s=5.0)
+    pace = ReplayPace(patience_s=3.0, service_s=5.0)
     with FakeService(endpoint), Connection(endpoint) as link:
         for streams in (1, 2):
             out = tmp_path / str(streams)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from optipmb_schemas import Tracks
 from optipmb_tools.datasets import open_dataset
 from optipmb_tools.run import rejoining
-from optipmb_tools.run.rejoining import Rejoin, joins, matching, tracklets
+from optipmb_tools.run.rejoining import RejoinOptions, joins, matching, tracklets
 from optipmb_tools.table_files import read_table
 from scipy.linalg import expm
 from scipy.optimize import Bounds, LinearConstraint, milp
@@ -145,7 +145,7 @@ def tracks(request: pytest.FixtureRequest) -> dict[int, Tracks]:
     return gaps.tracked(gaps.record(request.param, 7, 40.0).frames, GENERIC)
 
 
-def rows_of(tracks: dict[int, Tracks], how: Rejoin) -> list[tuple[Tracks, Any, Any]]:
+def rows_of(tracks: dict[int, Tracks], how: RejoinOptions) -> list[tuple[Tracks, Any, Any]]:
     objects = how.objects(tracks, GENERIC)
     found = []
     for one in tracks.values():
@@ -156,7 +156,7 @@ def rows_of(tracks: dict[int, Tracks], how: Rejoin) -> list[tuple[Tracks, Any, A
 
 def test_an_object_is_one_track_in_a_frame(tracks: dict[int, Tracks]) -> None:
     """An object is a confirmed track of no higher id, once in a frame, and with a product of sure joins."""
-    rows = rows_of(tracks, Rejoin(min_probability=0.6))
+    rows = rows_of(tracks, RejoinOptions(min_probability=0.6))
     confirmed = {int(n) for one in tracks.values() if one.confirmed is not None for n in one.id[one.confirmed > 0]}
     first = {int(n) for one, *_ in reversed(rows) for n in one.id}
     assert first
@@ -210,7 +210,7 @@ def test_joins_do_not_depend_on_axes_origin_and_names(tracks: dict[int, Tracks])
 
 def test_a_car_behind_a_building_is_the_same_object() -> None:
     """A car that is hidden for four seconds and goes on as before is joined; its first id is the object."""
-    rows = rows_of(gaps.tracked(gaps.cars((0, 3, (0, 0), (8, 0)), (7, 10, (0, 0), (8, 0))), GENERIC), Rejoin())
+    rows = rows_of(gaps.tracked(gaps.cars((0, 3, (0, 0), (8, 0)), (7, 10, (0, 0), (8, 0))), GENERIC), RejoinOptions())
     one, number, _ = rows[-1]
     assert one.id.tolist() == [2]
     assert number.tolist() == [1]
@@ -226,7 +226,7 @@ def test_of_two_equal_candidates_none_is_joined() -> None:
 def test_a_gap_beyond_the_limit_is_not_joined() -> None:
     """A gap of four seconds is not joined where three are allowed."""
     tracks = gaps.tracked(gaps.cars((0, 3, (0, 0), (8, 0)), (7, 10, (0, 0), (8, 0))), GENERIC)
-    objects = Rejoin(gap_s=3.0).objects(tracks, GENERIC)
+    objects = RejoinOptions(gap_s=3.0).objects(tracks, GENERIC)
     assert (objects.object == objects.id).all()
 
 
@@ -238,7 +238,7 @@ def test_what_is_unknown_of_a_box_counts_nothing() -> None:
     found = gaps.tracked(frames, GENERIC)
     short = tracklets(found, GENERIC.labels)
     assert np.isnan(short.size[:, :2]).all()
-    objects = Rejoin(min_probability=0.9).objects(found, GENERIC)
+    objects = RejoinOptions(min_probability=0.9).objects(found, GENERIC)
     assert len(set(objects.object.tolist())) < len(objects.id)
 
 

@@ -11,11 +11,11 @@ from fake_service import Behaviour, FakeService
 from optipmb_client import Connection, ServiceRefused
 from optipmb_schemas import Detections, Tracks
 from optipmb_tools.datasets import Dataset, open_dataset
-from optipmb_tools.run.replay import Pace, ReplayedSequence, Replaying, replay
+from optipmb_tools.run.replay import ReplayedSequence, Replaying, ReplayPace, replay
 from router import until
 
 FRAMES = 24
-QUICK = Pace(patience_s=60.0, service_s=60.0)
+QUICK = ReplayPace(patience_s=60.0, service_s=60.0)
 
 
 @pytest.fixture(scope="module")
@@ -92,10 +92,11 @@ def test_frames_without_clouds_say_that_none_comes(endpoint: str, link: Connecti
 
 
 @pytest.mark.parametrize(
-    ("pace", "seq", "most"), [(Pace(window=4, patience_s=60.0), 0, 4), (Pace(speed=1.0, patience_s=60.0), 2, 6)]
+    ("pace", "seq", "most"),
+    [(ReplayPace(window=4, patience_s=60.0), 0, 4), (ReplayPace(speed=1.0, patience_s=60.0), 2, 6)],
 )
 def test_frames_sent_ahead_are_bounded(
-    endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path, pace: Pace, seq: int, most: int
+    endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path, pace: ReplayPace, seq: int, most: int
 ) -> None:
     """Without tracks, at full speed a window of frames is sent ahead, at the recorded rate four frames with clouds.
 
@@ -123,7 +124,7 @@ def test_recorded_pace_is_kept(endpoint: str, link: Connection, dataset: Dataset
     """At twice the recorded rate, n frames of 0.1 s take (n - 1) / 20 s, whether or not tracks are slow."""
     with FakeService(endpoint) as service:
         begun = time.monotonic()
-        (result,) = run(link, dataset, tmp_path, pace=Pace(speed=2.0, patience_s=60.0))
+        (result,) = run(link, dataset, tmp_path, pace=ReplayPace(speed=2.0, patience_s=60.0))
         took = time.monotonic() - begun
     assert result.missing == 0
     assert took >= 0.05 * (FRAMES - 1)
@@ -138,7 +139,7 @@ def test_lost_tracks_are_reported_as_missing(endpoint: str, link: Connection, da
         return [] if message.seq in lost else [tracks]
 
     with FakeService(endpoint, Behaviour(answer)):
-        (result,) = run(link, dataset, tmp_path, pace=Pace(patience_s=1e6))
+        (result,) = run(link, dataset, tmp_path, pace=ReplayPace(patience_s=1e6))
     assert (result.sent, result.returned, result.missing) == (FRAMES, FRAMES - 3, 3)
     frames = {int(line.split()[0]) for line in result.file.read_text().splitlines()}
     assert frames.isdisjoint(lost)
@@ -154,7 +155,7 @@ def test_a_service_that_falls_silent_ends_the_replay(
         return [tracks] if message.seq < 5 else []
 
     with FakeService(endpoint, Behaviour(answer)):
-        (result,) = run(link, dataset, tmp_path, pace=Pace(patience_s=6.0))
+        (result,) = run(link, dataset, tmp_path, pace=ReplayPace(patience_s=6.0))
     assert (result.returned, result.missing) == (5, FRAMES - 5)
     assert result.sent == 5 + 8
 
@@ -180,7 +181,7 @@ def test_a_service_that_comes_late_is_waited_for(
     """A replay started just before its service goes through."""
     results: list[ReplayedSequence] = []
     thread = threading.Thread(
-        target=lambda: results.extend(run(link, dataset, tmp_path, pace=Pace(service_s=20.0))), daemon=True
+        target=lambda: results.extend(run(link, dataset, tmp_path, pace=ReplayPace(service_s=20.0))), daemon=True
     )
     thread.start()
     with FakeService(endpoint):

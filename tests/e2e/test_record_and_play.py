@@ -18,7 +18,7 @@ from optipmb_schemas import Tracks, decode, encode
 from optipmb_tools.cli import run
 from optipmb_tools.datasets import Dataset, DatasetError, open_dataset
 from optipmb_tools.recordings.files import RecordingFile
-from optipmb_tools.run.replay import Pace, Replaying, replay
+from optipmb_tools.run.replay import Replaying, ReplayPace, replay
 from real_data import REPOSITORY
 from service_process import ServiceProcess
 
@@ -98,7 +98,7 @@ def recorded_replay(service: ServiceProcess, folder: Path, dataset: "Dataset", *
 
     with recording(service, path) as process:
         with Connection(service.endpoint) as connection:
-            pace = Pace(patience_s=2 * DEADLINE_S)
+            pace = ReplayPace(patience_s=2 * DEADLINE_S)
             replayed = replay(
                 connection,
                 dataset,

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 from optipmb_schemas import Tracks
-from optipmb_tools.run.rejoining import Rejoin
+from optipmb_tools.run.rejoining import RejoinOptions
 from optipmb_tools.run.tracking import fields_of
 
 import optipmb
@@ -417,7 +417,7 @@ def judge(
     gaps = []
     for j in np.flatnonzero(begun != FALSE_OBJECT).tolist():
         gap = (found.first_ns[j] - found.last_ns) * 1e-9
-        same = np.flatnonzero((ended == begun[j]) & (gap > 0.0) & (gap <= Rejoin.gap_s))
+        same = np.flatnonzero((ended == begun[j]) & (gap > 0.0) & (gap <= RejoinOptions.gap_s))
         if len(same):
             i = int(same[gap[same].argmin()])
             gaps.append((gap[i], by.get((i, j), 0.0)))

@@ -16,7 +16,7 @@ from optipmb_schemas.certificates import end_of, ended
 from optipmb_client.errors import ConnectionFailed
 from optipmb_client.incoming import Answer, Inbox
 from optipmb_client.zenoh.configuration import BUSY, certificates, configured
-from optipmb_client.zenoh.handles import Reading, Sender
+from optipmb_client.zenoh.handles import Dispatcher, Sender
 from optipmb_client.zenoh.session import CACHED, Session, opened
 
 __all__ = ["DEFAULT_ENDPOINT", "Connection"]
@@ -99,7 +99,7 @@ class Connection:
         """Open what sends the detections and the clouds of a stream, each keeping the newest for recovery."""
         return self._session.senders(Keys(prefix), stream, cache=cache, cache_clouds=cache_clouds)
 
-    def subscribe(self, pattern: str, inbox: Inbox, *, history: bool = True) -> Reading:
+    def subscribe(self, pattern: str, inbox: Inbox, *, history: bool = True) -> Dispatcher:
         """Move all that is published under `pattern` into `inbox`; losses are recovered from the publishers' caches.
 
         With `history`, what those caches hold from before the subscription comes first.

@@ -15,7 +15,7 @@ from optipmb_schemas import Message, Problem, encode, encoding_of
 
 from optipmb_client.errors import ConnectionFailed
 
-__all__ = ["Channel", "Declared", "Query", "Reading", "Sender", "directly", "reason", "usable"]
+__all__ = ["Declared", "Dispatcher", "ItemQueue", "Query", "Sender", "directly", "reason", "usable"]
 
 CLOSE_S = 5.0
 """Longest wait of `close` until received items are handed over."""
@@ -111,7 +111,7 @@ class Sender(Declared):
         self._withdraw(lambda: publisher)  # the reference ends with the function
 
 
-class Reading:
+class Dispatcher:
     """A subscription or queryable whose items a daemon thread hands over, one after the other.
 
     Args:
@@ -130,7 +130,7 @@ class Reading:
         items: Iterable[_Item],
         receive: Callable[[_Item], None],
         failed: Callable[[str], object],
-        ended: "Callable[[Reading], None]",
+        ended: "Callable[[Dispatcher], None]",
     ) -> None:
         def drain() -> None:
             with contextlib.suppress(zenoh.ZError):  # how Zenoh's channels end
@@ -149,7 +149,7 @@ class Reading:
     def withdraw(self) -> None:
         """Withdraw it; items received before are still handed over."""
         self._declared.close()
-        if isinstance(self._items, Channel):
+        if isinstance(self._items, ItemQueue):
             self._items.close()
 
     def close(self, timeout: float = CLOSE_S) -> None:
@@ -160,7 +160,7 @@ class Reading:
         self._ended(self)
 
 
-class Channel(Generic[_Item]):
+class ItemQueue(Generic[_Item]):
     """Items from the threads of the network, in their order, for one thread that iterates over them.
 
     Zenoh's own channels wake their reader ten times a second, to look for signals.

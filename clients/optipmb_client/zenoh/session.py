@@ -19,7 +19,17 @@ from optipmb_schemas import Detections, Keys, Points, Problem, encoding_of
 from optipmb_client.errors import ConnectionFailed
 from optipmb_client.incoming import Answer, Arrival
 from optipmb_client.trace_context import attached
-from optipmb_client.zenoh.handles import CLOSE_S, Channel, Declared, Query, Reading, Sender, directly, reason, usable
+from optipmb_client.zenoh.handles import (
+    CLOSE_S,
+    Declared,
+    Dispatcher,
+    ItemQueue,
+    Query,
+    Sender,
+    directly,
+    reason,
+    usable,
+)
 from optipmb_client.zenoh.late_join import ANSWER_S, CacheQueries, LateJoin
 
 __all__ = ["EVERYTHING", "NEWEST", "KeyNumbers", "Opened", "Sample", "Session", "opened"]
@@ -130,7 +140,7 @@ class Session:
         self._failed = failed
         self._lock = threading.Lock()
         self._keys = self._open_keys = 0
-        self._readings: set[Reading] = set()
+        self._readings: set[Dispatcher] = set()
         self._declared: set[Declared] = set()
         """References: Zenoh withdraws declarations without any. Senders are withdrawn so."""
         self._senders: weakref.WeakSet[Sender] = weakref.WeakSet()
@@ -239,7 +249,7 @@ class Session:
 
     # Receiving
 
-    def subscribe(self, key: str, receive: Callable[[Arrival], object], *, history: bool | None = None) -> Reading:
+    def subscribe(self, key: str, receive: Callable[[Arrival], object], *, history: bool | None = None) -> Dispatcher:
         """Hand over all that is published under `key`, on a thread of its own.
 
         Losses are recovered from the publishers' caches. What those caches hold from before comes first: with
@@ -266,7 +276,7 @@ class Session:
             queries.close()
             late_join.close()
 
-        samples: Channel[Sample] = Channel(SUBSCRIBED)
+        samples: ItemQueue[Sample] = ItemQueue(SUBSCRIBED)
         declared = self.listen(key, samples.put, recovers=True, history=EVERYTHING if history else None)
         if history is False:  # samples after the newest ones of the caches are new
             newest: list[Sample] = []
@@ -280,7 +290,7 @@ class Session:
             begun.wait(ANSWER_S)
         return self._read(key, declared, samples, late_join.take, ended)
 
-    def read_newest(self, key: str, receive: Callable[[Sample], None], *, most: int = 1) -> Reading:
+    def read_newest(self, key: str, receive: Callable[[Sample], None], *, most: int = 1) -> Dispatcher:
         """Hand over samples on a thread of its own; the newest `most` may wait."""
         with self._counted(PLAIN):
             subscriber = self._session.declare_subscriber(key, zenoh.handlers.RingChannel(most))
@@ -337,9 +347,9 @@ class Session:
             token = self._session.liveliness().declare_token(key)
         return self._keep(token.undeclare, 0)
 
-    def watch(self, pattern: str, changed: Callable[[str, bool], object]) -> Reading:
+    def watch(self, pattern: str, changed: Callable[[str, bool], object]) -> Dispatcher:
         """Tell which tokens of a pattern are there, and which come (True) and go, on a thread of its own."""
-        tokens: Channel[Sample] = Channel(CHANNEL)
+        tokens: ItemQueue[Sample] = ItemQueue(CHANNEL)
         with usable():
             subscriber = self._session.liveliness().declare_subscriber(pattern, directly(tokens.put), history=True)
 
@@ -348,9 +358,9 @@ class Session:
 
         return self._read(pattern, self._keep(subscriber.undeclare, 0), tokens, take)
 
-    def watch_links(self, changed: Callable[[str, str, bool], object]) -> Reading:
+    def watch_links(self, changed: Callable[[str, str, bool], object]) -> Dispatcher:
         """Tell the id and kind of the nodes and routers that are linked, and that come (True) and go."""
-        events: Channel[Any] = Channel(CHANNEL)
+        events: ItemQueue[Any] = ItemQueue(CHANNEL)
         with usable():
             listener = self._session.info.declare_transport_events_listener(directly(events.put), history=True)
 
@@ -368,7 +378,7 @@ class Session:
 
     # Queries
 
-    def serve(self, key: str, answer: Callable[[Query], None], *, most: int, refusal: Problem) -> Reading:
+    def serve(self, key: str, answer: Callable[[Query], None], *, most: int, refusal: Problem) -> Dispatcher:
         """Hand over the queries of a key expression on a thread of its own, in their order.
 
         Args:
@@ -378,7 +388,7 @@ class Session:
             refusal: Answer to those beyond.
         """
         room = threading.Semaphore(most)
-        queries: Channel[Query] = Channel(most)
+        queries: ItemQueue[Query] = ItemQueue(most)
 
         def take(query: zenoh.Query) -> None:
             if room.acquire(blocking=False):
@@ -469,12 +479,12 @@ class Session:
         items: Iterable[_Item],
         receive: Callable[[_Item], None],
         ended: Callable[[], None] = lambda: None,
-    ) -> Reading:
-        def forget(reading: Reading) -> None:
+    ) -> Dispatcher:
+        def forget(reading: Dispatcher) -> None:
             self._readings.discard(reading)
             ended()
 
-        reading = Reading(name, declared, items, receive, self._failed, forget)
+        reading = Dispatcher(name, declared, items, receive, self._failed, forget)
         self._readings.add(reading)
         return reading
 

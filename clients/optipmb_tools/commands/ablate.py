@@ -116,7 +116,7 @@ def sweep(
     report(result, *([] if out is None else [f"figures in {out}"]), as_json=as_json)
 
 
-def _source(opened: Data, profile: str | None, classes: list[str] | None) -> "tuple[str, Any, tuning.Source]":
+def _source(opened: Data, profile: str | None, classes: list[str] | None) -> "tuple[str, Any, tuning.TuningData]":
     """Return the name of the profile, its parameters, and the data to measure."""
     from optipmb_tools import tuning  # noqa: PLC0415  loads the tracker and its compiler
     from optipmb_tools.run.profiles import profile_compared  # noqa: PLC0415  as above
@@ -124,14 +124,14 @@ def _source(opened: Data, profile: str | None, classes: list[str] | None) -> "tu
     name = profile or opened.dataset.profile
     parameters = profile_compared(name, opened.sequences)
     detections = opened.dataset.arguments.detections
-    return name, parameters, tuning.Source.of(opened.name, detections, opened.sequences, parameters, classes)
+    return name, parameters, tuning.TuningData.of(opened.name, detections, opened.sequences, parameters, classes)
 
 
 def _head(command: str, opened: Data, profile: str) -> dict[str, Any]:
     return {"command": command, "dataset": opened.name, "profile": profile, "sequences": opened.names}
 
 
-def _measured(title: str, source: "tuning.Source", variants: "Many[Variant]") -> "list[Row]":
+def _measured(title: str, source: "tuning.TuningData", variants: "Many[Variant]") -> "list[Row]":
     """Measure variants of the tracker, with a progress bar."""
     from optipmb_tools.tuning import measure_variants  # noqa: PLC0415  as above
 

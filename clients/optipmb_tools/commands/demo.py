@@ -57,7 +57,7 @@ def demo(
 
     from optipmb_tools.datasets import Preloaded, open_dataset  # noqa: PLC0415  packages of this command alone
     from optipmb_tools.evaluation import combine, default_rules, evaluate_files  # noqa: PLC0415  as above
-    from optipmb_tools.run.replay import Pace, Replaying, replay  # noqa: PLC0415  as above
+    from optipmb_tools.run.replay import Replaying, ReplayPace, replay  # noqa: PLC0415  as above
     from optipmb_tools.run.service_process import ServiceProcess  # noqa: PLC0415  as above
     from optipmb_tools.views.pictures import draw_results  # noqa: PLC0415  as above
 
@@ -74,7 +74,7 @@ def demo(
             service.wait_until_ready(START_S)
             rate = "frame by frame" if pace is None else f"{pace:g} times as fast as recorded"
             progress.note(f"replaying through {service.endpoint}, {rate}")
-            how = Replaying(dataset.profile, Pace(speed=pace, window=1, patience_s=PATIENCE_S))
+            how = Replaying(dataset.profile, ReplayPace(speed=pace, window=1, patience_s=PATIENCE_S))
             with Connection(service.endpoint) as connection:
                 (replayed,) = replay(connection, dataset, [sequence], table, how, progress.advance)
         progress.note("comparing the tracks with the truth, drawing them")

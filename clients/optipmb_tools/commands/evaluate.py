@@ -205,13 +205,17 @@ def _evaluated(
     from optipmb_tools.evaluation import evaluate_files  # noqa: PLC0415  as above
     from optipmb_tools.evaluation.evaluate import (  # noqa: PLC0415  as above
         Evaluation,
-        Settings,
+        FigureOptions,
         class_average,
         figures_of,
     )
 
     asked = opened.dataset.arguments
-    settings = Settings((how.iou,), how.cutoff, how.order) if how.iou else Settings(cutoff=how.cutoff, order=how.order)
+    settings = (
+        FigureOptions((how.iou,), how.cutoff, how.order)
+        if how.iou
+        else FigureOptions(cutoff=how.cutoff, order=how.order)
+    )
     if opened.name == "nuscenes" and asked.root is not None:
         protocol = _nuscenes(asked.root, opened.names, tracks, names, how, by)
     else:

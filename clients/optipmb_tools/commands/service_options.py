@@ -8,7 +8,7 @@ import typer
 from optipmb_client.zenoh import DEFAULT_ENDPOINT, Connection
 from optipmb_schemas import PREFIX
 
-from optipmb_tools.run.replay import Pace
+from optipmb_tools.run.replay import ReplayPace
 
 Speed = Annotated[
     str, typer.Option("--speed", help="1: as recorded, 10: ten times as fast, max: as fast as tracks come back.")
@@ -26,8 +26,8 @@ class PaceOptions:
         float, typer.Option("--patience", min=1.0, help="End when no tracks come for so many seconds.")
     ] = 30.0
 
-    def pace(self) -> Pace:
-        return Pace(speed_of(self.speed), self.window, self.patience, self.wait)
+    def pace(self) -> ReplayPace:
+        return ReplayPace(speed_of(self.speed), self.window, self.patience, self.wait)
 
 
 def _endpoints(given: list[str] | None) -> list[str] | None:

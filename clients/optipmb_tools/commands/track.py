@@ -32,7 +32,7 @@ from optipmb_tools.table_files import is_table
 from optipmb_tools.views.progress import FrameProgress
 
 if TYPE_CHECKING:
-    from optipmb_tools.run.rejoining import Rejoin
+    from optipmb_tools.run.rejoining import RejoinOptions
     from optipmb_tools.run.tracking import TrackedSequence
 
 
@@ -107,7 +107,7 @@ class TrackOptions:
         typer.Option(metavar="[SCORE]", help="Write a submission; of KITTI confirmed tracks from this mean score on."),
     ] = None
 
-    def rejoining(self) -> "Rejoin | None":
+    def rejoining(self) -> "RejoinOptions | None":
         """Return which tracks are joined.
 
         Raises:
@@ -115,9 +115,9 @@ class TrackOptions:
         """
         if self.rejoin is None:
             return None
-        from optipmb_tools.run.rejoining import Rejoin  # noqa: PLC0415  only with this option
+        from optipmb_tools.run.rejoining import RejoinOptions  # noqa: PLC0415  only with this option
 
-        return Rejoin(self.rejoin, *() if self.min_probability is None else (self.min_probability,))
+        return RejoinOptions(self.rejoin, *() if self.min_probability is None else (self.min_probability,))
 
     def check_out(self, data: Data) -> None:
         """Refuse a file where the results are several; a bag of tracks holds one topic of a bag."""

@@ -90,7 +90,7 @@ def tune(data: LabelledOptions, *, how: TuneOptions, jobs: TuneJobs, as_json: As
     curves: tuning.Curves = {}
     if reference is not None:
         parameters, curves = tuning.calibrate_scores(asked, reference, chosen, parameters, how.classes, out, how.name)
-    source = tuning.Source.of(asked.name, asked.detections, chosen, parameters, how.classes)
+    source = tuning.TuningData.of(asked.name, asked.detections, chosen, parameters, how.classes)
     estimates = tuning.estimate_all(source, parameters, out)
     if not as_json:
         for one in estimates.values():

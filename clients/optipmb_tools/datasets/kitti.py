@@ -71,7 +71,7 @@ _MATRICES = {
 
 
 @dataclass(frozen=True)
-class Calibration:
+class KittiCalibration:
     """Matrices of one calibration file."""
 
     path: Path
@@ -99,7 +99,7 @@ class KittiSequence(DataSequence):
         return len(self._world_from_camera)
 
     @cached_property
-    def calibration(self) -> Calibration:
+    def calibration(self) -> KittiCalibration:
         return read_calibration(self._dataset.text("calib", self.name))
 
     @property
@@ -363,7 +363,7 @@ def read_scan(path: Path) -> Points:
     return read_points(path, "a velodyne scan", 4)
 
 
-def read_calibration(path: Path) -> Calibration:
+def read_calibration(path: Path) -> KittiCalibration:
     """Return the calibration of a sequence.
 
     Names may end in a colon or not, and both spellings in use are known (`R0_rect` and `R_rect`, `Tr_velo_to_cam` and
@@ -383,7 +383,7 @@ def read_calibration(path: Path) -> Calibration:
     rectified = np.eye(4)
     rectified[:3, :3] = found["R0_rect"]
     imu = _homogeneous(found["Tr_imu_to_velo"]) if "Tr_imu_to_velo" in found else None
-    return Calibration(path, found["P2"], rectified @ _homogeneous(found["Tr_velo_to_cam"]), imu)
+    return KittiCalibration(path, found["P2"], rectified @ _homogeneous(found["Tr_velo_to_cam"]), imu)
 
 
 def _homogeneous(matrix: Floats) -> Floats:
@@ -410,7 +410,7 @@ def read_poses(path: Path) -> Floats:
     return _homogeneous(matrices)
 
 
-def read_oxts(path: Path, calibration: Calibration) -> Floats:
+def read_oxts(path: Path, calibration: KittiCalibration) -> Floats:
     """Return the poses (F, 4, 4) world <- rectified camera from GPS/IMU packets; the world is camera frame 0.
 
     Position is the mercator projection of latitude and longitude, with the scale of the first latitude, and the

@@ -159,7 +159,7 @@ class PlannedFrame(NamedTuple):
 
 
 @dataclass
-class Plan:
+class TopicPlan:
     """Frames and clouds of one topic of detections."""
 
     topic: str
@@ -197,7 +197,7 @@ def read_transforms(bag: Bag, choice: Choice) -> Transforms:
     return transforms
 
 
-def plan(bag: Bag, topic: str, transforms: Transforms, choice: Choice) -> Plan:
+def plan(bag: Bag, topic: str, transforms: Transforms, choice: Choice) -> TopicPlan:
     """Return the plan of one topic of detections.
 
     Raises:
@@ -208,7 +208,7 @@ def plan(bag: Bag, topic: str, transforms: Transforms, choice: Choice) -> Plan:
         raise DatasetError(bag.path, f"messages on {topic}", "none")
     first = heads[0][0].frame
     world = choice.fixed_frame.removeprefix("/") or _root(bag, transforms, first)
-    made = Plan(topic, world)
+    made = TopicPlan(topic, world)
     without: list[TransformError] = []
     for head, received_ns in heads:
         try:
@@ -227,7 +227,7 @@ def plan(bag: Bag, topic: str, transforms: Transforms, choice: Choice) -> Plan:
     return made
 
 
-def _match_clouds(bag: Bag, made: Plan, transforms: Transforms, choice: Choice, sensor: str) -> None:
+def _match_clouds(bag: Bag, made: TopicPlan, transforms: Transforms, choice: Choice, sensor: str) -> None:
     topics = bag.of_type(CLOUD)
     if choice.points and choice.points not in topics:
         raise DatasetError("option points", f"one of {', '.join(topics) or 'no topics'}", choice.points)
@@ -298,7 +298,7 @@ def detection_topics(bag: Bag) -> tuple[str, ...]:
     return topics
 
 
-def write_bag(path: Path, bag: Bag, plan: Plan, tracks: Mapping[int, Tracks], *, keep_input: bool) -> Path:
+def write_bag(path: Path, bag: Bag, plan: TopicPlan, tracks: Mapping[int, Tracks], *, keep_input: bool) -> Path:
     """Write the tracks (world frame) of one topic of a bag, by frame index; return the file.
 
     With `keep_input` every message of the bag is copied too.
@@ -361,7 +361,7 @@ _CLASS = "class."
 class RosbagSequence(DataSequence):
     """One topic of detections."""
 
-    def __init__(self, bag: Bag, plan_: Plan, classes: Mapping[str, str], *, covariance: bool, skip: bool) -> None:
+    def __init__(self, bag: Bag, plan_: TopicPlan, classes: Mapping[str, str], *, covariance: bool, skip: bool) -> None:
         self.name = plan_.topic.strip("/").replace("/", ".")
         self.plan = plan_
         self.bag = bag

@@ -94,7 +94,7 @@ def evaluate_files(
 
 
 @dataclass(frozen=True)
-class Recording:
+class EvaluatedSequence:
     """One sequence with its truth and its tracks, both in the world frame."""
 
     sequence: DataSequence
@@ -104,7 +104,7 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class Settings:
+class FigureOptions:
     """Options of the figures."""
 
     limits: tuple[float, ...] = IOU_LIMITS  # least 3D intersections over union for AB3DMOT's protocol
@@ -157,7 +157,7 @@ class ClassFigures:
 
 def load_recordings(
     dataset: str, sequences: Sequence[DataSequence], results: Path, names: Sequence[str] = (), by: By = "id"
-) -> list[Recording]:
+) -> list[EvaluatedSequence]:
     """Return the sequences with their truth and their tracks, which each data set has in a layout of its own.
 
     Raises:
@@ -167,12 +167,12 @@ def load_recordings(
         return _nuscenes_recordings(sequences, results)
     pairs = zip(sequences, read_compared(sequences, results, names, by=by), strict=True)
     return [
-        Recording(one, truth, tracks.to_world(one.poses), read_full_tracks(result_file(results, one.name)))
+        EvaluatedSequence(one, truth, tracks.to_world(one.poses), read_full_tracks(result_file(results, one.name)))
         for one, (truth, tracks) in pairs
     ]
 
 
-def _nuscenes_recordings(sequences: Sequence[DataSequence], results: Path) -> list[Recording]:
+def _nuscenes_recordings(sequences: Sequence[DataSequence], results: Path) -> list[EvaluatedSequence]:
     submission, shown = read_nuscenes_results(results), shown_submission(results)
     recordings = []
     for sequence in sequences:
@@ -186,7 +186,7 @@ def _nuscenes_recordings(sequences: Sequence[DataSequence], results: Path) -> li
         reach = np.array([CLASS_RANGE.get(name, 0.0) for name in table.labels] or [0.0])
         near = sequence.ego_distance(table.frame, table.center) < reach[table.label]
         full = read_full_tracks(scene_file(submission.path.parent, sequence.name))
-        recordings.append(Recording(sequence, truth, table.take(near), full))
+        recordings.append(EvaluatedSequence(sequence, truth, table.take(near), full))
     return recordings
 
 
@@ -206,9 +206,9 @@ def class_average(figures: Sequence[ClassFigures]) -> dict[str, dict[str, float 
 
 def evaluate_figures(
     dataset: str,
-    recordings: Sequence[Recording],
+    recordings: Sequence[EvaluatedSequence],
     names: Sequence[str],
-    settings: Settings | None = None,
+    settings: FigureOptions | None = None,
     thresholds: Mapping[str, float] | None = None,
 ) -> list[ClassFigures]:
     """Return the figures of each class; classes that neither the truth nor the tracks have are left out.
@@ -221,7 +221,7 @@ def evaluate_figures(
         thresholds: lowest mean score of the tracks that are also evaluated without the others, by class; for KITTI by
             default the threshold with the highest MOTA of AB3DMOT's protocol at its first limit.
     """
-    settings, thresholds = settings or Settings(), thresholds or {}
+    settings, thresholds = settings or FigureOptions(), thresholds or {}
     present = {name for one in recordings for table in (one.truth, one.tracks) for name in table.names.tolist()}
     local = [
         (one.truth.to_sensor(one.sequence.poses), one.tracks.to_sensor(one.sequence.poses), one.sequence.name)
@@ -286,13 +286,13 @@ class Evaluation:
     data: DatasetArguments
     names: tuple[str, ...]  # of the sequences
     tracks: Path
-    settings: Settings
+    settings: FigureOptions
     classes: tuple[str, ...] = ()  # names that classes of truth and tracks are mapped to
     here: Sequence[DataSequence] | None = None  # the sequences, where this process has opened them
     by: By = "id"
 
     @cached_property
-    def recordings(self) -> Sequence[Recording]:
+    def recordings(self) -> Sequence[EvaluatedSequence]:
         """Truth and tracks; a process reads them once."""
         sequences = self.here or self.data.open().sequences(self.names)
         return load_recordings(self.data.name, sequences, self.tracks, self.classes, self.by)

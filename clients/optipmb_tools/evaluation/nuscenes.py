@@ -194,7 +194,7 @@ def interpolate(boxes: TrackBoxes, stamp_us: Ints) -> TrackBoxes:
     )
 
 
-class Event(IntEnum):
+class ObjectState(IntEnum):
     """State of an object in a frame."""
 
     MISS = 0
@@ -224,23 +224,23 @@ def pair(truth: TrackBoxes, tracks: TrackBoxes, label: int, limit: float) -> Cas
 
 
 @dataclass(frozen=True)
-class Matching:
+class ThresholdMatches:
     """Matches of the tracks with a score from a threshold on."""
 
-    event: Ints  # (T,) `Event` of each object in each of its frames
+    event: Ints  # (T,) `ObjectState` of each object in each of its frames
     score: Floats  # (T,) of the track; NaN for misses
     distance: Floats  # (T,) metres; 0 for misses
     false_positives: int
     frames: int  # in which there is an object or a track
 
     @classmethod
-    def of(cls, case: Case, threshold: float = -np.inf) -> "Matching":
+    def of(cls, case: Case, threshold: float = -np.inf) -> "ThresholdMatches":
         """Match the tracks of a class in a scene."""
         case = case.keep(case.track_score >= threshold)
         match = match_frames(case, continuity="first")
         hit, pairs = match >= 0, case.matched(match)
-        event = np.where(hit, Event.MATCH, Event.MISS).astype(np.int64)
-        event[track_changes(case, match, hit)[0]] = Event.SWITCH
+        event = np.where(hit, ObjectState.MATCH, ObjectState.MISS).astype(np.int64)
+        event[track_changes(case, match, hit)[0]] = ObjectState.SWITCH
         score, distance = np.full(len(match), np.nan), np.zeros(len(match))
         score[hit], distance[case.truth_row[pairs]] = case.track_score[match[hit]], case.cost[pairs]
         frames = np.union1d(case.truth_frame, case.track_frame)
@@ -302,11 +302,11 @@ def evaluate_class(cases: Sequence[Case], config: NuScenesConfig) -> NuScenesCla
     count = sum(len(case.truth_id) for case in cases)
     if not count:
         return NuScenesClass(math.nan, math.nan, UNDEFINED, named, (None,) * len(named))
-    everything = [Matching.of(case) for case in cases]
-    scores = np.concatenate([one.score[one.event == Event.MATCH] for one in everything])
+    everything = [ThresholdMatches.of(case) for case in cases]
+    scores = np.concatenate([one.score[one.event == ObjectState.MATCH] for one in everything])
     thresholds = score_thresholds(scores, count, recalls)[::-1]
     known = {
-        threshold: figures(cases, [Matching.of(case, threshold) for case in cases], threshold)
+        threshold: figures(cases, [ThresholdMatches.of(case, threshold) for case in cases], threshold)
         for threshold in np.unique(thresholds[~np.isnan(thresholds)]).tolist()
     }
     curve = tuple(known.get(threshold) for threshold in thresholds.tolist())
@@ -339,18 +339,20 @@ def score_thresholds(scores: Floats, count: int, recalls: Floats) -> Floats:
     return np.asarray(thresholds, dtype=np.float64)
 
 
-def figures(cases: Sequence[Case], matchings: Sequence[Matching], threshold: float) -> NuScenesFigures:
+def figures(cases: Sequence[Case], matchings: Sequence[ThresholdMatches], threshold: float) -> NuScenesFigures:
     """Return the figures of one class from the matchings of all scenes at a threshold."""
     events = np.concatenate([matching.event for matching in matchings])
     gt = len(events)
-    tp, ids, fn = (int((events == kind).sum()) for kind in (Event.MATCH, Event.SWITCH, Event.MISS))
+    tp, ids, fn = (int((events == kind).sum()) for kind in (ObjectState.MATCH, ObjectState.SWITCH, ObjectState.MISS))
     fp = sum(matching.false_positives for matching in matchings)
     frames = sum(matching.frames for matching in matchings)
     metres = sum(float(matching.distance.sum()) for matching in matchings)
     first = np.cumsum([0, *(len(np.unique(case.truth_id)) for case in cases)])
     owner = [np.unique(case.truth_id, return_inverse=True)[1] + k for case, k in zip(cases, first[:-1], strict=True)]
     # Objects are filled in: in every frame from the first to the last.
-    paths = lives(np.concatenate(owner), np.concatenate([case.truth_frame for case in cases]), events != Event.MISS)
+    paths = lives(
+        np.concatenate(owner), np.concatenate([case.truth_frame for case in cases]), events != ObjectState.MISS
+    )
     share = tp / gt
     return NuScenesFigures(
         threshold=threshold,

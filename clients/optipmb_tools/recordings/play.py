@@ -19,7 +19,7 @@ from optipmb_schemas import PREFIX, Keys, Problem, SessionParameters, Tracks
 from optipmb_tools.recordings.files import Recorded, RecordingFile
 from optipmb_tools.recordings.plan import FrameId, Step, StreamPlan, content, plan, renamed, steps
 from optipmb_tools.results.output import Latency, latency
-from optipmb_tools.run.replay import CLOUD_WAIT_S, Exchange, Pace, await_wanted
+from optipmb_tools.run.replay import CLOUD_WAIT_S, Exchange, ReplayPace, await_wanted
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class PlayedStream:
 class Playing:
     """How a recording is played."""
 
-    pace: Pace
+    pace: ReplayPace
     site: str | None  # streams are played as `<site>-<their site>/...` and meet no session; None: as recorded
     profile: str | None = None  # default: the recorded one
     prefix: str = PREFIX  # first part of all keys

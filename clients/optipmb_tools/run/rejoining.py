@@ -39,7 +39,7 @@ AT_ONCE: Final = 256
 
 
 @dataclass(frozen=True)
-class Rejoin:
+class RejoinOptions:
     """Which tracks are joined."""
 
     gap_s: float = 60.0  # longest gap

@@ -40,7 +40,7 @@ KEPT_PROBLEMS = 20
 
 
 @dataclass(frozen=True)
-class Pace:
+class ReplayPace:
     """How fast frames are sent, and how long a replay waits; at a `speed` it takes the time between the stamps."""
 
     speed: float | None = None  # multiple of the recorded rate; None: as fast as tracks come back
@@ -54,7 +54,7 @@ class Replaying:
     """How sequences are replayed."""
 
     profile: str  # name that the service knows
-    pace: Pace
+    pace: ReplayPace
     classes: Sequence[str] = ()  # only detections of these; empty: all
     streams: int = 1  # sequences at once
     prefix: str = PREFIX  # first part of all keys
@@ -90,7 +90,7 @@ class Exchange:
     """Frames that were published on one stream, and the tracks that came back, each of which `on_frame` counts."""
 
     def __init__(
-        self, stream: str, link: Link, frames: int, *, pace: Pace, prefix: str, on_frame: Callable[[], None]
+        self, stream: str, link: Link, frames: int, *, pace: ReplayPace, prefix: str, on_frame: Callable[[], None]
     ) -> None:
         self.stop = threading.Event()  # set to end early
         self.results: dict[FrameId, Tracks] = {}  # newest revision

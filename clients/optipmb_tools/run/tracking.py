@@ -46,7 +46,7 @@ from optipmb_tools.run.bulk import Executor, Failed, Here, in_order, run
 from optipmb_tools.table_files import Columns
 
 if TYPE_CHECKING:
-    from optipmb_tools.run.rejoining import Rejoin
+    from optipmb_tools.run.rejoining import RejoinOptions
 
 SHOWN = 20  # recordings that failed, named in the error
 
@@ -239,7 +239,7 @@ class Tracking:
     hindsight_s: float = 0.0  # time after a frame that tells its velocities (`learning.hindsight`); 0: no hindsight
     show: float | None = None  # existence from which tracks are confirmed; None: as the profile says
     sensors: Sensors = ALIKE  # how frames that name their sensor are used
-    rejoin: "Rejoin | None" = None  # join tracks over gaps (`optipmb_tools.run.rejoining`)
+    rejoin: "RejoinOptions | None" = None  # join tracks over gaps (`optipmb_tools.run.rejoining`)
     view: Path | None = None  # page of the tracks, of one sequence
 
 

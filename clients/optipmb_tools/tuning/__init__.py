@@ -1,7 +1,7 @@
 """Tuning: from a detector's results and labels to a parameter profile; ablation and parameter sweeps."""
 
 from optipmb_tools.tuning.estimate import Estimate
-from optipmb_tools.tuning.run import Curves, Source, calibrate_scores, estimate_all, tune_all
+from optipmb_tools.tuning.run import Curves, TuningData, calibrate_scores, estimate_all, tune_all
 from optipmb_tools.tuning.scoring import Figures, plain_figures
 from optipmb_tools.tuning.study import Plan, Tuned
 from optipmb_tools.tuning.values import value_of
@@ -13,8 +13,8 @@ __all__ = [
     "Figures",
     "Plan",
     "Row",
-    "Source",
     "Tuned",
+    "TuningData",
     "Variant",
     "ablation",
     "calibrate_scores",

@@ -90,7 +90,7 @@ def _velocities(given: Floats, time: Floats, position: Floats) -> Floats:
 
 
 @dataclass(frozen=True)
-class Pairs:
+class LabelledDetections:
     """Detections of one class, and which label each belongs to; rows are ordered by frame."""
 
     clip: str
@@ -107,7 +107,7 @@ class Pairs:
     frames: int
 
 
-def pair_detections(clip: Clip, name: str, least: float, limit: float, rules: Rules) -> Pairs:
+def pair_detections(clip: Clip, name: str, least: float, limit: float, rules: Rules) -> LabelledDetections:
     """Pair the detections of a class with its labels.
 
     Args:
@@ -138,7 +138,7 @@ def pair_detections(clip: Clip, name: str, least: float, limit: float, rules: Ru
     owner[matched[same]] = case.truth_id[label[same]]
     false = ~case.excused
     false[matched] = False
-    return Pairs(
+    return LabelledDetections(
         clip=clip.name,
         frame=when,
         score=score,
@@ -172,7 +172,7 @@ class Residuals:
         return np.isnan(self.gap)
 
 
-def residuals(pairs: Sequence[Pairs], paths: Sequence[dict[int, Trajectory]]) -> Residuals:
+def residuals(pairs: Sequence[LabelledDetections], paths: Sequence[dict[int, Trajectory]]) -> Residuals:
     """Return detection minus label of all pairs."""
     parts = [(np.empty(0), np.empty((0, 2)), np.empty(0), np.empty((0, 2)))]
     parts += [
@@ -188,8 +188,8 @@ def residuals(pairs: Sequence[Pairs], paths: Sequence[dict[int, Trajectory]]) ->
 
 
 def detected(
-    pairs: Sequence[Pairs], paths: Sequence[dict[int, Trajectory]]
-) -> Iterator[tuple[Pairs, Trajectory, Ints, Ints]]:
+    pairs: Sequence[LabelledDetections], paths: Sequence[dict[int, Trajectory]]
+) -> Iterator[tuple[LabelledDetections, Trajectory, Ints, Ints]]:
     """Yield each detected object: its recording, its path, and the rows of its detections in both."""
     for found, objects in zip(pairs, paths, strict=True):
         for identity, path in objects.items():
@@ -289,7 +289,7 @@ def estimate(clips: Sequence[Clip], name: str, parameters: Parameters, rules: Ru
     )
 
 
-def pair_all(clips: Sequence[Clip], name: str, parameters: Parameters, rules: Rules) -> list[Pairs]:
+def pair_all(clips: Sequence[Clip], name: str, parameters: Parameters, rules: Rules) -> list[LabelledDetections]:
     """Return the detections of all scores of a class, paired with its labels; arguments as in `estimate`."""
     limit = min(PAIR_LIMIT, parameters.classes[name].gate)
     return [pair_detections(clip, name, 0.0, limit, rules) for clip in clips]
@@ -341,7 +341,9 @@ def _unbroken(path: Trajectory, longest: float) -> list[Trajectory]:
     ]
 
 
-def _birth(errors: Residuals, pairs: Sequence[Pairs], paths: Sequence[dict[int, Trajectory]]) -> dict[str, float]:
+def _birth(
+    errors: Residuals, pairs: Sequence[LabelledDetections], paths: Sequence[dict[int, Trajectory]]
+) -> dict[str, float]:
     """Return P^0 from the first detection of each object, and from what objects do."""
     first = errors.first
     velocity = errors.velocity[first]
@@ -368,20 +370,20 @@ def _lasting(errors: Residuals, period: float) -> float:
     return float((here[pair] * here[pair - 1]).sum()) / squared if squared else math.nan
 
 
-def _longest_gap(pairs: Sequence[Pairs], paths: Sequence[dict[int, Trajectory]], period: float) -> float:
+def _longest_gap(pairs: Sequence[LabelledDetections], paths: Sequence[dict[int, Trajectory]], period: float) -> float:
     """Return the nominal periods within which nearly all breaks between detections of an object end."""
     between = [one for _, path, _, at in detected(pairs, paths) for one in np.diff(path.time[at]).tolist()]
     gaps = [one / period - 1.0 for one in between if one > 1.5 * period]
     return float(np.quantile(gaps, _GAP_QUANTILE)) if gaps else math.nan
 
 
-def _area(pairs: Sequence[Pairs], cell: float = 5.0) -> float:
+def _area(pairs: Sequence[LabelledDetections], cell: float = 5.0) -> float:
     """Return the area of the cells around the sensor in which there are detections."""
     cells = {tuple(row) for one in pairs for row in np.floor(one.place / cell).astype(np.int64).tolist()}
     return cell * cell * len(cells)
 
 
-def _scores(pairs: Sequence[Pairs]) -> tuple[tuple[ScoreBin, ...], float, float]:
+def _scores(pairs: Sequence[LabelledDetections]) -> tuple[tuple[ScoreBin, ...], float, float]:
     """Return how often detections of each score are true, and the fit of the log odds (Platt, 1999)."""
     score, true = counted_scores(pairs)
     edges = np.linspace(0.0, 1.0, _BINS + 1)
@@ -431,7 +433,7 @@ def spread(errors: Floats) -> float:
 
 
 @dataclass(frozen=True)
-class Motion:
+class WindowMotion:
     """Motion of an object at the middles of windows of time that do not overlap."""
 
     time: Floats  # (W,) s
@@ -467,7 +469,7 @@ class Motion:
         return (changes / np.sqrt(tau)[:, None])[moves], variances[moves]
 
 
-def fit_motion(time: Floats, position: Floats, yaw: Floats, window: float) -> Motion:
+def fit_motion(time: Floats, position: Floats, yaw: Floats, window: float) -> WindowMotion:
     """Fit polynomials to pieces of a trajectory: quadratic ones to the position, straight lines to the heading.
 
     Args:
@@ -486,7 +488,7 @@ def fit_motion(time: Floats, position: Floats, yaw: Floats, window: float) -> Mo
         middle = time[0] + (which + 0.5) * window
         rows.append((middle, *_fit(time[use] - middle, position[use], turned[use])))
     table = np.array(rows, dtype=np.float64).reshape(len(rows), 9)
-    return Motion(table[:, 0], table[:, 1], table[:, 2], table[:, 3], table[:, 4], table[:, 5:])
+    return WindowMotion(table[:, 0], table[:, 1], table[:, 2], table[:, 3], table[:, 4], table[:, 5:])
 
 
 def _fit(time: Floats, position: Floats, yaw: Floats) -> tuple[float, ...]:
@@ -513,7 +515,7 @@ def _fit(time: Floats, position: Floats, yaw: Floats) -> tuple[float, ...]:
     )
 
 
-def counted_scores(pairs: Sequence[Pairs]) -> tuple[Floats, Bools]:
+def counted_scores(pairs: Sequence[LabelledDetections]) -> tuple[Floats, Bools]:
     """Return the scores of the detections that belong to a label or to none without excuse, and which do."""
     score = np.concatenate([one.score for one in pairs]) if pairs else np.empty(0)
     true = np.concatenate([one.object >= 0 for one in pairs]) if pairs else np.empty(0, dtype=np.bool_)
@@ -521,7 +523,7 @@ def counted_scores(pairs: Sequence[Pairs]) -> tuple[Floats, Bools]:
     return score[counted], true[counted]
 
 
-def score_curve(own: Sequence[Pairs], reference: Sequence[Pairs]) -> ScoreCalibration | None:
+def score_curve(own: Sequence[LabelledDetections], reference: Sequence[LabelledDetections]) -> ScoreCalibration | None:
     """Return the curve from a detector's scores to the reference's; None where there is too little to measure it.
 
     Both have all detections of one class, paired with its labels.

@@ -30,7 +30,7 @@ Curves = dict[str, ScoreCalibration | None]  # by class; None where there was to
 
 
 @dataclass(frozen=True)
-class Source:
+class TuningData:
     """The data."""
 
     dataset: str
@@ -47,7 +47,7 @@ class Source:
         sequences: Sequence[DataSequence],
         parameters: Parameters,
         classes: Sequence[str] | None,
-    ) -> "Source":
+    ) -> "TuningData":
         """Read the sequences; by default the classes of the parameters that have labels.
 
         Raises:
@@ -78,7 +78,7 @@ class Source:
         return f"{self.dataset}{detections}, sequences {' '.join(one.name for one in self.sequences)}"
 
 
-def estimate_all(source: Source, parameters: Parameters, out: Path) -> dict[str, Estimate]:
+def estimate_all(source: TuningData, parameters: Parameters, out: Path) -> dict[str, Estimate]:
     """Estimate every class, and write `estimate.json` and `estimated.toml`."""
     found, tables = {}, {}
     for name in source.classes:
@@ -118,8 +118,8 @@ def calibrate_scores(
         raise UsageError(f"--reference {reference}: detections of one of the sequences, received none")
     common = {one.name for one in known}
     plain = with_score_calibration(parameters, dict.fromkeys(parameters.labels))
-    source = Source.of(data.name, data.detections, sequences, plain, classes)
-    other = Source.of(data.name, reference, known, plain, None)
+    source = TuningData.of(data.name, data.detections, sequences, plain, classes)
+    other = TuningData.of(data.name, reference, known, plain, None)
     curves: Curves = {}
     for label in source.classes:
         base, rules = only(plain, label), rules_of(data.name)
@@ -140,7 +140,7 @@ def calibrate_scores(
 
 
 def tune_all(
-    source: Source,
+    source: TuningData,
     parameters: Parameters,
     plan: Plan,
     out: Path,

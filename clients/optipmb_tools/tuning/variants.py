@@ -18,7 +18,7 @@ from optipmb import Modules, Parameters, warm_up
 from optipmb_tools.evaluation.figures import overall
 from optipmb_tools.files import write_whole
 from optipmb_tools.tuning.clips import track_clip
-from optipmb_tools.tuning.run import Source
+from optipmb_tools.tuning.run import TuningData
 from optipmb_tools.tuning.scoring import Figures, Scorer, plain_figures, scorer_of
 from optipmb_tools.tuning.values import with_values
 from optipmb_tools.views.colours import colour_of
@@ -77,7 +77,7 @@ def sweep(parameters: Parameters, classes: Sequence[str], path: str, values: Seq
     return variants
 
 
-def measure_variants(source: Source, variants: Sequence[Variant], on_clip: Callable[[int], None]) -> Iterator[Row]:
+def measure_variants(source: TuningData, variants: Sequence[Variant], on_clip: Callable[[int], None]) -> Iterator[Row]:
     """Track everything once with each variant; yield its row when it is done.
 
     The classes of the source are reported, all classes of the parameters are tracked; `on_clip` gets the frames of each
@@ -89,7 +89,7 @@ def measure_variants(source: Source, variants: Sequence[Variant], on_clip: Calla
         yield _row(source, variant, scorers, on_clip)
 
 
-def _row(source: Source, variant: Variant, scorers: Sequence[Scorer], on_clip: Callable[[int], None]) -> Row:
+def _row(source: TuningData, variant: Variant, scorers: Sequence[Scorer], on_clip: Callable[[int], None]) -> Row:
     seconds, frames = 0.0, 0
     measured: dict[str, list[Any]] = {scorer.name: [] for scorer in scorers}
     for clip in source.clips:

@@ -116,7 +116,7 @@ def _times(problem: Problem) -> str:
 
 
 @dataclass
-class _Seen:
+class _InstanceView:
     """Last status of an instance, and its rates."""
 
     status: ServiceStatus
@@ -136,7 +136,7 @@ class StatusView:
 
     def __init__(self, where: str) -> None:
         self._where = where
-        self._seen: dict[str, _Seen] = {}
+        self._seen: dict[str, _InstanceView] = {}
         self._problems: dict[tuple[str, str, str, str], tuple[float, Problem]] = {}
         self._now_s = 0.0
 
@@ -145,7 +145,7 @@ class StatusView:
         self._now_s = now_s
         for status in services:
             old = self._seen.get(status.instance)
-            seen = _Seen(status, now_s, curve=old.curve if old else deque(maxlen=HISTORY))
+            seen = _InstanceView(status, now_s, curve=old.curve if old else deque(maxlen=HISTORY))
             if old is not None and old.status.started_ns == status.started_ns and now_s > old.at_s:
                 seconds = now_s - old.at_s
                 seen.frames_hz = max(0, status.frames - old.status.frames) / seconds
@@ -176,7 +176,7 @@ class StatusView:
             shown += [Text(), *(self._problem(at_s, problem) for at_s, problem in problems)]
         return Group(*shown)
 
-    def _title(self, alive: Sequence[_Seen]) -> Text:
+    def _title(self, alive: Sequence[_InstanceView]) -> Text:
         streams = sum(len(seen.status.sessions) for seen in alive)
         frames = sum(seen.frames_hz for seen in alive)
         lost = sum(sum(seen.lost_hz.values()) for seen in alive)
@@ -211,7 +211,7 @@ class StatusView:
             )
         return table
 
-    def _streams(self, rows: list[tuple[_Seen, SessionSummary]], room: int, longest: int) -> Table:
+    def _streams(self, rows: list[tuple[_InstanceView, SessionSummary]], room: int, longest: int) -> Table:
         several = len(self._seen) > 1
         names = ("stream", *(("instance",) if several else ()), "profile", "state")
         figures = ("frames/s", "p50 ms", "p99 ms", "tracks", "waiting", "lost/s", "lost", "last frame")
@@ -238,7 +238,7 @@ class StatusView:
             table.add_row(Text(f"and {len(ordered) - len(shown)} more in better state", style=QUIET))
         return table
 
-    def _urgency(self, seen: _Seen, session: SessionSummary) -> float:
+    def _urgency(self, seen: _InstanceView, session: SessionSummary) -> float:
         """Return how urgent a stream is: losses first, then silence, then waiting and lateness."""
         losing = 1e6 * (seen.lost_hz.get(session.stream, 0.0) > 0)
         silent = 1e5 * (session.state not in {"running", "new"})

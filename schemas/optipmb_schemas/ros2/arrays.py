@@ -93,7 +93,7 @@ def boxes_of(
         MessageError: a value is not allowed; the path names it.
     """
     vision = hasattr(message, "detections")
-    rows: list[_Row] = []
+    rows: list[_Box] = []
     for i, one in enumerate(message.detections if vision else message.objects):
         try:
             rows.append(_of_vision(i, one) if vision else _of_autoware(i, one))
@@ -151,7 +151,7 @@ def points_of(message: Any) -> NDArray[np.float32]:
 
 
 @dataclass(frozen=True)
-class _Row:
+class _Box:
     label: str
     center: Sequence[float]
     size: Sequence[float]
@@ -161,14 +161,14 @@ class _Row:
     velocity: Sequence[float] = (math.nan, math.nan)
 
 
-def _of_vision(number: int, detection: Any) -> _Row:
+def _of_vision(number: int, detection: Any) -> _Box:
     path = f"detections[{number}]"
     if not detection.results:
         raise invalid(f"{path}.results", "at least one hypothesis", "none")
     result: Any = max(detection.results, key=lambda one: float(_hypothesis(one).score))
     best = _hypothesis(result)
     box = detection.bbox
-    return _Row(
+    return _Box(
         label=str(best.class_id if hasattr(best, "class_id") else best.id),
         center=_vector(f"{path}.bbox.center.position", box.center.position),
         size=_size(f"{path}.bbox.size", box.size),
@@ -183,7 +183,7 @@ def _hypothesis(result: Any) -> Any:
     return getattr(result, "hypothesis", result)
 
 
-def _of_autoware(number: int, detected: Any) -> _Row:
+def _of_autoware(number: int, detected: Any) -> _Box:
     path = f"objects[{number}]"
     if not detected.classification:
         raise invalid(f"{path}.classification", "at least one class", "none")
@@ -200,7 +200,7 @@ def _of_autoware(number: int, detected: Any) -> _Row:
         turn = 0.0 if math.isnan(yaw) else yaw  # the twist is in the frame of the object
         cos, sin = math.cos(turn), math.sin(turn)
         velocity = (cos * along - sin * across, sin * along + cos * across)
-    return _Row(
+    return _Box(
         label=CLASS_NAMES.get(int(best.label), "unknown"),
         center=center,
         size=size,

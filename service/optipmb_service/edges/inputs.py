@@ -252,7 +252,7 @@ class _Clock:
 
 
 @dataclass
-class _Stream:
+class _SenderStream:
     """A stream of the edge: its numbers, the newest frames, and who waits for tracks. To be used on the loop."""
 
     epoch: bytes = field(default_factory=lambda: secrets.token_bytes(16))
@@ -306,7 +306,7 @@ class Inputs:
         self._gap_s = settings.gap_limit_s
         self._session_of = sessions
         self._loop = asyncio.get_running_loop()
-        self._streams: collections.OrderedDict[str, _Stream] = collections.OrderedDict()
+        self._streams: collections.OrderedDict[str, _SenderStream] = collections.OrderedDict()
         self._remembered = 0
         self._idle: IdlePool[_Link] = IdlePool(IDLE_PUBLISHERS)
         self._reporter = ProblemReporter(client.publish_problem)
@@ -367,13 +367,13 @@ class Inputs:
             return sent, before is not None, await self._tracks(name, sent, tracks, wait_s, is_new=before is None)
 
     @contextlib.asynccontextmanager
-    async def _used(self, name: str) -> AsyncIterator[_Stream]:
+    async def _used(self, name: str) -> AsyncIterator[_SenderStream]:
         """Give a stream; the last user leaves its publisher to the next one.
 
         Raises:
             RefusedError: the network cannot be used meanwhile.
         """
-        stream = self._streams.get(name) or _Stream()
+        stream = self._streams.get(name) or _SenderStream()
         self._streams[name] = stream
         self._streams.move_to_end(name)
         stream.users += 1
@@ -390,7 +390,7 @@ class Inputs:
                 stream.link = None
             self._forget()
 
-    async def _prepare(self, name: str, stream: _Stream) -> None:
+    async def _prepare(self, name: str, stream: _SenderStream) -> None:
         """Open the publisher of a stream, and ask once for its tracked frames.
 
         Raises:
@@ -404,7 +404,7 @@ class Inputs:
             found = [one for one, _ in await asyncio.to_thread(self._cached, name)]
             stream.tracked = {one.stamp_ns: Sent(one.epoch, one.seq, one.stamp_ns) for one in found}
 
-    def _before(self, stream: _Stream, frame: JsonFrame, mark: _Mark | None, rules: InputSettings) -> Sent | None:
+    def _before(self, stream: _SenderStream, frame: JsonFrame, mark: _Mark | None, rules: InputSettings) -> Sent | None:
         """Return with which numbers a frame was sent; None of a new one.
 
         Raises:
@@ -426,7 +426,7 @@ class Inputs:
             raise RefusedError("late", expected, str(stamp_ns))
         return None
 
-    def _numbered(self, stream: _Stream, frame: JsonFrame, rules: InputSettings) -> Sent:
+    def _numbered(self, stream: _SenderStream, frame: JsonFrame, rules: InputSettings) -> Sent:
         """Return the numbers of a new frame.
 
         Raises:
@@ -451,13 +451,13 @@ class Inputs:
             return Sent(message.epoch, message.seq, stamp_ns)
         return Sent(stream.epoch, stream.seq, stamp_ns)
 
-    async def _put(self, stream: _Stream, frame: JsonFrame, sent: Sent, traceparent: str) -> None:
+    async def _put(self, stream: _SenderStream, frame: JsonFrame, sent: Sent, traceparent: str) -> None:
         assert stream.link is not None  # noqa: S101 - in use: said for the type checker
         await put(stream.link.outgoing.detections, schemas.encode(frame.message, **sent._asdict()), traceparent)
         stream.in_flight.add(sent.epoch, sent.seq)
         stream.seq += not frame.is_numbered
 
-    def _remember(self, stream: _Stream, mark: _Mark | None, sent: Sent) -> None:
+    def _remember(self, stream: _SenderStream, mark: _Mark | None, sent: Sent) -> None:
         if mark is not None:
             self._remembered += 1
             stream.sent[mark.key] = _Known(sent, mark.content, mark.size)

@@ -37,7 +37,7 @@ PAUSE_S: Final = 0.2
 log = structlog.get_logger("optipmb_service")
 
 
-class _Row(NamedTuple):
+class _InputTopic(NamedTuple):
     """An input of the settings."""
 
     topic: re.Pattern[str]
@@ -59,7 +59,7 @@ class MqttInputs:
         self._inputs = inputs
         self._own = f"{settings.prefix}/"
         self._rows = [
-            _Row(re.compile(re.escape(one.pattern).replace(r"\+", "([^/]*)")), stream)
+            _InputTopic(re.compile(re.escape(one.pattern).replace(r"\+", "([^/]*)")), stream)
             for stream, one in settings.mqtt.inputs.items()
         ]
         self._tasks: set[asyncio.Task[None]] = set()

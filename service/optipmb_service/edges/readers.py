@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
     from optipmb_client.incoming import Answer, Arrival
-    from optipmb_client.zenoh.handles import Reading
+    from optipmb_client.zenoh.handles import Dispatcher
     from optipmb_client.zenoh.session import Session
     from optipmb_schemas.json_form import Place
 
@@ -292,7 +292,7 @@ class Bounds(NamedTuple):
 BOUNDS: Final = Bounds()
 
 
-class Event(NamedTuple):
+class LoggedEvent(NamedTuple):
     """An event in a log; `at` is the monotonic time at which it came."""
 
     number: int
@@ -316,7 +316,7 @@ class EventLog:
         self._name = f"{time.time_ns():x}"
         self._lock = threading.Lock()
         self._held = FinalEventsOfStreams()
-        self._kept: dict[int, Event] = {}
+        self._kept: dict[int, LoggedEvent] = {}
         self._numbers: dict[str, collections.deque[int]] = {}
         self._size = 0
         self._last = 0
@@ -329,7 +329,7 @@ class EventLog:
             for each in self._held.take(message) if self._is_final else [message]:
                 for text in json_form.event_json(each, one.place):
                     self._last += 1
-                    self._kept[self._last] = Event(self._last, time.monotonic(), message.stream, text)
+                    self._kept[self._last] = LoggedEvent(self._last, time.monotonic(), message.stream, text)
                     self._size += len(text)
                     numbers = self._numbers.setdefault(message.stream, collections.deque())
                     numbers.append(self._last)
@@ -353,7 +353,7 @@ class EventLog:
                 return None
             return min(int(number), self._last)
 
-    def after(self, number: int) -> tuple[list[Event], int]:
+    def after(self, number: int) -> tuple[list[LoggedEvent], int]:
         """Return the events after a number, and the count of dropped ones."""
         with self._lock:
             self._expire()
@@ -603,7 +603,7 @@ class Feeds:
             closing.callback(self.session.subscribe(key, read, history=True).close)
             return closing.pop_all()
 
-    def _subscribe(self, key: str, receive: Callable[[Publication], None]) -> Reading:
+    def _subscribe(self, key: str, receive: Callable[[Publication], None]) -> Dispatcher:
         self._turns.take()
 
         def read(sample: Any) -> None:

@@ -136,7 +136,7 @@ class Quarantined:
 Output = TrackedFrame | schemas.Problem | Begun | Quarantined
 
 
-class RefusedError(ValueError):
+class CommandRefusedError(ValueError):
     """A command was refused.
 
     Attributes:

@@ -86,8 +86,9 @@ class SensorQueue:
     """Frames of one sensor that wait, in the order in which they will be processed, and its clouds.
 
     Args:
-        policy: how long frames wait; may be replaced.
-        timeline: places of the frames that have been processed.
+        policy: how long a frame waits for its cloud and for other sensors, and how much may wait. The session replaces
+            it when its profile changes.
+        timeline: places of the processed frames, after which the waiting ones find theirs.
     """
 
     def __init__(self, policy: Policy, timeline: Timeline) -> None:

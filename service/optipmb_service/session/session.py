@@ -31,7 +31,7 @@ from optipmb_service.session.checks import ScoreChecks
 from optipmb_service.session.counts import Counters, Deliveries, present, total
 from optipmb_service.session.frame_problems import FrameProblems
 from optipmb_service.session.identity import Incarnation
-from optipmb_service.session.outputs import Begun, Output, Quarantined, RefusedError, events_of
+from optipmb_service.session.outputs import Begun, CommandRefusedError, Output, Quarantined, events_of
 from optipmb_service.session.pending import PendingFrame, SensorQueues
 from optipmb_service.session.policy import MAX_CLOUD_WAIT_NS, SECOND, Policy
 from optipmb_service.session.state import FilterState, ProcessedFrame
@@ -219,11 +219,11 @@ class Session:
             restart: whether the density may be discarded.
 
         Raises:
-            RefusedError: another profile, frames were processed, and no restart was asked for; or too long a wait.
+            CommandRefusedError: another profile after frames were processed, without a restart; or too long a wait.
         """
         if cloud_wait_s is not None and cloud_wait_s * SECOND > MAX_CLOUD_WAIT_NS:
             longest = f"at most {MAX_CLOUD_WAIT_NS / SECOND:g} seconds"
-            raise RefusedError("cloud_wait_s", longest, f"{cloud_wait_s:g}")
+            raise CommandRefusedError("cloud_wait_s", longest, f"{cloud_wait_s:g}")
         before, frames = self.parameters, self.counters.frames
         wanted = parameters or before
         if horizons is not None:
@@ -231,7 +231,7 @@ class Session:
         changes = wanted.model_copy(update={"horizons": before.horizons}) != before
         if changes and not restart and frames:
             expected = f"{before.name!r}, or restart = true: {frames} frames have been tracked with it"
-            raise RefusedError("profile", expected, repr(wanted.name))
+            raise CommandRefusedError("profile", expected, repr(wanted.name))
         outputs = self.flush() if changes else []
         if cloud_wait_s is not None:
             self._cloud_wait_ns = round(cloud_wait_s * SECOND)

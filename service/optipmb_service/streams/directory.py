@@ -42,7 +42,7 @@ def node_of(stream: str) -> str:
 
 
 @dataclass(slots=True)
-class _Known:
+class _StreamEntry:
     tokens: set[str] = field(default_factory=set)
     """Of publishers with a cache."""
     announcements: set[str] = field(default_factory=set)
@@ -73,7 +73,7 @@ class StreamDirectory:
         self._unproven: dict[str, int] = {}
         self._queued: dict[str, int] = {}
         self._lock = threading.Lock()
-        self._streams: dict[str, _Known] = {}
+        self._streams: dict[str, _StreamEntry] = {}
         self._nodes: dict[str, dict[str, None]] = {}
         """The streams of each node, in the order in which they came."""
         self._awaited: dict[str, int] = {}
@@ -170,7 +170,7 @@ class StreamDirectory:
             there = (one for node in nodes for one in self._nodes.get(node, ()) if self._streams[one].tokens)
             found = {stream: True for stream in there if belongs(stream)}
             for stream in sensors:
-                known = self._streams.get(stream, _Known(left_ns=self.began_ns))
+                known = self._streams.get(stream, _StreamEntry(left_ns=self.began_ns))
                 if known.left_ns is not None and now_ns - known.left_ns < BACK_NS:
                     found[stream] = False
         return found
@@ -215,10 +215,10 @@ class StreamDirectory:
                     self._unproven[stream] = now_ns
                     known.announced, known.left_ns, known.seen_ns = True, None, seen_ns
 
-    def _found(self, stream: str) -> _Known | None:
+    def _found(self, stream: str) -> _StreamEntry | None:
         known = self._streams.get(stream)
         if known is None and len(self._streams) < MAX_STREAMS:
-            known = self._streams[stream] = _Known()
+            known = self._streams[stream] = _StreamEntry()
             self._nodes.setdefault(node_of(stream), {})[stream] = None
         return known
 
@@ -230,7 +230,7 @@ class StreamDirectory:
             del self._nodes[node_of(stream)]
 
     @staticmethod
-    def _settled(known: _Known, now_ns: int) -> bool:
+    def _settled(known: _StreamEntry, now_ns: int) -> bool:
         """Note whether anybody still speaks for a stream."""
         if known.tokens or known.announcements or known.announced:
             known.left_ns = None

@@ -22,7 +22,7 @@ import optipmb
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.session.checkpoint import digest_of
 from optipmb_service.session.convert import density_of
-from optipmb_service.session.outputs import RefusedError
+from optipmb_service.session.outputs import CommandRefusedError
 from optipmb_service.session.policy import SECOND
 from optipmb_service.session.problems import problem_of
 
@@ -72,7 +72,7 @@ def guarded(request: Query, answer: Callable[[], Future[None] | None], *, instan
     Args:
         request: the query.
         answer: answers it, or returns what will do so, and finish it, on another thread. A `MessageError` or
-            `RefusedError` that it raises is the answer.
+            `CommandRefusedError` that it raises is the answer.
         instance: name of the service, for problems.
         stream: whose problem it is.
     """
@@ -82,7 +82,7 @@ def guarded(request: Query, answer: Callable[[], Future[None] | None], *, instan
             later = answer()
         except schemas.MessageError as error:
             request.refuse(problem_with(error, instance=instance, stream=stream))
-        except RefusedError as error:
+        except CommandRefusedError as error:
             refused = schemas.MessageError("invalid_value", error.path, error.expected, error.received)
             request.refuse(problem_with(refused, instance=instance, stream=stream, code="refused"))
     except TransportError as error:
@@ -188,7 +188,7 @@ class StreamQueries:
             request.finish()
             return
         if not self._room_for_wildcards.acquire(blocking=False):
-            full = RefusedError(
+            full = CommandRefusedError(
                 "key", f"at most {MOST_WILDCARDS} queries about many streams open at once", "another one"
             )
             guarded(request, partial(_raise, full), instance=self._instance)
@@ -285,7 +285,7 @@ class StreamQueries:
             raise schemas.MessageError("invalid_value", "profile", expected, repr(asked.profile))
         if asked != empty:
             if stream.session is None:
-                raise RefusedError("stream", "a stream that is tracked already", "no room for another")
+                raise CommandRefusedError("stream", "a stream that is tracked already", "no room for another")
             horizons = None if asked.horizons is None else asked.horizons.tolist()
             stream.deliver(stream.session.configure(parameters, asked.cloud_wait_s, horizons, restart=asked.restart))
         request.answer(self._keys.query(stream.name, "parameters"), self._in_force(stream))

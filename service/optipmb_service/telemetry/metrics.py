@@ -54,8 +54,9 @@ class MetricFamily:
     Attributes:
         kind: type of the metric in Prometheus.
         meaning: its help text.
-        read: takes the source of the table; returns the value, or the values by labels, or None.
-        labels: their names.
+        read: function of the object that the table is added with; returns the value, or the values by their labels, or
+            None where there is none.
+        labels: names of the labels.
     """
 
     kind: Literal["counter", "gauge", "histogram"]

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from optipmb_client.incoming import Arrival
-    from optipmb_client.zenoh.handles import Reading, Sender
+    from optipmb_client.zenoh.handles import Dispatcher, Sender
     from optipmb_client.zenoh.session import Opened
 
     from optipmb_service.settings import Settings
@@ -288,7 +288,7 @@ class Client(Session):
             with contextlib.suppress(TransportError):  # at the end: the session is closed
                 self.put(self.keys.problems(problem.stream), schemas.encode(problem), schemas.encoding_of(problem))
 
-    def subscribe(self, key: str, receive: Callable[[Arrival], object], *, history: bool | None = None) -> Reading:
+    def subscribe(self, key: str, receive: Callable[[Arrival], object], *, history: bool | None = None) -> Dispatcher:
         """Hand over publications under a key expression, as `Session` does.
 
         Raises:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
     from collections.abc import Set as AbstractSet
 
-    from optipmb_client.zenoh.handles import Declared, Query, Reading, Sender
+    from optipmb_client.zenoh.handles import Declared, Dispatcher, Query, Sender
     from optipmb_client.zenoh.session import Sample, Session
 
     from optipmb_service.settings import Settings
@@ -118,7 +118,7 @@ class Transport:
         """Announces streams, and no others."""
         self._returned = ReturnedPublishers(self._client, lambda *_: 0)
         self._alive: Declared | None = None
-        self._owners: Reading | None = None
+        self._owners: Dispatcher | None = None
 
     # Receiving
 

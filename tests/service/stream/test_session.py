@@ -11,7 +11,7 @@ import sessions
 from optipmb_schemas import PATHS
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint
 from optipmb_service.session.identity import Incarnation
-from optipmb_service.session.outputs import Output, RefusedError
+from optipmb_service.session.outputs import CommandRefusedError, Output
 from optipmb_service.session.policy import Policy
 from optipmb_service.session.session import Session
 from router import SECOND, Sensor, plain
@@ -352,7 +352,7 @@ def test_parameters_change_only_before_frames_or_with_a_restart() -> None:
     assert (one.parameters.name, one.cloud_wait_s) == ("kitti", 0.5)
     one.configure(NUSCENES, None, restart=False)
     feed(one, range(3))
-    with pytest.raises(RefusedError, match="profile"):
+    with pytest.raises(CommandRefusedError, match="profile"):
         one.configure(kitti, 0.7, restart=False)
     assert (one.parameters.name, one.cloud_wait_s) == ("nuscenes", 0.5)
     one.configure(NUSCENES, 0.2, restart=False)
@@ -402,7 +402,7 @@ def test_a_profile_brings_its_own_horizons() -> None:
     assert one.parameters.horizons == (3.0,)
     one.configure(NUSCENES, None, restart=False)
     assert one.parameters.horizons == ()
-    with pytest.raises(RefusedError, match="profile"):
+    with pytest.raises(CommandRefusedError, match="profile"):
         one.configure(optipmb.load_profile("kitti"), None, [1.0], restart=False)
     assert one.parameters == NUSCENES
 

@@ -10,7 +10,7 @@ from typing import Final
 
 import optipmb_client.zenoh.session
 import pytest
-from optipmb_client.zenoh.handles import Channel
+from optipmb_client.zenoh.handles import ItemQueue
 from optipmb_client.zenoh.session import Session
 from optipmb_schemas import Keys
 from optipmb_service.settings import load
@@ -64,7 +64,7 @@ def test_as_many_tokens_may_be_there_as_there_are(monkeypatch: pytest.MonkeyPatc
 
 def test_a_channel_waits_for_room_only_where_it_is_read() -> None:
     """Before, who fills it is who will read it."""
-    channel: Channel[int] = Channel(2)
+    channel: ItemQueue[int] = ItemQueue(2)
     ends(lambda: [channel.put(one) for one in range(10)])
     reading = iter(channel)
     assert [next(reading) for _ in range(10)] == list(range(10))

@@ -15,7 +15,7 @@ from optipmb_schemas import Tracks
 
 from optipmb_tools.camera import synthetic_camera
 from optipmb_tools.datasets.interface import Cloud, DataSequence, Dataset, DetectionFrame, Truth
-from optipmb_tools.datasets.scene.detector import CLASSES, Found, Seen, detect
+from optipmb_tools.datasets.scene.detector import CLASSES, Found, InRange, detect
 from optipmb_tools.datasets.scene.lidar import Scan, scan
 from optipmb_tools.datasets.scene.traffic import World, build_world, fixed_boxes, street
 from optipmb_tools.files import DatasetError
@@ -127,7 +127,7 @@ class SceneSequence(DataSequence):
         rows = self._in_range(frame)
         center, yaw = self._local(frame, world.center[frame, rows], world.yaw[frame, rows])
         ahead = rotation_of(self.poses[frame].quaternion)[:2, :2]
-        seen = Seen(
+        seen = InRange(
             index=rows,
             label=world.label[rows],
             center=center,

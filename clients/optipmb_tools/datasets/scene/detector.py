@@ -27,7 +27,7 @@ _STUDENT = 5.0  # degrees of freedom of the errors
 
 
 @dataclass(frozen=True)
-class Seen:
+class InRange:
     """The objects in range at one time."""
 
     index: Ints  # (N,) which objects of the scene they are
@@ -50,7 +50,7 @@ class Found:
     yaw: Floats
     velocity: Floats
     score: Floats
-    source: Ints  # (M,) index of the object as in `Seen.index`, or `FALSE`
+    source: Ints  # (M,) index of the object as in `InRange.index`, or `FALSE`
 
 
 def detection_probability(points: Ints, ease: Floats) -> Floats:
@@ -59,7 +59,7 @@ def detection_probability(points: Ints, ease: Floats) -> Floats:
     return np.where(points > 0, 0.985 / (1.0 + np.exp(-logit)), 0.0)
 
 
-def detect(seen: Seen, sites: Floats, radius: float, height: float, rng: np.random.Generator) -> Found:
+def detect(seen: InRange, sites: Floats, radius: float, height: float, rng: np.random.Generator) -> Found:
     """Return what the detector finds, in random order.
 
     Args:
@@ -79,7 +79,7 @@ def detect(seen: Seen, sites: Floats, radius: float, height: float, rng: np.rand
     return Found(*(np.concatenate([getattr(true, n), getattr(false, n)])[order] for n in Found.__dataclass_fields__))
 
 
-def _noisy(seen: Seen, hit: Ints, score: Floats, rng: np.random.Generator) -> Found:
+def _noisy(seen: InRange, hit: Ints, score: Floats, rng: np.random.Generator) -> Found:
     """Return the detections of some objects."""
     label, points = seen.label[hit], seen.points[hit]
     count = len(hit)

@@ -29,7 +29,7 @@ from optipmb_tools.datasets.interface import (
 )
 from optipmb_tools.datasets.table import pixels
 from optipmb_tools.datasets.table.columns import ALIASES
-from optipmb_tools.datasets.table.draft import Boxes
+from optipmb_tools.datasets.table.draft import TableRows
 from optipmb_tools.datasets.table.findings import Finding, Reading, Understood
 from optipmb_tools.datasets.table.names import NO_ID
 from optipmb_tools.datasets.table.read import read_tables
@@ -74,7 +74,7 @@ class ObjectTable:
     """A table of objects with ids, and the assumptions about it."""
 
     path: Path
-    boxes: Boxes
+    boxes: TableRows
     options: Mapping[str, str]
     notes: tuple[str, ...] = ()
     confirmed: Bools | None = None  # (R,) of every row; None without such a column
@@ -89,7 +89,7 @@ class ObjectTable:
             numbers: (F,) of the frames, by which tables without stamps are matched.
 
         Returns:
-            Boxes (R,) ordered by frame; their frames (R,), -1 where at none; the frames (F,) with rows; notes.
+            TableRows (R,) ordered by frame; their frames (R,), -1 where at none; the frames (F,) with rows; notes.
 
         Raises:
             DatasetError: The table has no ids, or one id twice at a stamp.
@@ -238,7 +238,7 @@ class TableSequence(DataSequence):
     tables: TableOptions
 
     def __init__(
-        self, name: str, stem: str, boxes: Boxes, key: str, truth: tuple[ObjectTable, str] | None, origin: int = 0
+        self, name: str, stem: str, boxes: TableRows, key: str, truth: tuple[ObjectTable, str] | None, origin: int = 0
     ) -> None:
         self.name = name
         self.key_columns = dict(zip(boxes.key_columns, boxes.keys[key], strict=True))

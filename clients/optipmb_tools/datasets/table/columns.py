@@ -14,7 +14,7 @@ from optipmb_tools.table_files import BOX_LISTS
 
 
 @dataclass(frozen=True)
-class Column:
+class TableColumn:
     """A column of a table."""
 
     name: str  # as the table has it
@@ -144,7 +144,9 @@ FACTORS: Final[Mapping[str, float]] = {
 """Metres, or metres per second, of other units in the names of columns."""
 
 
-def find_columns(names: Iterable[str], chosen: Mapping[str, str], texts: Collection[str] = ()) -> dict[str, Column]:
+def find_columns(
+    names: Iterable[str], chosen: Mapping[str, str], texts: Collection[str] = ()
+) -> dict[str, TableColumn]:
     """Return the column of each meaning among `names`.
 
     Args:
@@ -153,7 +155,7 @@ def find_columns(names: Iterable[str], chosen: Mapping[str, str], texts: Collect
         texts: Columns without any number, which hold no quantities under any name.
     """
     known = [normalised(name) for name in names]
-    taken: dict[str, Column] = {}
+    taken: dict[str, TableColumn] = {}
     used = set(chosen.values())
     for role in ALIASES:
         aliases = _names_of(role)
@@ -161,7 +163,7 @@ def find_columns(names: Iterable[str], chosen: Mapping[str, str], texts: Collect
             continue
         if role in chosen:
             unit = next((one.unit for one in known if one.name == chosen[role]), None)
-            taken[role] = Column(chosen[role], unit, "")
+            taken[role] = TableColumn(chosen[role], unit, "")
             continue
         fitting = [
             one
@@ -178,7 +180,9 @@ def find_columns(names: Iterable[str], chosen: Mapping[str, str], texts: Collect
                 one.base for one in known if "stamp" in taken and one.name == taken["stamp"].name and one.unit == "s"
             }
             parts = [one for one in known if bases and _is_second_half(one)]
-            fitting = [Column(one.name, "ns", aliases[0]) for one in parts if one.base in bases or one.base in aliases]
+            fitting = [
+                TableColumn(one.name, "ns", aliases[0]) for one in parts if one.base in bases or one.base in aliases
+            ]
         if fitting:
             best = min(fitting, key=lambda one: (aliases.index(one.base), _is_second_half(one), len(one.name)))
             taken[role] = best
@@ -186,7 +190,7 @@ def find_columns(names: Iterable[str], chosen: Mapping[str, str], texts: Collect
     return taken
 
 
-def _is_shared(column: Column, known: Collection[Column]) -> bool:
+def _is_shared(column: TableColumn, known: Collection[TableColumn]) -> bool:
     """Tell whether a column is one of several of an orientation, as `rotation.angle` with `rotation.axis`."""
     group = column.name.rpartition(".")[0]
     others = [one for one in known if one.name.startswith(f"{group}.") and one.name != column.name]
@@ -215,7 +219,7 @@ def _names_of(role: str) -> tuple[str, ...]:
     return (*first, *ALIASES[role], *last)
 
 
-def _is_second_half(column: Column) -> bool:
+def _is_second_half(column: TableColumn) -> bool:
     """Tell whether a column may be the rest of a stamp, as `stamp.nanosec` of `stamp.sec`; `stamp_ns` is not."""
     return column.unit == "ns" and not _plain(column.name).endswith("ns")
 
@@ -225,7 +229,7 @@ def _plain(name: str) -> str:
     return re.sub(r"[^a-z0-9]+", "_", words.lower()).strip("_")
 
 
-def normalised(name: str) -> Column:
+def normalised(name: str) -> TableColumn:
     """Return a column by its name, with the unit that the name has.
 
     Of a name with dots the last parts count where only they have a meaning, as in `psr.position.x`.
@@ -238,9 +242,9 @@ def normalised(name: str) -> Column:
         if _known(last) and not re.search(f"_({_NO_PLACE})(_?[23]d)?_", group):
             of = (kind for kind, words in _GROUP_OF if re.search(f"_({words})(_?[23]d)?_", group))
             named = f"{next(of, '')}_{last}".strip("_")
-            return Column(name, last_unit, named if _known(named) else last)
+            return TableColumn(name, last_unit, named if _known(named) else last)
     rest = _LEADING.sub("", base, count=1)
-    return Column(name, unit, base if _known(base) or not _known(rest) else rest)
+    return TableColumn(name, unit, base if _known(base) or not _known(rest) else rest)
 
 
 def _known(base: str) -> bool:
@@ -259,7 +263,7 @@ def _base(name: str) -> tuple[str, str | None]:
     return head if head and tail in _LENGTHS else base, None
 
 
-def turn_of(known: Iterable[Column]) -> tuple[str, list[str]] | None:
+def turn_of(known: Iterable[TableColumn]) -> tuple[str, list[str]] | None:
     """Return the kind and the columns of an orientation that has several numbers, if there is one.
 
     `quaternion` columns are named or in a list; `angles` are about x, y and z; a `matrix` is by rows.

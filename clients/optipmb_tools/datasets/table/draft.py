@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from optipmb_tools.datasets.interface import Reports
 from optipmb_tools.datasets.motion import Moves
-from optipmb_tools.datasets.table.columns import FACTORS, Column, candidates
+from optipmb_tools.datasets.table.columns import FACTORS, TableColumn, candidates
 from optipmb_tools.datasets.table.findings import Reading
 from optipmb_tools.datasets.table.pixels import Placed
 from optipmb_tools.files import DatasetError
@@ -51,7 +51,7 @@ class Draft:
     rows: int
     scored: bool = False  # whether boxes are detections, which have a score
     framed: bool = False  # whether each of the files is a frame
-    roles: Mapping[str, Column] = field(default_factory=dict)
+    roles: Mapping[str, TableColumn] = field(default_factory=dict)
     turn_of: str = ""  # kind of an orientation of several numbers
     turn_columns: tuple[str, ...] = ()
     key: NDArray[np.str_] = field(default_factory=_unset)  # (R,) recording and sensor
@@ -96,7 +96,7 @@ class Draft:
 
 
 @dataclass(frozen=True)
-class Boxes:
+class TableRows:
     """Rows of one table; a row that stands for an empty frame is left out of all but the frames."""
 
     frame_stamp: Ints  # (R,) ns, of every row, also those without a box
@@ -123,7 +123,7 @@ class Boxes:
     apart: tuple[str, ...] = ()  # classes whose boxes are things of their own, however close
     camera: "GroundCamera | None" = None  # that placed the boxes
 
-    def rows(self, first: int, last: int) -> "Boxes":
+    def rows(self, first: int, last: int) -> "TableRows":
         """Return the table of the rows from `first` up to `last`, which are counted from 0 again."""
         if (first, last) == (0, len(self.frame_stamp)):
             return self

@@ -10,7 +10,7 @@ import numpy as np
 from optipmb_tools.datasets.evidence import Evidence
 from optipmb_tools.datasets.motion import LEAST_ALONG, MOST, SAME_DIRECTION, Moves
 from optipmb_tools.datasets.table.angles import ANGLE_UNITS, FULL_TURN, read_quaternion
-from optipmb_tools.datasets.table.columns import BEARINGS, Column, normalised, turned
+from optipmb_tools.datasets.table.columns import BEARINGS, TableColumn, normalised, turned
 from optipmb_tools.datasets.table.corners import CORNERED
 from optipmb_tools.datasets.table.draft import Draft, column_numbers, numbers
 from optipmb_tools.datasets.table.findings import HALF, NOISE, Claim, Reading
@@ -120,7 +120,7 @@ def _heading(reading: Reading, draft: Draft) -> Floats:
         unknown = int(np.isnan(yaw).sum())
         if unknown < len(yaw):
             moving = unposed and is_moving(yaw, long)
-            column = draft.roles.get("yaw", Column("", None, ""))
+            column = draft.roles.get("yaw", TableColumn("", None, ""))
             way = _Way(
                 strict=draft.scored,
                 unposed=unposed,

@@ -11,7 +11,7 @@ from optipmb_tools.datasets.evidence import Evidence
 from optipmb_tools.datasets.motion import find_moves
 from optipmb_tools.datasets.table import roles, times
 from optipmb_tools.datasets.table.angles import read_angle, read_quaternion, read_turn
-from optipmb_tools.datasets.table.columns import Column, find_columns
+from optipmb_tools.datasets.table.columns import TableColumn, find_columns
 from optipmb_tools.datasets.table.draft import Draft, column_numbers, numbers
 from optipmb_tools.datasets.table.findings import Claim, Reading
 from optipmb_tools.files import DatasetError
@@ -112,7 +112,7 @@ def _poses_at(reading: Reading, path: Path, stamp: Ints) -> Floats:
         DatasetError: a stamp lies before the first or after the last pose.
     """
     columns = read_table(path, reading.options)
-    column = find_columns(columns, {}).get("stamp", Column("", None, ""))
+    column = find_columns(columns, {}).get("stamp", TableColumn("", None, ""))
     time = reading.options.get("time")
     options = {"time": time} if time in times.SECONDS and column.unit is None else {}
     own = Reading(path, {name: one for name, one in reading.options.items() if name in {"yaw", "quaternion"}} | options)

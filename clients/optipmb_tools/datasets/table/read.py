@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 
 from optipmb_tools.datasets.table import frames, headings, kept, names, places, poses, roles, scores, sizes, times
-from optipmb_tools.datasets.table.columns import Column
-from optipmb_tools.datasets.table.draft import Boxes, Draft
+from optipmb_tools.datasets.table.columns import TableColumn
+from optipmb_tools.datasets.table.draft import Draft, TableRows
 from optipmb_tools.datasets.table.findings import Reading
 from optipmb_tools.files import DatasetError
 from optipmb_tools.table_files import Columns, frame_numbers, read_table
@@ -34,7 +34,7 @@ STEPS: Final = (
 
 def read_tables(
     paths: Sequence[Path], reading: Reading, *, scored: bool, loaded: Mapping[Path, Columns] | None = None
-) -> list[tuple[Path, Boxes]]:
+) -> list[tuple[Path, TableRows]]:
     """Read the tables of a recording; tables with the same columns share units and conventions.
 
     Args:
@@ -48,12 +48,14 @@ def read_tables(
         ClientError: pyarrow is not installed.
     """
     tables = dict(loaded or {path: read_table(path, reading.options) for path in paths})
-    known: dict[Path, Mapping[str, Column]] = {path: roles.find(reading, columns) for path, columns in tables.items()}
+    known: dict[Path, Mapping[str, TableColumn]] = {
+        path: roles.find(reading, columns) for path, columns in tables.items()
+    }
     framed = _is_frame_each(reading, tables, known)
     groups: dict[tuple[str, ...], list[Path]] = {}
     for path in tables:
         groups.setdefault(tuple(sorted(f"{role} {one.name}" for role, one in known[path].items())), []).append(path)
-    found: dict[Path, Boxes] = {}
+    found: dict[Path, TableRows] = {}
     for members in groups.values():
         lengths = [len(next(iter(tables[path].values()), ())) for path in members]
         ends = np.cumsum(lengths).tolist()
@@ -73,7 +75,7 @@ def read_tables(
     return [(path, found[path]) for path in paths]
 
 
-def _is_frame_each(reading: Reading, tables: dict[Path, Columns], known: dict[Path, Mapping[str, Column]]) -> bool:
+def _is_frame_each(reading: Reading, tables: dict[Path, Columns], known: dict[Path, Mapping[str, TableColumn]]) -> bool:
     """Tell whether the tables of a folder are frames of one recording; those without stamps get their file's number."""
     filled = {path: columns for path, columns in tables.items() if len(next(iter(columns.values()), ()))}
     found = {path: known[path] for path in filled}
@@ -110,14 +112,14 @@ def _joined(tables: Sequence[Columns]) -> Columns:
     return joined
 
 
-def _boxes(reading: Reading, draft: Draft) -> Boxes:
+def _boxes(reading: Reading, draft: Draft) -> TableRows:
     """Return what all steps read."""
     for one in STEPS:
         draft = one(reading, draft)
     center, sensor = draft.center, draft.roles.get("sensor")
     if draft.scored and draft.centres and draft.height not in draft.roles:  # not even that is taken for granted
         center = np.insert(center[:, :2], 2, np.nan, axis=1)
-    return Boxes(
+    return TableRows(
         frame_stamp=draft.stamps.ns,
         frame_key=draft.key,
         frame_pose=draft.pose,

@@ -8,7 +8,15 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from optipmb_tools.datasets.table.columns import ALIASES, NOTHING, Column, candidates, find_columns, normalised, turn_of
+from optipmb_tools.datasets.table.columns import (
+    ALIASES,
+    NOTHING,
+    TableColumn,
+    candidates,
+    find_columns,
+    normalised,
+    turn_of,
+)
 from optipmb_tools.datasets.table.corners import with_boxes
 from optipmb_tools.datasets.table.draft import Draft
 from optipmb_tools.datasets.table.findings import Reading, Understood
@@ -42,7 +50,7 @@ def step(reading: Reading, draft: Draft) -> Draft:
     return replace(draft, columns=boxes, roles=roles, turn_of=kind, turn_columns=tuple(members))
 
 
-def find(reading: Reading, columns: Columns) -> dict[str, Column]:
+def find(reading: Reading, columns: Columns) -> dict[str, TableColumn]:
     """Return the column of each meaning, as the user says or by names and values."""
     chosen = {key.removeprefix("column."): name for key, name in reading.options.items() if key.startswith("column.")}
     for role, name in chosen.items():
@@ -63,7 +71,7 @@ def find(reading: Reading, columns: Columns) -> dict[str, Column]:
         name for name in columns if re.fullmatch(r"(.*[._])?(ego|sensor|lidar)?_?pose(_matrix)?[._]\d[._]\d", name)
     ]
     if "pose_x" not in found and len(cells) in _MATRICES:  # a matrix by rows, which `poses` reads as a whole
-        found |= {role: Column(name, None, "") for role, name in zip(("pose_x", "pose_y"), cells, strict=False)}
+        found |= {role: TableColumn(name, None, "") for role, name in zip(("pose_x", "pose_y"), cells, strict=False)}
     track = found.get("id")
     over_ground = track is not None and track.base == "track" and columns[track.name].dtype.kind == "f"
     if track is not None and over_ground and {"lat", "lon"} <= found.keys() and "yaw" not in found:
@@ -72,7 +80,7 @@ def find(reading: Reading, columns: Columns) -> dict[str, Column]:
         named = [name for name in candidates(columns, "class") if name in words - used]
         few = [name for name in named if len(unique_texts(columns[name])[0]) <= _FEW_CLASSES]
         if len(few) == 1:
-            found["class"] = Column(few[0], None, "")
+            found["class"] = TableColumn(few[0], None, "")
     return found
 
 
@@ -98,7 +106,7 @@ def note(reading: Reading, draft: Draft) -> Draft:
     return draft
 
 
-def _with_frame_numbers(reading: Reading, columns: Columns, found: Mapping[str, Column]) -> Columns:
+def _with_frame_numbers(reading: Reading, columns: Columns, found: Mapping[str, TableColumn]) -> Columns:
     """Return columns with the numbers of frames, or stamps, that their names hold: `frame_12.bin`.
 
     Raises:

@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from optipmb_tools.datasets.table.columns import UNITS, Column
+from optipmb_tools.datasets.table.columns import UNITS, TableColumn
 from optipmb_tools.datasets.table.draft import Draft, Stamps, missing, numbers
 from optipmb_tools.datasets.table.findings import HALF, Reading
 from optipmb_tools.geometry import Bools, Ints
@@ -308,7 +308,7 @@ def _stamps(reading: Reading, draft: Draft) -> Stamps:
     return Stamps(stamp, shown if shown.dtype.kind == "U" and unit == "s" else values, column.name, skipped)
 
 
-def _of_texts(reading: Reading, values: NDArray[Any], column: Column) -> tuple[np.ndarray, str | None]:
+def _of_texts(reading: Reading, values: NDArray[Any], column: TableColumn) -> tuple[np.ndarray, str | None]:
     """Return the numbers (R,) of stamps that are texts, and their unit."""
     if values.dtype.kind == "U" and (clock := read_clock(values)) is not None:
         reading.note("time", f"stamps are times of a day in column {column.name}")

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from google.protobuf.message import Message as ProtoMessage
 
     from optipmb_service.edges.access import Caller
-    from optipmb_service.edges.grpc.server import Server
+    from optipmb_service.edges.grpc.server import GrpcServer
     from optipmb_service.edges.readers import Outbox
 
     P = TypeVar("P", bound=ProtoMessage)
@@ -94,7 +94,7 @@ class Call:
     """
 
     def __init__(
-        self, gateway: Server, context: grpc.aio.ServicerContext[Any, Any], caller: Caller, method: str
+        self, gateway: GrpcServer, context: grpc.aio.ServicerContext[Any, Any], caller: Caller, method: str
     ) -> None:
         self.gateway = gateway
         self.caller = caller

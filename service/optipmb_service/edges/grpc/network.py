@@ -56,9 +56,9 @@ class Item:
     """Message of the network, encoded as a response of any streaming method.
 
     Attributes:
-        tracks: of which it is, if it is of any.
-        problem: its code and path, if it is one.
-        events: of zones, if it is these; each call makes its own response of them.
+        tracks: of a message of tracks, as they came; else None.
+        problem: code and path of a problem; else None.
+        events: events of zones, of which each call makes a response of its own; else None.
     """
 
     stream: str

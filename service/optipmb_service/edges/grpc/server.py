@@ -98,7 +98,7 @@ class CallMetrics:
         self.invalid = 0
 
 
-class Server:
+class GrpcServer:
     """A gateway that serves, and what its calls share; to be made and used on its loop.
 
     Args:
@@ -263,8 +263,8 @@ class Server:
 
 
 @contextlib.contextmanager
-def serving(settings: Settings, client: Client, sessions: Callable[[str], str]) -> Iterator[Server]:
-    """Serve meanwhile, on a thread with a loop of its own: neither side waits for the other. Arguments as of `Server`.
+def serving(settings: Settings, client: Client, sessions: Callable[[str], str]) -> Iterator[GrpcServer]:
+    """Serve meanwhile, on a thread with a loop of its own: neither side waits for the other. As `GrpcServer`.
 
     Raises:
         ClientError: the address, the certificates or the access cannot be used.
@@ -273,12 +273,12 @@ def serving(settings: Settings, client: Client, sessions: Callable[[str], str]) 
     thread = threading.Thread(target=loop.run_forever, name="grpc", daemon=True)
     thread.start()
 
-    async def begin() -> Server:
-        server = Server(settings, client, sessions)
+    async def begin() -> GrpcServer:
+        server = GrpcServer(settings, client, sessions)
         await server.start()
         return server
 
-    server: Server | None = None
+    server: GrpcServer | None = None
     try:
         server = asyncio.run_coroutine_threadsafe(begin(), loop).result()
         log.info("grpc", address=server.address)

@@ -308,7 +308,7 @@ class Readers:
             begins = await ended.enter_async_context(self.joined(keys, reader))
             revoked = asyncio.create_task(self.revoked(request, caller))
             ended.callback(revoked.cancel)
-            return _Stream(self._lines(reader, begins, pause_s, revoked), ended.pop_all(), headers)
+            return _EventResponse(self._lines(reader, begins, pause_s, revoked), ended.pop_all(), headers)
 
     async def _lines(
         self, reader: Source, begins: str, pause_s: float, revoked: asyncio.Task[None]
@@ -329,7 +329,7 @@ class Readers:
             await asyncio.sleep(pause_s)
 
 
-class _Stream(StreamingResponse):
+class _EventResponse(StreamingResponse):
     """Server-sent events for one reader; closes `ended` when they end, however they do."""
 
     def __init__(

@@ -74,7 +74,7 @@ STATUS: Final = {
 """Statuses of refused frames by their codes; of others 400."""
 
 
-class _Stream(msgspec.Struct):
+class _StreamName(msgspec.Struct):
     """The stream that a frame names."""
 
     stream: str = ""
@@ -314,7 +314,7 @@ class _Sender:
         """Return the stream on which a frame that is not valid is reported; empty: on none."""
         name = self.stream
         try:
-            name = name or msgspec.json.decode(payload, type=_Stream).stream
+            name = name or msgspec.json.decode(payload, type=_StreamName).stream
             self.inputs.client.keys.problems(name)
             self.caller.may_publish(name)
         except (ValueError, msgspec.DecodeError, RecursionError, NotAllowedError):

@@ -50,7 +50,7 @@ CLOCK_BACK_NS: Final = 5 * 10**9
 
 
 @dataclass
-class _Waiting:
+class _Pending:
     kind: Kind
     message: Any
     stamp_ns: int
@@ -69,7 +69,7 @@ class _Stream:
     """Until when messages wait for the session to restart in another world; clock of the bridge."""
     ended: str = ""
     """Id of the session in the world before, whose tracks may still come."""
-    waiting: dict[Kind, collections.deque[_Waiting]] = field(
+    waiting: dict[Kind, collections.deque[_Pending]] = field(
         default_factory=lambda: {"detections": collections.deque(), "points": collections.deque()}
     )
     arrived: collections.OrderedDict[int, float] = field(default_factory=collections.OrderedDict)
@@ -103,7 +103,7 @@ class _Stream:
     """Objects without a place in the CPM, by reason."""
 
 
-class Bridge:
+class Ros2Bridge:
     """The streams of the settings, and the transforms that they share. Not for several threads."""
 
     def __init__(self, settings: Settings, node: Ros2Node) -> None:
@@ -165,7 +165,7 @@ class Bridge:
                 one.newest_ns = stamp_ns
             one.newest_ns = max(one.newest_ns, stamp_ns)
         queue = one.waiting[kind]
-        queue.append(_Waiting(kind, message, stamp_ns, now + self._settings.tf_wait_s, now))
+        queue.append(_Pending(kind, message, stamp_ns, now + self._settings.tf_wait_s, now))
         if len(queue) > WAITING[kind]:
             shed = queue.popleft()
             self._tell(one, "shed", f"more than {WAITING[kind]} {kind} wait for their pose", shed.stamp_ns)
@@ -276,7 +276,7 @@ class Bridge:
             stream.ask_s = now + ASK_S
             self._node.set_parameters(stream.name, schemas.SessionParameters(horizons=np.array(horizons)))
 
-    def _sent(self, stream: _Stream, waiting: _Waiting, now: float) -> bool:
+    def _sent(self, stream: _Stream, waiting: _Pending, now: float) -> bool:
         """Send or drop a message; False while it has to wait."""
         frame = arrays.frame_of(waiting.message.header)
         try:
@@ -304,7 +304,7 @@ class Bridge:
                 stream.arrived.popitem(last=False)
         return True
 
-    def _message(self, stream: _Stream, waiting: _Waiting, pose: schemas.Pose) -> schemas.Detections | schemas.Points:
+    def _message(self, stream: _Stream, waiting: _Pending, pose: schemas.Pose) -> schemas.Detections | schemas.Points:
         header: Any = {
             "stream": stream.name,
             "epoch": stream.epoch,

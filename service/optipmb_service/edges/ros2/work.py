@@ -19,7 +19,7 @@ from optipmb_schemas.ros2.cpm import CPM
 from optipmb_schemas.ros2.tracks import TOPICS
 
 from optipmb_service.edges.ros2 import graph
-from optipmb_service.edges.ros2.bridge import DIAGNOSTICS, Bridge
+from optipmb_service.edges.ros2.bridge import DIAGNOSTICS, Ros2Bridge
 from optipmb_service.telemetry.health import STUCK_S, Component
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ class Work(Component):
         super().__init__(node.client)
         self._settings = settings
         self._node = node
-        self._bridge = Bridge(settings, node)
+        self._bridge = Ros2Bridge(settings, node)
         self._queue: collections.deque[tuple[Callable[[], None], int, bool]] = collections.deque()
         self._waiting_bytes = 0
         self._lock = threading.Lock()
