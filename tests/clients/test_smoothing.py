@@ -17,12 +17,16 @@ from optipmb_tools.run.profiles import read_profile
 from optipmb_tools.run.smoothing import smooth
 from optipmb_tools.run.tracking import track_whole
 
-from optipmb import load_profile
+from optipmb import load_profile, parse_parameters
 from optipmb.filter.lightweight import turn_around
 from optipmb.model.table import ClassTable
 
 Array = NDArray[np.float64]
 FRAMES = 60
+LEVEL = {
+    "memory": 0.5, "missed": 2.0, "evidence": [0.0], "existence": [0.5], "along": [0.2], "across": [0.1],
+}  # fmt: skip
+"""Calibration that is the same for all tracks."""
 
 
 @pytest.fixture(scope="module")
@@ -104,6 +108,21 @@ def test_a_track_keeps_one_sign(sequence: DataSequence) -> None:
         backward.append(sum(heading > 0.5 * np.pi for _, heading in errors(loaded, tracks)))
     assert turns[0] > 0 == turns[1]
     assert backward[1] < 0.5 * backward[0]
+
+
+def test_the_factors_of_a_calibration_hold_for_smoothed_states(sequence: DataSequence) -> None:
+    """They scale the published deviations of speeds and turn rates, and change nothing that is smoothed."""
+    factors = np.array([1.0, 1.0, 2.0, 1.0, 3.0, 1.0])
+    found = []
+    for speed, turn_rate in ((1.0, 1.0), (2.0, 3.0)):
+        document = read_profile("kitti").model_dump()
+        for own in document["classes"].values():
+            own["calibration"] = (own["calibration"] or LEVEL) | {"speed": speed, "turn_rate": turn_rate}
+        found.append(track_whole(parse_parameters(document), sequence, smooth=True).tracks)
+    for one, scaled in zip(*(tracks.values() for tracks in found), strict=True):
+        np.testing.assert_allclose(scaled.covariance, one.covariance * np.outer(factors, factors), rtol=1e-6, atol=1e-9)
+        for name in ("center", "yaw", "velocity"):
+            np.testing.assert_allclose(getattr(scaled, name), getattr(one, name), rtol=1e-9)
 
 
 def test_a_sequence_without_frames_has_no_tracks(sequence: DataSequence) -> None:

@@ -289,6 +289,35 @@ def test_an_object_of_autoware_is_read_whole() -> None:
     assert boxes_of(autoware(), {"truck": "Lorry"}).labels == ("Lorry",)
 
 
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1), (1, 2, 0)])
+@pytest.mark.parametrize("kind", ["vision_msgs", "vision_msgs before 4", "autoware"])
+def test_the_likeliest_of_several_classes_is_taken(kind: str, order: tuple[int, ...]) -> None:
+    """Label, score and covariance are those of the likeliest hypothesis, wherever it stands."""
+    labels, scores = ("bus", "truck", "car"), (0.2, 0.7, 0.1)
+    if kind == "autoware":
+        message = autoware(existence_probability=0.0)
+        message.objects[0].classification = [SimpleNamespace(label=(3, 2, 1)[k], probability=scores[k]) for k in order]
+        assert (boxes_of(message).labels, boxes_of(message).score.tolist()) == (("truck",), [0.7])
+        return
+    pose = autoware().objects[0].kinematics.pose_with_covariance.pose
+    results = []
+    for k in order:
+        one: dict[str, Any] = {"class_id" if kind == "vision_msgs" else "id": labels[k], "score": scores[k]}
+        place = SimpleNamespace(covariance=np.arange(36.0) + k + 1.0)
+        own = {"hypothesis": SimpleNamespace(**one)} if kind == "vision_msgs" else one
+        results.append(SimpleNamespace(pose=place, **own))
+    box = SimpleNamespace(center=pose, size=SimpleNamespace(x=4.0, y=2.0, z=1.5))
+    array: Any = SimpleNamespace(
+        __msgtype__=DETECTIONS[0],
+        header=autoware().header,
+        detections=[SimpleNamespace(results=results, bbox=box, id="")],
+    )
+    boxes = boxes_of(array, covariance=True)
+    assert (boxes.labels, boxes.score.tolist()) == (("truck",), [0.7])
+    assert boxes.position_covariance is not None
+    assert boxes.position_covariance[0, 0, 0] == 2.0
+
+
 def test_covariances_of_positions_are_read_where_asked_for() -> None:
     """Covariances of a pose's x, y and z, if the message says that it has them; zeros are unknown."""
     types, spread = own_types(), np.arange(36.0)

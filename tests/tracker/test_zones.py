@@ -145,6 +145,15 @@ def test_how_a_line_is_crossed(path: list[tuple[float, float] | None], direction
     assert [one.direction for one in events_of([GATE], along(*path))] == directions
 
 
+@pytest.mark.parametrize("share", [0.1, 0.25, 0.9])
+def test_a_crossing_is_where_and_when_the_way_meets_the_line(share: float) -> None:
+    """Place and time lie as far from the frame before as the line does."""
+    gate = Zone("gate", line=((10.0 * share, -50.0), (10.0 * share, 50.0)), margin=0.2)
+    (crossed,) = events_of([gate], along((0.0, 0.0), (10.0, -4.0)))
+    assert crossed.at_ns == round(share * STEP_NS)
+    assert crossed.position == pytest.approx((10.0 * share, -4.0 * share, 0.0))
+
+
 def test_a_bent_line_is_crossed_where_it_is() -> None:
     """Not where the way crosses the chord between its ends."""
     bend = Zone("bend", line=((0, 0), (0, 10), (10, 10)))
