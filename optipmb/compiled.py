@@ -20,7 +20,6 @@ What the stages of a step take is described once, here; docstrings list what a s
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import logging
 import os
@@ -39,8 +38,14 @@ from llvmlite.binding import get_host_cpu_features
 from numba.core import config, event
 from numba.core.caching import IndexDataCacheFile, InTreeCacheLocator
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from typing import IO
 
     F = TypeVar("F", bound=Callable[..., object])
 else:
@@ -155,15 +160,17 @@ class _Calls:
             self.signatures[name, tuple(map(numba.typeof, arguments))] = None
             self._inside = True
             try:  # columns of a class are attributes to numba, which they are in a recarray
-                return function(*(np.asarray(one).view(np.recarray) if _has_names(one) else one for one in arguments))
+                with np.errstate(all="ignore"):  # as in machine code
+                    return function(*map(_with_attributes, arguments))
             finally:
                 self._inside = False
 
         return cast("F", call)
 
 
-def _has_names(value: object) -> bool:
-    return isinstance(value, np.ndarray) and value.dtype.names is not None
+def _with_attributes(value: object) -> object:
+    named = isinstance(value, np.ndarray | np.void) and value.dtype.names is not None
+    return np.asarray(value).view(np.recarray)[()] if named else value  # [()]: a row stays one
 
 
 calls: Final = _Calls()
@@ -233,7 +240,7 @@ class _Index(IndexDataCacheFile):
         with ExitStack() as stack:
             with suppress(OSError):  # its file system has no locks
                 file = stack.enter_context((Path(self._cache_path) / "optipmb.index.lock").open("a"))
-                fcntl.flock(file, fcntl.LOCK_EX)
+                _lock(file)
             super().save(key, data)  # type: ignore[no-untyped-call]  # numba ships no types
 
 
@@ -289,6 +296,12 @@ def _package_folder(folder: Path) -> Path:
     return folder.parent / name
 
 
+def _lock(file: IO[str], *, wait: bool = True) -> None:
+    """Keep other processes from locking a file until it is closed; without locks, on Windows, each compiles."""
+    if fcntl is not None:
+        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+
+
 @contextmanager
 def _one_at_a_time(folder: Path) -> Iterator[bool]:
     """Hold the lock of a folder of machine code; yield whether the folder can be written to."""
@@ -297,10 +310,10 @@ def _one_at_a_time(folder: Path) -> Iterator[bool]:
             folder.mkdir(parents=True, exist_ok=True)
             file = stack.enter_context((folder / "optipmb.lock").open("a"))
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                _lock(file, wait=False)
             except BlockingIOError:
                 _log.warning("optipmb: waiting for another process, which compiles the tracker")
-                fcntl.flock(file, fcntl.LOCK_EX)
+                _lock(file)
         yield os.access(folder, os.W_OK)
 
 
@@ -341,6 +354,8 @@ def _private_folder() -> str | None:
 
     Machine code is loaded from it: a folder that somebody else owns or may write to is not used.
     """
+    if not hasattr(os, "getuid"):  # on Windows numba has a folder of the user, or none
+        return None
     folder = Path(tempfile.gettempdir()) / f"optipmb-kernels-{os.getuid()}"
     try:
         folder.mkdir(mode=0o700, exist_ok=True)

@@ -2,6 +2,7 @@
 
 import faulthandler
 import gc
+import os
 import signal
 import sys
 from collections.abc import Generator
@@ -31,11 +32,19 @@ OTHERS = {
 }
 """Files whose tests `make test` leaves to `make alone` and `make accuracy`, by their marker."""
 
+MACHINE_CODE = ("tracker/test_prepared.py", "tracker/test_returned_arrays.py", "tracker/test_warm_up.py")
+"""Files about compilation, which are left out where there is none."""
+
+PLAIN = os.environ.get("NUMBA_DISABLE_JIT") == "1"
+"""Whether kernels run as Python."""
+
 WAITING = ("docker", "e2e", "grpc", "service")
 """Folders whose tests mostly start processes and wait for them."""
 
 # The same thirty examples in every run, unless a test says otherwise; `--hypothesis-profile default` looks at more.
-hypothesis.settings.register_profile("same", derandomize=True, deadline=None, database=None, max_examples=30)
+# Kernels as Python take a hundred times as long.
+EXAMPLES = 3 if PLAIN else 30
+hypothesis.settings.register_profile("same", derandomize=True, deadline=None, database=None, max_examples=EXAMPLES)
 hypothesis.settings.load_profile("same")
 # It also draws constants of the modules that are loaded, and those depend on the tests that a process ran before. There
 # is no setting for it.
@@ -57,9 +66,20 @@ def pytest_collection() -> Generator[None, object, object]:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     _interleave(items)
     marker_of = {HERE / name: marker for marker, names in OTHERS.items() for name in names}
+    left_out = {HERE / name for name in MACHINE_CODE} if PLAIN else set()
     for item in items:
         if item.path in marker_of:
             item.add_marker(marker_of[item.path])
+        if item.path in left_out:
+            item.add_marker(pytest.mark.skip(reason="nothing is compiled"))
+
+
+def pytest_report_teststatus(report: pytest.CollectReport | pytest.TestReport) -> tuple[str, str, str] | None:
+    """Name a test where it fails, not at the end of the run alone, which may be cut."""
+    if not report.failed:
+        return None
+    category = "failed" if report.when == "call" else "error"
+    return category, f"\n{category.upper()} {report.nodeid}\n", category.upper()
 
 
 def _interleave(items: list[pytest.Item]) -> None:

@@ -87,15 +87,15 @@ optipmb.warm._run = lambda: [call() for call in calls[:: int(os.environ["ORDER"]
 WITH_SHIPPED = """
 import sys
 from pathlib import Path
-import numpy as np
 import optipmb.compiled
+from optipmb.filter.predict import wrap
 from optipmb.warm import compilations
 
 optipmb.compiled.SHIPPED = Path(sys.argv[1])
 lacking = sys.argv[2:]
 features = optipmb.compiled.get_host_cpu_features()
 optipmb.compiled.get_host_cpu_features = lambda: {name: has and name not in lacking for name, has in features.items()}
-optipmb.bev_iou(np.zeros((1, 5)), np.zeros((1, 5)))
+wrap(0.5)
 print(compilations())
 """
 
@@ -174,16 +174,28 @@ def test_programs_that_start_at_once_compile_once_together(tmp_path: Path) -> No
 def test_a_process_that_cannot_start_others_compiles_alone() -> None:
     """Without the right to run the interpreter a kernel is compiled where it is called, and one line says so."""
     program = (
-        "import sys; sys.executable = '/no/interpreter'\n"
-        "import numpy as np, optipmb; print(optipmb.bev_iou(np.zeros((1, 5)), np.zeros((1, 5))).shape)"
+        "import sys; sys.executable = '/no/interpreter'\nfrom optipmb.filter.predict import wrap; print(wrap(0.5))"
     )
     with tempfile.TemporaryDirectory() as cache:
         environment = os.environ | {"NUMBA_CACHE_DIR": cache, "OPTIPMB_COMPILE_PROCESSES": "2"}
         command = [sys.executable, "-W", "ignore", "-c", program]
         done = subprocess.run(command, capture_output=True, text=True, timeout=110, check=True, env=environment)
-    assert done.stdout == "(1, 1)\n"
+    assert done.stdout == "0.5\n"
     line = "optipmb: cannot start other processes ([Errno 2] No such file or directory: '/no/interpreter'): "
     assert done.stderr.count(f"{line}this one compiles alone\n") == 1
+
+
+def test_without_locks_of_files_kernels_are_compiled_and_kept() -> None:
+    """Windows has no `fcntl`: the library can be imported, and the second process compiles nothing."""
+    program = (
+        "import sys; sys.modules['fcntl'] = None\n"
+        "from optipmb.filter.predict import wrap; from optipmb.warm import compilations; wrap(0.5); print(compilations())"
+    )
+    with tempfile.TemporaryDirectory() as cache:
+        environment = os.environ | {"NUMBA_CACHE_DIR": cache, "OPTIPMB_COMPILE_PROCESSES": "0"}
+        command = [sys.executable, "-W", "ignore", "-c", program]
+        runs = [subprocess.run(command, capture_output=True, text=True, check=True, env=environment) for _ in range(2)]
+    assert [int(one.stdout) for one in runs] == [1, 0]
 
 
 @pytest.mark.parametrize("setting", ["OPTIPMB_COMPILE_PROCESSES", "NUMBA_OPT"])
@@ -193,8 +205,7 @@ def test_a_compilation_is_announced_once_with_its_progress(setting: str) -> None
     Without optimization nothing can be cached: no other processes compile.
     """
     program = (
-        "import optipmb.compiled as compiled; compiled.STEPS = 1000\n"
-        "import numpy as np, optipmb; optipmb.bev_iou(np.zeros((1, 5)), np.zeros((1, 5)))"
+        "import optipmb.compiled as compiled; compiled.STEPS = 1000\nfrom optipmb.filter.predict import wrap; wrap(0.5)"
     )
     with tempfile.TemporaryDirectory() as cache:
         environment = os.environ | {"NUMBA_CACHE_DIR": cache, setting: "0"}

@@ -20,7 +20,7 @@ from rich.table import Table
 from optipmb_tools.datasets import DATASETS, DataSequence, Dataset, dataset_at, open_dataset
 from optipmb_tools.datasets.interface import Assumption
 from optipmb_tools.results.exports import FEATURES, OPENLABEL, is_openlabel
-from optipmb_tools.run.bulk import Executor, executor_for
+from optipmb_tools.run.bulk import Executor, executor_for, processors
 from optipmb_tools.table_files import SUFFIXES
 
 WORTH_PROCESSES = 3000  # frames from which further processes are faster than this one alone
@@ -258,7 +258,7 @@ class JobOptions:
             return executor_for(self.jobs or 0, self.ray)
         jobs = self.jobs
         if jobs is None:
-            jobs = len(os.sched_getaffinity(0)) if frames > WORTH_PROCESSES else 1
+            jobs = processors() if frames > WORTH_PROCESSES else 1
         return executor_for(min(jobs, tasks))
 
 

@@ -213,6 +213,11 @@ def _run(call: str, task: Any) -> str:
     return str(file)
 
 
+def processors() -> int:
+    """Return how many processors this process may use; where the system does not say, as on macOS, all there are."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def executor_for(jobs: int, ray: str | None = None) -> Executor:
     """Return the executor for `jobs` tasks at once.
 

@@ -19,7 +19,7 @@ import ray
 from optipmb_client.errors import ClientError
 from ray.exceptions import RayError, RayTaskError
 
-from optipmb_tools.run.bulk import ATTEMPTS, Executor, Failed, Function, WorkerDiedError, attempt
+from optipmb_tools.run.bulk import ATTEMPTS, Executor, Failed, Function, WorkerDiedError, attempt, processors
 
 LOCAL = "local"  # the address of a cluster that is started here and ends with the command
 STORE_BYTES = 256 * 2**20  # shared memory of a local cluster; the rest is written to disk
@@ -48,7 +48,7 @@ class RayCluster(Executor):
             os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
             self._folder = tempfile.TemporaryDirectory(prefix="optipmb-ray-", ignore_cleanup_errors=True)
             options |= {
-                "num_cpus": jobs or len(os.sched_getaffinity(0)),
+                "num_cpus": jobs or processors(),
                 "object_store_memory": STORE_BYTES,
                 "include_dashboard": False,
                 "_node_ip_address": "127.0.0.1",  # nothing listens to other machines
