@@ -22,8 +22,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"
 
 from gaps import (
     CLASSES,
+    DECLARED,
     FALSE_OBJECT,
     SCENES,
+    SITES,
     SIZES,
     Judged,
     decided,
@@ -151,6 +153,29 @@ def head(*cells: object) -> None:
     print()
     line(*cells)
     line(*["---"] * len(cells))
+
+
+def sites(seeds: Sequence[int], how: How) -> None:
+    """Print the table of the scenes in which exits and passages may be declared, joined while tracking."""
+    parameters = generic_parameters(CLASSES, 0.1)
+    head("scene", "declared", "right", "wrong", "true gaps of 2 to 10 s", "of 10 to 30 s", "the same after 120 s")
+    for name in SITES:
+        for declared in (False, True):
+            every, later = Judged(), Judged()
+            for seed in seeds:
+                recording = record(name, seed, 300.0)
+                settings = optipmb.Rejoin(min_probability=how.least, **DECLARED[name] if declared else {})
+                made = (optipmb.make_frame(parameters, **one)[0] for one in recording.frames)
+                tracks = followed(made, parameters, settings)
+                found, joined = how.joins(tracks, parameters)
+                owner = owners(tracks, recording.source)
+                every += judge(found, joined, owner)
+                late = found.first_ns[joined[1]] >= 120 * 10**9
+                rows = found.take(found.first_ns >= 0)
+                later += judge(rows, tuple(one[late] for one in joined), owner)  # type: ignore[arg-type]
+            right, wrong, _ = every.counts(how.least)
+            shares = [every.share(low, high, how.least) for low, high in ((2, 10), (10, 30))]
+            line(name, "yes" if declared else "no", right, wrong, *(f"{100 * a:.0f} of {n}" for a, n in shares), "")
 
 
 def generated(seeds: Sequence[int], how: How, scenes: Sequence[str]) -> None:

@@ -230,7 +230,7 @@ class Tracker:
         self.modules = modules if modules is not None else Modules()
         self._labels = parameters.labels
         self._table = ClassTable.of(parameters)
-        self._kinds = Kinds.of(parameters)
+        self._kinds = Kinds.of(parameters, rejoin)
         self._horizons = np.array(parameters.horizons, np.float64)
 
     def initial(self, next_id: int = 1) -> Density:

@@ -9,7 +9,11 @@ P is the probability that an object returns, and f(T) = 1 / (T log(1 + gap / T_0
 p(y, w | i, T) is a mixture along and across the heading of i: the object stays, keeps its velocity up to white noise of
 its acceleration, wanders (its velocity is an Ornstein-Uhlenbeck process), or is anywhere in reach. lambda is the rate
 of new objects, half uniform over the area of the class, half around other beginnings. Each beginning counts with the
-probability that it was new.
+probability that it was new; those of what is there when a session or one of its sensors starts count nothing.
+
+Exits and passages may be declared. What is lost in an exit does not return, and what begins there is new. An object
+that is lost at the start of a passage may be seen again at its end after a time within bounds, which adds a part to
+p(y, T | i): most objects keep their speed on the way, the time of the others is uniform.
 
 The joins are the matching of ends and beginnings with the largest sum of positive s_ij. A join has the probability
 1 / (1 + exp(-m)) with the margin m: the largest sum less the largest one without that pair. Two equal candidates have
@@ -35,6 +39,7 @@ from optipmb.model.density import OMEGA, objects_in
 from optipmb.model.errors import ParameterError
 from optipmb.model.frame import LONGEST_MODEL
 from optipmb.model.lost_objects import PLACES, Beginnings, Lost, Places, Rejoining, Statistics, Tracklets
+from optipmb.model.polygons import check_polygon, inside
 from optipmb.model.rows import arrays_of, views_of
 from optipmb.model.tracks import Tracks, tracks_in
 
@@ -100,6 +105,15 @@ SPACING_NS: Final = 80_000_000
 """Least distance of the places of a live track that are kept, at most `PLACES`, ns."""
 RECENT_NS: Final = 120 * 10**9
 """Beginnings that count for the rate of new objects while tracking."""
+MOST_SHAPES: Final = 64
+"""Exits and passages of a `Rejoin`, and"""
+MOST_CORNERS: Final = 100
+"""corners of each of their polygons."""
+RETURNS_BY_PASSAGE: Final = 0.9
+PACE: Final = 0.12
+"""Standard deviation of the speed in a passage from the one before or behind it, relative."""
+BY_PACE: Final = 0.8
+"""Share of the objects in a passage that keep their speed; the time of the others is uniform within the bounds."""
 RIVAL_NS: Final = 3 * 10**9
 """Tracks that began so lately compete for lost objects."""
 LEAST_SIZES: Final = 5
@@ -122,6 +136,24 @@ _BOUNDS: Final = MappingProxyType(
 """Least and largest values of `Rejoin`."""
 
 
+Polygon = tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True)
+class Passage:
+    """Way on which objects are not detected.
+
+    Args:
+        start: polygon in which they are lost, m, world frame.
+        end: polygon in which they are seen again.
+        s: shortest and longest time between, s.
+    """
+
+    start: Polygon
+    end: Polygon
+    s: tuple[float, float]
+
+
 @dataclass(frozen=True)
 class Rejoin:
     """Joining of tracks while tracking.
@@ -132,6 +164,8 @@ class Rejoin:
         decide_s: time from the first detection of a track to its decision, s.
         most: lost objects that are kept; then the oldest are dropped.
         embedding_model: model whose vectors are compared; None: none are.
+        exits: polygons of the world frame, m, as doors: what is lost inside is gone, and what begins inside is new.
+        passages: ways on which objects are not detected.
 
     Raises:
         ParameterError: a value is out of its bounds.
@@ -142,6 +176,8 @@ class Rejoin:
     decide_s: float = 0.3
     most: int = 1000
     embedding_model: str | None = None
+    exits: tuple[Polygon, ...] = ()
+    passages: tuple[Passage, ...] = ()
 
     def __post_init__(self) -> None:
         for name, (least, most, expected) in _BOUNDS.items():
@@ -151,6 +187,18 @@ class Rejoin:
         if self.embedding_model is not None and not 1 <= len(self.embedding_model) <= LONGEST_MODEL:
             expected = f"1 to {LONGEST_MODEL} characters"
             raise ParameterError("rejoin.embedding_model", expected, str(len(self.embedding_model)))
+        if (count := len(self.exits) + len(self.passages)) > MOST_SHAPES:
+            raise ParameterError("rejoin.exits", f"at most {MOST_SHAPES} exits and passages", str(count))
+        for k, one in enumerate(self.exits):
+            check_polygon(f"rejoin.exits[{k}]", one, MOST_CORNERS)
+        for k, way in enumerate(self.passages):
+            path = f"rejoin.passages[{k}]"
+            check_polygon(f"{path}.from", way.start, MOST_CORNERS)
+            check_polygon(f"{path}.to", way.end, MOST_CORNERS)
+            low, high = way.s
+            if not 0.0 <= low < high <= self.gap_s:
+                expected = f"two ascending times in [0, {self.gap_s:g}] s, the second within gap_s"
+                raise ParameterError(f"{path}.s", expected, str(way.s))
 
 
 TrackletArrays: Final = arrays_of(Tracklets, "TrackletArrays", __name__)
@@ -176,20 +224,52 @@ _BEGINNINGS: Final = _layout(Beginnings)
 """First word and words of each column."""
 
 
+class Declared(NamedTuple):
+    """Exits and passages as arrays.
+
+    Attributes:
+        corners: (K, 2) of all polygons: of the exits, then start and end of each passage.
+        first: (Z + 1,) first corner of each polygon.
+        seconds: (Q, 2) shortest and longest time of each passage.
+        area: (Q,) of the ends of passages, m^2.
+    """
+
+    corners: Array
+    first: Index
+    seconds: Array
+    area: Array
+
+    @classmethod
+    def of(cls, settings: Rejoin | None) -> Declared:
+        """Return what settings declare."""
+        exits, passages = (settings.exits, settings.passages) if settings is not None else ((), ())
+        shapes = [*exits, *(one for way in passages for one in (way.start, way.end))]
+        ends = [np.array(way.end, np.float64) for way in passages]
+        turned = [one[:, 0] * np.roll(one[:, 1], -1) - one[:, 1] * np.roll(one[:, 0], -1) for one in ends]
+        return cls(
+            np.array([place for one in shapes for place in one], np.float64).reshape(-1, 2),
+            np.cumsum([0, *map(len, shapes)]).astype(np.int64),
+            np.array([way.s for way in passages], np.float64).reshape(-1, 2),
+            np.array([0.5 * abs(one.sum()) for one in turned], np.float64),
+        )
+
+
 class Kinds(NamedTuple):
-    """What joining knows of classes."""
+    """What joining knows of classes, and of the place."""
 
     motion: Array  # (C, 8) fields of `Motion`
     kind: Index  # (C,) first class of its group
     area: Array  # (C,) m^2
+    declared: Declared
 
     @classmethod
-    def of(cls, parameters: Parameters) -> Kinds:
-        """Return what joining knows of the classes of a profile."""
+    def of(cls, parameters: Parameters, settings: Rejoin | None = None) -> Kinds:
+        """Return what joining knows of the classes of a profile, and what settings declare."""
         groups = [one.group or name for name, one in parameters.classes.items()]
         motion = np.array([motion_of(name) for name in parameters.labels])
         kind = np.array([groups.index(one) for one in groups], dtype=np.int64)
-        return cls(motion, kind, np.array([one.area for one in parameters.classes.values()]))
+        area = np.array([one.area for one in parameters.classes.values()])
+        return cls(motion, kind, area, Declared.of(settings))
 
 
 def motion_of(name: str) -> Motion:
@@ -309,6 +389,65 @@ def pair_score(i: Tracklets, n: int, j: Tracklets, k: int, kind: Index, motion: 
     velocity = (cos * vx + sin * vy, cos * vy - sin * vx)
     moved = motion_score(offset, velocity, variance, later, j.begin_variance[k], t, reach, own)
     return moved + math.log(RETURNS / (max(t, SHORTEST_S) * math.log1p(gap_s / SHORTEST_S)))
+
+
+@kernel
+def _within(declared: Declared, shape: int, place: Array) -> bool:
+    """Return whether a place (2,) is inside a declared polygon."""
+    corners: Array = declared.corners[declared.first[shape] : declared.first[shape + 1]]
+    return inside(corners, place[0], place[1])
+
+
+@kernel
+def _in_exit(declared: Declared, place: Array) -> bool:
+    for shape in range(declared.first.shape[0] - 1 - 2 * declared.area.shape[0]):
+        if _within(declared, shape, place):
+            return True
+    return False
+
+
+@kernel
+def _pace(before: tuple[Array, float], after: tuple[Array, float]) -> tuple[float, float]:
+    """Return the speed between two velocities with variances, and its relative deviation; NaN where none is known."""
+    total = weights = 0.0
+    for velocity, variance in (before, after):
+        speed = math.hypot(velocity[0], velocity[1])
+        if not math.isnan(variance) and speed > 0.0:
+            weight = 1.0 / (variance + (PACE * speed) ** 2)
+            total, weights = total + weight * speed, weights + weight
+    speed = total / weights if weights > 0.0 else math.nan
+    return speed, 1.0 / (math.sqrt(weights) * speed)
+
+
+@kernel
+def passage_score(i: Tracklets, n: int, j: Tracklets, k: int, declared: Declared) -> float:
+    """Return log p(y, T | i, a declared passage) of row `n` before it and row `k` behind it; -inf: there is none."""
+    t, total, passages = (j.first_ns[k] - i.last_ns[n]) * _NS, 0.0, declared.area.shape[0]
+    for q in range(passages):
+        low, high = declared.seconds[q]
+        shape = declared.first.shape[0] - 1 + 2 * (q - passages)
+        if not (low <= t <= high and _within(declared, shape, i.end[n]) and _within(declared, shape + 1, j.begin[k])):
+            continue
+        density = 1.0 / (high - low)
+        way = math.hypot(j.begin[k, 0] - i.end[n, 0], j.begin[k, 1] - i.end[n, 1])
+        known = (i.end_velocity[n], i.end_variance[n]), (j.begin_velocity[k], j.begin_variance[k])
+        speed, deviation = _pace(known[0], known[1])
+        if way > 0.0 and speed > 0.0:
+            square = (math.log(t * speed / way) / deviation) ** 2
+            density *= 1.0 - BY_PACE
+            density += BY_PACE * math.exp(-0.5 * square) / (math.sqrt(2.0 * math.pi) * deviation * t)
+        total += RETURNS_BY_PASSAGE * density / declared.area[q]
+    return math.log(total) if total > 0.0 else -math.inf
+
+
+@kernel
+def _settles_ns(declared: Declared, place: Array) -> int:
+    """Return the time after a start in which what begins at a place was there before: in a passage, its longest."""
+    seconds, passages = 0.0, declared.area.shape[0]
+    for q in range(passages):
+        if _within(declared, declared.first.shape[0] + 2 * (q - passages), place):
+            seconds = max(seconds, declared.seconds[q, 1])
+    return int(seconds / _NS)
 
 
 @kernel
@@ -702,6 +841,114 @@ def _newest(stamp_ns: Index, most: int) -> Index:
 
 
 @kernel
+def _scores(
+    tables: tuple[Tracklets, Tracklets, Beginnings, Statistics],
+    ends: Index,
+    young: Index,
+    due: Flags,
+    moment: tuple[int, float],
+    kinds: Columns,
+    vectors: Vectors,
+) -> Array:
+    """Return s_ij (E, M) of ends and beginnings, NaN or -inf where they are not joined.
+
+    Only what is connected with a decision by pairs that may be joined is scored.
+
+    Args:
+        tables: lost objects, live tracks, beginnings and statistics of classes.
+        ends: (E,) rows of the lost objects and, behind these, of live tracks.
+        young: (M,) rows of live tracks that began lately.
+        due: (M,) those on which to decide.
+        moment: stamp and `Rejoin.gap_s`.
+        kinds: the fields of `Kinds`.
+        vectors: of the tracks and of the lost objects.
+    """
+    (lost, live, begun, known), (motion, kind, area, plan), (stamp_ns, gap_s) = tables, kinds, moment
+    declared, many = Declared(*plan), lost.id.shape[0]
+    score = np.full((ends.shape[0], young.shape[0]), math.nan)
+    wanted, used, grows = due.copy(), np.zeros(ends.shape[0], np.bool_), True
+    news = np.zeros(area.shape[0])
+    for n in range(begun.id.shape[0]):
+        news[begun.kind[n]] += begun.new[n]
+    while grows:
+        grows = False
+        for m in range(young.shape[0]):
+            k = young[m]
+            c = kind[live.label[k]]
+            seconds = max(min(RECENT_NS, stamp_ns - known.since_ns[c]) * _NS, 1.0)
+            # The own beginning of a track that was decided on is among the others, with at most one.
+            everywhere = max(1.0 + news[c] - (live.object[k] >= 0), 1e-12) / area[live.label[k]]
+            least_log, log_rate = math.log(0.5 * everywhere / seconds), math.nan
+            if _in_exit(declared, live.begin[k]):
+                least_log = math.inf
+            for at in range(ends.shape[0]):
+                if not math.isnan(score[at, m]) or not (wanted[m] or used[at]):
+                    continue
+                table, n = (lost, ends[at]) if ends[at] < many else (live, ends[at] - many)
+                value = pair_score(table, n, live, k, kind, motion, gap_s)
+                if value > -math.inf:
+                    value = _log_sum(value, passage_score(table, n, live, k, declared))
+                    sizes = known.count[c], known.mean[c], known.square[c]
+                    value += size_score(table.size[n], live.size[k], sizes[0], sizes[1], sizes[2], LEAST_SIZES)
+                    if vectors.total.shape[1] > 0:
+                        value += appearance_score(vectors, table.id[n], live.id[k], c)
+                if value > least_log and not _in_exit(declared, table.end[n]):
+                    if math.isnan(log_rate):
+                        around = _around(begun, c, live.id[k], live.begin[k, 0], live.begin[k, 1])
+                        log_rate = math.log(0.5 * (everywhere + around) / seconds)
+                    value = round((value - log_rate) / QUANTUM) * QUANTUM
+                else:
+                    value = -math.inf
+                score[at, m] = value
+                if value > 0.0:
+                    grows |= not (wanted[m] and used[at])
+                    wanted[m] = used[at] = True
+    return score
+
+
+@kernel
+def _measure(known: Statistics, c: int, size: Array) -> None:
+    """Count the sizes (3,) of a track in the statistics of a class."""
+    for s in range(3):
+        if not math.isnan(size[s]):
+            known.count[c, s] += 1.0
+            apart = size[s] - known.mean[c, s]
+            known.mean[c, s] += apart / known.count[c, s]
+            known.square[c, s] += apart * (size[s] - known.mean[c, s])
+
+
+@kernel
+def _continue(live: Tracklets, k: int, table: Tracklets, row: int, probability: float) -> None:
+    """Let live row `k` go on with the object of a row before the gap."""
+    live.object[k], live.probability[k] = table.object[row], table.probability[row] * probability
+    share = table.detections[row] / (table.detections[row] + live.detections[k])
+    for s in range(3):
+        size, own = table.size[row, s], live.size[k, s]
+        live.size[k, s] = own if math.isnan(size) else size if math.isnan(own) else own + share * (size - own)
+    live.detections[k] += table.detections[row]
+
+
+@kernel
+def _with_beginnings(
+    begun_words: Array, live: Tracklets, rows: Index, odds: Array, stamp_ns: int, kinds: Columns, known: Statistics
+) -> Array:
+    """Return the words of the beginnings of the last time, and of rows of live tracks with their odds to be joined."""
+    begun, kind, declared = beginnings_in(begun_words), kinds[1], Declared(*kinds[3])
+    recent = np.flatnonzero(begun.stamp_ns >= stamp_ns - RECENT_NS)
+    recent = recent[max(0, recent.shape[0] + rows.shape[0] - MOST_BEGINNINGS) :]
+    more = np.empty((recent.shape[0] + rows.shape[0]) * _BEGINNING)
+    found = beginnings_in(more)
+    _copy(begun_words, recent, more, np.arange(recent.shape[0]), _BEGINNINGS)
+    for n in range(rows.shape[0]):
+        at, k = recent.shape[0] + n, rows[n]
+        c = kind[live.label[k]]
+        found.id[at], found.kind[at], found.stamp_ns[at] = live.id[k], c, live.first_ns[k]
+        settled = live.first_ns[k] >= known.settled_ns[c] + _settles_ns(declared, live.begin[k])
+        found.place[at], found.new[at] = live.begin[k], settled / (1.0 + math.exp(odds[n]))
+    return more
+
+
+@kernel
 def decide(
     given: tuple[Array, Array, Array, Array],
     young: Index,
@@ -727,105 +974,41 @@ def decide(
         detected any more, and end.
     """
     live_words, lost_words, begun_words, class_words = given
-    (motion, kind, area), (gap_s, least) = kinds, limits
     live, lost, known = tracklets_in(live_words), tracklets_in(lost_words), statistics_in(class_words)
-    begun = beginnings_in(begun_words)
-    count, many = young.shape[0], lost.id.shape[0]
+    kind, many = kinds[1], lost.id.shape[0]
     coasting = np.flatnonzero((live.object >= 0) & (live.last_ns < stamp_ns))
-    last = np.concatenate((lost.last_ns, live.last_ns[coasting]))
-    candidates = _newest(last, MOST_SCORES // max(count, 1))
-    most = candidates.shape[0]
-    # Only what is connected with a decision by pairs that may be joined is scored.
-    score = np.full((most, count), math.nan)
-    wanted, used, grows = due.copy(), np.zeros(most, np.bool_), True
-    news = np.zeros(area.shape[0])
-    for n in range(begun.id.shape[0]):
-        news[begun.kind[n]] += begun.new[n]
-    while grows:
-        grows = False
-        for m in range(count):
-            k = young[m]
-            c = kind[live.label[k]]
-            seconds = max(min(RECENT_NS, stamp_ns - known.since_ns[c]) * _NS, 1.0)
-            # The own beginning of a track that was decided on is among the others, with at most one.
-            everywhere = (1.0 + news[c] - (live.object[k] >= 0)) / area[live.label[k]]
-            least_log, log_rate = math.log(0.5 * max(everywhere, 1e-12) / seconds), math.nan
-            for at in range(most):
-                if not math.isnan(score[at, m]) or not (wanted[m] or used[at]):
-                    continue
-                one = candidates[at]
-                table, n = (lost, one) if one < many else (live, coasting[one - many])
-                value = pair_score(table, n, live, k, kind, motion, gap_s)
-                if value > -math.inf:
-                    sizes = known.count[c], known.mean[c], known.square[c]
-                    value += size_score(table.size[n], live.size[k], sizes[0], sizes[1], sizes[2], LEAST_SIZES)
-                    if vectors.total.shape[1] > 0:
-                        value += appearance_score(vectors, table.id[n], live.id[k], c)
-                if value > least_log:
-                    if math.isnan(log_rate):
-                        around = _around(begun, c, live.id[k], live.begin[k, 0], live.begin[k, 1])
-                        log_rate = math.log(0.5 * (everywhere + around) / seconds)
-                    value = round((value - log_rate) / QUANTUM) * QUANTUM
-                else:
-                    value = -math.inf
-                score[at, m] = value
-                if value > 0.0:
-                    grows |= not (wanted[m] and used[at])
-                    wanted[m] = used[at] = True
+    ends = np.concatenate((np.arange(many), many + coasting))
+    ends = ends[_newest(np.concatenate((lost.last_ns, live.last_ns[coasting])), MOST_SCORES // max(young.shape[0], 1))]
+    tables = lost, live, beginnings_in(begun_words), known
+    score = _scores(tables, ends, young, due, (stamp_ns, limits[0]), kinds, vectors)
     before, after = np.nonzero(score > 0.0)
-    gain, pairs = np.empty(before.shape[0]), before.shape[0]
-    for p in range(pairs):
+    gain = np.empty(before.shape[0])
+    for p in range(before.shape[0]):
         gain[p] = score[before[p], after[p]]
-        before[p] = candidates[before[p]]
-    if pairs > MOST_PAIRS:
+    if before.shape[0] > MOST_PAIRS:
         best = np.sort(np.argsort(-gain, kind="mergesort")[:MOST_PAIRS])
-        before, after, gain, pairs = before[best], after[best], gain[best], MOST_PAIRS
-    taken, margin, odds = match(before, after, gain, due, many + coasting.shape[0])
-    partner, sure = np.full(count, -1), np.zeros(count)
-    for p in range(pairs):
-        if taken[p]:
-            partner[after[p]], sure[after[p]] = before[p], 1.0 / (1.0 + math.exp(-margin[p]))
-    kept, ends = np.ones(many, np.bool_), np.zeros(live.id.shape[0], np.bool_)
+        before, after, gain = before[best], after[best], gain[best]
+    taken, margin, odds = match(before, after, gain, due, ends.shape[0])
+    kept, gone = np.ones(many, np.bool_), np.zeros(live.id.shape[0], np.bool_)
     decided = np.flatnonzero(due)
-    for m in range(count):
-        if not due[m]:
+    for one in young[decided]:
+        _measure(known, kind[live.label[one]], live.size[one])
+        live.object[one] = live.id[one]
+    for p in np.flatnonzero(taken):
+        probability = 1.0 / (1.0 + math.exp(-margin[p]))
+        if not due[after[p]] or probability < limits[1]:
             continue
-        k, n = young[m], partner[m]
-        c = kind[live.label[k]]
-        for s in range(3):
-            size = live.size[k, s]
-            if not math.isnan(size):
-                known.count[c, s] += 1.0
-                apart = size - known.mean[c, s]
-                known.mean[c, s] += apart / known.count[c, s]
-                known.square[c, s] += apart * (size - known.mean[c, s])
-        live.object[k] = live.id[k]
-        if n < 0 or sure[m] < least:
-            continue
-        table, row = (lost, n) if n < many else (live, coasting[n - many])
-        live.object[k], live.probability[k] = table.object[row], table.probability[row] * sure[m]
-        share = table.detections[row] / (table.detections[row] + live.detections[k])
-        for s in range(3):
-            size, own = table.size[row, s], live.size[k, s]
-            live.size[k, s] = own if math.isnan(size) else size if math.isnan(own) else own + share * (size - own)
-        live.detections[k] += table.detections[row]
-        if n < many:
-            kept[n] = False
+        k, row = young[after[p]], ends[before[p]]
+        if row < many:
+            kept[row] = False
+            _continue(live, k, lost, row, probability)
         else:
-            ends[row] = True
+            gone[row - many] = True
+            _continue(live, k, live, row - many, probability)
     if not kept.all():
         lost_words = _selected(lost_words, np.flatnonzero(kept), _TRACKLETS)
-    recent = np.flatnonzero(begun.stamp_ns >= stamp_ns - RECENT_NS)
-    recent = recent[max(0, recent.shape[0] + decided.shape[0] - MOST_BEGINNINGS) :]
-    more = np.empty((recent.shape[0] + decided.shape[0]) * _BEGINNING)
-    rows = beginnings_in(more)
-    _copy(begun_words, recent, more, np.arange(recent.shape[0]), _BEGINNINGS)
-    for n in range(decided.shape[0]):
-        at, m = recent.shape[0] + n, decided[n]
-        k = young[m]
-        rows.id[at], rows.kind[at], rows.stamp_ns[at] = live.id[k], kind[live.label[k]], live.first_ns[k]
-        rows.place[at], rows.new[at] = live.begin[k], 1.0 / (1.0 + math.exp(odds[m]))
-    return lost_words, more, np.flatnonzero(ends)
+    begun_words = _with_beginnings(begun_words, live, young[decided], odds[decided], stamp_ns, kinds, known)
+    return lost_words, begun_words, np.flatnonzero(gone)
 
 
 @kernel
@@ -971,7 +1154,11 @@ def rejoin_tracks(
         appearance, ids = looks
         vectors = Vectors(ids, appearance.total, state.lost.id, appearance.lost, appearance.counts)
     *words, objects, probability, ended, joins, dropped = advance(
-        given, (tracks.words, density.bernoulli.words, density.stamp_ns), tuple(kinds), limits, tuple(vectors)
+        given,
+        (tracks.words, density.bernoulli.words, density.stamp_ns),
+        (*kinds[:3], tuple(kinds.declared)),
+        limits,
+        tuple(vectors),
     )
     live, places, lost, begun, known = words
     after = Rejoining(Tracklets.of(live), Places.of(places), Lost.of(lost), Beginnings.of(begun), Statistics.of(known))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -17,6 +18,8 @@ PLACES: Final = 13
 """Places of a live track that are kept."""
 EMBEDDING: Final = (2, 512)
 """Least and most numbers of a vector of appearance."""
+SETTLES_NS: Final = 2 * 10**9
+"""Time after the start of a session or of a sensor in which beginnings are of what was there before."""
 DISTANCES: Final = 26
 """Bins of the distances of vectors of appearance."""
 
@@ -114,6 +117,7 @@ class Statistics(Rows):
 
     Attributes:
         since_ns: (C,) int64 stamp from which beginnings are counted.
+        settled_ns: (C,) int64 stamp before which a beginning is of what was there when a session or sensor started.
         count: (C, 3) tracks whose length, width and height are known.
         mean: (C, 3) of their logarithms.
         square: (C, 3) sum of squared differences from it.
@@ -123,6 +127,7 @@ class Statistics(Rows):
     __slots__ = ()
 
     since_ns = Column(np.int64)
+    settled_ns = Column(np.int64)
     count = Column(np.float64, 3)
     mean = Column(np.float64, 3)
     square = Column(np.float64, 3)
@@ -189,5 +194,11 @@ class Rejoining:
     def empty(cls, classes: int, stamp_ns: int) -> Rejoining:
         """Return the state before the first frame."""
         none = np.zeros((classes, 3))
-        since = Statistics(since_ns=np.full(classes, stamp_ns), count=none, mean=none, square=none)
-        return cls(Tracklets.empty(), Places.empty(), Lost.empty(), Beginnings.empty(), since)
+        since = np.full(classes, stamp_ns)
+        known = Statistics(since_ns=since, settled_ns=since + SETTLES_NS, count=none, mean=none, square=none)
+        return cls(Tracklets.empty(), Places.empty(), Lost.empty(), Beginnings.empty(), known)
+
+    def with_sensor(self, stamp_ns: int) -> Rejoining:
+        """Return the state before the first frame of another sensor, which sees what was there before."""
+        settled = np.full(len(self.classes), stamp_ns + SETTLES_NS)
+        return replace(self, classes=self.classes.replaced(settled_ns=settled))

@@ -21,6 +21,7 @@ import numpy as np
 
 from optipmb.compiled import kernel
 from optipmb.model.errors import ParameterError
+from optipmb.model.polygons import crosses_itself, inside
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -80,7 +81,7 @@ class Zone:
         least, most = (3, 1000) if self.polygon else (2, 100)
         if not least <= len(self.polygon or self.line) <= most:
             raise ParameterError(self.name, f"{least} to {most} points", str(len(self.polygon or self.line)))
-        if self.polygon and _crosses_itself(self.polygon):
+        if self.polygon and crosses_itself(self.polygon):
             raise ParameterError(f"{self.name}.polygon", "edges that do not cross", "others")
 
     @cached_property
@@ -202,12 +203,10 @@ def locate(
                 net[i, k] = crossings(shape, p, q, x, y)[0]
             if x < left or x > right or y < low or y > high:
                 continue
-            inside, nearest = False, np.inf
+            within, nearest = closed[k] and inside(shape, x, y), np.inf
             for j in range(len(shape) if closed[k] else len(shape) - 1):
                 x1, y1 = shape[j]
                 x2, y2 = shape[(j + 1) % len(shape)]
-                if (y1 > y) != (y2 > y) and x < x1 + (y - y1) / (y2 - y1) * (x2 - x1):
-                    inside = not inside
                 dx, dy = x2 - x1, y2 - y1
                 long = dx * dx + dy * dy
                 share = min(1.0, max(0.0, ((x - x1) * dx + (y - y1) * dy) / long)) if long > 0.0 else 0.0
@@ -215,9 +214,9 @@ def locate(
             beyond = max(height[k, 0] - z, z - height[k, 1], 0.0)
             if not closed[k]:
                 where[i, k] = 1 if nearest < margin[k] else 0
-            elif inside and beyond == 0.0:
+            elif within and beyond == 0.0:
                 where[i, k] = 2
-            elif max(0.0 if inside else nearest, beyond) <= margin[k]:
+            elif max(0.0 if within else nearest, beyond) <= margin[k]:
                 where[i, k] = 1
     return where, net
 
@@ -502,24 +501,6 @@ def _crossing(points: tuple[Point, ...], start: Moment, now: Event) -> tuple[int
         return net, now.at_ns, now.position
     x, y, z = (p + share * (q - p) for p, q in zip(begin, now.position, strict=True))
     return net, since_ns + round(share * (now.at_ns - since_ns)), (x, y, z)
-
-
-def _crosses_itself(polygon: tuple[Point, ...]) -> bool:
-    """Return whether two edges that are no neighbours touch, or one turns back on itself."""
-    edges = np.array([(*one, *two) for one, two in zip(polygon, (*polygon[1:], polygon[0]), strict=True)])
-
-    def side(x: Array, y: Array) -> Array:
-        x1, y1, x2, y2 = (one[:, None] for one in edges.T)
-        return np.asarray(np.sign((x2 - x1) * (y - y1) - (y2 - y1) * (x - x1)))
-
-    first, second = side(edges[:, 0], edges[:, 1]), side(edges[:, 2], edges[:, 3])
-    apart = first * second > 0
-    low, high = np.minimum(edges[:, :2], edges[:, 2:]), np.maximum(edges[:, :2], edges[:, 2:])
-    boxes = ((low[:, None] <= high[None]) & (high[:, None] >= low[None])).all(axis=2)
-    count = len(edges)
-    step = (np.arange(count)[:, None] - np.arange(count)[None]) % count
-    others = (step > 1) & (step < count - 1)
-    return bool((~apart & ~apart.T & boxes & others).any()) or len(set(polygon)) < count
 
 
 def _ns(seconds: float) -> int:

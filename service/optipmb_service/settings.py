@@ -47,6 +47,7 @@ from pydantic_settings import (
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
+    from optipmb import Rejoin
     from optipmb.world.zones import Zone
 
 PREFIX: Final = "OPTIPMB_"  # of environment variables
@@ -558,6 +559,19 @@ class CpmSettings(BaseModel):
     """sensors that the messages name once a second"""
 
 
+class PassageSettings(BaseModel):
+    """Way on which objects are not detected."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    start: Shape = Field(alias="from")
+    """polygon in which objects are lost, 3 to 100 corners in the world frame, m"""
+    to: Shape
+    """polygon in which they are seen again"""
+    s: tuple[float, float]
+    """shortest and longest time between, s"""
+
+
 class RejoinSettings(BaseModel):
     """Joining of tracks of the same object over gaps."""
 
@@ -573,6 +587,28 @@ class RejoinSettings(BaseModel):
     """lost objects that are kept; then the oldest are dropped"""
     embedding_model: str | None = Field(default=None, min_length=1, max_length=64)
     """model whose vectors (`embedding` of Detections) are compared; vectors of other models are ignored"""
+    exits: tuple[Shape, ...] = ()
+    """polygons of 3 to 100 corners in the world frame, m, as doors: what is lost inside is gone, and what begins inside
+    is new; with passages at most 64"""
+    passages: tuple[PassageSettings, ...] = ()
+    """ways on which objects are not detected"""
+
+    @field_validator("exits", "passages")
+    @classmethod
+    def _check_shapes(cls, value: tuple[Any, ...], info: ValidationInfo) -> tuple[Any, ...]:
+        if value:
+            try:
+                cls.model_construct(**info.data | {str(info.field_name): value}).joining()
+            except ValueError as error:
+                raise ValueError(str(error).removeprefix("rejoin.")) from None
+        return value
+
+    def joining(self) -> Rejoin:
+        """Return these settings as the tracker takes them."""
+        from optipmb import Passage, Rejoin  # noqa: PLC0415 - compiles kernels
+
+        values = dict(self)
+        return Rejoin(**values | {"passages": tuple(Passage(one.start, one.to, one.s) for one in self.passages)})
 
 
 def _default_instance() -> str:

@@ -23,7 +23,15 @@ FORMATS: dict[str, dict[str, Any]] = {
     "a/b/c.mapping.objects": {"a/b/c": {"format": "mapped", "mapping": {"objects": "a b", "class": "c"}}},
 }
 """The same of `inputs`."""
-JOINS = {"gap_s": 0, "min_probability": 1.0, "most": 0, "decide_s": 6, "other": 1, "embedding_model": ""}
+JOINS = {
+    "gap_s": 0,
+    "min_probability": 1.0,
+    "most": 0,
+    "decide_s": 6,
+    "other": 1,
+    "embedding_model": "",
+    "exits": [[[0, 0]]],
+}
 PATTERN = "a pattern of streams looks like site/*/lidar*"
 ONE_SITE = "patterns of one site, named without *, received"
 NODES = {"a": {"streams": ["s/n/*"]}}

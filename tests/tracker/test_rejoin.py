@@ -1,6 +1,7 @@
 """Tracks joined over gaps while tracking: what objects are, when they are decided, and the state between frames."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import gaps
@@ -9,7 +10,7 @@ import pytest
 from optipmb_tools.run.rejoining import tracklets
 
 import optipmb
-from optipmb import OnlineTracker, ParameterError, Rejoin, Relocation, Tracker, generic_parameters
+from optipmb import OnlineTracker, ParameterError, Passage, Rejoin, Relocation, Tracker, generic_parameters
 
 GENERIC = generic_parameters(gaps.CLASSES, 0.1)
 HIDDEN = gaps.cars((0, 3, (0, 0), (8, 0)), (7, 10, (0, 0), (8, 0)))
@@ -60,6 +61,50 @@ def test_without_a_sure_candidate_it_is_a_new_object(more: Any) -> None:
     last = objects(gaps.cars((0, 3, (0, 0), (8, 0)), first, *more), Rejoin(gap_s=60.0 if more else 3.0))[-1]
     assert all(number == identity for identity, (number, _) in last.items())
     assert all(probability == 1.0 for _, probability in last.values())
+
+
+def box(x0: float, y0: float, x1: float, y1: float) -> tuple[tuple[float, float], ...]:
+    return (x0, y0), (x1, y0), (x1, y1), (x0, y1)
+
+
+def last_objects(frames: list[dict[str, Any]], how: Rejoin) -> list[int]:
+    return [number for number, _ in objects(frames, how)[-1].values()]
+
+
+def test_what_is_there_at_the_start_has_not_begun_there() -> None:
+    """A parked car that is seen from the first frame on, and not for six seconds, is the same object."""
+    assert last_objects(gaps.cars((0, 2, (0, 0), (0, 0)), (8, 10, (0, 0), (0, 0))), Rejoin()) == [1]
+
+
+def test_another_sensor_sees_what_was_there() -> None:
+    """What begins with the first frame of a sensor in a session counts nothing as a beginning, and later ones do."""
+    frames = gaps.cars((0, 10, (0, 0), (0, 0)), (5, 10, (30, 0), (0, 0)), (8, 10, (60, 0), (0, 0)))
+
+    def change(density: optipmb.Density) -> optipmb.Density:
+        state = density.rejoining
+        if density.stamp_ns != 49 * 10**8 or state is None:
+            return density
+        return replace(density, rejoining=state.with_sensor(5 * 10**9))
+
+    *_, last = steps(frames, Rejoin(), change)
+    assert last.density.rejoining is not None
+    assert last.density.rejoining.beginnings.new.round(1).tolist() == [0.0, 0.0, 1.0]
+
+
+@pytest.mark.parametrize("exit_", [box(20, -2, 30, 2), box(50, -2, 62, 2)], ids=["lost", "begun"])
+def test_what_is_lost_or_begins_in_an_exit_is_not_joined(exit_: Any) -> None:
+    """What is lost inside does not return, and what begins inside is new; another exit changes nothing."""
+    assert last_objects(HIDDEN, Rejoin(exits=(box(30, 10, 40, 20), exit_))) == [2]
+    assert last_objects(HIDDEN, Rejoin(exits=(box(30, 10, 40, 20),))) == [1]
+
+
+@pytest.mark.parametrize(("s", "expected"), [((2.0, 8.0), 1), ((6.0, 8.0), 2)])
+def test_a_passage_joins_its_ends(s: tuple[float, float], expected: int) -> None:
+    """A car that is seen again at its other end, within the time, is the same object; without it that is new."""
+    frames = gaps.cars((0, 3, (0, 0), (8, 0)), (8, 10, (20, 90), (0, -8)))
+    way = Passage(box(18, -3, 30, 3), box(15, 20, 25, 32), s)
+    assert last_objects(frames, Rejoin(passages=(way,))) == [expected]
+    assert last_objects(frames, Rejoin()) == [2]
 
 
 @pytest.fixture(scope="module", params=["street", "square"])
@@ -165,7 +210,12 @@ def test_without_joining_the_state_is_dropped() -> None:
 @pytest.mark.parametrize(
     ("value", "path"),
     [({"gap_s": 0.0}, "gap_s"), ({"min_probability": 0.4}, "min_probability"), ({"most": 0}, "most"),
-     ({"decide_s": 5.1}, "decide_s"), ({"gap_s": float("nan")}, "gap_s")],
+     ({"decide_s": 5.1}, "decide_s"), ({"gap_s": float("nan")}, "gap_s"),
+     ({"exits": (box(0, 0, 1, 1)[:2],)}, r"exits\[0\]: expected 3 to 100 points"),
+     ({"exits": ((*box(0, 0, 1, 1), (0.5, -1)),)}, r"exits\[0\]: expected edges that do not cross"),
+     ({"exits": (box(0, 0, 1, float("inf")),)}, r"exits\[0\]"), ({"exits": (box(0, 0, 1, 1),) * 65}, "exits"),
+     ({"passages": (Passage(box(0, 0, 1, 1), (), (0, 1)),)}, r"passages\[0\].to"),
+     ({"passages": (Passage(box(0, 0, 1, 1), box(0, 0, 1, 1), (0, 61)),)}, r"passages\[0\].s")],
 )  # fmt: skip
 def test_settings_out_of_bounds_are_named(value: dict[str, Any], path: str) -> None:
     """A value out of its bounds raises an error that names it."""

@@ -189,7 +189,8 @@ def test_without_locks_of_files_kernels_are_compiled_and_kept() -> None:
     """Windows has no `fcntl`: the library can be imported, and the second process compiles nothing."""
     program = (
         "import sys; sys.modules['fcntl'] = None\n"
-        "from optipmb.filter.predict import wrap; from optipmb.warm import compilations; wrap(0.5); print(compilations())"
+        "from optipmb.filter.predict import wrap; from optipmb.warm import compilations\n"
+        "wrap(0.5); print(compilations())"
     )
     with tempfile.TemporaryDirectory() as cache:
         environment = os.environ | {"NUMBA_CACHE_DIR": cache, "OPTIPMB_COMPILE_PROCESSES": "0"}

@@ -1,7 +1,7 @@
 """Joining of the tracks of a recording over gaps, by the scores and the matching of `optipmb.joining.rejoin`.
 
 Beginnings before and after a track count for the rate of new objects, with the probabilities to be new that `TURNS`
-turns estimate.
+turns estimate. What is there when a recording starts has not begun then, and counts nothing.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,7 @@ from optipmb.joining.rejoin import (
     pair_scores,
     size_score,
 )
-from optipmb.model.lost_objects import Tracklets
+from optipmb.model.lost_objects import SETTLES_NS, Tracklets
 from optipmb_tools.geometry import Floats, Ints
 from optipmb_tools.results import stacked
 from optipmb_tools.results.output import Objects
@@ -123,12 +123,13 @@ def joins(found: Tracklets, parameters: Parameters, gap_s: float) -> tuple[Ints,
     parts = [_pairs(found, one, kinds, gap_s) for one in np.split(order, range(AT_ONCE, len(order), AT_ONCE))]
     before, after, score = (np.concatenate(rows) for rows in zip(*parts, strict=True))
     score += _size_scores(found.size, kind, before, after)
-    new = np.ones(len(found))
+    settled = (found.first_ns - found.first_ns.min(initial=2**62) >= SETTLES_NS).astype(np.float64)
+    new = settled.copy()
     for _ in range(TURNS):
         total = np.round((score - np.log(rates(found, kind, area, new))[after]) / QUANTUM) * QUANTUM
         chosen, margin, nodes, odds = matching(before, after, total)
-        new = np.ones(len(found))
-        new[nodes] = 1.0 / (1.0 + np.exp(odds))
+        new = settled.copy()
+        new[nodes] *= 1.0 / (1.0 + np.exp(odds))
     return before[chosen], after[chosen], 1.0 / (1.0 + np.exp(-margin))
 
 

@@ -327,7 +327,10 @@ class Transition:
             density = before.density if keeps else self.no_objects(before.density.next_id)
             before = before.begun_anew(density, begun.session)
         sensor = before.sensor(frame_id.sensor)
-        result = self._used(frame_id.sensor)[1].step(before.density, seen)
+        density = before.density
+        if sensor.tracked is None and density.rejoining is not None:
+            density = replace(density, rejoining=density.rejoining.with_sensor(frame_id.stamp_ns))
+        result = self._used(frame_id.sensor)[1].step(density, seen)
         used = bool(result.diagnostics.cloud_used)
         same = sensor.tracked is not None and sensor.tracked[0] == frame_id.epoch
         highest = sensor.tracked[1] if sensor.tracked is not None and same else frame_id.seq - 1

@@ -6,7 +6,6 @@ from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
-import optipmb
 from optipmb.world.zones import MOST
 from optipmb_service.session.fixed_rate import FixedRate
 from optipmb_service.session.policy import SECOND, Policy
@@ -67,7 +66,7 @@ class SessionFactory:
             sensors=sensors,
             needs_view=bool(sensors.uses) or name in self._fusion.sites,
             has_place=site in self._settings.sites,
-            rejoin=None if rejoin is None else optipmb.Rejoin(**rejoin.model_dump()),
+            rejoin=None if rejoin is None else rejoin.joining(),
         )
 
     def fixed_rate(self, name: str) -> FixedRate | None:
