@@ -1,0 +1,235 @@
+"""Links between streams: the pure part."""
+
+import dataclasses
+import random
+
+import numpy as np
+import pytest
+from optipmb_schemas import Tracks
+from optipmb_service.links.linker import Linker
+from optipmb_service.links.rules import Passage, Placement, Region, Rules
+from sites import BEGIN_NS, RATE, View, World, circle, copied, corridor, plaza
+from tracks_message import tracks_message
+
+WEST = View("site/west/lidar", circle(-15.0, 0.0, 40.0))
+EAST = View("site/east/lidar", circle(15.0, 0.0, 40.0))
+
+
+def together(*streams: list[Tracks]) -> list[Tracks]:
+    return [one for frame in zip(*streams, strict=True) for one in frame]
+
+
+def run(messages: list[Tracks], linker: Linker | None = None) -> Linker:
+    linker = linker or Linker(Rules("area"))
+    for one in messages:
+        linker.take(one, one.stamp_ns)
+    return linker
+
+
+def ids(linker: Linker) -> dict[tuple[str, int], bytes]:
+    return {(row.stream, row.object): row.global_id for row in linker.rows()}
+
+
+def common(world: World) -> list[int]:
+    """Return the objects that both streams have seen for the last two seconds."""
+    place = world.place[-20:].reshape(-1, 2)
+    found: list[int] = np.flatnonzero((WEST.inside(place) & EAST.inside(place)).reshape(20, -1).all(axis=0)).tolist()
+    assert len(found) > 15
+    return found
+
+
+def line(
+    speed: float, *, seconds: float = 30.0, x: float = 0.0, y: float = 0.0, label: int = 1, turn: float = 0.0
+) -> World:
+    """Return one object on a straight line along x, which goes along y from half the time on with `turn` m/s."""
+    time = np.arange(round(seconds * RATE)) / RATE
+    place = np.column_stack((x + speed * time, y + turn * np.maximum(time - 0.5 * seconds, 0.0)))
+    return World(np.array([label]), place[:, None])
+
+
+def beside(*worlds: World) -> World:
+    return World(np.concatenate([one.label for one in worlds]), np.concatenate([one.place for one in worlds], axis=1))
+
+
+@pytest.fixture(scope="module")
+def site() -> tuple[World, list[Tracks]]:
+    world = plaza(3, 12.0)
+    east = dataclasses.replace(EAST, shift=(0.4, -0.3), turn=np.radians(1.0), late=0.1)
+    return world, together(copied(world, WEST, 3), copied(world, east, 3))
+
+
+def test_overlap(site: tuple[World, list[Tracks]]) -> None:
+    """Tracks of common objects get one id, and others none, where a stream is off by .5 m, 1 degree and 100 ms."""
+    world, messages = site
+    linker = run(messages)
+    found = ids(linker)
+    for (stream, one), identity in found.items():
+        assert {other for (_, other), own in found.items() if own == identity} == {one}, stream
+    for one in common(world):
+        assert found["site/west/lidar", one] == found["site/east/lidar", one]
+    bias = linker.biases[0]
+    assert np.degrees(bias["estimate"][2]) == pytest.approx(-1.0, abs=0.2)
+    assert bias["estimate"][3] == pytest.approx(0.1, abs=0.02)
+
+
+def test_state_goes_on(site: tuple[World, list[Tracks]]) -> None:
+    """A linker that is restored at any message ends with the bytes of one that went on."""
+    _, messages = site
+    whole = run(messages)
+    for cut in (1, 17, 118):
+        part = run(messages[:cut])
+        rows, changes = part.rows(), part.changes()
+        part = Linker.restored(part.rules, part.state())
+        assert part.rows() == rows
+        run(messages[cut:], part)
+        assert part.state() == whole.state()
+        assert changes + part.changes() == run(messages).changes()
+
+
+def test_state_refused() -> None:
+    """A state of another version, and bytes that are none, are refused."""
+    rules = Rules("area")
+    for state in (b"", b"\x81", Linker(rules).state()[:-3], b"\x95\x07" + Linker(rules).state()[2:]):
+        with pytest.raises(ValueError, match="state of links"):
+            Linker.restored(rules, state)
+
+
+def test_disorder(site: tuple[World, list[Tracks]]) -> None:
+    """Messages that come twice, or in another order within a second, change no link."""
+    world, messages = site
+    mixed, rng = [*messages[:2]], random.Random(1)
+    for at in range(2, len(messages), 8):
+        part = messages[at : at + 8] * 2
+        rng.shuffle(part)
+        mixed += part
+    one, other = run(messages), run(mixed)
+    for linker in (one, other):
+        found = ids(linker)
+        assert all(found["site/west/lidar", n] == found["site/east/lidar", n] for n in common(world))
+    assert other.counters["repeated"] + other.counters["late"] > 50
+
+
+@pytest.mark.parametrize("off_s", [-3600.0, 3600.0, 5.0])
+def test_wrong_clock(off_s: float, site: tuple[World, list[Tracks]]) -> None:
+    """A stream whose clock is wrong is named and left out; the links of the others do not change."""
+    world, messages = site
+    third = [
+        one.model_copy(update={"stamp_ns": one.stamp_ns + round(off_s * 1e9)})
+        for one in copied(world, View("site/wrong/lidar", circle(0.0, 0.0, 40.0)), 3)
+    ]
+    linker = Linker(Rules("area"))
+    for n, one in enumerate(messages):
+        linker.take(one, one.stamp_ns)
+        if n % 2:
+            linker.take(third[n // 2], one.stamp_ns)
+    assert ids(linker) == ids(run(messages))
+    assert "stamps are" in linker.problems["site/wrong/lidar", "wrong_clock"]
+
+
+def test_parting() -> None:
+    """The link of two who walk side by side, each seen by one stream, is withdrawn when they part: one has a new id."""
+    pair = beside(line(1.0, y=-0.15), line(1.0, y=0.15, turn=2.0))
+    west = copied(World(pair.label[:1], pair.place[:, :1]), WEST, 1)
+    east = copied(World(pair.label[1:], pair.place[:, 1:]), EAST, 1)
+    linker, seen = Linker(Rules("area")), []
+    for one in together(west, east):
+        linker.take(one, one.stamp_ns)
+        seen.append(len(linker.rows()))
+    assert max(seen[:300]) == 2
+    assert seen[-1] == 0
+    told = [row for row in linker.changes() if row.kind == "none" and not row.ended]
+    assert len({row.global_id for row in told}) == 1
+
+
+def test_session_restarts() -> None:
+    """An object keeps its id while a stream that sees it begins another session."""
+    world = plaza(5, 16.0, objects=12)
+    old, new = copied(world, EAST, 1), copied(world, EAST, 2, session="1" * 32)
+    new = [one.model_copy(update={"id": one.id + 100}) for one in new]
+    linker = run(together(copied(world, WEST, 1), [*old[:80], *new[80:]]))
+    found: dict[bytes, set[tuple[str, int]]] = {}
+    for row in linker.rows():
+        found.setdefault(row.global_id, set()).add((row.session, row.object % 100))
+    assert any(len(one) == 3 or {session for session, _ in one} == {"0" * 32, "1" * 32} for one in found.values())
+    assert all(len({number for _, number in one}) == 1 for one in found.values())
+
+
+def test_off_for_ten_minutes() -> None:
+    """A site that was off for ten minutes is linked as before when it is back."""
+    world = plaza(7, 610.0, objects=4, half=(12.0, 12.0))
+    before, after = range(50), range(6050, 6100)
+    linker = run(together(copied(world, WEST, 1, frames=before), copied(world, EAST, 1, frames=before)))
+    run(copied(world, WEST, 1, frames=range(50, 6050, 5)), linker)
+    run(together(copied(world, WEST, 1, frames=after), copied(world, EAST, 1, frames=after)), linker)
+    found = ids(linker)
+    assert all(found["site/west/lidar", n] == found["site/east/lidar", n] for n in range(4))
+
+
+@pytest.fixture(scope="module")
+def walks() -> list[Tracks]:
+    """Return tracks of people who leave one view and come into the next one, to and fro."""
+    world = corridor(2, objects=25, every=40.0)
+    views = (View("a/n/s", lambda p: p[:, 0] < 0.0), View("b/n/s", lambda p: p[:, 0] > 20.0))
+    messages = []
+    for number, view in enumerate(views):
+        tracks = copied(world, view, 2, frames=range(0, len(world.place), 2))
+        messages.append([one.model_copy(update={"id": one.id + 1000 * number}) for one in tracks])
+    return together(*messages)
+
+
+@pytest.mark.parametrize("planes", [0, 1])
+def test_passages_are_learned(planes: int, walks: list[Tracks]) -> None:
+    """Objects that pass from view to view keep their id, also where nobody knows how the world frames lie."""
+    rules = Rules("area", place=lambda stream: Placement(plane=planes if stream == "b/n/s" else 0))
+    linker = Linker(rules)
+    linked = set()
+    for one in walks:
+        linker.take(one, one.stamp_ns)
+        linked |= {(row.stream, row.object % 1000, row.global_id) for row in linker.changes() if row.kind == "passage"}
+    by_id: dict[bytes, set[int]] = {}
+    for _, number, identity in linked:
+        by_id.setdefault(identity, set()).add(number)
+    assert all(len(one) == 1 for one in by_id.values())
+    assert len(by_id) >= (15 if planes == 0 else 5)
+
+
+def test_exit(walks: list[Tracks]) -> None:
+    """Nothing that ended at an exit comes back anywhere."""
+    door = Region("a/*/*", ((-4.0, -5.0), (2.0, -5.0), (2.0, 5.0), (-4.0, 5.0)))
+    passage = Passage(Region("a/*/*"), Region("b/*/*"), (10.0, 20.0))
+    linker = run(walks, Linker(Rules("area", passages=(passage,), exits=(door,))))
+    assert linker.rows() == []
+
+
+def test_many() -> None:
+    """A thousand objects, and many tracks at one place, are bounded and named."""
+    rng = np.random.default_rng(0)
+    place = np.column_stack((rng.uniform(-200, 200, (1000, 2)), np.zeros(1000)))
+    linker = Linker(Rules("area", most=1500))
+    for n in range(8):
+        for stream, offset, session in (("a/n/s", 0, n // 4), ("b/n/s", 1, n // 4)):
+            linker.take(
+                tracks_message(
+                    stream,
+                    n,
+                    list(range(1000)),
+                    stamp_ns=BEGIN_NS + n * 200_000_000 + offset,
+                    center=place + 0.1 * rng.standard_normal((1000, 1)),
+                    covariance=0.01 * np.eye(6),
+                    session=f"{session:032d}",
+                    confirmed=1,
+                ),
+                BEGIN_NS + n * 200_000_000,
+            )
+    assert len(linker.objects) <= 1500 + 1000
+    assert ("", "too_many_objects") in linker.problems
+    crowd = Linker(Rules("area"))
+    for n in range(4):
+        for stream in ("a/n/s", "b/n/s"):
+            crowd.take(
+                tracks_message(stream, n, list(range(2500)), stamp_ns=BEGIN_NS + n * 200_000_000, confirmed=1),
+                BEGIN_NS + n * 200_000_000,
+            )
+    assert {code for _, code in crowd.problems} == {"crowded", "too_many_tracks"}
+    assert crowd.rows() == []
+    assert len(crowd.pairs) == 0
