@@ -3,10 +3,11 @@
 Row by row an object is shown late, and again and again for a moment only. Where later frames are known, a track is
 shown as a whole, from its first detection to its last, gaps included, or not at all:
 
-    logit p = mean of logit p_j over the frames j of the track up to its last detection
+    logit p = mean of logit p_j over the frames j of the track up to its last detection - `AGAINST` / h
 
-with log odds of at most `SURE`. It is confirmed from `confirm_from` on, at most from `EVEN`. The frames after the last
-detection keep their existence, and are not confirmed. Recordings and outputs with a delay use this function.
+with log odds of at most `SURE`, and h detections: a track of few needs them surer. It is confirmed from `confirm_from`
+on, at most from `EVEN`. The frames after the last detection keep their existence, and are not confirmed. Recordings and
+outputs with a delay use this function.
 
 Tracks are thus shown from their first frames on, in which their speed is hardly known. The velocity of a track is the
 mean of its velocities in the frames j of some time after it, taken back over the time d between with their acceleration
@@ -43,6 +44,8 @@ LEAST_VARIANCE: Final = 1e-6
 """Of a speed, m^2/s^2."""
 ROUNDING: Final = 1e-6
 """Of the difference of two ages, s."""
+AGAINST: Final = 2.0
+"""Log odds against a track, which its detections have to outweigh together."""
 EVEN: Final = 0.5
 """Existence from which showing a track is right more often than not."""
 
@@ -75,6 +78,7 @@ def with_hindsight(
     shown = place <= np.maximum.reduceat(detected, first)[track] if len(order) else detected >= 0
     total = np.bincount(track, np.where(shown, _log_odds(existence[order]), 0.0), len(first))
     odds = total / np.maximum(np.bincount(track, shown, len(first)), 1.0)
+    odds -= AGAINST / np.maximum(np.bincount(track, detected >= 0, len(first)), 1.0)
     existence[order] = np.where(shown, 1.0 / (1.0 + np.exp(-odds[track])), existence[order])
     least = np.array([min(one.confirm_from, EVEN) if show is None else show for one in parameters.classes.values()])
     changed: dict[str, NDArray[Any]] = {"existence": existence, "confirmed": shown[back] & (existence >= least[label])}

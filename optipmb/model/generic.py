@@ -44,8 +44,8 @@ DOUBT: Final = ((0.5, 0.6, 0.8, 0.9, 0.95, 0.98), (3.2, 2.75, 2.4, 2.1, 1.8, 1.0
 """Lasting errors relative to those of sure tracks, by existence: boxes of far and half-hidden objects, which have low
 scores, are off."""
 HISTORY: Final = (
-    {"offset": -2.1, "existence": 0.8, "duration": 1.1, "share": 2.3, "speed": 0.1},
-    {"offset": -3.6, "existence": 0.4, "duration": 1.25, "share": 2.0, "speed": 1.15},
+    {"offset": -0.25, "existence": 0.85, "duration": 0.4, "share": 0.85, "speed": 0.0},
+    {"offset": -1.0, "existence": 0.45, "duration": 0.45, "share": 0.5, "speed": 1.2},
 )
 """How whole tracks count: of cars, and of people and cyclists, who move where they are not clutter. Boxes of trucks and
 buses that last are often parts of something else."""
@@ -112,8 +112,8 @@ def _of_class(kind: str, period: float) -> dict[str, Any]:
         "birth_overlap": 0.1,
         "motion": "cv" if agile else "ctra",
         "acceleration_time": None if agile else 1.0 if two_wheeled else 3.0,
-        "confirm_from": 0.6,
-        "confirm_until": 0.5,
+        "confirm_from": 0.65,
+        "confirm_until": 0.55,
         "calibration": {
             "memory": round(0.8 ** (10.0 * period), 4),  # 0.8 over a tenth of a second
             "missed": 1.0,

@@ -4,8 +4,8 @@ An object that ended at e and one that began at y, a time T later, are one with 
 
     P p(T, y | e) / lambda(y)
 
-p is the sum of the motion of joining over gaps (`optipmb.rejoin`, where the world frames can be compared), of declared
-passages, and of what beginnings have taught: each of them counts for all ends it may continue, with its odds, at the
+p is the sum of the motion of joining over gaps (`optipmb.joining.rejoin`, where the world frames can be compared), of
+declared passages, and of what beginnings have taught: each of them counts for all ends it may continue, with its odds, at the
 places of both and the time between them, or that times the speed, whichever was steadier. lambda is the rate of new
 objects, in which each beginning counts with the probability that it was new. Kernels of `KERNEL_M` around places stand
 for cells.
@@ -17,14 +17,14 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from optipmb.lost_objects import Tracklets
-from optipmb.rejoin import KERNEL_M, QUANTUM, REACH_M, RETURNS, SHORTEST_S, Motion, match, pair_scores
+from optipmb.joining.rejoin import KERNEL_M, QUANTUM, REACH_M, RETURNS, SHORTEST_S, Motion, match, pair_scores
+from optipmb.model.lost_objects import Tracklets
 from optipmb_service.links.rules import AREA_M2, MOTION
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from optipmb.rows import Array, Index
+    from optipmb.model.rows import Array, Index
     from optipmb_service.links.rules import Passage, Region, Rules
 
     Table = NDArray[np.void]

@@ -19,8 +19,8 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from optipmb.appearance import MOST_COUNTS, Vectors, appearance_score, bin_of, distance
-from optipmb.lost_objects import DISTANCES
+from optipmb.joining.appearance import MOST_COUNTS, Vectors, appearance_score, bin_of, distance
+from optipmb.model.lost_objects import DISTANCES
 from optipmb_service.links import gaps, views
 from optipmb_service.links.gaps import EXAMPLE, PLACE, End, Learned
 from optipmb_service.links.rules import KINDS, Placement, kinds_of
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from optipmb_schemas import Tracks
 
-    from optipmb.rows import Array, Index
+    from optipmb.model.rows import Array, Index
     from optipmb_service.links.rules import Rules
 
     Table = NDArray[np.void]

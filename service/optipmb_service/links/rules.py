@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from optipmb.class_names import common_name
-from optipmb.rejoin import Kinds, motion_of
-from optipmb.zones import Shapes, Zone, locate
+from optipmb.joining.rejoin import Kinds, motion_of
+from optipmb.model.class_names import common_name
+from optipmb.world.zones import Shapes, Zone, locate
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from optipmb.rows import Array, Index
-    from optipmb.zones import Point
+    from optipmb.model.rows import Array, Index
+    from optipmb.world.zones import Point
 
 KINDS: Final = ("", "car", "bicycle", "pedestrian")
 """Kinds of objects that are told apart, by the common name of one of their classes; `""`: any other class."""

@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from optipmb.rejoin import QUANTUM, match
+from optipmb.joining.rejoin import QUANTUM, match
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from optipmb.rows import Array, Index
+    from optipmb.model.rows import Array, Index
 
     Table = NDArray[np.void]
 
