@@ -991,14 +991,14 @@ def decide(
     taken, margin, odds = match(before, after, gain, due, ends.shape[0])
     kept, gone = np.ones(many, np.bool_), np.zeros(live.id.shape[0], np.bool_)
     decided = np.flatnonzero(due)
-    for one in young[decided]:
-        _measure(known, kind[live.label[one]], live.size[one])
-        live.object[one] = live.id[one]
-    for p in np.flatnonzero(taken):
-        probability = 1.0 / (1.0 + math.exp(-margin[p]))
-        if not due[after[p]] or probability < limits[1]:
+    for k in young[decided]:
+        _measure(known, kind[live.label[k]], live.size[k])
+        live.object[k] = live.id[k]
+    for n in np.flatnonzero(taken):
+        probability = 1.0 / (1.0 + math.exp(-margin[n]))
+        if not due[after[n]] or probability < limits[1]:
             continue
-        k, row = young[after[p]], ends[before[p]]
+        k, row = young[after[n]], ends[before[n]]
         if row < many:
             kept[row] = False
             _continue(live, k, lost, row, probability)

@@ -5,10 +5,10 @@ An object that ended at e and one that began at y, a time T later, are one with 
     P p(T, y | e) / lambda(y)
 
 p is the sum of the motion of joining over gaps (`optipmb.joining.rejoin`, where the world frames can be compared), of
-declared passages, and of what beginnings have taught: each of them counts for all ends it may continue, with its odds, at the
-places of both and the time between them, or that times the speed, whichever was steadier. lambda is the rate of new
-objects, in which each beginning counts with the probability that it was new. Kernels of `KERNEL_M` around places stand
-for cells.
+declared passages, and of what beginnings have taught: each of them counts for all ends it may continue, with its odds,
+at the places of both and the time between them, or that times the speed, whichever was steadier. lambda is the rate of
+new objects, in which each beginning counts with the probability that it was new. Kernels of `KERNEL_M` around places
+stand for cells.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from optipmb.joining.rejoin import Kinds, motion_of
+from optipmb.joining.rejoin import Declared, Kinds, motion_of
 from optipmb.model.class_names import common_name
 from optipmb.world.zones import Shapes, Zone, locate
 
@@ -28,6 +28,7 @@ MOTION: Final = Kinds(
     np.array([motion_of(name) for name in KINDS]),
     np.arange(len(KINDS)),
     np.full(len(KINDS), AREA_M2),
+    Declared.of(None),
 )
 
 
