@@ -173,14 +173,7 @@ def track(
         return
     from optipmb_tools.run import profiles, tracking  # noqa: PLC0415  loads the tracker and its compiler
 
-    more: dict[str, float | str] = {name: 1 for name in ("keep_input", "fuse") if getattr(how, name)}
-    more["digits"] = how.digits
-    if how.origin is not None:
-        more["origin"] = how.origin
-    if how.submission is not None:
-        more["submission"] = number_or_text(how.submission)
-    opened = data.open(**more)
-    how.check_out(opened)
+    opened = _opened(data, how)
     rejoin = how.rejoining()
     chosen = opened.sequences
     name = how.profile or opened.dataset.profile
@@ -231,6 +224,18 @@ def track(
     if failed is not None:
         raise failed
     _complain(results, parameters.name)
+
+
+def _opened(data: DataOptions, how: TrackOptions) -> Data:
+    more: dict[str, float | str] = {name: 1 for name in ("keep_input", "fuse") if getattr(how, name)}
+    more["digits"] = how.digits
+    if how.origin is not None:
+        more["origin"] = how.origin
+    if how.submission is not None:
+        more["submission"] = number_or_text(how.submission)
+    opened = data.open(**more)
+    how.check_out(opened)
+    return opened
 
 
 def _say_result(result: "TrackedSequence") -> None:

@@ -212,20 +212,26 @@ def read_heading(
         least=LEAST_ALONG if sure else 0.0,
     )
     if claims[axis == other].evidence.share > HALF and not way.moving:  # along a grid of streets only the sense differs
-        turned = axis.removesuffix("-clockwise") if axis.endswith("-clockwise") else f"{axis}-clockwise"
-        ways = (axis, axis.removeprefix("-") if axis.startswith("-") else f"-{axis}", *(() if way.free else (turned,)))
-        claims = [
-            Claim(
-                one,
-                share(found, one)[1],
-                f"if it is {one}" if one != axis and not way.free else "",
-                _POSES if way.unposed and one_way(moves) else f"--option heading={one}, or heading={axis} to keep it",
-                "taken" if way.free else "doubt",
-            )
-            for one in ways
-        ]
+        poses = _POSES if way.unposed and one_way(moves) else ""
+        claims = _senses(axis, lambda one: share(found, one)[1], poses, free=way.free)
         axis = reading.decide("yaw", claims, "moves are forward", clash="many boxes drive backwards", asked=zero)
     return _radians(values, found, axis)
+
+
+def _senses(axis: str, forward: Callable[[str], Evidence], option: str, *, free: bool) -> list[Claim]:
+    """Return the claims of an axis, of the opposite one, and of the other turn where the corners are not `free`."""
+    turned = axis.removesuffix("-clockwise") if axis.endswith("-clockwise") else f"{axis}-clockwise"
+    ways = (axis, axis.removeprefix("-") if axis.startswith("-") else f"-{axis}", *(() if free else (turned,)))
+    return [
+        Claim(
+            one,
+            forward(one),
+            f"if it is {one}" if one != axis and not free else "",
+            option or f"--option heading={one}, or heading={axis} to keep it",
+            "taken" if free else "doubt",
+        )
+        for one in ways
+    ]
 
 
 def _radians(values: Floats, unit: str, axis: str) -> Floats:
