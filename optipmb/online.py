@@ -482,8 +482,6 @@ class OnlineTracker:
 
     def _on_ground(self, camera: GroundCamera, pose: Pose | None, columns: dict[str, Any]) -> dict[str, Any]:
         """Return the detections of pixel boxes, in the frame of the camera's position."""
-        if camera.mount == "fixed" and pose is not None:
-            raise FrameError("pose", "none, for the camera is fixed in the world (mount)", "a pose")
         given = columns.pop("label")
         if np.asarray(given).dtype.kind in "iuf" and np.size(given):
             expected = (

@@ -331,17 +331,19 @@ class GroundCamera(ParameterTable):
             foot: (M, 2) u v, where objects stand.
             label: (M,) class names.
             score: (M,); None: 1.
-            pose: of the vehicle; required if the camera is on one.
+            pose: of the vehicle; required if the camera is on one, and refused if it is fixed.
 
         Returns:
             `center` (K, 3) with z NaN, `position_covariance` (K, 3, 3), `label`, `score`; `row` (K,) of each in the
             arguments; `left_out`, counts by reason: `horizon`, `cut` by the border, `far`.
 
         Raises:
-            FrameError: wrong shapes or values; names the row.
+            FrameError: wrong shapes or values, which name the row; or a pose where there may be none, or none.
         """
-        if self.mount == "vehicle" and pose is None:
-            raise FrameError("pose", "the pose of the vehicle at each frame (mount = vehicle)", "none")
+        if (pose is None) == (self.mount == "vehicle"):
+            fixed, vehicle = "none, for the camera is fixed in the world", "the pose of the vehicle at each frame"
+            expected = f"{fixed if pose else vehicle} (mount = {self.mount})"
+            raise FrameError("pose", expected, "a pose" if pose else "none")
         names = np.asarray(label).astype(np.str_)
         boxes = self._boxes(box, foot, names)
         count = len(boxes.foot)

@@ -472,6 +472,14 @@ def test_a_camera_on_a_vehicle_moves_with_its_pose() -> None:
     np.testing.assert_allclose(view.pose.translation, other_view.pose.translation, atol=1e-9)
 
 
+def test_a_pose_belongs_to_a_camera_on_a_vehicle() -> None:
+    """A fixed camera refuses one, which would change nothing; one on a vehicle needs it. The error has the mount."""
+    pose = optipmb.Pose(np.zeros(3), np.array([1.0, 0, 0, 0]))
+    for mount, given in (("fixed", pose), ("vehicle", None)):
+        with pytest.raises(optipmb.FrameError, match=rf"pose: expected .* \(mount = {mount}\)"):
+            optipmb.GroundCamera.parse(pinhole(mount=mount)).detections([[900, 700, 1000, 780]], ["car"], pose=given)
+
+
 @pytest.mark.parametrize(
     ("mount", "given", "path"),
     [

@@ -13,7 +13,7 @@ from datetime import datetime
 from fnmatch import fnmatchcase
 from functools import cache
 from math import atan2, hypot, nan, pi, sqrt
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -305,16 +305,11 @@ class FrameReader:
         if (camera := self._camera(stream)) is None:
             expected = "`camera` in `inputs` of the stream, for pixels"
             raise schemas.MessageError("invalid_value", f"objects[0].{name}", expected, "no calibration")
-        is_fixed = camera.mount == "fixed"
-        if is_fixed and "pose" in fields:
-            raise schemas.MessageError("invalid_value", "pose", "none, for the camera is fixed in the world", "a pose")
-        if not is_fixed and "pose" not in fields:
-            raise schemas.MessageError("missing_field", "pose", "the pose of the vehicle at each frame", "nothing")
         if "position_covariance" in fields:
             at = next(at for at, one in enumerate(objects) if one.position_covariance is not None)
             path = f"objects[{at}].position_covariance"
             raise schemas.MessageError("invalid_value", path, "none beside pixels", "one")
-        fields["frame"] = "world" if is_fixed else "sensor"
+        fields["frame"] = "world" if camera.mount == "fixed" else "sensor"
         pixels = np.array([getattr(one, name) for one in objects], np.float64)
         if box_unit == "image":
             pixels *= np.resize(np.array(camera.image, np.float64), pixels.shape[1])
@@ -327,8 +322,10 @@ class FrameReader:
             found = camera.detections(label=labels, score=fields["score"], pose=pose, **given)
         except FrameError as error:
             match = re.fullmatch(r"\w+\[(\d+)\]", error.path)
-            path = f"objects[{match[1]}].{name}" if match else "objects"
-            raise schemas.MessageError("invalid_value", path, error.expected, error.received) from None
+            path = f"objects[{match[1]}].{name}" if match else "pose" if error.path == "pose" else "objects"
+            is_missing = path == "pose" and pose is None
+            code: Literal["missing_field", "invalid_value"] = "missing_field" if is_missing else "invalid_value"
+            raise schemas.MessageError(code, path, error.expected, error.received) from None
         rows = found["row"]
         for column in ("label", "score", "yaw", "size", "velocity", "embedding"):
             if column in fields:
