@@ -12,7 +12,7 @@ KITTI = --dataset kitti --root $(DATA)/kitti --detections pointrcnn
 NUSCENES = --dataset nuscenes --root $(DATA)/nuscenes --detections centerpoint
 
 FUZZ_TARGETS := fuzz-messages fuzz-checkpoints fuzz-protobuf fuzz-frames
-.PHONY: help kernels dist wheels docs pictures release image demo-files compare demo test accuracy alone bounds ray bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests check mutants lowest paths pythons repeat schemas wheel clean tune ablate
+.PHONY: help kernels dist wheels docs pictures release image demo-files compare demo test accuracy alone bounds plain ray bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests check mutants lowest paths pythons repeat schemas wheel clean tune ablate
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
 	@echo "make install a virtual environment with everything, and compiled kernels"
@@ -24,6 +24,7 @@ help:
 	@echo "make mutants  make N=25 small faults by SEED=1 in a copy, and print which ones the nearest tests miss"
 	@echo "make alone   run the tests that measure memory, latency and outages, one after the other"
 	@echo "make bounds  call the tracker with every kernel compiled with bounds checks, which takes a minute"
+	@echo "make plain   test the tracker with its kernels as Python, which makes small faults in it visible"
 	@echo "make ray     track on Ray clusters, with workers and a node killed, which takes a minute"
 	@echo "make lowest  test the wheel with the oldest packages that it may be installed with"
 	@echo "make pythons test the wheel with the newest Python that this machine has"
@@ -95,27 +96,34 @@ kernels: $(VENV)/.installed
 JOBS ?= 5
 # What a test calls with types that the warm-up lacks is compiled in its own process, not by others for it.
 # Rewritten assertions are written to disk by one process before all workers would do the same.
+# What failed in a run that was cut is in out/junit, and named in the output.
+JUNIT = --junitxml=out/junit/$@.xml
 tests: kernels
 	test -d tests/tracker/__pycache__ || $(BIN)/pytest --collect-only -qq >/dev/null
-	OPTIPMB_COMPILE_PROCESSES=0 $(BIN)/pytest -n $(JOBS) --max-worker-restart 0 --dist loadfile --no-loadscope-reorder -m "not accuracy and not alone and not bounds and not ray"
+	OPTIPMB_COMPILE_PROCESSES=0 $(BIN)/pytest $(JUNIT) -n $(JOBS) --max-worker-restart 0 --dist loadfile --no-loadscope-reorder -m "not accuracy and not alone and not bounds and not ray"
 
 # Whole recordings, outages and clusters take longer than the two minutes that other tests have.
 LONG := --timeout 500
 # The figures of accuracy that docs/tuning.md and docs/ablation.md give, on the KITTI and nuScenes data.
 accuracy: kernels
-	$(BIN)/pytest -n $(JOBS) --max-worker-restart 0 $(LONG) tests/clients -m accuracy
+	$(BIN)/pytest $(JUNIT) -n $(JOBS) --max-worker-restart 0 $(LONG) tests/clients -m accuracy
 
 # What measures memory, latency and outages, one test after the other.
 alone: kernels
-	$(BIN)/pytest $(LONG) tests/e2e tests/service/stream/test_memory.py -m alone
+	$(BIN)/pytest $(JUNIT) $(LONG) tests/e2e tests/service/stream/test_memory.py -m alone
 
 # Compiling all kernels a second time takes a minute; what is compiled is kept in .pytest_cache.
 bounds: $(VENV)/.installed
-	$(BIN)/pytest $(LONG) tests/tracker -m bounds
+	$(BIN)/pytest $(JUNIT) $(LONG) tests/tracker -m bounds
+
+# The tracker with its kernels as Python, as `make mutants` has it: files whose scenes are short.
+PLAIN := oracle calibration class_posterior consistency field_of_view geometry hypotheses lifecycle motion soundness unknown_heading update zones
+plain: $(VENV)/.installed
+	NUMBA_DISABLE_JIT=1 $(BIN)/pytest $(JUNIT) -n 2 $(PLAIN:%=tests/tracker/test_%.py) -m "not bounds"
 
 # Clusters on this machine, with the machine for themselves.
 ray: kernels
-	$(BIN)/pytest $(LONG) tests/clients -m ray
+	$(BIN)/pytest $(JUNIT) $(LONG) tests/clients -m ray
 
 # For a developer: style, types, and the tests nearest to what changed since SINCE (a commit; files not committed count).
 SINCE ?= main

@@ -88,7 +88,7 @@ def wrap(angle: float) -> float:
     """Return the angle in (-pi, pi]."""
     if -math.pi < angle <= math.pi:
         return angle
-    wrapped = angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
+    wrapped = angle - 2.0 * math.pi * np.floor((angle + math.pi) / (2.0 * math.pi))
     return wrapped if wrapped > -math.pi else math.pi
 
 
