@@ -131,12 +131,12 @@ check: $(VENV)/.installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python tests/nearest.py $(SINCE)
+	$(BIN)/python benchmarks/nearest.py $(SINCE)
 
 # Small faults at random places, in a copy of the tree: which ones do the nearest tests miss?
 SEED ?= 1
 mutants: kernels
-	$(BIN)/python tests/mutants.py $(SEED) $(if $(filter command line,$(origin N)),$(N),25)
+	$(BIN)/python benchmarks/mutants.py $(SEED) $(if $(filter command line,$(origin N)),$(N),25)
 
 # Both wheels without machine code, once for all that install them.
 dist: $(VENV)/.installed
@@ -159,7 +159,7 @@ lowest: dist
 # What stands on the first pages, from pip install to tracks, with processor time and halts; PATHS=start, csv, python, node, web or kitti walks one of them alone.
 PATHS ?=
 paths: dist
-	$(BIN)/python tests/paths.py out/dist $(PATHS)
+	$(BIN)/python benchmarks/paths.py out/dist $(PATHS)
 
 pythons: dist
 	sh tests/pythons.sh out/dist

@@ -4,7 +4,7 @@ The commands come from the pages. Nothing of the source tree can be imported. A 
 go on: a command that fails, or output that is not what the page says. The last lines have, for each path, the processor
 time of the installation and of all that follows, and the halts; with halts the status is 1.
 
-Called as: python tests/paths.py DIST [PATH...]
+Called as: python benchmarks/paths.py DIST [PATH...]
     DIST  folder with the two wheels
     PATH  those to walk: start csv python node web kitti; default: all
 """
